@@ -1,0 +1,318 @@
+"""Which OpenCL device computes, and the programs built for it.
+
+Order of preference: a GPU, Intel's processor runtime, PoCL, anything else. An explicit choice overrides it: the
+`device` argument, then PYOPENCL_CTX (pyopencl's own "platform:device" notation), then USSIM_DEVICE (either that
+notation or part of a device or platform name).
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import sys
+import zlib
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+
+from SlicerUSSim.Logic.errors import SimulationError
+
+INTEL_HINT = 'pip install "SlicerUSSim[intel]"'
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One OpenCL device: `index` in "platform:device" notation, names, and its rank (smaller is preferred)."""
+
+    index: str
+    name: str
+    platform: str
+    kind: str  # "GPU", "CPU" or "other"
+    compute_units: int
+    memory_mb: int
+    rank: int
+    handle: object = field(repr=False, compare=False)
+
+    def __str__(self) -> str:
+        return f"{self.index}  {self.name} ({self.kind}, {self.platform}, {self.compute_units} compute units)"
+
+
+@lru_cache(maxsize=1)
+def _pyopencl():
+    """Import pyopencl with every installed runtime visible to its ICD loader, or say what to install."""
+    if "pyopencl" not in sys.modules and sys.platform == "linux" and "OCL_ICD_VENDORS" not in os.environ:
+        _register_pip_runtimes()
+    try:
+        import pyopencl
+    except ImportError as error:
+        raise SimulationError(f"pyopencl cannot be imported ({error}); install it with: pip install pyopencl") from None
+    return pyopencl
+
+
+def _register_pip_runtimes() -> None:
+    """Point the ICD loader at a folder that names every runtime by absolute path.
+
+    Intel's wheel ships an .icd file with a placeholder path, and OCL_ICD_VENDORS *replaces* the loader's own folders,
+    so a folder of our own has to list Intel's library, PoCL's wheel and whatever the system has installed.
+    """
+    libraries = {}
+    for name, distribution, pattern in (
+        ("intel", "intel-opencl-rt", "libintelocl.so"),
+        ("pocl", "pocl-binary-distribution", "libpocl-"),
+    ):
+        library = _library_of(distribution, pattern)
+        if library is not None:
+            libraries[f"ussim-{name}.icd"] = str(library)
+    if "ussim-intel.icd" not in libraries:
+        return  # without Intel's wheel the loader finds everything by itself
+    for vendor in Path("/etc/OpenCL/vendors").glob("*.icd"):
+        libraries[vendor.name] = vendor.read_text().strip()
+    folder = Path(platformdirs.user_cache_dir("ussim")) / "vendors" / f"{zlib.crc32(sys.prefix.encode()):08x}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for stale in folder.glob("*.icd"):
+            if stale.name not in libraries:
+                stale.unlink(missing_ok=True)
+        for name, library in libraries.items():
+            if not (folder / name).exists() or (folder / name).read_text() != library:
+                partial = folder / f"{name}.{os.getpid()}"
+                partial.write_text(library)
+                partial.replace(folder / name)
+    except OSError:
+        return  # a read-only home: the loader's own folders still work
+    os.environ["OCL_ICD_VENDORS"] = str(folder)
+
+
+def _library_of(distribution: str, pattern: str) -> Path | None:
+    try:
+        files = importlib.metadata.files(distribution) or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    for file in files:
+        if file.name.startswith(pattern) and ".so" in file.name and not file.name.endswith((".py", ".pyc")):
+            path = Path(str(file.locate())).resolve()
+            if path.exists():
+                return path
+    return None
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Every usable OpenCL device, best first. Empty when there is none.
+
+    Raises SimulationError if pyopencl itself is missing.
+    """
+    cl = _pyopencl()
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError:  # the loader's way of saying "no platform at all"
+        return []
+    devices = []
+    for platform_index, cl_platform in enumerate(platforms):
+        try:
+            handles = cl_platform.get_devices()
+        except cl.Error:
+            continue  # a driver without hardware
+        for device_index, handle in enumerate(handles):
+            devices.append(_describe(cl, f"{platform_index}:{device_index}", cl_platform, handle))
+    return sorted(devices, key=lambda device: device.rank)
+
+
+def _describe(cl, index, cl_platform, handle) -> DeviceInfo:
+    is_gpu = bool(handle.type & cl.device_type.GPU)
+    is_cpu = bool(handle.type & cl.device_type.CPU)
+    platform_name = cl_platform.name.strip()
+    if "FPGA" in platform_name or "FPGA" in handle.name:
+        rank = 9  # Intel's FPGA emulator also lists itself; it is for FPGA developers
+    elif is_gpu:
+        rank = 0
+    elif is_cpu and "Intel" in platform_name:
+        rank = 1
+    elif is_cpu and "Portable Computing Language" in platform_name:
+        rank = 2
+    else:
+        rank = 3
+    return DeviceInfo(
+        index=index,
+        name=handle.name.strip(),
+        platform=platform_name,
+        kind="GPU" if is_gpu else "CPU" if is_cpu else "other",
+        compute_units=handle.max_compute_units,
+        memory_mb=handle.global_mem_size // 2**20,
+        rank=rank,
+        handle=handle,
+    )
+
+
+def choose_device(device: str | DeviceInfo | None = None) -> tuple[DeviceInfo, str]:
+    """The device to use and the reason, one short phrase.
+
+    Parameters
+    ----------
+    device : "0:1" (platform:device), part of a name, a DeviceInfo, or None for PYOPENCL_CTX, then USSIM_DEVICE, then
+        the best there is.
+
+    Raises SimulationError if there is no device or none fits the choice.
+    """
+    if isinstance(device, DeviceInfo):
+        return device, "chosen by argument"
+    devices = list_devices()
+    if not devices:
+        raise SimulationError(
+            "no OpenCL device found; on Linux run: pip install pocl-binary-distribution (or, faster: "
+            f"{INTEL_HINT}); on Windows and macOS install the graphics driver"
+        )
+    for choice, source in (
+        (device, "argument"),
+        (os.environ.get("PYOPENCL_CTX"), "PYOPENCL_CTX"),
+        (os.environ.get("USSIM_DEVICE"), "USSIM_DEVICE"),
+    ):
+        if choice:
+            return _find(devices, str(choice), source), f"chosen by {source}"
+    return devices[0], {0: "a GPU", 1: "the fastest processor runtime"}.get(devices[0].rank, "the only kind found")
+
+
+def _find(devices: list[DeviceInfo], choice: str, source: str) -> DeviceInfo:
+    text = choice.strip().lower()
+    exact = text if ":" in text else f"{text}:0"
+    for device in devices:
+        if device.index == exact or (not text.isdigit() and text in f"{device.name} {device.platform}".lower()):
+            return device
+    known = "; ".join(f"{device.index} {device.platform}" for device in devices)
+    raise SimulationError(f"{source}: no OpenCL device fits {choice!r}, expected one of: {known}")
+
+
+def faster_hint(device: DeviceInfo) -> str | None:
+    """The one pip line that would give a faster device than `device` on this computer, or None."""
+    if device.kind == "CPU" and "Intel" not in device.platform and sys.platform == "linux":
+        return INTEL_HINT
+    return None
+
+
+class Device:
+    """An OpenCL device ready to compute: its context, its in-order queue and its built programs.
+
+    Use `Device.get(choice)`, which makes one per device and process, so that programs are built once.
+    With `profiling = True` every kernel's event is kept until `take_profile()`.
+    """
+
+    def __init__(self, info: DeviceInfo) -> None:
+        cl = _pyopencl()
+        self.cl = cl
+        self.info = info
+        if "Portable Computing Language" in info.platform:
+            from SlicerUSSim.Logic.pocl import name_unknown_processor
+
+            name_unknown_processor(info.handle)
+        try:
+            self.context = cl.Context([info.handle])
+            self.queue = cl.CommandQueue(
+                self.context, properties=cl.command_queue_properties.PROFILING_ENABLE
+            )
+        except cl.Error as error:
+            raise SimulationError(f"OpenCL device {info} cannot be opened: {error}") from None
+        self.lanes = _vector_lanes(info)
+        self.profiling = False
+        self._events: list[tuple[str, object]] = []
+        self._kernels: dict[tuple, dict[str, object]] = {}
+
+    @staticmethod
+    def get(device: str | DeviceInfo | Device | None = None) -> Device:
+        """The Device for a choice (see choose_device); the same object for the same hardware."""
+        if isinstance(device, Device):
+            return device
+        return _open_device(choose_device(device)[0])
+
+    def kernels(self, file_name: str, struct_source: str = "", **defines) -> dict[str, object]:
+        """The kernels of kernels/`file_name`, built once with the given preprocessor definitions.
+
+        `struct_source` is C text put in front of the file: the structs shared with the host.
+        """
+        key = (file_name, struct_source, tuple(sorted(defines.items())))
+        if key not in self._kernels:
+            folder = kernel_folder()
+            source = "\n".join([struct_source, (folder / "common.clh").read_text(), (folder / file_name).read_text()])
+            options = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros"]
+            options += [f"-D{name}={value}" for name, value in defines.items()]
+            try:
+                program = self.cl.Program(self.context, source).build(options=options)
+            except self.cl.Error as error:
+                raise SimulationError(
+                    f"OpenCL device {self.info} cannot build {file_name}: {error}; try another device "
+                    "(`ussim devices` lists them)"
+                ) from None
+            self._kernels[key] = {kernel.function_name: kernel for kernel in program.all_kernels()}
+        return self._kernels[key]
+
+    def run(self, kernel, global_size: tuple[int, ...], *arguments, local_size=None) -> None:
+        """Enqueue a kernel; its profiling event is kept if `profiling` is on."""
+        event = kernel(self.queue, global_size, local_size, *arguments)
+        if self.profiling:
+            self._events.append((kernel.function_name, event))
+
+    def upload(self, array: np.ndarray):
+        """A new read-only device buffer holding a copy of `array`."""
+        flags = self.cl.mem_flags
+        self._check_size(array.nbytes)
+        return self.cl.Buffer(self.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=np.ascontiguousarray(array))
+
+    def empty(self, nbytes: int):
+        """A new uninitialised device buffer."""
+        self._check_size(nbytes)
+        return self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size=max(int(nbytes), 4))
+
+    def write(self, buffer, array: np.ndarray) -> None:
+        """Copy `array` into a buffer that is at least as large."""
+        self.cl.enqueue_copy(self.queue, buffer, array, is_blocking=True)
+
+    def download(self, buffer, shape, dtype) -> np.ndarray:
+        """A new host array with the buffer's content; waits for everything enqueued before."""
+        array = np.empty(shape, dtype)
+        if array.nbytes:
+            self.cl.enqueue_copy(self.queue, array, buffer)
+        return array
+
+    def take_profile(self) -> dict[str, float]:
+        """Milliseconds per kernel since the last call (profiling has to be on)."""
+        self.queue.finish()
+        events, self._events = self._events, []
+        total: dict[str, float] = {}
+        for name, event in events:
+            total[name] = total.get(name, 0.0) + (event.profile.end - event.profile.start) * 1e-6
+        return total
+
+    def _check_size(self, nbytes: int) -> None:
+        limit = self.info.handle.max_mem_alloc_size
+        if nbytes > limit:
+            raise SimulationError(
+                f"a buffer of {nbytes / 2**20:.0f} MB is needed but {self.info.name} allows {limit / 2**20:.0f} MB; "
+                "use a smaller or coarser volume, or another device"
+            )
+
+
+@lru_cache(maxsize=None)
+def _open_device(info: DeviceInfo) -> Device:
+    return Device(info)
+
+
+def _vector_lanes(info: DeviceInfo) -> int:
+    """How many scatterers one work-item computes side by side.
+
+    PoCL does not vectorise across work-items, so the kernels do it by hand there; GPUs and Intel's compiler do it
+    themselves and are slower with explicit vectors.
+    """
+    if "Portable Computing Language" not in info.platform:
+        return 1
+    return 16 if info.handle.native_vector_width_float >= 16 else 8
+
+
+@lru_cache(maxsize=1)
+def kernel_folder() -> Path:
+    """The folder of the .cl files: inside an installed package, or beside it in a checkout or Slicer module."""
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "kernels", package.parent / "kernels"):
+        if (folder / "common.clh").exists():
+            return folder
+    raise SimulationError(f"the OpenCL kernels are missing beside {package}; reinstall SlicerUSSim")

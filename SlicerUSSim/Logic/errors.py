@@ -1,0 +1,25 @@
+"""The one exception a user of this package has to know."""
+
+
+class SimulationError(Exception):
+    """A failure the caller caused and can mend.
+
+    The message is one line; it names the value, says what was expected and, where that is not obvious, what to do.
+    The command line prints it and exits with status 2; the Slicer panel shows it in one message box.
+    """
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise SimulationError(message) unless `condition` holds."""
+    if not condition:
+        raise SimulationError(message)
+
+
+def require_between(owner: str, name: str, value: float, low: float, high: float) -> None:
+    """Raise SimulationError unless `value` is a finite number with low <= value <= high."""
+    try:
+        inside = low <= float(value) <= high  # False for NaN
+    except (TypeError, ValueError):
+        inside = False
+    if not inside:
+        raise SimulationError(f"{owner}: {name} is {value!r}, expected a number between {low:g} and {high:g}")

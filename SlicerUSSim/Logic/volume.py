@@ -1,0 +1,270 @@
+"""Volume: a 3D image with its place in the patient. The only file where ITK's LPS becomes RAS and back."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from SlicerUSSim.Logic.errors import SimulationError, require
+
+LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """A scalar image in patient space.
+
+    Parameters
+    ----------
+    array : (k, j, i) numbers; i varies fastest in memory, as in ITK and VTK.
+    ijk_to_ras : (4, 4) takes homogeneous voxel indices (i, j, k, 1) of voxel *centres* to RAS millimetres.
+
+    Raises SimulationError for an array that is not 3D or not numeric, and for a singular or non-affine matrix.
+    """
+
+    array: np.ndarray
+    ijk_to_ras: np.ndarray
+
+    def __post_init__(self) -> None:
+        array = np.asarray(self.array)
+        matrix = np.array(self.ijk_to_ras, dtype=np.float64)
+        require(array.ndim == 3, f"volume has {array.ndim} dimensions {array.shape}, expected 3")
+        require(array.size > 0, f"volume is empty (shape {array.shape})")
+        require(
+            np.issubdtype(array.dtype, np.number) or array.dtype == bool,
+            f"volume holds {array.dtype}, expected numbers",
+        )
+        require(matrix.shape == (4, 4), f"ijk_to_ras has shape {matrix.shape}, expected (4, 4)")
+        require(
+            bool(np.isfinite(matrix).all()) and np.allclose(matrix[3], [0, 0, 0, 1]),
+            f"ijk_to_ras is not an affine matrix of finite numbers: {matrix.tolist()}",
+        )
+        columns = np.linalg.norm(matrix[:3, :3], axis=0)
+        require(
+            bool((columns > 0).all()) and abs(np.linalg.det(matrix[:3, :3] / np.where(columns > 0, columns, 1))) > 1e-6,
+            f"ijk_to_ras is singular: {matrix.tolist()}",
+        )
+        matrix.setflags(write=False)
+        object.__setattr__(self, "array", array)
+        object.__setattr__(self, "ijk_to_ras", matrix)
+
+    @property
+    def spacing_mm(self) -> np.ndarray:
+        """(3,) voxel size along i, j, k in millimetres."""
+        return np.linalg.norm(self.ijk_to_ras[:3, :3], axis=0)
+
+    @property
+    def ras_to_ijk(self) -> np.ndarray:
+        """(4, 4) inverse of ijk_to_ras."""
+        return np.linalg.inv(self.ijk_to_ras)
+
+    def with_array(self, array: np.ndarray) -> Volume:
+        """Another image on the same grid. Raises SimulationError if the shape differs."""
+        require(np.shape(array) == self.array.shape, f"array has shape {np.shape(array)}, expected {self.array.shape}")
+        return Volume(array, self.ijk_to_ras)
+
+    # ---- files -------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def read(cls, path: str | os.PathLike) -> Volume:
+        """Read NIfTI, NRRD, MetaImage, MINC 2, VTI, or a folder with one DICOM series.
+
+        Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
+        """
+        path = Path(path)
+        require(path.exists(), f"{path}: no such file or folder")
+        if path.suffix.lower() == ".vti":
+            return cls._read_vti(path)
+        image = _read_dicom_series(path) if path.is_dir() else _read_image(path)
+        return cls.from_sitk(image, name=str(path))
+
+    @classmethod
+    def from_sitk(cls, image, name: str = "image") -> Volume:
+        """From a SimpleITK image (LPS). Raises SimulationError if it is not 3D and scalar."""
+        import SimpleITK as sitk  # noqa: N813
+
+        if image.GetDimension() == 4 and image.GetSize()[3] == 1:
+            image = image[..., 0]  # NIfTI files often carry a time axis of length one
+        size = image.GetSize()
+        require(
+            image.GetDimension() == 3 and min(size) > 1,
+            f"{name}: is a {'x'.join(map(str, size))} image, expected three dimensions with two or more samples each",
+        )
+        channels = image.GetNumberOfComponentsPerPixel()
+        require(channels == 1, f"{name}: has {channels} components per voxel, expected 1")
+        index_to_lps = np.eye(4)
+        index_to_lps[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * np.array(image.GetSpacing())
+        index_to_lps[:3, 3] = image.GetOrigin()
+        return cls(sitk.GetArrayFromImage(image), LPS_TO_RAS @ index_to_lps)
+
+    def to_sitk(self):
+        """A SimpleITK image (LPS). Raises SimulationError if the axes are not perpendicular (ITK cannot store that)."""
+        import SimpleITK as sitk  # noqa: N813
+
+        direction, spacing, origin = self._direction_spacing_origin(LPS_TO_RAS @ self.ijk_to_ras)
+        array = self.array.astype(np.uint8) if self.array.dtype == bool else self.array
+        image = sitk.GetImageFromArray(np.ascontiguousarray(array))
+        image.SetSpacing(spacing.tolist())
+        image.SetOrigin(origin.tolist())
+        image.SetDirection(direction.ravel().tolist())
+        return image
+
+    def write(self, path: str | os.PathLike) -> None:
+        """Write the volume whole or not at all; the format follows from the suffix.
+
+        Raises SimulationError for an unknown suffix or an unwritable place.
+        """
+        path = Path(path)
+        require(
+            path.name.lower().endswith(WRITABLE_SUFFIXES),
+            f"{path}: unknown image format, expected a name ending in one of {', '.join(WRITABLE_SUFFIXES)}",
+        )
+        with written_whole(path) as partial:
+            if path.suffix.lower() == ".vti":
+                self._write_vti(partial)
+            else:
+                import SimpleITK as sitk  # noqa: N813
+
+                sitk.WriteImage(self.to_sitk(), str(partial), useCompression=not path.name.lower().endswith(".mhd"))
+
+    # ---- VTK ---------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_vtk(cls, image_data, ijk_to_ras: np.ndarray | None = None) -> Volume:
+        """From a vtkImageData whose physical coordinates are RAS, or with a matrix of its own as MRML nodes have.
+
+        Raises SimulationError for an image without scalars, with several components, or that is not 3D.
+        """
+        from vtkmodules.util.numpy_support import vtk_to_numpy
+
+        dims = image_data.GetDimensions()
+        require(min(dims) > 0, "vtkImageData is empty")
+        scalars = image_data.GetPointData().GetScalars()
+        require(scalars is not None, "vtkImageData has no scalars")
+        components = scalars.GetNumberOfComponents()
+        require(components == 1, f"vtkImageData has {components} components per voxel, expected 1")
+        array = vtk_to_numpy(scalars).reshape(dims[::-1])
+        if ijk_to_ras is None:
+            vtk_matrix = image_data.GetIndexToPhysicalMatrix()
+            ijk_to_ras = np.array([[vtk_matrix.GetElement(r, c) for c in range(4)] for r in range(4)])
+        # VTK counts indices from the extent's start; this class counts from zero.
+        first = np.eye(4)
+        first[:3, 3] = image_data.GetExtent()[0::2]
+        return cls(array, np.asarray(ijk_to_ras, float) @ first)
+
+    def to_vtk(self):
+        """A vtkImageData in RAS with a direction matrix; it has its own copy of the voxels."""
+        from vtkmodules.util.numpy_support import numpy_to_vtk
+        from vtkmodules.vtkCommonDataModel import vtkImageData
+
+        direction, spacing, origin = self._direction_spacing_origin(self.ijk_to_ras)
+        array = self.array.astype(np.uint8) if self.array.dtype == bool else self.array
+        image = vtkImageData()
+        image.SetDimensions(*self.array.shape[::-1])
+        image.SetSpacing(*spacing)
+        image.SetOrigin(*origin)
+        image.SetDirectionMatrix(*direction.ravel())
+        scalars = numpy_to_vtk(np.ascontiguousarray(array).ravel(), deep=True)
+        scalars.SetName("ImageScalars")
+        image.GetPointData().SetScalars(scalars)
+        return image
+
+    def _direction_spacing_origin(self, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        spacing = np.linalg.norm(matrix[:3, :3], axis=0)
+        direction = matrix[:3, :3] / spacing
+        skew = np.abs(direction.T @ direction - np.eye(3)).max()
+        require(skew < 1e-4, f"volume axes are not perpendicular (cosine {skew:.3g}); resample it to a regular grid")
+        # Rounding in files leaves the axes slightly off; ITK and VTK want them exact. The nearest rotation or reflection:
+        u, _, vt = np.linalg.svd(direction)
+        return u @ vt, spacing, matrix[:3, 3]
+
+    @classmethod
+    def _read_vti(cls, path: Path) -> Volume:
+        from vtkmodules.vtkIOXML import vtkXMLImageDataReader
+
+        reader = vtkXMLImageDataReader()
+        require(bool(reader.CanReadFile(str(path))), f"{path}: cannot be read as a VTK image")
+        reader.SetFileName(str(path))
+        reader.Update()
+        return cls.from_vtk(reader.GetOutput())
+
+    def _write_vti(self, path: Path) -> None:
+        from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+        writer = vtkXMLImageDataWriter()
+        writer.SetFileName(str(path))
+        writer.SetInputData(self.to_vtk())
+        require(writer.Write() == 1, f"{path}: cannot be written")
+
+
+def check_rigid(name: str, matrix: np.ndarray) -> np.ndarray:
+    """`matrix` as a (4, 4) float64 array. Raises SimulationError unless it is a rotation and a translation."""
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise SimulationError(f"{name} is not a matrix of numbers, expected a 4x4 rigid transform") from None
+    require(pose.shape == (4, 4), f"{name} has shape {pose.shape}, expected (4, 4)")
+    require(bool(np.isfinite(pose).all()), f"{name} holds a value that is not finite, expected a 4x4 rigid transform")
+    require(np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6), f"{name} has last row {pose[3].tolist()}, expected 0 0 0 1")
+    rotation = pose[:3, :3]
+    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    require(off < 1e-3, f"{name} is not rigid: its axes are off by {off:.3g} (expected unit length, perpendicular)")
+    require(np.linalg.det(rotation) > 0, f"{name} mirrors (determinant -1), expected a right-handed rotation")
+    return pose
+
+
+@contextmanager
+def written_whole(path: str | os.PathLike) -> Iterator[Path]:
+    """Yield a temporary path to write to; it replaces `path` only if the block succeeds.
+
+    Raises SimulationError naming `path` if it cannot be written.
+    """
+    path = Path(path)
+    require(path.parent.is_dir(), f"{path}: the folder {path.parent} does not exist")
+    require(not path.is_dir(), f"{path}: is a folder, expected a file name")
+    try:
+        folder = tempfile.mkdtemp(prefix=".ussim-", dir=path.parent)
+    except OSError as error:
+        raise SimulationError(f"{path}: cannot be written ({error.strerror})") from None
+    try:
+        yield Path(folder) / path.name
+        for file in sorted(Path(folder).iterdir()):  # .mhd and .nhdr come with a second file
+            file.replace(path.parent / file.name)
+    except (OSError, RuntimeError) as error:
+        raise SimulationError(f"{path}: cannot be written ({str(error).strip().splitlines()[-1]})") from None
+    finally:
+        for file in Path(folder).iterdir():
+            file.unlink()
+        os.rmdir(folder)
+
+
+def _read_image(path: Path):
+    import SimpleITK as sitk  # noqa: N813
+
+    sitk.ProcessObject.SetGlobalWarningDisplay(False)
+    try:
+        return sitk.ReadImage(str(path))
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
+
+
+def _read_dicom_series(folder: Path):
+    import SimpleITK as sitk  # noqa: N813
+
+    series = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
+    require(bool(series), f"{folder}: holds no DICOM series")
+    require(len(series) == 1, f"{folder}: holds {len(series)} DICOM series, expected 1; put the one to use in its own folder")
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0]))
+    try:
+        return reader.Execute()
+    except RuntimeError as error:
+        raise SimulationError(f"{folder}: cannot be read ({str(error).strip().splitlines()[-1]})") from None

@@ -1,0 +1,5 @@
+"""`python -m SlicerUSSim` is the `ussim` command."""
+
+from SlicerUSSim.cli import main
+
+main()
