@@ -12,6 +12,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.errors import SimulationError, require, require_between
 
+NOMINAL_SPEED_M_S = 1540.0
 FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
@@ -41,8 +42,6 @@ class Probe:
     elevation_aperture_mm: float = 8.0
     #: Focus of the lens; None puts it at 60 % of the depth.
     elevation_focus_mm: float | None = None
-    #: Speed the scanner assumes; sets the wavelength and the depth scale.
-    reference_speed_m_s: float = 1540.0
 
     def __post_init__(self) -> None:
         owner = type(self).__name__
@@ -54,7 +53,6 @@ class Probe:
         require_between(owner, "aperture_mm", self.aperture_mm, 0.5, 200)
         require_between(owner, "receive_f_number", self.receive_f_number, 0.5, 20)
         require_between(owner, "elevation_aperture_mm", self.elevation_aperture_mm, 0.5, 100)
-        require_between(owner, "reference_speed_m_s", self.reference_speed_m_s, 300, 6000)
         for name in ("focus_mm", "elevation_focus_mm"):
             value = getattr(self, name)
             if value is None:
@@ -130,8 +128,8 @@ class Probe:
 
     @property
     def wavelength_mm(self) -> float:
-        """Wavelength at the reference speed."""
-        return self.reference_speed_m_s / self.frequency_mhz * 1e-3
+        """Wavelength at the nominal speed of sound, 1540 m/s, which arrays are designed for."""
+        return NOMINAL_SPEED_M_S / self.frequency_mhz * 1e-3
 
     @property
     def cycles_per_mm(self) -> float:
@@ -146,16 +144,21 @@ class Probe:
         sigma_t = 1 / (2 pi sigma_f); depth is c t / 2.
         """
         sigma_mhz = self.fractional_bandwidth * self.frequency_mhz / FWHM_PER_SIGMA
-        return self.reference_speed_m_s * 1e-3 / (4.0 * np.pi * sigma_mhz)
+        return NOMINAL_SPEED_M_S * 1e-3 / (4.0 * np.pi * sigma_mhz)
 
     def beam_sigma_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
         """(lateral, elevational) standard deviation of the two-way beam amplitude at `depth_mm` along a scan line."""
         depth = np.asarray(depth_mm, dtype=float)
         transmit = self._gaussian_beam(depth, *self.transmit_waist())
-        receive = self.wavelength_mm / FWHM_PER_SIGMA * np.maximum(self.receive_f_number, depth / self.aperture_mm)
+        receive = self.receive_sigma_mm(depth)
         lateral = transmit * receive / np.hypot(transmit, receive)
         elevational = self._gaussian_beam(depth, *self.elevation_waist()) / np.sqrt(2.0)
         return lateral, elevational
+
+    def receive_sigma_mm(self, depth_mm) -> np.ndarray:
+        """One-way lateral standard deviation of the receive beam, focused at every depth."""
+        f_number = np.maximum(self.receive_f_number, np.asarray(depth_mm, dtype=float) / self.aperture_mm)
+        return self.wavelength_mm * f_number / FWHM_PER_SIGMA
 
     def transmit_waist(self) -> tuple[float, float, float]:
         """(sigma at the focus, focus, Rayleigh length) of the one-way lateral transmit beam, millimetres."""

@@ -1,0 +1,158 @@
+"""The acoustic medium as the device sees it: labels, membrane and tissue numbers in two buffers.
+
+A voxel takes two bytes. The low byte holds the label and a flag for cells (the cube between eight voxel centres) whose
+corners agree, so that most look-ups need one load. The high byte holds the *fluid fraction*: the indicator of the
+membrane's fluids smoothed by a Gaussian. Smoothing a planar border at distance d gives Phi(d / sigma), so a layer of
+thickness t is where the fraction lies within Phi(+-t / 2 sigma): a sub-voxel layer without stairs.
+"""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.device import Device
+from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.layout import CONSTANTS, TISSUE
+from SlicerUSSim.Logic.tissues import MAX_LABEL, Tissue, TissueTable
+from SlicerUSSim.Logic.volume import Volume
+
+_PAD = 1  # one voxel of coupling medium around the volume, so that a clamped look-up outside finds it
+
+
+class Medium:
+    """Labels and tissues on a device.
+
+    Parameters
+    ----------
+    labels : Volume of whole numbers; 0 is the coupling medium.
+    tissues : a Tissue for every label that occurs.
+
+    Raises SimulationError for labels that are not whole numbers or have no tissue.
+    """
+
+    def __init__(self, labels: Volume, tissues: TissueTable, device: Device) -> None:
+        self.device = device
+        self.labels = labels
+        array = _as_labels(labels.array)
+        self.present = np.flatnonzero(np.bincount(array.ravel(), minlength=256))
+        self.dims = np.array(array.shape[::-1]) + 2 * _PAD
+        self._check(tissues)
+        padded = np.pad(array, _PAD)
+        self._upload(padded, tissues)
+        self.tissue_buffer = device.upload(_tissue_rows(tissues))
+        self.tissues = tissues
+
+    @property
+    def ras_to_voxel(self) -> np.ndarray:
+        """(3, 4) affine map from RAS mm to padded voxel indices (i, j, k)."""
+        matrix = self.labels.ras_to_ijk[:3].copy()
+        matrix[:, 3] += _PAD
+        return matrix
+
+    def set_tissues(self, tissues: TissueTable) -> None:
+        """Change tissue parameters; the voxels are touched only if the membrane's place has changed."""
+        self._check(tissues)
+        if _membrane_shape(tissues) != _membrane_shape(self.tissues):
+            self._upload(np.pad(_as_labels(self.labels.array), _PAD), tissues)
+        self.device.write(self.tissue_buffer, _tissue_rows(tissues))
+        self.tissues = tissues
+
+    def _check(self, tissues: TissueTable) -> None:
+        missing = [int(label) for label in self.present if label not in tissues]
+        require(
+            not missing,
+            f"label {', '.join(map(str, missing))} has no tissue; the table has {', '.join(map(str, tissues))}",
+        )
+
+    def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:
+        fraction, self.membrane_reach = self._fluid_fraction(padded, tissues)
+        words = padded.astype(np.uint16)
+        words |= np.uint16(CONSTANTS["UNIFORM_CELL"]) * _uniform_cells(padded, fraction, self.membrane_reach)
+        if fraction is not None:
+            words |= fraction.astype(np.uint16) << 8
+        self.voxel_buffer = self.device.upload(words)
+
+    def _fluid_fraction(self, padded: np.ndarray, tissues: TissueTable) -> tuple[np.ndarray | None, float]:
+        membrane = tissues.membrane
+        if membrane is None or membrane.thickness_mm == 0:
+            return None, -1.0
+        fluids = [label for label, tissue in tissues.items() if tissue.name in membrane.fluids]
+        is_fluid = np.isin(np.arange(256), fluids)[padded]
+        if is_fluid.all() or not is_fluid.any():
+            return None, -1.0
+        spacing = self.labels.spacing_mm[::-1]
+        # Wide enough to hide the voxels' stairs, narrow enough to keep a sulcus of two voxels open.
+        sigma_mm = 0.75 * float(np.cbrt(spacing.prod()))
+        smooth = ndimage.gaussian_filter(is_fluid.astype(np.float32), sigma_mm / spacing, mode="nearest", truncate=3.0)
+        reach = NormalDist().cdf(0.5 * membrane.thickness_mm / sigma_mm) - 0.5
+        return np.rint(smooth * 255.0).astype(np.uint8), reach * 255.0
+
+
+def _as_labels(array: np.ndarray) -> np.ndarray:
+    if array.dtype == np.uint8:
+        labels = array
+    else:
+        low, high = (array.min(), array.max()) if array.size else (0, 0)
+        require(
+            bool(np.isfinite(low) and np.isfinite(high)) and low >= 0 and high <= MAX_LABEL,
+            f"label map holds values from {low} to {high}, expected whole numbers from 0 to {MAX_LABEL}",
+        )
+        labels = array.astype(np.uint8)
+        if not np.array_equal(labels, array):
+            raise SimulationError("label map holds fractions, expected whole numbers; segment the MRI first")
+    require(int(labels.max()) <= MAX_LABEL, f"label map holds label {labels.max()}, expected 0 to {MAX_LABEL}")
+    return labels
+
+
+def _uniform_cells(labels: np.ndarray, fraction: np.ndarray | None, reach: float) -> np.ndarray:
+    """True where the eight voxels at (k, j, i) + {0, 1}^3 have one label and no membrane passes between them."""
+    lowest, highest = _cell_extremes(labels)
+    uniform = lowest == highest
+    if fraction is not None:
+        lowest, highest = _cell_extremes(fraction)
+        uniform &= (lowest > 127.5 + reach) | (highest < 127.5 - reach)
+    return uniform
+
+
+def _cell_extremes(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    lowest, highest = array.copy(), array.copy()
+    for axis in range(3):
+        here = [slice(None)] * 3
+        there = [slice(None)] * 3
+        here[axis], there[axis] = slice(0, -1), slice(1, None)
+        here, there = tuple(here), tuple(there)
+        # In-place with ascending memory order: `there` still holds its old value when `here` is written.
+        lowest[here] = np.minimum(lowest[here], lowest[there])
+        highest[here] = np.maximum(highest[here], highest[there])
+    return lowest, highest
+
+
+def _tissue_rows(tissues: TissueTable) -> np.ndarray:
+    rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
+    for label, tissue in tissues.items():
+        rows[label] = _tissue_row(tissue)
+    if tissues.membrane is not None:
+        rows[CONSTANTS["MEMBRANE_LABEL"]] = _tissue_row(tissues.membrane.tissue)
+    return rows
+
+
+def _tissue_row(tissue: Tissue) -> tuple:
+    return (
+        tissue.speed_of_sound_m_s,
+        tissue.impedance_mrayl,
+        tissue.attenuation_db_cm_mhz,
+        tissue.mu0,
+        tissue.sigma0,
+        tissue.scatterer_share,
+    )
+
+
+def _membrane_shape(tissues: TissueTable) -> tuple | None:
+    membrane = tissues.membrane
+    if membrane is None:
+        return None
+    fluids = tuple(label for label, tissue in tissues.items() if tissue.name in membrane.fluids)
+    return membrane.thickness_mm, fluids

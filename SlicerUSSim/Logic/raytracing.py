@@ -1,0 +1,108 @@
+"""Host side of kernels/raytracing.cl: the ray tree of every scan line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from statistics import NormalDist
+
+import numpy as np
+
+from SlicerUSSim.Logic.device import Device, Workspace
+from SlicerUSSim.Logic.layout import CONSTANTS, HIT, SEGMENT, shared_source
+from SlicerUSSim.Logic.medium import Medium
+
+
+@dataclass(frozen=True, eq=False)
+class RayTree:
+    """The tree of one frame, on the host.
+
+    segments : structured array (layout.SEGMENT) of every straight piece along the beam axes; `segment_line` (same
+        length) is its scan line.
+    hits : structured array (layout.HIT) of every interface crossing of the elevational rays; `hit_line` is its scan
+        line, as a fraction where lines are traced more finely than scanned, and `hit_ray` its elevational ray.
+    cut_weight : (traced lines, 1 + elevational rays) weight of the branches that were not followed.
+    """
+
+    segments: np.ndarray
+    segment_line: np.ndarray
+    hits: np.ndarray
+    hit_line: np.ndarray
+    hit_ray: np.ndarray
+    cut_weight: np.ndarray
+
+
+class RayTracer:
+    """Traces the scan lines through a medium; the tree stays on the device for the stages that follow."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.kernel = device.kernels("raytracing.cl", shared_source(), LANES=1)["trace"]
+        self.workspace = Workspace(device)
+        self._quantile_key: tuple | None = None
+
+    def run(self, scene_buffer, scene: np.ndarray, medium: Medium) -> None:
+        """Enqueue the tracing of one frame. `scene` is a layout.SCENE record, `scene_buffer` the same on the device."""
+        lines, rays, lateral = (int(scene[name]) for name in ("scan_lines", "elevational_rays", "lateral_rays"))
+        traced = (lines - 1) * lateral + 1
+        self.shape = lines, traced, rays, lateral
+        get = self.workspace.get
+        self.segments = get("segments", lines * CONSTANTS["MAX_SEGMENTS"] * SEGMENT.itemsize)
+        self.segment_counts = get("segment_counts", lines * 4)
+        self.hits = get("hits", traced * rays * CONSTANTS["MAX_HITS"] * HIT.itemsize)
+        self.hit_counts = get("hit_counts", traced * rays * 4)
+        self.cut = get("cut", traced * (rays + 1) * 4)
+        if self._quantile_key != (traced, rays):
+            self._quantiles = self.device.upload(_beam_quantiles(traced, rays))
+            self._quantile_key = (traced, rays)
+        self.device.run(
+            self.kernel,
+            (traced, rays + 1),
+            scene_buffer,
+            medium.voxel_buffer,
+            medium.tissue_buffer,
+            self._quantiles,
+            self.segments,
+            self.segment_counts,
+            self.hits,
+            self.hit_counts,
+            self.cut,
+        )
+
+    def download(self) -> RayTree:
+        """The tree of the frame traced last."""
+        lines, traced, rays, lateral = self.shape
+        segments = self.device.download(self.segments, (lines, CONSTANTS["MAX_SEGMENTS"]), SEGMENT)
+        counts = self.device.download(self.segment_counts, lines, np.int32)
+        kept = np.arange(CONSTANTS["MAX_SEGMENTS"]) < counts[:, None]
+        hits = self.device.download(self.hits, (traced, rays, CONSTANTS["MAX_HITS"]), HIT)
+        hit_counts = self.device.download(self.hit_counts, (traced, rays), np.int32)
+        hit_kept = np.arange(CONSTANTS["MAX_HITS"]) < hit_counts[..., None]
+        where = np.nonzero(hit_kept)
+        return RayTree(
+            segments=segments[kept],
+            segment_line=np.nonzero(kept)[0],
+            hits=hits[hit_kept],
+            hit_line=where[0] / lateral,
+            hit_ray=where[1],
+            cut_weight=self.device.download(self.cut, (traced, rays + 1), np.float32),
+        )
+
+    def overflow(self) -> tuple[int, int]:
+        """How many scan lines and elevational rays had more segments or hits than there is room for."""
+        lines, traced, rays, _ = self.shape
+        counts = self.device.download(self.segment_counts, lines, np.int32)
+        hit_counts = self.device.download(self.hit_counts, traced * rays, np.int32)
+        return int((counts > CONSTANTS["MAX_SEGMENTS"]).sum()), int((hit_counts > CONSTANTS["MAX_HITS"]).sum())
+
+
+@lru_cache(maxsize=16)
+def _beam_quantiles(traced: int, rays: int) -> np.ndarray:
+    """(traced, rays) float32 offsets in elevational sigmas: stratified quantiles of the beam profile.
+
+    Equal weights then reproduce the profile. Each line shifts the strata by a golden-ratio sequence, so that an
+    interface tilted in elevation does not show as `rays` separate lines but as the band its time differences make.
+    """
+    shift = np.mod(0.5 + np.arange(traced) * 0.6180339887498949, 1.0)
+    share = (np.arange(rays)[None, :] + 0.05 + 0.9 * shift[:, None]) / rays
+    return np.vectorize(NormalDist().inv_cdf)(share).astype(np.float32)

@@ -1,0 +1,77 @@
+"""Host side of kernels/scan_conversion.cl: from scan lines to an image in the probe plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from SlicerUSSim.Logic.bmode import Compressor
+from SlicerUSSim.Logic.device import Device, Workspace
+from SlicerUSSim.Logic.layout import shared_source
+from SlicerUSSim.Logic.probe import Probe
+
+_DEFAULT_ROWS = 512
+
+
+@dataclass(frozen=True)
+class ImageGrid:
+    """The pixels of the scan-converted image in the probe frame (millimetres)."""
+
+    rows: int
+    columns: int
+    #: Outer edges of the first pixel
+    left_mm: float
+    top_mm: float
+    #: (column, row)
+    pixel_spacing_mm: tuple[float, float]
+
+    @classmethod
+    def for_probe(cls, probe: Probe, image_size: tuple[int, int] | None) -> ImageGrid:
+        """The grid that just holds the imaged field; square pixels unless `image_size` (rows, columns) says otherwise."""
+        left, right, top, bottom = probe.image_bounds_mm()
+        if image_size is None:
+            pixel = (bottom - top) / _DEFAULT_ROWS
+            columns = max(int(np.ceil((right - left) / pixel)), 2)
+            centre = 0.5 * (left + right)
+            return cls(_DEFAULT_ROWS, columns, centre - 0.5 * columns * pixel, top, (pixel, pixel))
+        rows, columns = image_size
+        return cls(rows, columns, left, top, ((right - left) / columns, (bottom - top) / rows))
+
+    @property
+    def image_to_probe(self) -> np.ndarray:
+        """(4, 4) from (column, row, 0, 1) of pixel centres to the probe frame in millimetres."""
+        matrix = np.eye(4)
+        matrix[0, 0], matrix[1, 1] = self.pixel_spacing_mm
+        matrix[0, 3] = self.left_mm + 0.5 * self.pixel_spacing_mm[0]
+        matrix[1, 3] = self.top_mm + 0.5 * self.pixel_spacing_mm[1]
+        return matrix
+
+
+class ScanConverter:
+    """Interpolates the grey levels of the scan lines at the pixels of an ImageGrid."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.kernel = device.kernels("scan_conversion.cl", shared_source(), LANES=1)["scan_convert"]
+        self.workspace = Workspace(device)
+
+    def run(self, scene_buffer, grid: ImageGrid, lines: Compressor) -> None:
+        """Enqueue the conversion of one frame."""
+        self.grid = grid
+        self.image = self.workspace.get("image", grid.rows * grid.columns)
+        self.device.run(
+            self.kernel,
+            (grid.columns, grid.rows),
+            scene_buffer,
+            lines.grey,
+            np.float32(grid.left_mm),
+            np.float32(grid.top_mm),
+            np.float32(grid.pixel_spacing_mm[0]),
+            np.float32(grid.pixel_spacing_mm[1]),
+            self.image,
+        )
+
+    def download(self) -> np.ndarray:
+        """(rows, columns) uint8 image of the frame converted last."""
+        return self.device.download(self.image, (self.grid.rows, self.grid.columns), np.uint8)

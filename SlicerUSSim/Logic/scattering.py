@@ -1,0 +1,77 @@
+"""Host side of kernels/scattering.cl and kernels/interfaces.cl: echoes as baseband impulses along every scan line."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from SlicerUSSim.Logic.device import Device, Workspace
+from SlicerUSSim.Logic.layout import CONSTANTS, shared_source
+from SlicerUSSim.Logic.medium import Medium
+from SlicerUSSim.Logic.raytracing import RayTracer
+
+
+class EchoLines:
+    """Complex baseband impulses per scan line, planar: re, im float32 [scan line][stride], zeros on either side."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.workspace = Workspace(device)
+        self._shape: tuple[int, int] | None = None
+
+    def prepare(self, scan_lines: int, samples: int) -> None:
+        """Make room for a frame. Kernels write every sample between the pads, so only a new shape is cleared."""
+        self.stride = samples + 2 * CONSTANTS["LINE_PAD"]
+        nbytes = scan_lines * self.stride * 4
+        self.re, self.im = self.workspace.get("re", nbytes), self.workspace.get("im", nbytes)
+        if self._shape != (scan_lines, samples):
+            self.clear()
+            self._shape = scan_lines, samples
+
+    def clear(self) -> None:
+        """Set everything to zero."""
+        for buffer in (self.re, self.im):
+            self.device.cl.enqueue_fill_buffer(self.device.queue, buffer, np.float32(0), 0, buffer.size)
+
+
+class Scatterers:
+    """Adds speckle: every scatterer within the beam of every ray segment."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.kernel = device.kernels("scattering.cl", shared_source(), LANES=device.lanes)["scatter"]
+
+    def run(self, scene_buffer, scene: np.ndarray, medium: Medium, tree: RayTracer, lines: EchoLines) -> None:
+        """Enqueue the speckle of one frame; it overwrites `lines`."""
+        self.device.run(
+            self.kernel,
+            (int(scene["samples"]) // CONSTANTS["CHUNK"], int(scene["scan_lines"])),
+            scene_buffer,
+            medium.voxel_buffer,
+            medium.tissue_buffer,
+            tree.segments,
+            tree.segment_counts,
+            lines.re,
+            lines.im,
+            np.int32(lines.stride),
+        )
+
+
+class InterfaceEchoes:
+    """Adds the echoes of the interfaces that the elevational rays hit."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.kernel = device.kernels("interfaces.cl", shared_source(), LANES=1)["interface_echoes"]
+
+    def run(self, scene_buffer, scene: np.ndarray, tree: RayTracer, lines: EchoLines) -> None:
+        """Enqueue the interface echoes of one frame; they are added to `lines`."""
+        self.device.run(
+            self.kernel,
+            (int(scene["scan_lines"]),),
+            scene_buffer,
+            tree.hits,
+            tree.hit_counts,
+            lines.re,
+            lines.im,
+            np.int32(lines.stride),
+        )

@@ -1,0 +1,268 @@
+"""UltrasoundSimulator: the line from a label map and a pose to a B-mode image, one stage after the other."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from time import perf_counter
+
+import numpy as np
+
+from SlicerUSSim.Logic.bmode import Compressor, PulseFilter
+from SlicerUSSim.Logic.device import Device
+from SlicerUSSim.Logic.layout import CONSTANTS, SCENE
+from SlicerUSSim.Logic.medium import Medium
+from SlicerUSSim.Logic.probe import NOMINAL_SPEED_M_S, Probe
+from SlicerUSSim.Logic.raytracing import RayTracer, RayTree
+from SlicerUSSim.Logic.scan_conversion import ImageGrid, ScanConverter
+from SlicerUSSim.Logic.scattering import EchoLines, InterfaceEchoes, Scatterers
+from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.tissues import TissueTable
+from SlicerUSSim.Logic.volume import Volume, check_rigid
+
+
+class EmptyViewWarning(UserWarning):
+    """The imaged field lies wholly outside the volume; the image is black."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One simulated image with its geometry and the signals it was made from."""
+
+    #: (scan_lines, samples) complex64 baseband (I/Q) signal before noise and TGC
+    iq: np.ndarray = field(repr=False)
+    #: (scan_lines, samples) float32 after noise and TGC
+    envelope: np.ndarray = field(repr=False)
+    #: (scan_lines, samples) uint8 grey levels along the scan lines
+    bmode: np.ndarray = field(repr=False)
+    #: (rows, columns) uint8 scan-converted image; outside the field 0
+    image: np.ndarray = field(repr=False)
+    #: Depth between samples
+    sample_interval_mm: float
+    #: Carrier cycles per millimetre of depth
+    cycles_per_mm: float
+    grid: ImageGrid
+    #: (4, 4)
+    probe_to_ras: np.ndarray
+    #: Milliseconds per stage; empty unless the simulator profiles
+    timings_ms: dict[str, float] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def rf(self) -> np.ndarray:
+        """(scan_lines, samples) complex64 analytic RF signal; its real part is what an A/D converter would see."""
+        depth = np.arange(self.iq.shape[1]) * self.sample_interval_mm
+        return self.iq * np.exp(2j * np.pi * self.cycles_per_mm * depth).astype(np.complex64)
+
+    @property
+    def pixel_spacing_mm(self) -> tuple[float, float]:
+        """(column, row) spacing of the image."""
+        return self.grid.pixel_spacing_mm
+
+    @property
+    def image_to_probe(self) -> np.ndarray:
+        """(4, 4) from (column, row, 0, 1) to the probe frame in millimetres."""
+        return self.grid.image_to_probe
+
+    def to_volume(self) -> Volume:
+        """The image as a Volume of one slice in patient space; the slice is as thick as a pixel is high."""
+        ijk_to_ras = self.probe_to_ras @ self.image_to_probe
+        ijk_to_ras[:3, 2] *= self.pixel_spacing_mm[1]
+        return Volume(self.image[None], ijk_to_ras)
+
+    def to_vtk(self):
+        """The image as a vtkImageData of one slice in patient space (RAS)."""
+        return self.to_volume().to_vtk()
+
+
+class UltrasoundSimulator:
+    """Simulates B-mode images of one patient.
+
+    Parameters
+    ----------
+    labels : Volume of tissue labels; 0 is the coupling medium around the patient.
+    tissues : TissueTable with a tissue for every label.
+    settings : SimulationSettings.
+    device : see device.choose_device.
+
+    Raises SimulationError for labels without a tissue and where no device can be used.
+    """
+
+    def __init__(
+        self,
+        labels: Volume,
+        tissues: TissueTable,
+        settings: SimulationSettings | None = None,
+        device: str | Device | None = None,
+    ) -> None:
+        self.settings = settings or SimulationSettings()
+        self.device = Device.get(device)
+        self.medium = Medium(labels, tissues, self.device)
+        self.tracer = RayTracer(self.device)
+        self.lines = EchoLines(self.device)
+        self.scatterers = Scatterers(self.device)
+        self.interfaces = InterfaceEchoes(self.device)
+        self.pulse = PulseFilter(self.device)
+        self.compressor = Compressor(self.device)
+        self.converter = ScanConverter(self.device)
+        self._scene_buffer = self.device.empty(SCENE.itemsize)
+        #: Measure every stage (Frame.timings_ms); each stage is then waited for.
+        self.profiling = False
+
+    def simulate(self, probe: Probe, probe_to_ras: np.ndarray, display: DisplaySettings | None = None) -> Frame:
+        """The image that `probe` sees at the pose `probe_to_ras` (4, 4).
+
+        Warns with EmptyViewWarning (and gives a black image) if the field misses the volume.
+        Raises SimulationError for a pose that is not rigid.
+        """
+        display = display or DisplaySettings()
+        pose = check_rigid("probe_to_ras", probe_to_ras)
+        self._warn_if_empty(probe, pose)
+        timings: dict[str, float] = {}
+
+        with self._stage("upload", timings):
+            scene = self._upload_scene(probe, pose)
+        with self._stage("ray tree", timings):
+            self.tracer.run(self._scene_buffer, scene, self.medium)
+        with self._stage("scatterers", timings):
+            self.lines.prepare(probe.scan_lines, int(scene["samples"]))
+            if self.settings.scattering:
+                self.scatterers.run(self._scene_buffer, scene, self.medium, self.tracer, self.lines)
+            else:
+                self.lines.clear()
+        with self._stage("interfaces", timings):
+            if self.settings.interfaces:
+                self.interfaces.run(self._scene_buffer, scene, self.tracer, self.lines)
+        with self._stage("pulse", timings):
+            self.pulse.run(scene, self._axial_sigma_mm(probe), self.lines)
+        with self._stage("B-mode", timings):
+            self.compressor.run(scene, display, self.pulse)
+        with self._stage("scan conversion", timings):
+            grid = ImageGrid.for_probe(probe, display.image_size)
+            self.converter.run(self._scene_buffer, grid, self.compressor)
+        with self._stage("download", timings):
+            samples = self._sample_count(probe)
+            iq = self.pulse.download(samples)
+            envelope, bmode = self.compressor.download(samples)
+            image = self.converter.download()
+
+        return Frame(
+            iq=iq,
+            envelope=envelope,
+            bmode=bmode,
+            image=image,
+            sample_interval_mm=self._sample_mm(probe),
+            cycles_per_mm=self._cycles_per_mm(probe),
+            grid=grid,
+            probe_to_ras=pose,
+            timings_ms=timings,
+        )
+
+    def trace(self, probe: Probe, probe_to_ras: np.ndarray) -> RayTree:
+        """The ray tree alone, on the host: segments along the beam axes and interface hits."""
+        scene = self._upload_scene(probe, check_rigid("probe_to_ras", probe_to_ras))
+        self.tracer.run(self._scene_buffer, scene, self.medium)
+        return self.tracer.download()
+
+    def sweep(
+        self,
+        probe: Probe,
+        poses: Iterable[np.ndarray],
+        display: DisplaySettings | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> Iterator[Frame]:
+        """One Frame per pose, as they are computed; `progress` is told how many are done."""
+        for count, pose in enumerate(poses, 1):
+            yield self.simulate(probe, pose, display)
+            if progress is not None:
+                progress(count)
+
+    def set_tissues(self, tissues: TissueTable) -> None:
+        """Change tissue parameters without building the medium anew."""
+        self.medium.set_tissues(tissues)
+
+    # ---- the scene record --------------------------------------------------------------------------------------
+
+    def _upload_scene(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
+        settings, medium = self.settings, self.medium
+        chunk = CONSTANTS["CHUNK"]
+        transmit, elevation = probe.transmit_waist(), probe.elevation_waist()
+        receive_sigma = probe.receive_sigma_mm(np.array([0.0, 1e6]))
+        axial_sigma = self._axial_sigma_mm(probe)
+        scene = np.zeros((), SCENE)
+        scene["ras_to_voxel"] = medium.ras_to_voxel.ravel()
+        scene["dims"] = medium.dims
+        scene["voxel_mm"] = medium.labels.spacing_mm.min()
+        scene["membrane_reach"] = medium.membrane_reach
+        scene["probe_to_ras"] = pose[:3].ravel()
+        scene["linear"] = probe.is_linear
+        scene["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
+        scene["first_line"] = probe.first_line
+        scene["line_spacing"] = probe.line_spacing
+        scene["scan_lines"] = probe.scan_lines
+        scene["depth_mm"] = probe.depth_mm
+        scene["frequency_mhz"] = probe.frequency_mhz
+        scene["reference_speed_m_s"] = settings.reference_speed_m_s
+        scene["cycles_per_mm"] = self._cycles_per_mm(probe)
+        scene["sample_mm"] = self._sample_mm(probe)
+        scene["samples"] = -(-self._sample_count(probe) // chunk) * chunk
+        scene["transmit_sigma"], scene["transmit_focus"], scene["transmit_rayleigh"] = transmit
+        scene["receive_sigma_min"] = receive_sigma[0]
+        scene["receive_sigma_slope"] = receive_sigma[1] * 1e-6
+        scene["elevation_sigma"] = elevation[0] / np.sqrt(2.0)
+        scene["elevation_focus"], scene["elevation_rayleigh"] = elevation[1:]
+        scene["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
+        scene["intensity_threshold"] = settings.intensity_threshold
+        scene["reflection_threshold"] = settings.reflection_threshold
+        scene["elevational_rays"] = settings.elevational_rays
+        scene["lateral_rays"] = settings.lateral_rays or _lateral_rays_for(probe)
+        scene["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
+        scene["interface_is_energy"] = settings.interface_reflection == "energy"
+        scene["specular_exponent"] = settings.specular_exponent
+        scene["cell_mm"] = settings.scatterers_per_mm3 ** (-1.0 / 3.0)
+        scene["seed"] = (settings.seed * 0x9E3779B1 + 0x165667B1) % 2**32
+        scene["beam_cutoff"] = settings.beam_cutoff
+        # The integral of the squared point spread function is pi^1.5 times the product of the three sigmas.
+        scene["speckle_scale"] = (settings.scatterers_per_mm3 * np.pi**1.5 * axial_sigma) ** -0.5
+        self.device.write(self._scene_buffer, scene)
+        return scene
+
+    def _cycles_per_mm(self, probe: Probe) -> float:
+        return probe.cycles_per_mm * NOMINAL_SPEED_M_S / self.settings.reference_speed_m_s
+
+    def _axial_sigma_mm(self, probe: Probe) -> float:
+        return probe.axial_sigma_mm * self.settings.reference_speed_m_s / NOMINAL_SPEED_M_S
+
+    def _sample_mm(self, probe: Probe) -> float:
+        return 1.0 / (self.settings.samples_per_cycle * self._cycles_per_mm(probe))
+
+    def _sample_count(self, probe: Probe) -> int:
+        return int(np.ceil(probe.depth_mm / self._sample_mm(probe)))
+
+    def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
+        """The box around the imaged field, in voxels, has to meet the volume."""
+        left, right, top, bottom = probe.image_bounds_mm()
+        corners = np.array([[x, y, 0.0, 1.0] for x in (left, right) for y in (top, bottom)])
+        voxels = (self.medium.labels.ras_to_ijk @ pose @ corners.T)[:3]
+        size = np.array(self.medium.labels.array.shape[::-1])
+        if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
+            warnings.warn("the probe looks past the volume: the image is black", EmptyViewWarning, stacklevel=3)
+
+    @contextmanager
+    def _stage(self, name: str, timings: dict[str, float]):
+        if not self.profiling:
+            yield
+            return
+        start = perf_counter()
+        yield
+        self.device.queue.finish()
+        timings[name] = (perf_counter() - start) * 1e3
+
+
+def _lateral_rays_for(probe: Probe) -> int:
+    """Traced lines per scan line, so that they are no further apart than the beam's lateral sigma anywhere."""
+    depth = np.linspace(0.0, probe.depth_mm, 33)
+    apart = probe.line_spacing * (1.0 if probe.is_linear else depth + probe.apex_radius_mm)
+    return int(min(np.ceil(np.max(apart / probe.beam_sigma_mm(depth)[0]) / 1.5), 4))

@@ -1,0 +1,45 @@
+// From complex baseband impulses to grey levels (PHYSICS sections 4 and 5). Global size (samples / LANES, scan lines).
+//
+// Buffers: re, im float [scan line][stride], LINE_PAD zeros on either side of the samples; pulse float [2 reach + 1];
+// iq float2 (real, imaginary), envelope float and grey uchar [scan line][samples].
+
+// The axial part of the point spread function. The pulse is exp(-x^2 / 2 sx^2) cos(2 pi f x); on baseband impulses,
+// which carry the carrier's phase, only its Gaussian envelope is left, and the magnitude needs no Hilbert transform.
+__kernel void convolve_pulse(__global const float *re, __global const float *im, int stride,
+                             __constant const float *pulse, int reach, __global float *iq, int samples) {
+  int sample = get_global_id(0) * LANES, line = get_global_id(1);
+  __global const float *from_re = re + line * stride + LINE_PAD + sample - reach;
+  __global const float *from_im = im + line * stride + LINE_PAD + sample - reach;
+  floatn sum_re = 0.0f, sum_im = 0.0f;
+  for (int k = 0; k <= 2 * reach; k++) {
+    sum_re += pulse[k] * LOAD_LANES(from_re + k);
+    sum_im += pulse[k] * LOAD_LANES(from_im + k);
+  }
+  STORE_PAIRS(sum_re, sum_im, iq + 2 * (line * samples + sample));
+}
+
+// Amplifier noise, time-gain compensation, envelope, log compression, eight bits.
+__kernel void compress(__global const float *iq, int samples, float noise, uint noise_seed, float tgc_per_sample,
+                       float level_of_white_db, float dynamic_range_db, __global float *envelope,
+                       __global uchar *grey) {
+  int sample = get_global_id(0) * LANES, line = get_global_id(1);
+  int here = line * samples + sample;
+  floatn re, im;
+  LOAD_PAIRS(re, im, iq + 2 * here);
+  const intn index = sample + LANE_INDEX;
+  if (noise > 0.0f) {
+    uintn key = hash_mixn(TO_UINTN(index) * 0x9E3779B1u + (noise_seed + (uint)line * 0x85EBCA77u));
+    re += noise * gaussian(key);
+    im += noise * gaussian(hash_mixn(key + 0x9E3779B9u));
+  }
+  floatn power = re * re + im * im + 1e-30f;
+  const floatn tgc_db = TO_FLOATN(index) * tgc_per_sample;
+  const floatn level_db = 3.01029996f * log2_fast(power) + tgc_db;
+  STORE_LANES(sqrt(power) * exp2_fast(clamp(tgc_db * 0.166096405f, -100.0f, 100.0f)), envelope + here);
+  floatn value = clamp(255.0f * (1.0f + (level_db - level_of_white_db) / dynamic_range_db), 0.0f, 255.0f) + 0.5f;
+#if LANES == 1
+  grey[here] = (uchar)value;
+#else
+  JOIN(vstore, LANES)(JOIN(convert_uchar, LANES)(value), 0, grey + here);
+#endif
+}

@@ -1,0 +1,303 @@
+// trace: the binary ray tree of every scan line (PHYSICS section 3).
+//
+// One work-item follows one ray and all its children. Global size (traced lines, 1 + elevational rays).
+//   ray 0 of a line runs along the beam axis and writes the segments along which the scatter kernel convolves;
+//   rays 1.. run at fixed quantiles of the elevational beam profile and write the interface hits, so that an interface
+//   echo has the beam's elevational width; its lateral width comes from the neighbouring lines (interfaces.cl).
+// Lines may be traced more finely than they are scanned (lateral_rays per scan line), for wide-spaced arrays.
+//
+// Buffers: voxels ushort [k][j][i] (medium.py); tissues Tissue [label]; quantiles float [traced line][elevational ray],
+// offsets in units of the elevational sigma; segments Segment [scan line][MAX_SEGMENTS] with segment_counts;
+// hits Hit [traced line][elevational ray][MAX_HITS] with hit_counts; cut float [traced line][1 + elevational ray],
+// the weight of the branches that were not followed.
+
+typedef struct {
+  float3 axis;  // a point on the beam axis at path length `path`
+  float3 direction;
+  float3 lateral;
+  float3 elevational;
+  float path;
+  float depth;
+  float log_attenuation;  // natural logarithm, two-way amplitude
+  float weight;
+  float blind_until;  // path length before which no crossing counts: a reflected ray has to get off its interface
+  int reflections;
+  int label;
+} Ray;
+
+// The label whose trilinear weight is largest at `voxel` (padded voxel indices): sub-voxel borders without stairs.
+inline int label_at(__global const ushort *voxels, __constant const Scene *scene, float3 voxel) {
+  int nx = scene->dims[0], ny = scene->dims[1], nz = scene->dims[2];
+  voxel = clamp(voxel, (float3)(0.0f), (float3)(nx - 1.001f, ny - 1.001f, nz - 1.001f));
+  int3 base = convert_int3(voxel);
+  int here = (base.z * ny + base.y) * nx + base.x;
+  uint word = voxels[here];
+  if (word & UNIFORM_CELL) return word & LABEL_MASK;
+  float3 f = voxel - convert_float3(base), g = 1.0f - f;
+  int labels[8];
+  float weights[8];
+  for (int c = 0; c < 8; c++) {
+    labels[c] = voxels[here + (c & 1) + ((c >> 1) & 1) * nx + (c >> 2) * nx * ny] & LABEL_MASK;
+    weights[c] = ((c & 1) ? f.x : g.x) * ((c & 2) ? f.y : g.y) * ((c & 4) ? f.z : g.z);
+  }
+  int best = labels[0];
+  float best_weight = -1.0f;
+  for (int c = 0; c < 8; c++) {
+    float total = 0.0f;
+    for (int e = 0; e < 8; e++) total += labels[e] == labels[c] ? weights[e] : 0.0f;
+    if (total > best_weight) {
+      best_weight = total;
+      best = labels[c];
+    }
+  }
+  return best;
+}
+
+// Unit normal (RAS) of the border between two labels near `voxel`, pointing to the side of `before`: the gradient of
+// their difference smoothed by a Gaussian of 1.5 voxels. The sum runs over voxel centres, so it is the exact gradient.
+inline float3 interface_normal(__global const ushort *voxels, __constant const Scene *scene, float3 voxel, int before,
+                               int behind, float3 direction) {
+  const int reach = 3;
+  int3 dims = (int3)(scene->dims[0], scene->dims[1], scene->dims[2]);
+  int3 centre = convert_int3(clamp(rint(voxel), (float3)(0.0f), convert_float3(dims - 1)));
+  int3 low = max(centre - reach, (int3)(0)), high = min(centre + reach, dims - 1);
+  float3 gradient = (float3)(0.0f);
+  float total = 1e-6f;
+  for (int k = low.z; k <= high.z; k++)
+    for (int j = low.y; j <= high.y; j++)
+      for (int i = low.x; i <= high.x; i++) {
+        float3 d = (float3)(i, j, k) - voxel;
+        float r2 = dot(d, d);
+        if (r2 > (reach + 0.5f) * (reach + 0.5f)) continue;
+        int label = voxels[(k * dims.y + j) * dims.x + i] & LABEL_MASK;
+        float weight = native_exp(-r2 / (2.0f * 1.5f * 1.5f));
+        total += weight;
+        gradient += d * (weight * ((label == before) - (label == behind)));
+      }
+  // A gradient in voxel indices becomes one in millimetres by the transposed map.
+  __constant const float *m = scene->ras_to_voxel;
+  float3 normal = (float3)(m[0] * gradient.x + m[4] * gradient.y + m[8] * gradient.z,
+                           m[1] * gradient.x + m[5] * gradient.y + m[9] * gradient.z,
+                           m[2] * gradient.x + m[6] * gradient.y + m[10] * gradient.z);
+  float length_ = length(gradient) < 1e-3f * total ? 0.0f : length(normal);
+  if (length_ == 0.0f) return -direction;  // no preferred side: as if hit head-on
+  normal /= length_;
+  return dot(normal, direction) > 0.0f ? -normal : normal;
+}
+
+// Carry a vector perpendicular to `from` along the smallest rotation that takes `from` to `to`.
+inline float3 carry(float3 v, float3 from, float3 to) { return v - dot(v, to) / (1.0f + dot(from, to)) * (from + to); }
+
+inline float3 mirror(float3 v, float3 normal) { return v - 2.0f * dot(v, normal) * normal; }
+
+__kernel void trace(__constant const Scene *scene, __global const ushort *voxels, __constant const Tissue *tissues,
+                    __global const float *quantiles, __global Segment *segments, __global int *segment_counts,
+                    __global Hit *hits, __global int *hit_counts, __global float *cut) {
+  int line = get_global_id(0), ray_of_line = get_global_id(1);
+  int rays = scene->elevational_rays, lateral = scene->lateral_rays;
+  int on_axis = ray_of_line == 0;
+  int slot = line * rays + ray_of_line - 1;
+  float quantile = on_axis ? 0.0f : quantiles[slot];
+  float cut_weight = 0.0f;
+  if (on_axis && line % lateral != 0) {
+    cut[line * (rays + 1)] = 0.0f;
+    return;
+  }
+  __global Segment *my_segments = segments + (line / lateral) * MAX_SEGMENTS;
+  __global Hit *my_hits = hits + max(slot, 0) * MAX_HITS;
+  int count = 0;
+
+  // The root: the beam frame of this line, taken from the probe frame to RAS.
+  float position = scene->first_line + scene->line_spacing * line / lateral;
+  float3 origin, direction, across;
+  if (scene->linear) {
+    origin = (float3)(position, 0.0f, 0.0f);
+    direction = (float3)(0.0f, 1.0f, 0.0f);
+    across = (float3)(1.0f, 0.0f, 0.0f);
+  } else {
+    float c = cos(position), s = sin(position);
+    origin = scene->apex_radius_mm * (float3)(s, c - 1.0f, 0.0f);
+    direction = (float3)(s, c, 0.0f);
+    across = (float3)(c, -s, 0.0f);
+  }
+  Ray stack[MAX_STACK];
+  int waiting = 1;
+  Ray root;
+  root.axis = affine_point(scene->probe_to_ras, origin);
+  root.direction = normalize(affine_vector(scene->probe_to_ras, direction));
+  root.lateral = normalize(affine_vector(scene->probe_to_ras, across));
+  root.elevational = normalize(affine_vector(scene->probe_to_ras, (float3)(0.0f, 0.0f, 1.0f)));
+  root.path = 0.0f;
+  root.depth = 0.0f;
+  root.log_attenuation = 0.0f;
+  root.weight = 1.0f;
+  root.blind_until = -1.0f;
+  root.reflections = 0;
+  root.label = -1;  // looked up at its start
+  stack[0] = root;
+
+  while (waiting > 0) {
+    Ray ray = stack[--waiting];
+    int alive = 1;
+    while (alive) {  // one turn per tree node: march to the next interface, branch, go on with the refracted child
+      float3 voxel0 = affine_point(scene->ras_to_voxel, ray.axis);
+      float3 voxel_step = affine_vector(scene->ras_to_voxel, ray.direction);
+      float3 voxel_aside = affine_vector(scene->ras_to_voxel, ray.elevational) * quantile;
+#define VOXEL_AT(l) (voxel0 + (l) * voxel_step + beam_sigma(scene, ray.path + (l)).y * voxel_aside)
+      if (ray.label < 0) ray.label = label_at(voxels, scene, VOXEL_AT(0.0f));
+      Tissue here = tissues[ray.label];
+      float depth_per_mm = scene->reference_speed_m_s / here.speed_m_s;
+      // Two-way amplitude: 10^(-alpha f 2 l / 20) with l in cm.
+      float decay = here.attenuation * scene->frequency_mhz * 0.2f * LN10_OVER_20;
+
+      // Last path length: the depth of the image, or the amplitude threshold, or the far side of the volume.
+      float to_depth = (scene->depth_mm - ray.depth) / depth_per_mm;
+      float to_silence = (log(ray.weight / scene->intensity_threshold) + ray.log_attenuation) / fmax(decay, 1e-9f);
+      float longest = fmin(to_depth, fmax(to_silence, 0.0f));
+      float enter = 0.0f, leave = longest;
+      float margin = 3.0f + fabs(quantile) * 4.0f / scene->voxel_mm;  // the ray runs beside the axis
+      float start_[3] = {voxel0.x, voxel0.y, voxel0.z}, step_[3] = {voxel_step.x, voxel_step.y, voxel_step.z};
+      for (int a = 0; a < 3; a++) {
+        float inverse = 1.0f / (fabs(step_[a]) < 1e-7f ? 1e-7f : step_[a]);
+        float t0 = (-margin - start_[a]) * inverse, t1 = (scene->dims[a] - 1 + margin - start_[a]) * inverse;
+        enter = fmax(enter, fmin(t0, t1));
+        leave = fmin(leave, fmax(t0, t1));
+      }
+
+      // March. `inside` is the last length known to be in this tissue, `beyond` the first one found in another.
+      float stride = 0.5f * scene->voxel_mm;
+      float inside = fmax(fmin(enter, longest), 0.0f), beyond = -1.0f;
+      int other = ray.label;
+      while (inside < leave) {
+        float next = fmin(inside + stride, leave + 1e-4f);
+        other = label_at(voxels, scene, VOXEL_AT(next));
+        if (other != ray.label && ray.path + next > ray.blind_until) {
+          beyond = next;
+          break;
+        }
+        inside = next;
+      }
+      int crossing = beyond >= 0.0f;
+      if (crossing)
+        for (int iteration = 0; iteration < 8; iteration++) {
+          float middle = 0.5f * (inside + beyond);
+          int label = label_at(voxels, scene, VOXEL_AT(middle));
+          if (label == ray.label)
+            inside = middle;
+          else {
+            beyond = middle;
+            other = label;
+          }
+        }
+      float length_mm = crossing ? beyond : longest;
+
+      if (on_axis) {
+        if (count < MAX_SEGMENTS && length_mm > 0.0f) {
+          Segment segment;
+          vstore3(ray.axis, 0, segment.start);
+          vstore3(ray.direction, 0, segment.direction);
+          vstore3(ray.lateral, 0, segment.lateral);
+          vstore3(ray.elevational, 0, segment.elevational);
+          segment.path_mm = ray.path;
+          segment.length_mm = length_mm;
+          segment.depth_mm = ray.depth;
+          segment.depth_per_mm = depth_per_mm;
+          segment.weight = ray.weight;
+          segment.attenuation = exp(ray.log_attenuation);
+          segment.decay_per_mm = decay;
+          segment.reflections = ray.reflections;
+          segment.label = ray.label;
+          my_segments[count] = segment;
+        }
+        count++;
+      }
+      if (!crossing) {
+        if (to_silence < to_depth) cut_weight += ray.weight;
+        break;
+      }
+
+      float3 voxel_hit = VOXEL_AT(beyond);
+      float3 normal = interface_normal(voxels, scene, voxel_hit, ray.label, other, ray.direction);
+      float path = ray.path + beyond;
+      float depth = ray.depth + beyond * depth_per_mm;
+      float log_attenuation = ray.log_attenuation - decay * beyond;
+      float attenuation = exp(log_attenuation);
+      float3 aside = quantile * beam_sigma(scene, path).y * ray.elevational;
+      float3 hit_point = ray.axis + beyond * ray.direction + aside;
+
+      // Snell and the pressure reflection coefficient of a fluid interface; R = r^2 is the two-way factor.
+      Tissue behind = tissues[other];
+      float cos_in = clamp(-dot(ray.direction, normal), 0.01f, 1.0f);
+      float ratio = behind.speed_m_s / here.speed_m_s;
+      float sin2_out = ratio * ratio * (1.0f - cos_in * cos_in);
+      int total = sin2_out >= 1.0f;
+      float cos_out = sqrt(fmax(0.0f, 1.0f - sin2_out));
+      float z_in = here.impedance * cos_out, z_out = behind.impedance * cos_in;
+      float pressure = total ? 1.0f : (z_out - z_in) / (z_out + z_in);
+      float reflectance = pressure * pressure;
+
+      if (!on_axis) {
+        if (count < MAX_HITS) {
+          Hit hit;
+          vstore3(hit_point, 0, hit.position);
+          vstore3(normal, 0, hit.normal);
+          hit.path_mm = path;
+          hit.depth_mm = depth;
+          hit.weight = ray.weight;
+          hit.attenuation = attenuation;
+          hit.cos_incidence = cos_in;
+          hit.reflectance = reflectance;
+          hit.echo = ray.weight * attenuation * (scene->interface_is_energy ? reflectance : fabs(pressure)) *
+                     pow(cos_in, scene->specular_exponent) * scene->interface_gain / rays;
+          hit.reflections = ray.reflections;
+          hit.label_before = ray.label;
+          hit.label_behind = other;
+          my_hits[count] = hit;
+        }
+        count++;
+      }
+
+      // The reflected child waits on the stack; weak ones and those beyond the tree's depth are cut.
+      float reflected_weight = ray.weight * reflectance;
+      if (ray.reflections < scene->max_ray_depth && reflected_weight >= scene->reflection_threshold &&
+          reflected_weight * attenuation >= scene->intensity_threshold && waiting < MAX_STACK) {
+        Ray child = ray;
+        child.direction = normalize(mirror(ray.direction, normal));
+        child.lateral = mirror(ray.lateral, normal);
+        child.elevational = mirror(ray.elevational, normal);
+        child.axis = hit_point - mirror(aside, normal);
+        child.path = path;
+        child.depth = depth;
+        child.log_attenuation = log_attenuation;
+        child.weight = reflected_weight;
+        child.blind_until = path + scene->voxel_mm;
+        child.reflections = ray.reflections + 1;
+        stack[waiting++] = child;
+      } else
+        cut_weight += reflected_weight;
+
+      // The refracted child: this ray, bent.
+      float refracted_weight = ray.weight * (1.0f - reflectance);
+      if (total) break;
+      if (refracted_weight * attenuation < scene->intensity_threshold || depth >= scene->depth_mm) {
+        cut_weight += refracted_weight;
+        break;
+      }
+      float3 bent = normalize(ratio * ray.direction + (ratio * cos_in - cos_out) * normal);
+      ray.lateral = carry(ray.lateral, ray.direction, bent);
+      ray.elevational = carry(ray.elevational, ray.direction, bent);
+      ray.direction = bent;
+      ray.axis = hit_point - quantile * beam_sigma(scene, path).y * ray.elevational;
+      ray.path = path;
+      ray.depth = depth;
+      ray.log_attenuation = log_attenuation;
+      ray.weight = refracted_weight;
+      ray.label = other;
+    }
+  }
+  cut[line * (rays + 1) + ray_of_line] = cut_weight;
+  if (on_axis)
+    segment_counts[line / lateral] = count;
+  else
+    hit_counts[slot] = count;
+}
