@@ -1,13 +1,13 @@
-// trace: the binary ray tree of every scan line (PHYSICS section 3).
+// trace: the binary ray tree of every traced line (PHYSICS section 3).
 //
 // One work-item follows one ray and all its children. Global size (traced lines, 1 + elevational rays).
-//   ray 0 of a line runs along the beam axis and writes the segments along which the scatter kernel convolves;
+//   ray 0 of a line runs along the beam axis and writes the segments along which the scatter kernel works;
 //   rays 1.. run at fixed quantiles of the elevational beam profile and write the interface hits, so that an interface
-//   echo has the beam's elevational width; its lateral width comes from the neighbouring lines (interfaces.cl).
-// Lines may be traced more finely than they are scanned (lateral_rays per scan line), for wide-spaced arrays.
+//   echo has the beam's elevational width. The lateral width comes from the neighbouring lines (beam.cl).
+// Lines are traced at least as finely as they are scanned (lateral_rays per scan line), and a few beyond the edges.
 //
 // Buffers: voxels ushort [k][j][i] (medium.py); tissues Tissue [label]; quantiles float [traced line][elevational ray],
-// offsets in units of the elevational sigma; segments Segment [scan line][MAX_SEGMENTS] with segment_counts;
+// offsets in units of the elevational sigma; segments Segment [traced line][MAX_SEGMENTS] with segment_counts;
 // hits Hit [traced line][elevational ray][MAX_HITS] with hit_counts; cut float [traced line][1 + elevational ray],
 // the weight of the branches that were not followed.
 
@@ -94,21 +94,17 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
                     __global const float *quantiles, __global Segment *segments, __global int *segment_counts,
                     __global Hit *hits, __global int *hit_counts, __global float *cut) {
   int line = get_global_id(0), ray_of_line = get_global_id(1);
-  int rays = scene->elevational_rays, lateral = scene->lateral_rays;
+  int rays = scene->elevational_rays;
   int on_axis = ray_of_line == 0;
   int slot = line * rays + ray_of_line - 1;
   float quantile = on_axis ? 0.0f : quantiles[slot];
   float cut_weight = 0.0f;
-  if (on_axis && line % lateral != 0) {
-    cut[line * (rays + 1)] = 0.0f;
-    return;
-  }
-  __global Segment *my_segments = segments + (line / lateral) * MAX_SEGMENTS;
+  __global Segment *my_segments = segments + line * MAX_SEGMENTS;
   __global Hit *my_hits = hits + max(slot, 0) * MAX_HITS;
   int count = 0;
 
   // The root: the beam frame of this line, taken from the probe frame to RAS.
-  float position = scene->first_line + scene->line_spacing * line / lateral;
+  float position = scene->first_line + scene->line_spacing * (line - scene->guard_lines) / scene->lateral_rays;
   float3 origin, direction, across;
   if (scene->linear) {
     origin = (float3)(position, 0.0f, 0.0f);
@@ -297,7 +293,7 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
   }
   cut[line * (rays + 1) + ray_of_line] = cut_weight;
   if (on_axis)
-    segment_counts[line / lateral] = count;
+    segment_counts[line] = count;
   else
     hit_counts[slot] = count;
 }

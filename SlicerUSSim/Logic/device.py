@@ -240,6 +240,8 @@ class Device:
             folder = kernel_folder()
             source = "\n".join([struct_source, (folder / "common.clh").read_text(), (folder / file_name).read_text()])
             options = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros"]
+            if self.lanes > 1 and "Intel" in self.info.platform:
+                options.append("-DNO_IMPLICIT_VECTORS")
             options += [f"-D{name}={value}" for name, value in defines.items()]
             try:
                 with warnings.catch_warnings():

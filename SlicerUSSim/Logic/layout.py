@@ -13,7 +13,7 @@ CONSTANTS = {
     "UNIFORM_CELL": 0x80,  # ... and one that says: all eight voxels of this cell agree and no membrane is near
     "MEMBRANE_LABEL": 127,
     "MAX_TISSUES": 128,
-    "MAX_SEGMENTS": 256,  # per scan line
+    "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 64,  # per traced ray
     "MAX_STACK": 24,  # reflected rays waiting to be followed
     "CHUNK": 64,  # samples one work-item of the scatter kernel owns
@@ -56,7 +56,9 @@ SCENE = np.dtype(
         ("intensity_threshold", _FLOAT),
         ("reflection_threshold", _FLOAT),
         ("elevational_rays", _INT),
-        ("lateral_rays", _INT),
+        ("lateral_rays", _INT),  # traced lines per scan line
+        ("guard_lines", _INT),  # traced lines beyond either edge of the field
+        ("traced_lines", _INT),
         ("interface_gain", _FLOAT),
         ("interface_is_energy", _INT),
         ("specular_exponent", _FLOAT),
@@ -64,7 +66,7 @@ SCENE = np.dtype(
         ("cell_mm", _FLOAT),
         ("seed", _UINT),
         ("beam_cutoff", _FLOAT),
-        ("speckle_scale", _FLOAT),  # 1 / sqrt(density * pi^1.5 * axial sigma): unit variance gives unit mean square
+        ("speckle_scale", _FLOAT),  # 1 / sqrt(density pi^1.5 axial sigma): unit variance gives unit mean square
     ]
 )
 
@@ -79,7 +81,7 @@ TISSUE = np.dtype(
     ]
 )
 
-#: One straight piece of a scan line's ray tree, in one tissue. (xyz triples are RAS mm.)
+#: One straight piece of a traced line's ray tree, in one tissue. (xyz triples are RAS mm.)
 SEGMENT = np.dtype(
     [
         ("start", _FLOAT, 3),
@@ -109,7 +111,7 @@ HIT = np.dtype(
         ("attenuation", _FLOAT),
         ("cos_incidence", _FLOAT),
         ("reflectance", _FLOAT),  # R = r^2
-        ("echo", _FLOAT),  # amplitude written into the line, before the beam profile
+        ("echo", _FLOAT),  # amplitude written into the line, before the lateral beam profile
         ("reflections", _INT),
         ("label_before", _INT),
         ("label_behind", _INT),

@@ -13,6 +13,8 @@ import numpy as np
 from SlicerUSSim.Logic.errors import SimulationError, require, require_between
 
 NOMINAL_SPEED_M_S = 1540.0
+#: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
+MAIN_LOBE = 1.21
 FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
@@ -23,7 +25,7 @@ class Probe:
     The two-way beam (amplitude, PHYSICS section 4) is Gaussian across its axis. Laterally it is the product of a
     transmit beam focused once at `focus_mm` and a receive beam that is focused at every depth, with an aperture that
     grows at constant f-number until it is fully open; elevationally the lens focuses both ways at one depth.
-    Each one-way beam has the diffraction-limited width FWHM = wavelength x f-number at its focus.
+    Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
     """
 
     #: Each kind declares it, so that it can be given by position.
@@ -35,11 +37,11 @@ class Probe:
     #: Transmit focus; None puts it at 60 % of the depth.
     focus_mm: float | None = None
     #: Lateral size of the fully open aperture.
-    aperture_mm: float = 15.0
+    aperture_mm: float = 12.0
     #: Smallest f-number of the receive aperture (it opens with depth until it reaches aperture_mm).
     receive_f_number: float = 2.0
     #: Height of the elements.
-    elevation_aperture_mm: float = 8.0
+    elevation_aperture_mm: float = 7.0
     #: Focus of the lens; None puts it at 60 % of the depth.
     elevation_focus_mm: float | None = None
 
@@ -158,7 +160,7 @@ class Probe:
     def receive_sigma_mm(self, depth_mm) -> np.ndarray:
         """One-way lateral standard deviation of the receive beam, focused at every depth."""
         f_number = np.maximum(self.receive_f_number, np.asarray(depth_mm, dtype=float) / self.aperture_mm)
-        return self.wavelength_mm * f_number / FWHM_PER_SIGMA
+        return MAIN_LOBE * self.wavelength_mm * f_number / FWHM_PER_SIGMA
 
     def transmit_waist(self) -> tuple[float, float, float]:
         """(sigma at the focus, focus, Rayleigh length) of the one-way lateral transmit beam, millimetres."""
@@ -169,7 +171,7 @@ class Probe:
         return self._waist(self.elevation_focus_mm, self.elevation_aperture_mm)
 
     def _waist(self, focus_mm: float, aperture_mm: float) -> tuple[float, float, float]:
-        sigma = self.wavelength_mm * focus_mm / aperture_mm / FWHM_PER_SIGMA
+        sigma = MAIN_LOBE * self.wavelength_mm * focus_mm / aperture_mm / FWHM_PER_SIGMA
         # A Gaussian beam of amplitude exp(-y^2 / w^2), w^2 = 2 sigma^2, has the Rayleigh length pi w^2 / wavelength.
         return sigma, focus_mm, 2.0 * np.pi * sigma**2 / self.wavelength_mm
 

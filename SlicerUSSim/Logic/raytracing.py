@@ -18,9 +18,10 @@ class RayTree:
     """The tree of one frame, on the host.
 
     segments : structured array (layout.SEGMENT) of every straight piece along the beam axes; `segment_line` (same
-        length) is its scan line.
-    hits : structured array (layout.HIT) of every interface crossing of the elevational rays; `hit_line` is its scan
-        line, as a fraction where lines are traced more finely than scanned, and `hit_ray` its elevational ray.
+        length) is its place among the scan lines: a fraction for a line traced between them, and outside
+        0..scan_lines - 1 for one beyond the edge of the field.
+    hits : structured array (layout.HIT) of every interface crossing of the elevational rays; `hit_line` is its place
+        among the scan lines and `hit_ray` its elevational ray.
     cut_weight : (traced lines, 1 + elevational rays) weight of the branches that were not followed.
     """
 
@@ -33,7 +34,7 @@ class RayTree:
 
 
 class RayTracer:
-    """Traces the scan lines through a medium; the tree stays on the device for the stages that follow."""
+    """Traces all lines through a medium; the tree stays on the device for the stages that follow."""
 
     def __init__(self, device: Device) -> None:
         self.device = device
@@ -43,12 +44,12 @@ class RayTracer:
 
     def run(self, scene_buffer, scene: np.ndarray, medium: Medium) -> None:
         """Enqueue the tracing of one frame. `scene` is a layout.SCENE record, `scene_buffer` the same on the device."""
-        lines, rays, lateral = (int(scene[name]) for name in ("scan_lines", "elevational_rays", "lateral_rays"))
-        traced = (lines - 1) * lateral + 1
-        self.shape = lines, traced, rays, lateral
+        traced, rays = int(scene["traced_lines"]), int(scene["elevational_rays"])
+        self.shape = traced, rays
+        self._place = lambda line: (line - float(scene["guard_lines"])) / float(scene["lateral_rays"])
         get = self.workspace.get
-        self.segments = get("segments", lines * CONSTANTS["MAX_SEGMENTS"] * SEGMENT.itemsize)
-        self.segment_counts = get("segment_counts", lines * 4)
+        self.segments = get("segments", traced * CONSTANTS["MAX_SEGMENTS"] * SEGMENT.itemsize)
+        self.segment_counts = get("segment_counts", traced * 4)
         self.hits = get("hits", traced * rays * CONSTANTS["MAX_HITS"] * HIT.itemsize)
         self.hit_counts = get("hit_counts", traced * rays * 4)
         self.cut = get("cut", traced * (rays + 1) * 4)
@@ -71,9 +72,9 @@ class RayTracer:
 
     def download(self) -> RayTree:
         """The tree of the frame traced last."""
-        lines, traced, rays, lateral = self.shape
-        segments = self.device.download(self.segments, (lines, CONSTANTS["MAX_SEGMENTS"]), SEGMENT)
-        counts = self.device.download(self.segment_counts, lines, np.int32)
+        traced, rays = self.shape
+        segments = self.device.download(self.segments, (traced, CONSTANTS["MAX_SEGMENTS"]), SEGMENT)
+        counts = self.device.download(self.segment_counts, traced, np.int32)
         kept = np.arange(CONSTANTS["MAX_SEGMENTS"]) < counts[:, None]
         hits = self.device.download(self.hits, (traced, rays, CONSTANTS["MAX_HITS"]), HIT)
         hit_counts = self.device.download(self.hit_counts, (traced, rays), np.int32)
@@ -81,17 +82,17 @@ class RayTracer:
         where = np.nonzero(hit_kept)
         return RayTree(
             segments=segments[kept],
-            segment_line=np.nonzero(kept)[0],
+            segment_line=self._place(np.nonzero(kept)[0]),
             hits=hits[hit_kept],
-            hit_line=where[0] / lateral,
+            hit_line=self._place(where[0]),
             hit_ray=where[1],
             cut_weight=self.device.download(self.cut, (traced, rays + 1), np.float32),
         )
 
     def overflow(self) -> tuple[int, int]:
-        """How many scan lines and elevational rays had more segments or hits than there is room for."""
-        lines, traced, rays, _ = self.shape
-        counts = self.device.download(self.segment_counts, lines, np.int32)
+        """How many traced lines and elevational rays had more segments or hits than there is room for."""
+        traced, rays = self.shape
+        counts = self.device.download(self.segment_counts, traced, np.int32)
         hit_counts = self.device.download(self.hit_counts, traced * rays, np.int32)
         return int((counts > CONSTANTS["MAX_SEGMENTS"]).sum()), int((hit_counts > CONSTANTS["MAX_HITS"]).sum())
 

@@ -1,4 +1,4 @@
-"""Host side of kernels/scattering.cl and kernels/interfaces.cl: echoes as baseband impulses along every scan line."""
+"""Host side of kernels/scattering.cl, interfaces.cl and beam.cl: echoes as baseband impulses along every line."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from SlicerUSSim.Logic.raytracing import RayTracer
 
 
 class EchoLines:
-    """Complex baseband impulses per scan line, planar: re, im float32 [scan line][stride], zeros on either side."""
+    """Complex baseband impulses per line, planar: re, im float32 [line][stride], zeros on either side."""
 
     def __init__(self, device: Device) -> None:
         self.device = device
         self.workspace = Workspace(device)
         self._shape: tuple[int, int] | None = None
 
-    def prepare(self, scan_lines: int, samples: int) -> None:
+    def prepare(self, lines: int, samples: int) -> None:
         """Make room for a frame. Kernels write every sample between the pads, so only a new shape is cleared."""
         self.stride = samples + 2 * CONSTANTS["LINE_PAD"]
-        nbytes = scan_lines * self.stride * 4
+        nbytes = lines * self.stride * 4
         self.re, self.im = self.workspace.get("re", nbytes), self.workspace.get("im", nbytes)
-        if self._shape != (scan_lines, samples):
+        if self._shape != (lines, samples):
             self.clear()
-            self._shape = scan_lines, samples
+            self._shape = lines, samples
 
     def clear(self) -> None:
         """Set everything to zero."""
@@ -34,7 +34,7 @@ class EchoLines:
 
 
 class Scatterers:
-    """Adds speckle: every scatterer within the beam of every ray segment."""
+    """Adds speckle: every scatterer beside every ray segment."""
 
     def __init__(self, device: Device) -> None:
         self.device = device
@@ -44,7 +44,7 @@ class Scatterers:
         """Enqueue the speckle of one frame; it overwrites `lines`."""
         self.device.run(
             self.kernel,
-            (int(scene["samples"]) // CONSTANTS["CHUNK"], int(scene["scan_lines"])),
+            (int(scene["samples"]) // CONSTANTS["CHUNK"], int(scene["traced_lines"])),
             scene_buffer,
             medium.voxel_buffer,
             medium.tissue_buffer,
@@ -67,11 +67,32 @@ class InterfaceEchoes:
         """Enqueue the interface echoes of one frame; they are added to `lines`."""
         self.device.run(
             self.kernel,
-            (int(scene["scan_lines"]),),
+            (int(scene["traced_lines"]),),
             scene_buffer,
             tree.hits,
             tree.hit_counts,
             lines.re,
             lines.im,
             np.int32(lines.stride),
+        )
+
+
+class LateralBeam:
+    """Spreads the impulses of the traced lines over the scan lines, as the lateral beam profile says."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.kernel = device.kernels("beam.cl", shared_source(), LANES=device.lanes)["lateral_beam"]
+
+    def run(self, scene_buffer, scene: np.ndarray, traced: EchoLines, scanned: EchoLines) -> None:
+        """Enqueue the lateral convolution of one frame; it overwrites `scanned`."""
+        self.device.run(
+            self.kernel,
+            (int(scene["samples"]) // self.device.lanes, int(scene["scan_lines"])),
+            scene_buffer,
+            traced.re,
+            traced.im,
+            scanned.re,
+            scanned.im,
+            np.int32(traced.stride),
         )

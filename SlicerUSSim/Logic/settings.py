@@ -31,13 +31,13 @@ class SimulationSettings:
     scattering: bool = True
     #: Echoes of tissue interfaces
     interfaces: bool = True
-    #: Sites of the scatterer lattice per cubic millimetre (a cell of 0.34 mm; the paper's Rayleigh test takes 1250)
-    scatterers_per_mm3: float = 25.0
+    #: Sites of the scatterer lattice per cubic millimetre (a cell of 0.3 mm; the paper's Rayleigh test takes 1250)
+    scatterers_per_mm3: float = 36.0
     #: Where the beam profile is cut off, in standard deviations
     beam_cutoff: float = 3.0
     #: Rays per scan line that sample interfaces across the elevational beam
     elevational_rays: int = 7
-    #: Traced lines per scan line for the lateral profile of interfaces; 0 chooses enough for the probe's spacing
+    #: Traced lines per scan line, which sample the beam laterally; 0 chooses enough for the probe's spacing
     lateral_rays: int = 0
     #: Level of a perpendicular perfect reflector, in dB re tissue of unit scatterer variance
     interface_gain_db: float = 26.0

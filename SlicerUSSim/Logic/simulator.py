@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.medium import Medium
 from SlicerUSSim.Logic.probe import NOMINAL_SPEED_M_S, Probe
 from SlicerUSSim.Logic.raytracing import RayTracer, RayTree
 from SlicerUSSim.Logic.scan_conversion import ImageGrid, ScanConverter
-from SlicerUSSim.Logic.scattering import EchoLines, InterfaceEchoes, Scatterers
+from SlicerUSSim.Logic.scattering import EchoLines, InterfaceEchoes, LateralBeam, Scatterers
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.tissues import TissueTable
 from SlicerUSSim.Logic.volume import Volume, check_rigid
@@ -101,9 +101,11 @@ class UltrasoundSimulator:
         self.device = Device.get(device)
         self.medium = Medium(labels, tissues, self.device)
         self.tracer = RayTracer(self.device)
-        self.lines = EchoLines(self.device)
+        self.traced_lines = EchoLines(self.device)
+        self.scan_lines = EchoLines(self.device)
         self.scatterers = Scatterers(self.device)
         self.interfaces = InterfaceEchoes(self.device)
+        self.beam = LateralBeam(self.device)
         self.pulse = PulseFilter(self.device)
         self.compressor = Compressor(self.device)
         self.converter = ScanConverter(self.device)
@@ -127,16 +129,20 @@ class UltrasoundSimulator:
         with self._stage("ray tree", timings):
             self.tracer.run(self._scene_buffer, scene, self.medium)
         with self._stage("scatterers", timings):
-            self.lines.prepare(probe.scan_lines, int(scene["samples"]))
+            samples = int(scene["samples"])
+            self.traced_lines.prepare(2 * int(scene["traced_lines"]), samples)  # two edges of each strip
             if self.settings.scattering:
-                self.scatterers.run(self._scene_buffer, scene, self.medium, self.tracer, self.lines)
+                self.scatterers.run(self._scene_buffer, scene, self.medium, self.tracer, self.traced_lines)
             else:
-                self.lines.clear()
+                self.traced_lines.clear()
         with self._stage("interfaces", timings):
             if self.settings.interfaces:
-                self.interfaces.run(self._scene_buffer, scene, self.tracer, self.lines)
+                self.interfaces.run(self._scene_buffer, scene, self.tracer, self.traced_lines)
+        with self._stage("beam", timings):
+            self.scan_lines.prepare(probe.scan_lines, samples)
+            self.beam.run(self._scene_buffer, scene, self.traced_lines, self.scan_lines)
         with self._stage("pulse", timings):
-            self.pulse.run(scene, self._axial_sigma_mm(probe), self.lines)
+            self.pulse.run(scene, self._axial_sigma_mm(probe), self.scan_lines)
         with self._stage("B-mode", timings):
             self.compressor.run(scene, display, self.pulse)
         with self._stage("scan conversion", timings):
@@ -217,7 +223,9 @@ class UltrasoundSimulator:
         scene["intensity_threshold"] = settings.intensity_threshold
         scene["reflection_threshold"] = settings.reflection_threshold
         scene["elevational_rays"] = settings.elevational_rays
-        scene["lateral_rays"] = settings.lateral_rays or _lateral_rays_for(probe)
+        lateral, guard = _traced_lines_for(probe, settings)
+        scene["lateral_rays"], scene["guard_lines"] = lateral, guard
+        scene["traced_lines"] = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
         scene["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
         scene["interface_is_energy"] = settings.interface_reflection == "energy"
         scene["specular_exponent"] = settings.specular_exponent
@@ -261,8 +269,16 @@ class UltrasoundSimulator:
         timings[name] = (perf_counter() - start) * 1e3
 
 
-def _lateral_rays_for(probe: Probe) -> int:
-    """Traced lines per scan line, so that they are no further apart than the beam's lateral sigma anywhere."""
-    depth = np.linspace(0.0, probe.depth_mm, 33)
-    apart = probe.line_spacing * (1.0 if probe.is_linear else depth + probe.apex_radius_mm)
-    return int(min(np.ceil(np.max(apart / probe.beam_sigma_mm(depth)[0]) / 1.5), 4))
+def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
+    """(traced lines per scan line, traced lines beyond either edge of the field).
+
+    Traced lines are at most 1.25 lateral beam sigmas apart at any depth, so that sums over them are integrals; those
+    beyond the edge give the outermost scan lines the other half of their beam (where it is no wider than 16 lines,
+    that is everywhere but next to the apex of a phased array).
+    """
+    depth = np.linspace(0.0, probe.depth_mm, 65)
+    apart = probe.line_spacing * (np.ones_like(depth) if probe.is_linear else depth + probe.apex_radius_mm)
+    sigmas = apart / probe.beam_sigma_mm(depth)[0]
+    lateral = settings.lateral_rays or int(min(np.ceil(sigmas.max() / 1.25), 9))
+    deep = sigmas[depth >= 0.1 * probe.depth_mm]
+    return lateral, int(min(np.ceil(settings.beam_cutoff * lateral / deep.min()), 16 * lateral))
