@@ -213,9 +213,21 @@ __kernel void scatter(__constant const Scene *scene, __global const ushort *voxe
     const uint step_v = v == 0 ? 0x9E3779B1u : v == 1 ? 0x85EBCA77u : 0xC2B2AE3Du;
     const uint step_w = w == 0 ? 0x9E3779B1u : w == 1 ? 0x85EBCA77u : 0xC2B2AE3Du;
 
+    // In the plane of v and w the piece is a band along the elevational axis; where that axis is oblique, the band
+    // leaves most of the box empty. Its v at a given w, and how far it reaches on either side:
+    const float along_band = fabs(e.z) < 0.02f ? 0.0f : e.y / e.z;
+    const float middle = 0.5f * (low + high);
+    const float band_v = start.y + middle * d.y - along_band * (start.z + middle * d.z);
+    const float band_reach = fabs(e.z) < 0.02f ? 1e6f
+                                               : 0.5f * (high - low) * fabs(d.y - along_band * d.z) +
+                                                     radius_l * fabs(l.y - along_band * l.z);
+
     int waiting = 0;
-    for (int cw = w_low; cw <= w_high; cw++)
-      for (int cv = v_low; cv <= v_high; cv++) {
+    for (int cw = w_low; cw <= w_high; cw++) {
+      const float v_here = band_v + along_band * cw * cell, v_next = v_here + along_band * cell;
+      const int v_first = max(v_low, (int)floor((fmin(v_here, v_next) - band_reach) * inverse_cell));
+      const int v_last = min(v_high, (int)floor((fmax(v_here, v_next) + band_reach) * inverse_cell));
+      for (int cv = v_first; cv <= v_last; cv++) {
         const float3 base = (float3)(0.5f * cell, (cv + 0.5f) * cell, (cw + 0.5f) * cell) - start;
         const float base_d = dot(base, d), base_l = dot(base, l), base_e = dot(base, e);
         const float d0 = (low - slack_d - base_d) * per_d, d1 = (high + slack_d - base_d) * per_d;
@@ -244,6 +256,7 @@ __kernel void scatter(__constant const Scene *scene, __global const ushort *voxe
           }
         }
       }
+    }
     scatter_batch(scene, voxels, tissues, &piece, cell_u, row_key, row_v, row_w, waiting, sum);
   }
   int left = 2 * line * stride + LINE_PAD + first, right = left + stride;
