@@ -32,7 +32,7 @@ inline int label_at(__global const ushort *voxels, __constant const Scene *scene
   int3 base = convert_int3(voxel);
   int here = (base.z * ny + base.y) * nx + base.x;
   uint word = voxels[here];
-  if (word & UNIFORM_CELL) return word & LABEL_MASK;
+  if (word & SAME_LABEL) return word & LABEL_MASK;
   float3 f = voxel - convert_float3(base), g = 1.0f - f;
   int labels[8];
   float weights[8];
@@ -40,8 +40,17 @@ inline int label_at(__global const ushort *voxels, __constant const Scene *scene
     labels[c] = voxels[here + (c & 1) + ((c >> 1) & 1) * nx + (c >> 2) * nx * ny] & LABEL_MASK;
     weights[c] = ((c & 1) ? f.x : g.x) * ((c & 2) ? f.y : g.y) * ((c & 4) ? f.z : g.z);
   }
-  int best = labels[0];
-  float best_weight = -1.0f;
+  // Nearly every border cell holds two labels: the first corner's and another one.
+  int first = labels[0], second = first;
+  float first_weight = 0.0f, second_weight = 0.0f;
+  for (int c = 0; c < 8; c++) second = labels[c] != first ? labels[c] : second;
+  for (int c = 0; c < 8; c++) {
+    first_weight += labels[c] == first ? weights[c] : 0.0f;
+    second_weight += labels[c] == second ? weights[c] : 0.0f;
+  }
+  int best = first_weight >= second_weight ? first : second;
+  float best_weight = fmax(first_weight, second_weight);
+  if (best_weight >= 1.0f - first_weight - second_weight) return best;
   for (int c = 0; c < 8; c++) {
     float total = 0.0f;
     for (int e = 0; e < 8; e++) total += labels[e] == labels[c] ? weights[e] : 0.0f;
@@ -61,19 +70,30 @@ inline float3 interface_normal(__global const ushort *voxels, __constant const S
   int3 dims = (int3)(scene->dims[0], scene->dims[1], scene->dims[2]);
   int3 centre = convert_int3(clamp(rint(voxel), (float3)(0.0f), convert_float3(dims - 1)));
   int3 low = max(centre - reach, (int3)(0)), high = min(centre + reach, dims - 1);
+  float wx[7], wy[7], wz[7];  // the Gaussian is separable
+  for (int n = 0; n < 7; n++) {
+    float3 d = (float3)(low.x + n, low.y + n, low.z + n) - voxel;
+    const float narrow = -0.5f / (1.5f * 1.5f);
+    wx[n] = native_exp(narrow * d.x * d.x);
+    wy[n] = native_exp(narrow * d.y * d.y);
+    wz[n] = native_exp(narrow * d.z * d.z);
+  }
   float3 gradient = (float3)(0.0f);
   float total = 1e-6f;
   for (int k = low.z; k <= high.z; k++)
-    for (int j = low.y; j <= high.y; j++)
+    for (int j = low.y; j <= high.y; j++) {
+      float yz = wy[j - low.y] * wz[k - low.z];
+      __global const ushort *row = voxels + (k * dims.y + j) * dims.x;
+      float sum = 0.0f, moment = 0.0f;  // along the row
       for (int i = low.x; i <= high.x; i++) {
-        float3 d = (float3)(i, j, k) - voxel;
-        float r2 = dot(d, d);
-        if (r2 > (reach + 0.5f) * (reach + 0.5f)) continue;
-        int label = voxels[(k * dims.y + j) * dims.x + i] & LABEL_MASK;
-        float weight = native_exp(-r2 / (2.0f * 1.5f * 1.5f));
-        total += weight;
-        gradient += d * (weight * ((label == before) - (label == behind)));
+        int label = row[i] & LABEL_MASK;
+        float weight = wx[i - low.x] * ((label == before) - (label == behind));
+        sum += weight;
+        moment += weight * (i - voxel.x);
       }
+      total += yz;
+      gradient += yz * (float3)(moment, sum * (j - voxel.y), sum * (k - voxel.z));
+    }
   // A gradient in voxel indices becomes one in millimetres by the transposed map.
   __constant const float *m = scene->ras_to_voxel;
   float3 normal = (float3)(m[0] * gradient.x + m[4] * gradient.y + m[8] * gradient.z,
@@ -90,6 +110,9 @@ inline float3 carry(float3 v, float3 from, float3 to) { return v - dot(v, to) / 
 
 inline float3 mirror(float3 v, float3 normal) { return v - 2.0f * dot(v, normal) * normal; }
 
+#ifdef NO_IMPLICIT_VECTORS
+__attribute__((intel_vec_len_hint(1)))
+#endif
 __kernel void trace(__constant const Scene *scene, __global const ushort *voxels, __constant const Tissue *tissues,
                     __global const float *quantiles, __global Segment *segments, __global int *segment_counts,
                     __global Hit *hits, __global int *hit_counts, __global float *cut) {
@@ -143,16 +166,10 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
       if (ray.label < 0) ray.label = label_at(voxels, scene, VOXEL_AT(0.0f));
       Tissue here = tissues[ray.label];
       float depth_per_mm = scene->reference_speed_m_s / here.speed_m_s;
-      // Two-way amplitude: 10^(-alpha f 2 l / 20) with l in cm.
-      float decay = here.attenuation * scene->frequency_mhz * 0.2f * LN10_OVER_20;
-
-      // Last path length: the depth of the image, or the amplitude threshold, or the far side of the volume.
       float to_depth = (scene->depth_mm - ray.depth) / depth_per_mm;
-      float to_silence = (log(ray.weight / scene->intensity_threshold) + ray.log_attenuation) / fmax(decay, 1e-9f);
-      float longest = fmin(to_depth, fmax(to_silence, 0.0f));
-      float enter = 0.0f, leave = longest;
-      float margin = 3.0f + fabs(quantile) * 4.0f / scene->voxel_mm;  // the ray runs beside the axis
       float start_[3] = {voxel0.x, voxel0.y, voxel0.z}, step_[3] = {voxel_step.x, voxel_step.y, voxel_step.z};
+      float margin = 3.0f + fabs(quantile) * 4.0f / scene->voxel_mm;  // the ray runs beside the axis
+      float enter = 0.0f, leave = to_depth;
       for (int a = 0; a < 3; a++) {
         float inverse = 1.0f / (fabs(step_[a]) < 1e-7f ? 1e-7f : step_[a]);
         float t0 = (-margin - start_[a]) * inverse, t1 = (scene->dims[a] - 1 + margin - start_[a]) * inverse;
@@ -160,55 +177,85 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
         leave = fmin(leave, fmax(t0, t1));
       }
 
-      // March. `inside` is the last length known to be in this tissue, `beyond` the first one found in another.
-      float stride = 0.5f * scene->voxel_mm;
-      float inside = fmax(fmin(enter, longest), 0.0f), beyond = -1.0f;
-      int other = ray.label;
-      while (inside < leave) {
-        float next = fmin(inside + stride, leave + 1e-4f);
-        other = label_at(voxels, scene, VOXEL_AT(next));
-        if (other != ray.label && ray.path + next > ray.blind_until) {
-          beyond = next;
-          break;
-        }
-        inside = next;
-      }
-      int crossing = beyond >= 0.0f;
-      if (crossing)
-        for (int iteration = 0; iteration < 8; iteration++) {
-          float middle = 0.5f * (inside + beyond);
-          int label = label_at(voxels, scene, VOXEL_AT(middle));
-          if (label == ray.label)
-            inside = middle;
-          else {
-            beyond = middle;
-            other = label;
+      // March. Tissues of one speed and impedance have no interface between them; only attenuation changes there, so the
+      // node goes on. `inside` is the last length known to be in this tissue, `beyond` the first one in another, `since`
+      // where this tissue began. A segment starts at `open`, with `spent_open` of the attenuation exponent `spent`.
+      float inside = fmax(fmin(enter, to_depth), 0.0f), beyond = 0.0f, longest = 0.0f;
+      float since = 0.0f, open = 0.0f, spent = 0.0f, spent_open = 0.0f;
+      int other, crossing, ended = 0;
+      Tissue behind;
+      do {
+        // Two-way amplitude: 10^(-alpha f 2 l / 20) with l in cm.
+        float decay = here.attenuation * scene->frequency_mhz * 0.2f * LN10_OVER_20;
+        float reserve = log(ray.weight / scene->intensity_threshold) + ray.log_attenuation - spent;
+        float to_silence = since + fmax(reserve, 0.0f) / fmax(decay, 1e-9f);
+        ended = to_silence < to_depth;
+        longest = fmin(to_depth, to_silence);
+        float last = fmin(leave, longest), stride = 0.5f * scene->voxel_mm;
+        crossing = 0;
+        while (inside < last) {
+          float next = fmin(inside + stride, last + 1e-4f);
+          other = label_at(voxels, scene, VOXEL_AT(next));
+          if (other != ray.label && ray.path + next > ray.blind_until) {
+            beyond = next;
+            crossing = 1;
+            break;
           }
+          inside = next;
         }
-      float length_mm = crossing ? beyond : longest;
-
-      if (on_axis) {
-        if (count < MAX_SEGMENTS && length_mm > 0.0f) {
-          Segment segment;
-          vstore3(ray.axis, 0, segment.start);
-          vstore3(ray.direction, 0, segment.direction);
-          vstore3(ray.lateral, 0, segment.lateral);
-          vstore3(ray.elevational, 0, segment.elevational);
-          segment.path_mm = ray.path;
-          segment.length_mm = length_mm;
-          segment.depth_mm = ray.depth;
-          segment.depth_per_mm = depth_per_mm;
-          segment.weight = ray.weight;
-          segment.attenuation = exp(ray.log_attenuation);
-          segment.decay_per_mm = decay;
-          segment.reflections = ray.reflections;
-          segment.label = ray.label;
-          my_segments[count] = segment;
+        if (crossing)
+          for (int iteration = 0; iteration < 8; iteration++) {
+            float middle = 0.5f * (inside + beyond);
+            int label = label_at(voxels, scene, VOXEL_AT(middle));
+            if (label == ray.label)
+              inside = middle;
+            else {
+              beyond = middle;
+              other = label;
+            }
+          }
+        float until = crossing ? beyond : longest;
+        // One segment has one decay, its mean. Where that would be off by more than 0.02 neper (0.17 dB) inside, the
+        // segment is closed at the last change of tissue.
+        float earlier = since - open, mean_decay = earlier > 0.0f ? (spent - spent_open) / earlier : decay;
+        int close = fabs(decay - mean_decay) * fmin(earlier, until - since) > 0.02f;
+        float spent_until = spent + decay * (until - since);
+        if (crossing) behind = tissues[other];
+        int interface_here = crossing && (behind.speed_m_s != here.speed_m_s || behind.impedance != here.impedance);
+        int last_piece = !crossing || interface_here;
+        for (int piece = close ? 0 : 1; piece < (last_piece ? 2 : 1) && on_axis; piece++) {
+          float end = piece == 0 ? since : until, spent_end = piece == 0 ? spent : spent_until;
+          if (end <= open) continue;
+          if (count < MAX_SEGMENTS) {
+            Segment segment;
+            vstore3(ray.axis + open * ray.direction, 0, segment.start);
+            vstore3(ray.direction, 0, segment.direction);
+            vstore3(ray.lateral, 0, segment.lateral);
+            vstore3(ray.elevational, 0, segment.elevational);
+            segment.path_mm = ray.path + open;
+            segment.length_mm = end - open;
+            segment.depth_mm = ray.depth + open * depth_per_mm;
+            segment.depth_per_mm = depth_per_mm;
+            segment.weight = ray.weight;
+            segment.attenuation = exp(ray.log_attenuation - spent_open);
+            segment.decay_per_mm = (spent_end - spent_open) / (end - open);
+            segment.reflections = ray.reflections;
+            segment.label = ray.label;
+            my_segments[count] = segment;
+          }
+          count++;
+          open = end;
+          spent_open = spent_end;
         }
-        count++;
-      }
+        spent = spent_until;
+        since = until;
+        if (last_piece) break;
+        here = behind;
+        ray.label = other;
+        inside = beyond;
+      } while (1);
       if (!crossing) {
-        if (to_silence < to_depth) cut_weight += ray.weight;
+        if (ended) cut_weight += ray.weight;
         break;
       }
 
@@ -216,13 +263,12 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
       float3 normal = interface_normal(voxels, scene, voxel_hit, ray.label, other, ray.direction);
       float path = ray.path + beyond;
       float depth = ray.depth + beyond * depth_per_mm;
-      float log_attenuation = ray.log_attenuation - decay * beyond;
+      float log_attenuation = ray.log_attenuation - spent;
       float attenuation = exp(log_attenuation);
       float3 aside = quantile * beam_sigma(scene, path).y * ray.elevational;
       float3 hit_point = ray.axis + beyond * ray.direction + aside;
 
       // Snell and the pressure reflection coefficient of a fluid interface; R = r^2 is the two-way factor.
-      Tissue behind = tissues[other];
       float cos_in = clamp(-dot(ray.direction, normal), 0.01f, 1.0f);
       float ratio = behind.speed_m_s / here.speed_m_s;
       float sin2_out = ratio * ratio * (1.0f - cos_in * cos_in);

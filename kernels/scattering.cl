@@ -99,7 +99,7 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
       const uint random = random_[j];
       const uint word = voxels[voxel_[j]];
       int label = word & LABEL_MASK;
-      if (!(word & UNIFORM_CELL)) {
+      if (!(word & PLAIN_CELL)) {
         const float fx = fx_[j], fy = fy_[j], fz = fz_[j];
         // Partial volume without blending: the scatterer takes the label of one corner, drawn with that corner's
         // trilinear weight from bits of its own. The border is soft on average and fixed in the patient.

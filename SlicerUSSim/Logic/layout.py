@@ -9,12 +9,13 @@ import numpy as np
 
 #: Constants known to host and kernels by the same name.
 CONSTANTS = {
-    "LABEL_MASK": 0x7F,  # low byte of a medium voxel: seven bits of label ...
-    "UNIFORM_CELL": 0x80,  # ... and one that says: all eight voxels of this cell agree and no membrane is near
-    "MEMBRANE_LABEL": 127,
-    "MAX_TISSUES": 128,
+    "LABEL_MASK": 0x3F,  # low byte of a medium voxel: six bits of label, ...
+    "SAME_LABEL": 0x40,  # ... one that says that all eight voxels of this cell have one label, ...
+    "PLAIN_CELL": 0x80,  # ... and one that says that they do and no membrane passes between them
+    "MEMBRANE_LABEL": 63,
+    "MAX_TISSUES": 64,
     "MAX_SEGMENTS": 256,  # per traced line
-    "MAX_HITS": 64,  # per traced ray
+    "MAX_HITS": 96,  # per traced ray
     "MAX_STACK": 24,  # reflected rays waiting to be followed
     "CHUNK": 64,  # samples one work-item of the scatter kernel owns
     "LINE_PAD": 32,  # zeros on either side of a line, so that the pulse filter needs no bounds

@@ -1,6 +1,6 @@
 """The acoustic medium as the device sees it: labels, membrane and tissue numbers in two buffers.
 
-A voxel takes two bytes. The low byte holds the label and a flag for cells (the cube between eight voxel centres) whose
+A voxel takes two bytes. The low byte holds the label and flags for cells (the cube between eight voxel centres) whose
 corners agree, so that most look-ups need one load. The high byte holds the *fluid fraction*: the indicator of the
 membrane's fluids smoothed by a Gaussian. Smoothing a planar border at distance d gives Phi(d / sigma), so a layer of
 thickness t is where the fraction lies within Phi(+-t / 2 sigma): a sub-voxel layer without stairs.
@@ -70,9 +70,13 @@ class Medium:
     def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:
         fraction, self.membrane_reach = self._fluid_fraction(padded, tissues)
         words = padded.astype(np.uint16)
-        words |= np.uint16(CONSTANTS["UNIFORM_CELL"]) * _uniform_cells(padded, fraction, self.membrane_reach)
+        lowest, highest = _cell_extremes(padded)
+        plain = same = lowest == highest
         if fraction is not None:
             words |= fraction.astype(np.uint16) << 8
+            lowest, highest = _cell_extremes(fraction)
+            plain = same & ((lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach))
+        words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["PLAIN_CELL"]) * plain
         self.voxel_buffer = self.device.upload(words)
 
     def _fluid_fraction(self, padded: np.ndarray, tissues: TissueTable) -> tuple[np.ndarray | None, float]:
@@ -107,17 +111,8 @@ def _as_labels(array: np.ndarray) -> np.ndarray:
     return labels
 
 
-def _uniform_cells(labels: np.ndarray, fraction: np.ndarray | None, reach: float) -> np.ndarray:
-    """True where the eight voxels at (k, j, i) + {0, 1}^3 have one label and no membrane passes between them."""
-    lowest, highest = _cell_extremes(labels)
-    uniform = lowest == highest
-    if fraction is not None:
-        lowest, highest = _cell_extremes(fraction)
-        uniform &= (lowest > 127.5 + reach) | (highest < 127.5 - reach)
-    return uniform
-
-
 def _cell_extremes(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest of the eight voxels at (k, j, i) + {0, 1}^3, for every (k, j, i)."""
     lowest, highest = array.copy(), array.copy()
     for axis in range(3):
         here = [slice(None)] * 3

@@ -21,8 +21,8 @@ class SimulationSettings:
     max_ray_depth: int = 6
     #: A ray ends when its two-way amplitude, attenuation included, falls below this (-120 dB)
     intensity_threshold: float = 1e-6
-    #: A reflected child is followed if its weight, attenuation aside, is at least this (-54 dB)
-    reflection_threshold: float = 2e-3
+    #: A reflected child is followed if its weight, attenuation aside, is at least this (-40 dB)
+    reflection_threshold: float = 1e-2
     #: What the scanner takes for the speed of sound
     reference_speed_m_s: float = 1540.0
     #: Follow reflected children at all

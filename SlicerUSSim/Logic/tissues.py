@@ -18,7 +18,7 @@ import numpy as np
 from SlicerUSSim.Logic.errors import SimulationError, require, require_between
 from SlicerUSSim.Logic.volume import written_whole
 
-MAX_LABEL = 126  # seven bits in the device's label volume, and 127 is the membrane
+MAX_LABEL = 62  # six bits in the device's label volume, and 63 is the membrane
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class TissueTable(Mapping):
     """Which tissue every label stands for: a read-only mapping {label: Tissue}, and the membrane, if any.
 
     Label 0 is the coupling medium around the patient and is added when it is not given.
-    Raises SimulationError for labels outside 0..126.
+    Raises SimulationError for labels outside 0..62.
     """
 
     def __init__(self, tissues: Mapping[int, Tissue], membrane: Membrane | None = None) -> None:

@@ -1,0 +1,75 @@
+"""Where to put a probe: poses from a target and a direction, and the plane of an MRI that a probe sees."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.errors import require
+from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.scan_conversion import ImageGrid
+from SlicerUSSim.Logic.volume import Volume
+
+
+def pose_looking_at(face_ras, target_ras, lateral_ras=(1.0, 0.0, 0.0)) -> np.ndarray:
+    """(4, 4) probe_to_ras of a probe whose face centre is at `face_ras` and whose axis points to `target_ras` (mm).
+
+    `lateral_ras` is the direction the image's left-to-right axis should have as nearly as possible.
+    Raises SimulationError if the points coincide or `lateral_ras` lies along the axis.
+    """
+    face, target, lateral = (np.asarray(v, dtype=float) for v in (face_ras, target_ras, lateral_ras))
+    depth = target - face
+    require(np.linalg.norm(depth) > 1e-6, f"probe face and target are both at {face.tolist()}, expected two points")
+    y = depth / np.linalg.norm(depth)
+    x = lateral - (lateral @ y) * y
+    require(np.linalg.norm(x) > 1e-3, f"lateral direction {lateral.tolist()} is along the probe's axis, expected across it")
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
+    pose[:3, 3] = face
+    return pose
+
+
+def surface_point(foreground: Volume, target_ras, outward_ras) -> np.ndarray:
+    """(3,) where the line from `target_ras` along `outward_ras` leaves the foreground (non-zero voxels) for good.
+
+    Raises SimulationError if the line meets no foreground at all.
+    """
+    target, outward = np.asarray(target_ras, float), np.asarray(outward_ras, float)
+    outward = outward / np.linalg.norm(outward)
+    distance = np.arange(0.0, 400.0, 0.25)
+    points = target + distance[:, None] * outward
+    inside = sample(foreground, points, order=0) > 0
+    require(bool(inside.any()), f"no tissue from {target.tolist()} in direction {outward.round(3).tolist()}")
+    return points[np.flatnonzero(inside)[-1]]
+
+
+def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standoff_mm: float = 1.0) -> np.ndarray:
+    """(4, 4) probe_to_ras of a coronal view through a parasagittal craniotomy, aimed below the centre of the brain.
+
+    `brain` is a mask or label map (non-zero inside). The view crosses cortex, a lateral ventricle and the midline.
+    """
+    inside = brain.array > 0
+    require(bool(inside.any()), "the brain mask is empty, expected voxels inside")
+    centre_kji = np.array(ndimage.center_of_mass(inside))
+    centre = brain.ijk_to_ras[:3] @ np.append(centre_kji[::-1], 1.0)
+    tilt = np.deg2rad(tilt_deg)
+    outward = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+    target = centre + [0.0, 0.0, 2.0]
+    face = surface_point(brain, target, outward) + standoff_mm * outward
+    return pose_looking_at(face, target, lateral_ras=(1.0, 0.0, 0.0))
+
+
+def sample(volume: Volume, points_ras: np.ndarray, order: int = 1) -> np.ndarray:
+    """Values of `volume` at (..., 3) RAS points; order 0 is nearest neighbour, 1 linear; 0 outside."""
+    points = np.asarray(points_ras, float)
+    ijk = points @ volume.ras_to_ijk[:3, :3].T + volume.ras_to_ijk[:3, 3]
+    return ndimage.map_coordinates(volume.array, np.moveaxis(ijk[..., ::-1], -1, 0), order=order, cval=0)
+
+
+def slice_under_probe(volume: Volume, grid: ImageGrid, probe_to_ras: np.ndarray, order: int = 1) -> np.ndarray:
+    """(rows, columns) of `volume` resampled at the pixels of a probe's image."""
+    columns, rows = np.meshgrid(np.arange(grid.columns), np.arange(grid.rows))
+    pixels = np.stack([columns, rows, np.zeros_like(rows), np.ones_like(rows)], axis=-1).astype(float)
+    points = pixels @ (probe_to_ras @ grid.image_to_probe).T
+    return sample(volume, points[..., :3], order)
