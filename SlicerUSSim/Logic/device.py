@@ -255,8 +255,13 @@ class Device:
             self._kernels[key] = {kernel.function_name: kernel for kernel in program.all_kernels()}
         return self._kernels[key]
 
-    def run(self, kernel, global_size: tuple[int, ...], *arguments, local_size=None) -> None:
-        """Enqueue a kernel; its profiling event is kept if `profiling` is on."""
+    def run(self, kernel, global_size: tuple[int, ...], *arguments, heavy: bool = False) -> None:
+        """Enqueue a kernel; its profiling event is kept if `profiling` is on.
+
+        `heavy` is for work-items with large private arrays: on a processor each is then a group of its own, since PoCL
+        keeps the arrays of a whole group on one thread's stack and ends the process when that overflows.
+        """
+        local_size = (1,) * len(global_size) if heavy and self.info.kind != "GPU" else None
         event = kernel(self.queue, global_size, local_size, *arguments)
         if self.profiling:
             self._events.append((kernel.function_name, event))

@@ -39,7 +39,7 @@ class Probe:
     #: Lateral size of the fully open aperture.
     aperture_mm: float = 12.0
     #: Smallest f-number of the receive aperture (it opens with depth until it reaches aperture_mm).
-    receive_f_number: float = 2.0
+    receive_f_number: float = 2.5
     #: Height of the elements.
     elevation_aperture_mm: float = 7.0
     #: Focus of the lens; None puts it at 60 % of the depth.

@@ -68,6 +68,7 @@ class RayTracer:
             self.hits,
             self.hit_counts,
             self.cut,
+            heavy=True,
         )
 
     def download(self) -> RayTree:

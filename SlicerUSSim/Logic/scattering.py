@@ -53,6 +53,7 @@ class Scatterers:
             lines.re,
             lines.im,
             np.int32(lines.stride),
+            heavy=True,
         )
 
 

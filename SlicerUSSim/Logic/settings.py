@@ -21,8 +21,8 @@ class SimulationSettings:
     max_ray_depth: int = 6
     #: A ray ends when its two-way amplitude, attenuation included, falls below this (-120 dB)
     intensity_threshold: float = 1e-6
-    #: A reflected child is followed if its weight, attenuation aside, is at least this (-40 dB)
-    reflection_threshold: float = 1e-2
+    #: A reflected child is followed if its weight, attenuation aside, is at least this (-34 dB)
+    reflection_threshold: float = 2e-2
     #: What the scanner takes for the speed of sound
     reference_speed_m_s: float = 1540.0
     #: Follow reflected children at all
@@ -34,7 +34,7 @@ class SimulationSettings:
     #: Sites of the scatterer lattice per cubic millimetre (a cell of 0.3 mm; the paper's Rayleigh test takes 1250)
     scatterers_per_mm3: float = 36.0
     #: Where the beam profile is cut off, in standard deviations
-    beam_cutoff: float = 3.0
+    beam_cutoff: float = 2.6
     #: Rays per scan line that sample interfaces across the elevational beam
     elevational_rays: int = 7
     #: Traced lines per scan line, which sample the beam laterally; 0 chooses enough for the probe's spacing

@@ -272,13 +272,13 @@ class UltrasoundSimulator:
 def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
     """(traced lines per scan line, traced lines beyond either edge of the field).
 
-    Traced lines are at most 1.3 lateral beam sigmas apart at any depth, so that sums over them are integrals; those
+    Traced lines are at most 1.5 lateral beam sigmas apart at any depth, so that sums over them are integrals; those
     beyond the edge give the outermost scan lines the other half of their beam (where it is no wider than 16 lines,
     that is everywhere but next to the apex of a phased array).
     """
     depth = np.linspace(0.0, probe.depth_mm, 65)
     apart = probe.line_spacing * (np.ones_like(depth) if probe.is_linear else depth + probe.apex_radius_mm)
     sigmas = apart / probe.beam_sigma_mm(depth)[0]
-    lateral = settings.lateral_rays or int(min(np.ceil(sigmas.max() / 1.3), 9))
+    lateral = settings.lateral_rays or int(min(np.ceil(sigmas.max() / 1.5), 9))
     deep = sigmas[depth >= 0.1 * probe.depth_mm]
     return lateral, int(min(np.ceil(settings.beam_cutoff * lateral / deep.min()), 16 * lateral))
