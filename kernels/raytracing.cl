@@ -25,8 +25,11 @@ typedef struct {
   int label;
 } Ray;
 
-// The label whose trilinear weight is largest at `voxel` (padded voxel indices): sub-voxel borders without stairs.
-inline int label_at(__global const ushort *voxels, __constant const Scene *scene, float3 voxel) {
+// The label at `voxel` (padded voxel indices): the acoustic group with the largest trilinear weight, so that borders are
+// sub-voxel and without stairs, and within it the label of the nearest corner. Voting by group keeps the border of
+// fluid against brain smooth wherever grey, white and other brain labels change along it.
+inline int label_at(__global const ushort *voxels, __constant const Scene *scene, __constant const Tissue *tissues,
+                    float3 voxel) {
   int nx = scene->dims[0], ny = scene->dims[1], nz = scene->dims[2];
   voxel = clamp(voxel, (float3)(0.0f), (float3)(nx - 1.001f, ny - 1.001f, nz - 1.001f));
   int3 base = convert_int3(voxel);
@@ -34,38 +37,47 @@ inline int label_at(__global const ushort *voxels, __constant const Scene *scene
   uint word = voxels[here];
   if (word & SAME_LABEL) return word & LABEL_MASK;
   float3 f = voxel - convert_float3(base), g = 1.0f - f;
-  int labels[8];
+  int labels[8], groups[8];
   float weights[8];
   for (int c = 0; c < 8; c++) {
     labels[c] = voxels[here + (c & 1) + ((c >> 1) & 1) * nx + (c >> 2) * nx * ny] & LABEL_MASK;
+    groups[c] = tissues[labels[c]].group;
     weights[c] = ((c & 1) ? f.x : g.x) * ((c & 2) ? f.y : g.y) * ((c & 4) ? f.z : g.z);
   }
-  // Nearly every border cell holds two labels: the first corner's and another one.
-  int first = labels[0], second = first;
+  // Nearly every border cell holds two groups: the first corner's and another one.
+  int first = groups[0], second = first;
   float first_weight = 0.0f, second_weight = 0.0f;
-  for (int c = 0; c < 8; c++) second = labels[c] != first ? labels[c] : second;
+  for (int c = 0; c < 8; c++) second = groups[c] != first ? groups[c] : second;
   for (int c = 0; c < 8; c++) {
-    first_weight += labels[c] == first ? weights[c] : 0.0f;
-    second_weight += labels[c] == second ? weights[c] : 0.0f;
+    first_weight += groups[c] == first ? weights[c] : 0.0f;
+    second_weight += groups[c] == second ? weights[c] : 0.0f;
   }
   int best = first_weight >= second_weight ? first : second;
   float best_weight = fmax(first_weight, second_weight);
-  if (best_weight >= 1.0f - first_weight - second_weight) return best;
-  for (int c = 0; c < 8; c++) {
-    float total = 0.0f;
-    for (int e = 0; e < 8; e++) total += labels[e] == labels[c] ? weights[e] : 0.0f;
-    if (total > best_weight) {
-      best_weight = total;
-      best = labels[c];
+  if (best_weight < 1.0f - first_weight - second_weight)
+    for (int c = 0; c < 8; c++) {
+      float total = 0.0f;
+      for (int e = 0; e < 8; e++) total += groups[e] == groups[c] ? weights[e] : 0.0f;
+      if (total > best_weight) {
+        best_weight = total;
+        best = groups[c];
+      }
     }
-  }
-  return best;
+  int label = 0;
+  float nearest = -1.0f;
+  for (int c = 0; c < 8; c++)
+    if (groups[c] == best && weights[c] > nearest) {
+      nearest = weights[c];
+      label = labels[c];
+    }
+  return label;
 }
 
-// Unit normal (RAS) of the border between two labels near `voxel`, pointing to the side of `before`: the gradient of
-// their difference smoothed by a Gaussian of 1.5 voxels. The sum runs over voxel centres, so it is the exact gradient.
-inline float3 interface_normal(__global const ushort *voxels, __constant const Scene *scene, float3 voxel, int before,
-                               int behind, float3 direction) {
+// Unit normal (RAS) of the border between two acoustic groups near `voxel`, pointing to the side of `before`: the
+// gradient of their difference smoothed by a Gaussian of 1.5 voxels. The sum runs over voxel centres, so it is the exact gradient.
+inline float3 interface_normal(__global const ushort *voxels, __constant const Scene *scene,
+                               __constant const Tissue *tissues, float3 voxel, int before, int behind,
+                               float3 direction) {
   const int reach = 3;
   int3 dims = (int3)(scene->dims[0], scene->dims[1], scene->dims[2]);
   int3 centre = convert_int3(clamp(rint(voxel), (float3)(0.0f), convert_float3(dims - 1)));
@@ -86,8 +98,8 @@ inline float3 interface_normal(__global const ushort *voxels, __constant const S
       __global const ushort *row = voxels + (k * dims.y + j) * dims.x;
       float sum = 0.0f, moment = 0.0f;  // along the row
       for (int i = low.x; i <= high.x; i++) {
-        int label = row[i] & LABEL_MASK;
-        float weight = wx[i - low.x] * ((label == before) - (label == behind));
+        int group = tissues[row[i] & LABEL_MASK].group;
+        float weight = wx[i - low.x] * ((group == before) - (group == behind));
         sum += weight;
         moment += weight * (i - voxel.x);
       }
@@ -163,7 +175,7 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
       float3 voxel_step = affine_vector(scene->ras_to_voxel, ray.direction);
       float3 voxel_aside = affine_vector(scene->ras_to_voxel, ray.elevational) * quantile;
 #define VOXEL_AT(l) (voxel0 + (l) * voxel_step + beam_sigma(scene, ray.path + (l)).y * voxel_aside)
-      if (ray.label < 0) ray.label = label_at(voxels, scene, VOXEL_AT(0.0f));
+      if (ray.label < 0) ray.label = label_at(voxels, scene, tissues, VOXEL_AT(0.0f));
       Tissue here = tissues[ray.label];
       float depth_per_mm = scene->reference_speed_m_s / here.speed_m_s;
       float to_depth = (scene->depth_mm - ray.depth) / depth_per_mm;
@@ -195,7 +207,7 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
         crossing = 0;
         while (inside < last) {
           float next = fmin(inside + stride, last + 1e-4f);
-          other = label_at(voxels, scene, VOXEL_AT(next));
+          other = label_at(voxels, scene, tissues, VOXEL_AT(next));
           if (other != ray.label && ray.path + next > ray.blind_until) {
             beyond = next;
             crossing = 1;
@@ -206,7 +218,7 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
         if (crossing)
           for (int iteration = 0; iteration < 8; iteration++) {
             float middle = 0.5f * (inside + beyond);
-            int label = label_at(voxels, scene, VOXEL_AT(middle));
+            int label = label_at(voxels, scene, tissues, VOXEL_AT(middle));
             if (label == ray.label)
               inside = middle;
             else {
@@ -221,7 +233,7 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
         int close = fabs(decay - mean_decay) * fmin(earlier, until - since) > 0.02f;
         float spent_until = spent + decay * (until - since);
         if (crossing) behind = tissues[other];
-        int interface_here = crossing && (behind.speed_m_s != here.speed_m_s || behind.impedance != here.impedance);
+        int interface_here = crossing && behind.group != here.group;
         int last_piece = !crossing || interface_here;
         for (int piece = close ? 0 : 1; piece < (last_piece ? 2 : 1) && on_axis; piece++) {
           float end = piece == 0 ? since : until, spent_end = piece == 0 ? spent : spent_until;
@@ -260,7 +272,7 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
       }
 
       float3 voxel_hit = VOXEL_AT(beyond);
-      float3 normal = interface_normal(voxels, scene, voxel_hit, ray.label, other, ray.direction);
+      float3 normal = interface_normal(voxels, scene, tissues, voxel_hit, here.group, behind.group, ray.direction);
       float path = ray.path + beyond;
       float depth = ray.depth + beyond * depth_per_mm;
       float log_attenuation = ray.log_attenuation - spent;

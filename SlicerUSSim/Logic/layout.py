@@ -79,6 +79,7 @@ TISSUE = np.dtype(
         ("mu0", _FLOAT),
         ("sigma0", _FLOAT),
         ("share", _FLOAT),  # p = 1 - Phi(mu1)
+        ("group", _INT),  # tissues of one speed and impedance: no interface between them
     ]
 )
 

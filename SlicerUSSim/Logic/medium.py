@@ -16,7 +16,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.device import Device
 from SlicerUSSim.Logic.errors import SimulationError, require
 from SlicerUSSim.Logic.layout import CONSTANTS, TISSUE
-from SlicerUSSim.Logic.tissues import MAX_LABEL, Tissue, TissueTable
+from SlicerUSSim.Logic.tissues import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.volume import Volume
 
 _PAD = 1  # one voxel of coupling medium around the volume, so that a clamped look-up outside finds it
@@ -127,22 +127,21 @@ def _cell_extremes(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _tissue_rows(tissues: TissueTable) -> np.ndarray:
     rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
-    for label, tissue in tissues.items():
-        rows[label] = _tissue_row(tissue)
+    groups: dict[tuple[float, float], int] = {}
+    members = dict(tissues)
     if tissues.membrane is not None:
-        rows[CONSTANTS["MEMBRANE_LABEL"]] = _tissue_row(tissues.membrane.tissue)
+        members[CONSTANTS["MEMBRANE_LABEL"]] = tissues.membrane.tissue
+    for label, tissue in members.items():
+        acoustics = (tissue.speed_of_sound_m_s, tissue.impedance_mrayl)
+        rows[label] = (
+            *acoustics,
+            tissue.attenuation_db_cm_mhz,
+            tissue.mu0,
+            tissue.sigma0,
+            tissue.scatterer_share,
+            groups.setdefault(acoustics, len(groups)),
+        )
     return rows
-
-
-def _tissue_row(tissue: Tissue) -> tuple:
-    return (
-        tissue.speed_of_sound_m_s,
-        tissue.impedance_mrayl,
-        tissue.attenuation_db_cm_mhz,
-        tissue.mu0,
-        tissue.sigma0,
-        tissue.scatterer_share,
-    )
 
 
 def _membrane_shape(tissues: TissueTable) -> tuple | None:

@@ -53,18 +53,28 @@ class ScanConverter:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self.kernel = device.kernels("scan_conversion.cl", shared_source(), LANES=1)["scan_convert"]
+        self.average = device.kernels("bmode.cl", shared_source(), LANES=device.lanes)["average_depth"]
+        self.convert = device.kernels("scan_conversion.cl", shared_source(), LANES=1)["scan_convert"]
         self.workspace = Workspace(device)
 
-    def run(self, scene_buffer, grid: ImageGrid, lines: Compressor) -> None:
+    def run(self, scene_buffer, scene: np.ndarray, grid: ImageGrid, lines: Compressor) -> None:
         """Enqueue the conversion of one frame."""
         self.grid = grid
         self.image = self.workspace.get("image", grid.rows * grid.columns)
+        smooth = self.workspace.get("smooth", lines.lines * lines.samples)
         self.device.run(
-            self.kernel,
+            self.average,
+            (lines.samples // self.device.lanes, lines.lines),
+            lines.grey,
+            smooth,
+            np.int32(lines.samples),
+            np.int32(max(round(grid.pixel_spacing_mm[1] / float(scene["sample_mm"])), 1)),
+        )
+        self.device.run(
+            self.convert,
             (grid.columns, grid.rows),
             scene_buffer,
-            lines.grey,
+            smooth,
             np.float32(grid.left_mm),
             np.float32(grid.top_mm),
             np.float32(grid.pixel_spacing_mm[0]),

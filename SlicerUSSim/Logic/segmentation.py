@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -33,7 +34,7 @@ _EPSILON_PER_NOISE = 1.5
 class Segmentation:
     """A label map and the mixture it came from."""
 
-    #: uint8; label n + 1 is class n, 0 is background
+    #: uint8; label n + 1 is class n, 0 is background; one label more for thin sulci
     labels: Volume
     #: Name of label n + 1
     tissue_names: tuple[str, ...]
@@ -67,6 +68,7 @@ def segment_mri(
     filter_radius: int = 1,
     filter_epsilon: float | None = None,
     bias_correction: bool = False,
+    thin_sulci: bool = False,
     device: str | Device | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Segmentation:
@@ -81,6 +83,8 @@ def segment_mri(
     filter_radius : of the guided filter in voxels; 0 switches it off.
     filter_epsilon : of the guided filter, squared intensity; default: from the noise found in the image.
     bias_correction : run N4 first (slow); for scans with a visible intensity gradient.
+    thin_sulci : also label the middle of sulci too narrow to reach CSF intensity, one voxel thick, as one more tissue
+        named "leptomeninges", taken from the grey matter. Ultrasound shows them, intensity classes lose them.
     progress : called with the share done, 0 to 1.
 
     Raises SimulationError for a contrast or number of classes that is not known, an image that is not finite or
@@ -109,6 +113,14 @@ def segment_mri(
     means, deviations, weights, likelihoods = fit_mixture(values, classes)
     labels = np.zeros(intensity.shape, np.uint8)
     labels[foreground] = _classify(values, means, deviations, weights)
+    if thin_sulci:
+        csf, grey = names.index("csf"), names.index("grey matter")
+        middles = _sulcal_middles(filtered, labels, grey + 1, means[csf], means[grey], noise)
+        # CSF less than two voxels thick is such a sulcus too; left as CSF it would be a chain of droplets, each a lens.
+        is_csf = labels == csf + 1
+        middles |= is_csf & ~ndimage.binary_opening(is_csf, np.ones((2, 2, 2)))
+        labels[middles] = classes + 1
+        names = (*names, "leptomeninges")
     report(1.0)
     return Segmentation(
         labels=mri.with_array(labels),
@@ -262,6 +274,36 @@ def _classify(values, means, deviations, weights) -> np.ndarray:
     best = np.maximum.accumulate(best)
     index = np.rint((values - levels[0]) / (levels[1] - levels[0])).astype(np.int32)
     return (best[index] + 1).astype(np.uint8)
+
+
+def _sulcal_middles(
+    filtered: np.ndarray, labels: np.ndarray, grey_label: int, csf_mean: float, grey_mean: float, noise: float
+) -> np.ndarray:
+    """(k, j, i) True at grey voxels on the middle of a sheet that is closer to CSF than both of its sides.
+
+    Along any of the 13 directions of the 26-neighbourhood the voxel has to be an extremum against both neighbours and
+    a valley against the better of the first two voxels on either side.
+    """
+    towards_csf = np.sign(csf_mean - grey_mean)
+    # Depth below grey matter; what is further from CSF than grey counts as grey, or every cortex would be a valley
+    # between white matter and white matter.
+    depth = np.where(labels > 0, np.maximum(towards_csf * (filtered - grey_mean), 0), 0).astype(np.float32)
+    depth = np.pad(ndimage.gaussian_filter(depth, 0.6), 2)
+    flat, steps = depth.ravel(), np.array([depth.shape[1] * depth.shape[2], depth.shape[2], 1])
+    grey = np.flatnonzero(np.pad(labels == grey_label, 2))
+    here = flat[grey]
+    least = max(0.15 * abs(csf_mean - grey_mean), noise)
+    is_middle = np.zeros(grey.size, bool)
+    for direction in itertools.product((-1, 0, 1), repeat=3):
+        if direction <= (0, 0, 0):
+            continue  # the opposite direction says the same
+        step = int(np.dot(direction, steps))
+        before, behind = flat[grey - step], flat[grey + step]
+        side = np.maximum(np.minimum(before, flat[grey - 2 * step]), np.minimum(behind, flat[grey + 2 * step]))
+        is_middle |= (here >= before) & (here >= behind) & (here - side > least)
+    result = np.zeros(depth.shape, bool)
+    result.ravel()[grey[is_middle]] = True
+    return result[2:-2, 2:-2, 2:-2]
 
 
 def _class_names(contrast: str, classes: int) -> tuple[str, ...]:

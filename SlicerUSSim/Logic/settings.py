@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from SlicerUSSim.Logic.errors import require, require_between
 
 #: Level of full white at 0 dB gain, in dB re the mean square echo of tissue with unit scatterer variance.
-FULL_SCALE_DB = 22.0
+FULL_SCALE_DB = 25.0
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class SimulationSettings:
     #: Traced lines per scan line, which sample the beam laterally; 0 chooses enough for the probe's spacing
     lateral_rays: int = 0
     #: Level of a perpendicular perfect reflector, in dB re tissue of unit scatterer variance
-    interface_gain_db: float = 26.0
+    interface_gain_db: float = 31.0
     #: "pressure": echo ~ |r|, what a wave does; "energy": echo ~ r^2, equation 2 of the paper as printed
     interface_reflection: str = "pressure"
     #: n in cos^n of the angle of incidence: how specular interfaces are

@@ -147,7 +147,7 @@ class UltrasoundSimulator:
             self.compressor.run(scene, display, self.pulse)
         with self._stage("scan conversion", timings):
             grid = ImageGrid.for_probe(probe, display.image_size)
-            self.converter.run(self._scene_buffer, grid, self.compressor)
+            self.converter.run(self._scene_buffer, scene, grid, self.compressor)
         with self._stage("download", timings):
             samples = self._sample_count(probe)
             iq = self.pulse.download(samples)

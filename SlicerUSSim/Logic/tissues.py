@@ -74,8 +74,8 @@ class Membrane:
     tissue: Tissue
     #: Thickness of the layer, centred on the border
     thickness_mm: float = 1.0
-    #: Names of the tissues on its fluid side
-    fluids: tuple[str, ...] = ("csf", "coupling")
+    #: Names of the tissues on its fluid side; thin sulci, whose two sides meet, count as one sheet
+    fluids: tuple[str, ...] = ("csf", "coupling", "leptomeninges")
 
     def __post_init__(self) -> None:
         require_between("membrane", "thickness_mm", self.thickness_mm, 0, 10)
@@ -101,16 +101,16 @@ def _tissue(name, c, c_source, z, z_source, alpha, alpha_source, mu0=0.0, mu1=0.
 
 _DENSITY = f"density ({_ITIS}) x speed of sound"
 
-# Grey and white matter share Szabo's speed for brain: published differences between them are smaller than between
-# publications, and a difference would bend rays at every voxel of a border that is not a sharp interface at all.
+# Grey and white matter share Szabo's speed for brain and one impedance: published differences between them are smaller
+# than between publications, and a difference would bend rays at every voxel of a border that is not a sharp interface.
 TISSUES: dict[str, Tissue] = {
     tissue.name: tissue
     for tissue in (
         _tissue("coupling", 1504.5, "as cerebrospinal fluid: saline over an open craniotomy", 1.515, "as CSF", 0.002, "as CSF"),
         _tissue("csf", 1504.5, _ITIS, 1.515, f"1007 kg/m3 {_DENSITY}", 0.002, "as water, " + _DUCK),
-        _tissue("grey matter", 1541.0, f"brain, {_SZABO}", 1.610, f"1045 kg/m3 {_DENSITY}", 0.50,
+        _tissue("grey matter", 1541.0, f"brain, {_SZABO}", 1.607, f"brain, 1043 kg/m3 {_DENSITY}", 0.50,
                 f"cortex is below white matter, {_DUCK}", 0.20, 0.0, 0.08, _level("about 5 dB below white matter")),
-        _tissue("white matter", 1541.0, f"brain, {_SZABO}", 1.604, f"1041 kg/m3 {_DENSITY}", 0.54, _PAPER_BEFORE,
+        _tissue("white matter", 1541.0, f"brain, {_SZABO}", 1.607, f"brain, 1043 kg/m3 {_DENSITY}", 0.54, _PAPER_BEFORE,
                 0.33, 0.0, 0.15, _PAPER),
         _tissue("enhancing", 1550.0, "within the range for tumours, " + _DUCK, 1.63, "glioma, as for tumour", 0.60,
                 "between brain and tumour", 0.70, 0.0, 0.35, _level("vessels, choroid plexus, tumour rim: 8 dB above white")),
@@ -118,7 +118,7 @@ TISSUES: dict[str, Tissue] = {
                 "tumours attenuate more than brain, " + _DUCK, 0.60, 0.0, 0.28, _level("about 6 dB above white matter")),
         _tissue("falx", 1600.0, "collagenous membrane, " + _DUCK, 1.80, f"dura 1174 kg/m3 {_DENSITY}, softened", 1.0,
                 "connective tissue, " + _DUCK, 0.90, 0.0, 0.45, _level("about 10 dB above white matter")),
-        _tissue("leptomeninges", 1541.0, "as brain: too thin to matter", 1.61, "as brain", 0.54, "as brain",
+        _tissue("leptomeninges", 1541.0, "as brain: too thin to matter", 1.607, "as brain", 0.54, "as brain",
                 0.90, 0.0, 0.50, _level("about 9 dB above white matter: arachnoid, pia, vessels in sulci; ependyma")),
         _tissue("skull", 2814.0, f"skull, {_ITIS}", 5.37, f"1908 kg/m3 {_DENSITY}", 7.8, f"skull, {_DUCK}",
                 0.50, 0.0, 0.30, _level("masked by its own surface echo")),
