@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from SlicerUSSim.Logic.errors import require, require_between
 
 #: Level of full white at 0 dB gain, in dB re the mean square echo of tissue with unit scatterer variance.
-FULL_SCALE_DB = 25.0
+FULL_SCALE_DB = 23.0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,34 @@
+"""The public interface. Names are imported when first used, so that importing this package costs nothing."""
+
+from __future__ import annotations
+
+import importlib
+
+_HOMES = {
+    "ConvexProbe": "probe",
+    "DisplaySettings": "settings",
+    "Frame": "simulator",
+    "LinearProbe": "probe",
+    "Membrane": "tissues",
+    "PhasedProbe": "probe",
+    "Segmentation": "segmentation",
+    "SimulationError": "errors",
+    "SimulationSettings": "settings",
+    "Tissue": "tissues",
+    "TissueTable": "tissues",
+    "UltrasoundSimulator": "simulator",
+    "Volume": "volume",
+    "list_devices": "device",
+    "segment_mri": "segmentation",
+}
+__all__ = list(_HOMES)  # noqa: PLE0604
+
+
+def __getattr__(name: str):
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,94 @@
+"""Pictures of what a probe sees: MRI, labels and B-mode in the probe's plane, with a millimetre scale."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from SlicerUSSim.Logic.errors import SimulationError
+from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.volume import written_whole
+
+_BACKGROUND, _INK, _FAN = "#111111", "#dddddd", "#ffc83d"
+# Quiet, distinguishable colours for labels 1, 2, ...; 0 is black.
+_LABEL_COLOURS = ("#000000", "#2c5f8a", "#8c8c8c", "#e8e4d8", "#c85a54", "#d9a441", "#5f9e6e", "#8f6bb0", "#4fb0c6")
+
+
+def draw_views(
+    path: str | os.PathLike,
+    views: list[tuple[str, np.ndarray, str]],
+    probe: Probe,
+    bounds_mm: tuple[float, float, float, float],
+    tissue_names: tuple[str, ...] = (),
+) -> None:
+    """Write a PNG with the given views side by side; whole or not at all.
+
+    Parameters
+    ----------
+    views : (title, image (rows, columns), kind) with kind "mri", "labels" or "bmode".
+    bounds_mm : (left, right, top, bottom) of all of them in the probe frame.
+    tissue_names : of labels 1, 2, ...; shown as a legend beside labels.
+
+    Raises SimulationError without matplotlib and for an unwritable path.
+    """
+    figure_class, patches = _matplotlib()
+    left, right, top, bottom = bounds_mm
+    height = 5.0
+    width = height * (right - left) / (bottom - top)
+    size = (len(views) * (width + 0.35) + 0.5, height + 0.75)
+    figure = figure_class(figsize=size, facecolor=_BACKGROUND, dpi=110, layout="constrained")
+    axes = figure.subplots(1, len(views), squeeze=False)[0]
+    for axis, (title, image, kind) in zip(axes, views, strict=True):
+        extent = (left, right, bottom, top)
+        if kind == "labels":
+            from matplotlib.colors import ListedColormap
+
+            axis.imshow(image, cmap=ListedColormap(_LABEL_COLOURS), vmin=-0.5, vmax=len(_LABEL_COLOURS) - 0.5,
+                        extent=extent, interpolation="nearest")  # fmt: skip
+            handles = [
+                patches.Patch(color=_LABEL_COLOURS[n % len(_LABEL_COLOURS)], label=name)
+                for n, name in enumerate(tissue_names, 1)
+            ]
+            axis.legend(handles=handles, loc="lower left", fontsize=7, framealpha=0.6, facecolor=_BACKGROUND, labelcolor=_INK)
+        else:
+            top_value = 255.0 if kind == "bmode" else float(np.percentile(image[image > 0], 99.8)) if (image > 0).any() else 1.0
+            axis.imshow(image, cmap="gray", vmin=0, vmax=top_value, extent=extent, interpolation="bilinear")
+        if kind != "bmode":
+            outline = probe.outline_mm()
+            axis.plot(outline[:, 0], outline[:, 1], color=_FAN, linewidth=1.2)
+        _scale_bar(axis, right, bottom)
+        axis.set_title(title, color=_INK, fontsize=11)
+        axis.set_xlim(left, right)
+        axis.set_ylim(bottom, top)
+        axis.set_facecolor("black")
+        axis.tick_params(colors=_INK, labelsize=8)
+        for spine in axis.spines.values():
+            spine.set_color("#555555")
+        axis.set_xlabel("lateral [mm]", color=_INK, fontsize=8)
+    axes[0].set_ylabel("depth [mm]", color=_INK, fontsize=8)
+    with written_whole(path) as partial:
+        figure.savefig(partial, facecolor=_BACKGROUND)
+
+
+def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
+    """Write a (rows, columns) uint8 image as it is; whole or not at all."""
+    from PIL import Image
+
+    with written_whole(path) as partial:
+        Image.fromarray(image).save(partial)
+
+
+def _scale_bar(axis, right: float, bottom: float) -> None:
+    y = bottom - 0.04 * bottom
+    axis.plot([right - 13.0, right - 3.0], [y, y], color=_INK, linewidth=2.5, solid_capstyle="butt")
+    axis.text(right - 8.0, y - 1.0, "10 mm", color=_INK, fontsize=7, ha="center", va="bottom")
+
+
+def _matplotlib():
+    try:
+        from matplotlib import patches
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise SimulationError('figures need matplotlib; install it with: pip install "SlicerUSSim[demo]"') from None
+    return Figure, patches

@@ -1,0 +1,251 @@
+"""The `ussim` command. Heavy imports happen inside the commands, so that --help answers at once."""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from pathlib import Path
+
+import click
+
+from SlicerUSSim import __version__
+from SlicerUSSim.Logic.errors import SimulationError, require
+
+
+class _Commands(click.Group):
+    """Turns what the user caused into one line on stderr and exit status 2."""
+
+    def invoke(self, ctx: click.Context):
+        try:
+            return super().invoke(ctx)
+        except SimulationError as error:
+            click.echo(f"ussim: {error}", err=True)
+            ctx.exit(2)
+        except MemoryError:
+            click.echo("ussim: not enough memory; use a smaller or coarser volume", err=True)
+            ctx.exit(2)
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="ussim")
+def main() -> None:
+    """B-mode ultrasound simulated from a patient's MRI."""
+    warnings.showwarning = _show_warning
+
+
+def _show_warning(message, category, *_, **__) -> None:
+    """Our own warnings are one line; those of the libraries are not for the user of a command."""
+    if category.__module__.startswith("SlicerUSSim"):
+        click.echo(f"ussim: warning: {message}", err=True)
+
+
+_device_option = click.option("--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).')
+_seed_option = click.option("--seed", type=int, default=0, show_default=True, help="Which speckle and noise.")
+_contrast_option = click.option(
+    "--contrast", type=click.Choice(["t1", "t1gd", "t2", "flair"]), default="t1", show_default=True, help="MRI contrast."
+)
+_mask_option = click.option("--mask", type=click.Path(), help="Foreground on the MRI's grid (default: found by Otsu).")
+_sulci_option = click.option(
+    "--thin-sulci/--no-thin-sulci", default=True, show_default=True,
+    help="Label sulci too narrow to reach CSF intensity as leptomeninges.",
+)  # fmt: skip
+
+
+@main.command()
+@click.option("--out", type=click.Path(path_type=Path), default="ussim-demo", show_default=True, help="Folder for the results.")
+@click.option("--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain that nilearn carries).")
+@click.option("--probe", "kind", type=click.Choice(["phased", "convex"]), default="phased", show_default=True)
+@_seed_option
+@_device_option
+def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -> None:
+    """The whole line on a real brain MRI: segmentation, a craniotomy view, pictures."""
+    from SlicerUSSim.Logic.demo import PROBES, demo_mri, run_demo
+    from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
+    from SlicerUSSim.Logic.volume import Volume
+
+    settings = SimulationSettings(seed=seed)
+    volume, source = (Volume.read(mri), os.path.abspath(mri)) if mri else demo_mri()
+    click.echo(f"MRI: {source}, {'x'.join(map(str, volume.array.shape[::-1]))} voxels")
+    with _steps(5) as step:
+        summary = run_demo(out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step)
+    times = summary["milliseconds"]
+    click.echo(f"device: {summary['device']}")
+    click.echo(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")
+    click.echo(f"wrote {out / 'figure.png'} and seven more files beside it")
+
+
+@main.command()
+@click.argument("mri", type=click.Path())
+@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Label map; its tissues go to a .json beside it.")
+@_contrast_option
+@click.option("--classes", type=int, default=3, show_default=True, help="Number of tissues.")
+@_mask_option
+@click.option("--radius", type=int, default=1, show_default=True, help="Radius of the guided filter in voxels; 0: none.")
+@click.option("--bias-correction", is_flag=True, help="Run N4 first.")
+@_sulci_option
+@_device_option
+def segment(mri, out, contrast, classes, mask, radius, bias_correction, thin_sulci, device) -> None:
+    """Label the tissues of a skull-stripped brain MRI."""
+    from SlicerUSSim.Logic.segmentation import segment_mri
+    from SlicerUSSim.Logic.tissues import TissueTable
+    from SlicerUSSim.Logic.volume import Volume
+
+    _check_volume_name(out)
+    volume = Volume.read(mri)
+    with _share() as progress:
+        result = segment_mri(
+            volume, classes=classes, contrast=contrast, mask=Volume.read(mask) if mask else None, filter_radius=radius,
+            bias_correction=bias_correction, thin_sulci=thin_sulci, device=device, progress=progress,
+        )  # fmt: skip
+    result.labels.write(out)
+    TissueTable.brain(result.tissue_names).write(_tissue_file(out))
+    for label, (name, mean, sd, weight) in enumerate(
+        zip(result.tissue_names, result.means, result.standard_deviations, result.weights, strict=False), 1
+    ):
+        click.echo(f"label {label}: {name:14s} mean {mean:8.2f}  sd {sd:7.2f}  share {weight:5.1%}")
+    click.echo(f"wrote {out} and {_tissue_file(out)}")
+
+
+@main.command()
+@click.argument("mri_or_labels", type=click.Path())
+@click.option("--pose", required=True, help='File with probe_to_ras (JSON, 16 numbers, or a Slicer transform), or "auto".')
+@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Image: .png .mha .nrrd .nii.gz or .vti")
+@click.option("--labels/--mri", "is_labels", default=None, help="What the input is (default: few whole numbers are labels).")
+@click.option("--probe", "probe_file", type=click.Path(), help="Probe as JSON (default: the demo's phased array).")
+@click.option("--tissues", "tissue_file", type=click.Path(), help="Tissue table as JSON (default: beside the labels, or brain).")
+@_contrast_option
+@_mask_option
+@_sulci_option
+@click.option("--gain", type=float, default=0.0, show_default=True, help="Gain [dB].")
+@click.option("--dynamic-range", type=float, default=55.0, show_default=True, help="Dynamic range [dB].")
+@click.option("--tgc", type=float, default=0.5, show_default=True, help="Time-gain compensation [dB/(cm MHz)].")
+@_seed_option
+@_device_option
+def simulate(
+    mri_or_labels, pose, out, is_labels, probe_file, tissue_file, contrast, mask, thin_sulci, gain, dynamic_range, tgc, seed, device
+) -> None:
+    """One B-mode image from an MRI or a label map at a given pose."""
+    _check_image_name(out)
+    from SlicerUSSim.Logic.demo import PROBES
+    from SlicerUSSim.Logic.figures import write_png
+    from SlicerUSSim.Logic.placement import craniotomy_pose
+    from SlicerUSSim.Logic.pose import read_pose
+    from SlicerUSSim.Logic.probe import probe_from_dict
+    from SlicerUSSim.Logic.segmentation import segment_mri
+    from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
+    from SlicerUSSim.Logic.simulator import UltrasoundSimulator
+    from SlicerUSSim.Logic.tissues import TissueTable, read_json
+    from SlicerUSSim.Logic.volume import Volume
+
+    display = DisplaySettings(gain_db=gain, dynamic_range_db=dynamic_range, tgc_db_cm_mhz=tgc)
+    settings = SimulationSettings(seed=seed)
+    probe = probe_from_dict(read_json(probe_file), str(probe_file)) if probe_file else PROBES["phased"]
+    matrix = None if pose == "auto" else read_pose(pose)
+    volume = Volume.read(mri_or_labels)
+    if is_labels is None:
+        is_labels = _looks_like_labels(volume)
+    if is_labels:
+        labels, names = volume, ("csf", "grey matter", "white matter", "leptomeninges")
+        beside = _tissue_file(Path(mri_or_labels))
+        tissue_file = tissue_file or (beside if beside.exists() else None)
+    else:
+        with _share() as progress:
+            result = segment_mri(
+                volume, contrast=contrast, mask=Volume.read(mask) if mask else None, thin_sulci=thin_sulci, device=device,
+                progress=progress,
+            )  # fmt: skip
+        labels, names = result.labels, result.tissue_names
+    tissues = TissueTable.read(tissue_file) if tissue_file else TissueTable.brain(names)
+    simulator = UltrasoundSimulator(labels, tissues, settings, device)
+    frame = simulator.simulate(probe, craniotomy_pose(labels, probe) if matrix is None else matrix, display)
+    if out.suffix.lower() == ".png":
+        write_png(out, frame.image)
+    else:
+        frame.to_volume().write(out)
+    click.echo(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {'labels' if is_labels else 'MRI'})")
+
+
+@main.command()
+@_device_option
+def devices(device: str | None) -> None:
+    """Which OpenCL devices exist, which one is used and why, and how to get a faster one."""
+    from SlicerUSSim.Logic.device import choose_device, faster_hint, list_devices
+
+    chosen, reason = choose_device(device)
+    for info in list_devices():
+        click.echo(f"{'*' if info == chosen else ' '} {info}, {info.memory_mb} MB")
+    click.echo(f"used: {chosen.index}, {reason}")
+    hint = faster_hint(chosen)
+    if hint:
+        click.echo(f"faster on this computer: {hint}")
+
+
+def _looks_like_labels(volume) -> bool:
+    import numpy as np
+
+    return bool(np.issubdtype(volume.array.dtype, np.integer)) and int(volume.array.min()) >= 0 and len(
+        np.unique(volume.array)
+    ) <= 32
+
+
+def _tissue_file(labels: Path) -> Path:
+    name = labels.name
+    for suffix in (".nii.gz", labels.suffix):
+        if suffix and name.endswith(suffix):
+            return labels.with_name(name[: -len(suffix)] + ".json")
+    return labels.with_name(name + ".json")
+
+
+def _check_volume_name(out: Path) -> None:
+    from SlicerUSSim.Logic.volume import WRITABLE_SUFFIXES
+
+    require(
+        out.name.lower().endswith(WRITABLE_SUFFIXES),
+        f"{out}: unknown image format, expected a name ending in one of {', '.join(WRITABLE_SUFFIXES)}",
+    )
+    require(out.parent.is_dir(), f"{out}: the folder {out.parent} does not exist")
+
+
+def _check_image_name(out: Path) -> None:
+    if out.suffix.lower() == ".png":
+        require(out.parent.is_dir(), f"{out}: the folder {out.parent} does not exist")
+    else:
+        _check_volume_name(out)
+
+
+class _steps:  # noqa: N801
+    """A progress bar that is told the name of each step."""
+
+    def __init__(self, count: int) -> None:
+        from tqdm import tqdm
+
+        self.bar = tqdm(total=count, bar_format="|{bar:24}| {desc}", file=sys.stderr, leave=False)
+        self.begun = 0
+
+    def __enter__(self):
+        return self
+
+    def __call__(self, name: str) -> None:
+        self.bar.set_description_str(name, refresh=False)
+        self.bar.update(1 if self.begun else 0)
+        self.bar.refresh()
+        self.begun += 1
+
+    def __exit__(self, *_) -> None:
+        self.bar.close()
+
+
+class _share(_steps):  # noqa: N801
+    """The same for a share done between 0 and 1."""
+
+    def __init__(self) -> None:
+        super().__init__(100)
+        self.bar.set_description_str("segment")
+
+    def __call__(self, share: float) -> None:
+        self.bar.update(int(100 * share) - self.bar.n)
+
+
+if __name__ == "__main__":
+    main()
