@@ -40,10 +40,16 @@ def _show_warning(message, category, *_, **__) -> None:
         click.echo(f"ussim: warning: {message}", err=True)
 
 
-_device_option = click.option("--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).')
+_device_option = click.option(
+    "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
+)
 _seed_option = click.option("--seed", type=int, default=0, show_default=True, help="Which speckle and noise.")
 _contrast_option = click.option(
-    "--contrast", type=click.Choice(["t1", "t1gd", "t2", "flair"]), default="t1", show_default=True, help="MRI contrast."
+    "--contrast",
+    type=click.Choice(["t1", "t1gd", "t2", "flair"]),
+    default="t1",
+    show_default=True,
+    help="MRI contrast.",
 )
 _mask_option = click.option("--mask", type=click.Path(), help="Foreground on the MRI's grid (default: found by Otsu).")
 _sulci_option = click.option(
@@ -53,8 +59,12 @@ _sulci_option = click.option(
 
 
 @main.command()
-@click.option("--out", type=click.Path(path_type=Path), default="ussim-demo", show_default=True, help="Folder for the results.")
-@click.option("--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain that nilearn carries).")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default="ussim-demo", show_default=True, help="Folder for the results."
+)
+@click.option(
+    "--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain that nilearn carries)."
+)
 @click.option("--probe", "kind", type=click.Choice(["phased", "convex"]), default="phased", show_default=True)
 @_seed_option
 @_device_option
@@ -77,11 +87,19 @@ def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -
 
 @main.command()
 @click.argument("mri", type=click.Path())
-@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Label map; its tissues go to a .json beside it.")
+@click.option(
+    "-o",
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Label map; its tissues go to a .json beside it.",
+)
 @_contrast_option
 @click.option("--classes", type=int, default=3, show_default=True, help="Number of tissues.")
 @_mask_option
-@click.option("--radius", type=int, default=1, show_default=True, help="Radius of the guided filter in voxels; 0: none.")
+@click.option(
+    "--radius", type=int, default=1, show_default=True, help="Radius of the guided filter in voxels; 0: none."
+)
 @click.option("--bias-correction", is_flag=True, help="Run N4 first.")
 @_sulci_option
 @_device_option
@@ -109,11 +127,19 @@ def segment(mri, out, contrast, classes, mask, radius, bias_correction, thin_sul
 
 @main.command()
 @click.argument("mri_or_labels", type=click.Path())
-@click.option("--pose", required=True, help='File with probe_to_ras (JSON, 16 numbers, or a Slicer transform), or "auto".')
-@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Image: .png .mha .nrrd .nii.gz or .vti")
-@click.option("--labels/--mri", "is_labels", default=None, help="What the input is (default: few whole numbers are labels).")
+@click.option(
+    "--pose", required=True, help='File with probe_to_ras (JSON, 16 numbers, or a Slicer transform), or "auto".'
+)
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path), required=True, help="Image: .png .mha .nrrd .nii.gz or .vti"
+)
+@click.option(
+    "--labels/--mri", "is_labels", default=None, help="What the input is (default: few whole numbers are labels)."
+)
 @click.option("--probe", "probe_file", type=click.Path(), help="Probe as JSON (default: the demo's phased array).")
-@click.option("--tissues", "tissue_file", type=click.Path(), help="Tissue table as JSON (default: beside the labels, or brain).")
+@click.option(
+    "--tissues", "tissue_file", type=click.Path(), help="Tissue table as JSON (default: beside the labels, or brain)."
+)
 @_contrast_option
 @_mask_option
 @_sulci_option
@@ -123,7 +149,20 @@ def segment(mri, out, contrast, classes, mask, radius, bias_correction, thin_sul
 @_seed_option
 @_device_option
 def simulate(
-    mri_or_labels, pose, out, is_labels, probe_file, tissue_file, contrast, mask, thin_sulci, gain, dynamic_range, tgc, seed, device
+    mri_or_labels,
+    pose,
+    out,
+    is_labels,
+    probe_file,
+    tissue_file,
+    contrast,
+    mask,
+    thin_sulci,
+    gain,
+    dynamic_range,
+    tgc,
+    seed,
+    device,
 ) -> None:
     """One B-mode image from an MRI or a label map at a given pose."""
     _check_image_name(out)
@@ -152,8 +191,8 @@ def simulate(
     else:
         with _share() as progress:
             result = segment_mri(
-                volume, contrast=contrast, mask=Volume.read(mask) if mask else None, thin_sulci=thin_sulci, device=device,
-                progress=progress,
+                volume, contrast=contrast, mask=Volume.read(mask) if mask else None, thin_sulci=thin_sulci,
+                device=device, progress=progress,
             )  # fmt: skip
         labels, names = result.labels, result.tissue_names
     tissues = TissueTable.read(tissue_file) if tissue_file else TissueTable.brain(names)
@@ -184,9 +223,11 @@ def devices(device: str | None) -> None:
 def _looks_like_labels(volume) -> bool:
     import numpy as np
 
-    return bool(np.issubdtype(volume.array.dtype, np.integer)) and int(volume.array.min()) >= 0 and len(
-        np.unique(volume.array)
-    ) <= 32
+    return (
+        bool(np.issubdtype(volume.array.dtype, np.integer))
+        and int(volume.array.min()) >= 0
+        and len(np.unique(volume.array)) <= 32
+    )
 
 
 def _tissue_file(labels: Path) -> Path:

@@ -74,44 +74,73 @@ inline int label_at(__global const ushort *voxels, __constant const Scene *scene
 }
 
 // Unit normal (RAS) of the border between two acoustic groups near `voxel`, pointing to the side of `before`: the
-// gradient of their difference smoothed by a Gaussian of 1.5 voxels. The sum runs over voxel centres, so it is the exact gradient.
+// gradient of their difference smoothed by a Gaussian of BORDER_SIGMA voxels. The sum runs over voxel centres, so it is the exact gradient.
+//
+// `overshoot` is the length along the ray, in millimetres, by which `voxel` lies beyond the border. The trilinear border
+// wavers by a fifth of a voxel; the smoothed difference D of the two sides knows better. A plane at distance d has the
+// share Phi(d / sigma) behind it, and sigma^2 D'' / |D'| = d as well; a border of mean curvature H moves by sigma^2 H
+// under smoothing, which enters the two with opposite signs. The second is noisier, hence the weights. The overshoot is
+// 0 where the two borders do not agree to half a voxel (thin sheets, corners). Measured on a sphere of radius 20 voxels:
+// normals within 2.8 degrees and positions within 0.145 voxel RMS (trilinear: 0.18).
+#define BORDER_SIGMA 1.3f
 inline float3 interface_normal(__global const ushort *voxels, __constant const Scene *scene,
                                __constant const Tissue *tissues, float3 voxel, int before, int behind,
-                               float3 direction) {
+                               float3 direction, float3 voxel_step, float *overshoot) {
   const int reach = 3;
   int3 dims = (int3)(scene->dims[0], scene->dims[1], scene->dims[2]);
   int3 centre = convert_int3(clamp(rint(voxel), (float3)(0.0f), convert_float3(dims - 1)));
   int3 low = max(centre - reach, (int3)(0)), high = min(centre + reach, dims - 1);
-  float wx[7], wy[7], wz[7];  // the Gaussian is separable
+  float wx[7], wy[7], wz[7], dx[7];  // the Gaussian is separable
   for (int n = 0; n < 7; n++) {
     float3 d = (float3)(low.x + n, low.y + n, low.z + n) - voxel;
-    const float narrow = -0.5f / (1.5f * 1.5f);
+    const float narrow = -0.5f / (BORDER_SIGMA * BORDER_SIGMA);
+    dx[n] = d.x;
     wx[n] = native_exp(narrow * d.x * d.x);
     wy[n] = native_exp(narrow * d.y * d.y);
     wz[n] = native_exp(narrow * d.z * d.z);
   }
+  float row_weight = 0.0f, row_square = 0.0f;
+  for (int n = 0; n <= high.x - low.x; n++) {
+    row_weight += wx[n];
+    row_square += wx[n] * dx[n] * dx[n];
+  }
+  // Moments of order 0, 1 and 2 of D = [before] - [behind], and of the window itself.
+  float total = 1e-6f, total_square = 0.0f, difference = 0.0f, square = 0.0f, either = 1e-6f;
   float3 gradient = (float3)(0.0f);
-  float total = 1e-6f;
   for (int k = low.z; k <= high.z; k++)
     for (int j = low.y; j <= high.y; j++) {
-      float yz = wy[j - low.y] * wz[k - low.z];
-      __global const ushort *row = voxels + (k * dims.y + j) * dims.x;
-      float sum = 0.0f, moment = 0.0f;  // along the row
-      for (int i = low.x; i <= high.x; i++) {
-        int group = tissues[row[i] & LABEL_MASK].group;
-        float weight = wx[i - low.x] * ((group == before) - (group == behind));
+      float yz = wy[j - low.y] * wz[k - low.z], dy = j - voxel.y, dz = k - voxel.z, aside2 = dy * dy + dz * dz;
+      __global const ushort *row = voxels + (k * dims.y + j) * dims.x + low.x;
+      float sum = 0.0f, moment = 0.0f, moment2 = 0.0f, sum_either = 0.0f;
+      for (int n = 0; n <= high.x - low.x; n++) {
+        int group = tissues[row[n] & LABEL_MASK].group;
+        float sign = (group == before) - (group == behind), weight = wx[n] * sign;
         sum += weight;
-        moment += weight * (i - voxel.x);
+        moment += weight * dx[n];
+        moment2 += weight * dx[n] * dx[n];
+        sum_either += weight * sign;
       }
-      total += yz;
-      gradient += yz * (float3)(moment, sum * (j - voxel.y), sum * (k - voxel.z));
+      gradient += yz * (float3)(moment, sum * dy, sum * dz);
+      difference += yz * sum;
+      square += yz * (moment2 + sum * aside2);
+      either += yz * sum_either;
+      total += yz * row_weight;
+      total_square += yz * (row_square + row_weight * aside2);
     }
+  float steepness = fmax(length(gradient), 1e-9f);
+  // Logistic approximation of the inverse of Phi, near enough within half a voxel.
+  float share = clamp(0.5f - 0.5f * difference / either, 0.01f, 0.99f);
+  float by_share = BORDER_SIGMA / 1.702f * log(share / (1.0f - share));
+  float by_bend = (square - total_square / total * difference) / steepness;
+  float distance = mix(by_share, by_bend, 0.3f);
+  float across = -dot(voxel_step, gradient) / steepness;  // voxels per mm of ray
+  *overshoot = fabs(distance) < 0.5f && across * scene->voxel_mm > 0.2f ? distance / across : 0.0f;
   // A gradient in voxel indices becomes one in millimetres by the transposed map.
   __constant const float *m = scene->ras_to_voxel;
   float3 normal = (float3)(m[0] * gradient.x + m[4] * gradient.y + m[8] * gradient.z,
                            m[1] * gradient.x + m[5] * gradient.y + m[9] * gradient.z,
                            m[2] * gradient.x + m[6] * gradient.y + m[10] * gradient.z);
-  float length_ = length(gradient) < 1e-3f * total ? 0.0f : length(normal);
+  float length_ = steepness < 1e-3f * total ? 0.0f : length(normal);
   if (length_ == 0.0f) return -direction;  // no preferred side: as if hit head-on
   normal /= length_;
   return dot(normal, direction) > 0.0f ? -normal : normal;
@@ -272,7 +301,13 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
       }
 
       float3 voxel_hit = VOXEL_AT(beyond);
-      float3 normal = interface_normal(voxels, scene, tissues, voxel_hit, here.group, behind.group, ray.direction);
+      float overshoot;
+      float3 normal = interface_normal(voxels, scene, tissues, voxel_hit, here.group, behind.group, ray.direction,
+                                       voxel_step, &overshoot);
+      overshoot = fmin(overshoot, beyond - since);
+      beyond -= overshoot;
+      if (on_axis && count <= MAX_SEGMENTS && count > 0) my_segments[count - 1].length_mm -= overshoot;
+      spent -= overshoot * here.attenuation * scene->frequency_mhz * 0.2f * LN10_OVER_20;
       float path = ray.path + beyond;
       float depth = ray.depth + beyond * depth_per_mm;
       float log_attenuation = ray.log_attenuation - spent;
@@ -347,6 +382,7 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
       ray.log_attenuation = log_attenuation;
       ray.weight = refracted_weight;
       ray.label = other;
+      ray.blind_until = path + fmax(overshoot, 0.0f);  // until the trilinear border is behind, too
     }
   }
   cut[line * (rays + 1) + ray_of_line] = cut_weight;

@@ -44,8 +44,9 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
 
   for (int begin = 0; begin < count; begin += LANES) {
     const intn cells = LOAD_LANES(cell_u + begin);
-    const uintn key = hash_mixn(LOAD_LANES(row_key + begin) + TO_UINTN(cells) * step_u);
+    const uintn key = hash_mixn((LOAD_LANES(row_key + begin) + TO_UINTN(cells) * step_u) ^ scene->seed);
     const uintn key1 = hash_mixn(key + 0x9E3779B9u), key2 = hash_mixn(key + 0x3C6EF372u);
+    // (The seed is not added: one added to another would be the same patient, shifted by a cell.)
     // Jitter belongs to the lattice axes: u, v, w take the bits of the axis they stand for.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
                 bits_w = (key >> (10 * w)) & 0x3ffu;
@@ -237,7 +238,7 @@ __kernel void scatter(__constant const Scene *scene, __global const ushort *voxe
         const float to = fmin(fmin(fmax(d0, d1), fmax(l0, l1)), fmin(fmax(e0, e1), box_high.x + 1.0f));
         if (from > to) continue;
         const int u_low = (int)ceil(from), u_high = (int)floor(to);
-        const uint key = scene->seed + (uint)cv * step_v + (uint)cw * step_w;
+        const uint key = (uint)cv * step_v + (uint)cw * step_w;
         for (int cu = u_low; cu <= u_high; cu += LANES) {
           STORE_LANES(cu + LANE_INDEX, cell_u + waiting);
           STORE_LANES((uintn)(key), row_key + waiting);

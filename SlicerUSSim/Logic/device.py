@@ -13,7 +13,7 @@ import sys
 import warnings
 import zlib
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -119,7 +119,11 @@ def list_devices() -> list[DeviceInfo]:
         for device_index, handle in enumerate(handles):
             device = _describe(cl, f"{platform_index}:{device_index}", cl_platform, handle)
             # A runtime registered twice (its wheel and a vendors folder) would be listed twice.
-            if not any((device.platform, device.name) == (known.platform, known.name) for known in devices if device.kind == "CPU"):
+            if not any(
+                (device.platform, device.name) == (known.platform, known.name)
+                for known in devices
+                if device.kind == "CPU"
+            ):
                 devices.append(device)
     return sorted(devices, key=lambda device: device.rank)
 
@@ -213,9 +217,7 @@ class Device:
             name_unknown_processor(info.handle)
         try:
             self.context = cl.Context([info.handle])
-            self.queue = cl.CommandQueue(
-                self.context, properties=cl.command_queue_properties.PROFILING_ENABLE
-            )
+            self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         except cl.Error as error:
             raise SimulationError(f"OpenCL device {info} cannot be opened: {error}") from None
         self.lanes = _vector_lanes(info)
@@ -248,10 +250,11 @@ class Device:
                     warnings.simplefilter("ignore", self.cl.CompilerWarning)  # runtimes report success at length
                     program = self.cl.Program(self.context, source).build(options=options)
             except self.cl.Error as error:
+                lines = [line.strip() for line in str(error).splitlines() if "error:" in line] or [str(error)]
                 raise SimulationError(
-                    f"OpenCL device {self.info} cannot build {file_name}: {error}; try another device "
+                    f"OpenCL device {self.info} cannot build {file_name} ({lines[0]}); try another device "
                     "(`ussim devices` lists them)"
-                ) from None
+                ) from error
             self._kernels[key] = {kernel.function_name: kernel for kernel in program.all_kernels()}
         return self._kernels[key]
 
@@ -306,7 +309,7 @@ class Device:
             )
 
 
-@lru_cache(maxsize=None)
+@cache
 def _open_device(info: DeviceInfo) -> Device:
     return Device(info)
 

@@ -50,9 +50,13 @@ def draw_views(
                 patches.Patch(color=_LABEL_COLOURS[n % len(_LABEL_COLOURS)], label=name)
                 for n, name in enumerate(tissue_names, 1)
             ]
-            axis.legend(handles=handles, loc="lower left", fontsize=7, framealpha=0.6, facecolor=_BACKGROUND, labelcolor=_INK)
+            axis.legend(
+                handles=handles, loc="lower left", fontsize=7, framealpha=0.6, facecolor=_BACKGROUND, labelcolor=_INK
+            )
         else:
-            top_value = 255.0 if kind == "bmode" else float(np.percentile(image[image > 0], 99.8)) if (image > 0).any() else 1.0
+            top_value = (
+                255.0 if kind == "bmode" else float(np.percentile(image[image > 0], 99.8)) if (image > 0).any() else 1.0
+            )
             axis.imshow(image, cmap="gray", vmin=0, vmax=top_value, extent=extent, interpolation="bilinear")
         if kind != "bmode":
             outline = probe.outline_mm()

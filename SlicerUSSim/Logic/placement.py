@@ -22,7 +22,9 @@ def pose_looking_at(face_ras, target_ras, lateral_ras=(1.0, 0.0, 0.0)) -> np.nda
     require(np.linalg.norm(depth) > 1e-6, f"probe face and target are both at {face.tolist()}, expected two points")
     y = depth / np.linalg.norm(depth)
     x = lateral - (lateral @ y) * y
-    require(np.linalg.norm(x) > 1e-3, f"lateral direction {lateral.tolist()} is along the probe's axis, expected across it")
+    require(
+        np.linalg.norm(x) > 1e-3, f"lateral direction {lateral.tolist()} is along the probe's axis, expected across it"
+    )
     x /= np.linalg.norm(x)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)

@@ -50,12 +50,14 @@ def _starts_like_itk(path: Path) -> bool:
 
 
 def _read_itk(path: Path) -> np.ndarray:
-    import SimpleITK as sitk  # noqa: N813
+    import SimpleITK as sitk
 
     try:
         transform = sitk.ReadTransform(str(path))
     except RuntimeError as error:
-        raise SimulationError(f"{path}: cannot be read as a transform ({str(error).splitlines()[-1].strip()})") from None
+        raise SimulationError(
+            f"{path}: cannot be read as a transform ({str(error).splitlines()[-1].strip()})"
+        ) from None
     require(transform.IsLinear(), f"{path}: the transform is not linear, expected a rigid one")
     # A linear map is known from where it takes the origin and the axes.
     origin = np.array(transform.TransformPoint((0.0, 0.0, 0.0)))
@@ -63,5 +65,7 @@ def _read_itk(path: Path) -> np.ndarray:
     for axis, unit in enumerate(np.eye(3)):
         world_to_probe[:3, axis] = np.array(transform.TransformPoint(unit.tolist())) - origin
     world_to_probe[:3, 3] = origin
-    require(abs(np.linalg.det(world_to_probe[:3, :3])) > 1e-9, f"{path}: the transform is singular, expected a rigid one")
+    require(
+        abs(np.linalg.det(world_to_probe[:3, :3])) > 1e-9, f"{path}: the transform is singular, expected a rigid one"
+    )
     return check_rigid(f"{path}: transform", LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS)

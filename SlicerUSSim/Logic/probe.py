@@ -6,7 +6,7 @@ Probe frame (millimetres): origin at the centre of the probe face, +x lateral (l
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 
 import numpy as np
 
@@ -49,7 +49,10 @@ class Probe:
         owner = type(self).__name__
         require_between(owner, "depth_mm", self.depth_mm, 1, 400)
         require_between(owner, "scan_lines", self.scan_lines, 2, 4096)
-        require(int(self.scan_lines) == self.scan_lines, f"{owner}: scan_lines is {self.scan_lines}, expected a whole number")
+        require(
+            int(self.scan_lines) == self.scan_lines,
+            f"{owner}: scan_lines is {self.scan_lines}, expected a whole number",
+        )
         require_between(owner, "frequency_mhz", self.frequency_mhz, 0.5, 40)
         require_between(owner, "fractional_bandwidth", self.fractional_bandwidth, 0.05, 1.5)
         require_between(owner, "aperture_mm", self.aperture_mm, 0.5, 200)
@@ -60,7 +63,7 @@ class Probe:
             if value is None:
                 object.__setattr__(self, name, 0.6 * self.depth_mm)
             else:
-                require_between(owner, name, value, 1, 1000)
+                require_between(owner, name, value, 0.1, 1000)
 
     # ---- geometry, defined by each kind ------------------------------------------------------------------------
 
@@ -253,17 +256,21 @@ _KIND_NAMES = {LinearProbe: "linear", ConvexProbe: "convex", PhasedProbe: "phase
 
 def probe_from_dict(values: dict, source: str = "probe") -> Probe:
     """The probe described by plain values (see Probe.to_dict). Raises SimulationError for an unknown kind or name."""
-    require(isinstance(values, dict), f"{source}: is a {type(values).__name__}, expected an object with a \"kind\"")
+    require(isinstance(values, dict), f'{source}: is a {type(values).__name__}, expected an object with a "kind"')
     kinds = {name: kind for kind, name in _KIND_NAMES.items()}
     kind = values.get("kind")
     require(kind in kinds, f"{source}: kind is {kind!r}, expected one of {', '.join(kinds)}")
     arguments = {name: value for name, value in values.items() if name != "kind"}
     known = {field.name for field in fields(kinds[kind])}
     for name in arguments:
-        require(name in known, f"{source}: {name} is not a parameter of a {kind} probe, expected one of {', '.join(sorted(known))}")
+        require(
+            name in known,
+            f"{source}: {name} is not a parameter of a {kind} probe, expected one of {', '.join(sorted(known))}",
+        )
     try:
         return kinds[kind](**arguments)
     except SimulationError as error:
         raise SimulationError(f"{source}: {error}") from None
-    except TypeError as error:
-        raise SimulationError(f"{source}: a {kind} probe needs more: {str(error).split(') ')[-1]}") from None
+    except TypeError:
+        needed = {field.name for field in fields(kinds[kind]) if field.default is MISSING} - set(arguments)
+        raise SimulationError(f"{source}: a {kind} probe also needs {', '.join(sorted(needed))}") from None

@@ -28,7 +28,7 @@ class ImageGrid:
 
     @classmethod
     def for_probe(cls, probe: Probe, image_size: tuple[int, int] | None) -> ImageGrid:
-        """The grid that just holds the imaged field; square pixels unless `image_size` (rows, columns) says otherwise."""
+        """The grid that just holds the imaged field; square pixels unless `image_size` (rows, columns) is given."""
         left, right, top, bottom = probe.image_bounds_mm()
         if image_size is None:
             pixel = (bottom - top) / _DEFAULT_ROWS

@@ -55,7 +55,9 @@ class Segmentation:
         """(classes, k, j, i) float32 probability of every class in the order of the labels; 0 in the background."""
         foreground = self.labels.array > 0
         result = np.zeros((len(self.means), *foreground.shape), np.float32)
-        result[:, foreground] = _posteriors(self._filtered[foreground], self.means, self.standard_deviations, self.weights)
+        result[:, foreground] = _posteriors(
+            self._filtered[foreground], self.means, self.standard_deviations, self.weights
+        )
         return result
 
 
@@ -109,7 +111,9 @@ def segment_mri(
 
     values = filtered[foreground]
     spread = float(values.max() - values.min())
-    require(spread > 0, f"MRI is constant ({values[0]:g}) inside the foreground, expected tissues of different intensity")
+    require(
+        spread > 0, f"MRI is constant ({values[0]:g}) inside the foreground, expected tissues of different intensity"
+    )
     means, deviations, weights, likelihoods = fit_mixture(values, classes)
     labels = np.zeros(intensity.shape, np.uint8)
     labels[foreground] = _classify(values, means, deviations, weights)
@@ -189,7 +193,14 @@ def guided_filter(
     summed(second, second)
     least_variance = max(1e-4 * float(image[mask].var()), 1e-20)
     device.run(
-        kernels["linear_model"], whole, count, inside_mask, first, second, np.float32(epsilon), np.float32(least_variance)
+        kernels["linear_model"],
+        whole,
+        count,
+        inside_mask,
+        first,
+        second,
+        np.float32(epsilon),
+        np.float32(least_variance),
     )
     summed(count, count)
     summed(first, first)
@@ -227,7 +238,10 @@ def fit_mixture(values: np.ndarray, classes: int) -> tuple[np.ndarray, np.ndarra
     # Start from classes of equal population: no random restarts, and the same result every time.
     cumulative = np.cumsum(share)
     means = np.interp((np.arange(classes) + 0.5) / classes, cumulative, levels)
-    deviations = np.full(classes, max(np.sqrt(np.average((levels - np.average(levels, weights=share)) ** 2, weights=share)) / classes, step))
+    deviations = np.full(
+        classes,
+        max(np.sqrt(np.average((levels - np.average(levels, weights=share)) ** 2, weights=share)) / classes, step),
+    )
     weights = np.full(classes, 1.0 / classes)
     likelihoods: list[float] = []
     for _ in range(_MAX_ITERATIONS):
@@ -307,11 +321,11 @@ def _sulcal_middles(
 
 
 def _class_names(contrast: str, classes: int) -> tuple[str, ...]:
-    require(
-        contrast in _CLASS_NAMES, f"contrast is {contrast!r}, expected one of {', '.join(_CLASS_NAMES)}"
-    )
+    require(contrast in _CLASS_NAMES, f"contrast is {contrast!r}, expected one of {', '.join(_CLASS_NAMES)}")
     known = _CLASS_NAMES[contrast]
-    require(classes in known, f"classes is {classes!r}, expected {' or '.join(map(str, known))} for contrast {contrast}")
+    require(
+        classes in known, f"classes is {classes!r}, expected {' or '.join(map(str, known))} for contrast {contrast}"
+    )
     return known[classes]
 
 
@@ -345,7 +359,7 @@ def _given_mask(mask: Volume, mri: Volume) -> np.ndarray:
 
 
 def _without_bias(mri: Volume, foreground: np.ndarray) -> np.ndarray:
-    import SimpleITK as sitk  # noqa: N813
+    import SimpleITK as sitk
 
     image = sitk.Cast(mri.to_sitk(), sitk.sitkFloat32)
     mask = mri.with_array(foreground.astype(np.uint8)).to_sitk()

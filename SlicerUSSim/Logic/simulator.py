@@ -230,7 +230,7 @@ class UltrasoundSimulator:
         scene["interface_is_energy"] = settings.interface_reflection == "energy"
         scene["specular_exponent"] = settings.specular_exponent
         scene["cell_mm"] = settings.scatterers_per_mm3 ** (-1.0 / 3.0)
-        scene["seed"] = (settings.seed * 0x9E3779B1 + 0x165667B1) % 2**32
+        scene["seed"] = _mixed(settings.seed)
         scene["beam_cutoff"] = settings.beam_cutoff
         # The integral of the squared point spread function is pi^1.5 times the product of the three sigmas.
         scene["speckle_scale"] = (settings.scatterers_per_mm3 * np.pi**1.5 * axial_sigma) ** -0.5
@@ -267,6 +267,13 @@ class UltrasoundSimulator:
         yield
         self.device.queue.finish()
         timings[name] = (perf_counter() - start) * 1e3
+
+
+def _mixed(seed: int) -> int:
+    """The seed with all its bits stirred (the kernels' hash), so that neighbouring seeds have nothing in common."""
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+        seed = ((seed ^ (seed >> shift)) * factor) % 2**32
+    return seed ^ (seed >> 16) ^ 0x2545F491
 
 
 def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:

@@ -103,19 +103,20 @@ _DENSITY = f"density ({_ITIS}) x speed of sound"
 
 # Grey and white matter share Szabo's speed for brain and one impedance: published differences between them are smaller
 # than between publications, and a difference would bend rays at every voxel of a border that is not a sharp interface.
+# fmt: off
 TISSUES: dict[str, Tissue] = {
     tissue.name: tissue
     for tissue in (
-        _tissue("coupling", 1504.5, "as cerebrospinal fluid: saline over an open craniotomy", 1.515, "as CSF", 0.002, "as CSF"),
+        _tissue("coupling", 1504.5, "as CSF: saline over an open craniotomy", 1.515, "as CSF", 0.002, "as CSF"),
         _tissue("csf", 1504.5, _ITIS, 1.515, f"1007 kg/m3 {_DENSITY}", 0.002, "as water, " + _DUCK),
         _tissue("grey matter", 1541.0, f"brain, {_SZABO}", 1.607, f"brain, 1043 kg/m3 {_DENSITY}", 0.50,
                 f"cortex is below white matter, {_DUCK}", 0.20, 0.0, 0.08, _level("about 5 dB below white matter")),
         _tissue("white matter", 1541.0, f"brain, {_SZABO}", 1.607, f"brain, 1043 kg/m3 {_DENSITY}", 0.54, _PAPER_BEFORE,
                 0.33, 0.0, 0.15, _PAPER),
         _tissue("enhancing", 1550.0, "within the range for tumours, " + _DUCK, 1.63, "glioma, as for tumour", 0.60,
-                "between brain and tumour", 0.70, 0.0, 0.35, _level("vessels, choroid plexus, tumour rim: 8 dB above white")),
+                "between brain and tumour", 0.70, 0.0, 0.35, _level("vessels, choroid plexus: 7 dB above white")),
         _tissue("tumour", 1550.0, "within the range for tumours, " + _DUCK, 1.63, "slightly denser than brain", 0.70,
-                "tumours attenuate more than brain, " + _DUCK, 0.60, 0.0, 0.28, _level("about 6 dB above white matter")),
+                "more than brain, " + _DUCK, 0.60, 0.0, 0.28, _level("about 6 dB above white matter")),
         _tissue("falx", 1600.0, "collagenous membrane, " + _DUCK, 1.80, f"dura 1174 kg/m3 {_DENSITY}, softened", 1.0,
                 "connective tissue, " + _DUCK, 0.90, 0.0, 0.45, _level("about 10 dB above white matter")),
         _tissue("leptomeninges", 1541.0, "as brain: too thin to matter", 1.607, "as brain", 0.54, "as brain",
@@ -127,7 +128,7 @@ TISSUES: dict[str, Tissue] = {
         _tissue("blood", 1584.0, _SZABO, 1.679, f"1060 kg/m3, {_SZABO}", 0.14, _SZABO, 0.03, 0.0, 0.02,
                 _level("some 20 dB below tissue at 5 MHz")),
         _tissue("water", 1524.0, "37 degrees C, " + _DUCK, 1.514, "993 kg/m3, " + _DUCK, 0.002, _DUCK),
-        _tissue("gel", 1540.0, "standard coupling gel, matched to tissue", 1.57, "1020 kg/m3 x 1540 m/s", 0.05, "nearly water"),
+        _tissue("gel", 1540.0, "coupling gel, matched to tissue", 1.57, "1020 kg/m3 x 1540 m/s", 0.05, "nearly water"),
         _tissue("air", 343.0, "20 degrees C", 0.0004, "1.2 kg/m3 x 343 m/s", 12.0, f"at 1 MHz, {_DUCK}"),
         _tissue("fat", 1430.0, _SZABO, 1.327, f"928 kg/m3, {_SZABO}", 0.60, _SZABO, 0.25, 0.0, 0.12,
                 _level("hypoechoic lobules")),
@@ -142,9 +143,12 @@ TISSUES: dict[str, Tissue] = {
     )
 }
 
+# fmt: on
+
 #: Other names for the same tissue, as label maps and segmentations use them.
 _ALIASES = {
-    "background": "coupling", "cerebrospinal fluid": "csf", "ventricles": "csf", "cyst": "csf", "gray matter": "grey matter",
+    "background": "coupling", "cerebrospinal fluid": "csf", "ventricles": "csf", "cyst": "csf",
+    "gray matter": "grey matter",
     "gm": "grey matter", "wm": "white matter", "tumor": "tumour", "dura": "falx", "skin": "scalp", "vessels": "blood",
     "vessel": "blood", "cortical bone": "bone", "choroid plexus": "enhancing",
 }  # fmt: skip
@@ -203,7 +207,7 @@ class TissueTable(Mapping):
 
     @classmethod
     def named(cls, tissue_names: Iterable[str], membrane: Membrane | None = None) -> TissueTable:
-        """Presets for labels 1, 2, ... by name, for the body as for the brain. Raises SimulationError for a new name."""
+        """Presets for labels 1, 2, ... by name, for the body as for the brain. SimulationError for a new one."""
         return cls({label: tissue_named(name) for label, name in enumerate(tissue_names, 1)}, membrane)
 
     def label_of(self, name: str) -> int:
@@ -221,7 +225,10 @@ class TissueTable(Mapping):
         """A new table in which the tissue `name` (the membrane's too) has the given parameters changed."""
         known = {field.name for field in fields(Tissue)}
         for parameter in changes:
-            require(parameter in known, f"{parameter!r} is not a tissue parameter, expected one of: {', '.join(sorted(known))}")
+            require(
+                parameter in known,
+                f"{parameter!r} is not a tissue parameter, expected one of: {', '.join(sorted(known))}",
+            )
         if self.membrane is not None and name == self.membrane.tissue.name and name not in self.names():
             return TissueTable(self, replace(self.membrane, tissue=replace(self.membrane.tissue, **changes)))
         label = self.label_of(name)
@@ -247,7 +254,10 @@ class TissueTable(Mapping):
     @classmethod
     def from_dict(cls, values: dict, source: str = "tissues") -> TissueTable:
         """The table described by to_dict. Raises SimulationError naming `source` and what is wrong in it."""
-        require(isinstance(values, dict) and isinstance(values.get("tissues"), dict), f'{source}: expected {{"tissues": {{"1": {{...}}}}}}')
+        require(
+            isinstance(values, dict) and isinstance(values.get("tissues"), dict),
+            f'{source}: expected {{"tissues": {{"1": {{...}}}}}}',
+        )
         try:
             table = {int(label): Tissue(**tissue) for label, tissue in values["tissues"].items()}
             membrane = values.get("membrane")

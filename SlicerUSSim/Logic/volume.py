@@ -88,7 +88,7 @@ class Volume:
     @classmethod
     def from_sitk(cls, image, name: str = "image") -> Volume:
         """From a SimpleITK image (LPS). Raises SimulationError if it is not 3D and scalar."""
-        import SimpleITK as sitk  # noqa: N813
+        import SimpleITK as sitk
 
         if image.GetDimension() == 4 and image.GetSize()[3] == 1:
             image = image[..., 0]  # NIfTI files often carry a time axis of length one
@@ -106,7 +106,7 @@ class Volume:
 
     def to_sitk(self):
         """A SimpleITK image (LPS). Raises SimulationError if the axes are not perpendicular (ITK cannot store that)."""
-        import SimpleITK as sitk  # noqa: N813
+        import SimpleITK as sitk
 
         direction, spacing, origin = self._direction_spacing_origin(LPS_TO_RAS @ self.ijk_to_ras)
         array = self.array.astype(np.uint8) if self.array.dtype == bool else self.array
@@ -130,7 +130,7 @@ class Volume:
             if path.suffix.lower() == ".vti":
                 self._write_vti(partial)
             else:
-                import SimpleITK as sitk  # noqa: N813
+                import SimpleITK as sitk
 
                 sitk.WriteImage(self.to_sitk(), str(partial), useCompression=not path.name.lower().endswith(".mhd"))
 
@@ -181,7 +181,7 @@ class Volume:
         direction = matrix[:3, :3] / spacing
         skew = np.abs(direction.T @ direction - np.eye(3)).max()
         require(skew < 1e-4, f"volume axes are not perpendicular (cosine {skew:.3g}); resample it to a regular grid")
-        # Rounding in files leaves the axes slightly off; ITK and VTK want them exact. The nearest rotation or reflection:
+        # Rounding in files leaves the axes slightly off; ITK and VTK want them exact.
         u, _, vt = np.linalg.svd(direction)
         return u @ vt, spacing, matrix[:3, 3]
 
@@ -246,7 +246,7 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def _read_image(path: Path):
-    import SimpleITK as sitk  # noqa: N813
+    import SimpleITK as sitk
 
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
     try:
@@ -257,11 +257,14 @@ def _read_image(path: Path):
 
 
 def _read_dicom_series(folder: Path):
-    import SimpleITK as sitk  # noqa: N813
+    import SimpleITK as sitk
 
     series = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
     require(bool(series), f"{folder}: holds no DICOM series")
-    require(len(series) == 1, f"{folder}: holds {len(series)} DICOM series, expected 1; put the one to use in its own folder")
+    require(
+        len(series) == 1,
+        f"{folder}: holds {len(series)} DICOM series, expected 1; put the one to use in its own folder",
+    )
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0]))
     try:

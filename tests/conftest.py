@@ -1,0 +1,79 @@
+"""Shared media and helpers. Everything runs on the device that `ussim devices` would use."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import hypothesis
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from SlicerUSSim.Logic import LinearProbe, SimulationSettings, Tissue, TissueTable, UltrasoundSimulator, Volume
+from SlicerUSSim.Logic.tissues import TISSUES
+
+hypothesis.settings.register_profile("ussim", deadline=None, derandomize=True, max_examples=50)
+hypothesis.settings.load_profile("ussim")
+
+#: Probe orientations in which physics must not differ: aligned with the voxels, and two oblique ones.
+ORIENTATIONS = {
+    "aligned": np.eye(3),
+    "oblique": Rotation.from_euler("xyz", [20, 33, 11], degrees=True).as_matrix(),
+    "diagonal": Rotation.from_euler("xyz", [45, 40, 10], degrees=True).as_matrix(),
+}
+
+#: Speckle without attenuation, so that statistics do not change with depth; and fluids without scatterers.
+SPECKLE = replace(TISSUES["white matter"], name="speckle", attenuation_db_cm_mhz=0.0)
+FLUID = Tissue("fluid", 1540.0, 1.54, 0.0)
+
+
+def rigid(rotation: np.ndarray, translation) -> np.ndarray:
+    """(4, 4) matrix from a rotation (3, 3) and a translation (3,) in the rotated frame."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = rotation @ np.asarray(translation, float)
+    return matrix
+
+
+def block(label_function, half_mm=(30, 30, 30), spacing_mm=1.0) -> Volume:
+    """A label volume centred at the RAS origin; `label_function(x, y, z)` of voxel centres in millimetres."""
+    counts = [int(2 * h / spacing_mm) + 1 for h in half_mm]
+    axes = [(np.arange(n) - (n - 1) / 2) * spacing_mm for n in counts]
+    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+    matrix = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
+    matrix[:3, 3] = [a[0] for a in axes]
+    return Volume(np.asarray(label_function(x, y, z) * np.ones_like(x), np.uint8), matrix)
+
+
+def simulator(
+    labels: Volume, *tissues: Tissue, coupling: Tissue = FLUID, membrane=None, **settings
+) -> UltrasoundSimulator:
+    """A simulator for labels 1, 2, ... with `coupling` around them."""
+    table = TissueTable({0: coupling, **dict(enumerate(tissues, 1))}, membrane)
+    return UltrasoundSimulator(labels, table, SimulationSettings(**settings))
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Magnitude of the complex correlation coefficient of two zero-mean signals."""
+    return float(abs((a * b.conj()).sum()) / np.sqrt((abs(a) ** 2).sum() * (abs(b) ** 2).sum()))
+
+
+def level_db(signal: np.ndarray) -> float:
+    """Mean power in dB."""
+    return float(10 * np.log10((np.abs(signal) ** 2).mean()))
+
+
+@pytest.fixture(scope="session")
+def small_probe() -> LinearProbe:
+    return LinearProbe(20, 30, scan_lines=64, focus_mm=15, elevation_focus_mm=15)
+
+
+@pytest.fixture(scope="session")
+def mni():
+    """(T1, grey map, white map) of the MNI152 template that nilearn carries."""
+    nilearn = pytest.importorskip("nilearn", reason="the MNI152 brain comes with nilearn: pip install '.[demo]'")
+    folder = Path(nilearn.__file__).parent / "datasets" / "data"
+    return tuple(
+        Volume.read(folder / f"mni_icbm152_{kind}_tal_nlin_sym_09a_converted.nii.gz") for kind in ("t1", "gm", "wm")
+    )

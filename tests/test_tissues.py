@@ -1,0 +1,131 @@
+"""Tissues and tables: sources beside the numbers, JSON both ways, errors that name tissue and value."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from SlicerUSSim.Logic import Membrane, SimulationError, SimulationSettings, Tissue, TissueTable
+from SlicerUSSim.Logic.settings import DisplaySettings
+from SlicerUSSim.Logic.tissues import TISSUES, tissue_named
+
+PARAMETERS = {"speed_of_sound_m_s", "impedance_mrayl", "attenuation_db_cm_mhz", "mu0", "mu1", "sigma0"}
+
+tissues = st.builds(
+    Tissue,
+    st.text(min_size=1).filter(str.strip),
+    st.floats(100, 10000),
+    st.floats(1e-3, 50),
+    st.floats(0, 50),
+    st.floats(-5, 5),
+    st.floats(-3, 3),
+    st.floats(0, 5),
+)
+
+
+@pytest.mark.parametrize("name", list(TISSUES))
+def test_every_number_of_a_preset_has_a_source(name):
+    assert set(TISSUES[name].sources) == PARAMETERS
+    assert all(TISSUES[name].sources.values())
+
+
+@pytest.mark.parametrize(
+    "name", ["csf", "grey matter", "white matter", "tumour", "falx", "skull", "scalp", "blood", "coupling"]
+)
+def test_brain_presets_exist(name):
+    assert tissue_named(name).name == name
+
+
+@pytest.mark.parametrize("name", ["fat", "muscle", "liver", "kidney", "bone", "air", "water", "gel"])
+def test_body_presets_exist(name):
+    assert tissue_named(name.upper()).name == name
+
+
+def test_white_matter_is_a_few_decibels_above_grey_and_leptomeninges_above_both():
+    variance = {name: TISSUES[name].scatterer_variance for name in ("grey matter", "white matter", "leptomeninges")}
+    assert 1.5 < variance["white matter"] / variance["grey matter"] < 6
+    assert variance["leptomeninges"] > 4 * variance["white matter"]
+
+
+def test_echogenicity_follows_the_formula():
+    # mu1 = 0: half of the sites; Var = 1/4 mu0^2 + 1/2 sigma0^2
+    assert Tissue("t", 1540, 1.6, 0.5, mu0=0.4, mu1=0.0, sigma0=0.2).scatterer_variance == pytest.approx(0.06)
+    assert Tissue("t", 1540, 1.6, 0.5, mu0=1.0, mu1=-9.0, sigma0=0.0).scatterer_variance == pytest.approx(0, abs=1e-9)
+
+
+@given(
+    st.dictionaries(st.integers(0, 62), tissues, max_size=6), st.none() | st.builds(Membrane, tissues, st.floats(0, 5))
+)
+def test_tables_survive_json(members, membrane):
+    table = TissueTable(members, membrane)
+    assert TissueTable.from_dict(json.loads(json.dumps(table.to_dict()))) == table
+
+
+def test_replace_changes_one_tissue_and_the_membrane_by_name():
+    table = TissueTable.brain()
+    changed = table.replace("white matter", mu0=0.3).replace("leptomeninges", mu0=0.1)
+    assert changed[table.label_of("white matter")].mu0 == 0.3
+    assert changed.membrane.tissue.mu0 == 0.1
+    assert table[table.label_of("white matter")].mu0 == 0.33  # the old table is as it was
+    with pytest.raises(SimulationError, match="no tissue named 'bone'"):
+        table.replace("bone", mu0=0.3)
+    with pytest.raises(SimulationError, match="'mu9' is not a tissue parameter"):
+        table.replace("white matter", mu9=0.3)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (
+            {"speed_of_sound_m_s": -1},
+            "tissue 'bone': speed_of_sound_m_s is -1, expected a number between 100 and 10000",
+        ),
+        ({"impedance_mrayl": 0}, "impedance_mrayl is 0"),
+        ({"attenuation_db_cm_mhz": float("nan")}, "attenuation_db_cm_mhz is nan"),
+        ({"sigma0": "much"}, "sigma0 is 'much'"),
+        ({"name": " "}, "expected text"),
+    ],
+)
+def test_impossible_tissues_are_refused(change, message):
+    values = {"name": "bone", "speed_of_sound_m_s": 3000, "impedance_mrayl": 6, "attenuation_db_cm_mhz": 5} | change
+    with pytest.raises(SimulationError, match=message):
+        Tissue(**values)
+
+
+def test_tables_refuse_labels_and_files_they_cannot_use(tmp_path):
+    with pytest.raises(SimulationError, match="tissue label is 63"):
+        TissueTable({63: TISSUES["bone"]})
+    with pytest.raises(SimulationError, match="no preset for tissue 'cheese'"):
+        TissueTable.named(["cheese"])
+    path = tmp_path / "tissues.json"
+    for text, message in (
+        ("{", "is not JSON"),
+        ("[]", 'expected {"tissues"'),
+        ('{"tissues": {"1": {"name": "x"}}}', "not a tissue table"),
+        ('{"tissues": {"1": {"name": "x", "speed_of_sound_m_s": 1, "impedance_mrayl": 1, "attenuation_db_cm_mhz": 1}}}',
+         "speed_of_sound_m_s is 1"),
+    ):  # fmt: skip
+        path.write_text(text)
+        with pytest.raises(SimulationError, match=r"tissues\.json: .*" + message.replace("{", "\\{")):
+            TissueTable.read(path)
+    with pytest.raises(SimulationError, match="cannot be read"):
+        TissueTable.read(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        (lambda: SimulationSettings(seed=-1), "seed is -1"),
+        (lambda: SimulationSettings(elevational_rays=2.5), "expected a whole number"),
+        (lambda: SimulationSettings(interface_reflection="loud"), "expected one of pressure, energy"),
+        (lambda: DisplaySettings(dynamic_range_db=0), "dynamic_range_db is 0"),
+        (lambda: DisplaySettings(image_size=(0, 5)), "image_size rows is 0"),
+        (lambda: DisplaySettings(noise_db=float("inf")), "noise_db is inf"),
+    ],
+)
+def test_settings_check_themselves(settings, message):
+    with pytest.raises(SimulationError, match=message):
+        settings()

@@ -1,0 +1,175 @@
+"""Volume: geometry survives every way in and out, and bad files are refused in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic.volume import check_rigid
+
+angles = st.floats(-180, 180)
+spacings = st.floats(0.2, 6.0)
+offsets = st.floats(-300, 300)
+
+
+@st.composite
+def geometries(draw):
+    """Oblique, anisotropic, right- and left-handed ijk_to_ras matrices."""
+    matrix = np.eye(4)
+    rotation = Rotation.from_euler("xyz", [draw(angles) for _ in range(3)], degrees=True).as_matrix()
+    flips = np.diag([draw(st.sampled_from([-1.0, 1.0])) for _ in range(3)])
+    matrix[:3, :3] = rotation @ flips @ np.diag([draw(spacings) for _ in range(3)])
+    matrix[:3, 3] = [draw(offsets) for _ in range(3)]
+    return matrix
+
+
+def numbered(shape=(3, 4, 5)) -> np.ndarray:
+    return np.arange(np.prod(shape), dtype=np.int16).reshape(shape)
+
+
+@given(geometries())
+def test_geometry_survives_vtk(matrix):
+    volume = Volume(numbered(), matrix)
+    back = Volume.from_vtk(volume.to_vtk())
+    np.testing.assert_array_equal(back.array, volume.array)
+    np.testing.assert_allclose(back.ijk_to_ras, matrix, atol=1e-6)
+
+
+@given(geometries())
+def test_geometry_survives_itk(matrix):
+    volume = Volume(numbered(), matrix)
+    back = Volume.from_sitk(volume.to_sitk())
+    np.testing.assert_array_equal(back.array, volume.array)
+    np.testing.assert_allclose(back.ijk_to_ras, matrix, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd", ".mha", ".mhd", ".vti"])
+@settings(max_examples=8, deadline=None)
+@given(matrix=geometries())
+def test_geometry_survives_files(suffix, tmp_path_factory, matrix):
+    path = tmp_path_factory.mktemp("volume") / f"v{suffix}"
+    volume = Volume(numbered(), matrix)
+    volume.write(path)
+    back = Volume.read(path)
+    np.testing.assert_array_equal(back.array, volume.array)
+    np.testing.assert_allclose(back.ijk_to_ras, matrix, atol=2e-3)  # NIfTI stores float32 quaternions
+
+
+def test_minc2_is_read_as_written_by_itk(tmp_path):
+    matrix = np.diag([1.0, 1.5, 2.0, 1.0])
+    matrix[:3, 3] = [-10, 20, 30]
+    Volume(numbered().astype(np.float32), matrix).write(tmp_path / "v.mnc")
+    back = Volume.read(tmp_path / "v.mnc")
+    np.testing.assert_allclose(back.ijk_to_ras @ [1, 2, 1, 1], matrix @ [1, 2, 1, 1], atol=1e-4)
+    np.testing.assert_allclose(back.array, numbered(), atol=1e-3)
+
+
+def test_dicom_series_in_a_folder_is_read(tmp_path):
+    import SimpleITK as sitk
+
+    volume = Volume(numbered(), np.diag([-1.0, -1.0, 2.5, 1.0]))
+    image = volume.to_sitk()
+    writer = sitk.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    for k in range(image.GetSize()[2]):
+        sheet = image[:, :, k]
+        position = image.TransformIndexToPhysicalPoint((0, 0, k))
+        for tag, value in {
+            "0008|0060": "MR", "0020|000e": "1.2.3.4", "0020|000d": "1.2.3", "0020|0013": str(k),
+            "0020|0032": "\\".join(map(str, position)), "0020|0037": "1\\0\\0\\0\\1\\0", "0018|0050": "2.5",
+        }.items():  # fmt: skip
+            sheet.SetMetaData(tag, value)
+        writer.SetFileName(str(tmp_path / f"{k}.dcm"))
+        writer.Execute(sheet)
+    back = Volume.read(tmp_path)
+    np.testing.assert_array_equal(back.array, volume.array)
+    np.testing.assert_allclose(back.ijk_to_ras, volume.ijk_to_ras, atol=1e-4)
+
+
+def test_vtk_extent_that_does_not_start_at_zero_keeps_its_place():
+    from vtkmodules.vtkImagingCore import vtkExtractVOI
+
+    volume = Volume(numbered(), np.diag([1.0, 2.0, 3.0, 1.0]))
+    crop = vtkExtractVOI()
+    crop.SetInputData(volume.to_vtk())
+    crop.SetVOI(1, 3, 1, 2, 1, 2)
+    crop.Update()
+    part = Volume.from_vtk(crop.GetOutput())
+    np.testing.assert_array_equal(part.array, volume.array[1:3, 1:3, 1:4])
+    np.testing.assert_allclose(part.ijk_to_ras @ [0, 0, 0, 1], volume.ijk_to_ras @ [1, 1, 1, 1])
+
+
+def test_nifti_with_a_time_axis_of_one_is_a_volume(tmp_path):
+    import SimpleITK as sitk
+
+    sitk.WriteImage(sitk.GetImageFromArray(numbered((1, 3, 4, 5)), isVector=False), str(tmp_path / "t.nii.gz"))
+    assert Volume.read(tmp_path / "t.nii.gz").array.shape == (3, 4, 5)
+
+
+@pytest.mark.parametrize("shape", [(4, 5), (3, 2, 4, 5)])
+def test_images_that_are_not_3d_are_refused(tmp_path, shape):
+    import SimpleITK as sitk
+
+    sitk.WriteImage(sitk.GetImageFromArray(np.zeros(shape, np.uint8), isVector=False), str(tmp_path / "i.nrrd"))
+    with pytest.raises(SimulationError, match=r"i\.nrrd: is a .* image, expected three dimensions"):
+        Volume.read(tmp_path / "i.nrrd")
+
+
+def test_missing_and_unreadable_files_are_named(tmp_path):
+    with pytest.raises(SimulationError, match=r"nothing\.nii: no such file"):
+        Volume.read(tmp_path / "nothing.nii")
+    (tmp_path / "bad.nii").write_text("not an image")
+    with pytest.raises(SimulationError, match=r"bad\.nii: cannot be read"):
+        Volume.read(tmp_path / "bad.nii")
+    with pytest.raises(SimulationError, match="holds no DICOM series"):
+        Volume.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "array, matrix, message",
+    [
+        (np.zeros((2, 2)), np.eye(4), "2 dimensions"),
+        (np.zeros((2, 0, 2)), np.eye(4), "empty"),
+        (np.array([[["a"]]]), np.eye(4), "expected numbers"),
+        (np.zeros((2, 2, 2)), np.eye(3), "shape"),
+        (np.zeros((2, 2, 2)), np.diag([1.0, 0, 1, 1]), "singular"),
+        (np.zeros((2, 2, 2)), np.diag([1.0, np.nan, 1, 1]), "not an affine matrix"),
+    ],
+)
+def test_impossible_volumes_are_refused(array, matrix, message):
+    with pytest.raises(SimulationError, match=message):
+        Volume(array, matrix)
+
+
+def test_a_failed_write_leaves_nothing_behind(tmp_path):
+    skewed = np.eye(4)
+    skewed[0, 1] = 0.5
+    target = tmp_path / "v.nrrd"
+    target.write_text("what was there before")
+    with pytest.raises(SimulationError, match="not perpendicular"):
+        Volume(numbered(), skewed).write(target)
+    assert target.read_text() == "what was there before"
+    assert list(tmp_path.iterdir()) == [target]
+    with pytest.raises(SimulationError, match="unknown image format"):
+        Volume(numbered(), np.eye(4)).write(tmp_path / "v.xyz")
+    with pytest.raises(SimulationError, match="does not exist"):
+        Volume(numbered(), np.eye(4)).write(tmp_path / "nowhere" / "v.nrrd")
+
+
+@given(geometries())
+def test_only_rotations_with_translation_pass_as_poses(matrix):
+    rotation = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+    pose = matrix.copy()
+    pose[:3, :3] = rotation
+    if np.linalg.det(rotation) > 0:
+        np.testing.assert_array_equal(check_rigid("pose", pose), pose)
+    else:
+        with pytest.raises(SimulationError, match="mirrors"):
+            check_rigid("pose", pose)
+    pose[:3, :3] *= 1.1
+    with pytest.raises(SimulationError, match="not rigid"):
+        check_rigid("pose", pose)
