@@ -89,7 +89,7 @@ def test_probes_survive_json(depth, count, frequency, kind):
     [
         ({"kind": "convex", "radius_mm": 60, "field_of_view_deg": 70, "depth_mm": 120, "frequency_mhz": -5.0},
          r"probe.json: ConvexProbe: frequency_mhz is -5.0, expected a number between 0.5"),
-        ({"kind": "convex", "radius_mm": 60, "field_of_view_deg": 70}, "also needs depth_mm"),
+        ({"kind": "convex", "radius_mm": 60, "field_of_view_deg": 70}, "probe also needs depth_mm"),
         ({"kind": "ring"}, "kind is 'ring', expected one of linear, convex, phased"),
         ({"kind": "linear", "width_mm": 40, "depth_mm": 50, "colour": 3}, "colour is not a parameter of a linear probe"),
         ({"kind": "linear", "width_mm": "wide", "depth_mm": 50}, "width_mm is 'wide'"),

@@ -28,8 +28,7 @@ class Probe:
     Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
     """
 
-    #: Each kind declares it, so that it can be given by position.
-    depth_mm = None
+    # depth_mm is declared by each kind, so that it can be given by position.
     scan_lines: int = 192
     frequency_mhz: float = 5.0
     #: Fractional -6 dB bandwidth of the two-way pulse.
