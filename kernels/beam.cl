@@ -3,8 +3,9 @@
 // One work-item computes LANES samples of one scan line; global size (samples / LANES, scan lines). In the unfolded
 // geometry of the array two lines are y = (R + s) dtheta apart at path length s (or a fixed distance for a linear
 // array), wherever refraction and reflection have sent them; so each part of the beam has gone its own way, and the
-// edge of a shadow is as soft as the beam is wide. The weights are a Gaussian of unit sum. Scatterers come shared between
-// the edges of a strip (scattering.cl), which has the mean variance step^2 / 6; this Gaussian is narrower by that.
+// edge of a shadow is as soft as the beam is wide. The weights are a Gaussian of unit sum. Scatterers come shared
+// between the edges of a strip (scattering.cl), which has the mean variance step^2 / 6; this Gaussian is narrower by
+// that.
 //
 // Buffers: from_re, from_im float [2 traced line + side][stride]; to_re, to_im float [scan line][stride].
 
@@ -12,14 +13,21 @@ __kernel void lateral_beam(__constant const Scene *scene, __global const float *
                            __global float *to_re, __global float *to_im, int stride) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int centre = scene->guard_lines + line * scene->lateral_rays;
-  // Widths at the first and last of these samples; linear in between.
   float s0 = sample * scene->sample_mm, s1 = (sample + LANES) * scene->sample_mm;
-  float step0 = line_distance(scene, s0) / beam_sigma(scene, s0).x, step1 = line_distance(scene, s1) / beam_sigma(scene, s1).x;
-  floatn step = step0 + (step1 - step0) * TO_FLOATN(LANE_INDEX) / LANES;  // between traced lines, in sigmas
+  float widest = fmax(beam_sigma(scene, s0).x, beam_sigma(scene, s1).x);
+  // beam_sigma and line_distance, lane by lane: near a tight focus the width changes from sample to sample.
+  const floatn s = (TO_FLOATN(LANE_INDEX) + sample) * scene->sample_mm;
+  const floatn a = (s - scene->transmit_focus) / scene->transmit_rayleigh;
+  const floatn transmit2 = scene->transmit_sigma * scene->transmit_sigma * (1.0f + a * a);
+  const floatn receive = fmax(s * scene->receive_sigma_slope, scene->receive_sigma_min);
+  const floatn sigma = sqrt(transmit2 * receive * receive / (transmit2 + receive * receive));
+  const float spacing = scene->line_spacing / scene->lateral_rays;
+  const floatn apart = fmax(scene->linear ? spacing + 0.0f * s : spacing * (scene->apex_radius_mm + s), 1e-4f);
+  floatn step = apart / sigma;  // between traced lines, in sigmas
   floatn step2 = step * step;
   floatn narrow2 = fmax(1.0f - step2 / 6.0f, 0.25f);  // (sigma of these weights / sigma of the beam)^2
   floatn exponent = -0.5f * LOG2_E * step2 / narrow2;
-  int reach = (int)ceil(scene->beam_cutoff / fmax(fmin(step0, step1), 1e-4f));
+  int reach = (int)ceil(scene->beam_cutoff * widest / line_distance(scene, s0));
   // Edge `edge` lies half a step before traced line `edge`; the strips on both its sides contribute.
   int first = max(centre - reach, 1), last = min(centre + reach + 1, scene->traced_lines - 1);
   int here = LINE_PAD + sample;

@@ -25,8 +25,8 @@ typedef struct {
   int label;
 } Ray;
 
-// The label at `voxel` (padded voxel indices): the acoustic group with the largest trilinear weight, so that borders are
-// sub-voxel and without stairs, and within it the label of the nearest corner. Voting by group keeps the border of
+// The label at `voxel` (padded voxel indices): the acoustic group with the largest trilinear weight, so that borders
+// are sub-voxel and without stairs, and within it the label of the nearest corner. Voting by group keeps the border of
 // fluid against brain smooth wherever grey, white and other brain labels change along it.
 inline int label_at(__global const ushort *voxels, __constant const Scene *scene, __constant const Tissue *tissues,
                     float3 voxel) {
@@ -74,18 +74,19 @@ inline int label_at(__global const ushort *voxels, __constant const Scene *scene
 }
 
 // Unit normal (RAS) of the border between two acoustic groups near `voxel`, pointing to the side of `before`: the
-// gradient of their difference smoothed by a Gaussian of BORDER_SIGMA voxels. The sum runs over voxel centres, so it is the exact gradient.
+// gradient of their difference smoothed by a Gaussian of BORDER_SIGMA voxels. The sum runs over voxel centres, so it is
+// the exact gradient.
 //
-// `overshoot` is the length along the ray, in millimetres, by which `voxel` lies beyond the border. The trilinear border
-// wavers by a fifth of a voxel; the smoothed difference D of the two sides knows better. A plane at distance d has the
-// share Phi(d / sigma) behind it, and sigma^2 D'' / |D'| = d as well; a border of mean curvature H moves by sigma^2 H
-// under smoothing, which enters the two with opposite signs. The second is noisier, hence the weights. The overshoot is
-// 0 where the two borders do not agree to half a voxel (thin sheets, corners). Measured on a sphere of radius 20 voxels:
-// normals within 2.9 degrees and positions within 0.145 voxel RMS (trilinear: 0.18).
+// `overshoot` is the length along the ray, in millimetres, by which `voxel` lies beyond the border. The trilinear
+// border wavers by a fifth of a voxel; the smoothed difference D of the two sides knows better. A plane at distance d
+// has the share Phi(d / sigma) behind it, and sigma^2 D'' / |D'| = d as well; a border of mean curvature H moves by
+// sigma^2 H under smoothing, which enters the two with opposite signs. The second is noisier, hence the weights. The
+// overshoot is 0 where the two borders do not agree to half a voxel (thin sheets, corners). Measured on a sphere of
+// radius 20 voxels: normals within 2.9 degrees and positions within 0.145 voxel RMS (trilinear: 0.18).
 #define BORDER_SIGMA 1.5f
 inline float3 interface_normal(__global const ushort *voxels, __constant const Scene *scene,
-                               __constant const Tissue *tissues, float3 voxel, int before, int behind,
-                               float3 direction, float3 voxel_step, float *overshoot) {
+                               __constant const Tissue *tissues, float3 voxel, int before, int behind, float3 direction,
+                               float3 voxel_step, float *overshoot) {
   // All voxels within 3.5 of the point: a window that is not symmetric about it would shift the border.
   int3 top = (int3)(scene->dims[0], scene->dims[1], scene->dims[2]) - 1;
   float3 inside = clamp(voxel, (float3)(0.0f), convert_float3(top));
@@ -155,9 +156,10 @@ inline float3 mirror(float3 v, float3 normal) { return v - 2.0f * dot(v, normal)
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
-__kernel void trace(__constant const Scene *scene, __global const ushort *voxels, __constant const Tissue *tissues,
-                    __global const float *quantiles, __global Segment *segments, __global int *segment_counts,
-                    __global Hit *hits, __global int *hit_counts, __global float *cut) {
+__kernel void
+trace(__constant const Scene *scene, __global const ushort *voxels, __constant const Tissue *tissues,
+      __global const float *quantiles, __global Segment *segments, __global int *segment_counts, __global Hit *hits,
+      __global int *hit_counts, __global float *cut) {
   int line = get_global_id(0), ray_of_line = get_global_id(1);
   int rays = scene->elevational_rays;
   int on_axis = ray_of_line == 0;
@@ -204,7 +206,7 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
       float3 voxel0 = affine_point(scene->ras_to_voxel, ray.axis);
       float3 voxel_step = affine_vector(scene->ras_to_voxel, ray.direction);
       float3 voxel_aside = affine_vector(scene->ras_to_voxel, ray.elevational) * quantile;
-#define VOXEL_AT(l) (voxel0 + (l) * voxel_step + beam_sigma(scene, ray.path + (l)).y * voxel_aside)
+#define VOXEL_AT(l) (voxel0 + (l)*voxel_step + elevation_sigma(scene, ray.path + (l)) * voxel_aside)
       if (ray.label < 0) ray.label = label_at(voxels, scene, tissues, VOXEL_AT(0.0f));
       Tissue here = tissues[ray.label];
       float depth_per_mm = scene->reference_speed_m_s / here.speed_m_s;
@@ -219,9 +221,10 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
         leave = fmin(leave, fmax(t0, t1));
       }
 
-      // March. Tissues of one speed and impedance have no interface between them; only attenuation changes there, so the
-      // node goes on. `inside` is the last length known to be in this tissue, `beyond` the first one in another, `since`
-      // where this tissue began. A segment starts at `open`, with `spent_open` of the attenuation exponent `spent`.
+      // March. Tissues of one speed and impedance have no interface between them; only attenuation changes there, so
+      // the node goes on. `inside` is the last length known to be in this tissue, `beyond` the first one in another,
+      // `since` where this tissue began. A segment starts at `open`, with `spent_open` of the attenuation exponent
+      // `spent`.
       float inside = fmax(fmin(enter, to_depth), 0.0f), beyond = 0.0f, longest = 0.0f;
       float since = 0.0f, open = 0.0f, spent = 0.0f, spent_open = 0.0f;
       int other, crossing, ended = 0;
@@ -313,7 +316,7 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
       float depth = ray.depth + beyond * depth_per_mm;
       float log_attenuation = ray.log_attenuation - spent;
       float attenuation = exp(log_attenuation);
-      float3 aside = quantile * beam_sigma(scene, path).y * ray.elevational;
+      float3 aside = quantile * elevation_sigma(scene, path) * ray.elevational;
       float3 hit_point = ray.axis + beyond * ray.direction + aside;
 
       // Snell and the pressure reflection coefficient of a fluid interface; R = r^2 is the two-way factor.
@@ -377,7 +380,7 @@ __kernel void trace(__constant const Scene *scene, __global const ushort *voxels
       ray.lateral = carry(ray.lateral, ray.direction, bent);
       ray.elevational = carry(ray.elevational, ray.direction, bent);
       ray.direction = bent;
-      ray.axis = hit_point - quantile * beam_sigma(scene, path).y * ray.elevational;
+      ray.axis = hit_point - quantile * elevation_sigma(scene, path) * ray.elevational;
       ray.path = path;
       ray.depth = depth;
       ray.log_attenuation = log_attenuation;

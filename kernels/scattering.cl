@@ -26,7 +26,8 @@ typedef struct {
   float gain0, gain1;                    // amplitude as an exponent of two, likewise
   float line0, line1;                    // 1 / distance of traced lines, likewise
   float bend;                            // 1 / (2 radius) of the surfaces of equal range
-  float depth0, slope, length_mm;
+  float depth0, slope;
+  float from_mm, to_mm;  // path lengths whose scatterers belong to this piece
   int u, v, w, first;
 } Piece;
 
@@ -73,13 +74,13 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
 
     const intn bins = TO_INTN(bin) - piece->first;
-    const intn counts = (right >= 0.0f) & (right < 1.0f) & (r2 <= cutoff2) & (bins >= -1) & (bins < CHUNK) & (along >= 0.0f) &
-                        (along < piece->length_mm);
+    const intn counts = (right >= 0.0f) & (right < 1.0f) & (r2 <= cutoff2) & (bins >= -1) & (bins < CHUNK) &
+                        (along >= piece->from_mm) & (along < piece->to_mm);
     SPREAD(int, counts_, counts);
     SPREAD(int, bin_, bins);
     SPREAD(float, part_, place - bin);
     SPREAD(float, right_, right);
-    SPREAD(float, re_, amplitude * cosine);
+    SPREAD(float, re_, amplitude *cosine);
     SPREAD(float, im_, amplitude * -sine);
     SPREAD(float, t0_, gaussian(key1));
     SPREAD(uint, random_, key2);
@@ -132,9 +133,10 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
-__kernel void scatter(__constant const Scene *scene, __global const ushort *voxels, __global const Tissue *tissues,
-                      __global const Segment *segments, __global const int *segment_counts, __global float *re,
-                      __global float *im, int stride) {
+__kernel void
+scatter(__constant const Scene *scene, __global const ushort *voxels, __global const Tissue *tissues,
+        __global const Segment *segments, __global const int *segment_counts, __global float *re, __global float *im,
+        int stride) {
   int chunk = get_global_id(0), line = get_global_id(1);
   int first = chunk * CHUNK;
   float4 sum[CHUNK + 2];  // left re, im, right re, im
@@ -153,10 +155,9 @@ __kernel void scatter(__constant const Scene *scene, __global const ushort *voxe
     piece.first = first;
     piece.slope = segment->depth_per_mm;
     piece.depth0 = segment->depth_mm;
-    piece.length_mm = segment->length_mm;
-    const float low = fmax(0.0f, (depth_low - piece.depth0) / piece.slope);
-    const float high = fmin(piece.length_mm, (depth_high - piece.depth0) / piece.slope);
-    if (low >= high) continue;
+    const float segment_low = fmax(0.0f, (depth_low - piece.depth0) / piece.slope);
+    const float segment_high = fmin(segment->length_mm, (depth_high - piece.depth0) / piece.slope);
+    if (segment_low >= segment_high) continue;
 
     // Lattice axes in an order that puts the beam's elevational width, the longest, along u, where the lanes run.
     float wide[3];
@@ -176,89 +177,98 @@ __kernel void scatter(__constant const Scene *scene, __global const ushort *voxe
     piece.row_j = (float3)(m[4 + u], m[4 + v], m[4 + w]);
     piece.row_k = (float3)(m[8 + u], m[8 + v], m[8 + w]);
 
-    // Widths and gains vary slowly: linear between the two ends of the piece.
-    const float path_low = segment->path_mm + low, path_high = segment->path_mm + high;
-    const float2 sigma_low = beam_sigma(scene, path_low), sigma_high = beam_sigma(scene, path_high);
-    const float apart_low = line_distance(scene, path_low), apart_high = line_distance(scene, path_high);
-    piece.low = low;
-    piece.span = 1.0f / fmax(high - low, 1e-6f);
-    piece.bend = scene->linear ? 0.0f : 0.5f / fmax(scene->apex_radius_mm + path_low, 1.0f);
-    piece.line0 = 1.0f / apart_low;
-    piece.line1 = 1.0f / apart_high - piece.line0;
-    piece.narrow0 = 0.5f * LOG2_E / (sigma_low.y * sigma_low.y);
-    piece.narrow1 = 0.5f * LOG2_E / (sigma_high.y * sigma_high.y) - piece.narrow0;
-    // Unit energy of the point spread function, whatever its widths: sqrt(1 / (sigma_l sigma_e)) times the scale; and
-    // beam.cl weighs with unit sum, that is with apart / (sqrt(2 pi) sigma_l) at the peak.
-    const float gain = log2(segment->weight * segment->attenuation * scene->speckle_scale * 2.50662827f);
-    const float decay = LOG2_E * segment->decay_per_mm;
-    piece.gain0 = gain - decay * low + 0.5f * log2(sigma_low.x / sigma_low.y) - log2(apart_low);
-    piece.gain1 = gain - decay * high + 0.5f * log2(sigma_high.x / sigma_high.y) - log2(apart_high) - piece.gain0;
+    // Widths and gains are taken as linear between the two ends of a piece, so it must not be long for the beam's
+    // waist.
+    const float waist = fmin(scene->transmit_rayleigh, scene->elevation_rayleigh);
+    const int pieces = max(1, (int)ceil((segment_high - segment_low) / (0.4f * waist)));
+    for (int n = 0; n < pieces; n++) {
+      const float low = mix(segment_low, segment_high, (float)n / pieces);
+      const float high = mix(segment_low, segment_high, (float)(n + 1) / pieces);
+      piece.from_mm = n == 0 ? 0.0f : low;
+      piece.to_mm = n == pieces - 1 ? segment->length_mm : high;
+      const float path_low = segment->path_mm + low, path_high = segment->path_mm + high;
+      const float2 sigma_low = beam_sigma(scene, path_low), sigma_high = beam_sigma(scene, path_high);
+      const float apart_low = line_distance(scene, path_low), apart_high = line_distance(scene, path_high);
+      piece.low = low;
+      piece.span = 1.0f / fmax(high - low, 1e-6f);
+      piece.bend = scene->linear ? 0.0f : 0.5f / fmax(scene->apex_radius_mm + path_low, 1.0f);
+      piece.line0 = 1.0f / apart_low;
+      piece.line1 = 1.0f / apart_high - piece.line0;
+      piece.narrow0 = 0.5f * LOG2_E / (sigma_low.y * sigma_low.y);
+      piece.narrow1 = 0.5f * LOG2_E / (sigma_high.y * sigma_high.y) - piece.narrow0;
+      // Unit energy of the point spread function, whatever its widths: sqrt(1 / (sigma_l sigma_e)) times the scale; and
+      // beam.cl weighs with unit sum, that is with apart / (sqrt(2 pi) sigma_l) at the peak.
+      const float gain = log2(segment->weight * segment->attenuation * scene->speckle_scale * 2.50662827f);
+      const float decay = LOG2_E * segment->decay_per_mm;
+      piece.gain0 = gain - decay * low + 0.5f * log2(sigma_low.x / sigma_low.y) - log2(apart_low);
+      piece.gain1 = gain - decay * high + 0.5f * log2(sigma_high.x / sigma_high.y) - log2(apart_high) - piece.gain0;
 
-    // The box of lattice cells around this piece, then rows along u clipped by the three slabs that bound it.
-    const float radius_l = 0.5f * fmax(apart_low, apart_high);
-    const float radius_e = scene->beam_cutoff * fmax(sigma_low.y, sigma_high.y);
-    const float3 near_end = start + low * d, far_end = start + high * d;
-    const float3 reach = radius_l * fabs(l) + radius_e * fabs(e);
-    const float3 box_low = (fmin(near_end, far_end) - reach) * inverse_cell;
-    const float3 box_high = (fmax(near_end, far_end) + reach) * inverse_cell;
-    const int v_low = (int)floor(box_low.y), v_high = (int)floor(box_high.y);
-    const int w_low = (int)floor(box_low.z), w_high = (int)floor(box_high.z);
-    // A scatterer is at most half a cell from its cell's centre along each axis.
-    const float slack_d = 0.5f * cell * (fabs(d.x) + fabs(d.y) + fabs(d.z));
-    const float limit_l = radius_l + 0.5f * cell * (fabs(l.x) + fabs(l.y) + fabs(l.z));
-    const float limit_e = radius_e + 0.5f * cell * (fabs(e.x) + fabs(e.y) + fabs(e.z));
-    const float per_d = inverse_cell / (fabs(d.x) < 1e-5f ? 1e-5f : d.x);
-    const float per_l = inverse_cell / (fabs(l.x) < 1e-5f ? 1e-5f : l.x);
-    const float per_e = inverse_cell / (fabs(e.x) < 1e-5f ? 1e-5f : e.x);
-    // The hash counts cells by lattice axis, not by u, v, w: the same scatterer from every direction.
-    const uint step_v = v == 0 ? 0x9E3779B1u : v == 1 ? 0x85EBCA77u : 0xC2B2AE3Du;
-    const uint step_w = w == 0 ? 0x9E3779B1u : w == 1 ? 0x85EBCA77u : 0xC2B2AE3Du;
+      // The box of lattice cells around this piece, then rows along u clipped by the three slabs that bound it.
+      const float radius_l = 0.5f * fmax(apart_low, apart_high);
+      const float radius_e = scene->beam_cutoff * fmax(sigma_low.y, sigma_high.y);
+      const float3 near_end = start + low * d, far_end = start + high * d;
+      const float3 reach = radius_l * fabs(l) + radius_e * fabs(e);
+      const float3 box_low = (fmin(near_end, far_end) - reach) * inverse_cell;
+      const float3 box_high = (fmax(near_end, far_end) + reach) * inverse_cell;
+      const int v_low = (int)floor(box_low.y), v_high = (int)floor(box_high.y);
+      const int w_low = (int)floor(box_low.z), w_high = (int)floor(box_high.z);
+      // A scatterer is at most half a cell from its cell's centre along each axis.
+      const float slack_d = 0.5f * cell * (fabs(d.x) + fabs(d.y) + fabs(d.z));
+      const float limit_l = radius_l + 0.5f * cell * (fabs(l.x) + fabs(l.y) + fabs(l.z));
+      const float limit_e = radius_e + 0.5f * cell * (fabs(e.x) + fabs(e.y) + fabs(e.z));
+      const float per_d = inverse_cell / (fabs(d.x) < 1e-5f ? 1e-5f : d.x);
+      const float per_l = inverse_cell / (fabs(l.x) < 1e-5f ? 1e-5f : l.x);
+      const float per_e = inverse_cell / (fabs(e.x) < 1e-5f ? 1e-5f : e.x);
+      // The hash counts cells by lattice axis, not by u, v, w: the same scatterer from every direction.
+      const uint step_v = v == 0 ? 0x9E3779B1u : v == 1 ? 0x85EBCA77u : 0xC2B2AE3Du;
+      const uint step_w = w == 0 ? 0x9E3779B1u : w == 1 ? 0x85EBCA77u : 0xC2B2AE3Du;
 
-    // In the plane of v and w the piece is a band along the elevational axis; where that axis is oblique, the band
-    // leaves most of the box empty. Its v at a given w, and how far it reaches on either side:
-    const float along_band = fabs(e.z) < 0.02f ? 0.0f : e.y / e.z;
-    const float middle = 0.5f * (low + high);
-    const float band_v = start.y + middle * d.y - along_band * (start.z + middle * d.z);
-    const float band_reach = fabs(e.z) < 0.02f ? 1e6f
-                                               : 0.5f * (high - low) * fabs(d.y - along_band * d.z) +
-                                                     radius_l * fabs(l.y - along_band * l.z);
+      // In the plane of v and w the piece is a band along the elevational axis; where that axis is oblique, the band
+      // leaves most of the box empty. Its v at a given w, and how far it reaches on either side:
+      const float along_band = fabs(e.z) < 0.02f ? 0.0f : e.y / e.z;
+      const float middle = 0.5f * (low + high);
+      const float band_v = start.y + middle * d.y - along_band * (start.z + middle * d.z);
+      const float band_reach = fabs(e.z) < 0.02f ? 1e6f
+                                                 : 0.5f * (high - low) * fabs(d.y - along_band * d.z) +
+                                                       radius_l * fabs(l.y - along_band * l.z);
 
-    int waiting = 0;
-    for (int cw = w_low; cw <= w_high; cw++) {
-      const float v_here = band_v + along_band * cw * cell, v_next = v_here + along_band * cell;
-      const int v_first = max(v_low, (int)floor((fmin(v_here, v_next) - band_reach) * inverse_cell));
-      const int v_last = min(v_high, (int)floor((fmax(v_here, v_next) + band_reach) * inverse_cell));
-      for (int cv = v_first; cv <= v_last; cv++) {
-        const float3 base = (float3)(0.5f * cell, (cv + 0.5f) * cell, (cw + 0.5f) * cell) - start;
-        const float base_d = dot(base, d), base_l = dot(base, l), base_e = dot(base, e);
-        const float d0 = (low - slack_d - base_d) * per_d, d1 = (high + slack_d - base_d) * per_d;
-        const float l0 = (-limit_l - base_l) * per_l, l1 = (limit_l - base_l) * per_l;
-        const float e0 = (-limit_e - base_e) * per_e, e1 = (limit_e - base_e) * per_e;
-        const float from = fmax(fmax(fmin(d0, d1), fmin(l0, l1)), fmax(fmin(e0, e1), box_low.x - 1.0f));
-        const float to = fmin(fmin(fmax(d0, d1), fmax(l0, l1)), fmin(fmax(e0, e1), box_high.x + 1.0f));
-        if (from > to) continue;
-        const int u_low = (int)ceil(from), u_high = (int)floor(to);
-        const uint key = (uint)cv * step_v + (uint)cw * step_w;
-        for (int cu = u_low; cu <= u_high; cu += LANES) {
-          STORE_LANES(cu + LANE_INDEX, cell_u + waiting);
-          STORE_LANES((uintn)(key), row_key + waiting);
-          STORE_LANES((floatn)(cv * cell - start.y), row_v + waiting);
-          STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
-          waiting += min(LANES, u_high - cu + 1);
-          if (waiting >= BATCH) {
-            scatter_batch(scene, voxels, tissues, &piece, cell_u, row_key, row_v, row_w, BATCH, sum);
-            waiting -= BATCH;
-            for (int i = 0; i < waiting; i++) {
-              cell_u[i] = cell_u[BATCH + i];
-              row_key[i] = row_key[BATCH + i];
-              row_v[i] = row_v[BATCH + i];
-              row_w[i] = row_w[BATCH + i];
+      int waiting = 0;
+      for (int cw = w_low; cw <= w_high; cw++) {
+        const float v_here = band_v + along_band * cw * cell, v_next = v_here + along_band * cell;
+        const int v_first = max(v_low, (int)floor((fmin(v_here, v_next) - band_reach) * inverse_cell));
+        const int v_last = min(v_high, (int)floor((fmax(v_here, v_next) + band_reach) * inverse_cell));
+        for (int cv = v_first; cv <= v_last; cv++) {
+          const float3 base = (float3)(0.5f * cell, (cv + 0.5f) * cell, (cw + 0.5f) * cell) - start;
+          const float base_d = dot(base, d), base_l = dot(base, l), base_e = dot(base, e);
+          const float d0 = (low - slack_d - base_d) * per_d, d1 = (high + slack_d - base_d) * per_d;
+          const float l0 = (-limit_l - base_l) * per_l, l1 = (limit_l - base_l) * per_l;
+          const float e0 = (-limit_e - base_e) * per_e, e1 = (limit_e - base_e) * per_e;
+          const float from = fmax(fmax(fmin(d0, d1), fmin(l0, l1)), fmax(fmin(e0, e1), box_low.x - 1.0f));
+          const float to = fmin(fmin(fmax(d0, d1), fmax(l0, l1)), fmin(fmax(e0, e1), box_high.x + 1.0f));
+          if (from > to) continue;
+          const int u_low = (int)ceil(from), u_high = (int)floor(to);
+          const uint key = (uint)cv * step_v + (uint)cw * step_w;
+          for (int cu = u_low; cu <= u_high; cu += LANES) {
+            STORE_LANES(cu + LANE_INDEX, cell_u + waiting);
+            STORE_LANES((uintn)(key), row_key + waiting);
+            STORE_LANES((floatn)(cv * cell - start.y), row_v + waiting);
+            STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
+            waiting += min(LANES, u_high - cu + 1);
+            if (waiting >= BATCH) {
+              scatter_batch(scene, voxels, tissues, &piece, cell_u, row_key, row_v, row_w, BATCH, sum);
+              waiting -= BATCH;
+              for (int i = 0; i < waiting; i++) {
+                cell_u[i] = cell_u[BATCH + i];
+                row_key[i] = row_key[BATCH + i];
+                row_v[i] = row_v[BATCH + i];
+                row_w[i] = row_w[BATCH + i];
+              }
             }
           }
         }
       }
+      scatter_batch(scene, voxels, tissues, &piece, cell_u, row_key, row_v, row_w, waiting, sum);
     }
-    scatter_batch(scene, voxels, tissues, &piece, cell_u, row_key, row_v, row_w, waiting, sum);
   }
   int left = 2 * line * stride + LINE_PAD + first, right = left + stride;
   for (int i = 0; i < CHUNK; i++) {

@@ -88,10 +88,10 @@ def test_probes_survive_json(depth, count, frequency, kind):
     "values, message",
     [
         ({"kind": "convex", "radius_mm": 60, "field_of_view_deg": 70, "depth_mm": 120, "frequency_mhz": -5.0},
-         r"probe.json: ConvexProbe: frequency_mhz is -5.0, expected a number between 0.5"),
+         r"probe.json: ConvexProbe: frequency_mhz is -5.0, expected a number"),
         ({"kind": "convex", "radius_mm": 60, "field_of_view_deg": 70}, "probe also needs depth_mm"),
         ({"kind": "ring"}, "kind is 'ring', expected one of linear, convex, phased"),
-        ({"kind": "linear", "width_mm": 40, "depth_mm": 50, "colour": 3}, "colour is not a parameter of a linear probe"),
+        ({"kind": "linear", "width_mm": 40, "depth_mm": 50, "colour": 3}, "colour is not a parameter of a linear"),
         ({"kind": "linear", "width_mm": "wide", "depth_mm": 50}, "width_mm is 'wide'"),
         ({"kind": "linear", "width_mm": 40, "depth_mm": 50, "scan_lines": 10.5}, "expected a whole number"),
         ([1, 2], "is a list"),

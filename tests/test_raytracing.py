@@ -120,7 +120,7 @@ def test_weights_of_the_tree_and_what_was_cut_make_one():
         path = tree.segments[tree.segment_line == line]
         ends = path["depth_mm"] + path["length_mm"] * path["depth_per_mm"]
         leaves = path["weight"][ends > 60 - 1e-3].sum()
-        index = int(round(line + (tree.cut_weight.shape[0] - 5) / 2))
+        index = round(line + (tree.cut_weight.shape[0] - 5) / 2)
         total = leaves + tree.cut_weight[index, 0]
         assert total == pytest.approx(1.0, abs=2e-3)
 

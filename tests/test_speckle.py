@@ -37,7 +37,7 @@ def test_speckle_is_fully_developed(simulators, orientation):
 @pytest.mark.parametrize("depth", [8, 25, 42])
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 def test_speckle_correlates_as_the_point_spread_function_says(simulators, orientation, depth):
-    """exp(-d^2 / 4 sigma^2) between signals d apart: laterally, elevationally, axially; at the focus and away from it."""
+    """exp(-d^2 / 4 sigma^2) between signals d apart: laterally, elevationally, axially; at and away from the focus."""
     rotation = ORIENTATIONS[orientation]
     sigma_l, sigma_e = LINEAR.beam_sigma_mm(depth)
     step_e = 0.8 * sigma_e

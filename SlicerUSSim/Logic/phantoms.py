@@ -15,10 +15,8 @@ def head_mri(spacing_mm: float = 1.0, seed: int = 0) -> Volume:
     half = np.array([74.0, 88.0, 68.0])
     counts = (2 * (half + 6) / spacing_mm).astype(int)
     origin = -0.5 * (counts - 1) * spacing_mm
-    z, y, x = np.meshgrid(
-        *((np.arange(n) * spacing_mm + o).astype(np.float32) for n, o in zip(counts, origin, strict=True))[::-1],
-        indexing="ij",
-    )
+    axes = [(np.arange(n) * spacing_mm + start).astype(np.float32) for n, start in zip(counts, origin, strict=True)]
+    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     # Distance from the surface of an ellipsoid, in millimetres (positive inside), and angles around the centre.
     radius = np.sqrt((x / half[0]) ** 2 + (y / half[1]) ** 2 + (z / half[2]) ** 2) + 1e-6
     depth = (1.0 - radius) * 75.0

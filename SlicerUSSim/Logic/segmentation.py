@@ -271,8 +271,7 @@ def _posteriors(values, means, deviations, weights) -> np.ndarray:
     levels = np.linspace(values.min(), values.max(), 4 * _HISTOGRAM_BINS)
     density = _densities(levels, means, deviations, weights)
     table = (density / (density.sum(axis=0) + 1e-300)).astype(np.float32)
-    index = np.rint((values - levels[0]) / (levels[1] - levels[0])).astype(np.int32)
-    return table[:, index]
+    return table[:, _nearest(levels, values)]
 
 
 def _classify(values, means, deviations, weights) -> np.ndarray:
@@ -286,8 +285,13 @@ def _classify(values, means, deviations, weights) -> np.ndarray:
     best[levels <= means[0]] = 0
     best[levels >= means[-1]] = len(means) - 1
     best = np.maximum.accumulate(best)
+    return (best[_nearest(levels, values)] + 1).astype(np.uint8)
+
+
+def _nearest(levels: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Index of the nearest of equally spaced `levels`; rounding in float32 must not step past the last one."""
     index = np.rint((values - levels[0]) / (levels[1] - levels[0])).astype(np.int32)
-    return (best[index] + 1).astype(np.uint8)
+    return np.clip(index, 0, len(levels) - 1)
 
 
 def _sulcal_middles(

@@ -1,0 +1,237 @@
+"""The ussim command: what it writes, and that a mistake is one line on stderr, exit 2, and nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from SlicerUSSim.cli import main
+from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic.phantoms import head_mri
+from SlicerUSSim.Logic.pose import read_pose, write_pose
+
+
+def ussim(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def head(tmp_path_factory):
+    path = tmp_path_factory.mktemp("head") / "head.nii.gz"
+    head_mri(2.0).write(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def labels(head):
+    path = head.with_name("labels.nii.gz")
+    result = ussim("segment", head, "-o", path)
+    assert result.exit_code == 0, result.output
+    return path
+
+
+def test_help_names_the_commands():
+    result = ussim("--help")
+    assert result.exit_code == 0
+    for command in ("demo", "segment", "simulate", "devices"):
+        assert command in result.output
+
+
+def test_demo_writes_everything_it_promises(head, tmp_path):
+    pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
+    out = tmp_path / "out"
+    result = ussim("demo", "--mri", head, "--out", out, "--probe", "convex", "--seed", 3)
+    assert result.exit_code == 0, result.output
+    names = {
+        "mri.png",
+        "labels.png",
+        "bmode.png",
+        "figure.png",
+        "bmode.mha",
+        "labels.nii.gz",
+        "labels.json",
+        "demo.json",
+    }
+    assert names <= {p.name for p in out.iterdir()}
+    for name in names:
+        if name.endswith(".png"):
+            picture = np.asarray(Image.open(out / name))
+            assert picture.std() > 10, name
+    summary = json.loads((out / "demo.json").read_text())
+    assert summary["settings"]["seed"] == 3 and summary["probe"]["kind"] == "convex"
+    assert summary["milliseconds_per_stage"]["scatterers"] > 0 and summary["device"]
+    # The image with geometry is the picture, in its place in the patient.
+    import SimpleITK as sitk
+
+    image = sitk.ReadImage(str(out / "bmode.mha"))
+    np.testing.assert_array_equal(sitk.GetArrayFromImage(image)[0], np.asarray(Image.open(out / "bmode.png")))
+    pose = read_pose(out / "pose.json")
+    centre_ras = np.array(image.TransformContinuousIndexToPhysicalPoint([(n - 1) / 2 for n in image.GetSize()])) * [
+        -1,
+        -1,
+        1,
+    ]
+    assert abs((np.linalg.inv(pose) @ [*centre_ras, 1])[2]) < 1e-3
+
+
+def test_the_demo_without_nilearn_says_that_it_uses_a_phantom(monkeypatch):
+    import importlib.util
+
+    from SlicerUSSim.Logic.demo import demo_mri
+
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "nilearn" else find(name, *rest)
+    )
+    volume, source = demo_mri()
+    assert "phantom made by code" in source and volume.array.max() > 0
+
+
+def test_segment_writes_labels_and_their_tissues(labels, head):
+    volume = Volume.read(labels)
+    assert set(np.unique(volume.array)) == {0, 1, 2, 3, 4}
+    np.testing.assert_allclose(volume.ijk_to_ras, Volume.read(head).ijk_to_ras, atol=1e-4)
+    tissues = json.loads(labels.with_name("labels.json").read_text())
+    assert tissues["tissues"]["3"]["name"] == "white matter" and "membrane" in tissues
+
+
+@pytest.mark.parametrize("suffix", [".png", ".mha", ".nrrd", ".nii.gz", ".vti"])
+def test_simulate_writes_every_format(labels, tmp_path, suffix):
+    out = tmp_path / f"image{suffix}"
+    result = ussim("simulate", labels, "--pose", "auto", "-o", out)
+    assert result.exit_code == 0, result.output
+    assert "from labels" in result.output and out.stat().st_size > 1000
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_simulate_takes_probe_tissues_and_pose_from_files(labels, head, tmp_path):
+    from SlicerUSSim.Logic import LinearProbe
+
+    (tmp_path / "probe.json").write_text(json.dumps(LinearProbe(40, 50).to_dict()))
+    pose = np.eye(4)
+    pose[:3, 3] = [10, -30, 0]
+    write_pose(tmp_path / "pose.json", pose)
+    pictures = []
+    for number, source in enumerate((labels, labels, head)):
+        out = tmp_path / f"{number}.png"
+        result = ussim("simulate", source, "--pose", tmp_path / "pose.json", "--probe", tmp_path / "probe.json",
+                       "--tissues", labels.with_name("labels.json"), "-o", out, "--seed", number)  # fmt: skip
+        assert result.exit_code == 0, result.output
+        pictures.append(np.asarray(Image.open(out)).astype(float))
+    assert 0.2 < pictures[0].shape[1] / pictures[0].shape[0] < 1.2
+    assert np.abs(pictures[0] - pictures[1]).mean() > 1  # another seed
+    assert pictures[2].mean() == pytest.approx(pictures[0].mean(), rel=0.1)  # the MRI is segmented alike
+
+
+@pytest.mark.parametrize("kind", ["json", "bare", "text", "tfm"])
+def test_poses_are_read_in_every_form(kind, tmp_path):
+    from scipy.spatial.transform import Rotation
+
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix()
+    pose[:3, 3] = [1, -2, 30]
+    path = tmp_path / {"json": "p.json", "bare": "p.json", "text": "p.txt", "tfm": "p.tfm"}[kind]
+    if kind == "json":
+        write_pose(path, pose)
+    elif kind == "bare":
+        path.write_text(json.dumps(pose.tolist()))
+    elif kind == "text":
+        np.savetxt(path, pose)
+    else:
+        import SimpleITK as sitk
+
+        # As Slicer saves a linear transform: from world to probe, in LPS.
+        flip = np.diag([-1.0, -1, 1, 1])
+        inverse = flip @ np.linalg.inv(pose) @ flip
+        transform = sitk.AffineTransform(3)
+        transform.SetMatrix(inverse[:3, :3].ravel().tolist())
+        transform.SetTranslation(inverse[:3, 3].tolist())
+        sitk.WriteTransform(transform, str(path))
+    np.testing.assert_allclose(read_pose(path), pose, atol=1e-9)
+
+
+def test_devices_says_which_is_used():
+    result = ussim("devices")
+    assert result.exit_code == 0 and "used: " in result.output and "* " in result.output
+
+
+def bad_inputs(folder):
+    """(arguments, part of the message) for every mistake a user can make."""
+    np.savetxt(folder / "three.txt", np.eye(3))
+    np.savetxt(folder / "scaled.txt", np.eye(4) * 2)
+    np.savetxt(folder / "singular.txt", np.zeros((4, 4)))
+    (folder / "words.txt").write_text("to the left")
+    (folder / "nokey.json").write_text("{}")
+    (folder / "probe.json").write_text('{"kind": "linear", "width_mm": -4, "depth_mm": 50}')
+    (folder / "broken.nii.gz").write_text("broken")
+    (folder / "empty").mkdir()
+    import SimpleITK as sitk
+
+    sitk.WriteImage(sitk.GetImageFromArray(np.zeros((20, 20), np.uint8)), str(folder / "flat.nrrd"))
+    Volume(np.full((8, 8, 8), 5.0), np.eye(4)).write(folder / "constant.nrrd")
+    Volume(np.full((8, 8, 8), np.nan), np.eye(4)).write(folder / "nan.nrrd")
+    Volume(np.full((8, 8, 8), 9, np.uint8), np.eye(4)).write(folder / "nine.nrrd")
+    mri, out = folder / "head.nii.gz", folder / "out.png"
+    return [
+        (["segment", folder / "none.nii", "-o", folder / "l.nii.gz"], "none.nii: no such file"),
+        (["segment", folder / "broken.nii.gz", "-o", folder / "l.nii.gz"], "broken.nii.gz: cannot be read"),
+        (["segment", folder / "empty", "-o", folder / "l.nii.gz"], "no DICOM series"),
+        (["segment", folder / "flat.nrrd", "-o", folder / "l.nii.gz"], "flat.nrrd: is a 20x20 image"),
+        (["segment", folder / "constant.nrrd", "-o", folder / "l.nii.gz"], "constant"),
+        (["segment", folder / "nan.nrrd", "-o", folder / "l.nii.gz"], "not finite"),
+        (["segment", mri, "-o", folder / "l.gif"], "unknown image format"),
+        (["segment", mri, "-o", folder / "nowhere" / "l.nii.gz"], "does not exist"),
+        (["segment", mri, "-o", folder / "l.nii.gz", "--classes", 9], "classes is 9"),
+        (["segment", mri, "-o", folder / "l.nii.gz", "--mask", folder / "nine.nrrd"], "same grid"),
+        (["simulate", mri, "--pose", folder / "none.txt", "-o", out], "none.txt: no such file"),
+        (["simulate", mri, "--pose", folder / "three.txt", "-o", out], "9 numbers"),
+        (["simulate", mri, "--pose", folder / "scaled.txt", "-o", out], "last row"),
+        (["simulate", mri, "--pose", folder / "singular.txt", "-o", out], "last row"),
+        (["simulate", mri, "--pose", folder / "words.txt", "-o", out], "is not a pose"),
+        (["simulate", mri, "--pose", folder / "nokey.json", "-o", out], 'no "probe_to_ras"'),
+        (["simulate", mri, "--pose", "auto", "--probe", folder / "probe.json", "-o", out], "width_mm is -4"),
+        (["simulate", mri, "--pose", "auto", "--device", "abacus", "-o", out], "no OpenCL device fits 'abacus'"),
+        (["simulate", mri, "--pose", "auto", "--seed", -1, "-o", out], "seed is -1"),
+        (["simulate", mri, "--pose", "auto", "--dynamic-range", 0, "-o", out], "dynamic_range_db is 0"),
+        (["simulate", folder / "nine.nrrd", "--pose", "auto", "-o", out], "label 9 has no tissue"),
+        (["simulate", mri, "--pose", "auto", "-o", folder / "out.xyz"], "unknown image format"),
+        (["simulate", mri, "--pose", "auto", "-o", folder / "nowhere" / "o.png"], "does not exist"),
+        (["demo", "--mri", mri, "--out", folder / "probe.json" / "x"], "cannot be made"),
+    ]
+
+
+@pytest.mark.parametrize("number", range(24))
+def test_a_mistake_is_one_line_and_writes_nothing(number, head, tmp_path):
+    (tmp_path / "head.nii.gz").write_bytes(head.read_bytes())
+    cases = bad_inputs(tmp_path)
+    assert len(cases) == 24
+    arguments, message = cases[number]
+    before = sorted(tmp_path.rglob("*"))
+    result = ussim(*arguments)
+    assert result.exit_code == 2, result.output
+    errors = [line for line in result.stderr.splitlines() if line.startswith("ussim: ")]
+    assert len(errors) == 1 and message in errors[0], result.stderr
+    assert "Traceback" not in result.output
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_pose_past_the_volume_is_a_warning_and_a_black_image(labels, tmp_path):
+    pose = np.eye(4)
+    pose[:3, 3] = [500, 0, 0]
+    write_pose(tmp_path / "pose.json", pose)
+    result = ussim("simulate", labels, "--pose", tmp_path / "pose.json", "-o", tmp_path / "o.png")
+    assert result.exit_code == 0
+    assert "ussim: warning: the probe looks past the volume" in result.stderr
+    assert np.asarray(Image.open(tmp_path / "o.png")).max() < 40  # amplifier noise only
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
+def test_an_unwritable_folder_is_named(labels, tmp_path):
+    tmp_path.chmod(0o500)
+    result = ussim("simulate", labels, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert result.exit_code == 2 and "cannot be written" in result.stderr

@@ -1,0 +1,121 @@
+"""Choice of the OpenCL device, and the kernels it builds."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from SlicerUSSim.Logic import LinearProbe, SimulationError, UltrasoundSimulator, list_devices
+from SlicerUSSim.Logic.device import Device, DeviceInfo, choose_device, faster_hint, kernel_folder
+from SlicerUSSim.Logic.layout import shared_source
+from tests.conftest import SPECKLE, block, rigid, simulator
+
+
+def fake(index, name, platform, kind, rank) -> DeviceInfo:
+    return DeviceInfo(index, name, platform, kind, 2, 1000, rank, handle=None)
+
+
+GPU = fake("2:0", "GeForce", "NVIDIA CUDA", "GPU", 0)
+INTEL = fake("1:0", "Xeon", "Intel(R) OpenCL", "CPU", 1)
+POCL = fake("0:0", "pthread-Xeon", "Portable Computing Language", "CPU", 2)
+
+
+@pytest.fixture
+def three_devices(monkeypatch):
+    monkeypatch.setattr(
+        "SlicerUSSim.Logic.device.list_devices", lambda: sorted([POCL, INTEL, GPU], key=lambda d: d.rank)
+    )
+    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+    monkeypatch.delenv("USSIM_DEVICE", raising=False)
+
+
+def test_there_is_a_device_and_the_list_is_in_order():
+    devices = list_devices()
+    assert devices, "PoCL comes with the package on Linux"
+    assert [d.rank for d in devices] == sorted(d.rank for d in devices)
+    assert len({(d.platform, d.name) for d in devices if d.kind == "CPU"}) == sum(d.kind == "CPU" for d in devices)
+
+
+def test_the_fastest_is_taken_unless_told_otherwise(three_devices, monkeypatch):
+    assert choose_device()[0] is GPU
+    monkeypatch.setenv("USSIM_DEVICE", "pocl")
+    assert choose_device() == (POCL, "chosen by USSIM_DEVICE")
+    monkeypatch.setenv("PYOPENCL_CTX", "1:0")
+    assert choose_device() == (INTEL, "chosen by PYOPENCL_CTX")
+    assert choose_device("geforce") == (GPU, "chosen by argument")
+    monkeypatch.setenv("PYOPENCL_CTX", "1")
+    assert choose_device()[0] is INTEL
+
+
+def test_an_unknown_choice_lists_what_there_is(three_devices, monkeypatch):
+    with pytest.raises(SimulationError, match=r"argument: no OpenCL device fits 'Radeon', expected one of: 2:0 NVIDIA"):
+        choose_device("Radeon")
+    monkeypatch.setenv("USSIM_DEVICE", "7:7")
+    with pytest.raises(SimulationError, match="USSIM_DEVICE: no OpenCL device fits '7:7'"):
+        choose_device()
+
+
+def test_no_device_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("SlicerUSSim.Logic.device.list_devices", lambda: [])
+    with pytest.raises(SimulationError, match=r"pip install pocl-binary-distribution.*graphics driver"):
+        choose_device()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Intel's runtime from pip is for Linux")
+def test_only_a_slow_device_gets_a_hint():
+    assert "intel" in faster_hint(POCL)
+    assert faster_hint(INTEL) is None and faster_hint(GPU) is None
+
+
+def test_kernels_are_built_once_and_cached():
+    device = Device.get()
+    assert Device.get() is device
+    first = device.kernels("scan_conversion.cl", shared_source(), LANES=1)
+    assert device.kernels("scan_conversion.cl", shared_source(), LANES=1) is first
+
+
+def test_a_kernel_that_does_not_build_is_one_line(tmp_path, monkeypatch):
+    (tmp_path / "common.clh").write_text((kernel_folder() / "common.clh").read_text())
+    (tmp_path / "broken.cl").write_text("__kernel void broken() { this is not C; }")
+    monkeypatch.setattr("SlicerUSSim.Logic.device.kernel_folder", lambda: tmp_path)
+    with pytest.raises(SimulationError, match=r"cannot build broken\.cl") as caught:
+        Device.get().kernels("broken.cl", shared_source(), LANES=1)
+    assert "\n" not in str(caught.value)
+
+
+def test_profiles_name_every_kernel():
+    sim = simulator(block(lambda x, y, z: x * 0 + 1, half_mm=(10, 10, 10)), SPECKLE)
+    sim.device.profiling = True
+    try:
+        sim.simulate(LinearProbe(10, 15, scan_lines=32), rigid(np.eye(3), [0, -8, 0]))
+        profile = sim.device.take_profile()
+    finally:
+        sim.device.profiling = False
+    assert {"trace", "scatter", "lateral_beam", "convolve_pulse", "compress", "scan_convert"} <= set(profile)
+    assert all(milliseconds > 0 for milliseconds in profile.values())
+    assert sim.device.take_profile() == {}
+
+
+@pytest.mark.parametrize("lanes", [1, 8, 16])
+def test_vector_width_does_not_change_the_image(lanes):
+    solid = block(lambda x, y, z: np.where(y > 3, 0, 1), half_mm=(12, 12, 12))
+    probe, pose = LinearProbe(10, 15, scan_lines=32), rigid(np.eye(3), [0, -8, 0])
+    usual = simulator(solid, SPECKLE)
+    reference = usual.simulate(probe, pose)
+    other = Device(usual.device.info)
+    other.lanes = lanes
+    found = UltrasoundSimulator(solid, usual.medium.tissues, device=other).simulate(probe, pose)
+    difference = np.abs(found.image.astype(int) - reference.image)
+    assert (difference <= 1).mean() > 0.999
+
+
+def test_importing_the_interface_imports_nothing_heavy():
+    code = (
+        "import sys, SlicerUSSim.Logic as L; from SlicerUSSim.cli import main; L.SimulationError; "
+        "print([m for m in ('numpy', 'vtkmodules', 'SimpleITK', 'pyopencl', 'scipy') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

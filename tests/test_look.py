@@ -1,0 +1,126 @@
+"""Does a brain look like ultrasound? On the template, and on one person where Debian's Colin27 is installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from SlicerUSSim.Logic import PhasedProbe, TissueTable, UltrasoundSimulator, Volume, segment_mri
+from SlicerUSSim.Logic.errors import SimulationError
+from SlicerUSSim.Logic.placement import craniotomy_pose, pose_looking_at, sample, slice_under_probe, surface_point
+
+COLIN27 = Path("/usr/share/mricron/templates/ch2bet.nii.gz")
+
+
+@pytest.fixture(scope="module", params=["MNI152", "Colin27"])
+def view(request):
+    """(frame, labels under the probe) of the demo's view, averaged over seeds to look through the speckle."""
+    if request.param == "MNI152":
+        mri = request.getfixturevalue("mni")[0]
+    elif COLIN27.exists():
+        mri = Volume.read(COLIN27)
+    else:
+        pytest.skip("Colin27 comes with Debian's package mricron-data")
+    from SlicerUSSim.Logic import SimulationSettings
+
+    segmentation = segment_mri(mri, thin_sulci=True)
+    table = TissueTable.brain(segmentation.tissue_names)
+    probe = PhasedProbe(80, 90, scan_lines=196)
+    pose = craniotomy_pose(segmentation.labels, probe)
+    images = []
+    for seed in range(4):
+        simulator = UltrasoundSimulator(segmentation.labels, table, SimulationSettings(seed=seed))
+        frame = simulator.simulate(probe, pose)
+        images.append(frame.image)
+    labels = slice_under_probe(segmentation.labels, frame.grid, pose, order=0)
+    return np.stack(images).astype(float), labels, probe, frame
+
+
+def eroded(mask: np.ndarray, pixels: int) -> np.ndarray:
+    from scipy.ndimage import binary_erosion
+
+    return binary_erosion(mask, iterations=pixels)
+
+
+def in_field(probe, frame) -> np.ndarray:
+    rows, columns = frame.image.shape
+    x, y = np.meshgrid(
+        np.arange(columns) * frame.pixel_spacing_mm[0] + frame.image_to_probe[0, 3],
+        np.arange(rows) * frame.pixel_spacing_mm[1] + frame.image_to_probe[1, 3],
+    )
+    return (np.abs(np.arctan2(x, y)) < -probe.first_line * 0.95) & (np.hypot(x, y) < 0.95 * probe.depth_mm) & (y > 3)
+
+
+def test_mean_grey_is_neither_dark_nor_washed_out(view):
+    images, _, probe, frame = view
+    assert 40 < images[:, in_field(probe, frame)].mean() < 90
+
+
+def test_ventricles_are_black_and_white_matter_is_above_grey(view):
+    images, labels, probe, frame = view
+    mean, field = images.mean(axis=0), in_field(probe, frame)
+    levels = {label: mean[eroded(labels == label, 6) & field] for label in (1, 2, 3)}
+    assert levels[1].size > 200
+    assert np.median(levels[1]) < 12
+    near = in_field(PhasedProbe(80, 50, scan_lines=196), frame)  # before enhancement and shadow have had their say
+    grey, white = (np.median(mean[eroded(labels == label, 3) & field & near]) for label in (2, 3))
+    assert white > grey + 8
+
+
+def test_sulci_and_walls_are_bright(view):
+    images, labels, probe, frame = view
+    mean, field = images.mean(axis=0), in_field(probe, frame)
+    sulci = mean[(labels == 4) & field]
+    brain = mean[eroded(np.isin(labels, (2, 3)), 6) & field]
+    assert sulci.size > 200
+    assert np.median(sulci) > np.median(brain) + 25
+    # Ventricle walls: a rim about the eroded fluid.
+    from scipy.ndimage import binary_dilation, label
+
+    fluid = eroded((labels == 1) & field, 4)
+    parts, count = label(fluid)
+    assert count >= 1
+    largest = parts == np.argmax(np.bincount(parts.ravel())[1:]) + 1
+    rim = binary_dilation(largest, iterations=9) & ~binary_dilation(largest, iterations=3) & field
+    assert np.percentile(mean[rim], 75) > np.median(brain) + 15
+
+
+def test_speckle_widens_with_depth(view):
+    _, _, probe, frame = view
+    lines = frame.bmode.astype(float)
+    widths = []
+    for depth in (15, 80):
+        first, last = (int((depth + s) / frame.sample_interval_mm) for s in (-5, 5))
+        part = lines[20:-20, first:last]
+        part = part - part.mean(axis=0)
+        apart = probe.line_spacing * depth
+        correlations = [
+            (part[:-k] * part[k:]).sum() / np.sqrt((part[:-k] ** 2).sum() * (part[k:] ** 2).sum()) for k in range(1, 12)
+        ]
+        widths.append(np.interp(-0.5, -np.array(correlations), np.arange(1, 12)) * apart)
+    assert widths[1] > 1.5 * widths[0]
+
+
+def test_poses_look_where_they_are_told():
+    pose = pose_looking_at([0, 0, 100], [0, 0, 0], lateral_ras=[1, 0.2, 0])
+    np.testing.assert_allclose(pose[:3, 1], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-12)
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1) and pose[0, 0] > 0.9
+    with pytest.raises(SimulationError, match="expected two points"):
+        pose_looking_at([1, 2, 3], [1, 2, 3])
+    with pytest.raises(SimulationError, match="along the probe's axis"):
+        pose_looking_at([0, 0, 9], [0, 0, 0], lateral_ras=[0, 0, 1])
+
+
+def test_the_surface_is_found_from_inside():
+    z, y, x = np.meshgrid(*(np.arange(-30, 31),) * 3, indexing="ij")
+    matrix = np.eye(4)
+    matrix[:3, 3] = -30
+    ball = Volume((x**2 + y**2 + z**2 < 20**2).astype(np.uint8), matrix)
+    for direction in ([0, 0, 1], [1, 1, 1], [-1, 0.3, 0.2]):
+        assert np.linalg.norm(surface_point(ball, [0, 0, 0], direction)) == pytest.approx(20, abs=1)
+    with pytest.raises(SimulationError, match="no tissue"):
+        surface_point(ball, [0, 0, 40], [0, 0, 1])
+    assert sample(ball, np.array([[0.0, 0, 0], [100, 0, 0]]), order=0).tolist() == [1, 0]

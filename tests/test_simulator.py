@@ -1,0 +1,276 @@
+"""UltrasoundSimulator and Frame: geometry of the image, display, tissues, poses, warnings."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from SlicerUSSim.Logic import (
+    ConvexProbe,
+    DisplaySettings,
+    LinearProbe,
+    Membrane,
+    PhasedProbe,
+    SimulationError,
+    Tissue,
+    TissueTable,
+    UltrasoundSimulator,
+    Volume,
+)
+from SlicerUSSim.Logic.simulator import EmptyViewWarning
+from SlicerUSSim.Logic.tissues import TISSUES
+from tests.conftest import FLUID, ORIENTATIONS, SPECKLE, block, level_db, rigid, simulator
+
+PROBES = {
+    "linear": LinearProbe(40, 50, scan_lines=161),
+    "convex": ConvexProbe(40, 60, 50, scan_lines=161),
+    "phased": PhasedProbe(75, 50, scan_lines=161),
+}
+QUIET = DisplaySettings(tgc_db_cm_mhz=0.0, noise_db=None)
+
+
+@pytest.fixture(scope="module")
+def solid():
+    return simulator(block(lambda x, y, z: np.ones_like(x), half_mm=(40, 40, 40)), SPECKLE)
+
+
+@pytest.mark.parametrize("kind", PROBES)
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_a_small_target_appears_where_it_is_in_the_patient(kind, orientation):
+    """The brightest pixel, taken to RAS by the frame's own matrices, is the target's front."""
+    probe, rotation = PROBES[kind], ORIENTATIONS[orientation]
+    target = np.array([6.0, 3.0, -2.0])
+    ball = block(lambda x, y, z: (x - 6) ** 2 + (y - 3) ** 2 + (z + 2) ** 2 < 2.0**2, spacing_mm=0.5)
+    sim = simulator(ball, Tissue("ball", 1540.0, 8.0, 0.0), scattering=False)
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    # The target lies in the probe plane, 7 mm to the right of its axis and 30 mm deep.
+    pose[:3, 3] = target - rotation @ [7.0, 30.0, 0.0]
+    frame = sim.simulate(probe, pose, QUIET)
+    row, column = np.unravel_index(np.argmax(frame.image), frame.image.shape)
+    found = pose @ frame.image_to_probe @ [column, row, 0, 1]
+    along_line = np.array([7.0, 30.0 + (probe.apex_radius_mm if np.isfinite(probe.apex_radius_mm) else 1e9), 0.0])
+    front = target - 2.0 * rotation @ along_line / np.linalg.norm(along_line)
+    assert np.linalg.norm(found[:3] - front) < 0.6
+    volume = frame.to_volume()
+    np.testing.assert_allclose(volume.ijk_to_ras @ [column, row, 0, 1], found, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", PROBES)
+def test_outside_the_field_the_image_is_black(solid, kind):
+    probe = PROBES[kind]
+    frame = solid.simulate(probe, rigid(np.eye(3), [0, -25, 0]), replace(QUIET, gain_db=100.0))
+    columns, rows = np.meshgrid(np.arange(frame.image.shape[1]), np.arange(frame.image.shape[0]))
+    x = columns * frame.pixel_spacing_mm[0] + frame.image_to_probe[0, 3]
+    y = rows * frame.pixel_spacing_mm[1] + frame.image_to_probe[1, 3]
+    if probe.is_linear:
+        inside = (np.abs(x) < 20) & (y > 0) & (y < 50)
+    else:
+        radius, angle = np.hypot(x, y + probe.apex_radius_mm), np.arctan2(x, y + probe.apex_radius_mm)
+        inside = (
+            (np.abs(angle) < -probe.first_line) & (radius > probe.apex_radius_mm) & (radius < probe.apex_radius_mm + 50)
+        )
+    from scipy.ndimage import binary_dilation, binary_erosion
+
+    assert (frame.image[~binary_dilation(inside, iterations=3)] == 0).all()
+    assert (frame.image[binary_erosion(inside, iterations=6)] > 200).mean() > 0.99
+
+
+@given(st.integers(8, 300), st.integers(8, 300))
+@settings(max_examples=10)
+def test_the_image_has_the_size_asked_for_and_holds_the_field(solid, rows, columns):
+    probe = PROBES["convex"]
+    frame = solid.simulate(probe, rigid(np.eye(3), [0, -25, 0]), DisplaySettings(image_size=(rows, columns)))
+    assert frame.image.shape == (rows, columns)
+    left, right, top, bottom = probe.image_bounds_mm()
+    assert frame.pixel_spacing_mm == pytest.approx(((right - left) / columns, (bottom - top) / rows))
+
+
+def test_pixels_are_square_by_default(solid):
+    frame = solid.simulate(PROBES["phased"], rigid(np.eye(3), [0, -25, 0]))
+    assert frame.pixel_spacing_mm[0] == pytest.approx(frame.pixel_spacing_mm[1])
+
+
+def test_tgc_undoes_the_attenuation_it_is_set_to():
+    lossy = replace(SPECKLE, attenuation_db_cm_mhz=0.5)
+    sim = simulator(block(lambda x, y, z: np.ones_like(x)), lossy)
+    frame = sim.simulate(
+        PROBES["linear"], rigid(np.eye(3), [0, -25, 0]), DisplaySettings(tgc_db_cm_mhz=0.5, noise_db=None)
+    )
+    dz = frame.sample_interval_mm
+    raw = [level_db(frame.iq[:, int(d / dz) : int((d + 8) / dz)]) for d in (5, 37)]
+    seen = [level_db(frame.envelope[:, int(d / dz) : int((d + 8) / dz)]) for d in (5, 37)]
+    assert raw[1] - raw[0] == pytest.approx(-2 * 0.5 * 5 * 3.2, abs=0.7)
+    assert seen[1] - seen[0] == pytest.approx(0, abs=0.7)
+
+
+def test_grey_levels_are_decibels_in_the_dynamic_range(solid):
+    pose = rigid(np.eye(3), [0, -25, 0])
+    frame = solid.simulate(PROBES["linear"], pose, replace(QUIET, dynamic_range_db=60.0))
+    louder = solid.simulate(PROBES["linear"], pose, replace(QUIET, dynamic_range_db=60.0, gain_db=12.0))
+    middle = (frame.bmode > 10) & (louder.bmode < 245)
+    rise = louder.bmode[middle].astype(int) - frame.bmode[middle]
+    assert np.abs(rise - 255 * 12 / 60).max() <= 1
+    decibels = 20 * np.log10(frame.envelope[middle])
+    slope = np.polyfit(decibels, frame.bmode[middle], 1)[0]
+    assert slope == pytest.approx(255 / 60, rel=0.01)
+
+
+def test_noise_has_the_level_asked_for_and_is_seeded():
+    empty = block(lambda x, y, z: np.ones_like(x))
+    pose = rigid(np.eye(3), [0, -25, 0])
+    noisy = DisplaySettings(tgc_db_cm_mhz=0.0, noise_db=-40.0)
+    frames = [simulator(empty, FLUID, seed=seed).simulate(PROBES["linear"], pose, noisy) for seed in (1, 1, 2)]
+    assert level_db(frames[0].envelope) == pytest.approx(-40, abs=0.1)
+    np.testing.assert_array_equal(frames[0].envelope, frames[1].envelope)
+    assert np.corrcoef(frames[0].envelope.ravel(), frames[2].envelope.ravel())[0, 1] < 0.01
+    assert frames[0].envelope.mean() / frames[0].envelope.std() == pytest.approx(1.913, rel=0.01)
+
+
+def test_rf_is_the_carrier_times_the_baseband(solid):
+    frame = solid.simulate(PROBES["linear"], rigid(np.eye(3), [0, -25, 0]))
+    np.testing.assert_allclose(np.abs(frame.rf), np.abs(frame.iq), rtol=1e-5, atol=1e-9)
+    spectrum = np.abs(np.fft.fft(frame.rf, axis=1)).mean(axis=0)
+    frequency = np.fft.fftfreq(frame.rf.shape[1], frame.sample_interval_mm)
+    mean = (frequency * spectrum**2).sum() / (spectrum**2).sum()
+    assert mean * 1.54 / 2 == pytest.approx(5.0, rel=0.03)  # MHz
+
+
+def test_frames_go_to_vtk_with_their_place_in_the_patient(solid):
+    pose = rigid(ORIENTATIONS["oblique"], [0, -25, 0])
+    frame = solid.simulate(PROBES["convex"], pose)
+    image = frame.to_vtk()
+    rows, columns = frame.image.shape
+    assert image.GetDimensions() == (columns, rows, 1)
+    corner = [0.0, 0.0, 0.0]
+    image.TransformIndexToPhysicalPoint([columns - 1, rows - 1, 0], corner)
+    np.testing.assert_allclose(corner, (pose @ frame.image_to_probe @ [columns - 1, rows - 1, 0, 1])[:3], atol=1e-4)
+
+
+@given(
+    st.lists(st.floats(-180, 180), min_size=3, max_size=3),
+    st.lists(st.floats(-25, 25), min_size=3, max_size=3),
+    st.lists(st.sampled_from([-1.0, 1.0]), min_size=3, max_size=3),
+)
+@settings(max_examples=15)
+def test_the_grid_of_the_labels_does_not_matter_only_their_place(angles, shift, flips):
+    """The same tissue stored on a rotated or mirrored grid gives the same speckle: scatterers live in the patient."""
+    rotation = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation @ np.diag(flips) * 1.5
+    matrix[:3, 3] = -matrix[:3, :3] @ [40, 40, 40] + shift
+    solid_labels = Volume(np.ones((81, 81, 81), np.uint8), matrix)
+    pose = rigid(np.eye(3), [0, -10, 0])
+    probe = LinearProbe(10, 20, scan_lines=24)
+    stored = simulator(solid_labels, SPECKLE).simulate(probe, pose)
+    straight = simulator(block(lambda x, y, z: np.ones_like(x), half_mm=(40, 40, 40)), SPECKLE).simulate(probe, pose)
+    np.testing.assert_allclose(stored.iq, straight.iq, atol=2e-3 * np.abs(straight.iq).max())
+
+
+def test_changed_tissues_give_what_a_new_simulator_would(solid):
+    labels = block(lambda x, y, z: np.where(x**2 + y**2 + z**2 < 100, 2, 1))
+    pose, probe = rigid(np.eye(3), [0, -25, 0]), PROBES["linear"]
+    csf = replace(TISSUES["csf"], name="csf")
+    membrane = Membrane(TISSUES["leptomeninges"], thickness_mm=1.5)
+    before = TissueTable({0: FLUID, 1: SPECKLE, 2: csf})
+    after = TissueTable({0: FLUID, 1: replace(SPECKLE, mu0=0.9), 2: csf}, membrane)
+    sim = UltrasoundSimulator(labels, before)
+    sim.simulate(probe, pose)
+    sim.set_tissues(after)
+    np.testing.assert_array_equal(
+        sim.simulate(probe, pose).iq, UltrasoundSimulator(labels, after).simulate(probe, pose).iq
+    )
+    with pytest.raises(SimulationError, match="label 2 has no tissue"):
+        sim.set_tissues(TissueTable({0: FLUID, 1: SPECKLE}))
+    np.testing.assert_array_equal(
+        sim.simulate(probe, pose).iq, UltrasoundSimulator(labels, after).simulate(probe, pose).iq
+    )
+
+
+@pytest.mark.parametrize("thickness", [0.6, 1.0, 1.6])
+def test_the_membrane_is_as_thick_as_it_is_set(thickness):
+    """Thinner and thicker than a voxel: the share of scatterers it takes is its thickness (within 15 %)."""
+    half = block(lambda x, y, z: np.where(y > 0, 2, 1), half_mm=(25, 25, 25))
+    bright = Tissue("bright", 1540.0, 1.54, 0.0, mu0=1.0, sigma0=0.5)
+    silent, csf = Tissue("silent", 1540.0, 1.54, 0.0), Tissue("csf", 1540.0, 1.54, 0.0)
+    table = TissueTable({0: FLUID, 1: silent, 2: csf}, Membrane(bright, thickness, fluids=("csf",)))
+    probe = LinearProbe(30, 40, scan_lines=121, focus_mm=20, elevation_focus_mm=20)
+    powers = []
+    for seed in range(6):
+        from SlicerUSSim.Logic import SimulationSettings
+
+        iq = (
+            UltrasoundSimulator(half, table, SimulationSettings(seed=seed))
+            .simulate(probe, rigid(np.eye(3), [0, -20, 0]))
+            .iq
+        )
+        dz = 40 / iq.shape[1]
+        powers.append((np.abs(iq) ** 2).sum(axis=1).mean() * dz)
+    # Mean square times depth: unit energy of the pulse makes it variance x thickness.
+    assert np.mean(powers) / bright.scatterer_variance == pytest.approx(thickness, rel=0.15)
+
+
+def test_a_probe_that_looks_past_the_volume_gives_a_black_image_and_a_warning(solid):
+    with pytest.warns(EmptyViewWarning, match="looks past the volume"):
+        frame = solid.simulate(PROBES["linear"], rigid(np.eye(3), [300, 0, 0]), QUIET)
+    assert (frame.image == 0).all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solid.simulate(PROBES["linear"], rigid(np.eye(3), [0, -60, 0]), QUIET)
+
+
+@pytest.mark.parametrize(
+    "pose, message",
+    [
+        (np.zeros((4, 4)), "last row"),
+        (np.diag([1.0, 1, 1, 1]) * [[0], [1], [1], [1]], "not rigid"),
+        (np.diag([2.0, 2, 2, 1]), "not rigid"),
+        (np.diag([-1.0, 1, 1, 1]), "mirrors"),
+        (np.full((4, 4), np.nan), "not finite"),
+        (np.eye(3), "shape"),
+        ("here", "not a matrix of numbers"),
+    ],
+)
+def test_poses_that_are_not_rigid_are_refused(solid, pose, message):
+    with pytest.raises(SimulationError, match=f"probe_to_ras.*{message}"):
+        solid.simulate(PROBES["linear"], pose)
+
+
+@pytest.mark.parametrize(
+    "array, message",
+    [
+        (np.full((4, 4, 4), 3), "label 3 has no tissue"),
+        (np.full((4, 4, 4), 0.5), "fractions"),
+        (np.full((4, 4, 4), -1), "from -1"),
+        (np.full((4, 4, 4), 63, np.uint8), "label 63"),
+        (np.full((4, 4, 4), np.nan), "from nan"),
+    ],
+)
+def test_labels_that_cannot_be_used_are_refused(array, message):
+    with pytest.raises(SimulationError, match=message):
+        UltrasoundSimulator(Volume(array, np.eye(4)), TissueTable({1: SPECKLE}))
+
+
+def test_a_sweep_is_the_frames_of_its_poses(solid):
+    poses = [rigid(np.eye(3), [0, -25, z]) for z in (-1.0, 0.0, 2.0)]
+    seen = []
+    frames = list(solid.sweep(PROBES["linear"], poses, QUIET, progress=seen.append))
+    assert seen == [1, 2, 3]
+    for frame, pose in zip(frames, poses, strict=True):
+        np.testing.assert_array_equal(frame.image, solid.simulate(PROBES["linear"], pose, QUIET).image)
+
+
+def test_stages_are_timed_on_request(solid):
+    solid.profiling = True
+    try:
+        frame = solid.simulate(PROBES["linear"], rigid(np.eye(3), [0, -25, 0]))
+    finally:
+        solid.profiling = False
+    assert {"ray tree", "scatterers", "pulse", "B-mode", "scan conversion"} <= set(frame.timings_ms)
+    assert solid.simulate(PROBES["linear"], rigid(np.eye(3), [0, -25, 0])).timings_ms == {}
