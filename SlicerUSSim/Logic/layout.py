@@ -29,7 +29,7 @@ SCENE = np.dtype(
         ("ras_to_voxel", _FLOAT, 12),  # rows of the affine map from RAS mm to padded voxel indices (i, j, k)
         ("dims", _INT, 3),  # padded voxels along i, j, k
         ("voxel_mm", _FLOAT),  # smallest spacing
-        ("membrane_reach", _FLOAT),  # half the membrane in units of the fluid fraction (0..255); negative: none
+        ("membrane_reach", _FLOAT),  # half the membrane in units of the fluid distance (0..255); negative: none
         # probe and pose
         ("probe_to_ras", _FLOAT, 12),
         ("linear", _INT),

@@ -1,17 +1,16 @@
 """The acoustic medium as the device sees it: labels, membrane and tissue numbers in two buffers.
 
 A voxel takes two bytes. The low byte holds the label and flags for cells (the cube between eight voxel centres) whose
-corners agree, so that most look-ups need one load. The high byte holds the *fluid fraction*: the indicator of the
-membrane's fluids smoothed by a Gaussian. Smoothing a planar border at distance d gives Phi(d / sigma), so a layer of
-thickness t is where the fraction lies within Phi(+-t / 2 sigma): a sub-voxel layer without stairs.
+corners agree, so that most look-ups need one load. The high byte holds the *fluid distance*: how far inside the
+membrane's fluids the voxel lies. It comes from their indicator, smoothed by a Gaussian: a planar border at distance d
+smooths to Phi(d / sigma), so d = sigma Phi^-1 of it. Linear between voxels, it places a layer thinner than a voxel
+without stairs.
 """
 
 from __future__ import annotations
 
-from statistics import NormalDist
-
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, special
 
 from SlicerUSSim.Logic.device import Device
 from SlicerUSSim.Logic.errors import SimulationError, require
@@ -19,6 +18,7 @@ from SlicerUSSim.Logic.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissues import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.volume import Volume
 
+_FARTHEST_SIGMAS = 2.2  # where the stored distance ends
 _PAD = 1  # one voxel of coupling medium around the volume, so that a clamped look-up outside finds it
 
 
@@ -68,18 +68,19 @@ class Medium:
         )
 
     def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:
-        fraction, self.membrane_reach = self._fluid_fraction(padded, tissues)
+        distance, self.membrane_reach = self._fluid_distance(padded, tissues)
         words = padded.astype(np.uint16)
         lowest, highest = _cell_extremes(padded)
         plain = same = lowest == highest
-        if fraction is not None:
-            words |= fraction.astype(np.uint16) << 8
-            lowest, highest = _cell_extremes(fraction)
+        if distance is not None:
+            words |= distance.astype(np.uint16) << 8
+            lowest, highest = _cell_extremes(distance)
             plain = same & ((lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach))
         words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["PLAIN_CELL"]) * plain
         self.voxel_buffer = self.device.upload(words)
 
-    def _fluid_fraction(self, padded: np.ndarray, tissues: TissueTable) -> tuple[np.ndarray | None, float]:
+    def _fluid_distance(self, padded: np.ndarray, tissues: TissueTable) -> tuple[np.ndarray | None, float]:
+        """(distance as uint8 about 127.5, half the membrane in that unit), or (None, -1) where there is no membrane."""
         membrane = tissues.membrane
         if membrane is None or membrane.thickness_mm == 0:
             return None, -1.0
@@ -90,11 +91,17 @@ class Medium:
         spacing = self.labels.spacing_mm[::-1]
         # Wide enough to hide the voxels' stairs, narrow enough to keep a sulcus of two voxels open.
         sigma_mm = 0.75 * float(np.cbrt(spacing.prod()))
+        thickest = 2.0 * _FARTHEST_SIGMAS * sigma_mm
+        require(
+            membrane.thickness_mm < thickest,
+            f"membrane thickness_mm is {membrane.thickness_mm:g}, expected less than {thickest:.2g} at this voxel size; "
+            "label thicker layers in the label map",
+        )
         smooth = ndimage.gaussian_filter(is_fluid.astype(np.float32), sigma_mm / spacing, mode="nearest", truncate=3.0)
-        # Linear interpolation between voxels smooths once more, by a sixth of a voxel squared.
-        seen_sigma_mm = np.sqrt(sigma_mm**2 + float(np.cbrt(spacing.prod())) ** 2 / 6.0)
-        reach = NormalDist().cdf(0.5 * membrane.thickness_mm / seen_sigma_mm) - 0.5
-        return np.rint(smooth * 255.0).astype(np.uint8), reach * 255.0
+        lowest = special.ndtr(-_FARTHEST_SIGMAS)
+        sigmas = special.ndtri(np.clip(smooth, lowest, 1.0 - lowest))
+        unit = 127.5 / _FARTHEST_SIGMAS
+        return np.rint(127.5 + unit * sigmas).astype(np.uint8), 0.5 * membrane.thickness_mm / sigma_mm * unit
 
 
 def _as_labels(array: np.ndarray) -> np.ndarray:
