@@ -85,8 +85,11 @@ def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
 
 def _scale_bar(axis, right: float, bottom: float) -> None:
     y = bottom - 0.04 * bottom
-    axis.plot([right - 13.0, right - 3.0], [y, y], color=_INK, linewidth=2.5, solid_capstyle="butt")
-    axis.text(right - 8.0, y - 1.0, "10 mm", color=_INK, fontsize=7, ha="center", va="bottom")
+    from matplotlib.patheffects import withStroke
+
+    outline = [withStroke(linewidth=4.5, foreground="black")]  # readable on bright tissue too
+    axis.plot([right - 13.0, right - 3.0], [y, y], color="white", linewidth=2.5, path_effects=outline)
+    axis.text(right - 8.0, y - 1.0, "10 mm", color="white", fontsize=7, ha="center", va="bottom", path_effects=outline)
 
 
 def _matplotlib():

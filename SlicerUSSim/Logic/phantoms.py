@@ -23,14 +23,13 @@ def head_mri(spacing_mm: float = 1.0, seed: int = 0) -> Volume:
     azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
 
     def folds(frequency: float, phase: float) -> np.ndarray:
-        return np.sin(frequency * azimuth + 2.1 * np.sin(3.0 * elevation + phase)) * np.cos(
-            0.8 * frequency * elevation + 1.7 * np.sin(2.0 * azimuth + phase)
-        )
+        bend = 1.4 * np.sin(3.0 * elevation + 2.0 * azimuth + phase)
+        return np.sin(frequency * azimuth * np.cos(elevation) + bend) * np.cos(frequency * elevation + bend)
 
-    # Sulci are the zero lines of a smooth pattern, up to 14 mm deep; the cortex follows them.
+    # Sulci are the zero lines of a smooth pattern, up to 16 mm deep and narrower below; the cortex follows them.
     pattern = np.abs(folds(9.0, 0.3))
-    sulcus = (pattern < 0.045) & (depth < 14.0)
-    cortex = (depth < 4.0) | ((pattern < 0.22) & (depth < 17.0))
+    sulcus = (pattern < 0.07 - 0.003 * depth) & (depth < 16.0)
+    cortex = (depth < 3.5) | ((pattern < 0.34 - 0.006 * depth) & (depth < 20.0))
     midline = (np.abs(x) < 0.8) & (z > 8.0) & (depth < 40.0)
     near_midline = (np.abs(x) < 4.0) & (z > 6.0) & (depth < 43.0)
     side = np.abs(x) - 11.0

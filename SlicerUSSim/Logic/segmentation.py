@@ -235,14 +235,7 @@ def fit_mixture(values: np.ndarray, classes: int) -> tuple[np.ndarray, np.ndarra
     levels = 0.5 * (edges[1:] + edges[:-1])
     share = counts / counts.sum()
     step = edges[1] - edges[0]
-    # Start from classes of equal population: no random restarts, and the same result every time.
-    cumulative = np.cumsum(share)
-    means = np.interp((np.arange(classes) + 0.5) / classes, cumulative, levels)
-    deviations = np.full(
-        classes,
-        max(np.sqrt(np.average((levels - np.average(levels, weights=share)) ** 2, weights=share)) / classes, step),
-    )
-    weights = np.full(classes, 1.0 / classes)
+    means, deviations, weights = _first_guess(levels, counts, classes)
     likelihoods: list[float] = []
     for _ in range(_MAX_ITERATIONS):
         density = _densities(levels, means, deviations, weights)
@@ -259,6 +252,23 @@ def fit_mixture(values: np.ndarray, classes: int) -> tuple[np.ndarray, np.ndarra
         weights = population / population.sum()
     order = np.argsort(means)
     return means[order], deviations[order], weights[order], np.array(likelihoods)
+
+
+def _first_guess(levels, counts, classes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means, deviations and weights of the classes that multi-level Otsu thresholds cut; deterministic."""
+    from skimage.filters import threshold_multiotsu
+
+    coarse = 8  # Otsu's search grows fast with the number of bins
+    pooled = counts.reshape(-1, coarse).sum(axis=1)
+    centres = levels.reshape(-1, coarse).mean(axis=1)
+    thresholds = threshold_multiotsu(hist=(pooled, centres), classes=classes)
+    member = np.digitize(levels, thresholds)
+    share = counts / counts.sum()
+    step = levels[1] - levels[0]
+    weights = np.array([share[member == n].sum() for n in range(classes)]) + 1e-6
+    means = np.array([(share * levels)[member == n].sum() for n in range(classes)]) / weights
+    variances = np.array([(share * (levels - means[n]) ** 2)[member == n].sum() for n in range(classes)]) / weights
+    return means, np.sqrt(np.maximum(variances, step**2)), weights / weights.sum()
 
 
 def _densities(levels, means, deviations, weights) -> np.ndarray:
