@@ -1,0 +1,110 @@
+"""Milliseconds per stage and per frame, on every OpenCL device found.
+
+    python benchmarks/frames.py [--json FILE] [--repeat N]
+
+Frame A: phased array, 196 scan lines, 73 mm deep, 5 MHz. Frame B: convex array, 192 scan lines, 120 mm deep. Both on
+the MNI152 labels from the demo's view, ray tree to depth 6, from pose to scan-converted image on the host. Also the
+segmentation, the first frame of a fresh process with empty kernel caches, and peak memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from time import perf_counter
+
+from SlicerUSSim.Logic import ConvexProbe, PhasedProbe, TissueTable, UltrasoundSimulator, list_devices, segment_mri
+from SlicerUSSim.Logic.demo import demo_mri
+from SlicerUSSim.Logic.placement import craniotomy_pose
+
+PROBES = {"A": PhasedProbe(75, 73, scan_lines=196), "B": ConvexProbe(60, 70, 120, scan_lines=192)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="keep the numbers in this file")
+    parser.add_argument("--repeat", type=int, default=30, help="frames per measurement (best and median are shown)")
+    parser.add_argument("--first-frame", metavar="DEVICE", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.first_frame:
+        return first_frame(arguments.first_frame)
+
+    mri, source = demo_mri()
+    print(f"{source}, {'x'.join(map(str, mri.array.shape[::-1]))} voxels")
+    results = {}
+    for info in list_devices():
+        print(f"\n{info}")
+        results[str(info)] = measured = {}
+        times = [timed(lambda info=info: segment_mri(mri, device=info))[0] for _ in range(3)]
+        measured["segmentation"] = best_and_median(times)
+        print(f"  segmentation            {show(times)}")
+        segmentation = segment_mri(mri, device=info)
+        simulator = UltrasoundSimulator(segmentation.labels, TissueTable.brain(segmentation.tissue_names), device=info)
+        for name, probe in PROBES.items():
+            pose = craniotomy_pose(segmentation.labels, probe)
+            simulator.profiling = False
+            simulator.simulate(probe, pose)
+            times = [timed(lambda p=probe, q=pose: simulator.simulate(p, q))[0] for _ in range(arguments.repeat)]
+            measured[f"frame {name}"] = best_and_median(times)
+            print(f"  frame {name}                 {show(times)}")
+            simulator.profiling = True
+            frames = [simulator.simulate(probe, pose) for _ in range(arguments.repeat)]
+            for stage in frames[0].timings_ms:
+                times = [frame.timings_ms[stage] for frame in frames]
+                measured[f"frame {name}: {stage}"] = best_and_median(times)
+                print(f"    {stage:22s}{show(times)}")
+        measured["first frame, cold"] = cold = run_first_frame(info.index)
+        print(f"  first frame of a fresh process, empty caches {cold['seconds']:.1f} s, peak {cold['peak_mb']:.0f} MB")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
+
+
+def run_first_frame(device: str) -> dict:
+    """Seconds from interpreter start to the first image and peak memory, in a process of its own with empty caches."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "XDG_CACHE_HOME": folder, "POCL_CACHE_DIR": folder, "HOME": folder}
+        environment.pop("OCL_ICD_VENDORS", None)
+        start = perf_counter()
+        output = subprocess.run(
+            [sys.executable, __file__, "--first-frame", device],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=environment,
+        ).stdout
+        return {"seconds": perf_counter() - start, "peak_mb": float(output)}
+
+
+def first_frame(device: str) -> None:
+    """Read the MRI, segment it, simulate frame A once; print the peak memory in MB."""
+    mri, _ = demo_mri()
+    segmentation = segment_mri(mri, device=device)
+    simulator = UltrasoundSimulator(segmentation.labels, TissueTable.brain(segmentation.tissue_names), device=device)
+    simulator.simulate(PROBES["A"], craniotomy_pose(segmentation.labels, PROBES["A"]))
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+
+
+def timed(function) -> tuple[float, object]:
+    """(milliseconds, result)"""
+    start = perf_counter()
+    result = function()
+    return (perf_counter() - start) * 1e3, result
+
+
+def best_and_median(times: list[float]) -> dict[str, float]:
+    return {"best_ms": round(min(times), 3), "median_ms": round(sorted(times)[len(times) // 2], 3)}
+
+
+def show(times: list[float]) -> str:
+    values = best_and_median(times)
+    return f"best {values['best_ms']:8.2f} ms   median {values['median_ms']:8.2f} ms"
+
+
+if __name__ == "__main__":
+    main()
