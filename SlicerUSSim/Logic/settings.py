@@ -34,7 +34,7 @@ class SimulationSettings:
     #: Sites of the scatterer lattice per cubic millimetre (a cell of 0.3 mm; the paper's Rayleigh test takes 1250)
     scatterers_per_mm3: float = 36.0
     #: Where the beam profile is cut off, in standard deviations
-    beam_cutoff: float = 2.6
+    beam_cutoff: float = 2.5
     #: Rays per scan line that sample interfaces across the elevational beam
     elevational_rays: int = 7
     #: Traced lines per scan line, which sample the beam laterally; 0 chooses enough for the probe's spacing
