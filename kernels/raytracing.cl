@@ -80,9 +80,9 @@ inline int label_at(__global const ushort *voxels, __constant const Scene *scene
 // `overshoot` is the length along the ray, in millimetres, by which `voxel` lies beyond the border. The trilinear
 // border wavers by a fifth of a voxel; the smoothed difference D of the two sides knows better. A plane at distance d
 // has the share Phi(d / sigma) behind it, and sigma^2 D'' / |D'| = d as well; a border of mean curvature H moves by
-// sigma^2 H under smoothing, which enters the two with opposite signs. The second is noisier, hence the weights. The
-// overshoot is 0 where the two borders do not agree to half a voxel (thin sheets, corners). Measured on a sphere of
-// radius 20 voxels: normals within 2.9 degrees and positions within 0.145 voxel RMS (trilinear: 0.18).
+// sigma^2 H under smoothing, which enters the two with opposite signs: their mean is free of it. The overshoot is 0
+// where the two borders do not agree to half a voxel (thin sheets, corners). Measured on a sphere of radius 20 voxels:
+// normals within 2.9 degrees and positions within 0.1 voxel RMS (trilinear: 0.18).
 #define BORDER_SIGMA 1.5f
 inline float3 interface_normal(__global const ushort *voxels, __constant const Scene *scene,
                                __constant const Tissue *tissues, float3 voxel, int before, int behind, float3 direction,
@@ -134,7 +134,7 @@ inline float3 interface_normal(__global const ushort *voxels, __constant const S
   float share = clamp(0.5f - 0.5f * difference / either, 0.01f, 0.99f);
   float by_share = BORDER_SIGMA / 1.702f * log(share / (1.0f - share));
   float by_bend = (square - total_square / total * difference) / steepness;
-  float distance = mix(by_share, by_bend, 0.3f);
+  float distance = 0.5f * (by_share + by_bend);
   float across = -dot(voxel_step, gradient) / steepness;  // voxels per mm of ray
   *overshoot = fabs(distance) < 0.5f && across * scene->voxel_mm > 0.2f ? distance / across : 0.0f;
   // A gradient in voxel indices becomes one in millimetres by the transposed map.
@@ -153,38 +153,114 @@ inline float3 carry(float3 v, float3 from, float3 to) { return v - dot(v, to) / 
 
 inline float3 mirror(float3 v, float3 normal) { return v - 2.0f * dot(v, normal) * normal; }
 
-#ifdef NO_IMPLICIT_VECTORS
-__attribute__((intel_vec_len_hint(1)))
-#endif
-__kernel void
-trace(__constant const Scene *scene, __global const ushort *voxels, __constant const Tissue *tissues,
-      __global const float *quantiles, __global Segment *segments, __global int *segment_counts, __global Hit *hits,
-      __global int *hit_counts, __global float *cut) {
-  int line = get_global_id(0), ray_of_line = get_global_id(1);
-  int rays = scene->elevational_rays;
-  int on_axis = ray_of_line == 0;
-  int slot = line * rays + ray_of_line - 1;
-  float quantile = on_axis ? 0.0f : quantiles[slot];
-  float cut_weight = 0.0f;
-  __global Segment *my_segments = segments + line * MAX_SEGMENTS;
-  __global Hit *my_hits = hits + max(slot, 0) * MAX_HITS;
-  int count = 0;
+// The ray beside its axis, in padded voxel indices: start + l step + sigma(l) aside at length l from the node's start.
+typedef struct {
+  float3 start, step, aside;
+  float path;
+} Course;
 
-  // The root: the beam frame of this line, taken from the probe frame to RAS.
+inline float3 course_at(__constant const Scene *scene, const Course *course, float l) {
+  return course->start + l * course->step + elevation_sigma(scene, course->path + l) * course->aside;
+}
+
+// Lengths along the course at which it can be inside the volume: (enter, leave). `margin` is in voxels.
+inline float2 volume_span(__constant const Scene *scene, const Course *course, float margin, float longest) {
+  float start[3] = {course->start.x, course->start.y, course->start.z};
+  float step[3] = {course->step.x, course->step.y, course->step.z};
+  float enter = 0.0f, leave = longest;
+  for (int a = 0; a < 3; a++) {
+    float inverse = 1.0f / (fabs(step[a]) < 1e-7f ? 1e-7f : step[a]);
+    float t0 = (-margin - start[a]) * inverse, t1 = (scene->dims[a] - 1 + margin - start[a]) * inverse;
+    enter = fmax(enter, fmin(t0, t1));
+    leave = fmin(leave, fmax(t0, t1));
+  }
+  return (float2)(fmin(enter, longest), leave);
+}
+
+// March from `inside` until the label is no longer `label`, then bisect. Returns the first length found to be in
+// another tissue, whose label goes to `other`; or -1 if there is none up to `last`. Nothing before `blind_until`
+// counts.
+inline float next_border(__global const ushort *voxels, __constant const Scene *scene, __constant const Tissue *tissues,
+                         const Course *course, int label, float inside, float last, float blind_until, int *other) {
+  const float stride = 0.5f * scene->voxel_mm;
+  float beyond = -1.0f;
+  while (inside < last) {
+    float next = fmin(inside + stride, last + 1e-4f);
+    *other = label_at(voxels, scene, tissues, course_at(scene, course, next));
+    if (*other != label && course->path + next > blind_until) {
+      beyond = next;
+      break;
+    }
+    inside = next;
+  }
+  if (beyond < 0.0f) return beyond;
+  for (int iteration = 0; iteration < 8; iteration++) {
+    float middle = 0.5f * (inside + beyond);
+    int found = label_at(voxels, scene, tissues, course_at(scene, course, middle));
+    if (found == label) {
+      inside = middle;
+    } else {
+      beyond = middle;
+      *other = found;
+    }
+  }
+  return beyond;
+}
+
+// Two-way amplitude decay in nepers per mm: 10^(-alpha f 2 l / 20) with l in cm.
+inline float decay_in(__constant const Scene *scene, Tissue tissue) {
+  return tissue.attenuation * scene->frequency_mhz * 0.2f * LN10_OVER_20;
+}
+
+// The piece of a node from length `from` to `to`; `spent` is the attenuation exponent since the node's start at each.
+inline Segment segment_of(Ray ray, float from, float to, float spent_from, float spent_to, float depth_per_mm) {
+  Segment segment;
+  vstore3(ray.axis + from * ray.direction, 0, segment.start);
+  vstore3(ray.direction, 0, segment.direction);
+  vstore3(ray.lateral, 0, segment.lateral);
+  vstore3(ray.elevational, 0, segment.elevational);
+  segment.path_mm = ray.path + from;
+  segment.length_mm = to - from;
+  segment.depth_mm = ray.depth + from * depth_per_mm;
+  segment.depth_per_mm = depth_per_mm;
+  segment.weight = ray.weight;
+  segment.attenuation = exp(ray.log_attenuation - spent_from);
+  segment.decay_per_mm = (spent_to - spent_from) / (to - from);
+  segment.reflections = ray.reflections;
+  segment.label = ray.label;
+  return segment;
+}
+
+// What a fluid interface does to a wave (PHYSICS section 3): Snell, and the pressure reflection coefficient r.
+// R = r^2 is the two-way factor of the reflected branch, 1 - R that of the refracted one.
+typedef struct {
+  float cos_in, cos_out, speed_ratio, pressure;
+  int is_total;
+} Interface;
+
+inline Interface interface_between(Tissue here, Tissue behind, float3 direction, float3 normal) {
+  Interface result;
+  result.cos_in = clamp(-dot(direction, normal), 0.01f, 1.0f);
+  result.speed_ratio = behind.speed_m_s / here.speed_m_s;
+  float sin2_out = result.speed_ratio * result.speed_ratio * (1.0f - result.cos_in * result.cos_in);
+  result.is_total = sin2_out >= 1.0f;
+  result.cos_out = sqrt(fmax(0.0f, 1.0f - sin2_out));
+  float z_in = here.impedance * result.cos_out, z_out = behind.impedance * result.cos_in;
+  result.pressure = result.is_total ? 1.0f : (z_out - z_in) / (z_out + z_in);
+  return result;
+}
+
+// The root of a traced line: the beam frame at the probe face, taken from the probe frame to RAS.
+inline Ray root_of(__constant const Scene *scene, int line) {
   float position = scene->first_line + scene->line_spacing * (line - scene->guard_lines) / scene->lateral_rays;
-  float3 origin, direction, across;
-  if (scene->linear) {
-    origin = (float3)(position, 0.0f, 0.0f);
-    direction = (float3)(0.0f, 1.0f, 0.0f);
-    across = (float3)(1.0f, 0.0f, 0.0f);
-  } else {
+  float3 origin = (float3)(position, 0.0f, 0.0f), direction = (float3)(0.0f, 1.0f, 0.0f);
+  float3 across = (float3)(1.0f, 0.0f, 0.0f);
+  if (!scene->linear) {
     float c = cos(position), s = sin(position);
     origin = scene->apex_radius_mm * (float3)(s, c - 1.0f, 0.0f);
     direction = (float3)(s, c, 0.0f);
     across = (float3)(c, -s, 0.0f);
   }
-  Ray stack[MAX_STACK];
-  int waiting = 1;
   Ray root;
   root.axis = affine_point(scene->probe_to_ras, origin);
   root.direction = normalize(affine_vector(scene->probe_to_ras, direction));
@@ -197,140 +273,107 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __constant c
   root.blind_until = -1.0f;
   root.reflections = 0;
   root.label = -1;  // looked up at its start
-  stack[0] = root;
+  return root;
+}
 
+#ifdef NO_IMPLICIT_VECTORS
+__attribute__((intel_vec_len_hint(1)))
+#endif
+__kernel void
+trace(__constant const Scene *scene, __global const ushort *voxels, __constant const Tissue *tissues,
+      __global const float *quantiles, __global Segment *segments, __global int *segment_counts, __global Hit *hits,
+      __global int *hit_counts, __global float *cut) {
+  const int line = get_global_id(0), ray_of_line = get_global_id(1), rays = scene->elevational_rays;
+  const int on_axis = ray_of_line == 0;
+  const int slot = line * rays + ray_of_line - 1;
+  const float quantile = on_axis ? 0.0f : quantiles[slot];
+  __global Segment *my_segments = segments + line * MAX_SEGMENTS;
+  __global Hit *my_hits = hits + max(slot, 0) * MAX_HITS;
+  const int room = on_axis ? MAX_SEGMENTS : MAX_HITS;
+  int count = 0;  // of segments or hits; more than `room` says that some are missing
+  float cut_weight = 0.0f;
+
+  Ray stack[MAX_STACK];
+  stack[0] = root_of(scene, line);
+  int waiting = 1;
   while (waiting > 0) {
     Ray ray = stack[--waiting];
-    int alive = 1;
-    while (alive) {  // one turn per tree node: march to the next interface, branch, go on with the refracted child
-      float3 voxel0 = affine_point(scene->ras_to_voxel, ray.axis);
-      float3 voxel_step = affine_vector(scene->ras_to_voxel, ray.direction);
-      float3 voxel_aside = affine_vector(scene->ras_to_voxel, ray.elevational) * quantile;
-#define VOXEL_AT(l) (voxel0 + (l)*voxel_step + elevation_sigma(scene, ray.path + (l)) * voxel_aside)
-      if (ray.label < 0) ray.label = label_at(voxels, scene, tissues, VOXEL_AT(0.0f));
-      Tissue here = tissues[ray.label];
-      float depth_per_mm = scene->reference_speed_m_s / here.speed_m_s;
-      float to_depth = (scene->depth_mm - ray.depth) / depth_per_mm;
-      float start_[3] = {voxel0.x, voxel0.y, voxel0.z}, step_[3] = {voxel_step.x, voxel_step.y, voxel_step.z};
-      float margin = 3.0f + fabs(quantile) * 4.0f / scene->voxel_mm;  // the ray runs beside the axis
-      float enter = 0.0f, leave = to_depth;
-      for (int a = 0; a < 3; a++) {
-        float inverse = 1.0f / (fabs(step_[a]) < 1e-7f ? 1e-7f : step_[a]);
-        float t0 = (-margin - start_[a]) * inverse, t1 = (scene->dims[a] - 1 + margin - start_[a]) * inverse;
-        enter = fmax(enter, fmin(t0, t1));
-        leave = fmin(leave, fmax(t0, t1));
-      }
+    if (count > room) {  // nothing more can be written, and a tree can have more branches than a lifetime has seconds
+      cut_weight += ray.weight;
+      continue;
+    }
+    while (1) {  // one turn per tree node: march to the next interface, branch, go on with the refracted child
+      Course course;
+      course.start = affine_point(scene->ras_to_voxel, ray.axis);
+      course.step = affine_vector(scene->ras_to_voxel, ray.direction);
+      course.aside = affine_vector(scene->ras_to_voxel, ray.elevational) * quantile;
+      course.path = ray.path;
+      if (ray.label < 0) ray.label = label_at(voxels, scene, tissues, course_at(scene, &course, 0.0f));
+      Tissue here = tissues[ray.label], behind = here;
+      const float depth_per_mm = scene->reference_speed_m_s / here.speed_m_s;
+      const float to_depth = (scene->depth_mm - ray.depth) / depth_per_mm;
+      const float2 span = volume_span(scene, &course, 3.0f + fabs(quantile) * 4.0f / scene->voxel_mm, to_depth);
 
-      // March. Tissues of one speed and impedance have no interface between them; only attenuation changes there, so
-      // the node goes on. `inside` is the last length known to be in this tissue, `beyond` the first one in another,
-      // `since` where this tissue began. A segment starts at `open`, with `spent_open` of the attenuation exponent
-      // `spent`.
-      float inside = fmax(fmin(enter, to_depth), 0.0f), beyond = 0.0f, longest = 0.0f;
-      float since = 0.0f, open = 0.0f, spent = 0.0f, spent_open = 0.0f;
-      int other, crossing, ended = 0;
-      Tissue behind;
-      do {
-        // Two-way amplitude: 10^(-alpha f 2 l / 20) with l in cm.
-        float decay = here.attenuation * scene->frequency_mhz * 0.2f * LN10_OVER_20;
-        float reserve = log(ray.weight / scene->intensity_threshold) + ray.log_attenuation - spent;
-        float to_silence = since + fmax(reserve, 0.0f) / fmax(decay, 1e-9f);
-        ended = to_silence < to_depth;
-        longest = fmin(to_depth, to_silence);
-        float last = fmin(leave, longest), stride = 0.5f * scene->voxel_mm;
-        crossing = 0;
-        while (inside < last) {
-          float next = fmin(inside + stride, last + 1e-4f);
-          other = label_at(voxels, scene, tissues, VOXEL_AT(next));
-          if (other != ray.label && ray.path + next > ray.blind_until) {
-            beyond = next;
-            crossing = 1;
-            break;
+      // Tissues of one group have no interface between them: only attenuation changes there and the node goes on.
+      // `since` is where the present tissue began, `spent` the attenuation exponent up to there; a segment is open from
+      // `open`, with `spent_open`.
+      float since = 0.0f, spent = 0.0f, open = 0.0f, spent_open = 0.0f, inside = span.x, border;
+      int other = ray.label, is_silenced;
+      while (1) {
+        const float decay = decay_in(scene, here);
+        const float reserve = log(ray.weight / scene->intensity_threshold) + ray.log_attenuation - spent;
+        const float to_silence = since + fmax(reserve, 0.0f) / fmax(decay, 1e-9f);
+        is_silenced = to_silence < to_depth;
+        const float longest = fmin(to_depth, to_silence);
+        border = next_border(voxels, scene, tissues, &course, ray.label, inside, fmin(span.y, longest), ray.blind_until,
+                             &other);
+        const float until = border < 0.0f ? longest : border;
+        const float spent_until = spent + decay * (until - since);
+        if (border >= 0.0f) behind = tissues[other];
+        const int node_ends = border < 0.0f || behind.group != here.group;
+        if (on_axis) {
+          // A segment has one decay, its mean. Where that would be off by more than 0.02 neper (0.17 dB) inside, the
+          // segment is closed at the last change of tissue.
+          const float earlier = since - open, mean_decay = earlier > 0.0f ? (spent - spent_open) / earlier : decay;
+          if (fabs(decay - mean_decay) * fmin(earlier, until - since) > 0.02f) {
+            if (count < room) my_segments[count] = segment_of(ray, open, since, spent_open, spent, depth_per_mm);
+            count++;
+            open = since;
+            spent_open = spent;
           }
-          inside = next;
-        }
-        if (crossing)
-          for (int iteration = 0; iteration < 8; iteration++) {
-            float middle = 0.5f * (inside + beyond);
-            int label = label_at(voxels, scene, tissues, VOXEL_AT(middle));
-            if (label == ray.label)
-              inside = middle;
-            else {
-              beyond = middle;
-              other = label;
-            }
+          if (node_ends && until > open) {
+            if (count < room) my_segments[count] = segment_of(ray, open, until, spent_open, spent_until, depth_per_mm);
+            count++;
           }
-        float until = crossing ? beyond : longest;
-        // One segment has one decay, its mean. Where that would be off by more than 0.02 neper (0.17 dB) inside, the
-        // segment is closed at the last change of tissue.
-        float earlier = since - open, mean_decay = earlier > 0.0f ? (spent - spent_open) / earlier : decay;
-        int close = fabs(decay - mean_decay) * fmin(earlier, until - since) > 0.02f;
-        float spent_until = spent + decay * (until - since);
-        if (crossing) behind = tissues[other];
-        int interface_here = crossing && behind.group != here.group;
-        int last_piece = !crossing || interface_here;
-        for (int piece = close ? 0 : 1; piece < (last_piece ? 2 : 1) && on_axis; piece++) {
-          float end = piece == 0 ? since : until, spent_end = piece == 0 ? spent : spent_until;
-          if (end <= open) continue;
-          if (count < MAX_SEGMENTS) {
-            Segment segment;
-            vstore3(ray.axis + open * ray.direction, 0, segment.start);
-            vstore3(ray.direction, 0, segment.direction);
-            vstore3(ray.lateral, 0, segment.lateral);
-            vstore3(ray.elevational, 0, segment.elevational);
-            segment.path_mm = ray.path + open;
-            segment.length_mm = end - open;
-            segment.depth_mm = ray.depth + open * depth_per_mm;
-            segment.depth_per_mm = depth_per_mm;
-            segment.weight = ray.weight;
-            segment.attenuation = exp(ray.log_attenuation - spent_open);
-            segment.decay_per_mm = (spent_end - spent_open) / (end - open);
-            segment.reflections = ray.reflections;
-            segment.label = ray.label;
-            my_segments[count] = segment;
-          }
-          count++;
-          open = end;
-          spent_open = spent_end;
         }
         spent = spent_until;
+        if (node_ends) break;
         since = until;
-        if (last_piece) break;
         here = behind;
         ray.label = other;
-        inside = beyond;
-      } while (1);
-      if (!crossing) {
-        if (ended) cut_weight += ray.weight;
+        inside = border;
+      }
+      if (border < 0.0f) {
+        if (is_silenced) cut_weight += ray.weight;
         break;
       }
 
-      float3 voxel_hit = VOXEL_AT(beyond);
       float overshoot;
-      float3 normal = interface_normal(voxels, scene, tissues, voxel_hit, here.group, behind.group, ray.direction,
-                                       voxel_step, &overshoot);
-      overshoot = fmin(overshoot, beyond - since);
-      beyond -= overshoot;
-      if (on_axis && count <= MAX_SEGMENTS && count > 0) my_segments[count - 1].length_mm -= overshoot;
-      spent -= overshoot * here.attenuation * scene->frequency_mhz * 0.2f * LN10_OVER_20;
-      float path = ray.path + beyond;
-      float depth = ray.depth + beyond * depth_per_mm;
-      float log_attenuation = ray.log_attenuation - spent;
-      float attenuation = exp(log_attenuation);
-      float3 aside = quantile * elevation_sigma(scene, path) * ray.elevational;
-      float3 hit_point = ray.axis + beyond * ray.direction + aside;
-
-      // Snell and the pressure reflection coefficient of a fluid interface; R = r^2 is the two-way factor.
-      float cos_in = clamp(-dot(ray.direction, normal), 0.01f, 1.0f);
-      float ratio = behind.speed_m_s / here.speed_m_s;
-      float sin2_out = ratio * ratio * (1.0f - cos_in * cos_in);
-      int total = sin2_out >= 1.0f;
-      float cos_out = sqrt(fmax(0.0f, 1.0f - sin2_out));
-      float z_in = here.impedance * cos_out, z_out = behind.impedance * cos_in;
-      float pressure = total ? 1.0f : (z_out - z_in) / (z_out + z_in);
-      float reflectance = pressure * pressure;
+      const float3 normal = interface_normal(voxels, scene, tissues, course_at(scene, &course, border), here.group,
+                                             behind.group, ray.direction, course.step, &overshoot);
+      overshoot = fmin(overshoot, border - since);
+      border -= overshoot;
+      spent -= overshoot * decay_in(scene, here);
+      if (on_axis && count > 0 && count <= room) my_segments[count - 1].length_mm -= overshoot;
+      const float path = ray.path + border, depth = ray.depth + border * depth_per_mm;
+      const float log_attenuation = ray.log_attenuation - spent, attenuation = exp(log_attenuation);
+      const float3 aside = quantile * elevation_sigma(scene, path) * ray.elevational;
+      const float3 hit_point = ray.axis + border * ray.direction + aside;
+      const Interface surface = interface_between(here, behind, ray.direction, normal);
+      const float reflectance = surface.pressure * surface.pressure;
 
       if (!on_axis) {
-        if (count < MAX_HITS) {
+        if (count < room) {
           Hit hit;
           vstore3(hit_point, 0, hit.position);
           vstore3(normal, 0, hit.normal);
@@ -338,10 +381,10 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __constant c
           hit.depth_mm = depth;
           hit.weight = ray.weight;
           hit.attenuation = attenuation;
-          hit.cos_incidence = cos_in;
+          hit.cos_incidence = surface.cos_in;
           hit.reflectance = reflectance;
-          hit.echo = ray.weight * attenuation * (scene->interface_is_energy ? reflectance : fabs(pressure)) *
-                     pow(cos_in, scene->specular_exponent) * scene->interface_gain / rays;
+          hit.echo = ray.weight * attenuation * (scene->interface_is_energy ? reflectance : fabs(surface.pressure)) *
+                     pow(surface.cos_in, scene->specular_exponent) * scene->interface_gain / rays;
           hit.reflections = ray.reflections;
           hit.label_before = ray.label;
           hit.label_behind = other;
@@ -351,7 +394,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __constant c
       }
 
       // The reflected child waits on the stack; weak ones and those beyond the tree's depth are cut.
-      float reflected_weight = ray.weight * reflectance;
+      const float reflected_weight = ray.weight * reflectance, refracted_weight = ray.weight * (1.0f - reflectance);
       if (ray.reflections < scene->max_ray_depth && reflected_weight >= scene->reflection_threshold &&
           reflected_weight * attenuation >= scene->intensity_threshold && waiting < MAX_STACK) {
         Ray child = ray;
@@ -366,17 +409,18 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __constant c
         child.blind_until = path + scene->voxel_mm;
         child.reflections = ray.reflections + 1;
         stack[waiting++] = child;
-      } else
+      } else {
         cut_weight += reflected_weight;
+      }
 
-      // The refracted child: this ray, bent.
-      float refracted_weight = ray.weight * (1.0f - reflectance);
-      if (total) break;
-      if (refracted_weight * attenuation < scene->intensity_threshold || depth >= scene->depth_mm) {
+      // The refracted child is this ray, bent.
+      if (surface.is_total) break;
+      if (refracted_weight * attenuation < scene->intensity_threshold || depth >= scene->depth_mm || count > room) {
         cut_weight += refracted_weight;
         break;
       }
-      float3 bent = normalize(ratio * ray.direction + (ratio * cos_in - cos_out) * normal);
+      const float ratio = surface.speed_ratio;
+      const float3 bent = normalize(ratio * ray.direction + (ratio * surface.cos_in - surface.cos_out) * normal);
       ray.lateral = carry(ray.lateral, ray.direction, bent);
       ray.elevational = carry(ray.elevational, ray.direction, bent);
       ray.direction = bent;

@@ -110,7 +110,7 @@ def test_a_small_sheet_spreads_over_lines_and_slices_as_the_beam_says():
     half = 2.0
     # Fine voxels: the smoothing that finds the border rounds the sheet's corners by about a voxel.
     sheet = block(
-        lambda x, y, z: (np.abs(y) < 0.7) & (np.abs(x) < half) & (np.abs(z) < half), half_mm=(4, 2, 4), spacing_mm=0.2
+        lambda x, y, z: (np.abs(y) < 0.7) & (np.abs(x) < half) & (np.abs(z) < half), half_mm=(4, 2, 4), spacing_mm=0.1
     )
     hard = Tissue("sheet", 1540.0, 1.7, 0.0)
     sim = simulator(sheet, hard, scattering=False, elevational_rays=16, specular_exponent=0.0)
@@ -131,7 +131,7 @@ def test_a_small_sheet_spreads_over_lines_and_slices_as_the_beam_says():
     lateral = echo(0.0)
     offsets = np.arange(-6, 6.1, 0.4)
     elevational = np.array([echo(offset)[50] for offset in offsets])
-    box = (2 * half - 0.2) ** 2 / 12  # the outermost voxel centres are at 1.8 mm
+    box = (2 * half - 0.1) ** 2 / 12  # the outermost voxel centres are at 1.9 mm
     assert width(probe.line_positions(), lateral) == pytest.approx(np.sqrt(box + sigma_l**2), rel=0.1)
     assert width(offsets, elevational) == pytest.approx(np.sqrt(box + sigma_e**2), rel=0.1)
 

@@ -202,14 +202,15 @@ def bad_inputs(folder):
         (["simulate", mri, "--pose", "auto", "-o", folder / "out.xyz"], "unknown image format"),
         (["simulate", mri, "--pose", "auto", "-o", folder / "nowhere" / "o.png"], "does not exist"),
         (["demo", "--mri", mri, "--out", folder / "probe.json" / "x"], "cannot be made"),
+        (["simulate", mri, "--pose", "auto", "-o", "/proc/o.png"], "/proc/o.png: cannot be written"),
     ]
 
 
-@pytest.mark.parametrize("number", range(24))
+@pytest.mark.parametrize("number", range(25))
 def test_a_mistake_is_one_line_and_writes_nothing(number, head, tmp_path):
     (tmp_path / "head.nii.gz").write_bytes(head.read_bytes())
     cases = bad_inputs(tmp_path)
-    assert len(cases) == 24
+    assert len(cases) == 25
     arguments, message = cases[number]
     before = sorted(tmp_path.rglob("*"))
     result = ussim(*arguments)

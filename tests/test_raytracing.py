@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, Tissue
+from SlicerUSSim.Logic.simulator import TreeOverflowWarning
 from tests.conftest import FLUID, ORIENTATIONS, block, rigid, simulator
 
 SLOW, FAST = Tissue("slow", 1450.0, 1.45, 0.3), Tissue("fast", 1650.0, 1.9, 0.9)
@@ -35,6 +36,7 @@ def test_a_voxelised_sphere_has_smooth_normals_in_the_right_place(orientation):
     angle = np.degrees(np.arccos(np.clip((front["normal"] * outward).sum(axis=1), -1, 1)))
     assert np.sqrt((angle**2).mean()) < 3.0
     assert np.sqrt(((radius - 20.0) ** 2).mean()) < 0.15
+    assert abs((radius - 20.0).mean()) < 0.05  # curvature does not shrink it
 
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
@@ -147,6 +149,15 @@ def test_max_ray_depth_counts_reflections_and_zero_switches_them_off():
         assert tree.segments["reflections"].max() == depth
     off = simulator(plates, hard, reflections=False).trace(PROBES["linear"], pose)
     assert off.segments["reflections"].max() == 0
+
+
+def test_more_segments_than_there_is_room_for_are_a_warning():
+    """Plates that reflect nearly everything, and a threshold that follows every bounce."""
+    plates = block(lambda x, y, z: np.floor(y / 1.0).astype(int) % 2, half_mm=(6, 30, 6))
+    hard = Tissue("hard", 1540.0, 6.0, 0.0)
+    sim = simulator(plates, hard, reflection_threshold=1e-9, intensity_threshold=1e-9, max_ray_depth=16)
+    with pytest.warns(TreeOverflowWarning, match="have more than 256 ray segments"):
+        sim.simulate(LinearProbe(4, 60, scan_lines=5), rigid(np.eye(3), [0, -30, 0]))
 
 
 def test_a_line_that_leaves_the_volume_goes_on_in_the_coupling_medium():

@@ -11,7 +11,7 @@ from time import perf_counter
 import numpy as np
 
 from SlicerUSSim.Logic.errors import require
-from SlicerUSSim.Logic.figures import draw_views, write_png
+from SlicerUSSim.Logic.figures import draw_views, require_matplotlib, write_png
 from SlicerUSSim.Logic.phantoms import head_mri
 from SlicerUSSim.Logic.placement import craniotomy_pose, slice_under_probe
 from SlicerUSSim.Logic.pose import write_pose
@@ -53,6 +53,7 @@ def run_demo(
     `progress` is told the name of every step as it begins. Returns what demo.json holds.
     Raises SimulationError for anything the caller can mend.
     """
+    require_matplotlib()  # now rather than after the work
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

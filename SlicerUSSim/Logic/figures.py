@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 
 import numpy as np
@@ -32,12 +33,15 @@ def draw_views(
 
     Raises SimulationError without matplotlib and for an unwritable path.
     """
-    figure_class, patches = _matplotlib()
+    require_matplotlib()
+    from matplotlib import patches
+    from matplotlib.figure import Figure
+
     left, right, top, bottom = bounds_mm
     height = 5.0
     width = height * (right - left) / (bottom - top)
     size = (len(views) * (width + 0.35) + 0.5, height + 0.75)
-    figure = figure_class(figsize=size, facecolor=_BACKGROUND, dpi=110, layout="constrained")
+    figure = Figure(figsize=size, facecolor=_BACKGROUND, dpi=110, layout="constrained")
     axes = figure.subplots(1, len(views), squeeze=False)[0]
     for axis, (title, image, kind) in zip(axes, views, strict=True):
         extent = (left, right, bottom, top)
@@ -92,10 +96,7 @@ def _scale_bar(axis, right: float, bottom: float) -> None:
     axis.text(right - 8.0, y - 1.0, "10 mm", color="white", fontsize=7, ha="center", va="bottom", path_effects=outline)
 
 
-def _matplotlib():
-    try:
-        from matplotlib import patches
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise SimulationError('figures need matplotlib; install it with: pip install "SlicerUSSim[demo]"') from None
-    return Figure, patches
+def require_matplotlib() -> None:
+    """Raise SimulationError, saying what to install, if there is no matplotlib."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise SimulationError('figures need matplotlib; install it with: pip install "SlicerUSSim[demo]"')

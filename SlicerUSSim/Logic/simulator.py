@@ -28,6 +28,10 @@ class EmptyViewWarning(UserWarning):
     """The imaged field lies wholly outside the volume; the image is black."""
 
 
+class TreeOverflowWarning(UserWarning):
+    """Scan lines with more ray segments than there is room for lack the speckle of the last ones."""
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One simulated image with its geometry and the signals it was made from."""
@@ -153,6 +157,7 @@ class UltrasoundSimulator:
             iq = self.pulse.download(samples)
             envelope, bmode = self.compressor.download(samples)
             image = self.converter.download()
+            self._warn_if_overflown()
 
         return Frame(
             iq=iq,
@@ -257,6 +262,16 @@ class UltrasoundSimulator:
         size = np.array(self.medium.labels.array.shape[::-1])
         if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
             warnings.warn("the probe looks past the volume: the image is black", EmptyViewWarning, stacklevel=3)
+
+    def _warn_if_overflown(self) -> None:
+        lines, _ = self.tracer.overflow()
+        if lines:
+            warnings.warn(
+                f"{lines} traced lines have more than {CONSTANTS['MAX_SEGMENTS']} ray segments, the last are left out; "
+                "raise reflection_threshold or lower max_ray_depth",
+                TreeOverflowWarning,
+                stacklevel=3,
+            )
 
     @contextmanager
     def _stage(self, name: str, timings: dict[str, float]):
