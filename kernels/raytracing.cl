@@ -430,7 +430,8 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __constant c
       ray.log_attenuation = log_attenuation;
       ray.weight = refracted_weight;
       ray.label = other;
-      ray.blind_until = path + fmax(overshoot, 0.0f);  // until the trilinear border is behind, too
+      // Until the trilinear border is behind, too: at grazing incidence the ray would go on crossing the same border.
+      ray.blind_until = overshoot > 0.0f ? path + overshoot + 0.5f * scene->voxel_mm : path;
     }
   }
   cut[line * (rays + 1) + ray_of_line] = cut_weight;
