@@ -31,6 +31,9 @@ typedef struct {
   int u, v, w, first;
 } Piece;
 
+// The hash counts cells by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
+inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
+
 inline void scatter_batch(__constant const Scene *scene, __global const ushort *voxels, __global const Tissue *tissues,
                           const Piece *piece, const int *cell_u, const uint *row_key, const float *row_v,
                           const float *row_w, int count, float4 *sum) {
@@ -40,7 +43,7 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
   const int nx = scene->dims[0], ny = scene->dims[1];
   const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, scene->dims[2] - 1.001f);
   const int u = piece->u, v = piece->v, w = piece->w;
-  const uint step_u = u == 0 ? 0x9E3779B1u : u == 1 ? 0x85EBCA77u : 0xC2B2AE3Du;
+  const uint step_u = axis_step(u);
   const float3 d = piece->direction, l = piece->lateral, e = piece->elevational;
 
   for (int begin = 0; begin < count; begin += LANES) {
@@ -130,6 +133,80 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
   }
 }
 
+// The scatterers of one piece: finds the lattice cells beside it and computes them in batches. `start` is the segment's
+// start, `low` and `high` are the piece's ends along it, `radius_l` and `radius_e` how far it reaches to either side.
+inline void scatter_piece(__constant const Scene *scene, __global const ushort *voxels, __global const Tissue *tissues,
+                          const Piece *piece, float3 start, float low, float high, float radius_l, float radius_e,
+                          float4 *sum) {
+  int cell_u[BATCH + LANES];
+  uint row_key[BATCH + LANES];
+  float row_v[BATCH + LANES], row_w[BATCH + LANES];
+  const float cell = scene->cell_mm, inverse_cell = 1.0f / cell;
+  const float3 d = piece->direction, l = piece->lateral, e = piece->elevational;
+
+  // The box of lattice cells around this piece, then rows along u clipped by the three slabs that bound it.
+  const float3 near_end = start + low * d, far_end = start + high * d;
+  const float3 reach = radius_l * fabs(l) + radius_e * fabs(e);
+  const float3 box_low = (fmin(near_end, far_end) - reach) * inverse_cell;
+  const float3 box_high = (fmax(near_end, far_end) + reach) * inverse_cell;
+  const int v_low = (int)floor(box_low.y), v_high = (int)floor(box_high.y);
+  const int w_low = (int)floor(box_low.z), w_high = (int)floor(box_high.z);
+  // A scatterer is at most half a cell from its cell's centre along each axis.
+  const float slack_d = 0.5f * cell * (fabs(d.x) + fabs(d.y) + fabs(d.z));
+  const float limit_l = radius_l + 0.5f * cell * (fabs(l.x) + fabs(l.y) + fabs(l.z));
+  const float limit_e = radius_e + 0.5f * cell * (fabs(e.x) + fabs(e.y) + fabs(e.z));
+  const float per_d = inverse_cell / (fabs(d.x) < 1e-5f ? 1e-5f : d.x);
+  const float per_l = inverse_cell / (fabs(l.x) < 1e-5f ? 1e-5f : l.x);
+  const float per_e = inverse_cell / (fabs(e.x) < 1e-5f ? 1e-5f : e.x);
+  const uint step_v = axis_step(piece->v), step_w = axis_step(piece->w);
+
+  // In the plane of v and w the piece is a band along the elevational axis; where that axis is oblique, the band
+  // leaves most of the box empty. Its v at a given w, and how far it reaches on either side:
+  const float along_band = fabs(e.z) < 0.02f ? 0.0f : e.y / e.z;
+  const float middle = 0.5f * (low + high);
+  const float band_v = start.y + middle * d.y - along_band * (start.z + middle * d.z);
+  const float band_reach =
+      fabs(e.z) < 0.02f ? 1e6f
+                        : 0.5f * (high - low) * fabs(d.y - along_band * d.z) + radius_l * fabs(l.y - along_band * l.z);
+
+  int waiting = 0;
+  for (int cw = w_low; cw <= w_high; cw++) {
+    const float v_here = band_v + along_band * cw * cell, v_next = v_here + along_band * cell;
+    const int v_first = max(v_low, (int)floor((fmin(v_here, v_next) - band_reach) * inverse_cell));
+    const int v_last = min(v_high, (int)floor((fmax(v_here, v_next) + band_reach) * inverse_cell));
+    for (int cv = v_first; cv <= v_last; cv++) {
+      const float3 base = (float3)(0.5f * cell, (cv + 0.5f) * cell, (cw + 0.5f) * cell) - start;
+      const float base_d = dot(base, d), base_l = dot(base, l), base_e = dot(base, e);
+      const float d0 = (low - slack_d - base_d) * per_d, d1 = (high + slack_d - base_d) * per_d;
+      const float l0 = (-limit_l - base_l) * per_l, l1 = (limit_l - base_l) * per_l;
+      const float e0 = (-limit_e - base_e) * per_e, e1 = (limit_e - base_e) * per_e;
+      const float from = fmax(fmax(fmin(d0, d1), fmin(l0, l1)), fmax(fmin(e0, e1), box_low.x - 1.0f));
+      const float to = fmin(fmin(fmax(d0, d1), fmax(l0, l1)), fmin(fmax(e0, e1), box_high.x + 1.0f));
+      if (from > to) continue;
+      const int u_low = (int)ceil(from), u_high = (int)floor(to);
+      const uint key = (uint)cv * step_v + (uint)cw * step_w;
+      for (int cu = u_low; cu <= u_high; cu += LANES) {
+        STORE_LANES(cu + LANE_INDEX, cell_u + waiting);
+        STORE_LANES((uintn)(key), row_key + waiting);
+        STORE_LANES((floatn)(cv * cell - start.y), row_v + waiting);
+        STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
+        waiting += min(LANES, u_high - cu + 1);
+        if (waiting >= BATCH) {
+          scatter_batch(scene, voxels, tissues, piece, cell_u, row_key, row_v, row_w, BATCH, sum);
+          waiting -= BATCH;
+          for (int i = 0; i < waiting; i++) {
+            cell_u[i] = cell_u[BATCH + i];
+            row_key[i] = row_key[BATCH + i];
+            row_v[i] = row_v[BATCH + i];
+            row_w[i] = row_w[BATCH + i];
+          }
+        }
+      }
+    }
+  }
+  scatter_batch(scene, voxels, tissues, piece, cell_u, row_key, row_v, row_w, waiting, sum);
+}
+
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
@@ -141,11 +218,6 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
   int first = chunk * CHUNK;
   float4 sum[CHUNK + 2];  // left re, im, right re, im
   for (int i = 0; i < CHUNK + 2; i++) sum[i] = (float4)(0.0f);
-  int cell_u[BATCH + LANES];
-  uint row_key[BATCH + LANES];
-  float row_v[BATCH + LANES], row_w[BATCH + LANES];
-
-  const float cell = scene->cell_mm, inverse_cell = 1.0f / cell;
   const float depth_low = (first - 1) * scene->sample_mm, depth_high = (first + CHUNK) * scene->sample_mm;
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
@@ -203,71 +275,8 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
       piece.gain0 = gain - decay * low + 0.5f * log2(sigma_low.x / sigma_low.y) - log2(apart_low);
       piece.gain1 = gain - decay * high + 0.5f * log2(sigma_high.x / sigma_high.y) - log2(apart_high) - piece.gain0;
 
-      // The box of lattice cells around this piece, then rows along u clipped by the three slabs that bound it.
-      const float radius_l = 0.5f * fmax(apart_low, apart_high);
-      const float radius_e = scene->beam_cutoff * fmax(sigma_low.y, sigma_high.y);
-      const float3 near_end = start + low * d, far_end = start + high * d;
-      const float3 reach = radius_l * fabs(l) + radius_e * fabs(e);
-      const float3 box_low = (fmin(near_end, far_end) - reach) * inverse_cell;
-      const float3 box_high = (fmax(near_end, far_end) + reach) * inverse_cell;
-      const int v_low = (int)floor(box_low.y), v_high = (int)floor(box_high.y);
-      const int w_low = (int)floor(box_low.z), w_high = (int)floor(box_high.z);
-      // A scatterer is at most half a cell from its cell's centre along each axis.
-      const float slack_d = 0.5f * cell * (fabs(d.x) + fabs(d.y) + fabs(d.z));
-      const float limit_l = radius_l + 0.5f * cell * (fabs(l.x) + fabs(l.y) + fabs(l.z));
-      const float limit_e = radius_e + 0.5f * cell * (fabs(e.x) + fabs(e.y) + fabs(e.z));
-      const float per_d = inverse_cell / (fabs(d.x) < 1e-5f ? 1e-5f : d.x);
-      const float per_l = inverse_cell / (fabs(l.x) < 1e-5f ? 1e-5f : l.x);
-      const float per_e = inverse_cell / (fabs(e.x) < 1e-5f ? 1e-5f : e.x);
-      // The hash counts cells by lattice axis, not by u, v, w: the same scatterer from every direction.
-      const uint step_v = v == 0 ? 0x9E3779B1u : v == 1 ? 0x85EBCA77u : 0xC2B2AE3Du;
-      const uint step_w = w == 0 ? 0x9E3779B1u : w == 1 ? 0x85EBCA77u : 0xC2B2AE3Du;
-
-      // In the plane of v and w the piece is a band along the elevational axis; where that axis is oblique, the band
-      // leaves most of the box empty. Its v at a given w, and how far it reaches on either side:
-      const float along_band = fabs(e.z) < 0.02f ? 0.0f : e.y / e.z;
-      const float middle = 0.5f * (low + high);
-      const float band_v = start.y + middle * d.y - along_band * (start.z + middle * d.z);
-      const float band_reach = fabs(e.z) < 0.02f ? 1e6f
-                                                 : 0.5f * (high - low) * fabs(d.y - along_band * d.z) +
-                                                       radius_l * fabs(l.y - along_band * l.z);
-
-      int waiting = 0;
-      for (int cw = w_low; cw <= w_high; cw++) {
-        const float v_here = band_v + along_band * cw * cell, v_next = v_here + along_band * cell;
-        const int v_first = max(v_low, (int)floor((fmin(v_here, v_next) - band_reach) * inverse_cell));
-        const int v_last = min(v_high, (int)floor((fmax(v_here, v_next) + band_reach) * inverse_cell));
-        for (int cv = v_first; cv <= v_last; cv++) {
-          const float3 base = (float3)(0.5f * cell, (cv + 0.5f) * cell, (cw + 0.5f) * cell) - start;
-          const float base_d = dot(base, d), base_l = dot(base, l), base_e = dot(base, e);
-          const float d0 = (low - slack_d - base_d) * per_d, d1 = (high + slack_d - base_d) * per_d;
-          const float l0 = (-limit_l - base_l) * per_l, l1 = (limit_l - base_l) * per_l;
-          const float e0 = (-limit_e - base_e) * per_e, e1 = (limit_e - base_e) * per_e;
-          const float from = fmax(fmax(fmin(d0, d1), fmin(l0, l1)), fmax(fmin(e0, e1), box_low.x - 1.0f));
-          const float to = fmin(fmin(fmax(d0, d1), fmax(l0, l1)), fmin(fmax(e0, e1), box_high.x + 1.0f));
-          if (from > to) continue;
-          const int u_low = (int)ceil(from), u_high = (int)floor(to);
-          const uint key = (uint)cv * step_v + (uint)cw * step_w;
-          for (int cu = u_low; cu <= u_high; cu += LANES) {
-            STORE_LANES(cu + LANE_INDEX, cell_u + waiting);
-            STORE_LANES((uintn)(key), row_key + waiting);
-            STORE_LANES((floatn)(cv * cell - start.y), row_v + waiting);
-            STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
-            waiting += min(LANES, u_high - cu + 1);
-            if (waiting >= BATCH) {
-              scatter_batch(scene, voxels, tissues, &piece, cell_u, row_key, row_v, row_w, BATCH, sum);
-              waiting -= BATCH;
-              for (int i = 0; i < waiting; i++) {
-                cell_u[i] = cell_u[BATCH + i];
-                row_key[i] = row_key[BATCH + i];
-                row_v[i] = row_v[BATCH + i];
-                row_w[i] = row_w[BATCH + i];
-              }
-            }
-          }
-        }
-      }
-      scatter_batch(scene, voxels, tissues, &piece, cell_u, row_key, row_v, row_w, waiting, sum);
+      scatter_piece(scene, voxels, tissues, &piece, start, low, high, 0.5f * fmax(apart_low, apart_high),
+                    scene->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum);
     }
   }
   int left = 2 * line * stride + LINE_PAD + first, right = left + stride;
