@@ -165,3 +165,35 @@ def test_scatterers_can_be_as_dense_as_the_papers():
     assert np.mean([level_db(f.iq) for f in frames]) == pytest.approx(
         10 * np.log10(SPECKLE.scatterer_variance), abs=1.2
     )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_scatterer_is_in_the_same_place_seen_from_the_front_and_from_the_side(seed):
+    """Sparse scatterers, two probes at right angles: the lattice is enumerated along other axes, the patient stays."""
+    tissue = replace(SPECKLE, mu0=0.0, sigma0=1.0)
+    sim = simulator(SOLID, tissue, seed=seed, scatterers_per_mm3=0.1)
+    probe = LinearProbe(20, 40, scan_lines=101, focus_mm=20, elevation_focus_mm=20)
+
+    def seen(rotation, centre):
+        """Amplitudes of the frame that looks along the rotation's second column at `centre`, 20 mm deep."""
+        pose = np.eye(4)
+        pose[:3, :3] = rotation
+        pose[:3, 3] = centre - 20.0 * rotation[:, 1]
+        frame = sim.simulate(probe, pose)
+        return np.abs(frame.iq), frame.sample_interval_mm
+
+    front = np.eye(3)
+    heights = np.arange(-2.0, 2.01, 0.2)
+    stack = np.stack([seen(front, np.array([0.0, 0.0, z]))[0][30:71, 400:640] for z in heights])
+    n, line, sample = np.unravel_index(np.argmax(stack), stack.shape)
+    dz = seen(front, np.zeros(3))[1]
+    place = np.array([(line + 30 - 50) * 0.2, (sample + 400) * dz - 20.0, heights[n]])
+    strength = stack.max()
+
+    side = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # lateral z, depth x, elevational y
+    amplitude, dz = seen(side, place)
+    near = amplitude[47:54, int(19.6 / dz) : int(20.4 / dz)]
+    assert near.max() > 0.7 * strength
+    found_line, found_sample = np.unravel_index(np.argmax(near), near.shape)
+    assert abs(found_line - 3) <= 2  # 0.2 mm a line; the beam is wider
+    assert abs((found_sample + int(19.6 / dz)) * dz - 20.0) < 0.25
