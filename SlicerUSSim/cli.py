@@ -25,6 +25,12 @@ class _Commands(click.Group):
         except MemoryError:
             click.echo("ussim: not enough memory; use a smaller or coarser volume", err=True)
             ctx.exit(2)
+        except Exception as error:
+            if not type(error).__module__.startswith("pyopencl"):
+                raise
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            click.echo(f"ussim: the OpenCL device failed ({reason}); choose another with --device", err=True)
+            ctx.exit(2)
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -82,7 +88,7 @@ def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -
     times = summary["milliseconds"]
     click.echo(f"device: {summary['device']}")
     click.echo(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")
-    click.echo(f"wrote {out / 'figure.png'} and seven more files beside it")
+    click.echo(f"wrote {out / 'figure.png'} and eight more files beside it")
 
 
 @main.command()

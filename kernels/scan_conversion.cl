@@ -4,6 +4,16 @@
 // since lines are little denser than the beam is wide and linear interpolation shows as spokes in the far field.
 // Buffers: grey uchar [scan line][samples]; image uchar [row][column], 0 outside the field.
 
+// atan(x / y) for y > 0, to 2e-6 rad: a thousandth of the spacing of scan lines.
+inline float angle_of(float x, float y) {
+  float small = fmin(fabs(x), y), large = fmax(fabs(x), y);
+  float t = small / large, t2 = t * t;
+  float a = t * (0.99997726f +
+                 t2 * (-0.33262347f + t2 * (0.19354346f + t2 * (-0.11643287f + t2 * (0.05265332f - t2 * 0.0117212f)))));
+  a = fabs(x) > y ? 1.57079633f - a : a;
+  return x < 0.0f ? -a : a;
+}
+
 inline float sample_at(__global const uchar *grey, int line, int scan_lines, int samples, int bin, float part) {
   __global const uchar *at = grey + clamp(line, 0, scan_lines - 1) * samples + bin;
   return mix((float)at[0], (float)at[1], part);
@@ -19,8 +29,8 @@ __kernel void scan_convert(__constant const Scene *scene, __global const uchar *
     depth = y;
   } else {
     float from_apex = y + scene->apex_radius_mm;
-    lateral = atan2(x, from_apex);
     depth = sqrt(x * x + from_apex * from_apex) - scene->apex_radius_mm;
+    lateral = from_apex > 0.0f ? angle_of(x, from_apex) : 1e9f;  // the field opens to less than 180 degrees
   }
   float place = (lateral - scene->first_line) / scene->line_spacing, sample = depth / scene->sample_mm;
   int here = row * get_global_size(0) + column;

@@ -221,6 +221,18 @@ def test_a_mistake_is_one_line_and_writes_nothing(number, head, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_a_device_that_fails_is_one_line_too(labels, tmp_path, monkeypatch):
+    import pyopencl
+
+    def fail(*_):
+        raise pyopencl.MemoryError("clEnqueueNDRangeKernel", -4)
+
+    monkeypatch.setattr("SlicerUSSim.Logic.raytracing.RayTracer.run", fail)
+    result = ussim("simulate", labels, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert result.exit_code == 2 and "the OpenCL device failed" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_pose_past_the_volume_is_a_warning_and_a_black_image(labels, tmp_path):
     pose = np.eye(4)
     pose[:3, 3] = [500, 0, 0]

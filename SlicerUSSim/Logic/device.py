@@ -69,10 +69,10 @@ def _register_pip_runtimes() -> None:
             libraries[f"ussim-{name}.icd"] = str(library)
     if "ussim-intel.icd" not in libraries:
         return  # without Intel's wheel the loader finds everything by itself
-    for vendor in Path("/etc/OpenCL/vendors").glob("*.icd"):
-        libraries[vendor.name] = vendor.read_text().strip()
     folder = Path(platformdirs.user_cache_dir("ussim")) / "vendors" / f"{zlib.crc32(sys.prefix.encode()):08x}"
     try:
+        for vendor in Path("/etc/OpenCL/vendors").glob("*.icd"):
+            libraries[vendor.name] = vendor.read_text().strip()
         folder.mkdir(parents=True, exist_ok=True)
         for stale in folder.glob("*.icd"):
             if stale.name not in libraries:
@@ -119,11 +119,8 @@ def list_devices() -> list[DeviceInfo]:
         for device_index, handle in enumerate(handles):
             device = _describe(cl, f"{platform_index}:{device_index}", cl_platform, handle)
             # A runtime registered twice (its wheel and a vendors folder) would be listed twice.
-            if not any(
-                (device.platform, device.name) == (known.platform, known.name)
-                for known in devices
-                if device.kind == "CPU"
-            ):
+            names = {(known.platform, known.name) for known in devices if known.kind == "CPU"}
+            if (device.platform, device.name) not in names:
                 devices.append(device)
     return sorted(devices, key=lambda device: device.rank)
 
