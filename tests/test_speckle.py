@@ -85,6 +85,15 @@ def test_curved_probes_have_the_same_level_and_lateral_correlation_at_every_dept
     np.testing.assert_allclose(np.mean(levels, axis=0), 10 * np.log10(SPECKLE.scatterer_variance), atol=0.6)
 
 
+def test_lines_far_apart_see_as_much_as_lines_close_together():
+    """Twelve millimetres between scan lines: enough lines are traced between them to fill every beam."""
+    sparse = LinearProbe(48, 40, scan_lines=5, focus_mm=25, elevation_focus_mm=25)
+    levels = [
+        level_db(simulator(SOLID, SPECKLE, seed=s).simulate(sparse, rigid(np.eye(3), [0, -20, 0])).iq) for s in range(8)
+    ]
+    assert np.mean(levels) == pytest.approx(10 * np.log10(SPECKLE.scatterer_variance), abs=0.6)
+
+
 @pytest.mark.parametrize("name", ["grey matter", "white matter", "leptomeninges", "liver"])
 def test_level_is_the_variance_of_the_scatterers(name):
     """PHYSICS section 4: Var = p (1 - p) mu0^2 + p sigma0^2 alone sets the echogenicity; also with a rare mu1."""

@@ -59,7 +59,7 @@ class SimulationSettings:
         require_between(owner, "scatterers_per_mm3", self.scatterers_per_mm3, 0.1, 10000)
         require_between(owner, "beam_cutoff", self.beam_cutoff, 0.5, 6)
         require_between(owner, "elevational_rays", self.elevational_rays, 1, 32)
-        require_between(owner, "lateral_rays", self.lateral_rays, 0, 9)
+        require_between(owner, "lateral_rays", self.lateral_rays, 0, 128)
         require_between(owner, "interface_gain_db", self.interface_gain_db, -100, 100)
         require_between(owner, "specular_exponent", self.specular_exponent, 0, 100)
         require_between(owner, "samples_per_cycle", self.samples_per_cycle, 3, 16)

@@ -301,6 +301,6 @@ def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, 
     depth = np.linspace(0.0, probe.depth_mm, 65)
     apart = probe.line_spacing * (np.ones_like(depth) if probe.is_linear else depth + probe.apex_radius_mm)
     sigmas = apart / probe.beam_sigma_mm(depth)[0]
-    lateral = settings.lateral_rays or int(min(np.ceil(sigmas.max() / 1.5), 9))
+    lateral = settings.lateral_rays or int(min(np.ceil(sigmas.max() / 1.5), 128))
     deep = sigmas[depth >= 0.1 * probe.depth_mm]
     return lateral, int(min(np.ceil(settings.beam_cutoff * lateral / deep.min()), 16 * lateral))
