@@ -142,6 +142,20 @@ def test_rf_is_the_carrier_times_the_baseband(solid):
     assert mean * 1.54 / 2 == pytest.approx(5.0, rel=0.03)  # MHz
 
 
+@pytest.mark.parametrize("bandwidth, samples_per_cycle", [(0.5, 4), (0.05, 4), (0.1, 8), (0.5, 16), (0.05, 16)])
+def test_the_pulse_is_whole_at_every_bandwidth_and_sampling_rate(bandwidth, samples_per_cycle):
+    """A point-like echo is the Gaussian envelope of axial_sigma_mm, not a piece of it."""
+    wall = block(lambda x, y, z: y > 0)
+    probe = LinearProbe(4, 45, scan_lines=9, fractional_bandwidth=bandwidth)
+    sim = simulator(wall, Tissue("wall", 1540.0, 1.8, 0.0), scattering=False, samples_per_cycle=samples_per_cycle)
+    frame = sim.simulate(probe, rigid(np.eye(3), [0, -22, 0]))
+    envelope = np.abs(frame.iq[4])
+    depth = np.arange(envelope.size) * frame.sample_interval_mm
+    centre = np.average(depth, weights=envelope)
+    width = np.sqrt(np.average((depth - centre) ** 2, weights=envelope))
+    assert width == pytest.approx(probe.axial_sigma_mm, rel=0.03)
+
+
 def test_frames_go_to_vtk_with_their_place_in_the_patient(solid):
     pose = rigid(ORIENTATIONS["oblique"], [0, -25, 0])
     frame = solid.simulate(PROBES["convex"], pose)

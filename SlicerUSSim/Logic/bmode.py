@@ -91,6 +91,7 @@ def _pulse_taps(sigma: float) -> np.ndarray:
     average; the taps are narrower by that much so that the whole has the width asked for.
     """
     narrowed = np.sqrt(max(sigma**2 - 1.0 / 6.0, 0.25))
-    reach = min(int(np.ceil(3.7 * narrowed)), CONSTANTS["LINE_PAD"])
+    reach = int(np.ceil(3.7 * narrowed))
+    assert reach <= CONSTANTS["LINE_PAD"], "the bounds of Probe and SimulationSettings keep every pulse within the pad"
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / narrowed) ** 2)
     return (taps * sigma / narrowed).astype(np.float32)

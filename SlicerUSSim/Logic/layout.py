@@ -18,7 +18,7 @@ CONSTANTS = {
     "MAX_HITS": 96,  # per traced ray
     "MAX_STACK": 24,  # reflected rays waiting to be followed
     "CHUNK": 64,  # samples one work-item of the scatter kernel owns
-    "LINE_PAD": 32,  # zeros on either side of a line, so that the pulse filter needs no bounds
+    "LINE_PAD": 448,  # zeros on either side of a line: the longest pulse filter (bandwidth 0.05, 16 samples per cycle)
 }
 
 _FLOAT, _INT, _UINT = np.float32, np.int32, np.uint32
