@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim import __version__
-from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.errors import SimulationError
 
 
 class _Commands(click.Group):
@@ -115,7 +115,7 @@ def segment(mri, out, contrast, classes, mask, radius, bias_correction, thin_sul
     from SlicerUSSim.Logic.tissues import TissueTable
     from SlicerUSSim.Logic.volume import Volume
 
-    _check_volume_name(out)
+    _check_output(out)
     volume = Volume.read(mri)
     with _share() as progress:
         result = segment_mri(
@@ -171,7 +171,6 @@ def simulate(
     device,
 ) -> None:
     """One B-mode image from an MRI or a label map at a given pose."""
-    _check_image_name(out)
     from SlicerUSSim.Logic.demo import PROBES
     from SlicerUSSim.Logic.figures import write_png
     from SlicerUSSim.Logic.placement import craniotomy_pose
@@ -183,6 +182,7 @@ def simulate(
     from SlicerUSSim.Logic.tissues import TissueTable, read_json
     from SlicerUSSim.Logic.volume import Volume
 
+    _check_output(out, png=True)
     display = DisplaySettings(gain_db=gain, dynamic_range_db=dynamic_range, tgc_db_cm_mhz=tgc)
     settings = SimulationSettings(seed=seed)
     probe = probe_from_dict(read_json(probe_file), str(probe_file)) if probe_file else PROBES["phased"]
@@ -244,21 +244,13 @@ def _tissue_file(labels: Path) -> Path:
     return labels.with_name(name + ".json")
 
 
-def _check_volume_name(out: Path) -> None:
-    from SlicerUSSim.Logic.volume import WRITABLE_SUFFIXES
+def _check_output(out: Path, png: bool = False) -> None:
+    """Refuse an output that cannot be written now rather than after the work."""
+    from SlicerUSSim.Logic.volume import require_image_name, require_place
 
-    require(
-        out.name.lower().endswith(WRITABLE_SUFFIXES),
-        f"{out}: unknown image format, expected a name ending in one of {', '.join(WRITABLE_SUFFIXES)}",
-    )
-    require(out.parent.is_dir(), f"{out}: the folder {out.parent} does not exist")
-
-
-def _check_image_name(out: Path) -> None:
-    if out.suffix.lower() == ".png":
-        require(out.parent.is_dir(), f"{out}: the folder {out.parent} does not exist")
-    else:
-        _check_volume_name(out)
+    if not (png and out.suffix.lower() == ".png"):
+        require_image_name(out)
+    require_place(out)
 
 
 class _steps:  # noqa: N801

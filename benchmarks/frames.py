@@ -51,10 +51,10 @@ def main() -> None:
     for info in list_devices():
         print(f"\n{info}")
         results[str(info)] = measured = {}
-        times = [timed(lambda info=info: segment_mri(mri, device=info))[0] for _ in range(3)]
+        runs = [timed(lambda info=info: segment_mri(mri, device=info)) for _ in range(3)]
+        times, segmentation = [milliseconds for milliseconds, _ in runs], runs[-1][1]
         measured["segmentation"] = best_and_median(times)
         print(f"  segmentation            {show(times)}")
-        segmentation = segment_mri(mri, device=info)
         simulator = UltrasoundSimulator(segmentation.labels, TissueTable.brain(segmentation.tissue_names), device=info)
         for name, probe in PROBES.items():
             pose = craniotomy_pose(segmentation.labels, probe)

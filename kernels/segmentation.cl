@@ -5,8 +5,8 @@
 
 // Sums over 2 radius + 1 neighbours along j (axis 1) or k (axis 2). One work-item computes LANES columns;
 // global size (row / LANES, other axis).
-__kernel void box_sum_across(__global const float *from, __global float *to, int row, int count, int stride,
-                             int other_stride, int radius) {
+__kernel void box_sum_across(__global const float *from, __global float *to, int count, int stride, int other_stride,
+                             int radius) {
   int start = get_global_id(0) * LANES + get_global_id(1) * other_stride;
   floatn sum = 0.0f;
   for (int n = 0; n < min(radius, count); n++) sum += LOAD_LANES(from + start + n * stride);

@@ -10,7 +10,6 @@ import pytest
 
 from SlicerUSSim.Logic import LinearProbe, SimulationError, UltrasoundSimulator, list_devices
 from SlicerUSSim.Logic.device import Device, DeviceInfo, choose_device, faster_hint, kernel_folder
-from SlicerUSSim.Logic.layout import shared_source
 from tests.conftest import SPECKLE, block, rigid, simulator
 
 
@@ -73,8 +72,8 @@ def test_only_a_slow_device_gets_a_hint():
 def test_kernels_are_built_once_and_cached():
     device = Device.get()
     assert Device.get() is device
-    first = device.kernels("scan_conversion.cl", shared_source(), LANES=1)
-    assert device.kernels("scan_conversion.cl", shared_source(), LANES=1) is first
+    first = device.kernels("scan_conversion.cl")
+    assert device.kernels("scan_conversion.cl") is first
 
 
 def test_a_kernel_that_does_not_build_is_one_line(tmp_path, monkeypatch):
@@ -82,7 +81,7 @@ def test_a_kernel_that_does_not_build_is_one_line(tmp_path, monkeypatch):
     (tmp_path / "broken.cl").write_text("__kernel void broken() { this is not C; }")
     monkeypatch.setattr("SlicerUSSim.Logic.device.kernel_folder", lambda: tmp_path)
     with pytest.raises(SimulationError, match=r"cannot build broken\.cl") as caught:
-        Device.get().kernels("broken.cl", shared_source(), LANES=1)
+        Device.get().kernels("broken.cl")
     assert "\n" not in str(caught.value)
 
 

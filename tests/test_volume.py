@@ -31,18 +31,11 @@ def numbered(shape=(3, 4, 5)) -> np.ndarray:
     return np.arange(np.prod(shape), dtype=np.int16).reshape(shape)
 
 
-@given(geometries())
-def test_geometry_survives_vtk(matrix):
+@pytest.mark.parametrize("kind", ["vtk", "sitk"])
+@given(matrix=geometries())
+def test_geometry_survives_vtk_and_itk(kind, matrix):
     volume = Volume(numbered(), matrix)
-    back = Volume.from_vtk(volume.to_vtk())
-    np.testing.assert_array_equal(back.array, volume.array)
-    np.testing.assert_allclose(back.ijk_to_ras, matrix, atol=1e-6)
-
-
-@given(geometries())
-def test_geometry_survives_itk(matrix):
-    volume = Volume(numbered(), matrix)
-    back = Volume.from_sitk(volume.to_sitk())
+    back = Volume.from_vtk(volume.to_vtk()) if kind == "vtk" else Volume.from_sitk(volume.to_sitk())
     np.testing.assert_array_equal(back.array, volume.array)
     np.testing.assert_allclose(back.ijk_to_ras, matrix, atol=1e-6)
 

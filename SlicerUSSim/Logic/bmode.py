@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from SlicerUSSim.Logic.device import Device, Workspace
-from SlicerUSSim.Logic.layout import CONSTANTS, shared_source
+from SlicerUSSim.Logic.layout import CONSTANTS
 from SlicerUSSim.Logic.scattering import EchoLines
 from SlicerUSSim.Logic.settings import FULL_SCALE_DB, DisplaySettings
 
@@ -15,7 +15,7 @@ class PulseFilter:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self.kernel = device.kernels("bmode.cl", shared_source(), LANES=device.lanes)["convolve_pulse"]
+        self.kernel = device.kernels("bmode.cl", device.lanes)["convolve_pulse"]
         self.workspace = Workspace(device)
         self._sigma: float | None = None
 
@@ -51,7 +51,7 @@ class Compressor:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self.kernel = device.kernels("bmode.cl", shared_source(), LANES=device.lanes)["compress"]
+        self.kernel = device.kernels("bmode.cl", device.lanes)["compress"]
         self.workspace = Workspace(device)
 
     def run(self, scene: np.ndarray, display: DisplaySettings, signal: PulseFilter) -> None:

@@ -10,7 +10,7 @@ from time import perf_counter
 
 import numpy as np
 
-from SlicerUSSim.Logic.errors import require
+from SlicerUSSim.Logic.errors import SimulationError
 from SlicerUSSim.Logic.figures import draw_views, require_matplotlib, write_png
 from SlicerUSSim.Logic.phantoms import head_mri
 from SlicerUSSim.Logic.placement import craniotomy_pose, slice_under_probe
@@ -57,7 +57,7 @@ def run_demo(
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        require(False, f"{out}: cannot be made ({error.strerror})")
+        raise SimulationError(f"{out}: cannot be made ({error.strerror})") from None
     timings: dict[str, float] = {}
 
     progress("segment the MRI")

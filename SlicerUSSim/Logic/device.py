@@ -20,6 +20,7 @@ import numpy as np
 import platformdirs
 
 from SlicerUSSim.Logic.errors import SimulationError
+from SlicerUSSim.Logic.layout import shared_source
 
 INTEL_HINT = 'pip install "SlicerUSSim[intel]"'
 
@@ -220,7 +221,7 @@ class Device:
         self.lanes = _vector_lanes(info)
         self.profiling = False
         self._events: list[tuple[str, object]] = []
-        self._kernels: dict[tuple, dict[str, object]] = {}
+        self._kernels: dict[tuple[str, int], dict[str, object]] = {}
 
     @staticmethod
     def get(device: str | DeviceInfo | Device | None = None) -> Device:
@@ -229,19 +230,15 @@ class Device:
             return device
         return _open_device(choose_device(device)[0])
 
-    def kernels(self, file_name: str, struct_source: str = "", **defines) -> dict[str, object]:
-        """The kernels of kernels/`file_name`, built once with the given preprocessor definitions.
-
-        `struct_source` is C text put in front of the file: the structs shared with the host.
-        """
-        key = (file_name, struct_source, tuple(sorted(defines.items())))
+    def kernels(self, file_name: str, lanes: int = 1) -> dict[str, object]:
+        """The kernels of kernels/`file_name`, built once; each work-item computes `lanes` values side by side."""
+        key = (file_name, lanes)
         if key not in self._kernels:
             folder = kernel_folder()
-            source = "\n".join([struct_source, (folder / "common.clh").read_text(), (folder / file_name).read_text()])
-            options = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros"]
+            source = "\n".join([shared_source(), (folder / "common.clh").read_text(), (folder / file_name).read_text()])
+            options = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros", f"-DLANES={lanes}"]
             if self.lanes > 1 and "Intel" in self.info.platform:
                 options.append("-DNO_IMPLICIT_VECTORS")
-            options += [f"-D{name}={value}" for name, value in defines.items()]
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", self.cl.CompilerWarning)  # runtimes report success at length

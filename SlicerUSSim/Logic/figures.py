@@ -58,10 +58,9 @@ def draw_views(
                 handles=handles, loc="lower left", fontsize=7, framealpha=0.6, facecolor=_BACKGROUND, labelcolor=_INK
             )
         else:
-            top_value = (
-                255.0 if kind == "bmode" else float(np.percentile(image[image > 0], 99.8)) if (image > 0).any() else 1.0
-            )
-            axis.imshow(image, cmap="gray", vmin=0, vmax=top_value, extent=extent, interpolation="bilinear")
+            tissue = image[image > 0]
+            white = float(np.percentile(tissue, 99.8)) if kind == "mri" and tissue.size else 255.0
+            axis.imshow(image, cmap="gray", vmin=0, vmax=white, extent=extent, interpolation="bilinear")
         if kind != "bmode":
             outline = probe.outline_mm()
             axis.plot(outline[:, 0], outline[:, 1], color=_FAN, linewidth=1.2)
@@ -88,9 +87,9 @@ def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
 
 
 def _scale_bar(axis, right: float, bottom: float) -> None:
-    y = bottom - 0.04 * bottom
     from matplotlib.patheffects import withStroke
 
+    y = 0.96 * bottom
     outline = [withStroke(linewidth=4.5, foreground="black")]  # readable on bright tissue too
     axis.plot([right - 13.0, right - 3.0], [y, y], color="white", linewidth=2.5, path_effects=outline)
     axis.text(right - 8.0, y - 1.0, "10 mm", color="white", fontsize=7, ha="center", va="bottom", path_effects=outline)

@@ -15,7 +15,7 @@ from scipy import ndimage, special
 from SlicerUSSim.Logic.device import Device
 from SlicerUSSim.Logic.errors import SimulationError, require
 from SlicerUSSim.Logic.layout import CONSTANTS, TISSUE
-from SlicerUSSim.Logic.tissues import MAX_LABEL, TissueTable
+from SlicerUSSim.Logic.tissues import MAX_LABEL, Membrane, TissueTable
 from SlicerUSSim.Logic.volume import Volume
 
 _FARTHEST_SIGMAS = 2.2  # where the stored distance ends
@@ -84,7 +84,7 @@ class Medium:
         membrane = tissues.membrane
         if membrane is None or membrane.thickness_mm == 0:
             return None, -1.0
-        fluids = [label for label, tissue in tissues.items() if tissue.name in membrane.fluids]
+        fluids = _fluid_labels(tissues, membrane)
         is_fluid = np.isin(np.arange(256), fluids)[padded]
         if is_fluid.all() or not is_fluid.any():
             return None, -1.0
@@ -162,5 +162,8 @@ def _membrane_shape(tissues: TissueTable) -> tuple | None:
     membrane = tissues.membrane
     if membrane is None:
         return None
-    fluids = tuple(label for label, tissue in tissues.items() if tissue.name in membrane.fluids)
-    return membrane.thickness_mm, fluids
+    return membrane.thickness_mm, _fluid_labels(tissues, membrane)
+
+
+def _fluid_labels(tissues: TissueTable, membrane: Membrane) -> tuple[int, ...]:
+    return tuple(label for label, tissue in tissues.items() if tissue.name in membrane.fluids)

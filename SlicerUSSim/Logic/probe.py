@@ -154,15 +154,16 @@ class Probe:
         """(lateral, elevational) standard deviation of the two-way beam amplitude at `depth_mm` along a scan line."""
         depth = np.asarray(depth_mm, dtype=float)
         transmit = self._gaussian_beam(depth, *self.transmit_waist())
-        receive = self.receive_sigma_mm(depth)
+        least, slope = self.receive_beam()
+        receive = np.maximum(least, slope * depth)
         lateral = transmit * receive / np.hypot(transmit, receive)
         elevational = self._gaussian_beam(depth, *self.elevation_waist()) / np.sqrt(2.0)
         return lateral, elevational
 
-    def receive_sigma_mm(self, depth_mm) -> np.ndarray:
-        """One-way lateral standard deviation of the receive beam, focused at every depth."""
-        f_number = np.maximum(self.receive_f_number, np.asarray(depth_mm, dtype=float) / self.aperture_mm)
-        return MAIN_LOBE * self.wavelength_mm * f_number / FWHM_PER_SIGMA
+    def receive_beam(self) -> tuple[float, float]:
+        """(least sigma in mm, sigma per mm of depth) of the one-way lateral receive beam, focused at every depth."""
+        per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
+        return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
 
     def transmit_waist(self) -> tuple[float, float, float]:
         """(sigma at the focus, focus, Rayleigh length) of the one-way lateral transmit beam, millimetres."""

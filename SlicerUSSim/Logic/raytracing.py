@@ -9,7 +9,7 @@ from statistics import NormalDist
 import numpy as np
 
 from SlicerUSSim.Logic.device import Device, Workspace
-from SlicerUSSim.Logic.layout import CONSTANTS, HIT, SEGMENT, shared_source
+from SlicerUSSim.Logic.layout import CONSTANTS, HIT, SEGMENT
 from SlicerUSSim.Logic.medium import Medium
 
 
@@ -38,7 +38,7 @@ class RayTracer:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self.kernel = device.kernels("raytracing.cl", shared_source(), LANES=1)["trace"]
+        self.kernel = device.kernels("raytracing.cl")["trace"]
         self.workspace = Workspace(device)
         self._quantile_key: tuple | None = None
 
@@ -90,12 +90,10 @@ class RayTracer:
             cut_weight=self.device.download(self.cut, (traced, rays + 1), np.float32),
         )
 
-    def overflow(self) -> tuple[int, int]:
-        """How many traced lines and elevational rays had more segments or hits than there is room for."""
-        traced, rays = self.shape
-        counts = self.device.download(self.segment_counts, traced, np.int32)
-        hit_counts = self.device.download(self.hit_counts, traced * rays, np.int32)
-        return int((counts > CONSTANTS["MAX_SEGMENTS"]).sum()), int((hit_counts > CONSTANTS["MAX_HITS"]).sum())
+    def overflown_lines(self) -> int:
+        """How many traced lines had more segments than there is room for."""
+        counts = self.device.download(self.segment_counts, self.shape[0], np.int32)
+        return int((counts > CONSTANTS["MAX_SEGMENTS"]).sum())
 
 
 @lru_cache(maxsize=16)

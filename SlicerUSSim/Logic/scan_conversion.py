@@ -8,7 +8,6 @@ import numpy as np
 
 from SlicerUSSim.Logic.bmode import Compressor
 from SlicerUSSim.Logic.device import Device, Workspace
-from SlicerUSSim.Logic.layout import shared_source
 from SlicerUSSim.Logic.probe import Probe
 
 _DEFAULT_ROWS = 512
@@ -53,8 +52,8 @@ class ScanConverter:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self.average = device.kernels("bmode.cl", shared_source(), LANES=device.lanes)["average_depth"]
-        self.convert = device.kernels("scan_conversion.cl", shared_source(), LANES=1)["scan_convert"]
+        self.average = device.kernels("bmode.cl", device.lanes)["average_depth"]
+        self.convert = device.kernels("scan_conversion.cl")["scan_convert"]
         self.workspace = Workspace(device)
 
     def run(self, scene_buffer, scene: np.ndarray, grid: ImageGrid, lines: Compressor) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from SlicerUSSim.Logic.device import Device, Workspace
-from SlicerUSSim.Logic.layout import CONSTANTS, shared_source
+from SlicerUSSim.Logic.layout import CONSTANTS
 from SlicerUSSim.Logic.medium import Medium
 from SlicerUSSim.Logic.raytracing import RayTracer
 
@@ -38,7 +38,7 @@ class Scatterers:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self.kernel = device.kernels("scattering.cl", shared_source(), LANES=device.lanes)["scatter"]
+        self.kernel = device.kernels("scattering.cl", device.lanes)["scatter"]
 
     def run(self, scene_buffer, scene: np.ndarray, medium: Medium, tree: RayTracer, lines: EchoLines) -> None:
         """Enqueue the speckle of one frame; it overwrites `lines`."""
@@ -62,7 +62,7 @@ class InterfaceEchoes:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self.kernel = device.kernels("interfaces.cl", shared_source(), LANES=1)["interface_echoes"]
+        self.kernel = device.kernels("interfaces.cl")["interface_echoes"]
 
     def run(self, scene_buffer, scene: np.ndarray, tree: RayTracer, lines: EchoLines) -> None:
         """Enqueue the interface echoes of one frame; they are added to `lines`."""
@@ -83,7 +83,7 @@ class LateralBeam:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self.kernel = device.kernels("beam.cl", shared_source(), LANES=device.lanes)["lateral_beam"]
+        self.kernel = device.kernels("beam.cl", device.lanes)["lateral_beam"]
 
     def run(self, scene_buffer, scene: np.ndarray, traced: EchoLines, scanned: EchoLines) -> None:
         """Enqueue the lateral convolution of one frame; it overwrites `scanned`."""

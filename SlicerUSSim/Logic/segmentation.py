@@ -11,7 +11,6 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.device import Device
 from SlicerUSSim.Logic.errors import require, require_between
-from SlicerUSSim.Logic.layout import shared_source
 from SlicerUSSim.Logic.volume import Volume
 
 #: Tissue names per contrast and number of classes, in the order of intensity.
@@ -152,7 +151,7 @@ def guided_filter(
         return np.where(mask, image, 0).astype(np.float32)
     device = Device.get(device)
     lanes = device.lanes
-    kernels = device.kernels("segmentation.cl", shared_source(), LANES=lanes)
+    kernels = device.kernels("segmentation.cl", lanes)
     depth, height, width = image.shape
     row = -(-width // lanes) * lanes
     shape = (depth, height, row)
@@ -170,22 +169,15 @@ def guided_filter(
     count, first, second, spare, spare2 = (device.empty(nbytes) for _ in range(5))
     whole = (int(np.prod(shape)) // lanes,)
 
-    def box_sum(source, target) -> None:
-        device.run(kernels["box_sum_along"], (depth * height,), source, target, np.int32(row), np.int32(radius))
-        for count_, stride, other, extent in ((height, row, height * row, depth), (depth, height * row, row, height)):
-            source, target = target, (spare2 if target is not spare2 else spare)
-            device.run(
-                kernels["box_sum_across"],
-                (row // lanes, extent),
-                source,
-                target,
-                *(np.int32(value) for value in (row, count_, stride, other, radius)),
-            )
-        return target
+    def across(source, target, count_: int, stride: int, others: int, other_stride: int) -> None:
+        numbers = (np.int32(value) for value in (count_, stride, other_stride, radius))
+        device.run(kernels["box_sum_across"], (row // lanes, others), source, target, *numbers)
 
     def summed(source, into) -> None:
-        result = box_sum(source, spare)
-        device.cl.enqueue_copy(device.queue, into, result, byte_count=nbytes)
+        """Box sums of `source` into `into`, which may be the same buffer."""
+        device.run(kernels["box_sum_along"], (depth * height,), source, spare, np.int32(row), np.int32(radius))
+        across(spare, spare2, height, row, depth, height * row)
+        across(spare2, into, depth, height * row, height, row)
 
     summed(inside_mask, count)
     summed(values, first)

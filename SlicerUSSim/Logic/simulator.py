@@ -200,7 +200,6 @@ class UltrasoundSimulator:
         settings, medium = self.settings, self.medium
         chunk = CONSTANTS["CHUNK"]
         transmit, elevation = probe.transmit_waist(), probe.elevation_waist()
-        receive_sigma = probe.receive_sigma_mm(np.array([0.0, 1e6]))
         axial_sigma = self._axial_sigma_mm(probe)
         scene = np.zeros((), SCENE)
         scene["ras_to_voxel"] = medium.ras_to_voxel.ravel()
@@ -220,8 +219,7 @@ class UltrasoundSimulator:
         scene["sample_mm"] = self._sample_mm(probe)
         scene["samples"] = -(-self._sample_count(probe) // chunk) * chunk
         scene["transmit_sigma"], scene["transmit_focus"], scene["transmit_rayleigh"] = transmit
-        scene["receive_sigma_min"] = receive_sigma[0]
-        scene["receive_sigma_slope"] = receive_sigma[1] * 1e-6
+        scene["receive_sigma_min"], scene["receive_sigma_slope"] = probe.receive_beam()
         scene["elevation_sigma"] = elevation[0] / np.sqrt(2.0)
         scene["elevation_focus"], scene["elevation_rayleigh"] = elevation[1:]
         scene["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
@@ -264,7 +262,7 @@ class UltrasoundSimulator:
             warnings.warn("the probe looks past the volume: the image is black", EmptyViewWarning, stacklevel=3)
 
     def _warn_if_overflown(self) -> None:
-        lines, _ = self.tracer.overflow()
+        lines = self.tracer.overflown_lines()
         if lines:
             warnings.warn(
                 f"{lines} traced lines have more than {CONSTANTS['MAX_SEGMENTS']} ray segments, the last are left out; "

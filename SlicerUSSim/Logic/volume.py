@@ -122,10 +122,7 @@ class Volume:
         Raises SimulationError for an unknown suffix or an unwritable place.
         """
         path = Path(path)
-        require(
-            path.name.lower().endswith(WRITABLE_SUFFIXES),
-            f"{path}: unknown image format, expected a name ending in one of {', '.join(WRITABLE_SUFFIXES)}",
-        )
+        require_image_name(path)
         with written_whole(path) as partial:
             if path.suffix.lower() == ".vti":
                 self._write_vti(partial)
@@ -220,6 +217,20 @@ def check_rigid(name: str, matrix: np.ndarray) -> np.ndarray:
     return pose
 
 
+def require_image_name(path: Path) -> None:
+    """Raise SimulationError unless Volume.write knows the format that the name stands for."""
+    require(
+        path.name.lower().endswith(WRITABLE_SUFFIXES),
+        f"{path}: unknown image format, expected a name ending in one of {', '.join(WRITABLE_SUFFIXES)}",
+    )
+
+
+def require_place(path: Path) -> None:
+    """Raise SimulationError unless `path` could be a file in a folder that exists."""
+    require(path.parent.is_dir(), f"{path}: the folder {path.parent} does not exist")
+    require(not path.is_dir(), f"{path}: is a folder, expected a file name")
+
+
 @contextmanager
 def written_whole(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path to write to; it replaces `path` only if the block succeeds.
@@ -227,8 +238,7 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
     Raises SimulationError naming `path` if it cannot be written.
     """
     path = Path(path)
-    require(path.parent.is_dir(), f"{path}: the folder {path.parent} does not exist")
-    require(not path.is_dir(), f"{path}: is a folder, expected a file name")
+    require_place(path)
     try:
         folder = tempfile.mkdtemp(prefix=".ussim-", dir=path.parent)
     except OSError as error:
