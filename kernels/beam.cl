@@ -14,16 +14,10 @@ __kernel void lateral_beam(__constant const Scene *scene, __global const float *
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int centre = scene->guard_lines + line * scene->lateral_rays;
   float s0 = sample * scene->sample_mm, s1 = (sample + LANES) * scene->sample_mm;
-  float widest = fmax(beam_sigma(scene, s0).x, beam_sigma(scene, s1).x);
-  // beam_sigma and line_distance, lane by lane: near a tight focus the width changes from sample to sample.
+  float widest = fmax(lateral_sigma(scene, s0), lateral_sigma(scene, s1));
+  // Lane by lane: near a tight focus the width changes from sample to sample.
   const floatn s = (TO_FLOATN(LANE_INDEX) + sample) * scene->sample_mm;
-  const floatn a = (s - scene->transmit_focus) / scene->transmit_rayleigh;
-  const floatn transmit2 = scene->transmit_sigma * scene->transmit_sigma * (1.0f + a * a);
-  const floatn receive = fmax(s * scene->receive_sigma_slope, scene->receive_sigma_min);
-  const floatn sigma = sqrt(transmit2 * receive * receive / (transmit2 + receive * receive));
-  const float spacing = scene->line_spacing / scene->lateral_rays;
-  const floatn apart = fmax(scene->linear ? spacing + 0.0f * s : spacing * (scene->apex_radius_mm + s), 1e-4f);
-  floatn step = apart / sigma;  // between traced lines, in sigmas
+  floatn step = line_distance_lanes(scene, s) / lateral_sigma_lanes(scene, s);  // between traced lines, in sigmas
   floatn step2 = step * step;
   floatn narrow2 = fmax(1.0f - step2 / 6.0f, 0.25f);  // (sigma of these weights / sigma of the beam)^2
   floatn exponent = -0.5f * LOG2_E * step2 / narrow2;
