@@ -99,7 +99,17 @@ def first_frame(device: str, label_file: Path | None) -> None:
         labels, names = segmentation.labels, segmentation.tissue_names
     simulator = UltrasoundSimulator(labels, TissueTable.brain(names), device=device)
     simulator.simulate(PROBES["A"], craniotomy_pose(labels, PROBES["A"]))
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    print(peak_memory_mb())
+
+
+def peak_memory_mb() -> float:
+    """Peak resident memory of this process since it was started."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+    except OSError:
+        # Counts what the parent held when it started us, too.
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def timed(function) -> tuple[float, object]:
