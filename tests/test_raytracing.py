@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,31 @@ def test_a_voxelised_sphere_has_smooth_normals_in_the_right_place(orientation):
     assert np.sqrt((angle**2).mean()) < 3.0
     assert np.sqrt(((radius - 20.0) ** 2).mean()) < 0.15
     assert abs((radius - 20.0).mean()) < 0.05  # curvature does not shrink it
+
+
+@pytest.mark.parametrize("tilt_deg", [5, 10, 20, 35, 50])
+def test_a_tilted_plane_has_no_terraces(tilt_deg):
+    """Voxels cut a plane that is nearly aligned with them into long steps; its normals must not show them."""
+    normal = np.array([np.sin(np.radians(tilt_deg)), np.cos(np.radians(tilt_deg)), 0.0])
+    plane = block(lambda x, y, z: x * normal[0] + y * normal[1] > 0, half_mm=(30, 40, 20), spacing_mm=0.5)
+    sim = simulator(plane, FAST, coupling=replace(FAST, name="before", impedance_mrayl=1.6), reflections=False)
+    hits = sim.trace(LinearProbe(20, 40, scan_lines=161), rigid(np.eye(3), [0, -20, 0])).hits
+    angle = np.degrees(np.arccos(np.clip(-hits["normal"] @ normal, -1, 1)))
+    assert np.sqrt((angle**2).mean()) < 3.0
+    assert (hits["position"] @ normal).std() < 0.2 * 0.5
+
+
+def test_a_gap_of_a_few_voxels_keeps_its_width():
+    """Smoothing that sees both sides of a gap must not move them."""
+    for voxels in (3, 5, 7, 9):
+        gap = block(lambda x, y, z, half=0.5 * voxels: np.abs(y) < half, spacing_mm=1.0)
+        tree = simulator(gap, replace(FAST, speed_of_sound_m_s=1540.0)).trace(
+            PROBES["linear"], rigid(np.eye(3), [0, -20, 0])
+        )
+        straight = tree.hits[tree.hits["reflections"] == 0]
+        for behind, place in ((1, 20 - voxels / 2), (0, 20 + voxels / 2)):
+            depth = straight["depth_mm"][straight["label_behind"] == behind]
+            np.testing.assert_allclose(depth, place, atol=0.15)
 
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS)

@@ -14,6 +14,8 @@ CONSTANTS = {
     "PLAIN_CELL": 0x80,  # ... and one that says that they do and no membrane passes between them
     "MEMBRANE_LABEL": 63,
     "MAX_TISSUES": 64,
+    "SMOOTH_GROUPS": 6,  # acoustic groups with a smoothed indicator (medium.py)
+    "WIDE_SIGMA": 3.0,  # its Gaussian, voxels
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
     "MAX_STACK": 24,  # reflected rays waiting to be followed
@@ -133,6 +135,6 @@ def _c_struct(name: str, dtype: np.dtype) -> str:
 
 def shared_source() -> str:
     """C text of every constant and struct above; Device.kernels puts it in front of a kernel file."""
-    constants = [f"#define {name} {value}" for name, value in CONSTANTS.items()]
+    constants = [f"#define {name} {value}{'f' * isinstance(value, float)}" for name, value in CONSTANTS.items()]
     structs = [("Scene", SCENE), ("Tissue", TISSUE), ("Segment", SEGMENT), ("Hit", HIT)]
     return "\n".join(constants + [_c_struct(name, dtype) for name, dtype in structs])

@@ -1,4 +1,4 @@
-"""The acoustic medium as the device sees it: labels, membrane and tissue numbers in two buffers.
+"""The acoustic medium as the device sees it: labels, membrane, smoothed borders and tissue numbers in three buffers.
 
 A voxel takes two bytes. The low byte holds the label and flags for cells (the cube between eight voxel centres) whose
 corners agree, so that most look-ups need one load. The high byte holds the *fluid distance*: how far inside the
@@ -37,12 +37,15 @@ class Medium:
         self.device = device
         self.labels = labels
         array = _as_labels(labels.array)
-        self.present = np.flatnonzero(np.bincount(array.ravel(), minlength=256))
+        counts = np.bincount(array.ravel(), minlength=256)
+        #: Labels that occur, the most frequent first
+        self.present = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
         self.dims = np.array(array.shape[::-1]) + 2 * _PAD
         self._check(tissues)
         padded = np.pad(array, _PAD)
         self._upload(padded, tissues)
-        self.tissue_buffer = device.upload(_tissue_rows(tissues))
+        self._upload_smooth(padded, tissues)
+        self.tissue_buffer = device.upload(self._rows(tissues))
         self.tissues = tissues
 
     @property
@@ -57,15 +60,37 @@ class Medium:
         self._check(tissues)
         if _membrane_shape(tissues) != _membrane_shape(self.tissues):
             self._upload(np.pad(_as_labels(self.labels.array), _PAD), tissues)
-        self.device.write(self.tissue_buffer, _tissue_rows(tissues))
+        if not np.array_equal(self._rows(tissues)["group"], self._rows(self.tissues)["group"]):
+            self._upload_smooth(np.pad(_as_labels(self.labels.array), _PAD), tissues)
+        self.device.write(self.tissue_buffer, self._rows(tissues))
         self.tissues = tissues
 
     def _check(self, tissues: TissueTable) -> None:
-        missing = [int(label) for label in self.present if label not in tissues]
+        missing = [int(label) for label in sorted(self.present) if label not in tissues]
         require(
             not missing,
             f"label {', '.join(map(str, missing))} has no tissue; the table has {', '.join(map(str, tissues))}",
         )
+
+    def _rows(self, tissues: TissueTable) -> np.ndarray:
+        """layout.TISSUE per label. Acoustic groups are numbered from the most frequent tissue on: those get a smoothed
+        indicator."""
+        rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
+        members = {int(label): tissues[label] for label in self.present} | dict(tissues)
+        if tissues.membrane is not None:
+            members[CONSTANTS["MEMBRANE_LABEL"]] = tissues.membrane.tissue
+        groups: dict[tuple[float, float], int] = {}
+        for label, tissue in members.items():
+            acoustics = (tissue.speed_of_sound_m_s, tissue.impedance_mrayl)
+            rows[label] = (
+                *acoustics,
+                tissue.attenuation_db_cm_mhz,
+                tissue.mu0,
+                tissue.sigma0,
+                tissue.scatterer_share,
+                groups.setdefault(acoustics, len(groups)),
+            )
+        return rows
 
     def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:
         distance, self.membrane_reach = self._fluid_distance(padded, tissues)
@@ -78,6 +103,26 @@ class Medium:
             plain = same & ((lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach))
         words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["PLAIN_CELL"]) * plain
         self.voxel_buffer = self.device.upload(words)
+
+    def _upload_smooth(self, padded: np.ndarray, tissues: TissueTable) -> None:
+        """Indicators of the first acoustic groups, smoothed: where interfaces are flat, they know normals best."""
+        group_of = self._rows(tissues)["group"].astype(np.uint8)
+        # The coupling medium lies around the volume even where its label does not occur.
+        groups = {int(group_of[label]) for label in (0, *self.present)}
+        fields = np.zeros((min(max(groups) + 1, CONSTANTS["SMOOTH_GROUPS"]), *padded.shape), np.uint16)
+        if len(groups) > 1:
+            group = group_of[padded]
+            rest = np.full(padded.shape, 65535, np.uint16)  # indicators sum to one, which saves the last one's Gaussian
+            *all_but_last, last = sorted(groups)
+            for n in all_but_last[: len(fields)]:
+                indicator = np.where(group == n, np.float32(65535), np.float32(0))
+                sigma = CONSTANTS["WIDE_SIGMA"]
+                ndimage.gaussian_filter(indicator, sigma, output=indicator, mode="nearest", truncate=2.5)
+                fields[n] = indicator
+                rest -= np.minimum(fields[n], rest)
+            if last < len(fields):
+                fields[last] = rest
+        self.smooth_buffer = self.device.upload(fields)
 
     def _fluid_distance(self, padded: np.ndarray, tissues: TissueTable) -> tuple[np.ndarray | None, float]:
         """(distance as uint8 about 127.5, half the membrane in that unit), or (None, -1) without a membrane."""
@@ -137,25 +182,6 @@ def _cell_extremes(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         lowest[here] = np.minimum(lowest[here], lowest[there])
         highest[here] = np.maximum(highest[here], highest[there])
     return lowest, highest
-
-
-def _tissue_rows(tissues: TissueTable) -> np.ndarray:
-    rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
-    groups: dict[tuple[float, float], int] = {}
-    members = dict(tissues)
-    if tissues.membrane is not None:
-        members[CONSTANTS["MEMBRANE_LABEL"]] = tissues.membrane.tissue
-    for label, tissue in members.items():
-        acoustics = (tissue.speed_of_sound_m_s, tissue.impedance_mrayl)
-        rows[label] = (
-            *acoustics,
-            tissue.attenuation_db_cm_mhz,
-            tissue.mu0,
-            tissue.sigma0,
-            tissue.scatterer_share,
-            groups.setdefault(acoustics, len(groups)),
-        )
-    return rows
 
 
 def _membrane_shape(tissues: TissueTable) -> tuple | None:

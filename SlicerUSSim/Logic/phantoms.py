@@ -1,10 +1,391 @@
-"""Images made by code, for trying things out without a patient."""
+"""Test objects made by code: phantoms that say what theory expects of their image, and a stand-in for a head MRI.
+
+A phantom is described in the frame of the probe that looks at it (mm: x lateral, y depth, z elevational, origin at the
+probe face; no object changes along z unless it says so) and voxelised in patient space under any rotation: the same
+object then lies differently on the voxels, and nothing about its image may change.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
-from SlicerUSSim.Logic.volume import Volume
+import numpy as np
+from scipy.optimize import brentq
+
+from SlicerUSSim.Logic.errors import require
+from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.tissues import Tissue, TissueTable
+from SlicerUSSim.Logic.volume import Volume, check_rigid
+
+REFERENCE_SPEED_M_S = 1540.0
+#: Speckle in a medium that the scanner takes for what it is
+BACKGROUND = Tissue("background", REFERENCE_SPEED_M_S, 1.6, 0.5, mu0=0.33, sigma0=0.15)
+#: No echo, no attenuation
+FLUID = Tissue("fluid", REFERENCE_SPEED_M_S, 1.6, 0.0)
+#: Reflects nearly everything, so that little comes out of its back
+STEEL = Tissue("steel", REFERENCE_SPEED_M_S, 46.0, 0.0)
+_LATERAL, _DEPTH, _THICKNESS = 25.0, 62.0, 6.0  # half width, depth, half thickness of what a probe may see
+
+
+@dataclass(frozen=True)
+class Echo:
+    """Theory: the image shows an echo here."""
+
+    name: str
+    #: (lateral, depth) in the probe frame, where the image shows it
+    shown_mm: tuple[float, float]
+    #: (lateral, depth) of the object it comes from
+    object_mm: tuple[float, float]
+    #: In dB re the first echo of the phantom; None where theory says nothing
+    level_db: float | None = None
+
+
+@dataclass(frozen=True)
+class LevelChange:
+    """Theory: in this region the mean level differs from that of the phantom's `reference` tissues."""
+
+    name: str
+    #: (left, right, top, bottom) in the probe frame
+    region_mm: tuple[float, float, float, float]
+    change_db: float
+
+
+@dataclass(frozen=True, eq=False)
+class Phantom:
+    """A test object: labels, tissues, the pose to look at it from, and what its image must show."""
+
+    name: str
+    labels: Volume
+    tissues: TissueTable
+    #: (4, 4)
+    probe_to_ras: np.ndarray
+    #: What a given probe sees, by theory
+    expected: Callable[[Probe], tuple[Echo | LevelChange, ...]] = lambda probe: ()
+    #: The same object without the effect it demonstrates, for comparison
+    reference: TissueTable | None = None
+
+
+# ---- the five phantoms of the paper's Fig. 2 ---------------------------------------------------------------------------
+
+
+def attenuating_block(
+    attenuation_db_cm_mhz: float = 1.2, rotation: np.ndarray | None = None, *, thickness_mm: float = 12.0
+) -> Phantom:
+    """Shadow, or enhancement with less attenuation than the background's: a block in the middle of speckle.
+
+    Behind it the mean level changes by -2 (alpha_block - alpha_background) f d dB (PHYSICS section 7).
+    """
+    block = replace(BACKGROUND, name="block", attenuation_db_cm_mhz=attenuation_db_cm_mhz)
+    top = 14.0
+
+    def label(x, y, z):
+        return np.where((np.abs(x) < 8.0) & (y > top) & (y < top + thickness_mm), 2, 1)
+
+    def expected(probe: Probe):
+        more = attenuation_db_cm_mhz - BACKGROUND.attenuation_db_cm_mhz
+        change = -2.0 * more * probe.frequency_mhz * thickness_mm / 10.0
+        return (
+            LevelChange("behind the block", (-2.0, 2.0, top + thickness_mm + 6.0, top + thickness_mm + 22.0), change),
+        )
+
+    tissues = TissueTable({1: BACKGROUND, 2: block})
+    return _phantom(
+        "attenuating block", label, tissues, rotation, 0.5, expected, tissues.replace("block", **_acoustics(BACKGROUND))
+    )
+
+
+def speed_block(
+    speed_m_s: float = 1450.0, rotation: np.ndarray | None = None, *, thickness_mm: float = 16.0
+) -> Phantom:
+    """Range distortion: a wire behind a block of another speed of sound moves by d (c_ref / c - 1)."""
+    block = replace(BACKGROUND, name="block", speed_of_sound_m_s=speed_m_s)
+    top, wire, radius = 12.0, (0.0, 40.0), 0.6
+
+    def label(x, y, z):
+        labels = np.where((np.abs(x) < 10.0) & (y > top) & (y < top + thickness_mm), 2, 1)
+        return np.where(_in_cylinder(x, y, wire, radius), 3, labels)
+
+    def expected(probe: Probe):
+        moved = thickness_mm * (REFERENCE_SPEED_M_S / speed_m_s - 1.0)
+        front = wire[1] - radius
+        return (Echo("wire", (0.0, front + moved), (0.0, front)),)
+
+    tissues = TissueTable({1: BACKGROUND, 2: block, 3: STEEL})
+    return _phantom(
+        "speed block", label, tissues, rotation, 0.3, expected, tissues.replace("block", **_acoustics(BACKGROUND))
+    )
+
+
+def mirror(rotation: np.ndarray | None = None, *, tilt_deg: float = 35.0) -> Phantom:
+    """Mirroring: a rod before an oblique strong reflector appears again behind it, at its mirror image."""
+    tilt = np.radians(tilt_deg)
+    point, normal = np.array([0.0, 30.0]), np.array([-np.sin(tilt), -np.cos(tilt)])  # towards the probe
+    radius, away = 1.5, 12.0
+    down = np.array([0.0, 1.0])
+    rod = point + away * (down - 2.0 * (down @ normal) * normal)
+
+    def label(x, y, z):
+        labels = np.where((x - point[0]) * normal[0] + (y - point[1]) * normal[1] < 0.0, 2, 1)
+        return np.where(_in_cylinder(x, y, rod, radius), 3, labels)
+
+    def expected(probe: Probe):
+        image = rod - 2.0 * ((rod - point) @ normal) * normal
+        return (
+            Echo("rod", tuple(rod - radius * _line_direction_at(probe, rod)), tuple(rod)),
+            Echo("mirror image", tuple(image - radius * _line_direction_at(probe, image)), tuple(rod)),
+        )
+
+    plate = replace(STEEL, name="mirror")
+    dim = replace(BACKGROUND, attenuation_db_cm_mhz=0.1, mu0=0.033, sigma0=0.015)
+    return _phantom("mirror", label, TissueTable({1: dim, 2: plate, 3: STEEL}), rotation, 0.3, expected)
+
+
+def refracting_wedge(
+    rotation: np.ndarray | None = None, *, tilt_deg: float = 25.0, speeds_m_s: tuple[float, float] = (1450.0, 1620.0)
+) -> Phantom:
+    """Refraction: wires behind an oblique interface are shown where the unbent ray would have met them."""
+    tilt, radius = np.radians(tilt_deg), 0.6
+    point, normal = np.array([0.0, 20.0]), np.array([np.sin(tilt), -np.cos(tilt)])
+    wires = [np.array(wire) for wire in ((-8.0, 36.0), (0.0, 40.0), (8.0, 44.0))]
+
+    def label(x, y, z):
+        labels = np.where((x - point[0]) * normal[0] + (y - point[1]) * normal[1] < 0.0, 2, 1)
+        for wire in wires:
+            labels = np.where(_in_cylinder(x, y, wire, radius), 3, labels)
+        return labels
+
+    def expected(probe: Probe):
+        return tuple(
+            Echo(f"wire {n}", _shown_behind_plane(probe, wire, radius, point, normal, speeds_m_s), tuple(wire))
+            for n, wire in enumerate(wires, 1)
+        )
+
+    # One impedance on either side: what bends the ray is the speed alone.
+    above, below = (
+        replace(BACKGROUND, name=name, speed_of_sound_m_s=c, mu0=0.1, sigma0=0.045)
+        for name, c in zip(("slow", "fast"), speeds_m_s, strict=True)
+    )
+    return _phantom("refracting wedge", label, TissueTable({1: above, 2: below, 3: STEEL}), rotation, 0.3, expected)
+
+
+def parallel_plates(
+    rotation: np.ndarray | None = None, *, gap_mm: float = 7.2, speed_m_s: float = 1600.0, spacing_mm: float = 0.3
+) -> Phantom:
+    """Reverberation between two plane borders: an echo every d c_ref / c, each weaker by 20 log10(r1 r2) dB."""
+    top = 15.0
+    above, gap = FLUID, Tissue("gap", speed_m_s, 9.0, 0.0)
+    below = replace(FLUID, name="below", impedance_mrayl=1.8)
+
+    def label(x, y, z):
+        return np.where(y < top, 1, np.where(y < top + gap_mm, 2, 3))
+
+    def expected(probe: Probe):
+        r1, r2 = (
+            abs(gap.impedance_mrayl - t.impedance_mrayl) / (gap.impedance_mrayl + t.impedance_mrayl)
+            for t in (above, below)
+        )
+        apart, fall = gap_mm * REFERENCE_SPEED_M_S / speed_m_s, 20.0 * np.log10(r1 * r2)
+        far = top + gap_mm
+        return tuple(
+            Echo(f"bounce {n}" if n else "far side", (0.0, top + (n + 1) * apart), (0.0, far), n * fall)
+            for n in range(4)
+        )
+
+    return _phantom("parallel plates", label, TissueTable({1: above, 2: gap, 3: below}), rotation, spacing_mm, expected)
+
+
+# ---- resolution and speckle --------------------------------------------------------------------------------------------
+
+
+def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0.3) -> Phantom:
+    """A quality-assurance phantom: wires every 10 mm of depth, black cysts, and blocks 6 dB above and below."""
+    radius = 0.3
+    wires = [(0.0, depth) for depth in (10.0, 20.0, 30.0, 40.0, 50.0)]
+    cysts = {2: [(-12.0, 20.0), (-12.0, 45.0)], 3: [(12.0, 20.0)], 4: [(12.0, 45.0)]}
+    changes_db = {3: 6.0, 4: -6.0}
+    tissues = {1: replace(BACKGROUND, attenuation_db_cm_mhz=0.0), 2: FLUID, 5: STEEL}
+    for number, change in changes_db.items():
+        factor = 10.0 ** (change / 20.0)
+        name = f"{change:+.0f} dB"
+        tissues[number] = replace(tissues[1], name=name, mu0=factor * BACKGROUND.mu0, sigma0=factor * BACKGROUND.sigma0)
+
+    def label(x, y, z):
+        labels = np.ones(np.broadcast_shapes(x.shape, y.shape, z.shape), np.uint8)
+        for number, centres in cysts.items():
+            for centre in centres:
+                labels[_in_cylinder(x, y, centre, 4.0)] = number
+        for wire in wires:
+            labels[_in_cylinder(x, y, wire, radius)] = 5
+        return labels
+
+    def expected(probe: Probe):
+        echoes = tuple(Echo(f"wire at {depth:.0f} mm", (x, depth - radius), (x, depth)) for x, depth in wires)
+        levels = tuple(
+            LevelChange(tissues[number].name, (x - 2.5, x + 2.5, y - 2.5, y + 2.5), change)
+            for number, change in changes_db.items()
+            for x, y in cysts[number]
+        )
+        return echoes + levels
+
+    table = TissueTable(tissues)
+    plain = table
+    for number in changes_db:
+        plain = plain.replace(tissues[number].name, mu0=BACKGROUND.mu0, sigma0=BACKGROUND.sigma0)
+    return _phantom("wires and cysts", label, table, rotation, spacing_mm, expected, plain)
+
+
+def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom:
+    """One tissue everywhere: the level is Var of its scatterers, the envelope is Rayleigh, the PSF sets correlations."""
+    return _phantom(
+        "uniform speckle", lambda x, y, z: np.ones_like(x + y + z), TissueTable({0: tissue, 1: tissue}), rotation, 1.0
+    )
+
+
+def thin_rod(rotation: np.ndarray | None = None, *, depth_mm: float = 30.0, width_mm: float = 1.2) -> Phantom:
+    """A thin echogenic bar along the lateral axis, square in section, in a fluid: shows how thick the slice is."""
+
+    def label(x, y, z):
+        return np.where((np.abs(y - depth_mm) < 0.5 * width_mm) & (np.abs(z) < 0.5 * width_mm), 1, 0)
+
+    bar = replace(FLUID, name="bar", mu0=2.0, sigma0=1.0)
+    return _phantom("thin rod", label, TissueTable({0: FLUID, 1: bar}), rotation, 0.3, box_lateral_mm=12.0)
+
+
+# ---- voxels ------------------------------------------------------------------------------------------------------------
+
+
+def voxel_sphere(
+    rotation: np.ndarray | None = None,
+    *,
+    radius_mm: float = 20.0,
+    spacing_mm: float = 1.0,
+    centre_mm=(0.31, 0.17, -0.42),
+) -> Phantom:
+    """A sphere on coarse voxels, its centre nowhere special on them; PHYSICS section 3 bounds its stairs.
+
+    `centre_mm` is in RAS; the probe face is 29 mm before it.
+    """
+    centre = np.asarray(centre_mm, float)
+    half = int(np.ceil((radius_mm + 10.0) / spacing_mm))
+    axis = spacing_mm * np.arange(-half, half + 1)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    inside = (x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2 < radius_mm**2
+    matrix = np.diag([spacing_mm] * 3 + [1.0])
+    matrix[:3, 3] = axis[0]
+    pose = _pose(rotation)
+    pose[:3, 3] = -(radius_mm + 9.0) * pose[:3, 1]
+    # No impedance of its own is needed for a border, but a speed of its own would bend the rays inside.
+    tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sphere", impedance_mrayl=2.0)})
+    return Phantom("voxel sphere", Volume(inside.astype(np.uint8), matrix), tissues, pose)
+
+
+def voxel_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, spacing_mm: float = 1.0) -> Phantom:
+    """A sheet one voxel thick across the beam (falx, dura); oblique ones are voxelised so that voxels touch by edges."""
+    thickness = spacing_mm if rotation is None or np.allclose(np.abs(rotation).max(axis=0), 1.0) else 1.5 * spacing_mm
+
+    def label(x, y, z):
+        return np.where(np.abs(y - depth_mm) < 0.5 * thickness, 1, 0)
+
+    tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sheet", impedance_mrayl=1.9)})
+    return _phantom("voxel sheet", label, tissues, rotation, spacing_mm)
+
+
+def _phantom(
+    name, label, tissues, rotation, spacing_mm, expected=None, reference=None, box_lateral_mm=_LATERAL
+) -> Phantom:
+    pose = _pose(rotation)
+    labels = _voxelise(label, pose[:3, :3], spacing_mm, box_lateral_mm)
+    return Phantom(name, labels, tissues, pose, expected or (lambda probe: ()), reference)
+
+
+def _pose(rotation: np.ndarray | None) -> np.ndarray:
+    pose = np.eye(4)
+    if rotation is not None:
+        require(np.shape(rotation) == (3, 3), f"rotation has shape {np.shape(rotation)}, expected (3, 3)")
+        pose[:3, :3] = rotation
+    return check_rigid("rotation", pose)
+
+
+def _voxelise(label, rotation: np.ndarray, spacing_mm: float, lateral_mm: float) -> Volume:
+    """Labels on a grid along RAS. Voxel centres lie at odd multiples of half the spacing, so that a plane at a multiple
+    of the spacing is half-way between two layers: where the object lies straight, its borders are exact."""
+    corners = (
+        np.array(
+            [[x, y, z] for x in (-lateral_mm, lateral_mm) for y in (-4.0, _DEPTH) for z in (-_THICKNESS, _THICKNESS)]
+        )
+        @ rotation.T
+    )
+    low = np.floor(corners.min(axis=0) / spacing_mm).astype(int)
+    high = np.ceil(corners.max(axis=0) / spacing_mm).astype(int)
+    x, y, z = (spacing_mm * (np.arange(a, b) + 0.5) for a, b in zip(low, high, strict=True))
+    array = np.empty((len(z), len(y), len(x)), np.uint8)
+    yx = np.stack(np.meshgrid(y, x, indexing="ij"))
+    for k, depth in enumerate(z):  # slice by slice: whole volumes of coordinates would fill the memory
+        points = [rotation[0, a] * yx[1] + rotation[1, a] * yx[0] + rotation[2, a] * depth for a in range(3)]
+        array[k] = label(*points)
+    matrix = np.diag([spacing_mm] * 3 + [1.0])
+    matrix[:3, 3] = spacing_mm * (low + 0.5)
+    return Volume(array, matrix)
+
+
+def _acoustics(tissue: Tissue) -> dict[str, float]:
+    return {name: getattr(tissue, name) for name in ("speed_of_sound_m_s", "impedance_mrayl", "attenuation_db_cm_mhz")}
+
+
+def _in_cylinder(x, y, centre, radius: float):
+    """Inside the cylinder along z."""
+    return (x - centre[0]) ** 2 + (y - centre[1]) ** 2 < radius**2
+
+
+# ---- geometrical acoustics in the image plane, independent of the kernels ------------------------------------------------
+
+
+def _line_at(probe: Probe, position: float) -> tuple[np.ndarray, np.ndarray]:
+    """(origin, direction), both (lateral, depth), of the scan line at `position` (mm, or radians about the apex)."""
+    if probe.is_linear:
+        return np.array([position, 0.0]), np.array([0.0, 1.0])
+    sine, cosine, radius = np.sin(position), np.cos(position), probe.apex_radius_mm
+    return radius * np.array([sine, cosine - 1.0]), np.array([sine, cosine])
+
+
+def _line_direction_at(probe: Probe, point) -> np.ndarray:
+    """Direction of the scan line through a point (lateral, depth)."""
+    if probe.is_linear:
+        return np.array([0.0, 1.0])
+    away = np.asarray(point) + [0.0, probe.apex_radius_mm]
+    return away / np.linalg.norm(away)
+
+
+def _shown_behind_plane(probe, target, radius, point, normal, speeds_m_s) -> tuple[float, float]:
+    """Where a cylinder behind a plane border is shown: on the scan line whose refracted ray aims at its axis.
+
+    Snell's law in vector form; `normal` points towards the probe, `speeds_m_s` are before and behind the plane.
+    """
+
+    def bent(position: float):
+        origin, direction = _line_at(probe, position)
+        before = ((point - origin) @ normal) / (direction @ normal)
+        ratio, cos_in = speeds_m_s[1] / speeds_m_s[0], -(direction @ normal)
+        cos_out = np.sqrt(1.0 - ratio**2 * (1.0 - cos_in**2))
+        return before, origin + before * direction, ratio * direction + (ratio * cos_in - cos_out) * normal
+
+    def miss(position: float) -> float:
+        _, crossing, direction = bent(position)
+        to_target = target - crossing
+        return direction[0] * to_target[1] - direction[1] * to_target[0]
+
+    end = 0.9 * abs(probe.first_line)
+    position = brentq(miss, -end, end)
+    before, crossing, _ = bent(position)
+    behind = np.linalg.norm(target - crossing) - radius
+    depth = REFERENCE_SPEED_M_S * (before / speeds_m_s[0] + behind / speeds_m_s[1])
+    origin, direction = _line_at(probe, position)
+    shown = origin + depth * direction
+    return float(shown[0]), float(shown[1])
+
+
+# ---- a head ------------------------------------------------------------------------------------------------------------
 
 
 def head_mri(spacing_mm: float = 1.0, seed: int = 0) -> Volume:
