@@ -440,6 +440,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       spent -= overshoot * decay_in(scene, here);
       if (on_axis && count > 0 && count <= room) my_segments[count - 1].length_mm -= overshoot;
       const float path = ray.path + border, depth = ray.depth + border * depth_per_mm;
+      if (depth >= scene->depth_mm) break;  // with the overshoot taken back, the border lies beyond the field: a leaf
       const float log_attenuation = ray.log_attenuation - spent, attenuation = exp(log_attenuation);
       const float3 aside = quantile * elevation_sigma(scene, path) * ray.elevational;
       const float3 hit_point = ray.axis + border * ray.direction + aside;
@@ -489,7 +490,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
 
       // The refracted child is this ray, bent.
       if (surface.is_total) break;
-      if (refracted_weight * attenuation < scene->intensity_threshold || depth >= scene->depth_mm || count > room) {
+      if (refracted_weight * attenuation < scene->intensity_threshold || count > room) {
         cut_weight += refracted_weight;
         break;
       }

@@ -42,16 +42,17 @@ def echo_near(
 ) -> tuple[float, float, float]:
     """(lateral mm, depth mm, amplitude) of the strongest echo within a distance of a place (lateral, depth).
 
-    Across the lines the place is the centroid of the power at the echo's range; along the line the parabola through
-    the three highest samples.
+    Across the lines the place is the centroid of the power within half a millimetre of the echo's range; along the
+    line the parabola through the three highest samples.
     """
     x, y = sample_positions(frame, probe)
     near = np.hypot(x - place_mm[0], y - place_mm[1]) < within_mm
     require(bool(near.any()), f"no sample lies within {within_mm:g} mm of {place_mm}")
     amplitude = np.where(near, np.abs(frame.iq), 0.0)
     line, sample = np.unravel_index(np.argmax(amplitude), amplitude.shape)
-    across = amplitude[:, max(sample - 2, 0) : sample + 3].max(axis=1)
-    power = np.where(across > 0.5 * across.max(), across**2, 0.0)
+    half = max(round(0.5 / frame.sample_interval_mm), 1)
+    power = (amplitude[:, max(sample - half, 0) : sample + half + 1] ** 2).sum(axis=1)
+    power[power < 0.25 * power.max()] = 0.0
     position = float(np.average(np.arange(len(power)), weights=power))
     before, peak, after = np.abs(frame.iq[line, sample - 1 : sample + 2])
     curvature = before - 2.0 * peak + after

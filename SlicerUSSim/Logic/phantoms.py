@@ -7,7 +7,7 @@ object then lies differently on the voxels, and nothing about its image may chan
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +25,7 @@ BACKGROUND = Tissue("background", REFERENCE_SPEED_M_S, 1.6, 0.5, mu0=0.33, sigma
 FLUID = Tissue("fluid", REFERENCE_SPEED_M_S, 1.6, 0.0)
 #: Reflects nearly everything, so that little comes out of its back
 STEEL = Tissue("steel", REFERENCE_SPEED_M_S, 46.0, 0.0)
-_LATERAL, _DEPTH, _THICKNESS = 25.0, 62.0, 6.0  # half width, depth, half thickness of what a probe may see
+_LATERAL, _DEPTH, _THICKNESS = 18.0, 54.0, 6.0  # half width, depth, half thickness that a phantom has at least
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,11 @@ class Phantom:
     expected: Callable[[Probe], tuple[Echo | LevelChange, ...]] = lambda probe: ()
     #: The same object without the effect it demonstrates, for comparison
     reference: TissueTable | None = None
+    #: Centre of a sphere
+    centre_ras: tuple[float, float, float] | None = None
 
 
-# ---- the five phantoms of the paper's Fig. 2 ---------------------------------------------------------------------------
+# ---- the five phantoms of the paper's Fig. 2 ------------------------------------------------------------------------
 
 
 def attenuating_block(
@@ -89,7 +91,7 @@ def attenuating_block(
             LevelChange("behind the block", (-2.0, 2.0, top + thickness_mm + 6.0, top + thickness_mm + 22.0), change),
         )
 
-    tissues = TissueTable({1: BACKGROUND, 2: block})
+    tissues = TissueTable({0: BACKGROUND, 1: BACKGROUND, 2: block})
     return _phantom(
         "attenuating block", label, tissues, rotation, 0.5, expected, tissues.replace("block", **_acoustics(BACKGROUND))
     )
@@ -111,17 +113,17 @@ def speed_block(
         front = wire[1] - radius
         return (Echo("wire", (0.0, front + moved), (0.0, front)),)
 
-    tissues = TissueTable({1: BACKGROUND, 2: block, 3: STEEL})
+    tissues = TissueTable({0: BACKGROUND, 1: BACKGROUND, 2: block, 3: STEEL})
     return _phantom(
         "speed block", label, tissues, rotation, 0.3, expected, tissues.replace("block", **_acoustics(BACKGROUND))
     )
 
 
-def mirror(rotation: np.ndarray | None = None, *, tilt_deg: float = 35.0) -> Phantom:
+def mirror(rotation: np.ndarray | None = None, *, tilt_deg: float = 30.0) -> Phantom:
     """Mirroring: a rod before an oblique strong reflector appears again behind it, at its mirror image."""
     tilt = np.radians(tilt_deg)
     point, normal = np.array([0.0, 30.0]), np.array([-np.sin(tilt), -np.cos(tilt)])  # towards the probe
-    radius, away = 1.5, 12.0
+    radius, away = 0.6, 9.0
     down = np.array([0.0, 1.0])
     rod = point + away * (down - 2.0 * (down @ normal) * normal)
 
@@ -138,7 +140,7 @@ def mirror(rotation: np.ndarray | None = None, *, tilt_deg: float = 35.0) -> Pha
 
     plate = replace(STEEL, name="mirror")
     dim = replace(BACKGROUND, attenuation_db_cm_mhz=0.1, mu0=0.033, sigma0=0.015)
-    return _phantom("mirror", label, TissueTable({1: dim, 2: plate, 3: STEEL}), rotation, 0.3, expected)
+    return _phantom("mirror", label, TissueTable({0: dim, 1: dim, 2: plate, 3: STEEL}), rotation, 0.25, expected)
 
 
 def refracting_wedge(
@@ -166,11 +168,11 @@ def refracting_wedge(
         replace(BACKGROUND, name=name, speed_of_sound_m_s=c, mu0=0.1, sigma0=0.045)
         for name, c in zip(("slow", "fast"), speeds_m_s, strict=True)
     )
-    return _phantom("refracting wedge", label, TissueTable({1: above, 2: below, 3: STEEL}), rotation, 0.3, expected)
+    return _phantom("refracting wedge", label, TissueTable({1: above, 2: below, 3: STEEL}), rotation, 0.25, expected)
 
 
 def parallel_plates(
-    rotation: np.ndarray | None = None, *, gap_mm: float = 7.2, speed_m_s: float = 1600.0, spacing_mm: float = 0.3
+    rotation: np.ndarray | None = None, *, gap_mm: float = 7.2, speed_m_s: float = 1600.0, spacing_mm: float = 0.2
 ) -> Phantom:
     """Reverberation between two plane borders: an echo every d c_ref / c, each weaker by 20 log10(r1 r2) dB."""
     top = 15.0
@@ -189,22 +191,23 @@ def parallel_plates(
         far = top + gap_mm
         return tuple(
             Echo(f"bounce {n}" if n else "far side", (0.0, top + (n + 1) * apart), (0.0, far), n * fall)
-            for n in range(4)
+            for n in range(3)
         )
 
     return _phantom("parallel plates", label, TissueTable({1: above, 2: gap, 3: below}), rotation, spacing_mm, expected)
 
 
-# ---- resolution and speckle --------------------------------------------------------------------------------------------
+# ---- resolution and speckle -----------------------------------------------------------------------------------------
 
 
-def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0.3) -> Phantom:
+def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0.2) -> Phantom:
     """A quality-assurance phantom: wires every 10 mm of depth, black cysts, and blocks 6 dB above and below."""
-    radius = 0.3
-    wires = [(0.0, depth) for depth in (10.0, 20.0, 30.0, 40.0, 50.0)]
+    radius = 0.4
+    wires = [(0.3 * (depth - 30.0), depth) for depth in (10.0, 20.0, 30.0, 40.0, 50.0)]  # none behind another
     cysts = {2: [(-12.0, 20.0), (-12.0, 45.0)], 3: [(12.0, 20.0)], 4: [(12.0, 45.0)]}
     changes_db = {3: 6.0, 4: -6.0}
-    tissues = {1: replace(BACKGROUND, attenuation_db_cm_mhz=0.0), 2: FLUID, 5: STEEL}
+    plain = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
+    tissues = {0: plain, 1: plain, 2: FLUID, 5: STEEL}
     for number, change in changes_db.items():
         factor = 10.0 ** (change / 20.0)
         name = f"{change:+.0f} dB"
@@ -220,7 +223,10 @@ def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0
         return labels
 
     def expected(probe: Probe):
-        echoes = tuple(Echo(f"wire at {depth:.0f} mm", (x, depth - radius), (x, depth)) for x, depth in wires)
+        echoes = tuple(
+            Echo(f"wire at {wire[1]:.0f} mm", tuple(wire - radius * _line_direction_at(probe, wire)), tuple(wire))
+            for wire in map(np.array, wires)
+        )
         levels = tuple(
             LevelChange(tissues[number].name, (x - 2.5, x + 2.5, y - 2.5, y + 2.5), change)
             for number, change in changes_db.items()
@@ -229,10 +235,10 @@ def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0
         return echoes + levels
 
     table = TissueTable(tissues)
-    plain = table
+    reference = table
     for number in changes_db:
-        plain = plain.replace(tissues[number].name, mu0=BACKGROUND.mu0, sigma0=BACKGROUND.sigma0)
-    return _phantom("wires and cysts", label, table, rotation, spacing_mm, expected, plain)
+        reference = reference.replace(tissues[number].name, mu0=BACKGROUND.mu0, sigma0=BACKGROUND.sigma0)
+    return _phantom("wires and cysts", label, table, rotation, spacing_mm, expected, reference)
 
 
 def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom:
@@ -252,7 +258,21 @@ def thin_rod(rotation: np.ndarray | None = None, *, depth_mm: float = 30.0, widt
     return _phantom("thin rod", label, TissueTable({0: FLUID, 1: bar}), rotation, 0.3, box_lateral_mm=12.0)
 
 
-# ---- voxels ------------------------------------------------------------------------------------------------------------
+def layered(
+    tissues: Sequence[Tissue], borders_mm: Sequence[float], rotation: np.ndarray | None = None, *, tilt_deg: float = 0.0
+) -> Phantom:
+    """Plane layers of labels 1, 2, ... with borders at the given depths on the axis, tilted about the elevational axis."""
+    require(len(tissues) == len(borders_mm) + 1, f"{len(tissues)} tissues and {len(borders_mm)} borders do not fit")
+    tilt = np.radians(tilt_deg)
+
+    def label(x, y, z):
+        along = np.sin(tilt) * x + np.cos(tilt) * y
+        return 1 + sum((along > np.cos(tilt) * border).astype(np.uint8) for border in borders_mm)
+
+    return _phantom("layers", label, TissueTable(dict(enumerate(tissues, 1))), rotation, 0.5, box_lateral_mm=50.0)
+
+
+# ---- voxels ---------------------------------------------------------------------------------------------------------
 
 
 def voxel_sphere(
@@ -277,7 +297,7 @@ def voxel_sphere(
     pose[:3, 3] = -(radius_mm + 9.0) * pose[:3, 1]
     # No impedance of its own is needed for a border, but a speed of its own would bend the rays inside.
     tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sphere", impedance_mrayl=2.0)})
-    return Phantom("voxel sphere", Volume(inside.astype(np.uint8), matrix), tissues, pose)
+    return Phantom("voxel sphere", Volume(inside.astype(np.uint8), matrix), tissues, pose, centre_ras=tuple(centre))
 
 
 def voxel_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, spacing_mm: float = 1.0) -> Phantom:
@@ -288,7 +308,7 @@ def voxel_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, s
         return np.where(np.abs(y - depth_mm) < 0.5 * thickness, 1, 0)
 
     tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sheet", impedance_mrayl=1.9)})
-    return _phantom("voxel sheet", label, tissues, rotation, spacing_mm)
+    return _phantom("voxel sheet", label, tissues, rotation, spacing_mm, box_lateral_mm=50.0)
 
 
 def _phantom(
@@ -338,7 +358,7 @@ def _in_cylinder(x, y, centre, radius: float):
     return (x - centre[0]) ** 2 + (y - centre[1]) ** 2 < radius**2
 
 
-# ---- geometrical acoustics in the image plane, independent of the kernels ------------------------------------------------
+# ---- geometrical acoustics in the image plane, independent of the kernels -------------------------------------------
 
 
 def _line_at(probe: Probe, position: float) -> tuple[np.ndarray, np.ndarray]:
@@ -385,7 +405,7 @@ def _shown_behind_plane(probe, target, radius, point, normal, speeds_m_s) -> tup
     return float(shown[0]), float(shown[1])
 
 
-# ---- a head ------------------------------------------------------------------------------------------------------------
+# ---- a head ---------------------------------------------------------------------------------------------------------
 
 
 def head_mri(spacing_mm: float = 1.0, seed: int = 0) -> Volume:

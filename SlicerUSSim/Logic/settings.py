@@ -56,7 +56,7 @@ class SimulationSettings:
         require_between(owner, "intensity_threshold", self.intensity_threshold, 1e-12, 1)
         require_between(owner, "reflection_threshold", self.reflection_threshold, 1e-9, 1)
         require_between(owner, "reference_speed_m_s", self.reference_speed_m_s, 300, 6000)
-        require_between(owner, "scatterers_per_mm3", self.scatterers_per_mm3, 0.1, 10000)
+        require_between(owner, "scatterers_per_mm3", self.scatterers_per_mm3, 0.1, 200_000)
         require_between(owner, "beam_cutoff", self.beam_cutoff, 0.5, 6)
         require_between(owner, "elevational_rays", self.elevational_rays, 1, 32)
         require_between(owner, "lateral_rays", self.lateral_rays, 0, 128)

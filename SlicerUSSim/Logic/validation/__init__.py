@@ -1,0 +1,199 @@
+"""Is the simulator right? Every number of the model's specification, measured on phantoms against its prediction.
+
+A check measures one phenomenon for one orientation of its phantom on the voxels, with every probe it applies to; its
+outcome is rows of a table (predicted, measured, tolerance) and a picture. `ussim validate` runs them all.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.probe import ConvexProbe, LinearProbe, PhasedProbe, Probe
+
+#: How the phantoms, and the probes with them, lie on the voxels: along them, and two oblique ways.
+ORIENTATIONS: dict[str, np.ndarray] = {
+    "aligned": np.eye(3),
+    "oblique": Rotation.from_euler("xyz", [20, 33, 11], degrees=True).as_matrix(),
+    "diagonal": Rotation.from_euler("xyz", [45, 40, 10], degrees=True).as_matrix(),
+}
+
+_FOCUS = {"scan_lines": 161, "focus_mm": 30.0, "elevation_focus_mm": 30.0}
+PROBES: dict[str, Probe] = {
+    "linear": LinearProbe(36.0, 52.0, **_FOCUS),
+    "convex": ConvexProbe(60.0, 36.0, 52.0, **_FOCUS),
+    "phased": PhasedProbe(70.0, 52.0, **_FOCUS),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number: what theory predicts and what was measured."""
+
+    #: What is measured, and on which probe or at which depth
+    quantity: str
+    unit: str
+    predicted: float
+    measured: float
+    tolerance: float
+    #: "within": |measured - predicted| <= tolerance; "at most" and "at least": predicted + or - tolerance is a limit
+    kind: str = "within"
+
+    @property
+    def passed(self) -> bool:
+        """Whether the measured number is as predicted; not for one that is not finite."""
+        off = self.measured - self.predicted
+        if self.kind == "at most":
+            return bool(off <= self.tolerance)
+        if self.kind == "at least":
+            return bool(-off <= self.tolerance)
+        return bool(abs(off) <= self.tolerance)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one check found in one orientation."""
+
+    rows: tuple[Row, ...]
+    #: Writes the picture to a path; None where there is nothing to see
+    draw: Callable[[Path], None] | None = None
+
+
+@dataclass(frozen=True)
+class Check:
+    """One phenomenon. `measure(rotation, device)` gives an Outcome."""
+
+    name: str
+    #: What theory says, in one line
+    claim: str
+    measure: Callable[[np.ndarray, object], Outcome]
+    orientations: tuple[str, ...] = tuple(ORIENTATIONS)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A row with the check and the orientation it belongs to."""
+
+    check: str
+    orientation: str
+    row: Row
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """All rows of a validation."""
+
+    findings: tuple[Finding, ...]
+    device: str
+    pictures: tuple[str, ...] = field(default=())
+
+    @property
+    def failed(self) -> tuple[Finding, ...]:
+        """The rows that are not as predicted."""
+        return tuple(finding for finding in self.findings if not finding.row.passed)
+
+    def to_dict(self) -> dict:
+        """Plain values, one entry per row."""
+        return {
+            "device": self.device,
+            "passed": not self.failed,
+            "pictures": list(self.pictures),
+            "rows": [
+                {"check": f.check, "orientation": f.orientation, **asdict(f.row), "passed": f.row.passed}
+                for f in self.findings
+            ],
+        }
+
+    def to_markdown(self) -> str:
+        """The table, a section per check, with its claim and its picture."""
+        lines = ["# Validation", "", f"Device: {self.device}. {self.summary()}", ""]
+        claims = {check.name: check.claim for check in all_checks()}
+        for name in dict.fromkeys(finding.check for finding in self.findings):
+            lines += [f"## {name}", "", claims[name], ""]
+            if f"{_slug(name)}.png" in self.pictures:
+                lines += [f"![{name}]({_slug(name)}.png)", ""]
+            lines += ["| | orientation | predicted | measured | tolerance | |", "|---|---|---|---|---|---|"]
+            for finding in self.findings:
+                row = finding.row
+                if finding.check == name:
+                    sign = {"within": "± ", "at most": "≤ + ", "at least": "≥ - "}[row.kind]
+                    unit = f" {row.unit}" if row.unit else ""
+                    lines.append(
+                        f"| {row.quantity} | {finding.orientation} | {row.predicted:.4g}{unit} | {row.measured:.4g}{unit} "
+                        f"| {sign}{row.tolerance:.3g} | {'pass' if row.passed else '**FAIL**'} |"
+                    )
+            lines.append("")
+        return "\n".join(lines)
+
+    def summary(self) -> str:
+        """One sentence: how many rows passed."""
+        return f"{len(self.findings) - len(self.failed)} of {len(self.findings)} rows passed."
+
+
+def all_checks() -> tuple[Check, ...]:
+    """Every check, in the order of the physics: rays, speckle, artefacts, space."""
+    from SlicerUSSim.Logic.validation import rays, speckle
+
+    return (*rays.CHECKS, *speckle.CHECKS)
+
+
+def validate(
+    out: str | os.PathLike,
+    device=None,
+    only: Iterable[str] = (),
+    progress: Callable[[str], None] = lambda name: None,
+) -> Report:
+    """Run the checks (all, or those whose names contain one of `only`) and write report.md, report.json and pictures.
+
+    Raises SimulationError without matplotlib, for an `only` that no check has in its name, and for a folder that cannot
+    be made. A row that fails is no error: see Report.failed.
+    """
+    from SlicerUSSim.Logic.device import Device
+    from SlicerUSSim.Logic.figures import require_matplotlib
+    from SlicerUSSim.Logic.tissues import write_json
+    from SlicerUSSim.Logic.volume import written_whole
+
+    require_matplotlib()
+    checks = chosen_checks(only)
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SimulationError(f"{folder}: cannot be made ({error.strerror})") from None
+    opened = Device.get(device)
+    findings, pictures = [], []
+    for check in checks:
+        for orientation in check.orientations:
+            progress(f"{check.name}, {orientation}")
+            outcome = check.measure(ORIENTATIONS[orientation], opened)
+            findings += [Finding(check.name, orientation, row) for row in outcome.rows]
+            if outcome.draw is not None and orientation == check.orientations[0]:
+                name = f"{_slug(check.name)}.png"
+                outcome.draw(folder / name)
+                pictures.append(name)
+    report = Report(tuple(findings), str(opened.info), tuple(pictures))
+    write_json(folder / "report.json", report.to_dict())
+    with written_whole(folder / "report.md") as partial:
+        partial.write_text(report.to_markdown(), encoding="utf-8")
+    return report
+
+
+def chosen_checks(only: Iterable[str]) -> tuple[Check, ...]:
+    """The checks whose names contain one of the texts; all if there are none. SimulationError for one nobody has."""
+    wanted, checks = tuple(only), all_checks()
+    for text in wanted:
+        require(
+            any(text in check.name for check in checks),
+            f"no check has {text!r} in its name, expected part of: {', '.join(check.name for check in checks)}",
+        )
+    return tuple(check for check in checks if not wanted or any(text in check.name for text in wanted))
+
+
+def _slug(name: str) -> str:
+    return name.replace(" ", "-")
