@@ -212,6 +212,36 @@ def simulate(
 
 
 @main.command()
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default="ussim-validation",
+    show_default=True,
+    help="Folder for the report.",
+)
+@click.option(
+    "--only", multiple=True, metavar="TEXT", help="Only checks with this text in their name; may be repeated."
+)
+@_device_option
+@click.pass_context
+def validate(ctx: click.Context, out: Path, only: tuple[str, ...], device: str | None) -> None:
+    """Measure the simulator against theory on phantoms: tables and pictures; exit status 1 if any number is off."""
+    from SlicerUSSim.Logic.validation import chosen_checks
+    from SlicerUSSim.Logic.validation import validate as run
+
+    with _steps(sum(len(check.orientations) for check in chosen_checks(only))) as step:
+        report = run(out, device, only, step)
+    for finding in report.failed:
+        row = finding.row
+        click.echo(
+            f"off: {finding.check}, {row.quantity}, {finding.orientation}: {row.measured:.4g} {row.unit}, "
+            f"predicted {row.predicted:.4g} ({row.kind} {row.tolerance:.3g})"
+        )
+    click.echo(f"{report.summary()} Wrote {out / 'report.md'}, report.json and {len(report.pictures)} pictures.")
+    ctx.exit(1 if report.failed else 0)
+
+
+@main.command()
 @_device_option
 def devices(device: str | None) -> None:
     """Which OpenCL devices exist, which one is used and why, and how to get a faster one."""
@@ -259,7 +289,7 @@ class _steps:  # noqa: N801
     def __init__(self, count: int) -> None:
         from tqdm import tqdm
 
-        self.bar = tqdm(total=count, bar_format="|{bar:24}| {desc}", file=sys.stderr, leave=False)
+        self.bar = tqdm(total=count, bar_format="|{bar:24}| {desc}", file=sys.stderr, leave=False, disable=None)
         self.begun = 0
 
     def __enter__(self):

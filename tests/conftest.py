@@ -8,20 +8,12 @@ from pathlib import Path
 import hypothesis
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import LinearProbe, SimulationSettings, Tissue, TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.tissues import TISSUES
 
 hypothesis.settings.register_profile("ussim", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("ussim")
-
-#: Probe orientations in which physics must not differ: aligned with the voxels, and two oblique ones.
-ORIENTATIONS = {
-    "aligned": np.eye(3),
-    "oblique": Rotation.from_euler("xyz", [20, 33, 11], degrees=True).as_matrix(),
-    "diagonal": Rotation.from_euler("xyz", [45, 40, 10], degrees=True).as_matrix(),
-}
 
 #: Speckle without attenuation, so that statistics do not change with depth; and fluids without scatterers.
 SPECKLE = replace(TISSUES["white matter"], name="speckle", attenuation_db_cm_mhz=0.0)
@@ -52,16 +44,6 @@ def simulator(
     """A simulator for labels 1, 2, ... with `coupling` around them."""
     table = TissueTable({0: coupling, **dict(enumerate(tissues, 1))}, membrane)
     return UltrasoundSimulator(labels, table, SimulationSettings(**settings))
-
-
-def correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Magnitude of the complex correlation coefficient of two zero-mean signals."""
-    return float(abs((a * b.conj()).sum()) / np.sqrt((abs(a) ** 2).sum() * (abs(b) ** 2).sum()))
-
-
-def level_db(signal: np.ndarray) -> float:
-    """Mean power in dB."""
-    return float(10 * np.log10((np.abs(signal) ** 2).mean()))
 
 
 @pytest.fixture(scope="session")

@@ -23,9 +23,11 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     Volume,
 )
+from SlicerUSSim.Logic.measurement import level_db
 from SlicerUSSim.Logic.simulator import EmptyViewWarning
 from SlicerUSSim.Logic.tissues import TISSUES
-from tests.conftest import FLUID, ORIENTATIONS, SPECKLE, block, level_db, rigid, simulator
+from SlicerUSSim.Logic.validation import ORIENTATIONS
+from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
 
 PROBES = {
     "linear": LinearProbe(40, 50, scan_lines=161),

@@ -12,8 +12,8 @@ from SlicerUSSim.Logic.simulator import Frame
 
 
 def level_db(signal: np.ndarray) -> float:
-    """Mean power in dB."""
-    return float(10.0 * np.log10((np.abs(signal) ** 2).mean()))
+    """Mean power in dB; -300 for silence."""
+    return float(10.0 * np.log10(max((np.abs(signal) ** 2).mean(), 1e-30)))
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
@@ -43,21 +43,28 @@ def echo_near(
     """(lateral mm, depth mm, amplitude) of the strongest echo within a distance of a place (lateral, depth).
 
     Across the lines the place is the centroid of the power within half a millimetre of the echo's range; along the
-    line the parabola through the three highest samples.
+    line that of the power between the -6 dB points. Not a number where all is silent.
+    Raises SimulationError for a place outside the imaged field.
     """
     x, y = sample_positions(frame, probe)
     near = np.hypot(x - place_mm[0], y - place_mm[1]) < within_mm
     require(bool(near.any()), f"no sample lies within {within_mm:g} mm of {place_mm}")
     amplitude = np.where(near, np.abs(frame.iq), 0.0)
     line, sample = np.unravel_index(np.argmax(amplitude), amplitude.shape)
+    if amplitude[line, sample] == 0.0:
+        return np.nan, np.nan, 0.0
     half = max(round(0.5 / frame.sample_interval_mm), 1)
     power = (amplitude[:, max(sample - half, 0) : sample + half + 1] ** 2).sum(axis=1)
     power[power < 0.25 * power.max()] = 0.0
     position = float(np.average(np.arange(len(power)), weights=power))
-    before, peak, after = np.abs(frame.iq[line, sample - 1 : sample + 2])
-    curvature = before - 2.0 * peak + after
-    part = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
-    along = (sample + float(np.clip(part, -0.5, 0.5))) * frame.sample_interval_mm
+    trace = np.abs(frame.iq[line])
+    peak = trace[sample]
+    first = last = sample
+    while first > 0 and trace[first - 1] > 0.5 * peak:
+        first -= 1
+    while last + 1 < len(trace) and trace[last + 1] > 0.5 * peak:
+        last += 1
+    along = np.average(np.arange(first, last + 1), weights=trace[first : last + 1] ** 2) * frame.sample_interval_mm
     lines = np.arange(len(power))
     origin = [float(np.interp(position, lines, probe.origins_mm()[:, a])) for a in (0, 1)]
     direction = np.array([np.interp(position, lines, probe.directions()[:, a]) for a in (0, 1)])

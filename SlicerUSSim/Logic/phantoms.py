@@ -7,8 +7,10 @@ object then lies differently on the voxels, and nothing about its image may chan
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -23,9 +25,17 @@ REFERENCE_SPEED_M_S = 1540.0
 BACKGROUND = Tissue("background", REFERENCE_SPEED_M_S, 1.6, 0.5, mu0=0.33, sigma0=0.15)
 #: No echo, no attenuation
 FLUID = Tissue("fluid", REFERENCE_SPEED_M_S, 1.6, 0.0)
-#: Reflects nearly everything, so that little comes out of its back
-STEEL = Tissue("steel", REFERENCE_SPEED_M_S, 46.0, 0.0)
-_LATERAL, _DEPTH, _THICKNESS = 18.0, 54.0, 6.0  # half width, depth, half thickness that a phantom has at least
+#: Reflects nearly everything and absorbs the rest, so that no comet tail covers what lies behind
+STEEL = Tissue("steel", REFERENCE_SPEED_M_S, 46.0, 30.0)
+
+
+class _Box(NamedTuple):
+    """What a phantom holds at least, in the probe frame (mm)."""
+
+    half_width: float = 18.0
+    top: float = -4.0
+    bottom: float = 54.0
+    half_thickness: float = 6.0
 
 
 @dataclass(frozen=True)
@@ -102,7 +112,7 @@ def speed_block(
 ) -> Phantom:
     """Range distortion: a wire behind a block of another speed of sound moves by d (c_ref / c - 1)."""
     block = replace(BACKGROUND, name="block", speed_of_sound_m_s=speed_m_s)
-    top, wire, radius = 12.0, (0.0, 40.0), 0.6
+    top, wire, radius = 12.0, (0.0, 40.0), 0.8
 
     def label(x, y, z):
         labels = np.where((np.abs(x) < 10.0) & (y > top) & (y < top + thickness_mm), 2, 1)
@@ -115,7 +125,7 @@ def speed_block(
 
     tissues = TissueTable({0: BACKGROUND, 1: BACKGROUND, 2: block, 3: STEEL})
     return _phantom(
-        "speed block", label, tissues, rotation, 0.3, expected, tissues.replace("block", **_acoustics(BACKGROUND))
+        "speed block", label, tissues, rotation, 0.25, expected, tissues.replace("block", **_acoustics(BACKGROUND))
     )
 
 
@@ -194,7 +204,15 @@ def parallel_plates(
             for n in range(3)
         )
 
-    return _phantom("parallel plates", label, TissueTable({1: above, 2: gap, 3: below}), rotation, spacing_mm, expected)
+    return _phantom(
+        "parallel plates",
+        label,
+        TissueTable({0: below, 1: above, 2: gap, 3: below}),
+        rotation,
+        spacing_mm,
+        expected,
+        box=_Box(half_width=26.0, bottom=30.0),
+    )
 
 
 # ---- resolution and speckle -----------------------------------------------------------------------------------------
@@ -203,7 +221,8 @@ def parallel_plates(
 def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0.2) -> Phantom:
     """A quality-assurance phantom: wires every 10 mm of depth, black cysts, and blocks 6 dB above and below."""
     radius = 0.4
-    wires = [(0.3 * (depth - 30.0), depth) for depth in (10.0, 20.0, 30.0, 40.0, 50.0)]  # none behind another
+    # None is on another's scan line, or on a cyst's, for any kind of probe.
+    wires = [(-2.0, 10.0), (2.0, 20.0), (-1.0, 30.0), (1.0, 40.0), (0.0, 50.0)]
     cysts = {2: [(-12.0, 20.0), (-12.0, 45.0)], 3: [(12.0, 20.0)], 4: [(12.0, 45.0)]}
     changes_db = {3: 6.0, 4: -6.0}
     plain = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
@@ -242,7 +261,7 @@ def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0
 
 
 def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom:
-    """One tissue everywhere: the level is Var of its scatterers, the envelope is Rayleigh, the PSF sets correlations."""
+    """One tissue everywhere: the level is Var of its scatterers, the envelope Rayleigh; the PSF sets correlations."""
     return _phantom(
         "uniform speckle", lambda x, y, z: np.ones_like(x + y + z), TissueTable({0: tissue, 1: tissue}), rotation, 1.0
     )
@@ -255,13 +274,18 @@ def thin_rod(rotation: np.ndarray | None = None, *, depth_mm: float = 30.0, widt
         return np.where((np.abs(y - depth_mm) < 0.5 * width_mm) & (np.abs(z) < 0.5 * width_mm), 1, 0)
 
     bar = replace(FLUID, name="bar", mu0=2.0, sigma0=1.0)
-    return _phantom("thin rod", label, TissueTable({0: FLUID, 1: bar}), rotation, 0.3, box_lateral_mm=12.0)
+    return _phantom("thin rod", label, TissueTable({0: FLUID, 1: bar}), rotation, 0.3, box=_Box(half_width=12.0))
 
 
 def layered(
-    tissues: Sequence[Tissue], borders_mm: Sequence[float], rotation: np.ndarray | None = None, *, tilt_deg: float = 0.0
+    tissues: Sequence[Tissue],
+    borders_mm: Sequence[float],
+    rotation: np.ndarray | None = None,
+    *,
+    tilt_deg: float = 0.0,
+    spacing_mm: float = 0.5,
 ) -> Phantom:
-    """Plane layers of labels 1, 2, ... with borders at the given depths on the axis, tilted about the elevational axis."""
+    """Plane layers of labels 1, 2, ... with borders at the given depths on the axis, tilted about z."""
     require(len(tissues) == len(borders_mm) + 1, f"{len(tissues)} tissues and {len(borders_mm)} borders do not fit")
     tilt = np.radians(tilt_deg)
 
@@ -269,7 +293,20 @@ def layered(
         along = np.sin(tilt) * x + np.cos(tilt) * y
         return 1 + sum((along > np.cos(tilt) * border).astype(np.uint8) for border in borders_mm)
 
-    return _phantom("layers", label, TissueTable(dict(enumerate(tissues, 1))), rotation, 0.5, box_lateral_mm=50.0)
+    return _phantom(
+        "layers", label, TissueTable(dict(enumerate(tissues, 1))), rotation, spacing_mm, box=_Box(half_width=50.0)
+    )
+
+
+def small_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.0, half_mm: float = 2.0) -> Phantom:
+    """A square plate, small against the beam's changes and fine against its width, that faces the probe."""
+
+    def label(x, y, z):
+        return np.where((y > depth_mm) & (y < depth_mm + 1.5) & (np.abs(x) < half_mm) & (np.abs(z) < half_mm), 1, 0)
+
+    tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sheet", impedance_mrayl=1.8)})
+    box = _Box(half_mm + 2.0, depth_mm - 2.0, depth_mm + 4.0, half_mm + 6.0)
+    return _phantom("small sheet", label, tissues, rotation, 0.1, box=box)
 
 
 # ---- voxels ---------------------------------------------------------------------------------------------------------
@@ -301,21 +338,19 @@ def voxel_sphere(
 
 
 def voxel_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, spacing_mm: float = 1.0) -> Phantom:
-    """A sheet one voxel thick across the beam (falx, dura); oblique ones are voxelised so that voxels touch by edges."""
+    """A sheet one voxel thick across the beam (falx, dura); an oblique one has voxels that touch by edges at least."""
     thickness = spacing_mm if rotation is None or np.allclose(np.abs(rotation).max(axis=0), 1.0) else 1.5 * spacing_mm
 
     def label(x, y, z):
         return np.where(np.abs(y - depth_mm) < 0.5 * thickness, 1, 0)
 
     tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sheet", impedance_mrayl=1.9)})
-    return _phantom("voxel sheet", label, tissues, rotation, spacing_mm, box_lateral_mm=50.0)
+    return _phantom("voxel sheet", label, tissues, rotation, spacing_mm, box=_Box(half_width=50.0))
 
 
-def _phantom(
-    name, label, tissues, rotation, spacing_mm, expected=None, reference=None, box_lateral_mm=_LATERAL
-) -> Phantom:
+def _phantom(name, label, tissues, rotation, spacing_mm, expected=None, reference=None, box=None) -> Phantom:
     pose = _pose(rotation)
-    labels = _voxelise(label, pose[:3, :3], spacing_mm, box_lateral_mm)
+    labels = _voxelise(label, pose[:3, :3], spacing_mm, box or _Box())
     return Phantom(name, labels, tissues, pose, expected or (lambda probe: ()), reference)
 
 
@@ -327,15 +362,11 @@ def _pose(rotation: np.ndarray | None) -> np.ndarray:
     return check_rigid("rotation", pose)
 
 
-def _voxelise(label, rotation: np.ndarray, spacing_mm: float, lateral_mm: float) -> Volume:
+def _voxelise(label, rotation: np.ndarray, spacing_mm: float, box: _Box) -> Volume:
     """Labels on a grid along RAS. Voxel centres lie at odd multiples of half the spacing, so that a plane at a multiple
     of the spacing is half-way between two layers: where the object lies straight, its borders are exact."""
-    corners = (
-        np.array(
-            [[x, y, z] for x in (-lateral_mm, lateral_mm) for y in (-4.0, _DEPTH) for z in (-_THICKNESS, _THICKNESS)]
-        )
-        @ rotation.T
-    )
+    sides = (-box.half_width, box.half_width), (box.top, box.bottom), (-box.half_thickness, box.half_thickness)
+    corners = np.array(list(itertools.product(*sides))) @ rotation.T
     low = np.floor(corners.min(axis=0) / spacing_mm).astype(int)
     high = np.ceil(corners.max(axis=0) / spacing_mm).astype(int)
     x, y, z = (spacing_mm * (np.arange(a, b) + 0.5) for a, b in zip(low, high, strict=True))

@@ -106,6 +106,8 @@ class Report:
             "pictures": list(self.pictures),
             "rows": [
                 {"check": f.check, "orientation": f.orientation, **asdict(f.row), "passed": f.row.passed}
+                # What is no number, because the echo to be measured was not there, has no place in JSON either.
+                | {"measured": float(f.row.measured) if np.isfinite(f.row.measured) else None}
                 for f in self.findings
             ],
         }
@@ -124,10 +126,9 @@ class Report:
                 if finding.check == name:
                     sign = {"within": "± ", "at most": "≤ + ", "at least": "≥ - "}[row.kind]
                     unit = f" {row.unit}" if row.unit else ""
-                    lines.append(
-                        f"| {row.quantity} | {finding.orientation} | {row.predicted:.4g}{unit} | {row.measured:.4g}{unit} "
-                        f"| {sign}{row.tolerance:.3g} | {'pass' if row.passed else '**FAIL**'} |"
-                    )
+                    values = f"{row.predicted:.4g}{unit} | {row.measured:.4g}{unit} | {sign}{row.tolerance:.3g}"
+                    verdict = "pass" if row.passed else "**FAIL**"
+                    lines.append(f"| {row.quantity} | {finding.orientation} | {values} | {verdict} |")
             lines.append("")
         return "\n".join(lines)
 
@@ -138,9 +139,9 @@ class Report:
 
 def all_checks() -> tuple[Check, ...]:
     """Every check, in the order of the physics: rays, speckle, artefacts, space."""
-    from SlicerUSSim.Logic.validation import rays, speckle
+    from SlicerUSSim.Logic.validation import artefacts, beams, rays, speckle
 
-    return (*rays.CHECKS, *speckle.CHECKS)
+    return (*rays.CHECKS, *speckle.CHECKS, *artefacts.CHECKS, *beams.CHECKS)
 
 
 def validate(

@@ -1,3 +1,127 @@
-"""Pictures of the validation: phantom beside simulation with the prediction drawn in, in the style of the Fig. 2."""
-def draw_correlations(path, **k): pass
-def draw_rayleigh(path, **k): pass
+"""Pictures of the validation: phantom beside simulation, prediction drawn in, in the style of the paper's Fig. 2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from SlicerUSSim.Logic.measurement import RayleighFit
+from SlicerUSSim.Logic.phantoms import Echo, Phantom
+from SlicerUSSim.Logic.placement import slice_under_probe
+from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.simulator import Frame
+from SlicerUSSim.Logic.volume import written_whole
+
+_OBJECT, _PREDICTION = "#4fb0c6", "#ffc83d"
+# One grey per label, so that the phantom reads as a drawing: background, then its parts.
+_LABEL_GREYS = np.array([70, 70, 130, 255, 30, 255, 190], np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One phantom and its image."""
+
+    title: str
+    phantom: Phantom
+    probe: Probe
+    frame: Frame
+
+
+def draw_views(path: Path, views: list[View]) -> None:
+    """Phantom and simulated image side by side, one row per view; circles where objects are, crosses where theory says
+    that the image shows them, boxes where it predicts the level."""
+    from matplotlib import patches
+
+    figure, axes = _figure(len(views), 2, 4.2, 3.6)
+    for (left, right), view in zip(axes, views, strict=True):
+        bounds = view.probe.image_bounds_mm()
+        extent = (bounds[0], bounds[1], bounds[3], bounds[2])
+        labels = slice_under_probe(view.phantom.labels, view.frame.grid, view.phantom.probe_to_ras, order=0)
+        left.imshow(_LABEL_GREYS[labels], cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="nearest")
+        outline = view.probe.outline_mm()
+        left.plot(outline[:, 0], outline[:, 1], color="#888888", linewidth=0.8)
+        right.imshow(view.frame.image, cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="bilinear")
+        for axis in (left, right):
+            for mark in view.phantom.expected(view.probe):
+                if isinstance(mark, Echo):
+                    axis.plot(*mark.object_mm, "o", color=_OBJECT, fillstyle="none", markersize=9, markeredgewidth=1.2)
+                    axis.plot(*mark.shown_mm, "x", color=_PREDICTION, markersize=6, markeredgewidth=1.2)
+                else:
+                    x0, x1, y0, y1 = mark.region_mm
+                    axis.add_patch(patches.Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, color=_PREDICTION))
+                    axis.text(x1 + 0.5, 0.5 * (y0 + y1), f"{mark.change_db:+.1f} dB", color=_PREDICTION, fontsize=8)
+            axis.set_xlim(bounds[0], bounds[1])
+            axis.set_ylim(bounds[3], bounds[2])
+            axis.set_aspect("equal")
+        left.set_title(f"{view.title}: phantom", fontsize=10)
+        right.set_title("simulated; x: predicted, o: object", fontsize=10)
+        left.set_ylabel("depth [mm]")
+    for axis in axes[-1]:
+        axis.set_xlabel("lateral [mm]")
+    _save(figure, path)
+
+
+def draw_rayleigh(path: Path, fit: RayleighFit, envelope: np.ndarray) -> None:
+    """The envelope image and its histogram with the fitted density, as the paper's Fig. 4."""
+    figure, axes = _figure(1, 2, 4.2, 4.2)
+    image, histogram = axes[0]
+    image.imshow(envelope.T, cmap="gray", aspect="auto")
+    image.set_title("envelope", fontsize=10)
+    image.set_xlabel("scan line")
+    image.set_ylabel("sample")
+    grey = np.arange(256) + 0.5
+    histogram.bar(grey, fit.histogram, width=1.0, color="#8fb8c9", label="simulated")
+    histogram.plot(grey, fit.density, color="#c0392b", label=f"Rayleigh, sigma {fit.sigma:.2f}")
+    histogram.set_title(f"SSE {fit.sse:.2e} (paper 3.14e-05)", fontsize=10)
+    histogram.set_xlabel("grey level")
+    histogram.set_ylabel("share of samples")
+    histogram.legend(fontsize=8)
+    _save(figure, path)
+
+
+def draw_correlations(path: Path, curves: dict, frame: Frame, probe: Probe) -> None:
+    """Speckle, and its lateral correlation at three depths with the theory's curve."""
+    figure, axes = _figure(1, 2, 4.2, 4.2)
+    image, plot = axes[0]
+    left, right, top, bottom = probe.image_bounds_mm()
+    image.imshow(frame.image, cmap="gray", extent=(left, right, bottom, top))
+    image.set_title("uniform speckle", fontsize=10)
+    image.set_xlabel("lateral [mm]")
+    image.set_ylabel("depth [mm]")
+    for (depth, (lags, measured, sigma)), colour in zip(curves.items(), ("#c0392b", "#2c5f8a", "#5f9e6e"), strict=True):
+        fine = np.linspace(0.0, lags[-1], 100)
+        plot.plot(fine, np.exp(-(fine**2) / (4 * sigma**2)), color=colour, label=f"theory at {depth}")
+        plot.plot(lags, measured, "o", color=colour, markersize=4)
+    plot.set_title("lateral correlation, linear array", fontsize=10)
+    plot.set_xlabel("distance [mm]")
+    plot.legend(fontsize=8)
+    _save(figure, path)
+
+
+def draw_slice_thickness(path: Path, curves: dict) -> None:
+    """How a thin bar fades as the image plane moves away from it."""
+    figure, axes = _figure(1, 1, 5.2, 4.0)
+    plot = axes[0, 0]
+    for (name, (offsets, measured, expected)), colour in zip(
+        curves.items(), ("#c0392b", "#2c5f8a", "#5f9e6e"), strict=True
+    ):
+        plot.plot(offsets, expected, color=colour, label=f"theory, {name}")
+        plot.plot(offsets, measured, "o", color=colour, markersize=5)
+    plot.set_xlabel("distance from the image plane [mm]")
+    plot.set_ylabel("power of the bar [dB]")
+    plot.legend(fontsize=8)
+    _save(figure, path)
+
+
+def _figure(rows: int, columns: int, width: float, height: float):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(columns * width, rows * height), dpi=100, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _save(figure, path: Path) -> None:
+    with written_whole(path) as partial:
+        figure.savefig(partial)

@@ -1,0 +1,167 @@
+"""Checks of the beam (PHYSICS sections 3 and 4): echoes as wide as the point spread function, slice thickness."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from SlicerUSSim.Logic.measurement import echo_near, full_width
+from SlicerUSSim.Logic.phantoms import FLUID, layered, small_sheet, thin_rod, wires_and_cysts
+from SlicerUSSim.Logic.probe import FWHM_PER_SIGMA, LinearProbe
+from SlicerUSSim.Logic.settings import SimulationSettings
+from SlicerUSSim.Logic.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.validation import PROBES, Check, Outcome, Row, pictures
+
+
+def echo_level(rotation: np.ndarray, device) -> Outcome:
+    """A plane border across the beam, at every probe's focus and away from it."""
+    behind = replace(FLUID, name="behind", impedance_mrayl=1.9)
+    r = (1.9 - FLUID.impedance_mrayl) / (1.9 + FLUID.impedance_mrayl)
+    rows = []
+    phantom = layered([FLUID, behind], [25.0], rotation, spacing_mm=0.25)
+    for kind, expected in (("pressure", r), ("energy", r * r)):
+        settings = SimulationSettings(scattering=False, interface_reflection=kind)
+        simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+        for name, probe in PROBES.items():
+            low = replace(probe, frequency_mhz=2.0)  # as for reverberation
+            peak = echo_near(simulator.simulate(low, phantom.probe_to_ras), low, (0.0, 25.0), 1.0)[2]
+            predicted = 20 * np.log10(expected) + settings.interface_gain_db
+            rows.append(Row(f"{kind} echo, {name}", "dB", predicted, 20 * np.log10(peak), 0.5))
+    return Outcome(tuple(rows))
+
+
+def specular_echoes(rotation: np.ndarray, device) -> Outcome:
+    """The echo of every hit is w A |r| cos^n(i): a plane tilted by 15 degrees, two exponents."""
+    behind = replace(FLUID, name="behind", impedance_mrayl=1.9)
+    rows = []
+    for exponent in (0.0, 3.0):
+        phantom = layered([replace(FLUID, attenuation_db_cm_mhz=0.4), behind], [20.0], rotation, tilt_deg=15.0)
+        settings = SimulationSettings(specular_exponent=exponent, reflections=False)
+        simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+        for name, probe in PROBES.items():
+            hits = simulator.trace(probe, phantom.probe_to_ras).hits
+            r = (1.9 - FLUID.impedance_mrayl) / (1.9 + FLUID.impedance_mrayl)
+            loss = 10 ** (-0.4 * probe.frequency_mhz * 2 * hits["path_mm"].astype(float) / 10 / 20)
+            gain = 10 ** (settings.interface_gain_db / 20) / settings.elevational_rays
+            ratio = hits["echo"] / (loss * r * gain * hits["cos_incidence"].astype(float) ** exponent)
+            rows.append(Row(f"largest error, n = {exponent:.0f}, {name}", "", 0.0, float(abs(ratio - 1).max()), 0.01))
+    return Outcome(tuple(rows))
+
+
+def interface_width(rotation: np.ndarray, device) -> Outcome:
+    """A sheet of 4 x 4 mm, away from the focus: a box convolved with the beam."""
+    half, depth = 2.0, 20.0
+    phantom = small_sheet(rotation, depth_mm=depth, half_mm=half)
+    settings = SimulationSettings(scattering=False, elevational_rays=16, specular_exponent=0.0)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+    probe = LinearProbe(20.0, 30.0, scan_lines=101, focus_mm=35.0, elevation_focus_mm=35.0, frequency_mhz=3.0)
+    sigma_l, sigma_e = (float(s) for s in probe.beam_sigma_mm(depth))
+
+    def echo(offset_mm: float) -> np.ndarray:
+        pose = phantom.probe_to_ras.copy()
+        pose[:3, 3] += offset_mm * pose[:3, 2]
+        frame = simulator.simulate(probe, pose)
+        near = slice(int((depth - 2) / frame.sample_interval_mm), int((depth + 2) / frame.sample_interval_mm))
+        return np.abs(frame.iq[:, near]).max(axis=1)
+
+    offsets = np.arange(-6.0, 6.01, 0.5)
+    lateral, elevational = echo(0.0), np.array([echo(offset)[49:52].mean() for offset in offsets])
+    box = (2 * half) ** 2 / 12
+    predicted = {"lateral": np.sqrt(box + sigma_l**2), "elevational": np.sqrt(box + sigma_e**2)}
+    measured = {"lateral": _spread(probe.line_positions(), lateral), "elevational": _spread(offsets, elevational)}
+    return Outcome(
+        tuple(
+            Row(f"{axis} standard deviation of the echo", "mm", predicted[axis], measured[axis], 0.1 * predicted[axis])
+            for axis in predicted
+        )
+    )
+
+
+def _spread(positions: np.ndarray, values: np.ndarray) -> float:
+    """Second moment about the mean of values that stand for a box convolved with a Gaussian."""
+    mean = np.average(positions, weights=values)
+    return float(np.sqrt(np.average((positions - mean) ** 2, weights=values)))
+
+
+def resolution(rotation: np.ndarray, device) -> Outcome:
+    """Wires thinner than the beam: their echoes are as wide as the point spread function at their depth."""
+    phantom = wires_and_cysts(rotation)
+    settings = SimulationSettings(scattering=False, reflections=False)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+    rows = []
+    for name, probe in PROBES.items():
+        fine = replace(probe, scan_lines=481)
+        frame = simulator.simulate(fine, phantom.probe_to_ras)
+        for wire in (
+            e for e in phantom.expected(fine) if e.name in ("wire at 20 mm", "wire at 30 mm", "wire at 40 mm")
+        ):
+            depth = float(np.hypot(wire.shown_mm[0], wire.shown_mm[1] + _apex(fine))) - _apex(fine)
+            at = round(depth / frame.sample_interval_mm)
+            band = np.abs(frame.iq[:, at - 12 : at + 13]).max(axis=1)
+            apart = fine.line_spacing * (1.0 if fine.is_linear else fine.apex_radius_mm + depth)
+            width = full_width(np.arange(len(band)) * apart, band)
+            predicted = float(fine.beam_sigma_mm(depth)[0]) * FWHM_PER_SIGMA
+            rows.append(Row(f"lateral FWHM, {wire.name}, {name}", "mm", predicted, width, 0.15 * predicted))
+    return Outcome(tuple(rows))
+
+
+def _apex(probe) -> float:
+    return 0.0 if probe.is_linear else probe.apex_radius_mm
+
+
+def slice_thickness(rotation: np.ndarray, device) -> Outcome:
+    """A thin bar along the image, seen from a probe that moves away from it: its power falls as the beam says."""
+    depth, width = 30.0, 1.2
+    phantom = thin_rod(rotation, depth_mm=depth, width_mm=width)
+    # Dense scatterers: what varies with the offset must be the beam, not which scatterers it meets.
+    settings = SimulationSettings(scatterers_per_mm3=1000.0)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+    rows, curves = [], {}
+    across = np.linspace(-0.5 * width, 0.5 * width, 25)
+    for name, probe in PROBES.items():
+        wide = replace(probe, elevation_focus_mm=55.0)
+        sigma = float(wide.beam_sigma_mm(depth)[1])
+        offsets = sigma * np.array([0.0, 0.5, 1.0, 1.5, 2.0])
+        powers, theory = [], []
+        for offset in offsets:
+            pose = phantom.probe_to_ras.copy()
+            pose[:3, 3] += offset * pose[:3, 2]
+            frame = simulator.simulate(wide, pose)
+            powers.append(_band_power(frame, wide, depth))
+            theory.append(np.exp(-((across - offset) ** 2) / sigma**2).mean())
+        measured, expected = (10 * np.log10(np.maximum(v, 1e-30) / v[0]) for v in (powers, theory))
+        rows += [
+            Row(f"fall at {offset / sigma:.1f} sigma out of plane, {name}", "dB", e, m, 0.5 + 0.08 * abs(e))
+            for offset, e, m in zip(offsets[1:], expected[1:], measured[1:], strict=True)
+        ]
+        curves[name] = (offsets, measured, expected)
+    return Outcome(tuple(rows), partial(pictures.draw_slice_thickness, curves=curves))
+
+
+def _band_power(frame, probe, depth_mm: float) -> float:
+    """Mean power about the bar on the middle lines; curved arrays see it deeper, the further they look aside."""
+    middle = slice(len(frame.iq) // 2 - 40, len(frame.iq) // 2 + 41)
+    angle = 0.0 if probe.is_linear else abs(probe.line_positions()[middle]).max()
+    low = depth_mm - 2.0
+    high = depth_mm + 2.0 + (_apex(probe) + depth_mm) * (1 / np.cos(angle) - 1)
+    samples = slice(int(low / frame.sample_interval_mm), int(high / frame.sample_interval_mm))
+    return float((np.abs(frame.iq[middle, samples]) ** 2).mean())
+
+
+CHECKS = (
+    Check(
+        "echo level",
+        "A plane border across the beam echoes r, or r^2 by the paper's eq. 2, times the gain.",
+        echo_level,
+    ),
+    Check("specular echoes", "The echo of a hit is w A |r| cos^n of the angle of incidence.", specular_echoes),
+    Check("interface width", "A small sheet spreads over lines and slices as the beam does.", interface_width),
+    Check("resolution", "A wire is as wide as the beam at its depth.", resolution),
+    Check(
+        "slice thickness",
+        "A thin bar out of plane fades by exp(-z^2 / sigma^2) in power, averaged over its width.",
+        slice_thickness,
+    ),
+)

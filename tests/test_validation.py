@@ -1,0 +1,185 @@
+"""Every row of the validation, the phantoms it measures, and that it would notice if the physics were wrong."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from SlicerUSSim.cli import main
+from SlicerUSSim.Logic import SimulationError, phantoms, validation
+from SlicerUSSim.Logic.measurement import fit_rayleigh, full_width, level_db
+from SlicerUSSim.Logic.phantoms import Echo
+from SlicerUSSim.Logic.settings import SimulationSettings
+from SlicerUSSim.Logic.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.validation import ORIENTATIONS, PROBES, Row, all_checks, validate
+
+CASES = [(check, orientation) for check in all_checks() for orientation in check.orientations]
+
+
+@pytest.mark.parametrize(
+    ("check", "orientation"), CASES, ids=[f"{check.name}-{orientation}" for check, orientation in CASES]
+)
+def test_theory_and_simulation_agree(check, orientation):
+    outcome = check.measure(ORIENTATIONS[orientation], None)
+    assert outcome.rows
+    off = [
+        f"{row.quantity}: {row.measured:.5g}, predicted {row.predicted:.5g} ({row.kind} {row.tolerance:.3g})"
+        for row in outcome.rows
+        if not row.passed
+    ]
+    assert not off, "; ".join(off)
+
+
+def test_everything_the_specification_names_has_a_check_in_three_orientations():
+    lasting = {"rayleigh": 2}  # second long each, and speckle statistics has all three
+    for check in all_checks():
+        assert len(check.orientations) == lasting.get(check.name, 3), check.name
+    assert len({check.name for check in all_checks()}) == len(all_checks())
+
+
+@pytest.mark.parametrize(
+    ("kind", "measured", "passed"),
+    [
+        ("within", 10.4, True),
+        ("within", 9.4, False),
+        ("within", float("nan"), False),
+        ("at most", 10.4, True),
+        ("at most", -90.0, True),
+        ("at most", 10.6, False),
+        ("at least", 9.6, True),
+        ("at least", 90.0, True),
+        ("at least", 9.4, False),
+        ("at least", float("nan"), False),
+    ],
+)
+def test_a_row_passes_only_inside_its_tolerance(kind, measured, passed):
+    assert Row("x", "mm", 10.0, measured, 0.5, kind).passed is passed
+
+
+# ---- wrong physics is noticed ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("check", "wrong"),
+    [
+        ("attenuation and time", {"reference_speed_m_s": 1560.0}),
+        ("mirroring", {"reflections": False}),
+        ("reverberation", {"max_ray_depth": 1}),
+        ("interface width", {"elevational_rays": 1}),
+        ("specular echoes", {"interface_reflection": "energy"}),
+        ("slice thickness", {"beam_cutoff": 0.8}),
+        ("speckle statistics", {"scatterers_per_mm3": 4.0}),
+        ("speckle correlation", {"beam_cutoff": 0.6}),
+    ],
+)
+def test_wrong_physics_fails_the_check_of_its_phenomenon(monkeypatch, check, wrong):
+    """The same measurement on a simulator that ignores or distorts what the check is about."""
+
+    class Distorted(UltrasoundSimulator):
+        def __init__(self, labels, tissues, settings=None, device=None):
+            super().__init__(labels, tissues, replace(settings or SimulationSettings(), **wrong), device)
+
+    (chosen,) = (c for c in all_checks() if c.name == check)
+    for module in ("artefacts", "beams", "rays", "speckle"):
+        monkeypatch.setattr(f"SlicerUSSim.Logic.validation.{module}.UltrasoundSimulator", Distorted)
+    assert not all(row.passed for row in chosen.measure(ORIENTATIONS["aligned"], None).rows)
+
+
+# ---- the report -----------------------------------------------------------------------------------------------------
+
+
+def test_the_report_holds_every_row_and_its_pictures(tmp_path):
+    report = validate(tmp_path / "out", only=["sub-voxel", "thin sheet", "shadow"])
+    assert not report.failed
+    written = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert written["passed"] is True and len(written["rows"]) == len(report.findings)
+    assert {row["orientation"] for row in written["rows"]} == set(ORIENTATIONS)
+    table = (tmp_path / "out" / "report.md").read_text()
+    assert table.count("| pass |") == len(report.findings) and "FAIL" not in table
+    assert report.pictures == ("shadow-and-enhancement.png",)
+    assert (tmp_path / "out" / "shadow-and-enhancement.png").stat().st_size > 10_000
+
+
+def test_the_command_says_what_is_off_and_exits_with_one(tmp_path, monkeypatch):
+    good = next(check for check in all_checks() if check.name == "thin sheet")
+
+    def off(rotation, device):
+        return validation.Outcome((replace(good.measure(rotation, device).rows[0], predicted=2.0),))
+
+    monkeypatch.setattr(validation, "all_checks", lambda: (replace(good, measure=off),))
+    result = CliRunner().invoke(main, ["validate", "--out", str(tmp_path)])
+    assert result.exit_code == 1
+    assert "off: thin sheet, share of rays that see it, linear, oblique: 1" in result.output
+    assert json.loads((tmp_path / "report.json").read_text())["passed"] is False
+    assert "**FAIL**" in (tmp_path / "report.md").read_text()
+
+
+def test_the_command_exits_with_zero_when_all_is_well_and_two_for_a_wrong_name(tmp_path):
+    assert CliRunner().invoke(main, ["validate", "--out", str(tmp_path), "--only", "thin"]).exit_code == 0
+    result = CliRunner().invoke(main, ["validate", "--out", str(tmp_path), "--only", "gravity"])
+    assert result.exit_code == 2 and "no check has 'gravity' in its name" in result.stderr
+
+
+def test_a_report_that_cannot_be_written_is_one_clear_error(tmp_path):
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(SimulationError, match="taken: cannot be made"):
+        validate(tmp_path / "taken", only=["thin"])
+
+
+# ---- phantoms and measurements --------------------------------------------------------------------------------------
+
+
+@given(st.tuples(*[st.floats(-90, 90)] * 3))
+def test_a_rotated_phantom_has_the_same_size_and_a_rigid_pose(angles):
+    rotation = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    turned = phantoms.thin_rod(rotation, width_mm=3.0)
+    np.testing.assert_allclose(turned.probe_to_ras[:3, :3], rotation)
+    # The grid holds more of the bar than the box that it has to hold, so only a part of it is measured.
+    ijk = np.argwhere(turned.labels.array == 1)[:, ::-1]
+    along = (np.c_[ijk, np.ones(len(ijk))] @ turned.labels.ijk_to_ras.T)[:, :3] @ rotation
+    inside = abs(along[:, 0]) < 10.0
+    voxel = turned.labels.spacing_mm.prod()
+    assert inside.sum() * voxel == pytest.approx(20.0 * 3.0 * 3.0, rel=0.06)
+    assert abs(along[:, 1] - 30.0).max() < 1.51 and abs(along[:, 2]).max() < 1.51
+
+
+def test_a_rotation_that_is_none_is_refused():
+    with pytest.raises(SimulationError, match="rotation is not rigid"):
+        phantoms.mirror(2.0 * np.eye(3))
+    with pytest.raises(SimulationError, match=r"rotation has shape \(2, 2\)"):
+        phantoms.mirror(np.eye(2))
+
+
+@pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES)
+def test_refraction_between_equal_speeds_displaces_nothing(probe):
+    phantom = phantoms.refracting_wedge(speeds_m_s=(1540.0, 1540.0))
+    for echo in phantom.expected(probe):
+        assert isinstance(echo, Echo)
+        away = np.subtract(echo.object_mm, echo.shown_mm)
+        assert np.linalg.norm(away) == pytest.approx(0.6, abs=1e-6)  # the wire's radius: its front is what echoes
+
+
+def test_the_rayleigh_fit_finds_sigma_and_refuses_what_is_no_rayleigh():
+    rng = np.random.default_rng(0)
+    fit = fit_rayleigh(rng.rayleigh(3.0, 400_000))
+    top = 255.0 / 3.0  # grey levels per unit, times the largest of that many samples
+    assert fit.sigma == pytest.approx(3.0 * top / np.sqrt(2 * np.log(400_000)), rel=0.1)
+    assert fit.sse < 1e-5
+    assert fit_rayleigh(np.abs(rng.normal(1.0, 0.1, 100_000))).sse > 1e-3
+
+
+@given(st.floats(0.3, 3.0), st.floats(-2.0, 2.0))
+def test_the_width_of_a_gaussian_is_found_wherever_it_lies(sigma, centre):
+    x = np.linspace(-12, 12, 2001)
+    assert full_width(x, np.exp(-((x - centre) ** 2) / (2 * sigma**2))) == pytest.approx(2.3548 * sigma, rel=1e-3)
+
+
+def test_silence_has_a_level_that_json_can_hold():
+    assert level_db(np.zeros(10)) == -300.0
