@@ -131,84 +131,126 @@ def segment(mri, out, contrast, classes, mask, radius, bias_correction, thin_sul
     click.echo(f"wrote {out} and {_tissue_file(out)}")
 
 
+_SCENE_OPTIONS = (
+    click.argument("mri_or_labels", type=click.Path()),
+    click.option(
+        "--pose", required=True, help='File with probe_to_ras (JSON, 16 numbers, or a Slicer transform), or "auto".'
+    ),
+    click.option(
+        "--labels/--mri", "is_labels", default=None, help="What the input is (default: few whole numbers are labels)."
+    ),
+    click.option("--probe", "probe_file", type=click.Path(), help="Probe as JSON (default: the demo's phased array)."),
+    click.option(
+        "--tissues", "tissue_file", type=click.Path(),
+        help="Tissue table as JSON (default: beside the labels, or brain).",
+    ),
+    _contrast_option,
+    _mask_option,
+    _sulci_option,
+    click.option("--gain", type=float, default=0.0, show_default=True, help="Gain [dB]."),
+    click.option("--dynamic-range", type=float, default=55.0, show_default=True, help="Dynamic range [dB]."),
+    click.option("--tgc", type=float, default=0.5, show_default=True, help="Time-gain compensation [dB/(cm MHz)]."),
+    _seed_option,
+    _device_option,
+)  # fmt: skip
+
+
+def _scene_options(command):
+    """What every command that simulates takes; _Scene.open makes a simulator, a probe and a pose of it."""
+    for option in reversed(_SCENE_OPTIONS):
+        command = option(command)
+    return command
+
+
+class _Scene:
+    """A simulator for one patient, a probe, where it is, and how its images are shown."""
+
+    def __init__(
+        self, mri_or_labels, pose, is_labels, probe_file, tissue_file, contrast, mask, thin_sulci, gain, dynamic_range,
+        tgc, seed, device,
+    ) -> None:  # fmt: skip
+        from SlicerUSSim.Logic.demo import PROBES
+        from SlicerUSSim.Logic.placement import craniotomy_pose
+        from SlicerUSSim.Logic.pose import read_pose
+        from SlicerUSSim.Logic.probe import probe_from_dict
+        from SlicerUSSim.Logic.segmentation import segment_mri
+        from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
+        from SlicerUSSim.Logic.simulator import UltrasoundSimulator
+        from SlicerUSSim.Logic.tissues import TissueTable, read_json
+        from SlicerUSSim.Logic.volume import Volume
+
+        # What is cheap to check comes before what takes time.
+        self.display = DisplaySettings(gain_db=gain, dynamic_range_db=dynamic_range, tgc_db_cm_mhz=tgc)
+        settings = SimulationSettings(seed=seed)
+        self.probe = probe_from_dict(read_json(probe_file), str(probe_file)) if probe_file else PROBES["phased"]
+        matrix = None if pose == "auto" else read_pose(pose)
+        volume = Volume.read(mri_or_labels)
+        self.is_labels = _looks_like_labels(volume) if is_labels is None else is_labels
+        if self.is_labels:
+            labels, names = volume, ("csf", "grey matter", "white matter", "leptomeninges")
+            beside = _tissue_file(Path(mri_or_labels))
+            tissue_file = tissue_file or (beside if beside.exists() else None)
+        else:
+            with _share() as progress:
+                result = segment_mri(
+                    volume, contrast=contrast, mask=Volume.read(mask) if mask else None, thin_sulci=thin_sulci,
+                    device=device, progress=progress,
+                )  # fmt: skip
+            labels, names = result.labels, result.tissue_names
+        tissues = TissueTable.read(tissue_file) if tissue_file else TissueTable.brain(names)
+        self.simulator = UltrasoundSimulator(labels, tissues, settings, device)
+        self.pose = craniotomy_pose(labels, self.probe) if matrix is None else matrix
+
+
 @main.command()
-@click.argument("mri_or_labels", type=click.Path())
-@click.option(
-    "--pose", required=True, help='File with probe_to_ras (JSON, 16 numbers, or a Slicer transform), or "auto".'
-)
+@_scene_options
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), required=True, help="Image: .png .mha .nrrd .nii.gz or .vti"
 )
-@click.option(
-    "--labels/--mri", "is_labels", default=None, help="What the input is (default: few whole numbers are labels)."
-)
-@click.option("--probe", "probe_file", type=click.Path(), help="Probe as JSON (default: the demo's phased array).")
-@click.option(
-    "--tissues", "tissue_file", type=click.Path(), help="Tissue table as JSON (default: beside the labels, or brain)."
-)
-@_contrast_option
-@_mask_option
-@_sulci_option
-@click.option("--gain", type=float, default=0.0, show_default=True, help="Gain [dB].")
-@click.option("--dynamic-range", type=float, default=55.0, show_default=True, help="Dynamic range [dB].")
-@click.option("--tgc", type=float, default=0.5, show_default=True, help="Time-gain compensation [dB/(cm MHz)].")
-@_seed_option
-@_device_option
-def simulate(
-    mri_or_labels,
-    pose,
-    out,
-    is_labels,
-    probe_file,
-    tissue_file,
-    contrast,
-    mask,
-    thin_sulci,
-    gain,
-    dynamic_range,
-    tgc,
-    seed,
-    device,
-) -> None:
+def simulate(out: Path, **scene_options) -> None:
     """One B-mode image from an MRI or a label map at a given pose."""
-    from SlicerUSSim.Logic.demo import PROBES
     from SlicerUSSim.Logic.figures import write_png
-    from SlicerUSSim.Logic.placement import craniotomy_pose
-    from SlicerUSSim.Logic.pose import read_pose
-    from SlicerUSSim.Logic.probe import probe_from_dict
-    from SlicerUSSim.Logic.segmentation import segment_mri
-    from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
-    from SlicerUSSim.Logic.simulator import UltrasoundSimulator
-    from SlicerUSSim.Logic.tissues import TissueTable, read_json
-    from SlicerUSSim.Logic.volume import Volume
 
     _check_output(out, png=True)
-    display = DisplaySettings(gain_db=gain, dynamic_range_db=dynamic_range, tgc_db_cm_mhz=tgc)
-    settings = SimulationSettings(seed=seed)
-    probe = probe_from_dict(read_json(probe_file), str(probe_file)) if probe_file else PROBES["phased"]
-    matrix = None if pose == "auto" else read_pose(pose)
-    volume = Volume.read(mri_or_labels)
-    if is_labels is None:
-        is_labels = _looks_like_labels(volume)
-    if is_labels:
-        labels, names = volume, ("csf", "grey matter", "white matter", "leptomeninges")
-        beside = _tissue_file(Path(mri_or_labels))
-        tissue_file = tissue_file or (beside if beside.exists() else None)
-    else:
-        with _share() as progress:
-            result = segment_mri(
-                volume, contrast=contrast, mask=Volume.read(mask) if mask else None, thin_sulci=thin_sulci,
-                device=device, progress=progress,
-            )  # fmt: skip
-        labels, names = result.labels, result.tissue_names
-    tissues = TissueTable.read(tissue_file) if tissue_file else TissueTable.brain(names)
-    simulator = UltrasoundSimulator(labels, tissues, settings, device)
-    frame = simulator.simulate(probe, craniotomy_pose(labels, probe) if matrix is None else matrix, display)
+    scene = _Scene(**scene_options)
+    frame = scene.simulator.simulate(scene.probe, scene.pose, scene.display)
     if out.suffix.lower() == ".png":
         write_png(out, frame.image)
     else:
         frame.to_volume().write(out)
-    click.echo(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {'labels' if is_labels else 'MRI'})")
+    kind = "labels" if scene.is_labels else "MRI"
+    click.echo(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {kind})")
+
+
+@main.command()
+@_scene_options
+@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Volume: .nrrd .nii.gz .mha or .vti")
+@click.option("--tilt", type=float, help="Tilt the image plane about the probe's face by this many degrees in all.")
+@click.option("--slide", type=float, help="Slide the probe across its image plane by this many millimetres in all.")
+@click.option("--frames", type=click.IntRange(1), default=61, show_default=True, help="Images of the sweep.")
+@click.option("--spacing", type=float, default=0.5, show_default=True, help="Voxel size [mm].")
+@click.option("--like", type=click.Path(), help="Take the voxel grid of this volume instead (the MRI, say).")
+def volume(
+    out: Path, tilt: float | None, slide: float | None, frames: int, spacing: float, like: str | None, **scene_options
+) -> None:
+    """A 3D ultrasound volume: a sweep of images around a pose, compounded in patient space."""
+    from tqdm import tqdm
+
+    from SlicerUSSim.Logic.placement import slide_sweep, tilt_sweep
+    from SlicerUSSim.Logic.volume import Volume
+
+    _check_output(out)
+    if (tilt is None) == (slide is None):
+        raise SimulationError("expected either --tilt DEGREES or --slide MILLIMETRES, for a sweep of one kind")
+    grid = Volume.read(like) if like else None
+    scene = _Scene(**scene_options)
+    poses = slide_sweep(scene.pose, slide, frames) if tilt is None else tilt_sweep(scene.pose, tilt, frames)
+    with tqdm(total=frames, desc="sweep", file=sys.stderr, leave=False, disable=None) as bar:
+        result = scene.simulator.volume(
+            scene.probe, poses, scene.display, spacing_mm=spacing, like=grid, progress=lambda done: bar.update()
+        )
+    result.write(out)
+    click.echo(f"wrote {out} ({'x'.join(map(str, result.array.shape[::-1]))} voxels from {frames} images)")
 
 
 @main.command()

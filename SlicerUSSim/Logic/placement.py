@@ -62,6 +62,29 @@ def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standof
     return pose_looking_at(face, target, lateral_ras=(1.0, 0.0, 0.0))
 
 
+def slide_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int) -> list[np.ndarray]:
+    """Poses (4, 4) of a probe that slides across its image plane, `length_mm` in all, its middle at `probe_to_ras`."""
+    require(int(frames) == frames and frames >= 1, f"a sweep has {frames!r} frames, expected a whole number above 0")
+    offsets = np.linspace(-0.5, 0.5, int(frames)) * length_mm if frames > 1 else [0.0]
+    return [probe_to_ras @ _elevational_motion(offset, 0.0) for offset in offsets]
+
+
+def tilt_sweep(probe_to_ras: np.ndarray, angle_deg: float, frames: int) -> list[np.ndarray]:
+    """Poses (4, 4) of a probe that tilts about the lateral axis of its face, `angle_deg` in all: a fan of planes, as a
+    matrix array or a wobbling one scans it."""
+    require(int(frames) == frames and frames >= 1, f"a sweep has {frames!r} frames, expected a whole number above 0")
+    angles = np.deg2rad(np.linspace(-0.5, 0.5, int(frames)) * angle_deg) if frames > 1 else [0.0]
+    return [probe_to_ras @ _elevational_motion(0.0, angle) for angle in angles]
+
+
+def _elevational_motion(offset_mm: float, angle: float) -> np.ndarray:
+    """(4, 4) in the probe frame: by `offset_mm` along z and by `angle` (radians) about x, depth towards +z."""
+    motion = np.eye(4)
+    motion[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    motion[2, 3] = offset_mm
+    return motion
+
+
 def sample(volume: Volume, points_ras: np.ndarray, order: int = 1) -> np.ndarray:
     """Values of `volume` at (..., 3) RAS points; order 0 is nearest neighbour, 1 linear; 0 outside."""
     points = np.asarray(points_ras, float)

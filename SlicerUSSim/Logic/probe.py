@@ -128,6 +128,16 @@ class Probe:
             near, far = apex + self.apex_radius_mm * ray, apex + (self.apex_radius_mm + self.depth_mm) * ray
         return np.concatenate([near, far[::-1], near[:1]])
 
+    def holds(self, lateral_mm: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
+        """Whether points of the image plane (probe frame, any shape) lie in the imaged field."""
+        x, y = np.asarray(lateral_mm, float), np.asarray(depth_mm, float)
+        if self.is_linear:
+            position, along = x, y
+        else:
+            from_apex = y + self.apex_radius_mm
+            position, along = np.arctan2(x, from_apex), np.hypot(x, from_apex) - self.apex_radius_mm
+        return (np.abs(position) <= -self.first_line) & (along >= 0.0) & (along <= self.depth_mm)
+
     # ---- wave and beam -----------------------------------------------------------------------------------------
 
     @property

@@ -190,6 +190,32 @@ class UltrasoundSimulator:
             if progress is not None:
                 progress(count)
 
+    def volume(
+        self,
+        probe: Probe,
+        poses: Iterable[np.ndarray],
+        display: DisplaySettings | None = None,
+        *,
+        spacing_mm: float = 0.5,
+        like: Volume | None = None,
+        hole_mm: float | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> Volume:
+        """A 3D image: the sweep over `poses` (regular or freehand), compounded in patient space, holes filled.
+
+        `like` gives the grid (the MRI, say); without it the grid lies along the patient's axes with `spacing_mm`.
+        `hole_mm` is how wide a gap between images is filled (default: as wide as the sweep's widest, 10 mm at most).
+        The grey levels are uint8; where no image came near, 0. Raises SimulationError as sweep_grid and Compounder do.
+        """
+        from SlicerUSSim.Logic.compounding import Compounder, sweep_grid
+
+        poses = list(poses)
+        grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
+        compounder = Compounder(grid, probe)
+        for frame in self.sweep(probe, poses, display, progress):
+            compounder.add(frame)
+        return compounder.volume(hole_mm)
+
     def set_tissues(self, tissues: TissueTable) -> None:
         """Change tissue parameters without building the medium anew."""
         self.medium.set_tissues(tissues)

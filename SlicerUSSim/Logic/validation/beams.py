@@ -6,13 +6,16 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic.measurement import echo_near, full_width
 from SlicerUSSim.Logic.phantoms import FLUID, layered, small_sheet, thin_rod, wires_and_cysts
+from SlicerUSSim.Logic.placement import sample, slide_sweep, tilt_sweep
 from SlicerUSSim.Logic.probe import FWHM_PER_SIGMA, LinearProbe
-from SlicerUSSim.Logic.settings import SimulationSettings
+from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.validation import PROBES, Check, Outcome, Row, pictures
+from SlicerUSSim.Logic.volume import Volume
 
 
 def echo_level(rotation: np.ndarray, device) -> Outcome:
@@ -150,6 +153,74 @@ def _band_power(frame, probe, depth_mm: float) -> float:
     return float((np.abs(frame.iq[middle, samples]) ** 2).mean())
 
 
+def compounding(rotation: np.ndarray, device) -> Outcome:
+    """The thin bar in volumes compounded from a slide, from a tilt as of a matrix array, and from a free hand."""
+    depth, width = 30.0, 1.2
+    phantom = thin_rod(rotation, depth_mm=depth, width_mm=width)
+    settings = SimulationSettings(scatterers_per_mm3=300.0)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+    probe = replace(PROBES["linear"], width_mm=20.0, scan_lines=101, elevation_focus_mm=55.0)
+    display = DisplaySettings(gain_db=-25.0, dynamic_range_db=100.0, tgc_db_cm_mhz=0.0, noise_db=None)
+    sigma = float(probe.beam_sigma_mm(depth)[1])
+    sweeps = {
+        "slide": slide_sweep(phantom.probe_to_ras, 10.0, 41),
+        "tilt": tilt_sweep(phantom.probe_to_ras, 18.0, 41),
+        "freehand": freehand_sweep(phantom.probe_to_ras, 10.0, 60),
+    }
+    across = np.linspace(-0.5 * width, 0.5 * width, 25)
+    offsets = sigma * np.array([0.0, 0.5, 1.0, 1.5])
+    theory = 10 * np.log10([np.exp(-((across - offset) ** 2) / sigma**2).mean() for offset in offsets])
+    rows, volumes = [], {}
+    for name, poses in sweeps.items():
+        volume = volumes[name] = simulator.volume(probe, poses, display, spacing_mm=0.35)
+        level = _bar_level_db(volume, phantom.probe_to_ras, depth, offsets) * display.dynamic_range_db / 255.0
+        rows += [
+            Row(f"fall at {offset / sigma:.1f} sigma, {name}", "dB", e - theory[0], m - level[0], 0.6)
+            for offset, e, m in zip(offsets[1:], theory[1:], level[1:], strict=True)
+        ]
+        _, y, z = _bar_centre(volume, phantom.probe_to_ras, depth)
+        off = float(np.hypot(y - depth, z))
+        rows.append(Row(f"bar is off its place, {name}", "mm", 0.0, off, 0.3, "at most"))
+    draw = partial(pictures.draw_cross_sections, volumes=volumes, probe_to_ras=phantom.probe_to_ras, depth_mm=depth)
+    return Outcome(tuple(rows), draw)
+
+
+def freehand_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int, seed: int = 0) -> list[np.ndarray]:
+    """A slide as a hand does it: uneven steps, drift and tilt in every direction."""
+    rng = np.random.default_rng(seed)
+    along = np.cumsum(rng.uniform(0.3, 1.7, frames))
+    along = (along - along[0]) / (along[-1] - along[0]) - 0.5
+    # Slow waves of a few degrees and half a millimetre, no two axes alike.
+    wave = np.sin(2 * np.pi * (along[:, None] * rng.uniform(0.5, 2.0, 6) + rng.uniform(0, 1, 6)))
+    poses = []
+    for offset, (a, b, c, x, y, z) in zip(along * length_mm, wave, strict=True):
+        motion = np.eye(4)
+        motion[:3, :3] = Rotation.from_euler("xyz", [3 * a, 2 * b, 2 * c], degrees=True).as_matrix()
+        motion[:3, 3] = [0.5 * x, 0.2 * y, offset + 0.2 * z]
+        poses.append(probe_to_ras @ motion)
+    return poses
+
+
+def _bar_level_db(volume: Volume, probe_to_ras: np.ndarray, depth_mm: float, offsets_mm: np.ndarray) -> np.ndarray:
+    """Mean grey level of the bar at distances from its plane, on both sides."""
+    x, y = np.meshgrid(np.linspace(-7, 7, 80), depth_mm + np.linspace(-0.3, 0.3, 5))
+    levels = []
+    for offset in offsets_mm:
+        sides = [np.stack([x, y, np.full_like(x, side * offset), np.ones_like(x)], axis=-1) for side in (-1, 1)]
+        points = np.stack(sides) @ probe_to_ras.T
+        levels.append(sample(volume, points[..., :3]).mean())
+    return np.array(levels)
+
+
+def _bar_centre(volume: Volume, probe_to_ras: np.ndarray, depth_mm: float) -> np.ndarray:
+    """Centroid of the brightest voxels near the bar, in the probe frame."""
+    grey = volume.array.astype(float)
+    ijk = np.argwhere(grey > 0.85 * np.percentile(grey[grey > 0], 99.5))[:, ::-1]
+    points = np.c_[ijk, np.ones(len(ijk))] @ (np.linalg.inv(probe_to_ras) @ volume.ijk_to_ras).T
+    near = (abs(points[:, 0]) < 8) & (np.hypot(points[:, 1] - depth_mm, points[:, 2]) < 4)
+    return points[near, :3].mean(axis=0)
+
+
 CHECKS = (
     Check(
         "echo level",
@@ -163,5 +234,10 @@ CHECKS = (
         "slice thickness",
         "A thin bar out of plane fades by exp(-z^2 / sigma^2) in power, averaged over its width.",
         slice_thickness,
+    ),
+    Check(
+        "compounding",
+        "In a volume made of many images the bar lies where it is and is as thick as the elevational beam.",
+        compounding,
     ),
 )

@@ -9,10 +9,10 @@ import numpy as np
 
 from SlicerUSSim.Logic.measurement import RayleighFit
 from SlicerUSSim.Logic.phantoms import Echo, Phantom
-from SlicerUSSim.Logic.placement import slice_under_probe
+from SlicerUSSim.Logic.placement import sample, slice_under_probe
 from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.simulator import Frame
-from SlicerUSSim.Logic.volume import written_whole
+from SlicerUSSim.Logic.volume import Volume, written_whole
 
 _OBJECT, _PREDICTION = "#4fb0c6", "#ffc83d"
 # One grey per label, so that the phantom reads as a drawing: background, then its parts.
@@ -112,6 +112,20 @@ def draw_slice_thickness(path: Path, curves: dict) -> None:
     plot.set_xlabel("distance from the image plane [mm]")
     plot.set_ylabel("power of the bar [dB]")
     plot.legend(fontsize=8)
+    _save(figure, path)
+
+
+def draw_cross_sections(path: Path, volumes: dict[str, Volume], probe_to_ras: np.ndarray, depth_mm: float) -> None:
+    """Volumes across a bar: elevational against depth, in the middle of the probe."""
+    figure, axes = _figure(1, len(volumes), 3.4, 3.4)
+    z, y = np.meshgrid(np.linspace(-6, 6, 160), depth_mm + np.linspace(-6, 6, 160))
+    points = np.stack([np.zeros_like(z), y, z, np.ones_like(z)], axis=-1) @ probe_to_ras.T
+    for axis, (name, volume) in zip(axes[0], volumes.items(), strict=True):
+        axis.imshow(sample(volume, points[..., :3]), cmap="gray", vmin=0, extent=(-6, 6, depth_mm + 6, depth_mm - 6))
+        axis.plot(0, depth_mm, "o", color=_OBJECT, fillstyle="none", markersize=9)
+        axis.set_title(name, fontsize=10)
+        axis.set_xlabel("elevational [mm]")
+    axes[0, 0].set_ylabel("depth [mm]")
     _save(figure, path)
 
 
