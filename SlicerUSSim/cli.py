@@ -147,6 +147,14 @@ _SCENE_OPTIONS = (
     _contrast_option,
     _mask_option,
     _sulci_option,
+    click.option(
+        "--partial-volume/--hard-labels", default=False, show_default=True,
+        help="Scatterers take their tissue by the segmentation's probabilities (from an MRI only).",
+    ),
+    click.option(
+        "--mri-modulation", type=float, default=0.0, show_default=True,
+        help="Scatterers follow the MRI inside tissues, dB per standard deviation (from an MRI only).",
+    ),
     click.option("--gain", type=float, default=0.0, show_default=True, help="Gain [dB]."),
     click.option("--dynamic-range", type=float, default=55.0, show_default=True, help="Dynamic range [dB]."),
     click.option("--tgc", type=float, default=0.5, show_default=True, help="Time-gain compensation [dB/(cm MHz)]."),
@@ -166,8 +174,8 @@ class _Scene:
     """A simulator for one patient, a probe, where it is, and how its images are shown."""
 
     def __init__(
-        self, mri_or_labels, pose, is_labels, probe_file, tissue_file, contrast, mask, thin_sulci, gain, dynamic_range,
-        tgc, seed, device,
+        self, mri_or_labels, pose, is_labels, probe_file, tissue_file, contrast, mask, thin_sulci, partial_volume,
+        mri_modulation, gain, dynamic_range, tgc, seed, device,
     ) -> None:  # fmt: skip
         from SlicerUSSim.Logic.demo import PROBES
         from SlicerUSSim.Logic.placement import craniotomy_pose
@@ -181,12 +189,17 @@ class _Scene:
 
         # What is cheap to check comes before what takes time.
         self.display = DisplaySettings(gain_db=gain, dynamic_range_db=dynamic_range, tgc_db_cm_mhz=tgc)
-        settings = SimulationSettings(seed=seed)
+        settings = SimulationSettings(seed=seed, partial_volume=partial_volume, mri_modulation_db=mri_modulation)
         self.probe = probe_from_dict(read_json(probe_file), str(probe_file)) if probe_file else PROBES["phased"]
         matrix = None if pose == "auto" else read_pose(pose)
         volume = Volume.read(mri_or_labels)
         self.is_labels = _looks_like_labels(volume) if is_labels is None else is_labels
+        texture = None
         if self.is_labels:
+            if settings.needs_texture:
+                raise SimulationError(
+                    f"{mri_or_labels}: is a label map; --partial-volume and --mri-modulation need the MRI it came from"
+                )
             labels, names = volume, ("csf", "grey matter", "white matter", "leptomeninges")
             beside = _tissue_file(Path(mri_or_labels))
             tissue_file = tissue_file or (beside if beside.exists() else None)
@@ -197,8 +210,9 @@ class _Scene:
                     device=device, progress=progress,
                 )  # fmt: skip
             labels, names = result.labels, result.tissue_names
+            texture = result.texture() if settings.needs_texture else None
         tissues = TissueTable.read(tissue_file) if tissue_file else TissueTable.brain(names)
-        self.simulator = UltrasoundSimulator(labels, tissues, settings, device)
+        self.simulator = UltrasoundSimulator(labels, tissues, settings, device, texture)
         self.pose = craniotomy_pose(labels, self.probe) if matrix is None else matrix
 
 

@@ -13,7 +13,11 @@
 // zero mean, variance p (1 - p) mu0^2 + p sigma0^2, linear in mu0 and sigma0. The mean p mu0 of the field is taken out
 // because a uniform medium does not echo; on a fine lattice the pulse would cancel it, a jittered one would not.
 //
-// Buffers: voxels, tissues, segments as in raytracing.cl; re, im float [2 traced line + side][stride].
+// With TEXTURE defined, scatterers know more of the MRI than labels (texture.py): a scatterer takes the second tissue
+// of its voxel with that one's probability, and its amplitude follows the intensity.
+//
+// Buffers: voxels, tissues, segments as in raytracing.cl; texture uint [k][j][i] (one element without TEXTURE); re, im
+// float [2 traced line + side][stride].
 
 #define BATCH 256  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
@@ -34,9 +38,9 @@ typedef struct {
 // The hash counts cells by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
-inline void scatter_batch(__constant const Scene *scene, __global const ushort *voxels, __global const Tissue *tissues,
-                          const Piece *piece, const int *cell_u, const uint *row_key, const float *row_v,
-                          const float *row_w, int count, float4 *sum) {
+inline void scatter_batch(__constant const Scene *scene, __global const ushort *voxels, __global const uint *texture,
+                          __global const Tissue *tissues, const Piece *piece, const int *cell_u, const uint *row_key,
+                          const float *row_v, const float *row_w, int count, float4 *sum) {
   const float cell = scene->cell_mm, grain = cell / 1024.0f;
   const float cutoff2 = 0.5f * LOG2_E * scene->beam_cutoff * scene->beam_cutoff;
   const float inverse_sample = 1.0f / scene->sample_mm;
@@ -104,14 +108,26 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
       const uint random = random_[j];
       const uint word = voxels[voxel_[j]];
       int label = word & LABEL_MASK;
-      if (!(word & PLAIN_CELL)) {
+#ifdef TEXTURE
+      float gain = 1.0f;
+      const int is_plain = 0;  // texture varies inside tissues too
+#else
+      const int is_plain = word & PLAIN_CELL;
+#endif
+      if (!is_plain) {
         const float fx = fx_[j], fy = fy_[j], fz = fz_[j];
         // Partial volume without blending: the scatterer takes the label of one corner, drawn with that corner's
         // trilinear weight from bits of its own. The border is soft on average and fixed in the patient.
         const int dx = fx * 32.0f > (random & 31u) + 0.5f, dy = fy * 32.0f > ((random >> 5) & 31u) + 0.5f,
                   dz = fz * 32.0f > ((random >> 10) & 31u) + 0.5f;
         __global const ushort *corner = voxels + voxel_[j];
-        label = corner[dx + nx * (dy + ny * dz)] & LABEL_MASK;
+        const int drawn = dx + nx * (dy + ny * dz);
+        label = corner[drawn] & LABEL_MASK;
+#ifdef TEXTURE
+        const uint known = texture[voxel_[j] + drawn];
+        gain = native_exp(LN10_OVER_20 * TEXTURE_STEP_DB * ((int)((known >> 16) & 255u) - 128));
+        if ((hash_mix(random) & 255u) < ((known >> 8) & 255u)) label = known & LABEL_MASK;
+#endif
         if (scene->membrane_reach >= 0.0f) {
           const float near_z = mix(mix((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
                                    mix((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
@@ -123,7 +139,10 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
       }
       const float p = tissues[label].share;
       const int exists = (random >> 16) + 0.5f < p * 65536.0f;
-      const float strength = tissues[label].mu0 * (exists - p) + tissues[label].sigma0 * t0_[j] * exists;
+      float strength = tissues[label].mu0 * (exists - p) + tissues[label].sigma0 * t0_[j] * exists;
+#ifdef TEXTURE
+      if (label != MEMBRANE_LABEL) strength *= gain;
+#endif
       const float to_right = right_[j] * strength, to_left = strength - to_right;
       const float4 echo = (float4)(to_left, to_left, to_right, to_right) * (float4)(re_[j], im_[j], re_[j], im_[j]);
       // Bins count from -1, so that the first and last sample of the chunk get their share from scatterers beyond.
@@ -135,9 +154,9 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
 
 // The scatterers of one piece: finds the lattice cells beside it and computes them in batches. `start` is the segment's
 // start, `low` and `high` are the piece's ends along it, `radius_l` and `radius_e` how far it reaches to either side.
-inline void scatter_piece(__constant const Scene *scene, __global const ushort *voxels, __global const Tissue *tissues,
-                          const Piece *piece, float3 start, float low, float high, float radius_l, float radius_e,
-                          float4 *sum) {
+inline void scatter_piece(__constant const Scene *scene, __global const ushort *voxels, __global const uint *texture,
+                          __global const Tissue *tissues, const Piece *piece, float3 start, float low, float high,
+                          float radius_l, float radius_e, float4 *sum) {
   int cell_u[BATCH + LANES];
   uint row_key[BATCH + LANES];
   float row_v[BATCH + LANES], row_w[BATCH + LANES];
@@ -192,7 +211,7 @@ inline void scatter_piece(__constant const Scene *scene, __global const ushort *
         STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
         waiting += min(LANES, u_high - cu + 1);
         if (waiting >= BATCH) {
-          scatter_batch(scene, voxels, tissues, piece, cell_u, row_key, row_v, row_w, BATCH, sum);
+          scatter_batch(scene, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, BATCH, sum);
           waiting -= BATCH;
           for (int i = 0; i < waiting; i++) {
             cell_u[i] = cell_u[BATCH + i];
@@ -204,16 +223,16 @@ inline void scatter_piece(__constant const Scene *scene, __global const ushort *
       }
     }
   }
-  scatter_batch(scene, voxels, tissues, piece, cell_u, row_key, row_v, row_w, waiting, sum);
+  scatter_batch(scene, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, waiting, sum);
 }
 
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
 __kernel void
-scatter(__constant const Scene *scene, __global const ushort *voxels, __global const Tissue *tissues,
-        __global const Segment *segments, __global const int *segment_counts, __global float *re, __global float *im,
-        int stride) {
+scatter(__constant const Scene *scene, __global const ushort *voxels, __global const uint *texture,
+        __global const Tissue *tissues, __global const Segment *segments, __global const int *segment_counts,
+        __global float *re, __global float *im, int stride) {
   int chunk = get_global_id(0), line = get_global_id(1);
   int first = chunk * CHUNK;
   float4 sum[CHUNK + 2];  // left re, im, right re, im
@@ -275,7 +294,7 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
       piece.gain0 = gain - decay * low + 0.5f * log2(sigma_low.x / sigma_low.y) - log2(apart_low);
       piece.gain1 = gain - decay * high + 0.5f * log2(sigma_high.x / sigma_high.y) - log2(apart_high) - piece.gain0;
 
-      scatter_piece(scene, voxels, tissues, &piece, start, low, high, 0.5f * fmax(apart_low, apart_high),
+      scatter_piece(scene, voxels, texture, tissues, &piece, start, low, high, 0.5f * fmax(apart_low, apart_high),
                     scene->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum);
     }
   }

@@ -14,6 +14,7 @@ _HOMES = {
     "Segmentation": "segmentation",
     "SimulationError": "errors",
     "SimulationSettings": "settings",
+    "Texture": "texture",
     "Tissue": "tissues",
     "TissueTable": "tissues",
     "UltrasoundSimulator": "simulator",

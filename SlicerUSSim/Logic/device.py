@@ -221,7 +221,7 @@ class Device:
         self.lanes = _vector_lanes(info)
         self.profiling = False
         self._events: list[tuple[str, object]] = []
-        self._kernels: dict[tuple[str, int], dict[str, object]] = {}
+        self._kernels: dict[tuple, dict[str, object]] = {}
 
     @staticmethod
     def get(device: str | DeviceInfo | Device | None = None) -> Device:
@@ -230,13 +230,17 @@ class Device:
             return device
         return _open_device(choose_device(device)[0])
 
-    def kernels(self, file_name: str, lanes: int = 1) -> dict[str, object]:
-        """The kernels of kernels/`file_name`, built once; each work-item computes `lanes` values side by side."""
-        key = (file_name, lanes)
+    def kernels(self, file_name: str, lanes: int = 1, *defines: str) -> dict[str, object]:
+        """The kernels of kernels/`file_name`, built once; each work-item computes `lanes` values side by side.
+
+        `defines` are preprocessor names that choose a variant.
+        """
+        key = (file_name, lanes, *defines)
         if key not in self._kernels:
             folder = kernel_folder()
             source = "\n".join([shared_source(), (folder / "common.clh").read_text(), (folder / file_name).read_text()])
             options = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros", f"-DLANES={lanes}"]
+            options += [f"-D{name}" for name in defines]
             if self.lanes > 1 and "Intel" in self.info.platform:
                 options.append("-DNO_IMPLICIT_VECTORS")
             try:

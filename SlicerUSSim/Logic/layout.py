@@ -16,6 +16,7 @@ CONSTANTS = {
     "MAX_TISSUES": 64,
     "SMOOTH_GROUPS": 6,  # acoustic groups with a smoothed indicator (medium.py)
     "WIDE_SIGMA": 3.0,  # its Gaussian, voxels
+    "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
     "MAX_STACK": 24,  # reflected rays waiting to be followed

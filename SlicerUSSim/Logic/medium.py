@@ -29,14 +29,15 @@ class Medium:
     ----------
     labels : Volume of whole numbers; 0 is the coupling medium.
     tissues : a Tissue for every label that occurs.
+    texture : (k, j, i) uint32 of Texture.packed, if scatterers shall know more than labels.
 
     Raises SimulationError for labels that are not whole numbers or have no tissue.
     """
 
-    def __init__(self, labels: Volume, tissues: TissueTable, device: Device) -> None:
+    def __init__(self, labels: Volume, tissues: TissueTable, device: Device, texture: np.ndarray | None = None) -> None:
         self.device = device
         self.labels = labels
-        array = _as_labels(labels.array)
+        array = as_labels(labels.array)
         counts = np.bincount(array.ravel(), minlength=256)
         #: Labels that occur, the most frequent first
         self.present = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
@@ -45,6 +46,11 @@ class Medium:
         padded = np.pad(array, _PAD)
         self._upload(padded, tissues)
         self._upload_smooth(padded, tissues)
+        self.has_texture = texture is not None
+        no_texture = np.zeros(1, np.uint32)
+        self.texture_buffer = device.upload(
+            np.pad(texture, _PAD, constant_values=128 << 16) if self.has_texture else no_texture
+        )
         self.tissue_buffer = device.upload(self._rows(tissues))
         self.tissues = tissues
 
@@ -59,9 +65,9 @@ class Medium:
         """Change tissue parameters; the voxels are touched only if the membrane's place has changed."""
         self._check(tissues)
         if _membrane_shape(tissues) != _membrane_shape(self.tissues):
-            self._upload(np.pad(_as_labels(self.labels.array), _PAD), tissues)
+            self._upload(np.pad(as_labels(self.labels.array), _PAD), tissues)
         if not np.array_equal(self._rows(tissues)["group"], self._rows(self.tissues)["group"]):
-            self._upload_smooth(np.pad(_as_labels(self.labels.array), _PAD), tissues)
+            self._upload_smooth(np.pad(as_labels(self.labels.array), _PAD), tissues)
         self.device.write(self.tissue_buffer, self._rows(tissues))
         self.tissues = tissues
 
@@ -154,7 +160,8 @@ class Medium:
         return distance, 0.5 * membrane.thickness_mm / sigma_mm * unit
 
 
-def _as_labels(array: np.ndarray) -> np.ndarray:
+def as_labels(array: np.ndarray) -> np.ndarray:
+    """`array` as uint8 labels. Raises SimulationError unless it holds whole numbers from 0 to MAX_LABEL."""
     if array.dtype == np.uint8:
         labels = array
     else:

@@ -38,15 +38,16 @@ class Scatterers:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self.kernel = device.kernels("scattering.cl", device.lanes)["scatter"]
 
     def run(self, scene_buffer, scene: np.ndarray, medium: Medium, tree: RayTracer, lines: EchoLines) -> None:
         """Enqueue the speckle of one frame; it overwrites `lines`."""
+        variant = ("TEXTURE",) if medium.has_texture else ()
         self.device.run(
-            self.kernel,
+            self.device.kernels("scattering.cl", self.device.lanes, *variant)["scatter"],
             (int(scene["samples"]) // CONSTANTS["CHUNK"], int(scene["traced_lines"])),
             scene_buffer,
             medium.voxel_buffer,
+            medium.texture_buffer,
             medium.tissue_buffer,
             tree.segments,
             tree.segment_counts,

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.device import Device
 from SlicerUSSim.Logic.errors import require, require_between
+from SlicerUSSim.Logic.texture import Texture, tissue_deviation
 from SlicerUSSim.Logic.volume import Volume
 
 #: Tissue names per contrast and number of classes, in the order of intensity.
@@ -58,6 +59,25 @@ class Segmentation:
             self._filtered[foreground], self.means, self.standard_deviations, self.weights
         )
         return result
+
+    def texture(self) -> Texture:
+        """What the MRI knows beyond labels: every voxel's second tissue with its probability among the two, and the
+        filtered intensity in standard deviations of its tissue."""
+        labels = self.labels.array
+        foreground = labels > 0
+        label, values = labels[foreground], self._filtered[foreground]
+        posteriors = _posteriors(values, self.means, self.standard_deviations, self.weights)
+        # Labels are in order of intensity; beyond the outermost means a posterior of the widest class means nothing
+        # (see _classify), nor does one where the label does not come from the mixture (thin sulci).
+        sure = (label > len(self.means)) | (values <= self.means[0]) | (values >= self.means[-1])
+        own = np.where(sure, 1, label)[None] - 1
+        first = np.take_along_axis(posteriors, own, 0)[0]
+        np.put_along_axis(posteriors, own, -1.0, 0)
+        other = np.maximum(posteriors.max(axis=0), 0.0)
+        second_label, second_share = np.zeros(labels.shape, np.uint8), np.zeros(labels.shape, np.float32)
+        second_label[foreground] = posteriors.argmax(axis=0) + 1
+        second_share[foreground] = np.where(sure, 0.0, other / np.maximum(first + other, 1e-12))
+        return Texture(second_label, second_share, tissue_deviation(self._filtered, labels))
 
 
 def segment_mri(

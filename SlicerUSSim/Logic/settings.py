@@ -35,6 +35,12 @@ class SimulationSettings:
     #: ten of them fill the resolution cell and the envelope's mean / deviation is 1.87 instead of 1.91; 100 give 1.90
     #: and take twice the time. The paper's Rayleigh test has a lattice of 20 um: 125000, of which mu1 keeps 1 %
     scatterers_per_mm3: float = 42.0
+    #: Scatterers take their tissue by the probabilities of the segmentation instead of its labels (needs a Texture; off
+    #: is the paper)
+    partial_volume: bool = False
+    #: How far scatterers' amplitudes follow the MRI inside a tissue, in dB per standard deviation of its intensity
+    #: (needs a Texture; negative where bright means echo-poor; 0 is the paper)
+    mri_modulation_db: float = 0.0
     #: Where the beam profile is cut off, in standard deviations
     beam_cutoff: float = 2.5
     #: Rays per scan line that sample interfaces across the elevational beam
@@ -51,6 +57,11 @@ class SimulationSettings:
     #: RF samples per cycle of the carrier
     samples_per_cycle: int = 4
 
+    @property
+    def needs_texture(self) -> bool:
+        """Whether scatterers shall know more of the MRI than its labels."""
+        return self.partial_volume or self.mri_modulation_db != 0.0
+
     def __post_init__(self) -> None:
         owner = "SimulationSettings"
         require_between(owner, "seed", self.seed, 0, 2**32 - 1)
@@ -59,6 +70,7 @@ class SimulationSettings:
         require_between(owner, "reflection_threshold", self.reflection_threshold, 1e-9, 1)
         require_between(owner, "reference_speed_m_s", self.reference_speed_m_s, 300, 6000)
         require_between(owner, "scatterers_per_mm3", self.scatterers_per_mm3, 0.1, 200_000)
+        require_between(owner, "mri_modulation_db", self.mri_modulation_db, -6, 6)
         require_between(owner, "beam_cutoff", self.beam_cutoff, 0.5, 6)
         require_between(owner, "elevational_rays", self.elevational_rays, 1, 32)
         require_between(owner, "lateral_rays", self.lateral_rays, 0, 128)

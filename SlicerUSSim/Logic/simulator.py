@@ -13,13 +13,15 @@ import numpy as np
 
 from SlicerUSSim.Logic.bmode import Compressor, PulseFilter
 from SlicerUSSim.Logic.device import Device
+from SlicerUSSim.Logic.errors import require
 from SlicerUSSim.Logic.layout import CONSTANTS, SCENE
-from SlicerUSSim.Logic.medium import Medium
+from SlicerUSSim.Logic.medium import Medium, as_labels
 from SlicerUSSim.Logic.probe import NOMINAL_SPEED_M_S, Probe
 from SlicerUSSim.Logic.raytracing import RayTracer, RayTree
 from SlicerUSSim.Logic.scan_conversion import ImageGrid, ScanConverter
 from SlicerUSSim.Logic.scattering import EchoLines, InterfaceEchoes, LateralBeam, Scatterers
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.texture import Texture
 from SlicerUSSim.Logic.tissues import TissueTable
 from SlicerUSSim.Logic.volume import Volume, check_rigid
 
@@ -90,8 +92,11 @@ class UltrasoundSimulator:
     tissues : TissueTable with a tissue for every label.
     settings : SimulationSettings.
     device : see device.choose_device.
+    texture : what the MRI knows beyond labels (Segmentation.texture, Texture.from_mri); looked at only if the settings'
+        partial_volume or mri_modulation_db ask for it.
 
-    Raises SimulationError for labels without a tissue and where no device can be used.
+    Raises SimulationError for labels without a tissue, settings that need a texture where there is none or it does not
+    fit, and where no device can be used.
     """
 
     def __init__(
@@ -100,10 +105,11 @@ class UltrasoundSimulator:
         tissues: TissueTable,
         settings: SimulationSettings | None = None,
         device: str | Device | None = None,
+        texture: Texture | None = None,
     ) -> None:
         self.settings = settings or SimulationSettings()
         self.device = Device.get(device)
-        self.medium = Medium(labels, tissues, self.device)
+        self.medium = Medium(labels, tissues, self.device, _packed_texture(texture, labels, self.settings))
         self.tracer = RayTracer(self.device)
         self.traced_lines = EchoLines(self.device)
         self.scan_lines = EchoLines(self.device)
@@ -306,6 +312,22 @@ class UltrasoundSimulator:
         yield
         self.device.queue.finish()
         timings[name] = (perf_counter() - start) * 1e3
+
+
+def _packed_texture(texture: Texture | None, labels: Volume, settings: SimulationSettings) -> np.ndarray | None:
+    """The texture as the device reads it, or None if the settings ask for none."""
+    if not settings.needs_texture:
+        return None
+    require(
+        texture is not None,
+        f"partial_volume {settings.partial_volume}, mri_modulation_db {settings.mri_modulation_db:g} need a texture; "
+        "pass segmentation.texture(), or Texture.from_mri(mri, labels) for a label map of your own",
+    )
+    require(
+        texture.deviation.shape == labels.array.shape,
+        f"the texture has shape {texture.deviation.shape}, expected that of the labels, {labels.array.shape}",
+    )
+    return texture.packed(as_labels(labels.array), settings.partial_volume, settings.mri_modulation_db)
 
 
 def _mixed(seed: int) -> int:

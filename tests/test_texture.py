@@ -1,0 +1,204 @@
+"""Hybrid scatterers (PHYSICS section 8): tissues mixed by probability, amplitudes that follow the MRI."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from SlicerUSSim.cli import main
+from SlicerUSSim.Logic import (
+    LinearProbe,
+    SimulationError,
+    SimulationSettings,
+    Texture,
+    TissueTable,
+    UltrasoundSimulator,
+    Volume,
+    segment_mri,
+)
+from SlicerUSSim.Logic.measurement import correlation, level_db, region_level_db
+from tests.conftest import SPECKLE, block, rigid
+
+PROBE = LinearProbe(36, 46, scan_lines=145, focus_mm=25, elevation_focus_mm=25)
+POSE = rigid(np.eye(3), [0, -23, 0])
+DIM = replace(SPECKLE, name="dim", mu0=0.25 * SPECKLE.mu0, sigma0=0.25 * SPECKLE.sigma0)
+SOLID = block(lambda x, y, z: np.ones_like(x), half_mm=(30, 30, 12))
+TABLE = TissueTable({0: SPECKLE, 1: SPECKLE, 2: DIM})
+
+
+def texture(share=0.0, deviation=None) -> Texture:
+    shape = SOLID.array.shape
+    return Texture(
+        np.full(shape, 2, np.uint8),
+        np.full(shape, share, np.float32),
+        np.zeros(shape, np.float32) if deviation is None else deviation,
+    )
+
+
+def frames(known=None, seeds=range(4), table=TABLE, **settings):
+    return [
+        UltrasoundSimulator(SOLID, table, SimulationSettings(seed=seed, **settings), texture=known).simulate(
+            PROBE, POSE
+        )
+        for seed in seeds
+    ]
+
+
+def inner(found) -> np.ndarray:
+    return np.stack([f.iq[:, 64:-64] for f in found])
+
+
+def test_off_is_the_paper_bit_for_bit():
+    (plain,), (with_texture,) = frames(seeds=[0]), frames(texture(0.5), seeds=[0])
+    np.testing.assert_array_equal(plain.iq, with_texture.iq)
+    # And a texture that knows nothing more than the labels changes nothing either.
+    (ignorant,) = frames(texture(0.0), seeds=[0], partial_volume=True, mri_modulation_db=3.0)
+    np.testing.assert_array_equal(plain.iq, ignorant.iq)
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.9])
+def test_mixed_tissues_echo_with_the_mean_of_their_variances(share):
+    mixed = inner(frames(texture(share), partial_volume=True))
+    variance = (1 - share) * SPECKLE.scatterer_variance + share * DIM.scatterer_variance
+    assert level_db(mixed) == pytest.approx(10 * np.log10(variance), abs=0.5)
+
+
+def test_amplitudes_follow_the_mri_and_the_tissue_keeps_its_power():
+    x = (np.arange(SOLID.array.shape[2]) * 1.0 - 30.0) * np.ones(SOLID.array.shape)
+    known = texture(deviation=np.sign(x).astype(np.float32))
+    found = frames(known, mri_modulation_db=2.0)
+    levels = [
+        10 * np.log10(np.mean([10 ** (region_level_db(f, PROBE, (a, b, 3, 43)) / 10) for f in found]))
+        for a, b in ((-16, -2), (2, 16))
+    ]
+    assert levels[1] - levels[0] == pytest.approx(4.0, abs=0.5)
+    power = np.mean([10 ** (level / 10) for level in levels])
+    assert 10 * np.log10(power) == pytest.approx(10 * np.log10(SPECKLE.scatterer_variance), abs=0.5)
+
+
+def test_the_mri_changes_smoothly_not_voxel_by_voxel():
+    """A ramp of the MRI is a ramp of the level; the steps of 1 mm voxels do not show."""
+    x = (np.arange(SOLID.array.shape[2]) * 1.0 - 30.0) * np.ones(SOLID.array.shape)
+    found = frames(texture(deviation=np.clip(x / 8, -2, 2).astype(np.float32)), seeds=range(16), mri_modulation_db=4.0)
+    power = (np.abs(inner(found)) ** 2).mean(axis=(0, 2))
+    lines = PROBE.line_positions()
+    middle = np.abs(lines) < 12
+    fit = np.polynomial.Polynomial.fit(lines[middle], 10 * np.log10(power[middle]), 1)
+    assert fit.convert().coef[1] == pytest.approx(4.0 / 8, rel=0.1)
+    assert np.abs(10 * np.log10(power[middle]) - fit(lines[middle])).max() < 1.5
+
+
+def test_scatterers_stay_fixed_in_the_patient():
+    rng = np.random.default_rng(3)
+    shape = SOLID.array.shape
+    known = Texture(
+        np.full(shape, 2, np.uint8), rng.random(shape, np.float32), rng.normal(size=shape).astype(np.float32)
+    )
+    settings = SimulationSettings(partial_volume=True, mri_modulation_db=2.0)
+    sim = UltrasoundSimulator(SOLID, TABLE, settings, texture=known)
+    moved = POSE.copy()
+    moved[0, 3] += PROBE.line_spacing
+    here, there = sim.simulate(PROBE, POSE).iq, sim.simulate(PROBE, moved).iq
+    assert correlation(here[1:], there[:-1]) > 0.99
+
+
+def test_the_signal_stays_linear_in_mu0_and_sigma0():
+    rng = np.random.default_rng(4)
+    shape = SOLID.array.shape
+    known = Texture(
+        np.full(shape, 2, np.uint8), rng.random(shape, np.float32), rng.normal(size=shape).astype(np.float32)
+    )
+
+    def signal(mu0, sigma0):
+        table = TissueTable({label: replace(t, mu0=mu0, sigma0=sigma0) for label, t in TABLE.items()})
+        (frame,) = frames(known, seeds=[0], table=table, partial_volume=True, mri_modulation_db=2.0)
+        return frame.iq
+
+    combined = 0.4 * signal(1.0, 0.0) + 0.15 * signal(0.0, 1.0)
+    np.testing.assert_allclose(signal(0.4, 0.15), combined, atol=1e-5 * np.abs(combined).max())
+
+
+@pytest.fixture(scope="module")
+def ramp_segmentation():
+    """An MRI of three tissues with soft borders and a little noise, segmented without a filter."""
+    x = np.linspace(0, 3, 61)
+    step = 40 + 40 * (1 / (1 + np.exp(-(x - 1) / 0.05)) + 1 / (1 + np.exp(-(x - 2) / 0.05)))
+    rng = np.random.default_rng(0)
+    array = (step + rng.normal(0, 4, (24, 24, 61))).astype(np.float32)
+    mri = Volume(array, np.eye(4))
+    return segment_mri(mri, mask=mri.with_array(np.ones(array.shape, np.uint8)), filter_radius=0)
+
+
+def test_a_segmentation_knows_second_tissues_and_deviations(ramp_segmentation):
+    known, labels = ramp_segmentation.texture(), ramp_segmentation.labels.array
+    assert not (known.second_label == labels)[known.second_share > 0].any()
+    assert known.second_share.max() == pytest.approx(0.5, abs=0.02)  # or the label would be the other one
+    # Far from every border the label is sure; where intensities are half-way it is not.
+    means = ramp_segmentation.means
+    image = known.deviation  # per label; the intensity itself decides below
+    sure = known.second_share[:, :, [5, 30, 55]]
+    assert np.median(sure) < 0.01 and known.second_share[:, :, 20].mean() > 0.05
+    assert set(np.unique(known.second_label[:, :, 20][known.second_share[:, :, 20] > 0.05])) <= {1, 2}
+    for label in (1, 2, 3):
+        of_tissue = image[labels == label]
+        assert of_tissue.mean() == pytest.approx(0, abs=1e-3) and of_tissue.std() == pytest.approx(1, abs=1e-3)
+    assert means[0] < means[1] < means[2]
+
+
+def test_partial_volume_softens_the_border_between_tissues(ramp_segmentation):
+    """Power across a border: a step between labels, in between with probabilities."""
+    labels, known = ramp_segmentation.labels, ramp_segmentation.texture()
+    expected = []
+    for share in (0.0, 1.0):
+        column = slice(15, 26)
+        label, second = labels.array[:, :, column], known.second_label[:, :, column]
+        bright = (label == 2) * (1 - share * known.second_share[:, :, column])
+        bright = bright + (second == 2) * share * known.second_share[:, :, column]
+        expected.append(bright.mean(axis=(0, 1)))
+    assert np.abs(np.diff(expected[1])).max() < np.abs(np.diff(expected[0])).max()
+    assert expected[1].mean() == pytest.approx(expected[0].mean(), abs=0.03)
+
+
+def test_an_mri_beside_any_label_map_gives_its_intensity():
+    array = np.arange(SOLID.array.size, dtype=np.float32).reshape(SOLID.array.shape)
+    known = Texture.from_mri(SOLID.with_array(array), SOLID)
+    assert known.deviation.mean() == pytest.approx(0, abs=1e-3) and not known.second_share.any()
+    flat = Texture.from_mri(SOLID.with_array(np.full(array.shape, 7.0)), SOLID)
+    assert not flat.deviation.any()
+
+
+def test_textures_that_do_not_fit_are_refused():
+    with pytest.raises(SimulationError, match=r"mri_modulation_db 2 need a texture; pass segmentation\.texture"):
+        UltrasoundSimulator(SOLID, TABLE, SimulationSettings(mri_modulation_db=2.0))
+    small = Texture(*(np.zeros((2, 2, 2), dtype) for dtype in (np.uint8, np.float32, np.float32)))
+    with pytest.raises(SimulationError, match=r"the texture has shape \(2, 2, 2\), expected that of the labels"):
+        UltrasoundSimulator(SOLID, TABLE, SimulationSettings(partial_volume=True), texture=small)
+    with pytest.raises(SimulationError, match=r"second_share goes from 0 to 1\.5, expected 0 to 1"):
+        Texture(np.zeros((2, 2, 2), np.uint8), np.linspace(0, 1.5, 8).reshape(2, 2, 2), np.zeros((2, 2, 2)))
+    with pytest.raises(SimulationError, match="lie on different grids"):
+        Texture.from_mri(block(lambda x, y, z: x, half_mm=(5, 5, 5)), SOLID)
+    with pytest.raises(SimulationError, match="mri_modulation_db is 9"):
+        SimulationSettings(mri_modulation_db=9)
+
+
+def test_the_commands_take_the_settings_from_an_mri_and_refuse_them_for_labels(tmp_path):
+    from PIL import Image
+
+    from SlicerUSSim.Logic.phantoms import head_mri
+
+    head_mri(spacing_mm=3.0).write(tmp_path / "mri.nii.gz")
+    arguments = ["simulate", str(tmp_path / "mri.nii.gz"), "--pose", "auto", "-o", str(tmp_path / "a.png")]
+    images = []
+    for extra in ([], ["--partial-volume"], ["--mri-modulation", "3"]):
+        result = CliRunner().invoke(main, [*arguments, *extra])
+        assert result.exit_code == 0, result.output
+        images.append(np.asarray(Image.open(tmp_path / "a.png")).astype(int))
+    assert np.abs(images[1] - images[0]).max() > 0 and np.abs(images[2] - images[0]).max() > 0
+    SOLID.write(tmp_path / "labels.nii.gz")
+    arguments[1] = str(tmp_path / "labels.nii.gz")
+    result = CliRunner().invoke(main, [*arguments, "--partial-volume"])
+    assert result.exit_code == 2
+    assert "is a label map; --partial-volume and --mri-modulation need the MRI it came from" in result.stderr
