@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from SlicerUSSim.cli import main
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, SimulationError, Volume
 from SlicerUSSim.Logic.compounding import Compounder, sweep_grid
+from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.placement import slide_sweep, tilt_sweep
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
-from SlicerUSSim.Logic.simulator import Frame
 from SlicerUSSim.Logic.validation.beams import freehand_sweep
 from tests.conftest import SPECKLE, block, rigid, simulator
 

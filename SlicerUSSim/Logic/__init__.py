@@ -7,7 +7,7 @@ import importlib
 _HOMES = {
     "ConvexProbe": "probe",
     "DisplaySettings": "settings",
-    "Frame": "simulator",
+    "Frame": "frame",
     "LinearProbe": "probe",
     "Membrane": "tissues",
     "PhasedProbe": "probe",

@@ -9,8 +9,8 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.errors import require, require_between
+from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.probe import Probe
-from SlicerUSSim.Logic.simulator import Frame
 from SlicerUSSim.Logic.volume import Volume, check_rigid
 
 _MOST_VOXELS = 400_000_000

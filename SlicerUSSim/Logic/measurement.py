@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from SlicerUSSim.Logic.errors import require
+from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.probe import Probe
-from SlicerUSSim.Logic.simulator import Frame
 
 
 def level_db(signal: np.ndarray) -> float:

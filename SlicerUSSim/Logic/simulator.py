@@ -5,15 +5,15 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cached_property
 from time import perf_counter
 
 import numpy as np
 
 from SlicerUSSim.Logic.bmode import Compressor, PulseFilter
+from SlicerUSSim.Logic.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.device import Device
 from SlicerUSSim.Logic.errors import require
+from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.layout import CONSTANTS, SCENE
 from SlicerUSSim.Logic.medium import Medium, as_labels
 from SlicerUSSim.Logic.probe import NOMINAL_SPEED_M_S, Probe
@@ -32,55 +32,6 @@ class EmptyViewWarning(UserWarning):
 
 class TreeOverflowWarning(UserWarning):
     """Scan lines with more ray segments than there is room for lack the speckle of the last ones."""
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One simulated image with its geometry and the signals it was made from."""
-
-    #: (scan_lines, samples) complex64 baseband (I/Q) signal before noise and TGC
-    iq: np.ndarray = field(repr=False)
-    #: (scan_lines, samples) float32 after noise and TGC
-    envelope: np.ndarray = field(repr=False)
-    #: (scan_lines, samples) uint8 grey levels along the scan lines
-    bmode: np.ndarray = field(repr=False)
-    #: (rows, columns) uint8 scan-converted image; outside the field 0
-    image: np.ndarray = field(repr=False)
-    #: Depth between samples
-    sample_interval_mm: float
-    #: Carrier cycles per millimetre of depth
-    cycles_per_mm: float
-    grid: ImageGrid
-    #: (4, 4)
-    probe_to_ras: np.ndarray
-    #: Milliseconds per stage; empty unless the simulator profiles
-    timings_ms: dict[str, float] = field(default_factory=dict, repr=False)
-
-    @cached_property
-    def rf(self) -> np.ndarray:
-        """(scan_lines, samples) complex64 analytic RF signal; its real part is what an A/D converter would see."""
-        depth = np.arange(self.iq.shape[1]) * self.sample_interval_mm
-        return self.iq * np.exp(2j * np.pi * self.cycles_per_mm * depth).astype(np.complex64)
-
-    @property
-    def pixel_spacing_mm(self) -> tuple[float, float]:
-        """(column, row) spacing of the image."""
-        return self.grid.pixel_spacing_mm
-
-    @property
-    def image_to_probe(self) -> np.ndarray:
-        """(4, 4) from (column, row, 0, 1) to the probe frame in millimetres."""
-        return self.grid.image_to_probe
-
-    def to_volume(self) -> Volume:
-        """The image as a Volume of one slice in patient space; the slice is as thick as a pixel is high."""
-        ijk_to_ras = self.probe_to_ras @ self.image_to_probe
-        ijk_to_ras[:3, 2] *= self.pixel_spacing_mm[1]
-        return Volume(self.image[None], ijk_to_ras)
-
-    def to_vtk(self):
-        """The image as a vtkImageData of one slice in patient space (RAS)."""
-        return self.to_volume().to_vtk()
 
 
 class UltrasoundSimulator:
@@ -213,8 +164,6 @@ class UltrasoundSimulator:
         `hole_mm` is how wide a gap between images is filled (default: as wide as the sweep's widest, 10 mm at most).
         The grey levels are uint8; where no image came near, 0. Raises SimulationError as sweep_grid and Compounder do.
         """
-        from SlicerUSSim.Logic.compounding import Compounder, sweep_grid
-
         poses = list(poses)
         grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
         compounder = Compounder(grid, probe)

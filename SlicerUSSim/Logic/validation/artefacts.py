@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.measurement import echo_near, region_level_db
 from SlicerUSSim.Logic.phantoms import (
     Echo,
@@ -21,7 +22,7 @@ from SlicerUSSim.Logic.phantoms import (
 )
 from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.simulator import Frame, UltrasoundSimulator
+from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.validation import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.validation.pictures import View, draw_views
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.measurement import RayleighFit
 from SlicerUSSim.Logic.phantoms import Echo, Phantom
 from SlicerUSSim.Logic.placement import sample, slice_under_probe
 from SlicerUSSim.Logic.probe import Probe
-from SlicerUSSim.Logic.simulator import Frame
 from SlicerUSSim.Logic.volume import Volume, written_whole
 
 _OBJECT, _PREDICTION = "#4fb0c6", "#ffc83d"
@@ -34,7 +34,8 @@ def draw_views(path: Path, views: list[View]) -> None:
     that the image shows them, boxes where it predicts the level."""
     from matplotlib import patches
 
-    figure, axes = _figure(len(views), 2, 4.2, 3.6)
+    left, right, top, bottom = views[0].probe.image_bounds_mm()
+    figure, axes = _figure(len(views), 2, 3.2 * (right - left) / (bottom - top) + 0.9, 3.8)
     for (left, right), view in zip(axes, views, strict=True):
         bounds = view.probe.image_bounds_mm()
         extent = (bounds[0], bounds[1], bounds[3], bounds[2])

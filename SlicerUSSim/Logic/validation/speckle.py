@@ -8,11 +8,12 @@ from functools import partial
 import numpy as np
 from scipy import stats
 
+from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.measurement import correlation, fit_rayleigh, level_db
 from SlicerUSSim.Logic.phantoms import BACKGROUND, uniform_speckle
 from SlicerUSSim.Logic.probe import LinearProbe, Probe
 from SlicerUSSim.Logic.settings import SimulationSettings
-from SlicerUSSim.Logic.simulator import Frame, UltrasoundSimulator
+from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import Tissue
 from SlicerUSSim.Logic.validation import PROBES, Check, Outcome, Row, pictures
 
