@@ -274,7 +274,11 @@ def thin_rod(rotation: np.ndarray | None = None, *, depth_mm: float = 30.0, widt
         return np.where((np.abs(y - depth_mm) < 0.5 * width_mm) & (np.abs(z) < 0.5 * width_mm), 1, 0)
 
     bar = replace(FLUID, name="bar", mu0=2.0, sigma0=1.0)
-    return _phantom("thin rod", label, TissueTable({0: FLUID, 1: bar}), rotation, 0.3, box=_Box(half_width=12.0))
+    tissues = TissueTable({0: FLUID, 1: bar})
+    place = (0.0, depth_mm)
+    return _phantom(
+        "thin rod", label, tissues, rotation, 0.3, lambda probe: (Echo("bar", place, place),), box=_Box(half_width=12.0)
+    )
 
 
 def layered(
@@ -293,9 +297,19 @@ def layered(
         along = np.sin(tilt) * x + np.cos(tilt) * y
         return 1 + sum((along > np.cos(tilt) * border).astype(np.uint8) for border in borders_mm)
 
-    return _phantom(
-        "layers", label, TissueTable(dict(enumerate(tissues, 1))), rotation, spacing_mm, box=_Box(half_width=50.0)
-    )
+    def expected(probe: Probe):
+        if tilt_deg != 0.0:
+            return ()  # off the axis, or off the perpendicular
+        thickness = np.diff([0.0, *borders_mm])
+        speeds = [tissue.speed_of_sound_m_s for tissue in tissues[:-1]]
+        shown = np.cumsum(thickness * REFERENCE_SPEED_M_S / speeds)
+        return tuple(
+            Echo(f"border {n}", (0.0, float(depth)), (0.0, border))
+            for n, (depth, border) in enumerate(zip(shown, borders_mm, strict=True), 1)
+        )
+
+    table = TissueTable(dict(enumerate(tissues, 1)))
+    return _phantom("layers", label, table, rotation, spacing_mm, expected, box=_Box(half_width=50.0))
 
 
 def small_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.0, half_mm: float = 2.0) -> Phantom:
@@ -306,7 +320,7 @@ def small_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.0, h
 
     tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sheet", impedance_mrayl=1.8)})
     box = _Box(half_mm + 2.0, depth_mm - 2.0, depth_mm + 4.0, half_mm + 6.0)
-    return _phantom("small sheet", label, tissues, rotation, 0.1, box=box)
+    return _phantom("small sheet", label, tissues, rotation, 0.1, _facing(depth_mm), box=box)
 
 
 # ---- voxels ---------------------------------------------------------------------------------------------------------
@@ -334,7 +348,15 @@ def voxel_sphere(
     pose[:3, 3] = -(radius_mm + 9.0) * pose[:3, 1]
     # No impedance of its own is needed for a border, but a speed of its own would bend the rays inside.
     tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sphere", impedance_mrayl=2.0)})
-    return Phantom("voxel sphere", Volume(inside.astype(np.uint8), matrix), tissues, pose, centre_ras=tuple(centre))
+    x0, y0, z0 = pose[:3, :3].T @ (centre - pose[:3, 3])  # in the probe frame
+
+    def expected(probe: Probe):
+        # The image plane cuts the sphere beside its centre; the line towards the cut's centre meets it at right angles.
+        front = np.array([x0, y0]) - np.sqrt(radius_mm**2 - z0**2) * _line_direction_at(probe, (x0, y0))
+        return (Echo("front", tuple(front), tuple(front)),)
+
+    volume = Volume(inside.astype(np.uint8), matrix)
+    return Phantom("voxel sphere", volume, tissues, pose, expected, centre_ras=tuple(centre))
 
 
 def voxel_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, spacing_mm: float = 1.0) -> Phantom:
@@ -345,7 +367,21 @@ def voxel_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, s
         return np.where(np.abs(y - depth_mm) < 0.5 * thickness, 1, 0)
 
     tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sheet", impedance_mrayl=1.9)})
-    return _phantom("voxel sheet", label, tissues, rotation, spacing_mm, box=_Box(half_width=50.0))
+    _facing(depth_mm - 0.5 * thickness)
+    return _phantom(
+        "voxel sheet",
+        label,
+        tissues,
+        rotation,
+        spacing_mm,
+        _facing(depth_mm - 0.5 * thickness),
+        box=_Box(half_width=50.0),
+    )
+
+
+def _facing(depth_mm: float) -> Callable[[Probe], tuple[Echo, ...]]:
+    """What a face across the axis shows."""
+    return lambda probe: (Echo("face", (0.0, depth_mm), (0.0, depth_mm)),)
 
 
 def _phantom(name, label, tissues, rotation, spacing_mm, expected=None, reference=None, box=None) -> Phantom:

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
 
 from SlicerUSSim.Logic.measurement import echo_near, full_width
 from SlicerUSSim.Logic.phantoms import FLUID, layered, small_sheet, thin_rod, wires_and_cysts
@@ -14,7 +15,8 @@ from SlicerUSSim.Logic.placement import sample, slide_sweep, tilt_sweep
 from SlicerUSSim.Logic.probe import FWHM_PER_SIGMA, LinearProbe
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.validation import PROBES, Check, Outcome, Row, pictures
+from SlicerUSSim.Logic.validation import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.validation.pictures import Curve, Plot, draw_cross_sections, draw_plots
 from SlicerUSSim.Logic.volume import Volume
 
 
@@ -49,7 +51,37 @@ def specular_echoes(rotation: np.ndarray, device) -> Outcome:
             loss = 10 ** (-0.4 * probe.frequency_mhz * 2 * hits["path_mm"].astype(float) / 10 / 20)
             gain = 10 ** (settings.interface_gain_db / 20) / settings.elevational_rays
             ratio = hits["echo"] / (loss * r * gain * hits["cos_incidence"].astype(float) ** exponent)
-            rows.append(Row(f"largest error, n = {exponent:.0f}, {name}", "", 0.0, float(abs(ratio - 1).max()), 0.01))
+            # Where a voxelised normal leans out of plane, a ray's echo is a little short of this; never above.
+            rows += [
+                Row(f"median, n = {exponent:.0f}, {name}", "", 1.0, float(np.median(ratio)), 0.01),
+                Row(f"largest, n = {exponent:.0f}, {name}", "", 1.0, float(ratio.max()), 0.01, "at most"),
+            ]
+    return Outcome(tuple(rows))
+
+
+def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
+    """A plane that leans out of the image plane: over a Gaussian beam its echo is the Gaussian's Fourier transform."""
+    behind = replace(FLUID, name="behind", impedance_mrayl=1.9)
+    phantom = layered([FLUID, behind], [25.0], rotation, spacing_mm=0.25)
+    settings = SimulationSettings(scattering=False, specular_exponent=0.0)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+    rows = []
+    for name, probe in PROBES.items():
+        low = replace(probe, frequency_mhz=2.0)
+        sigma = float(low.beam_sigma_mm(25.0)[1])
+        peaks = {}
+        for tilt in (0.0, 2.0, 3.0, 8.0):
+            # About the point of the plane on the probe's axis.
+            turn = tilt_sweep(np.eye(4), 2.0 * tilt, 2)[1][:3, :3]
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = turn, np.array([0.0, 25.0, 0.0]) - turn @ [0.0, 25.0, 0.0]
+            frame = simulator.simulate(low, phantom.probe_to_ras @ pose)
+            peaks[tilt] = echo_near(frame, low, (0.0, 25.0), 2.0)[2]
+        for tilt in (2.0, 3.0):
+            turns = low.cycles_per_mm * np.tan(np.radians(tilt)) * sigma
+            theory = -20 * np.log10(np.e) * 0.5 * (2 * np.pi * turns) ** 2
+            rows.append(Row(f"{tilt:.0f} degrees, {name}", "dB", theory, 20 * np.log10(peaks[tilt] / peaks[0.0]), 1.0))
+        rows.append(Row(f"8 degrees, {name}", "dB", -15.0, 20 * np.log10(peaks[8.0] / peaks[0.0]), 0.0, "at most"))
     return Outcome(tuple(rows))
 
 
@@ -74,11 +106,20 @@ def interface_width(rotation: np.ndarray, device) -> Outcome:
     box = (2 * half) ** 2 / 12
     predicted = {"lateral": np.sqrt(box + sigma_l**2), "elevational": np.sqrt(box + sigma_e**2)}
     measured = {"lateral": _spread(probe.line_positions(), lateral), "elevational": _spread(offsets, elevational)}
+    plots = []
+    for axis, positions, values, sigma in (
+        ("lateral", probe.line_positions(), lateral, sigma_l),
+        ("elevational", offsets, elevational, sigma_e),
+    ):
+        theory = ndtr((positions + half) / sigma) - ndtr((positions - half) / sigma)  # a box convolved with a Gaussian
+        curve = Curve(f"sigma {sigma:.2f} mm", positions, values / values.max(), positions, theory / theory.max())
+        plots.append(Plot(f"sheet of {2 * half:.0f} mm", f"{axis} [mm]", "echo", [curve]))
     return Outcome(
         tuple(
             Row(f"{axis} standard deviation of the echo", "mm", predicted[axis], measured[axis], 0.1 * predicted[axis])
             for axis in predicted
-        )
+        ),
+        partial(draw_plots, plots=plots),
     )
 
 
@@ -93,7 +134,7 @@ def resolution(rotation: np.ndarray, device) -> Outcome:
     phantom = wires_and_cysts(rotation)
     settings = SimulationSettings(scattering=False, reflections=False)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
-    rows = []
+    rows, curves = [], []
     for name, probe in PROBES.items():
         fine = replace(probe, scan_lines=481)
         frame = simulator.simulate(fine, phantom.probe_to_ras)
@@ -107,7 +148,14 @@ def resolution(rotation: np.ndarray, device) -> Outcome:
             width = full_width(np.arange(len(band)) * apart, band)
             predicted = float(fine.beam_sigma_mm(depth)[0]) * FWHM_PER_SIGMA
             rows.append(Row(f"lateral FWHM, {wire.name}, {name}", "mm", predicted, width, 0.15 * predicted))
-    return Outcome(tuple(rows))
+            if name == "linear":
+                x = np.arange(len(band)) * apart
+                x = x - x[np.argmax(band)]
+                near = abs(x) < 1.5
+                theory = np.exp(-4 * np.log(2) * (x[near] / predicted) ** 2)
+                curves.append(Curve(wire.name, x[near], band[near] / band.max(), x[near], theory))
+    plot = Plot("wires, linear array", "lateral [mm]", "echo", curves)
+    return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
 
 
 def _apex(probe) -> float:
@@ -121,7 +169,7 @@ def slice_thickness(rotation: np.ndarray, device) -> Outcome:
     # Dense scatterers: what varies with the offset must be the beam, not which scatterers it meets.
     settings = SimulationSettings(scatterers_per_mm3=1000.0)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
-    rows, curves = [], {}
+    rows, curves = [], []
     across = np.linspace(-0.5 * width, 0.5 * width, 25)
     for name, probe in PROBES.items():
         wide = replace(probe, elevation_focus_mm=55.0)
@@ -139,8 +187,9 @@ def slice_thickness(rotation: np.ndarray, device) -> Outcome:
             Row(f"fall at {offset / sigma:.1f} sigma out of plane, {name}", "dB", e, m, 0.5 + 0.08 * abs(e))
             for offset, e, m in zip(offsets[1:], expected[1:], measured[1:], strict=True)
         ]
-        curves[name] = (offsets, measured, expected)
-    return Outcome(tuple(rows), partial(pictures.draw_slice_thickness, curves=curves))
+        curves.append(Curve(name, offsets, measured, offsets, expected))
+    plot = Plot("a thin bar", "distance from the image plane [mm]", "power [dB]", curves)
+    return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
 
 
 def _band_power(frame, probe, depth_mm: float) -> float:
@@ -181,7 +230,7 @@ def compounding(rotation: np.ndarray, device) -> Outcome:
         _, y, z = _bar_centre(volume, phantom.probe_to_ras, depth)
         off = float(np.hypot(y - depth, z))
         rows.append(Row(f"bar is off its place, {name}", "mm", 0.0, off, 0.3, "at most"))
-    draw = partial(pictures.draw_cross_sections, volumes=volumes, probe_to_ras=phantom.probe_to_ras, depth_mm=depth)
+    draw = partial(draw_cross_sections, volumes=volumes, probe_to_ras=phantom.probe_to_ras, depth_mm=depth)
     return Outcome(tuple(rows), draw)
 
 
@@ -228,6 +277,11 @@ CHECKS = (
         echo_level,
     ),
     Check("specular echoes", "The echo of a hit is w A |r| cos^n of the angle of incidence.", specular_echoes),
+    Check(
+        "elevational tilt",
+        "A plane leaning out of the image by t echoes exp(-(2 pi f tan t sigma)^2 / 2) as much, f in cycles per mm.",
+        tilted_in_elevation,
+    ),
     Check("interface width", "A small sheet spreads over lines and slices as the beam does.", interface_width),
     Check("resolution", "A wire is as wide as the beam at its depth.", resolution),
     Check(

@@ -15,8 +15,9 @@ from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.volume import Volume, written_whole
 
 _OBJECT, _PREDICTION = "#4fb0c6", "#ffc83d"
+_CURVES = ("#c0392b", "#2c5f8a", "#5f9e6e")
 # One grey per label, so that the phantom reads as a drawing: background, then its parts.
-_LABEL_GREYS = np.array([70, 70, 130, 255, 30, 255, 190], np.uint8)
+_LABEL_GREYS = np.array([45, 75, 130, 255, 30, 255, 190], np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,37 +83,52 @@ def draw_rayleigh(path: Path, fit: RayleighFit, envelope: np.ndarray) -> None:
     _save(figure, path)
 
 
-def draw_correlations(path: Path, curves: dict, frame: Frame, probe: Probe) -> None:
-    """Speckle, and its lateral correlation at three depths with the theory's curve."""
-    figure, axes = _figure(1, 2, 4.2, 4.2)
-    image, plot = axes[0]
-    left, right, top, bottom = probe.image_bounds_mm()
-    image.imshow(frame.image, cmap="gray", extent=(left, right, bottom, top))
-    image.set_title("uniform speckle", fontsize=10)
-    image.set_xlabel("lateral [mm]")
-    image.set_ylabel("depth [mm]")
-    for (depth, (lags, measured, sigma)), colour in zip(curves.items(), ("#c0392b", "#2c5f8a", "#5f9e6e"), strict=True):
-        fine = np.linspace(0.0, lags[-1], 100)
-        plot.plot(fine, np.exp(-(fine**2) / (4 * sigma**2)), color=colour, label=f"theory at {depth}")
-        plot.plot(lags, measured, "o", color=colour, markersize=4)
-    plot.set_title("lateral correlation, linear array", fontsize=10)
-    plot.set_xlabel("distance [mm]")
-    plot.legend(fontsize=8)
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """What was measured at some places, and theory's curve through them."""
+
+    name: str
+    x: np.ndarray
+    measured: np.ndarray
+    theory_x: np.ndarray
+    theory: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """Curves in one frame."""
+
+    title: str
+    x_label: str
+    y_label: str
+    curves: list[Curve]
+
+
+def draw_plots(path: Path, plots: list[Plot]) -> None:
+    """Plots side by side: dots are measured, lines are theory."""
+    figure, axes = _figure(1, len(plots), 4.4, 3.6)
+    for axis, plot in zip(axes[0], plots, strict=True):
+        for n, curve in enumerate(plot.curves):
+            colour = _CURVES[n % len(_CURVES)]
+            axis.plot(curve.theory_x, curve.theory, color=colour, linewidth=1.2, label=f"theory, {curve.name}")
+            axis.plot(curve.x, curve.measured, "o", color=colour, markersize=3.5)
+        axis.set_title(plot.title, fontsize=10)
+        axis.set_xlabel(plot.x_label)
+        axis.set_ylabel(plot.y_label)
+        axis.legend(fontsize=7)
     _save(figure, path)
 
 
-def draw_slice_thickness(path: Path, curves: dict) -> None:
-    """How a thin bar fades as the image plane moves away from it."""
-    figure, axes = _figure(1, 1, 5.2, 4.0)
-    plot = axes[0, 0]
-    for (name, (offsets, measured, expected)), colour in zip(
-        curves.items(), ("#c0392b", "#2c5f8a", "#5f9e6e"), strict=True
-    ):
-        plot.plot(offsets, expected, color=colour, label=f"theory, {name}")
-        plot.plot(offsets, measured, "o", color=colour, markersize=5)
-    plot.set_xlabel("distance from the image plane [mm]")
-    plot.set_ylabel("power of the bar [dB]")
-    plot.legend(fontsize=8)
+def draw_images(path: Path, images: dict[str, np.ndarray]) -> None:
+    """Envelopes (line, sample) side by side, in one grey scale of 50 dB."""
+    figure, axes = _figure(1, len(images), 3.4, 3.4)
+    loudest = max(np.abs(image).max() for image in images.values())
+    for axis, (name, image) in zip(axes[0], images.items(), strict=True):
+        level = 20.0 * np.log10(np.abs(image).T / loudest + 1e-9)
+        axis.imshow(level, cmap="gray", vmin=-50, vmax=0, aspect="auto")
+        axis.set_title(name, fontsize=10)
+        axis.set_xlabel("scan line")
+    axes[0, 0].set_ylabel("sample")
     _save(figure, path)
 
 

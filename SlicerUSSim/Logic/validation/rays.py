@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from SlicerUSSim.Logic.settings import SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import Tissue
 from SlicerUSSim.Logic.validation import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.validation.pictures import Curve, Plot, View, draw_plots, draw_views
 
 SLOW, FAST = Tissue("slow", 1450.0, 1.45, 0.3), Tissue("fast", 1650.0, 1.9, 0.9)
 
@@ -26,7 +28,7 @@ def refraction_and_reflectance(rotation: np.ndarray, device) -> Outcome:
     tilt = np.radians(20.0)
     normal = phantom.probe_to_ras[:3, :3] @ [-np.sin(tilt), -np.cos(tilt), 0.0]
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, device=device)
-    rows = []
+    rows, curves = [], []
     for name, probe in PROBES.items():
         tree = simulator.trace(probe, phantom.probe_to_ras)
         crossing = tree.hits[(tree.hits["reflections"] == 0) & (tree.hits["label_behind"] == 2)]
@@ -41,7 +43,11 @@ def refraction_and_reflectance(rotation: np.ndarray, device) -> Outcome:
                 _sine_ratio(tree, normal), 0.02,
             ),
         ]  # fmt: skip
-    return Outcome(tuple(rows))
+        order = np.argsort(cos_in)[:: max(len(cos_in) // 60, 1)]
+        incidence = np.degrees(np.arccos(cos_in[order]))
+        curves.append(Curve(name, incidence, crossing["reflectance"][order], incidence, expected[order]))
+    plot = Plot("a plane between two fluids", "angle of incidence [degrees]", "reflectance R", curves)
+    return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
 
 
 def _fluid_reflectance(cos_in: np.ndarray) -> np.ndarray:
@@ -75,12 +81,16 @@ def total_reflection(rotation: np.ndarray, device) -> Outcome:
     tree = simulator.trace(LinearProbe(2.0, 40.0, scan_lines=21), phantom.probe_to_ras)
     hits = tree.hits[(tree.hits["reflections"] == 0) & (tree.hits["label_behind"] == 2)]
     through = (tree.segments["reflections"] == 0) & (tree.segments["label"] == 2)
+    view = View(
+        "total reflection", phantom, PROBES["linear"], simulator.simulate(PROBES["linear"], phantom.probe_to_ras)
+    )
     reached = float(hits["reflectance"].min()) if len(hits) else 0.0
     return Outcome(
         (
             Row("smallest R beyond the critical angle", "", 1.0, reached, 0.0),
             Row("refracted rays", "", 0.0, float(through.sum()), 0.0),
-        )
+        ),
+        partial(draw_views, views=[view]),
     )
 
 
@@ -101,7 +111,8 @@ def attenuation_and_time(rotation: np.ndarray, device) -> Outcome:
             Row(f"depth of the back, {name}", "mm", depth, float(out["depth_mm"].mean()), 0.05),
             Row(f"two-way loss to the back, {name}", "dB", loss, float(measured), 0.1),
         ]
-    return Outcome(tuple(rows))
+    frame = simulator.simulate(PROBES["convex"], phantom.probe_to_ras)
+    return Outcome(tuple(rows), partial(draw_views, views=[View("fast slab", phantom, PROBES["convex"], frame)]))
 
 
 def sub_voxel_interfaces(rotation: np.ndarray, device) -> Outcome:
@@ -112,6 +123,8 @@ def sub_voxel_interfaces(rotation: np.ndarray, device) -> Outcome:
     probe = LinearProbe(30, 30, scan_lines=121, elevation_aperture_mm=30, elevation_focus_mm=60)
     hits = simulator.trace(probe, phantom.probe_to_ras).hits
     front = hits[hits["label_before"] == 0]
+    seen = replace(PROBES["convex"], depth_mm=60.0)
+    image = simulator.simulate(seen, phantom.probe_to_ras)
     from_centre = front["position"] - np.array(phantom.centre_ras)
     radius = np.linalg.norm(from_centre, axis=1)
     angle = np.degrees(np.arccos(np.clip((front["normal"] * from_centre / radius[:, None]).sum(axis=1), -1, 1)))
@@ -120,7 +133,8 @@ def sub_voxel_interfaces(rotation: np.ndarray, device) -> Outcome:
             Row("normal error RMS", "degrees", 0.0, _rms(angle), 3.0, "at most"),
             Row("position error RMS", "voxels", 0.0, _rms(radius - 20.0), 0.15, "at most"),
             Row("mean position error", "voxels", 0.0, float((radius - 20.0).mean()), 0.05),
-        )
+        ),
+        partial(draw_views, views=[View("sphere of 1 mm voxels", phantom, seen, image)]),
     )
 
 
@@ -138,7 +152,10 @@ def thin_sheet(rotation: np.ndarray, device) -> Outcome:
         )
         rays = len(np.unique(tree.segment_line)) * simulator.settings.elevational_rays
         rows.append(Row(f"share of rays that see it, {name}", "", 1.0, len(crossed) / rays, 0.0))
-    return Outcome(tuple(rows))
+    frame = simulator.simulate(PROBES["convex"], phantom.probe_to_ras)
+    return Outcome(
+        tuple(rows), partial(draw_views, views=[View("sheet of one voxel", phantom, PROBES["convex"], frame)])
+    )
 
 
 def energy(rotation: np.ndarray, device) -> Outcome:
