@@ -41,8 +41,8 @@ class SimulationSettings:
     #: How far scatterers' amplitudes follow the MRI inside a tissue, in dB per standard deviation of its intensity
     #: (needs a Texture; negative where bright means echo-poor; 0 is the paper)
     mri_modulation_db: float = 0.0
-    #: Where the beam profile is cut off, in standard deviations
-    beam_cutoff: float = 2.5
+    #: Where the beam profile is cut off, in standard deviations; what lies beyond has 0.15 % of its power
+    beam_cutoff: float = 2.25
     #: Rays per scan line that sample interfaces across the elevational beam
     elevational_rays: int = 7
     #: Traced lines per scan line, which sample the beam laterally; 0 chooses enough for the probe's spacing
