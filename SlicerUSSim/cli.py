@@ -291,7 +291,7 @@ def validate(ctx: click.Context, out: Path, only: tuple[str, ...], device: str |
         row = finding.row
         click.echo(
             f"off: {finding.check}, {row.quantity}, {finding.orientation}: {row.measured:.4g} {row.unit}, "
-            f"predicted {row.predicted:.4g} ({row.kind} {row.tolerance:.3g})"
+            f"predicted {row.predicted:.4g} ({row.limits})"
         )
     click.echo(f"{report.summary()} Wrote {out / 'report.md'}, report.json and {len(report.pictures)} pictures.")
     ctx.exit(1 if report.failed else 0)

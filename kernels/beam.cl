@@ -9,6 +9,8 @@
 //
 // Buffers: from_re, from_im float [2 traced line + side][stride]; to_re, to_im float [scan line][stride].
 
+#include "common.clh"
+
 __kernel void lateral_beam(__constant const Scene *scene, __global const float *from_re, __global const float *from_im,
                            __global float *to_re, __global float *to_im, int stride) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);

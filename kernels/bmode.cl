@@ -3,6 +3,8 @@
 // Buffers: re, im float [scan line][stride], LINE_PAD zeros on either side of the samples; pulse float [2 reach + 1];
 // iq float2 (real, imaginary), envelope float and grey uchar [scan line][samples].
 
+#include "common.clh"
+
 #if LANES == 1
 #define GREY_LANES(pointer) ((float)*(pointer))
 #define STORE_GREY(value, pointer) (*(pointer) = (uchar)(value))

@@ -6,6 +6,8 @@
 // Buffers: hits, hit_counts (raytracing.cl); re, im float [2 traced line + side][stride]: complex baseband impulses,
 // half on either side of the line (scattering.cl).
 
+#include "common.clh"
+
 __kernel void interface_echoes(__constant const Scene *scene, __global const Hit *hits, __global const int *hit_counts,
                                __global float *re, __global float *im, int stride) {
   int line = get_global_id(0), rays = scene->elevational_rays;

@@ -4,6 +4,8 @@
 // since lines are little denser than the beam is wide and linear interpolation shows as spokes in the far field.
 // Buffers: grey uchar [scan line][samples]; image uchar [row][column], 0 outside the field.
 
+#include "common.clh"
+
 // atan(x / y) for y > 0, to 2e-6 rad: a thousandth of the spacing of scan lines.
 inline float angle_of(float x, float y) {
   float small = fmin(fabs(x), y), large = fmax(fabs(x), y);

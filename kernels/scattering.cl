@@ -19,6 +19,8 @@
 // Buffers: voxels, tissues, segments as in raytracing.cl; texture uint [k][j][i] (one element without TEXTURE); re, im
 // float [2 traced line + side][stride].
 
+#include "common.clh"
+
 #define BATCH 256  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
 // What is the same for all scatterers beside one piece of a segment. Vectors are in the order u, v, w of lattice axes.

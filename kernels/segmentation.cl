@@ -3,6 +3,8 @@
 // Box windows are running sums along one axis at a time, so the cost does not depend on the radius. Volumes are float
 // [k][j][i] with i padded to whole lanes; the mask (1 inside) keeps air out of every mean.
 
+#include "common.clh"
+
 // Sums over 2 radius + 1 neighbours along j (axis 1) or k (axis 2). One work-item computes LANES columns;
 // global size (row / LANES, other axis).
 __kernel void box_sum_across(__global const float *from, __global float *to, int count, int stride, int other_stride,

@@ -30,7 +30,7 @@ def test_theory_and_simulation_agree(check, orientation):
     outcome = check.measure(ORIENTATIONS[orientation], None)
     assert outcome.rows
     off = [
-        f"{row.quantity}: {row.measured:.5g}, predicted {row.predicted:.5g} ({row.kind} {row.tolerance:.3g})"
+        f"{row.quantity}: {row.measured:.5g}, predicted {row.predicted:.5g} ({row.limits})"
         for row in outcome.rows
         if not row.passed
     ]
@@ -60,6 +60,20 @@ def test_everything_the_specification_names_has_a_check_in_three_orientations():
 )
 def test_a_row_passes_only_inside_its_tolerance(kind, measured, passed):
     assert Row("x", "mm", 10.0, measured, 0.5, kind).passed is passed
+
+
+@given(
+    st.sampled_from(["within", "at most", "at least"]),
+    st.floats(-100, 100),
+    st.floats(-100, 100),
+    st.floats(0.01, 10),
+)
+def test_the_strain_of_a_row_is_above_one_just_where_it_fails(kind, predicted, measured, tolerance):
+    row = Row("x", "", predicted, measured, tolerance, kind)
+    if row.passed:
+        assert row.strain <= 1.0 + 1e-9
+    else:
+        assert row.strain >= 1.0
 
 
 # ---- wrong physics is noticed ---------------------------------------------------------------------------------------
@@ -101,7 +115,11 @@ def test_the_report_holds_every_row_and_its_pictures(tmp_path):
     assert written["passed"] is True and len(written["rows"]) == len(report.findings)
     assert {row["orientation"] for row in written["rows"]} == set(ORIENTATIONS)
     table = (tmp_path / "out" / "report.md").read_text()
-    assert table.count("| pass |") == len(report.findings) and "FAIL" not in table
+    assert (
+        table.count("| pass |") == len(report.findings)
+        and "| [thin sheet](#thin-sheet) | 9 | 9 |" in table
+        and "FAIL" not in table
+    )
     assert report.pictures == ("sub-voxel-interfaces.png", "thin-sheet.png", "shadow-and-enhancement.png")
     for picture in report.pictures:
         assert (tmp_path / "out" / picture).stat().st_size > 10_000 and f"({picture})" in table

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
+import re
 import sys
 import warnings
 import zlib
@@ -237,8 +238,7 @@ class Device:
         """
         key = (file_name, lanes, *defines)
         if key not in self._kernels:
-            folder = kernel_folder()
-            source = "\n".join([shared_source(), (folder / "common.clh").read_text(), (folder / file_name).read_text()])
+            source = shared_source() + "\n" + _with_includes(kernel_folder(), file_name)
             options = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros", f"-DLANES={lanes}"]
             options += [f"-D{name}" for name in defines]
             if self.lanes > 1 and "Intel" in self.info.platform:
@@ -321,6 +321,18 @@ def _vector_lanes(info: DeviceInfo) -> int:
     if info.kind == "GPU":
         return 1
     return 16 if info.handle.native_vector_width_float >= 16 else 8
+
+
+def _with_includes(folder: Path, file_name: str) -> str:
+    """The text of a kernel file with the files it includes in place of the #include lines.
+
+    The compiler is not asked to find them: runtimes disagree about include paths that hold spaces.
+    """
+
+    def included(line: re.Match) -> str:
+        return _with_includes(folder, line.group(1))
+
+    return re.sub(r'^#include "([^"]+)"$', included, (folder / file_name).read_text(), flags=re.MULTILINE)
 
 
 @lru_cache(maxsize=1)

@@ -55,6 +55,26 @@ class Row:
             return bool(-off <= self.tolerance)
         return bool(abs(off) <= self.tolerance)
 
+    @property
+    def limits(self) -> str:
+        """What the measured number may be, in words."""
+        if self.kind == "at most":
+            return f"≤ {self.predicted + self.tolerance:.3g}"
+        if self.kind == "at least":
+            return f"≥ {self.predicted - self.tolerance:.3g}"
+        return f"± {self.tolerance:.3g}"
+
+    @property
+    def strain(self) -> float:
+        """How near the measured number is to its limit: 0 as predicted, 1 at the limit, above it failed."""
+        if self.kind == "within":
+            off = abs(self.measured - self.predicted)
+            return off / self.tolerance if self.tolerance > 0 else float(off > 0)
+        limit = self.predicted + (self.tolerance if self.kind == "at most" else -self.tolerance)
+        pair = (self.measured, limit) if self.kind == "at most" else (limit, self.measured)
+        # Of numbers of one sign, the share of the limit; a limit of zero or of another sign says only yes or no.
+        return pair[0] / pair[1] if min(pair) > 0 else float(not self.passed)
+
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
@@ -115,20 +135,28 @@ class Report:
     def to_markdown(self) -> str:
         """The table, a section per check, with its claim and its picture."""
         lines = ["# Validation", "", f"Device: {self.device}. {self.summary()}", ""]
-        claims = {check.name: check.claim for check in all_checks()}
-        for name in dict.fromkeys(finding.check for finding in self.findings):
-            lines += [f"## {name}", "", claims[name], ""]
+        checks = {check.name: check for check in all_checks()}
+        rows = {
+            name: [f for f in self.findings if f.check == name]
+            for name in dict.fromkeys(f.check for f in self.findings)
+        }
+        lines += ["| check | rows | passed | nearest to its limit | share of it |", "|---|---|---|---|---|"]
+        for name, findings in rows.items():
+            passed = sum(f.row.passed for f in findings)
+            worst = max(findings, key=lambda f: f.row.strain)
+            near = f"{worst.row.quantity}, {worst.orientation} | {100 * worst.row.strain:.0f} %"
+            lines.append(f"| [{name}](#{_slug(name)}) | {len(findings)} | {passed} | {near} |")
+        lines.append("")
+        for name, findings in rows.items():
+            lines += [f"## {name}", "", checks[name].claim, ""]
             if f"{_slug(name)}.png" in self.pictures:
                 lines += [f"![{name}]({_slug(name)}.png)", ""]
-            lines += ["| | orientation | predicted | measured | tolerance | |", "|---|---|---|---|---|---|"]
-            for finding in self.findings:
-                row = finding.row
-                if finding.check == name:
-                    sign = {"within": "± ", "at most": "≤ + ", "at least": "≥ - "}[row.kind]
-                    unit = f" {row.unit}" if row.unit else ""
-                    values = f"{row.predicted:.4g}{unit} | {row.measured:.4g}{unit} | {sign}{row.tolerance:.3g}"
-                    verdict = "pass" if row.passed else "**FAIL**"
-                    lines.append(f"| {row.quantity} | {finding.orientation} | {values} | {verdict} |")
+            lines += ["| | orientation | predicted | measured | limit | |", "|---|---|---|---|---|---|"]
+            for finding in findings:
+                row, unit = finding.row, f" {finding.row.unit}" if finding.row.unit else ""
+                values = f"{row.predicted:.4g}{unit} | {row.measured:.4g}{unit} | {row.limits}"
+                verdict = "pass" if row.passed else "**FAIL**"
+                lines.append(f"| {row.quantity} | {finding.orientation} | {values} | {verdict} |")
             lines.append("")
         return "\n".join(lines)
 

@@ -12,7 +12,7 @@ from scipy.special import ndtr
 from SlicerUSSim.Logic.measurement import echo_near, full_width
 from SlicerUSSim.Logic.phantoms import FLUID, layered, small_sheet, thin_rod, wires_and_cysts
 from SlicerUSSim.Logic.placement import sample, slide_sweep, tilt_sweep
-from SlicerUSSim.Logic.probe import FWHM_PER_SIGMA, LinearProbe
+from SlicerUSSim.Logic.probe import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.validation import PROBES, Check, Outcome, Row
@@ -86,41 +86,42 @@ def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
 
 
 def interface_width(rotation: np.ndarray, device) -> Outcome:
-    """A sheet of 4 x 4 mm, away from the focus: a box convolved with the beam."""
-    half, depth = 2.0, 20.0
+    """A small sheet away from the focus: a box convolved with the beam."""
+    half, depth = 1.5, 20.0
     phantom = small_sheet(rotation, depth_mm=depth, half_mm=half)
     settings = SimulationSettings(scattering=False, elevational_rays=16, specular_exponent=0.0)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
-    probe = LinearProbe(20.0, 30.0, scan_lines=101, focus_mm=35.0, elevation_focus_mm=35.0, frequency_mhz=3.0)
-    sigma_l, sigma_e = (float(s) for s in probe.beam_sigma_mm(depth))
+    offsets = np.arange(-5.0, 5.01, 0.5)
+    rows, plots = [], []
+    for name, probe in PROBES.items():
+        # At 2 MHz a flat sheet is in phase with the curved wave of a sector.
+        low = replace(probe, focus_mm=35.0, elevation_focus_mm=35.0, frequency_mhz=2.0)
+        sigma_l, sigma_e = (float(s) for s in low.beam_sigma_mm(depth))
 
-    def echo(offset_mm: float) -> np.ndarray:
-        pose = phantom.probe_to_ras.copy()
-        pose[:3, 3] += offset_mm * pose[:3, 2]
-        frame = simulator.simulate(probe, pose)
-        near = slice(int((depth - 2) / frame.sample_interval_mm), int((depth + 2) / frame.sample_interval_mm))
-        return np.abs(frame.iq[:, near]).max(axis=1)
+        def echo(offset_mm: float, low=low) -> np.ndarray:
+            pose = phantom.probe_to_ras.copy()
+            pose[:3, 3] += offset_mm * pose[:3, 2]
+            frame = simulator.simulate(low, pose)
+            near = slice(int((depth - 2) / frame.sample_interval_mm), int((depth + 2) / frame.sample_interval_mm))
+            return np.abs(frame.iq[:, near]).max(axis=1)
 
-    offsets = np.arange(-6.0, 6.01, 0.5)
-    lateral, elevational = echo(0.0), np.array([echo(offset)[49:52].mean() for offset in offsets])
-    box = (2 * half) ** 2 / 12
-    predicted = {"lateral": np.sqrt(box + sigma_l**2), "elevational": np.sqrt(box + sigma_e**2)}
-    measured = {"lateral": _spread(probe.line_positions(), lateral), "elevational": _spread(offsets, elevational)}
-    plots = []
-    for axis, positions, values, sigma in (
-        ("lateral", probe.line_positions(), lateral, sigma_l),
-        ("elevational", offsets, elevational, sigma_e),
-    ):
-        theory = ndtr((positions + half) / sigma) - ndtr((positions - half) / sigma)  # a box convolved with a Gaussian
-        curve = Curve(f"sigma {sigma:.2f} mm", positions, values / values.max(), positions, theory / theory.max())
-        plots.append(Plot(f"sheet of {2 * half:.0f} mm", f"{axis} [mm]", "echo", [curve]))
-    return Outcome(
-        tuple(
-            Row(f"{axis} standard deviation of the echo", "mm", predicted[axis], measured[axis], 0.1 * predicted[axis])
-            for axis in predicted
-        ),
-        partial(draw_plots, plots=plots),
-    )
+        across = low.line_positions() * (1.0 if low.is_linear else low.apex_radius_mm + depth)
+        profiles = {
+            "lateral": (across, echo(0.0), sigma_l),
+            "elevational": (offsets, np.array([echo(offset)[79:82].mean() for offset in offsets]), sigma_e),
+        }
+        for axis, (positions, values, sigma) in profiles.items():
+            predicted = float(np.sqrt((2 * half) ** 2 / 12 + sigma**2))
+            spread = _spread(positions, values)
+            rows.append(Row(f"{axis} standard deviation, {name}", "mm", predicted, spread, 0.1 * predicted))
+            if name == "linear":
+                # A box convolved with a Gaussian.
+                theory = ndtr((positions + half) / sigma) - ndtr((positions - half) / sigma)
+                curve = Curve(
+                    f"sigma {sigma:.2f} mm", positions, values / values.max(), positions, theory / theory.max()
+                )
+                plots.append(Plot(f"sheet of {2 * half:.0f} mm", f"{axis} [mm]", "echo", [curve]))
+    return Outcome(tuple(rows), partial(draw_plots, plots=plots))
 
 
 def _spread(positions: np.ndarray, values: np.ndarray) -> float:

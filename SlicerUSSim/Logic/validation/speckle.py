@@ -192,9 +192,11 @@ def rayleigh(rotation: np.ndarray, device) -> Outcome:
     apart = envelope[:, ::lines, ::samples].ravel()
     p_value = stats.kstest(apart, stats.rayleigh(scale=np.sqrt(0.5 * tissue.scatterer_variance)).cdf).pvalue
     snr = float(envelope.mean() / envelope.std())
+    sigma = 255.0 * float(np.sqrt(0.5 * tissue.scatterer_variance) / envelope.max())
     return Outcome(
         (
             Row("SSE of the fit", "", 3.14e-5, fit.sse, 0.0, "at most"),
+            Row("sigma of the fit", "grey levels", sigma, fit.sigma, 0.02 * sigma),
             Row("mean / standard deviation", "", RAYLEIGH_SNR, snr, 0.02 * RAYLEIGH_SNR),
             Row(f"p of Kolmogorov-Smirnov, {apart.size} samples", "", 0.05, float(p_value), 0.0, "at least"),
         ),
