@@ -4,8 +4,8 @@
 
 Frame A: phased array, 196 scan lines, 73 mm deep, 5 MHz. Frame B: convex array, 192 scan lines, 120 mm deep. Both on
 the MNI152 labels from the demo's view, ray tree to depth 6, from pose to scan-converted image on the host. Also the
-segmentation, and the first frame of a fresh process with empty kernel caches (from interpreter start to image, from a
-label map and from the MRI) with its peak memory.
+segmentation, a volume compounded from a tilt, and the first frame of a fresh process with empty kernel caches (from
+interpreter start to image, from a label map and from the MRI) with its peak memory.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.demo import demo_mri
-from SlicerUSSim.Logic.placement import craniotomy_pose
+from SlicerUSSim.Logic.placement import craniotomy_pose, tilt_sweep
 
 PROBES = {"A": PhasedProbe(75, 73, scan_lines=196), "B": ConvexProbe(60, 70, 120, scan_lines=192)}
 
@@ -69,6 +69,11 @@ def main() -> None:
                 times = [frame.timings_ms[stage] for frame in frames]
                 measured[f"frame {name}: {stage}"] = best_and_median(times)
                 print(f"    {stage:22s}{show(times)}")
+        simulator.profiling = False
+        poses = tilt_sweep(craniotomy_pose(segmentation.labels, PROBES["A"]), 50.0, 51)
+        times = [timed(lambda s=simulator, p=poses: s.volume(PROBES["A"], p))[0] for _ in range(2)]
+        measured["volume of 51 images"] = best_and_median(times)
+        print(f"  volume of 51 images     {show(times)}")
         with tempfile.TemporaryDirectory() as folder:
             labels = Path(folder) / "labels.nii.gz"
             segmentation.labels.write(labels)

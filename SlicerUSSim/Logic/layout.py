@@ -14,8 +14,7 @@ CONSTANTS = {
     "PLAIN_CELL": 0x80,  # ... and one that says that they do and no membrane passes between them
     "MEMBRANE_LABEL": 63,
     "MAX_TISSUES": 64,
-    "SMOOTH_GROUPS": 6,  # acoustic groups with a smoothed indicator (medium.py)
-    "WIDE_SIGMA": 3.0,  # its Gaussian, voxels
+    "WIDE_SIGMA": 3.0,  # of the Gaussian that smooths the indicators of acoustic groups (medium.py), voxels
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
@@ -32,6 +31,7 @@ SCENE = np.dtype(
         ("ras_to_voxel", _FLOAT, 12),  # rows of the affine map from RAS mm to padded voxel indices (i, j, k)
         ("dims", _INT, 3),  # padded voxels along i, j, k
         ("voxel_mm", _FLOAT),  # smallest spacing
+        ("smooth_groups", _INT),  # acoustic groups with a smoothed indicator
         ("membrane_reach", _FLOAT),  # half the membrane in units of the fluid distance (0..255); negative: none
         # probe and pose
         ("probe_to_ras", _FLOAT, 12),

@@ -19,6 +19,9 @@ from SlicerUSSim.Logic.tissues import MAX_LABEL, Membrane, TissueTable
 from SlicerUSSim.Logic.volume import Volume
 
 _FARTHEST_SIGMAS = 2.2  # where the stored distance ends
+# Smoothed indicators take two bytes a voxel and group: so many groups, so many voxels in all; but always two groups.
+_MOST_SMOOTHED_GROUPS = 6
+_SMOOTHED_VOXELS = 100_000_000
 _PAD = 1  # one voxel of coupling medium around the volume, so that a clamped look-up outside finds it
 
 
@@ -115,7 +118,9 @@ class Medium:
         group_of = self._rows(tissues)["group"].astype(np.uint8)
         # The coupling medium lies around the volume even where its label does not occur.
         groups = {int(group_of[label]) for label in (0, *self.present)}
-        fields = np.zeros((min(max(groups) + 1, CONSTANTS["SMOOTH_GROUPS"]), *padded.shape), np.uint16)
+        room = max(_SMOOTHED_VOXELS // padded.size, 2)
+        self.smooth_groups = min(max(groups) + 1, _MOST_SMOOTHED_GROUPS, room)
+        fields = np.zeros((self.smooth_groups, *padded.shape), np.uint16)
         if len(groups) > 1:
             group = group_of[padded]
             rest = np.full(padded.shape, 65535, np.uint16)  # indicators sum to one, which saves the last one's Gaussian

@@ -186,6 +186,7 @@ class UltrasoundSimulator:
         scene["ras_to_voxel"] = medium.ras_to_voxel.ravel()
         scene["dims"] = medium.dims
         scene["voxel_mm"] = medium.labels.spacing_mm.min()
+        scene["smooth_groups"] = medium.smooth_groups
         scene["membrane_reach"] = medium.membrane_reach
         scene["probe_to_ras"] = pose[:3].ravel()
         scene["linear"] = probe.is_linear
