@@ -22,6 +22,7 @@ typedef struct {
   float depth;
   float log_attenuation;  // natural logarithm, two-way amplitude
   float weight;
+  float4 tube;        // widths and growths per mm at `path`: lateral, its growth, elevational, its growth
   float blind_until;  // path length before which no crossing counts: a reflected ray has to get off its interface
   int reflections;
   int label;
@@ -139,6 +140,31 @@ inline float decay_in(__constant const Scene *scene, Tissue tissue) {
   return tissue.attenuation * scene->frequency_mhz * 0.2f * LN10_OVER_20;
 }
 
+// How a tube of neighbouring rays, one wide at the face in the unfolded beam, widens: a convex mirror spreads it, and
+// power is thinned by as much as it is wider (PHYSICS asks for none of this; a flat mirror leaves it as it is).
+inline float4 tube_after(float4 tube, float length) { return tube + (float4)(tube.y, 0.0f, tube.w, 0.0f) * length; }
+
+// Its growth behind a mirror of curvature k, met under the angle of incidence i in the plane of the offset: a ray
+// beside this one meets a normal turned by k / cos i per mm of offset, and is turned by twice that.
+inline float4 tube_reflected(__global const ushort *voxels, __global const ushort *smooth,
+                             __constant const Scene *scene, __constant const Tissue *tissues, float4 tube, Ray ray,
+                             float3 point, float3 normal, int before, int behind) {
+  for (int axis = 0; axis < 2; axis++) {
+    const float3 offset = axis == 0 ? ray.lateral : ray.elevational;
+    // Along the ray onto the surface, so longer by 1 / cos i.
+    const float3 along = offset - dot(normal, offset) / fmin(dot(normal, ray.direction), -0.2f) * ray.direction;
+    const float longer = fmax(length(along), 1e-3f);
+    const float curvature = border_curvature(voxels, smooth, scene, tissues, point, along / longer, before, behind);
+    // Concave mirrors focus; taken from voxels that would make random bright spots, so they count as flat.
+    const float growth = 2.0f * fmax(curvature, 0.0f) * longer;
+    if (axis == 0)
+      tube.y += growth * tube.x;
+    else
+      tube.w += growth * tube.z;
+  }
+  return tube;
+}
+
 // The piece of a node from length `from` to `to`; `spent` is the attenuation exponent since the node's start at each.
 inline Segment segment_of(Ray ray, float from, float to, float spent_from, float spent_to, float depth_per_mm) {
   Segment segment;
@@ -146,6 +172,7 @@ inline Segment segment_of(Ray ray, float from, float to, float spent_from, float
   vstore3(ray.direction, 0, segment.direction);
   vstore3(ray.lateral, 0, segment.lateral);
   vstore3(ray.elevational, 0, segment.elevational);
+  vstore4(tube_after(ray.tube, from), 0, segment.tube);
   segment.path_mm = ray.path + from;
   segment.length_mm = to - from;
   segment.depth_mm = ray.depth + from * depth_per_mm;
@@ -197,6 +224,7 @@ inline Ray root_of(__constant const Scene *scene, int line) {
   root.depth = 0.0f;
   root.log_attenuation = 0.0f;
   root.weight = 1.0f;
+  root.tube = (float4)(1.0f, 0.0f, 1.0f, 0.0f);
   root.blind_until = -1.0f;
   root.reflections = 0;
   root.label = -1;  // looked up at its start
@@ -309,6 +337,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       const float log_attenuation = ray.log_attenuation - spent, attenuation = exp(log_attenuation);
       const float3 aside = quantile * elevation_sigma(scene, path) * ray.elevational;
       const float3 hit_point = ray.axis + border * ray.direction + aside;
+      const float4 tube = tube_after(ray.tube, border);
       const Interface surface = interface_between(here, behind, ray.direction, normal);
       const float reflectance = surface.pressure * surface.pressure;
 
@@ -324,7 +353,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
           hit.cos_incidence = surface.cos_in;
           hit.reflectance = reflectance;
           hit.echo = ray.weight * attenuation * (scene->interface_is_energy ? reflectance : fabs(surface.pressure)) *
-                     pow(surface.cos_in, scene->specular_exponent) * scene->interface_gain / rays *
+                     pow(surface.cos_in, scene->specular_exponent) * scene->interface_gain / (rays * tube.x * tube.z) *
                      stratum_coherence(scene, ray, normal, quantile, path, depth_per_mm);
           hit.reflections = ray.reflections;
           hit.label_before = ray.label;
@@ -343,6 +372,9 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
         child.lateral = mirror(ray.lateral, normal);
         child.elevational = mirror(ray.elevational, normal);
         child.axis = hit_point - mirror(aside, normal);
+        if (scene->reflection_spreading)
+          child.tube =
+              tube_reflected(voxels, smooth, scene, tissues, tube, ray, hit_point, normal, here.group, behind.group);
         child.path = path;
         child.depth = depth;
         child.log_attenuation = log_attenuation;
@@ -366,6 +398,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       ray.elevational = carry(ray.elevational, ray.direction, bent);
       ray.direction = bent;
       ray.axis = hit_point - quantile * elevation_sigma(scene, path) * ray.elevational;
+      ray.tube = tube;
       ray.path = path;
       ray.depth = depth;
       ray.log_attenuation = log_attenuation;

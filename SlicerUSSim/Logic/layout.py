@@ -59,6 +59,7 @@ SCENE = np.dtype(
         ("max_ray_depth", _INT),
         ("intensity_threshold", _FLOAT),
         ("reflection_threshold", _FLOAT),
+        ("reflection_spreading", _INT),
         ("elevational_rays", _INT),
         ("lateral_rays", _INT),  # traced lines per scan line
         ("guard_lines", _INT),  # traced lines beyond either edge of the field
@@ -93,6 +94,7 @@ SEGMENT = np.dtype(
         ("direction", _FLOAT, 3),
         ("lateral", _FLOAT, 3),
         ("elevational", _FLOAT, 3),
+        ("tube", _FLOAT, 4),  # spreading at `start`: lateral width, growth per mm, elevational width, growth per mm
         ("path_mm", _FLOAT),  # unfolded path length from the probe face at `start`: sets the beam width
         ("length_mm", _FLOAT),
         ("depth_mm", _FLOAT),  # t c_ref / 2 at `start`: what the scanner believes

@@ -215,6 +215,33 @@ def parallel_plates(
     )
 
 
+def curved_mirror(rotation: np.ndarray | None = None, *, radius_mm: float = 12.0, is_sphere: bool = True) -> Phantom:
+    """A steel ball or a rod across the image, in speckle that it mirrors, thinner the further away.
+
+    A convex mirror of radius r has the focal length r/2, so at a distance l a narrow beam is 1 + 2 l / r times as wide:
+    in both directions behind a ball, laterally behind a rod. The power of what it shows falls by as much.
+    """
+    top = 22.0
+    plain = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
+
+    def label(x, y, z):
+        return np.where(x**2 + (y - top - radius_mm) ** 2 + is_sphere * z**2 < radius_mm**2, 2, 1)
+
+    def expected(probe: Probe):
+        reflectance = (
+            (STEEL.impedance_mrayl - plain.impedance_mrayl) / (STEEL.impedance_mrayl + plain.impedance_mrayl)
+        ) ** 2
+        changes = []
+        for away in (3.0, 6.0, 10.0):
+            wider = (1.0 + 2.0 * away / radius_mm) ** (2 if is_sphere else 1)
+            region = (-1.5, 1.5, top + away - 1.0, top + away + 1.0)
+            changes.append(LevelChange(f"{away:.0f} mm", region, 20 * np.log10(reflectance) - 10 * np.log10(wider)))
+        return tuple(changes)
+
+    tissues = TissueTable({0: plain, 1: plain, 2: STEEL})
+    return _phantom("curved mirror", label, tissues, rotation, 0.4, expected)
+
+
 # ---- resolution and speckle -----------------------------------------------------------------------------------------
 
 

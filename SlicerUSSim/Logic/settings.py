@@ -23,6 +23,9 @@ class SimulationSettings:
     intensity_threshold: float = 1e-6
     #: A reflected child is followed if its weight, attenuation aside, is at least this (-34 dB)
     reflection_threshold: float = 2e-2
+    #: Convex surfaces spread what they reflect, so that a bone's or a wire's shadow is not filled by what it mirrors
+    #: (False is the paper)
+    reflection_spreading: bool = True
     #: What the scanner takes for the speed of sound
     reference_speed_m_s: float = 1540.0
     #: Follow reflected children at all

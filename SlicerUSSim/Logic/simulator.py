@@ -207,6 +207,7 @@ class UltrasoundSimulator:
         scene["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
         scene["intensity_threshold"] = settings.intensity_threshold
         scene["reflection_threshold"] = settings.reflection_threshold
+        scene["reflection_spreading"] = settings.reflection_spreading
         scene["elevational_rays"] = settings.elevational_rays
         lateral, guard = _traced_lines_for(probe, settings)
         scene["lateral_rays"], scene["guard_lines"] = lateral, guard

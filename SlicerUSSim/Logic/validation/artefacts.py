@@ -14,6 +14,7 @@ from SlicerUSSim.Logic.phantoms import (
     LevelChange,
     Phantom,
     attenuating_block,
+    curved_mirror,
     mirror,
     parallel_plates,
     refracting_wedge,
@@ -92,6 +93,28 @@ def mirroring(rotation: np.ndarray, device) -> Outcome:
     return _displacements(mirror(rotation), device, 0.3, "linear", "mirror")
 
 
+def curved_mirrors(rotation: np.ndarray, device) -> Outcome:
+    """Speckle mirrored by a ball, a rod and a plane, against speckle seen directly."""
+    rows, views = [], []
+    for kind, shape in (("ball", {}), ("rod", {"is_sphere": False}), ("plane", {"radius_mm": 1e6})):
+        phantom = curved_mirror(rotation, **shape)
+        for name, probe in PROBES.items():
+            powers = []
+            for seed in range(12):
+                settings = replace(_SETTINGS, seed=seed, interfaces=False)
+                frame = _images(phantom, device, {name: probe}, settings)[name]
+                changes = phantom.expected(probe)
+                regions = [(-1.5, 1.5, 6.0, 18.0), *(change.region_mm for change in changes)]
+                powers.append([10 ** (region_level_db(frame, probe, region) / 10) for region in regions])
+            direct, *mirrored = 10 * np.log10(np.mean(powers, axis=0))
+            rows += [
+                Row(f"speckle {change.name} behind a {kind}, {name}", "dB", change.change_db, level - direct, 1.5)
+                for change, level in zip(changes, mirrored, strict=True)
+            ]
+        views.append(View(kind, phantom, probe, frame))
+    return Outcome(tuple(rows), partial(draw_views, views=views))
+
+
 def refraction(rotation: np.ndarray, device) -> Outcome:
     """Wires behind an oblique border between two speeds."""
     return _displacements(refracting_wedge(rotation), device, 0.3, "linear", "refracting wedge")
@@ -157,6 +180,11 @@ CHECKS = (
         range_distortion,
     ),
     Check("mirroring", "A target before an oblique mirror appears again at its mirror image.", mirroring),
+    Check(
+        "curved mirrors",
+        "A convex mirror of radius r spreads what it shows at a distance l: by 1 + 2 l / r in each curved direction.",
+        curved_mirrors,
+    ),
     Check("refraction", "A target behind an oblique border is displaced as Snell's law says.", refraction),
     Check(
         "reverberation",
