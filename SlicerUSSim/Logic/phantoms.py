@@ -178,7 +178,7 @@ def refracting_wedge(
         replace(BACKGROUND, name=name, speed_of_sound_m_s=c, mu0=0.1, sigma0=0.045)
         for name, c in zip(("slow", "fast"), speeds_m_s, strict=True)
     )
-    return _phantom("refracting wedge", label, TissueTable({1: above, 2: below, 3: STEEL}), rotation, 0.25, expected)
+    return _phantom("refracting wedge", label, TissueTable({1: above, 2: below, 3: STEEL}), rotation, 0.2, expected)
 
 
 def parallel_plates(

@@ -32,7 +32,10 @@ def echo_level(rotation: np.ndarray, device) -> Outcome:
         for name, probe in PROBES.items():
             low = replace(probe, frequency_mhz=2.0)  # as for reverberation
             peak = echo_near(simulator.simulate(low, phantom.probe_to_ras), low, (0.0, 25.0), 1.0)[2]
-            predicted = 20 * np.log10(expected) + settings.interface_gain_db
+            # The lines of a sector meet a plane at right angles only in the middle: y aside, it is y^2 / 2 R farther.
+            radius = np.inf if low.is_linear else low.apex_radius_mm + 25.0
+            turns = 2 * np.pi * low.cycles_per_mm * float(low.beam_sigma_mm(25.0)[0]) ** 2 / radius
+            predicted = 20 * np.log10(expected * (1 + turns**2) ** -0.25) + settings.interface_gain_db
             rows.append(Row(f"{kind} echo, {name}", "dB", predicted, 20 * np.log10(peak), 0.5))
     return Outcome(tuple(rows))
 
