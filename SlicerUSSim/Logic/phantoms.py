@@ -61,6 +61,17 @@ class LevelChange:
     change_db: float
 
 
+@dataclass(frozen=True)
+class Level:
+    """Theory: the mean level in this region."""
+
+    name: str
+    #: (left, right, top, bottom) in the probe frame
+    region_mm: tuple[float, float, float, float]
+    #: In dB re tissue of unit scatterer variance without attenuation
+    level_db: float
+
+
 @dataclass(frozen=True, eq=False)
 class Phantom:
     """A test object: labels, tissues, the pose to look at it from, and what its image must show."""
@@ -71,7 +82,7 @@ class Phantom:
     #: (4, 4)
     probe_to_ras: np.ndarray
     #: What a given probe sees, by theory
-    expected: Callable[[Probe], tuple[Echo | LevelChange, ...]] = lambda probe: ()
+    expected: Callable[[Probe], tuple[Echo | LevelChange | Level, ...]] = lambda probe: ()
     #: The same object without the effect it demonstrates, for comparison
     reference: TissueTable | None = None
     #: Centre of a sphere
@@ -231,12 +242,14 @@ def curved_mirror(rotation: np.ndarray | None = None, *, radius_mm: float = 12.0
         reflectance = (
             (STEEL.impedance_mrayl - plain.impedance_mrayl) / (STEEL.impedance_mrayl + plain.impedance_mrayl)
         ) ** 2
-        changes = []
+        direct = 10 * np.log10(plain.scatterer_variance)
+        levels = []
         for away in (3.0, 6.0, 10.0):
             wider = (1.0 + 2.0 * away / radius_mm) ** (2 if is_sphere else 1)
             region = (-1.5, 1.5, top + away - 1.0, top + away + 1.0)
-            changes.append(LevelChange(f"{away:.0f} mm", region, 20 * np.log10(reflectance) - 10 * np.log10(wider)))
-        return tuple(changes)
+            level = direct + 20 * np.log10(reflectance) - 10 * np.log10(wider)
+            levels.append(Level(f"{away:.0f} mm", region, level))
+        return tuple(levels)
 
     tissues = TissueTable({0: plain, 1: plain, 2: STEEL})
     return _phantom("curved mirror", label, tissues, rotation, 0.4, expected)
@@ -289,9 +302,15 @@ def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0
 
 def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom:
     """One tissue everywhere: the level is Var of its scatterers, the envelope Rayleigh; the PSF sets correlations."""
-    return _phantom(
-        "uniform speckle", lambda x, y, z: np.ones_like(x + y + z), TissueTable({0: tissue, 1: tissue}), rotation, 1.0
-    )
+
+    def expected(probe: Probe):
+        if tissue.attenuation_db_cm_mhz > 0.0:
+            return ()  # the level falls with depth
+        region = (-0.2 * probe.depth_mm, 0.2 * probe.depth_mm, 0.2 * probe.depth_mm, 0.9 * probe.depth_mm)
+        return (Level("speckle", region, 10 * np.log10(tissue.scatterer_variance)),)
+
+    tissues = TissueTable({0: tissue, 1: tissue})
+    return _phantom("uniform speckle", lambda x, y, z: np.ones_like(x + y + z), tissues, rotation, 1.0, expected)
 
 
 def thin_rod(rotation: np.ndarray | None = None, *, depth_mm: float = 30.0, width_mm: float = 1.2) -> Phantom:

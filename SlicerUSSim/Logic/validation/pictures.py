@@ -9,7 +9,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.measurement import RayleighFit
-from SlicerUSSim.Logic.phantoms import Echo, Phantom
+from SlicerUSSim.Logic.phantoms import Echo, LevelChange, Phantom
 from SlicerUSSim.Logic.placement import sample, slice_under_probe
 from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.volume import Volume, written_whole
@@ -53,7 +53,8 @@ def draw_views(path: Path, views: list[View]) -> None:
                 else:
                     x0, x1, y0, y1 = mark.region_mm
                     axis.add_patch(patches.Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, color=_PREDICTION))
-                    axis.text(x1 + 0.5, 0.5 * (y0 + y1), f"{mark.change_db:+.1f} dB", color=_PREDICTION, fontsize=8)
+                    text = f"{mark.change_db:+.1f} dB" if isinstance(mark, LevelChange) else f"{mark.level_db:.1f} dB"
+                    axis.text(x1 + 0.5, 0.5 * (y0 + y1), text, color=_PREDICTION, fontsize=8)
             axis.set_xlim(bounds[0], bounds[1])
             axis.set_ylim(bounds[3], bounds[2])
             axis.set_aspect("equal")

@@ -12,11 +12,11 @@ from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.measurement import correlation, fit_rayleigh, level_db
 from SlicerUSSim.Logic.phantoms import BACKGROUND, uniform_speckle
 from SlicerUSSim.Logic.probe import LinearProbe, Probe
-from SlicerUSSim.Logic.settings import SimulationSettings
+from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import Tissue
 from SlicerUSSim.Logic.validation import PROBES, Check, Outcome, Row
-from SlicerUSSim.Logic.validation.pictures import Curve, Plot, draw_images, draw_plots, draw_rayleigh
+from SlicerUSSim.Logic.validation.pictures import Curve, Plot, View, draw_images, draw_plots, draw_rayleigh, draw_views
 
 #: Without attenuation, so that statistics do not change with depth
 SPECKLE = replace(BACKGROUND, name="speckle", attenuation_db_cm_mhz=0.0)
@@ -53,7 +53,8 @@ def statistics(rotation: np.ndarray, device) -> Outcome:
             Row(f"level, {name}", "dB", variance, level_db(envelope), 0.5),
             Row(f"spectral peak over surroundings, {name}", "", 8.0, _spectral_peak(envelope), 0.0, "at most"),
         ]
-    return Outcome(tuple(rows))
+    frame = simulators[0].simulate(PROBES["convex"], phantom.probe_to_ras, DisplaySettings(tgc_db_cm_mhz=0.0))
+    return Outcome(tuple(rows), partial(draw_views, views=[View("speckle", phantom, PROBES["convex"], frame)]))
 
 
 def _spectral_peak(envelope: np.ndarray) -> float:
