@@ -334,6 +334,7 @@ def layered(
     *,
     tilt_deg: float = 0.0,
     spacing_mm: float = 0.5,
+    half_width_mm: float = 50.0,
 ) -> Phantom:
     """Plane layers of labels 1, 2, ... with borders at the given depths on the axis, tilted about z."""
     require(len(tissues) == len(borders_mm) + 1, f"{len(tissues)} tissues and {len(borders_mm)} borders do not fit")
@@ -355,7 +356,7 @@ def layered(
         )
 
     table = TissueTable(dict(enumerate(tissues, 1)))
-    return _phantom("layers", label, table, rotation, spacing_mm, expected, box=_Box(half_width=50.0))
+    return _phantom("layers", label, table, rotation, spacing_mm, expected, box=_Box(half_width=half_width_mm))
 
 
 def small_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.0, half_mm: float = 2.0) -> Phantom:

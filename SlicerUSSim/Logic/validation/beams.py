@@ -25,7 +25,7 @@ def echo_level(rotation: np.ndarray, device) -> Outcome:
     behind = replace(FLUID, name="behind", impedance_mrayl=1.9)
     r = (1.9 - FLUID.impedance_mrayl) / (1.9 + FLUID.impedance_mrayl)
     rows = []
-    phantom = layered([FLUID, behind], [25.0], rotation, spacing_mm=0.25)
+    phantom = layered([FLUID, behind], [25.0], rotation, spacing_mm=0.25, half_width_mm=14.0)
     for kind, expected in (("pressure", r), ("energy", r * r)):
         settings = SimulationSettings(scattering=False, interface_reflection=kind)
         simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
@@ -65,7 +65,7 @@ def specular_echoes(rotation: np.ndarray, device) -> Outcome:
 def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
     """A plane that leans out of the image plane: over a Gaussian beam its echo is the Gaussian's Fourier transform."""
     behind = replace(FLUID, name="behind", impedance_mrayl=1.9)
-    phantom = layered([FLUID, behind], [25.0], rotation, spacing_mm=0.25)
+    phantom = layered([FLUID, behind], [25.0], rotation, spacing_mm=0.25, half_width_mm=14.0)
     settings = SimulationSettings(scattering=False, specular_exponent=0.0)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     rows = []
@@ -228,7 +228,7 @@ def compounding(rotation: np.ndarray, device) -> Outcome:
         volume = volumes[name] = simulator.volume(probe, poses, display, spacing_mm=0.35)
         level = _bar_level_db(volume, phantom.probe_to_ras, depth, offsets) * display.dynamic_range_db / 255.0
         rows += [
-            Row(f"fall at {offset / sigma:.1f} sigma, {name}", "dB", e - theory[0], m - level[0], 0.6)
+            Row(f"fall at {offset / sigma:.1f} sigma, {name}", "dB", e - theory[0], m - level[0], 0.8)
             for offset, e, m in zip(offsets[1:], theory[1:], level[1:], strict=True)
         ]
         _, y, z = _bar_centre(volume, phantom.probe_to_ras, depth)
