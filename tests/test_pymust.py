@@ -26,7 +26,7 @@ from scipy.optimize import curve_fit
 from scipy.signal import hilbert
 
 from SlicerUSSim.Logic import LinearProbe
-from SlicerUSSim.Logic.measurement import correlation, echo_near, full_width, level_db
+from SlicerUSSim.Logic.measurement import correlation, depth_window, echo_near, full_width, level_db
 from SlicerUSSim.Logic.probe import FWHM_PER_SIGMA
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
 
@@ -190,7 +190,7 @@ def our_windows(array: LinearProbe, depths_mm, attenuation: float) -> tuple[list
         for seed in range(4)
     ]
     step = frames[0].sample_interval_mm
-    return [[f.iq[:, round((d - 3) / step) : round((d + 3) / step)].T for f in frames] for d in depths_mm], step
+    return [[depth_window(f, d, 3.0).T for f in frames] for d in depths_mm], step
 
 
 def correlation_length(pairs, spacing: float) -> float:

@@ -28,6 +28,12 @@ def sample_positions(frame: Frame, probe: Probe) -> tuple[np.ndarray, np.ndarray
     return tuple(origins[:, a, None] + along * directions[:, a, None] for a in (0, 1))
 
 
+def depth_window(frame: Frame, depth_mm: float, half_mm: float) -> np.ndarray:
+    """(scan_lines, samples) of the baseband signal within `half_mm` of a distance along the lines."""
+    first, last = (round((depth_mm + side * half_mm) / frame.sample_interval_mm) for side in (-1, 1))
+    return frame.iq[:, first:last]
+
+
 def region_level_db(frame: Frame, probe: Probe, region_mm: tuple[float, float, float, float]) -> float:
     """Mean power in dB of the samples in (left, right, top, bottom). Raises SimulationError if there are none."""
     x, y = sample_positions(frame, probe)
@@ -65,11 +71,9 @@ def echo_near(
     while last + 1 < len(trace) and trace[last + 1] > 0.5 * peak:
         last += 1
     along = np.average(np.arange(first, last + 1), weights=trace[first : last + 1] ** 2) * frame.sample_interval_mm
-    lines = np.arange(len(power))
-    origin = [float(np.interp(position, lines, probe.origins_mm()[:, a])) for a in (0, 1)]
-    direction = np.array([np.interp(position, lines, probe.directions()[:, a]) for a in (0, 1)])
-    direction /= np.linalg.norm(direction)
-    return origin[0] + along * float(direction[0]), origin[1] + along * float(direction[1]), float(peak)
+    origin, direction = probe.line_at(probe.first_line + position * probe.line_spacing)
+    x, y, _ = origin + along * direction
+    return float(x), float(y), float(peak)
 
 
 def full_width(positions: np.ndarray, amplitudes: np.ndarray, at: float = 0.5) -> float:

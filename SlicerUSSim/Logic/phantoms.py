@@ -89,6 +89,18 @@ class Phantom:
     centre_ras: tuple[float, float, float] | None = None
 
 
+def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence=1.0):
+    """Pressure reflection coefficient r of a border between two fluids; 1 beyond the critical angle.
+
+    r = (Z2 cos i - Z1 cos t) / (Z2 cos i + Z1 cos t), sin t / c2 = sin i / c1 (PHYSICS section 3).
+    """
+    cos_in = np.asarray(cos_incidence, float)
+    sin_out = behind.speed_of_sound_m_s / before.speed_of_sound_m_s * np.sqrt(1.0 - cos_in**2)
+    z_in = before.impedance_mrayl * np.sqrt(np.clip(1.0 - sin_out**2, 0.0, None))
+    z_out = behind.impedance_mrayl * cos_in
+    return np.where(sin_out >= 1.0, 1.0, (z_out - z_in) / (z_out + z_in))
+
+
 # ---- the five phantoms of the paper's Fig. 2 ------------------------------------------------------------------------
 
 
@@ -204,11 +216,8 @@ def parallel_plates(
         return np.where(y < top, 1, np.where(y < top + gap_mm, 2, 3))
 
     def expected(probe: Probe):
-        r1, r2 = (
-            abs(gap.impedance_mrayl - t.impedance_mrayl) / (gap.impedance_mrayl + t.impedance_mrayl)
-            for t in (above, below)
-        )
-        apart, fall = gap_mm * REFERENCE_SPEED_M_S / speed_m_s, 20.0 * np.log10(r1 * r2)
+        apart = gap_mm * REFERENCE_SPEED_M_S / speed_m_s
+        fall = 20.0 * np.log10(reflection_coefficient(gap, above) * reflection_coefficient(gap, below))
         far = top + gap_mm
         return tuple(
             Echo(f"bounce {n}" if n else "far side", (0.0, top + (n + 1) * apart), (0.0, far), n * fall)
@@ -239,9 +248,7 @@ def curved_mirror(rotation: np.ndarray | None = None, *, radius_mm: float = 12.0
         return np.where(x**2 + (y - top - radius_mm) ** 2 + is_sphere * z**2 < radius_mm**2, 2, 1)
 
     def expected(probe: Probe):
-        reflectance = (
-            (STEEL.impedance_mrayl - plain.impedance_mrayl) / (STEEL.impedance_mrayl + plain.impedance_mrayl)
-        ) ** 2
+        reflectance = reflection_coefficient(plain, STEEL) ** 2
         direct = 10 * np.log10(plain.scatterer_variance)
         levels = []
         for away in (3.0, 6.0, 10.0):
@@ -393,7 +400,7 @@ def voxel_sphere(
     matrix[:3, 3] = axis[0]
     pose = _pose(rotation)
     pose[:3, 3] = -(radius_mm + 9.0) * pose[:3, 1]
-    # No impedance of its own is needed for a border, but a speed of its own would bend the rays inside.
+    # An impedance of its own makes it a border; a speed of its own would bend the rays inside.
     tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sphere", impedance_mrayl=2.0)})
     x0, y0, z0 = pose[:3, :3].T @ (centre - pose[:3, 3])  # in the probe frame
 
@@ -414,7 +421,6 @@ def voxel_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, s
         return np.where(np.abs(y - depth_mm) < 0.5 * thickness, 1, 0)
 
     tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sheet", impedance_mrayl=1.9)})
-    _facing(depth_mm - 0.5 * thickness)
     return _phantom(
         "voxel sheet",
         label,
@@ -475,20 +481,15 @@ def _in_cylinder(x, y, centre, radius: float):
 # ---- geometrical acoustics in the image plane, independent of the kernels -------------------------------------------
 
 
-def _line_at(probe: Probe, position: float) -> tuple[np.ndarray, np.ndarray]:
-    """(origin, direction), both (lateral, depth), of the scan line at `position` (mm, or radians about the apex)."""
-    if probe.is_linear:
-        return np.array([position, 0.0]), np.array([0.0, 1.0])
-    sine, cosine, radius = np.sin(position), np.cos(position), probe.apex_radius_mm
-    return radius * np.array([sine, cosine - 1.0]), np.array([sine, cosine])
+def _line_at(probe: Probe, position) -> tuple[np.ndarray, np.ndarray]:
+    """(origin, direction), both (lateral, depth), of the scan line at `position`."""
+    origin, direction = probe.line_at(position)
+    return origin[:2], direction[:2]
 
 
 def _line_direction_at(probe: Probe, point) -> np.ndarray:
     """Direction of the scan line through a point (lateral, depth)."""
-    if probe.is_linear:
-        return np.array([0.0, 1.0])
-    away = np.asarray(point) + [0.0, probe.apex_radius_mm]
-    return away / np.linalg.norm(away)
+    return _line_at(probe, probe.line_through(*point)[0])[1]
 
 
 def _shown_behind_plane(probe, target, radius, point, normal, speeds_m_s) -> tuple[float, float]:

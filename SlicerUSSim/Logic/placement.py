@@ -64,25 +64,28 @@ def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standof
 
 def slide_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int) -> list[np.ndarray]:
     """Poses (4, 4) of a probe that slides across its image plane, `length_mm` in all, its middle at `probe_to_ras`."""
-    require(int(frames) == frames and frames >= 1, f"a sweep has {frames!r} frames, expected a whole number above 0")
-    offsets = np.linspace(-0.5, 0.5, int(frames)) * length_mm if frames > 1 else [0.0]
-    return [probe_to_ras @ _elevational_motion(offset, 0.0) for offset in offsets]
+    return [probe_to_ras @ elevational_motion(offset_mm=share * length_mm) for share in _shares(frames)]
 
 
 def tilt_sweep(probe_to_ras: np.ndarray, angle_deg: float, frames: int) -> list[np.ndarray]:
     """Poses (4, 4) of a probe that tilts about the lateral axis of its face, `angle_deg` in all: a fan of planes, as a
     matrix array or a wobbling one scans it."""
-    require(int(frames) == frames and frames >= 1, f"a sweep has {frames!r} frames, expected a whole number above 0")
-    angles = np.deg2rad(np.linspace(-0.5, 0.5, int(frames)) * angle_deg) if frames > 1 else [0.0]
-    return [probe_to_ras @ _elevational_motion(0.0, angle) for angle in angles]
+    return [probe_to_ras @ elevational_motion(angle_deg=share * angle_deg) for share in _shares(frames)]
 
 
-def _elevational_motion(offset_mm: float, angle: float) -> np.ndarray:
-    """(4, 4) in the probe frame: by `offset_mm` along z and by `angle` (radians) about x, depth towards +z."""
+def elevational_motion(offset_mm: float = 0.0, angle_deg: float = 0.0) -> np.ndarray:
+    """(4, 4) in the probe frame: by `offset_mm` along z, and by `angle_deg` about x, so that depth turns towards +z."""
+    angle = np.deg2rad(angle_deg)
     motion = np.eye(4)
     motion[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     motion[2, 3] = offset_mm
     return motion
+
+
+def _shares(frames: int) -> np.ndarray:
+    """(frames,) from -1/2 to 1/2, or 0 for a single frame. Raises SimulationError for a number that is none."""
+    require(int(frames) == frames and frames >= 1, f"a sweep has {frames!r} frames, expected a whole number above 0")
+    return np.linspace(-0.5, 0.5, int(frames)) if frames > 1 else np.zeros(1)
 
 
 def sample(volume: Volume, points_ras: np.ndarray, order: int = 1) -> np.ndarray:

@@ -90,22 +90,38 @@ class Probe:
         """(scan_lines,) position of every line: radians around the apex, or millimetres along a linear face."""
         return self.first_line + self.line_spacing * np.arange(self.scan_lines)
 
-    def origins_mm(self) -> np.ndarray:
-        """(scan_lines, 3) starting points on the probe face in the probe frame."""
-        position = self.line_positions()
+    def line_at(self, position) -> tuple[np.ndarray, np.ndarray]:
+        """((..., 3) origin in mm, (..., 3) unit direction) in the probe frame of the lines at these positions."""
+        position = np.asarray(position, float)
         zero = np.zeros_like(position)
         if self.is_linear:
-            return np.stack([position, zero, zero], axis=1)
-        radius = self.apex_radius_mm
-        return np.stack([radius * np.sin(position), radius * (np.cos(position) - 1.0), zero], axis=1)
+            return np.stack([position, zero, zero], axis=-1), np.stack([zero, zero + 1.0, zero], axis=-1)
+        sine, cosine, radius = np.sin(position), np.cos(position), self.apex_radius_mm
+        return (
+            np.stack([radius * sine, radius * (cosine - 1.0), zero], axis=-1),
+            np.stack([sine, cosine, zero], axis=-1),
+        )
+
+    def origins_mm(self) -> np.ndarray:
+        """(scan_lines, 3) starting points on the probe face in the probe frame."""
+        return self.line_at(self.line_positions())[0]
 
     def directions(self) -> np.ndarray:
         """(scan_lines, 3) unit vectors along the scan lines in the probe frame."""
-        position = self.line_positions()
-        zero = np.zeros_like(position)
+        return self.line_at(self.line_positions())[1]
+
+    def line_through(self, lateral_mm, depth_mm) -> tuple[np.ndarray, np.ndarray]:
+        """(position of the line, millimetres along it) of points of the image plane; the inverse of line_at."""
+        x, y = np.asarray(lateral_mm, float), np.asarray(depth_mm, float)
         if self.is_linear:
-            return np.stack([zero, zero + 1.0, zero], axis=1)
-        return np.stack([np.sin(position), np.cos(position), zero], axis=1)
+            return x, y
+        from_apex = y + self.apex_radius_mm
+        return np.arctan2(x, from_apex), np.hypot(x, from_apex) - self.apex_radius_mm
+
+    def line_distance_mm(self, along_mm) -> np.ndarray:
+        """Distance between neighbouring scan lines, `along_mm` from the face."""
+        along = np.asarray(along_mm, float)
+        return self.line_spacing * (np.ones_like(along) if self.is_linear else along + self.apex_radius_mm)
 
     def image_bounds_mm(self) -> tuple[float, float, float, float]:
         """(left, right, top, bottom) of the imaged field in the probe frame; top is negative for a curved face."""
@@ -130,12 +146,7 @@ class Probe:
 
     def holds(self, lateral_mm: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
         """Whether points of the image plane (probe frame, any shape) lie in the imaged field."""
-        x, y = np.asarray(lateral_mm, float), np.asarray(depth_mm, float)
-        if self.is_linear:
-            position, along = x, y
-        else:
-            from_apex = y + self.apex_radius_mm
-            position, along = np.arctan2(x, from_apex), np.hypot(x, from_apex) - self.apex_radius_mm
+        position, along = self.line_through(lateral_mm, depth_mm)
         return (np.abs(position) <= -self.first_line) & (along >= 0.0) & (along <= self.depth_mm)
 
     # ---- wave and beam -----------------------------------------------------------------------------------------

@@ -41,7 +41,8 @@ class UltrasoundSimulator:
     ----------
     labels : Volume of tissue labels; 0 is the coupling medium around the patient.
     tissues : TissueTable with a tissue for every label.
-    settings : SimulationSettings.
+    settings : SimulationSettings. The attribute may be replaced between frames, by another seed say; only what concerns
+        the texture counts at construction.
     device : see device.choose_device.
     texture : what the MRI knows beyond labels (Segmentation.texture, Texture.from_mri); looked at only if the settings'
         partial_volume or mri_modulation_db ask for it.
@@ -296,8 +297,7 @@ def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, 
     that is everywhere but next to the apex of a phased array).
     """
     depth = np.linspace(0.0, probe.depth_mm, 65)
-    apart = probe.line_spacing * (np.ones_like(depth) if probe.is_linear else depth + probe.apex_radius_mm)
-    sigmas = apart / probe.beam_sigma_mm(depth)[0]
+    sigmas = probe.line_distance_mm(depth) / probe.beam_sigma_mm(depth)[0]
     lateral = settings.lateral_rays or int(min(np.ceil(sigmas.max() / 1.5), 128))
     deep = sigmas[depth >= 0.1 * probe.depth_mm]
     return lateral, int(min(np.ceil(settings.beam_cutoff * lateral / deep.min()), 16 * lateral))

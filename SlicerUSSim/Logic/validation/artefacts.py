@@ -33,13 +33,27 @@ _SETTINGS = SimulationSettings(reflection_threshold=1e-2)
 _DISPLAY = DisplaySettings(dynamic_range_db=70.0, tgc_db_cm_mhz=0.5, noise_db=None)
 
 
-def _images(
-    phantom: Phantom, device, probes: dict[str, Probe], settings=_SETTINGS, reference: bool = False
-) -> dict[str, Frame]:
-    """What each probe sees of the phantom, or of its reference."""
-    tissues = phantom.reference if reference else phantom.tissues
-    simulator = UltrasoundSimulator(phantom.labels, tissues, settings, device)
+def _simulator(phantom: Phantom, device, settings: SimulationSettings = _SETTINGS) -> UltrasoundSimulator:
+    return UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+
+
+def _images(simulator: UltrasoundSimulator, phantom: Phantom, probes: dict[str, Probe] = PROBES) -> dict[str, Frame]:
+    """What each probe sees of the phantom."""
     return {name: simulator.simulate(probe, phantom.probe_to_ras, _DISPLAY) for name, probe in probes.items()}
+
+
+def _images_and_reference(phantom: Phantom, device) -> tuple[dict[str, Frame], dict[str, Frame]]:
+    """What each probe sees of the phantom, and of its reference."""
+    simulator = _simulator(phantom, device)
+    frames = _images(simulator, phantom)
+    simulator.set_tissues(phantom.reference)
+    return frames, _images(simulator, phantom)
+
+
+def _level_row(quantity: str, change: LevelChange, probe: Probe, frame: Frame, reference: Frame) -> Row:
+    """How far a region's level is from that of the reference."""
+    seen, plain = (region_level_db(image, probe, change.region_mm) for image in (frame, reference))
+    return Row(quantity, "dB", change.change_db, seen - plain, 0.5)
 
 
 def shadow_and_enhancement(rotation: np.ndarray, device) -> Outcome:
@@ -47,11 +61,10 @@ def shadow_and_enhancement(rotation: np.ndarray, device) -> Outcome:
     rows, views = [], []
     for kind, attenuation in (("shadow", 1.2), ("enhancement", 0.1)):
         phantom = attenuating_block(attenuation, rotation)
-        frames, plain = _images(phantom, device, PROBES), _images(phantom, device, PROBES, reference=True)
+        frames, plain = _images_and_reference(phantom, device)
         for name, probe in PROBES.items():
             (change,) = phantom.expected(probe)
-            levels = [region_level_db(f[name], probe, change.region_mm) for f in (frames, plain)]
-            rows.append(Row(f"level behind, {kind}, {name}", "dB", change.change_db, levels[0] - levels[1], 0.5))
+            rows.append(_level_row(f"level behind, {kind}, {name}", change, probe, frames[name], plain[name]))
         views.append(View(kind, phantom, PROBES["linear"], frames["linear"]))
     return Outcome(tuple(rows), partial(draw_views, views=views))
 
@@ -61,7 +74,7 @@ def range_distortion(rotation: np.ndarray, device) -> Outcome:
     rows, views = [], []
     for kind, speed in (("slow", 1450.0), ("fast", 1650.0)):
         phantom = speed_block(speed, rotation)
-        frames, plain = _images(phantom, device, PROBES), _images(phantom, device, PROBES, reference=True)
+        frames, plain = _images_and_reference(phantom, device)
         for name, probe in PROBES.items():
             (wire,) = phantom.expected(probe)
             shown = echo_near(frames[name], probe, wire.shown_mm, _SEARCH_MM)[1]
@@ -73,9 +86,9 @@ def range_distortion(rotation: np.ndarray, device) -> Outcome:
     return Outcome(tuple(rows), partial(draw_views, views=views))
 
 
-def _displacements(phantom: Phantom, device, tolerance_mm: float, picture: str, title: str) -> Outcome:
+def _displacements(phantom: Phantom, frames: dict[str, Frame], picture: str = "linear") -> Outcome:
     """Rows for every echo of a phantom: how far from its predicted place it is shown."""
-    frames = _images(phantom, device, PROBES)
+    tolerance_mm = 0.3
     rows = []
     for name, probe in PROBES.items():
         for echo in phantom.expected(probe):
@@ -85,12 +98,15 @@ def _displacements(phantom: Phantom, device, tolerance_mm: float, picture: str, 
                     Row(f"{echo.name}, lateral, {name}", "mm", echo.shown_mm[0], x, tolerance_mm),
                     Row(f"{echo.name}, depth, {name}", "mm", echo.shown_mm[1], y, tolerance_mm),
                 ]
-    return Outcome(tuple(rows), partial(draw_views, views=[View(title, phantom, PROBES[picture], frames[picture])]))
+    return Outcome(
+        tuple(rows), partial(draw_views, views=[View(phantom.name, phantom, PROBES[picture], frames[picture])])
+    )
 
 
 def mirroring(rotation: np.ndarray, device) -> Outcome:
     """A rod before an oblique strong reflector."""
-    return _displacements(mirror(rotation), device, 0.3, "linear", "mirror")
+    phantom = mirror(rotation)
+    return _displacements(phantom, _images(_simulator(phantom, device), phantom))
 
 
 def curved_mirrors(rotation: np.ndarray, device) -> Outcome:
@@ -98,7 +114,11 @@ def curved_mirrors(rotation: np.ndarray, device) -> Outcome:
     rows, views = [], []
     for kind, shape in (("ball", {}), ("rod", {"is_sphere": False}), ("plane", {"radius_mm": 1e6})):
         phantom = curved_mirror(rotation, **shape)
-        seen = [_images(phantom, device, PROBES, replace(_SETTINGS, seed=n, interfaces=False)) for n in range(12)]
+        simulator = _simulator(phantom, device, replace(_SETTINGS, interfaces=False))
+        seen = []
+        for seed in range(12):
+            simulator.settings = replace(simulator.settings, seed=seed)
+            seen.append(_images(simulator, phantom))
         for name, probe in PROBES.items():
             for level in phantom.expected(probe):
                 powers = [10 ** (region_level_db(frame[name], probe, level.region_mm) / 10) for frame in seen]
@@ -110,7 +130,8 @@ def curved_mirrors(rotation: np.ndarray, device) -> Outcome:
 
 def refraction(rotation: np.ndarray, device) -> Outcome:
     """Wires behind an oblique border between two speeds."""
-    return _displacements(refracting_wedge(rotation), device, 0.3, "linear", "refracting wedge")
+    phantom = refracting_wedge(rotation)
+    return _displacements(phantom, _images(_simulator(phantom, device), phantom))
 
 
 def reverberation(rotation: np.ndarray, device) -> Outcome:
@@ -121,7 +142,8 @@ def reverberation(rotation: np.ndarray, device) -> Outcome:
     """
     phantom = parallel_plates(rotation)
     probes = {name: replace(probe, frequency_mhz=2.0) for name, probe in PROBES.items()}
-    frames = _images(phantom, device, probes, replace(_SETTINGS, reflection_threshold=1e-3))
+    simulator = _simulator(phantom, device, replace(_SETTINGS, reflection_threshold=1e-3))
+    frames = _images(simulator, phantom, probes)
     rows = []
     for name, probe in probes.items():
         echoes = phantom.expected(probe)
@@ -134,29 +156,23 @@ def reverberation(rotation: np.ndarray, device) -> Outcome:
                 Row(f"distance to {echoes[n].name}, {name}", "mm", apart, found[n][1] - found[n - 1][1], tolerance),
                 Row(f"fall to {echoes[n].name}, {name}", "dB", fall, 20 * np.log10(found[n][2] / found[n - 1][2]), 0.5),
             ]
-    return Outcome(
-        tuple(rows), partial(draw_views, views=[View("parallel plates", phantom, probes["linear"], frames["linear"])])
-    )
+    view = View(phantom.name, phantom, probes["linear"], frames["linear"])
+    return Outcome(tuple(rows), partial(draw_views, views=[view]))
 
 
 def wires_cysts_and_contrast(rotation: np.ndarray, device) -> Outcome:
     """A quality-assurance phantom: places of wires, levels of cysts and contrast targets."""
     phantom = wires_and_cysts(rotation)
-    placed = _displacements(phantom, device, 0.3, "convex", "wires and cysts")
-    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
+    frames, plain = _images_and_reference(phantom, device)
+    placed = _displacements(phantom, frames, "convex")
     rows = list(placed.rows)
     for name, probe in PROBES.items():
-        changes = [change for change in phantom.expected(probe) if isinstance(change, LevelChange)]
-        levels = []
-        for tissues in (phantom.tissues, phantom.reference):
-            simulator.set_tissues(tissues)
-            frame = simulator.simulate(probe, phantom.probe_to_ras, _DISPLAY)
-            levels.append([region_level_db(frame, probe, change.region_mm) for change in changes])
-        for change, seen, plain in zip(changes, *levels, strict=True):
-            rows.append(Row(f"{change.name} target, {name}", "dB", change.change_db, seen - plain, 0.5))
+        for change in phantom.expected(probe):
+            if isinstance(change, LevelChange):
+                rows.append(_level_row(f"{change.name} target, {name}", change, probe, frames[name], plain[name]))
         # Inside a cyst there is nothing but what the beam's edges see of its surroundings.
-        black = region_level_db(frame, probe, (-13.5, -10.5, 18.5, 21.5))
-        around = region_level_db(frame, probe, (-10.0, -8.0, 24.0, 34.0))
+        black = region_level_db(frames[name], probe, (-13.5, -10.5, 18.5, 21.5))
+        around = region_level_db(frames[name], probe, (-10.0, -8.0, 24.0, 34.0))
         rows.append(Row(f"cyst below its surroundings, {name}", "dB", -40.0, black - around, 0.0, "at most"))
     return Outcome(tuple(rows), placed.draw)
 

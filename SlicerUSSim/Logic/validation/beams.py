@@ -9,9 +9,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
-from SlicerUSSim.Logic.measurement import echo_near, full_width
-from SlicerUSSim.Logic.phantoms import FLUID, layered, small_sheet, thin_rod, wires_and_cysts
-from SlicerUSSim.Logic.placement import sample, slide_sweep, tilt_sweep
+from SlicerUSSim.Logic.measurement import depth_window, echo_near, full_width
+from SlicerUSSim.Logic.phantoms import (
+    FLUID,
+    layered,
+    reflection_coefficient,
+    small_sheet,
+    thin_rod,
+    wires_and_cysts,
+)
+from SlicerUSSim.Logic.placement import elevational_motion, sample, slide_sweep, tilt_sweep
 from SlicerUSSim.Logic.probe import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
@@ -19,21 +26,24 @@ from SlicerUSSim.Logic.validation import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.validation.pictures import Curve, Plot, draw_cross_sections, draw_plots
 from SlicerUSSim.Logic.volume import Volume
 
+#: A border with FLUID that bends no ray
+BEHIND = replace(FLUID, name="behind", impedance_mrayl=1.9)
+
 
 def echo_level(rotation: np.ndarray, device) -> Outcome:
     """A plane border across the beam, at every probe's focus and away from it."""
-    behind = replace(FLUID, name="behind", impedance_mrayl=1.9)
-    r = (1.9 - FLUID.impedance_mrayl) / (1.9 + FLUID.impedance_mrayl)
+    r = reflection_coefficient(FLUID, BEHIND)
     rows = []
-    phantom = layered([FLUID, behind], [25.0], rotation, spacing_mm=0.25, half_width_mm=14.0)
+    phantom = layered([FLUID, BEHIND], [25.0], rotation, spacing_mm=0.25, half_width_mm=14.0)
+    settings = SimulationSettings(scattering=False)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     for kind, expected in (("pressure", r), ("energy", r * r)):
-        settings = SimulationSettings(scattering=False, interface_reflection=kind)
-        simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+        simulator.settings = replace(simulator.settings, interface_reflection=kind)
         for name, probe in PROBES.items():
             low = replace(probe, frequency_mhz=2.0)  # as for reverberation
             peak = echo_near(simulator.simulate(low, phantom.probe_to_ras), low, (0.0, 25.0), 1.0)[2]
             # The lines of a sector meet a plane at right angles only in the middle: y aside, it is y^2 / 2 R farther.
-            radius = np.inf if low.is_linear else low.apex_radius_mm + 25.0
+            radius = low.apex_radius_mm + 25.0
             turns = 2 * np.pi * low.cycles_per_mm * float(low.beam_sigma_mm(25.0)[0]) ** 2 / radius
             predicted = 20 * np.log10(expected * (1 + turns**2) ** -0.25) + settings.interface_gain_db
             rows.append(Row(f"{kind} echo, {name}", "dB", predicted, 20 * np.log10(peak), 0.5))
@@ -42,15 +52,16 @@ def echo_level(rotation: np.ndarray, device) -> Outcome:
 
 def specular_echoes(rotation: np.ndarray, device) -> Outcome:
     """The echo of every hit is w A |r| cos^n(i): a plane tilted by 15 degrees, two exponents."""
-    behind = replace(FLUID, name="behind", impedance_mrayl=1.9)
+    before = replace(FLUID, attenuation_db_cm_mhz=0.4)
+    r = reflection_coefficient(before, BEHIND)  # of one speed, so the same at every angle
+    phantom = layered([before, BEHIND], [20.0], rotation, tilt_deg=15.0)
+    settings = SimulationSettings(reflections=False)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     rows = []
     for exponent in (0.0, 3.0):
-        phantom = layered([replace(FLUID, attenuation_db_cm_mhz=0.4), behind], [20.0], rotation, tilt_deg=15.0)
-        settings = SimulationSettings(specular_exponent=exponent, reflections=False)
-        simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+        simulator.settings = replace(simulator.settings, specular_exponent=exponent)
         for name, probe in PROBES.items():
             hits = simulator.trace(probe, phantom.probe_to_ras).hits
-            r = (1.9 - FLUID.impedance_mrayl) / (1.9 + FLUID.impedance_mrayl)
             loss = 10 ** (-0.4 * probe.frequency_mhz * 2 * hits["path_mm"].astype(float) / 10 / 20)
             gain = 10 ** (settings.interface_gain_db / 20) / settings.elevational_rays
             ratio = hits["echo"] / (loss * r * gain * hits["cos_incidence"].astype(float) ** exponent)
@@ -64,8 +75,7 @@ def specular_echoes(rotation: np.ndarray, device) -> Outcome:
 
 def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
     """A plane that leans out of the image plane: over a Gaussian beam its echo is the Gaussian's Fourier transform."""
-    behind = replace(FLUID, name="behind", impedance_mrayl=1.9)
-    phantom = layered([FLUID, behind], [25.0], rotation, spacing_mm=0.25, half_width_mm=14.0)
+    phantom = layered([FLUID, BEHIND], [25.0], rotation, spacing_mm=0.25, half_width_mm=14.0)
     settings = SimulationSettings(scattering=False, specular_exponent=0.0)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     rows = []
@@ -74,11 +84,9 @@ def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
         sigma = float(low.beam_sigma_mm(25.0)[1])
         peaks = {}
         for tilt in (0.0, 2.0, 3.0, 8.0):
-            # About the point of the plane on the probe's axis.
-            turn = tilt_sweep(np.eye(4), 2.0 * tilt, 2)[1][:3, :3]
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = turn, np.array([0.0, 25.0, 0.0]) - turn @ [0.0, 25.0, 0.0]
-            frame = simulator.simulate(low, phantom.probe_to_ras @ pose)
+            motion = elevational_motion(angle_deg=tilt)
+            motion[:3, 3] = [0.0, 25.0, 0.0] - motion[:3, :3] @ [0.0, 25.0, 0.0]  # about the plane's point on the axis
+            frame = simulator.simulate(low, phantom.probe_to_ras @ motion)
             peaks[tilt] = echo_near(frame, low, (0.0, 25.0), 2.0)[2]
         for tilt in (2.0, 3.0):
             turns = low.cycles_per_mm * np.tan(np.radians(tilt)) * sigma
@@ -102,13 +110,10 @@ def interface_width(rotation: np.ndarray, device) -> Outcome:
         sigma_l, sigma_e = (float(s) for s in low.beam_sigma_mm(depth))
 
         def echo(offset_mm: float, low=low) -> np.ndarray:
-            pose = phantom.probe_to_ras.copy()
-            pose[:3, 3] += offset_mm * pose[:3, 2]
-            frame = simulator.simulate(low, pose)
-            near = slice(int((depth - 2) / frame.sample_interval_mm), int((depth + 2) / frame.sample_interval_mm))
-            return np.abs(frame.iq[:, near]).max(axis=1)
+            frame = simulator.simulate(low, phantom.probe_to_ras @ elevational_motion(offset_mm))
+            return np.abs(depth_window(frame, depth, 2.0)).max(axis=1)
 
-        across = low.line_positions() * (1.0 if low.is_linear else low.apex_radius_mm + depth)
+        across = low.line_positions() / low.line_spacing * low.line_distance_mm(depth)
         profiles = {
             "lateral": (across, echo(0.0), sigma_l),
             "elevational": (offsets, np.array([echo(offset)[79:82].mean() for offset in offsets]), sigma_e),
@@ -145,25 +150,20 @@ def resolution(rotation: np.ndarray, device) -> Outcome:
         for wire in (
             e for e in phantom.expected(fine) if e.name in ("wire at 20 mm", "wire at 30 mm", "wire at 40 mm")
         ):
-            depth = float(np.hypot(wire.shown_mm[0], wire.shown_mm[1] + _apex(fine))) - _apex(fine)
+            depth = float(fine.line_through(*wire.shown_mm)[1])
             at = round(depth / frame.sample_interval_mm)
             band = np.abs(frame.iq[:, at - 12 : at + 13]).max(axis=1)
-            apart = fine.line_spacing * (1.0 if fine.is_linear else fine.apex_radius_mm + depth)
-            width = full_width(np.arange(len(band)) * apart, band)
+            x = np.arange(len(band)) * fine.line_distance_mm(depth)
+            width = full_width(x, band)
             predicted = float(fine.beam_sigma_mm(depth)[0]) * FWHM_PER_SIGMA
             rows.append(Row(f"lateral FWHM, {wire.name}, {name}", "mm", predicted, width, 0.15 * predicted))
             if name == "linear":
-                x = np.arange(len(band)) * apart
                 x = x - x[np.argmax(band)]
                 near = abs(x) < 1.5
                 theory = np.exp(-4 * np.log(2) * (x[near] / predicted) ** 2)
                 curves.append(Curve(wire.name, x[near], band[near] / band.max(), x[near], theory))
     plot = Plot("wires, linear array", "lateral [mm]", "echo", curves)
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
-
-
-def _apex(probe) -> float:
-    return 0.0 if probe.is_linear else probe.apex_radius_mm
 
 
 def slice_thickness(rotation: np.ndarray, device) -> Outcome:
@@ -174,19 +174,14 @@ def slice_thickness(rotation: np.ndarray, device) -> Outcome:
     settings = SimulationSettings(scatterers_per_mm3=1000.0)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     rows, curves = [], []
-    across = np.linspace(-0.5 * width, 0.5 * width, 25)
     for name, probe in PROBES.items():
         wide = replace(probe, elevation_focus_mm=55.0)
         sigma = float(wide.beam_sigma_mm(depth)[1])
         offsets = sigma * np.array([0.0, 0.5, 1.0, 1.5, 2.0])
-        powers, theory = [], []
-        for offset in offsets:
-            pose = phantom.probe_to_ras.copy()
-            pose[:3, 3] += offset * pose[:3, 2]
-            frame = simulator.simulate(wide, pose)
-            powers.append(_band_power(frame, wide, depth))
-            theory.append(np.exp(-((across - offset) ** 2) / sigma**2).mean())
-        measured, expected = (10 * np.log10(np.maximum(v, 1e-30) / v[0]) for v in (powers, theory))
+        poses = [phantom.probe_to_ras @ elevational_motion(offset) for offset in offsets]
+        powers = [_band_power(frame, wide, depth) for frame in simulator.sweep(wide, poses)]
+        measured = 10 * np.log10(np.maximum(powers, 1e-30) / powers[0])
+        expected = _bar_fall_db(offsets, sigma, width)
         rows += [
             Row(f"fall at {offset / sigma:.1f} sigma out of plane, {name}", "dB", e, m, 0.5 + 0.08 * abs(e))
             for offset, e, m in zip(offsets[1:], expected[1:], measured[1:], strict=True)
@@ -196,13 +191,21 @@ def slice_thickness(rotation: np.ndarray, device) -> Outcome:
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
 
 
+def _bar_fall_db(offsets_mm: np.ndarray, sigma_mm: float, width_mm: float) -> np.ndarray:
+    """Theory: power of a bar, so wide, at distances from the image plane; re the first."""
+    across = np.linspace(-0.5 * width_mm, 0.5 * width_mm, 25)
+    power = np.exp(-((across - offsets_mm[:, None]) ** 2) / sigma_mm**2).mean(axis=1)
+    return 10 * np.log10(power / power[0])
+
+
 def _band_power(frame, probe, depth_mm: float) -> float:
     """Mean power about the bar on the middle lines; curved arrays see it deeper, the further they look aside."""
     middle = slice(len(frame.iq) // 2 - 40, len(frame.iq) // 2 + 41)
-    angle = 0.0 if probe.is_linear else abs(probe.line_positions()[middle]).max()
-    low = depth_mm - 2.0
-    high = depth_mm + 2.0 + (_apex(probe) + depth_mm) * (1 / np.cos(angle) - 1)
-    samples = slice(int(low / frame.sample_interval_mm), int(high / frame.sample_interval_mm))
+    # How far along the outermost of them the bar is.
+    origin, direction = probe.line_at(probe.line_positions()[middle][-1])
+    farthest = (depth_mm - origin[1]) / direction[1]
+    ends = (depth_mm - 2.0, farthest + 2.0)
+    samples = slice(*(int(end / frame.sample_interval_mm) for end in ends))
     return float((np.abs(frame.iq[middle, samples]) ** 2).mean())
 
 
@@ -220,15 +223,14 @@ def compounding(rotation: np.ndarray, device) -> Outcome:
         "tilt": tilt_sweep(phantom.probe_to_ras, 18.0, 41),
         "freehand": freehand_sweep(phantom.probe_to_ras, 10.0, 60),
     }
-    across = np.linspace(-0.5 * width, 0.5 * width, 25)
     offsets = sigma * np.array([0.0, 0.5, 1.0, 1.5])
-    theory = 10 * np.log10([np.exp(-((across - offset) ** 2) / sigma**2).mean() for offset in offsets])
+    theory = _bar_fall_db(offsets, sigma, width)
     rows, volumes = [], {}
     for name, poses in sweeps.items():
         volume = volumes[name] = simulator.volume(probe, poses, display, spacing_mm=0.35)
         level = _bar_level_db(volume, phantom.probe_to_ras, depth, offsets) * display.dynamic_range_db / 255.0
         rows += [
-            Row(f"fall at {offset / sigma:.1f} sigma, {name}", "dB", e - theory[0], m - level[0], 0.8)
+            Row(f"fall at {offset / sigma:.1f} sigma, {name}", "dB", e, m - level[0], 0.8)
             for offset, e, m in zip(offsets[1:], theory[1:], level[1:], strict=True)
         ]
         _, y, z = _bar_centre(volume, phantom.probe_to_ras, depth)

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from SlicerUSSim.Logic.phantoms import FLUID, Phantom, layered, voxel_sheet, voxel_sphere
+from SlicerUSSim.Logic.phantoms import FLUID, Phantom, layered, reflection_coefficient, voxel_sheet, voxel_sphere
 from SlicerUSSim.Logic.probe import LinearProbe
 from SlicerUSSim.Logic.settings import SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
@@ -34,7 +34,7 @@ def refraction_and_reflectance(rotation: np.ndarray, device) -> Outcome:
         crossing = tree.hits[(tree.hits["reflections"] == 0) & (tree.hits["label_behind"] == 2)]
         angle = np.degrees(np.arccos(np.clip(crossing["normal"] @ normal, -1, 1)))
         cos_in = crossing["cos_incidence"].astype(float)
-        expected = _fluid_reflectance(cos_in)
+        expected = reflection_coefficient(SLOW, FAST, cos_in) ** 2
         rows += [
             Row(f"normal error RMS, {name}", "degrees", 0.0, _rms(angle), 3.0, "at most"),
             Row(f"largest error of R, {name}", "", 0.0, float(abs(crossing["reflectance"] - expected).max()), 2e-4),
@@ -48,15 +48,6 @@ def refraction_and_reflectance(rotation: np.ndarray, device) -> Outcome:
         curves.append(Curve(name, incidence, crossing["reflectance"][order], incidence, expected[order]))
     plot = Plot("a plane between two fluids", "angle of incidence [degrees]", "reflectance R", curves)
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
-
-
-def _fluid_reflectance(cos_in: np.ndarray) -> np.ndarray:
-    """R = r^2 from SLOW to FAST; 1 beyond the critical angle."""
-    sin_out = FAST.speed_of_sound_m_s / SLOW.speed_of_sound_m_s * np.sqrt(1 - cos_in**2)
-    cos_out = np.sqrt(np.clip(1 - sin_out**2, 0, None))
-    z1, z2 = SLOW.impedance_mrayl, FAST.impedance_mrayl
-    r = (z2 * cos_in - z1 * cos_out) / (z2 * cos_in + z1 * cos_out)
-    return np.where(sin_out >= 1, 1.0, r**2)
 
 
 def _sine_ratio(tree, normal: np.ndarray) -> float:
@@ -145,11 +136,8 @@ def thin_sheet(rotation: np.ndarray, device) -> Outcome:
     rows = []
     for name, probe in PROBES.items():
         tree = simulator.trace(probe, phantom.probe_to_ras)
-        crossed = set(
-            zip(
-                tree.hit_line[tree.hits["label_behind"] == 1], tree.hit_ray[tree.hits["label_behind"] == 1], strict=True
-            )
-        )
+        front = tree.hits["label_behind"] == 1
+        crossed = set(zip(tree.hit_line[front], tree.hit_ray[front], strict=True))
         rays = len(np.unique(tree.segment_line)) * simulator.settings.elevational_rays
         rows.append(Row(f"share of rays that see it, {name}", "", 1.0, len(crossed) / rays, 0.0))
     frame = simulator.simulate(PROBES["convex"], phantom.probe_to_ras)

@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 from scipy import stats
 
-from SlicerUSSim.Logic.frame import Frame
-from SlicerUSSim.Logic.measurement import correlation, fit_rayleigh, level_db
+from SlicerUSSim.Logic.measurement import correlation, depth_window, fit_rayleigh, level_db
 from SlicerUSSim.Logic.phantoms import BACKGROUND, uniform_speckle
+from SlicerUSSim.Logic.placement import elevational_motion
 from SlicerUSSim.Logic.probe import LinearProbe, Probe
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
@@ -32,11 +32,6 @@ def _simulators(rotation: np.ndarray, device, tissue: Tissue = SPECKLE, seeds=SE
         UltrasoundSimulator(phantom.labels, phantom.tissues, SimulationSettings(seed=seed, **settings), device)
         for seed in seeds
     ]
-
-
-def _window(frame: Frame, depth_mm: float, half_mm: float) -> np.ndarray:
-    first, last = (round((depth_mm + s * half_mm) / frame.sample_interval_mm) for s in (-1, 1))
-    return frame.iq[:, first:last]
 
 
 def statistics(rotation: np.ndarray, device) -> Outcome:
@@ -79,13 +74,12 @@ def correlations(rotation: np.ndarray, device) -> Outcome:
         frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
         for depth in DEPTHS_MM:
             sigma_l, sigma_e = (float(s) for s in probe.beam_sigma_mm(depth))
-            apart = probe.line_spacing * (1.0 if probe.is_linear else probe.apex_radius_mm + depth)
+            apart = float(probe.line_distance_mm(depth))
             lag = max(1, round(sigma_l / apart))
-            beside = phantom.probe_to_ras.copy()
-            beside[:3, 3] += 0.8 * sigma_e * beside[:3, 2]
+            beside = phantom.probe_to_ras @ elevational_motion(0.8 * sigma_e)
             others = [s.simulate(probe, beside) for s in simulators]
-            near = [_window(f, depth, 1.0) for f in frames]
-            wide = [_window(f, depth, 3.0) for f in frames]
+            near = [depth_window(f, depth, 1.0) for f in frames]
+            wide = [depth_window(f, depth, 3.0) for f in frames]
             dz, sigma_a = frames[0].sample_interval_mm, probe.axial_sigma_mm
             axial = max(1, round(sigma_a / dz))
             found = {
@@ -93,7 +87,7 @@ def correlations(rotation: np.ndarray, device) -> Outcome:
                 "elevational": (
                     0.8 * sigma_e,
                     sigma_e,
-                    [correlation(s, _window(o, depth, 1.0)) for s, o in zip(near, others, strict=True)],
+                    [correlation(s, depth_window(o, depth, 1.0)) for s, o in zip(near, others, strict=True)],
                 ),
                 "axial": (axial * dz, sigma_a, [correlation(s[:, :-axial], s[:, axial:]) for s in wide]),
             }
