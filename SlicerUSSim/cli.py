@@ -117,7 +117,7 @@ def segment(mri, out, contrast, classes, mask, radius, bias_correction, thin_sul
 
     _check_output(out)
     volume = Volume.read(mri)
-    with _share() as progress:
+    with _share("segment") as progress:
         result = segment_mri(
             volume, classes=classes, contrast=contrast, mask=Volume.read(mask) if mask else None, filter_radius=radius,
             bias_correction=bias_correction, thin_sulci=thin_sulci, device=device, progress=progress,
@@ -204,7 +204,7 @@ class _Scene:
             beside = _tissue_file(Path(mri_or_labels))
             tissue_file = tissue_file or (beside if beside.exists() else None)
         else:
-            with _share() as progress:
+            with _share("segment") as progress:
                 result = segment_mri(
                     volume, contrast=contrast, mask=Volume.read(mask) if mask else None, thin_sulci=thin_sulci,
                     device=device, progress=progress,
@@ -248,8 +248,6 @@ def volume(
     out: Path, tilt: float | None, slide: float | None, frames: int, spacing: float, like: str | None, **scene_options
 ) -> None:
     """A 3D ultrasound volume: a sweep of images around a pose, compounded in patient space."""
-    from tqdm import tqdm
-
     from SlicerUSSim.Logic.placement import slide_sweep, tilt_sweep
     from SlicerUSSim.Logic.volume import Volume
 
@@ -259,10 +257,11 @@ def volume(
     grid = Volume.read(like) if like else None
     scene = _Scene(**scene_options)
     poses = slide_sweep(scene.pose, slide, frames) if tilt is None else tilt_sweep(scene.pose, tilt, frames)
-    with tqdm(total=frames, desc="sweep", file=sys.stderr, leave=False, disable=None) as bar:
+    with _share("sweep") as progress:
         result = scene.simulator.volume(
-            scene.probe, poses, scene.display, spacing_mm=spacing, like=grid, progress=lambda done: bar.update()
-        )
+            scene.probe, poses, scene.display, spacing_mm=spacing, like=grid,
+            progress=lambda done: progress(done / frames),
+        )  # fmt: skip
     result.write(out)
     click.echo(f"wrote {out} ({'x'.join(map(str, result.array.shape[::-1]))} voxels from {frames} images)")
 
@@ -364,9 +363,9 @@ class _steps:  # noqa: N801
 class _share(_steps):  # noqa: N801
     """The same for a share done between 0 and 1."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
         super().__init__(100)
-        self.bar.set_description_str("segment")
+        self.bar.set_description_str(name)
 
     def __call__(self, share: float) -> None:
         self.bar.update(int(100 * share) - self.bar.n)

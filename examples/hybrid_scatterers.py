@@ -42,10 +42,10 @@ def main() -> None:
     figure = Figure(figsize=(3.0 * (len(VARIANTS) + 1), 6.4), layout="constrained")
     axes = figure.subplots(2, len(VARIANTS) + 1)
     for column, (name, changes) in enumerate(VARIANTS.items(), 1):
-        settings = SimulationSettings(**changes)
+        simulator = UltrasoundSimulator(segmentation.labels, tissues, SimulationSettings(**changes), texture=texture)
         images = []
         for seed in range(arguments.patients):
-            simulator = UltrasoundSimulator(segmentation.labels, tissues, replace(settings, seed=seed), texture=texture)
+            simulator.settings = replace(simulator.settings, seed=seed)
             frame = simulator.simulate(probe, pose)
             images.append(frame.image)
         show(axes[0, column], images[0], probe, name)

@@ -140,12 +140,8 @@ inline float decay_in(__constant const Scene *scene, Tissue tissue) {
   return tissue.attenuation * scene->frequency_mhz * 0.2f * LN10_OVER_20;
 }
 
-// How a tube of neighbouring rays, one wide at the face in the unfolded beam, widens: a convex mirror spreads it, and
-// power is thinned by as much as it is wider (PHYSICS asks for none of this; a flat mirror leaves it as it is).
-inline float4 tube_after(float4 tube, float length) { return tube + (float4)(tube.y, 0.0f, tube.w, 0.0f) * length; }
-
-// Its growth behind a mirror of curvature k, met under the angle of incidence i in the plane of the offset: a ray
-// beside this one meets a normal turned by k / cos i per mm of offset, and is turned by twice that.
+// The tube (tube_after) behind a mirror of curvature k, met under the angle of incidence i in the plane of the offset:
+// a ray beside this one meets a normal turned by k / cos i per mm of offset, and is turned by twice that.
 inline float4 tube_reflected(__global const ushort *voxels, __global const ushort *smooth,
                              __constant const Scene *scene, __constant const Tissue *tissues, float4 tube, Ray ray,
                              float3 point, float3 normal, int before, int behind) {

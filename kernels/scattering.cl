@@ -294,12 +294,12 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
       const float gain = log2(segment->weight * segment->attenuation * scene->speckle_scale * 2.50662827f);
       const float decay = LOG2_E * segment->decay_per_mm;
       // Behind a curved mirror the same power has a wider tube to fill.
-      const float wide_low = (segment->tube[0] + low * segment->tube[1]) * (segment->tube[2] + low * segment->tube[3]);
-      const float wide_high =
-          (segment->tube[0] + high * segment->tube[1]) * (segment->tube[2] + high * segment->tube[3]);
-      piece.gain0 = gain - decay * low + 0.5f * log2(sigma_low.x / (sigma_low.y * wide_low)) - log2(apart_low);
-      piece.gain1 =
-          gain - decay * high + 0.5f * log2(sigma_high.x / (sigma_high.y * wide_high)) - log2(apart_high) - piece.gain0;
+      const float4 tube_low = tube_after(vload4(0, segment->tube), low);
+      const float4 tube_high = tube_after(vload4(0, segment->tube), high);
+      piece.gain0 =
+          gain - decay * low + 0.5f * log2(sigma_low.x / (sigma_low.y * tube_low.x * tube_low.z)) - log2(apart_low);
+      piece.gain1 = gain - decay * high + 0.5f * log2(sigma_high.x / (sigma_high.y * tube_high.x * tube_high.z)) -
+                    log2(apart_high) - piece.gain0;
 
       scatter_piece(scene, voxels, texture, tissues, &piece, start, low, high, 0.5f * fmax(apart_low, apart_high),
                     scene->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum);

@@ -23,8 +23,7 @@ def sweep_grid(probe: Probe, poses: Iterable[np.ndarray], spacing_mm: float = 0.
     Raises SimulationError without poses, for one that is not rigid, and for more voxels than a computer likes.
     """
     require_between("sweep_grid", "spacing_mm", spacing_mm, 0.02, 20)
-    outline = np.c_[probe.outline_mm(), np.ones(len(probe.outline_mm()))]
-    points = [(outline @ check_rigid("pose", pose).T)[:, :3] for pose in poses]
+    points = [_outline(probe, check_rigid("pose", pose)) for pose in poses]
     require(bool(points), "the sweep has no pose, expected at least one")
     low = np.min([p.min(axis=0) for p in points], axis=0) - spacing_mm
     high = np.max([p.max(axis=0) for p in points], axis=0) + spacing_mm
@@ -56,12 +55,13 @@ class Compounder:
         self.probe = probe
         self._sum = np.zeros(grid.array.shape, np.float32)
         self._weight = np.zeros(grid.array.shape, np.float32)
-        self._field: np.ndarray | None = None
+        self._field: np.ndarray | None = None  # 1 where a pixel lies in the imaged field, and its mean over a voxel
+        self._field_share: np.ndarray | None = None
         self._poses: list[np.ndarray] = []
 
     def add(self, frame: Frame) -> None:
         """Put one image into the volume."""
-        image, field = self._averaged(frame)
+        image = self._averaged(frame)
         voxel_to_image = np.linalg.inv(frame.probe_to_ras @ frame.image_to_probe) @ self.grid.ijk_to_ras
         self._poses.append(frame.probe_to_ras)
         # The plane is taken column by column of voxels along the axis that it crosses most steeply.
@@ -83,7 +83,7 @@ class Compounder:
             weight = 1.0 - np.abs(off) / reach
             near = (weight > 0) & (index[axis] >= 0) & (index[axis] < size[axis])
             places = np.stack([row[near], column[near]])
-            inside = ndimage.map_coordinates(field, places, order=0, mode="constant", cval=0) > 0
+            inside = ndimage.map_coordinates(self._field, places, order=0, mode="constant", cval=0) > 0
             grey = ndimage.map_coordinates(image, places[:, inside], order=1, mode="nearest")
             at = tuple(index[a][near][inside].astype(int) for a in (2, 1, 0))
             weight = weight[near][inside].astype(np.float32)
@@ -105,30 +105,33 @@ class Compounder:
             values = _filled(values, known, hole_mm / self.grid.spacing_mm[::-1])
         return self.grid.with_array(np.clip(np.rint(values), 0, 255).astype(np.uint8))
 
-    def _averaged(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        """(image, where it lies in the field), averaged over what a voxel covers: single pixels would alias speckle."""
+    def _averaged(self, frame: Frame) -> np.ndarray:
+        """The image averaged over what a voxel covers, within the field: single pixels would alias speckle."""
+        size = [max(round(float(self.grid.spacing_mm.min()) / s), 1) for s in frame.pixel_spacing_mm[::-1]]
         if self._field is None or self._field.shape != frame.image.shape:
             rows, columns = frame.image.shape
             pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
             places = pixels @ frame.image_to_probe[:2, :2].T + frame.image_to_probe[:2, 3]
             self._field = self.probe.holds(places[..., 0], places[..., 1]).astype(np.float32)
-        size = [max(round(float(self.grid.spacing_mm.min()) / s), 1) for s in frame.pixel_spacing_mm[::-1]]
-        share = ndimage.uniform_filter(self._field, size, mode="constant")
+            self._field_share = ndimage.uniform_filter(self._field, size, mode="constant")
         image = ndimage.uniform_filter(frame.image * self._field, size, mode="constant")
-        return np.divide(image, share, out=np.zeros_like(image), where=share > 1e-3), self._field
+        return np.divide(image, self._field_share, out=np.zeros_like(image), where=self._field_share > 1e-3)
 
     def _reach(self, frame: Frame, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """First and one past the last voxel of the box around the imaged field, within the grid."""
-        outline = np.c_[self.probe.outline_mm(), np.ones(len(self.probe.outline_mm()))]
-        index = (outline @ (self.grid.ras_to_ijk @ frame.probe_to_ras).T)[:, :3]
+        index = _outline(self.probe, self.grid.ras_to_ijk @ frame.probe_to_ras)
         low = np.clip(np.floor(index.min(axis=0)).astype(int) - 1, 0, size)
         return low, np.maximum(np.clip(np.ceil(index.max(axis=0)).astype(int) + 2, 0, size), low)
 
     def _widest_gap_mm(self) -> float:
         """How far any point of the field moves between neighbouring images at most."""
-        outline = np.c_[self.probe.outline_mm(17), np.ones(len(self.probe.outline_mm(17)))]
-        places = [(outline @ pose.T)[:, :3] for pose in self._poses]
+        places = [_outline(self.probe, pose) for pose in self._poses]
         return max((float(np.linalg.norm(b - a, axis=1).max()) for a, b in itertools.pairwise(places)), default=0.0)
+
+
+def _outline(probe: Probe, matrix: np.ndarray) -> np.ndarray:
+    """(points, 3) outline of the imaged field, taken from the probe frame by a (4, 4) matrix."""
+    return probe.outline_mm() @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _filled(values: np.ndarray, known: np.ndarray, hole_voxels: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ from time import perf_counter
 
 import numpy as np
 
-from SlicerUSSim.Logic.errors import SimulationError
 from SlicerUSSim.Logic.figures import draw_views, require_matplotlib, write_png
 from SlicerUSSim.Logic.phantoms import head_mri
 from SlicerUSSim.Logic.placement import craniotomy_pose, slice_under_probe
@@ -20,7 +19,7 @@ from SlicerUSSim.Logic.segmentation import segment_mri
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import TissueTable, write_json
-from SlicerUSSim.Logic.volume import Volume
+from SlicerUSSim.Logic.volume import Volume, make_folder
 
 PROBES: dict[str, Probe] = {
     "phased": PhasedProbe(field_of_view_deg=80.0, depth_mm=90.0, scan_lines=196, frequency_mhz=5.0),
@@ -54,10 +53,7 @@ def run_demo(
     Raises SimulationError for anything the caller can mend.
     """
     require_matplotlib()  # now rather than after the work
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SimulationError(f"{out}: cannot be made ({error.strerror})") from None
+    make_folder(out)
     timings: dict[str, float] = {}
 
     progress("segment the MRI")

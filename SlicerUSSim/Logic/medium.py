@@ -47,14 +47,15 @@ class Medium:
         self.dims = np.array(array.shape[::-1]) + 2 * _PAD
         self._check(tissues)
         padded = np.pad(array, _PAD)
+        self._rows = self._tissue_rows(tissues)
         self._upload(padded, tissues)
-        self._upload_smooth(padded, tissues)
+        self._upload_smooth(padded)
         self.has_texture = texture is not None
         no_texture = np.zeros(1, np.uint32)
         self.texture_buffer = device.upload(
             np.pad(texture, _PAD, constant_values=128 << 16) if self.has_texture else no_texture
         )
-        self.tissue_buffer = device.upload(self._rows(tissues))
+        self.tissue_buffer = device.upload(self._rows)
         self.tissues = tissues
 
     @property
@@ -65,13 +66,15 @@ class Medium:
         return matrix
 
     def set_tissues(self, tissues: TissueTable) -> None:
-        """Change tissue parameters; the voxels are touched only if the membrane's place has changed."""
+        """Change tissue parameters; voxels are touched only if the membrane's place or the acoustic groups change."""
         self._check(tissues)
         if _membrane_shape(tissues) != _membrane_shape(self.tissues):
             self._upload(np.pad(as_labels(self.labels.array), _PAD), tissues)
-        if not np.array_equal(self._rows(tissues)["group"], self._rows(self.tissues)["group"]):
-            self._upload_smooth(np.pad(as_labels(self.labels.array), _PAD), tissues)
-        self.device.write(self.tissue_buffer, self._rows(tissues))
+        groups_before = self._rows["group"]
+        self._rows = self._tissue_rows(tissues)
+        if not np.array_equal(self._rows["group"], groups_before):
+            self._upload_smooth(np.pad(as_labels(self.labels.array), _PAD))
+        self.device.write(self.tissue_buffer, self._rows)
         self.tissues = tissues
 
     def _check(self, tissues: TissueTable) -> None:
@@ -81,7 +84,7 @@ class Medium:
             f"label {', '.join(map(str, missing))} has no tissue; the table has {', '.join(map(str, tissues))}",
         )
 
-    def _rows(self, tissues: TissueTable) -> np.ndarray:
+    def _tissue_rows(self, tissues: TissueTable) -> np.ndarray:
         """layout.TISSUE per label. Acoustic groups are numbered from the most frequent tissue on: those get a smoothed
         indicator."""
         rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
@@ -113,9 +116,9 @@ class Medium:
         words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["PLAIN_CELL"]) * plain
         self.voxel_buffer = self.device.upload(words)
 
-    def _upload_smooth(self, padded: np.ndarray, tissues: TissueTable) -> None:
+    def _upload_smooth(self, padded: np.ndarray) -> None:
         """Indicators of the first acoustic groups, smoothed: where interfaces are flat, they know normals best."""
-        group_of = self._rows(tissues)["group"].astype(np.uint8)
+        group_of = self._rows["group"].astype(np.uint8)
         # The coupling medium lies around the volume even where its label does not occur.
         groups = {int(group_of[label]) for label in (0, *self.present)}
         room = max(_SMOOTHED_VOXELS // padded.size, 2)

@@ -66,26 +66,27 @@ class Texture:
         The gain is in TEXTURE_STEP_DB about 128. `modulation_db` per standard deviation; the mean square of the gain
         over each label is 1.
         """
-        packed = np.full(labels.shape, 128 << 16, np.uint32)
+        level = np.full(labels.shape, 128.0, np.float32)
+        if modulation_db != 0.0:
+            gain_db = modulation_db * np.clip(self.deviation, -_FARTHEST_DEVIATION, _FARTHEST_DEVIATION)
+            power_db = 10.0 * np.log10(_means(10.0 ** (gain_db / 10.0), labels) + 1e-30)
+            level += (gain_db - power_db[labels]) / CONSTANTS["TEXTURE_STEP_DB"]
+        packed = np.clip(np.rint(level), 0, 255).astype(np.uint32) << np.uint32(16)
         if partial_volume:
             share = np.rint(255.0 * self.second_share).astype(np.uint32)
             packed |= np.where(share > 0, self.second_label, 0).astype(np.uint32) | (share << np.uint32(8))
-        if modulation_db != 0.0:
-            gain_db = modulation_db * np.clip(self.deviation, -_FARTHEST_DEVIATION, _FARTHEST_DEVIATION)
-            flat, label = gain_db.ravel(), labels.ravel()
-            voxels = np.maximum(np.bincount(label), 1)
-            power_db = 10.0 * np.log10(np.bincount(label, 10.0 ** (flat / 10.0)) / voxels + 1e-30)
-            level = 128.0 + (gain_db - power_db[labels]) / CONSTANTS["TEXTURE_STEP_DB"]
-            packed &= np.uint32(0xFFFF)
-            packed |= np.clip(np.rint(level), 0, 255).astype(np.uint32) << np.uint32(16)
         return packed
 
 
 def tissue_deviation(intensity: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """(k, j, i) float32 intensity in standard deviations from the mean of each label's voxels."""
-    values, label = intensity.ravel().astype(np.float64), labels.ravel()
-    count = np.maximum(np.bincount(label), 1)
-    mean = np.bincount(label, values) / count
-    spread = np.sqrt(np.maximum(np.bincount(label, values**2) / count - mean**2, 0.0))
+    values = intensity.astype(np.float64)
+    mean = _means(values, labels)
+    spread = np.sqrt(np.maximum(_means(values**2, labels) - mean**2, 0.0))
     table = np.where(spread > 1e-6 * np.abs(mean).max(), spread, np.inf)  # a constant tissue deviates nowhere
     return ((intensity - mean[labels]) / table[labels]).astype(np.float32)
+
+
+def _means(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """(largest label + 1,) mean of `values` over the voxels of each label; 0 for one that does not occur."""
+    return np.bincount(labels.ravel(), values.ravel()) / np.maximum(np.bincount(labels.ravel()), 1)

@@ -231,6 +231,16 @@ def require_place(path: Path) -> None:
     require(not path.is_dir(), f"{path}: is a folder, expected a file name")
 
 
+def make_folder(path: str | os.PathLike) -> Path:
+    """The folder, made if it is not there. Raises SimulationError where that cannot be."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SimulationError(f"{folder}: cannot be made ({error.strerror})") from None
+    return folder
+
+
 @contextmanager
 def written_whole(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path to write to; it replaces `path` only if the block succeeds.

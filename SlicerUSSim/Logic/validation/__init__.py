@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.errors import require
 from SlicerUSSim.Logic.probe import ConvexProbe, LinearProbe, PhasedProbe, Probe
 
 #: How the phantoms, and the probes with them, lie on the voxels: along them, and two oblique ways.
@@ -111,7 +111,7 @@ class Report:
 
     findings: tuple[Finding, ...]
     device: str
-    pictures: tuple[str, ...] = field(default=())
+    pictures: tuple[str, ...] = ()
 
     @property
     def failed(self) -> tuple[Finding, ...]:
@@ -186,15 +186,11 @@ def validate(
     from SlicerUSSim.Logic.device import Device
     from SlicerUSSim.Logic.figures import require_matplotlib
     from SlicerUSSim.Logic.tissues import write_json
-    from SlicerUSSim.Logic.volume import written_whole
+    from SlicerUSSim.Logic.volume import make_folder, written_whole
 
     require_matplotlib()
     checks = chosen_checks(only)
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SimulationError(f"{folder}: cannot be made ({error.strerror})") from None
+    folder = make_folder(out)
     opened = Device.get(device)
     findings, pictures = [], []
     for check in checks:
