@@ -76,6 +76,11 @@ def test_the_strain_of_a_row_is_above_one_just_where_it_fails(kind, predicted, m
         assert row.strain >= 1.0
 
 
+@pytest.mark.parametrize("kind", ["within", "at most", "at least"])
+def test_an_echo_that_was_not_there_is_farther_from_its_limit_than_any_other(kind):
+    assert Row("x", "", 10.0, float("nan"), 0.5, kind).strain == float("inf")
+
+
 # ---- wrong physics is noticed ---------------------------------------------------------------------------------------
 
 

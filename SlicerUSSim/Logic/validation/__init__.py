@@ -67,6 +67,8 @@ class Row:
     @property
     def strain(self) -> float:
         """How near the measured number is to its limit: 0 as predicted, 1 at the limit, above it failed."""
+        if np.isnan(self.measured):  # what was to be measured was not there
+            return float("inf")
         if self.kind == "within":
             off = abs(self.measured - self.predicted)
             return off / self.tolerance if self.tolerance > 0 else float(off > 0)
