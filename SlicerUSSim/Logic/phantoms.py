@@ -227,11 +227,11 @@ def parallel_plates(
     return _phantom(
         "parallel plates",
         label,
-        TissueTable({0: below, 1: above, 2: gap, 3: below}),
+        TissueTable({0: above, 1: above, 2: gap, 3: below}),
         rotation,
         spacing_mm,
         expected,
-        box=_Box(half_width=26.0, bottom=30.0),
+        box=_Box(half_width=26.0),
     )
 
 
@@ -363,7 +363,9 @@ def layered(
         )
 
     table = TissueTable(dict(enumerate(tissues, 1)))
-    return _phantom("layers", label, table, rotation, spacing_mm, expected, box=_Box(half_width=half_width_mm))
+    # In a fast layer the field reaches farther than its nominal depth.
+    box = _Box(half_width=half_width_mm, bottom=60.0)
+    return _phantom("layers", label, table, rotation, spacing_mm, expected, box=box)
 
 
 def small_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.0, half_mm: float = 2.0) -> Phantom:
