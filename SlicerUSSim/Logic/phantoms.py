@@ -231,7 +231,7 @@ def parallel_plates(
         rotation,
         spacing_mm,
         expected,
-        box=_Box(half_width=26.0),
+        box=_Box(half_width=20.0),
     )
 
 
