@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -11,9 +13,10 @@ from click.testing import CliRunner
 from PIL import Image
 
 from SlicerUSSim.cli import main
-from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic import Preset, Volume
 from SlicerUSSim.Logic.phantoms import head_mri
 from SlicerUSSim.Logic.pose import read_pose, write_pose
+from SlicerUSSim.Logic.probe import PROBES
 
 
 def ussim(*arguments):
@@ -56,6 +59,7 @@ def test_demo_writes_everything_it_promises(head, tmp_path):
         "labels.nii.gz",
         "labels.json",
         "demo.json",
+        "preset.json",
     }
     assert names <= {p.name for p in out.iterdir()}
     for name in names:
@@ -248,3 +252,27 @@ def test_an_unwritable_folder_is_named(labels, tmp_path):
     tmp_path.chmod(0o500)
     result = ussim("simulate", labels, "--pose", "auto", "-o", tmp_path / "o.png")
     assert result.exit_code == 2 and "cannot be written" in result.stderr
+
+
+def test_a_preset_gives_the_same_image_and_options_go_before_it(head, labels, tmp_path):
+    preset = Preset(PROBES["microconvex"]).changed("display", gain_db=6.0).changed("settings", seed=5)
+    preset.write(tmp_path / "preset.json")
+    probe = tmp_path / "probe.json"
+    probe.write_text(json.dumps(preset.probe.to_dict()))
+
+    def image(*options):
+        out = tmp_path / "image.png"
+        result = ussim("simulate", labels, "--pose", "auto", "-o", out, *options)
+        assert result.exit_code == 0, result.output
+        return np.asarray(Image.open(out))
+
+    whole = image("--preset", tmp_path / "preset.json")
+    np.testing.assert_array_equal(whole, image("--probe", probe, "--gain", 6, "--seed", 5))
+    quieter = image("--preset", tmp_path / "preset.json", "--gain", -6)
+    np.testing.assert_array_equal(quieter, image("--probe", probe, "--gain", -6, "--seed", 5))
+    assert quieter.mean() < whole.mean()
+
+
+def test_python_m_is_the_command():
+    done = subprocess.run([sys.executable, "-m", "SlicerUSSim", "--version"], capture_output=True, text=True)
+    assert done.returncode == 0 and "ussim, version" in done.stdout

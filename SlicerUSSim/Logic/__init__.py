@@ -11,6 +11,7 @@ _HOMES = {
     "LinearProbe": "probe",
     "Membrane": "tissues",
     "PhasedProbe": "probe",
+    "Preset": "preset",
     "Segmentation": "segmentation",
     "SimulationError": "errors",
     "SimulationSettings": "settings",

@@ -14,17 +14,13 @@ from SlicerUSSim.Logic.figures import draw_views, require_matplotlib, write_png
 from SlicerUSSim.Logic.phantoms import head_mri
 from SlicerUSSim.Logic.placement import craniotomy_pose, slice_under_probe
 from SlicerUSSim.Logic.pose import write_pose
-from SlicerUSSim.Logic.probe import ConvexProbe, PhasedProbe, Probe
+from SlicerUSSim.Logic.preset import Preset
+from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.segmentation import segment_mri
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import TissueTable, write_json
 from SlicerUSSim.Logic.volume import Volume, make_folder
-
-PROBES: dict[str, Probe] = {
-    "phased": PhasedProbe(field_of_view_deg=80.0, depth_mm=90.0, scan_lines=196, frequency_mhz=5.0),
-    "convex": ConvexProbe(radius_mm=40.0, field_of_view_deg=60.0, depth_mm=100.0, scan_lines=192, frequency_mhz=5.0),
-}
 
 
 def demo_mri() -> tuple[Volume, str]:
@@ -94,6 +90,7 @@ def run_demo(
     segmentation.labels.write(out / "labels.nii.gz")
     tissues.write(out / "labels.json")
     write_pose(out / "pose.json", pose)
+    Preset(probe, display, settings, tissues).write(out / "preset.json")
     summary = {
         "mri": source,
         "device": str(simulator.device.info),

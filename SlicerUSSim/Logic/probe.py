@@ -295,3 +295,18 @@ def probe_from_dict(values: dict, source: str = "probe") -> Probe:
     except TypeError:
         needed = {field.name for field in fields(kinds[kind]) if field.default is MISSING} - set(arguments)
         raise SimulationError(f"{source}: a {kind} probe also needs {', '.join(sorted(needed))}") from None
+
+
+#: Probes to start from, by name: PROBES["phased"].
+PROBES: dict[str, Probe] = {
+    "phased": PhasedProbe(field_of_view_deg=80.0, depth_mm=90.0, scan_lines=196, frequency_mhz=5.0),
+    "convex": ConvexProbe(radius_mm=40.0, field_of_view_deg=60.0, depth_mm=100.0, scan_lines=192, frequency_mhz=5.0),
+    "linear": LinearProbe(width_mm=38.0, depth_mm=40.0, scan_lines=192, frequency_mhz=9.0, elevation_aperture_mm=5.0),
+    "microconvex": ConvexProbe(
+        radius_mm=14.0, field_of_view_deg=90.0, depth_mm=80.0, frequency_mhz=6.5, aperture_mm=8.0,
+    ),
+    "abdominal": ConvexProbe(
+        radius_mm=60.0, field_of_view_deg=70.0, depth_mm=160.0, frequency_mhz=3.5, aperture_mm=20.0,
+        elevation_aperture_mm=12.0,
+    ),
+}  # fmt: skip

@@ -154,10 +154,33 @@ _ALIASES = {
 }  # fmt: skip
 
 
+#: What a longer name, such as FreeSurfer's or a colleague's, is taken for by a word in it; the first that is found.
+_WORDS = {
+    "white matter": "white matter", "corpus callosum": "white matter", "ventricle": "csf", "csf": "csf",
+    "choroid plexus": "enhancing", "grey matter": "grey matter", "gray matter": "grey matter", "cortex": "grey matter",
+    "ctx": "grey matter", "thalamus": "grey matter", "caudate": "grey matter", "putamen": "grey matter",
+    "pallidum": "grey matter", "hippocampus": "grey matter", "amygdala": "grey matter", "accumbens": "grey matter",
+    "brain stem": "white matter", "tumor": "tumour", "tumour": "tumour", "glioma": "tumour", "metastasis": "tumour",
+    "meningioma": "tumour", "falx": "falx", "tentorium": "falx", "dura": "falx", "artery": "blood", "vein": "blood",
+    "vessel": "blood", "sinus": "blood", "skull": "skull", "scalp": "scalp", "skin": "scalp", "bone": "bone",
+    "muscle": "muscle", "liver": "liver", "kidney": "kidney", "fat": "fat", "cyst": "csf", "air": "air",
+}  # fmt: skip
+
+
+def _plain_name(name: str) -> str:
+    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+
+
 def tissue_named(name: str) -> Tissue:
-    """The preset for a tissue name (case and usual synonyms aside). Raises SimulationError for an unknown one."""
-    key = name.strip().lower().replace("_", " ")
+    """The preset for a tissue name: case, usual synonyms, and words in a longer name ("Left-Cerebral-White-Matter").
+
+    Raises SimulationError for a name that means none of them.
+    """
+    key = _plain_name(name)
     key = _ALIASES.get(key, key)
+    if key not in TISSUES:
+        texts = f" {key} ", f" {key} ".replace("s ", " ")  # as it stands, and without plurals
+        key = next((tissue for word, tissue in _WORDS.items() if any(f" {word} " in text for text in texts)), key)
     require(key in TISSUES, f"no preset for tissue {name!r}, expected one of: {', '.join(TISSUES)}")
     return TISSUES[key]
 
@@ -233,6 +256,25 @@ class TissueTable(Mapping):
             return TissueTable(self, replace(self.membrane, tissue=replace(self.membrane.tissue, **changes)))
         label = self.label_of(name)
         return TissueTable({**self, label: replace(self[label], **changes)}, self.membrane)
+
+    def for_names(self, names: Mapping[int, str]) -> TissueTable:
+        """A table for other labels: every tissue by its name, from this table if it has one of that name, else from the
+        presets; coupling medium and membrane stay.
+
+        Raises SimulationError that lists the names nobody knows.
+        """
+        mine = {_plain_name(tissue.name): tissue for tissue in self.values()}
+        table, unknown = {0: self[0]}, []
+        for label, name in names.items():
+            try:
+                table[label] = mine.get(_plain_name(name)) or tissue_named(name)
+            except SimulationError:
+                unknown.append(name)
+        require(
+            not unknown,
+            f"no tissue for {', '.join(map(repr, unknown))}, expected names among: {', '.join(TISSUES)}",
+        )
+        return TissueTable(table, self.membrane)
 
     def with_membrane(self, membrane: Membrane | None) -> TissueTable:
         """A new table with another membrane, or none."""

@@ -46,6 +46,7 @@ def _show_warning(message, category, *_, **__) -> None:
         click.echo(f"ussim: warning: {message}", err=True)
 
 
+_PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # probe.PROBES, which would import numpy
 _device_option = click.option(
     "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
 )
@@ -71,12 +72,13 @@ _sulci_option = click.option(
 @click.option(
     "--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain that nilearn carries)."
 )
-@click.option("--probe", "kind", type=click.Choice(["phased", "convex"]), default="phased", show_default=True)
+@click.option("--probe", "kind", type=click.Choice(_PROBE_NAMES), default="phased", show_default=True)
 @_seed_option
 @_device_option
 def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -> None:
     """The whole line on a real brain MRI: segmentation, a craniotomy view, pictures."""
-    from SlicerUSSim.Logic.demo import PROBES, demo_mri, run_demo
+    from SlicerUSSim.Logic.demo import demo_mri, run_demo
+    from SlicerUSSim.Logic.probe import PROBES
     from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
     from SlicerUSSim.Logic.volume import Volume
 
@@ -88,7 +90,7 @@ def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -
     times = summary["milliseconds"]
     click.echo(f"device: {summary['device']}")
     click.echo(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")
-    click.echo(f"wrote {out / 'figure.png'} and eight more files beside it")
+    click.echo(f"wrote {out / 'figure.png'} and nine more files beside it")
 
 
 @main.command()
@@ -139,26 +141,33 @@ _SCENE_OPTIONS = (
     click.option(
         "--labels/--mri", "is_labels", default=None, help="What the input is (default: few whole numbers are labels)."
     ),
-    click.option("--probe", "probe_file", type=click.Path(), help="Probe as JSON (default: the demo's phased array)."),
+    click.option(
+        "--preset", "preset_file", type=click.Path(),
+        help="Probe, display, settings and tissues as JSON, from `ussim demo` or the Slicer module; the options below "
+        "go before it.",
+    ),
+    click.option(
+        "--probe", "probe_file", type=click.Path(), help="Probe as JSON (default: the preset's, a phased array)."
+    ),
     click.option(
         "--tissues", "tissue_file", type=click.Path(),
-        help="Tissue table as JSON (default: beside the labels, or brain).",
+        help="Tissue table as JSON (default: the preset's, the file beside the labels, or brain).",
     ),
     _contrast_option,
     _mask_option,
     _sulci_option,
     click.option(
-        "--partial-volume/--hard-labels", default=False, show_default=True,
+        "--partial-volume/--hard-labels", default=None,
         help="Scatterers take their tissue by the segmentation's probabilities (from an MRI only).",
     ),
     click.option(
-        "--mri-modulation", type=float, default=0.0, show_default=True,
+        "--mri-modulation", type=float,
         help="Scatterers follow the MRI inside tissues, dB per standard deviation (from an MRI only).",
     ),
-    click.option("--gain", type=float, default=0.0, show_default=True, help="Gain [dB]."),
-    click.option("--dynamic-range", type=float, default=55.0, show_default=True, help="Dynamic range [dB]."),
-    click.option("--tgc", type=float, default=0.5, show_default=True, help="Time-gain compensation [dB/(cm MHz)]."),
-    _seed_option,
+    click.option("--gain", type=float, help="Gain [dB] (default: the preset's, 0)."),
+    click.option("--dynamic-range", type=float, help="Dynamic range [dB] (default: the preset's, 55)."),
+    click.option("--tgc", type=float, help="Time-gain compensation [dB/(cm MHz)] (default: the preset's, 0.5)."),
+    click.option("--seed", type=int, help="Which speckle and noise (default: the preset's, 0)."),
     _device_option,
 )  # fmt: skip
 
@@ -174,23 +183,26 @@ class _Scene:
     """A simulator for one patient, a probe, where it is, and how its images are shown."""
 
     def __init__(
-        self, mri_or_labels, pose, is_labels, probe_file, tissue_file, contrast, mask, thin_sulci, partial_volume,
-        mri_modulation, gain, dynamic_range, tgc, seed, device,
+        self, mri_or_labels, pose, is_labels, preset_file, probe_file, tissue_file, contrast, mask, thin_sulci,
+        partial_volume, mri_modulation, gain, dynamic_range, tgc, seed, device,
     ) -> None:  # fmt: skip
-        from SlicerUSSim.Logic.demo import PROBES
         from SlicerUSSim.Logic.placement import craniotomy_pose
         from SlicerUSSim.Logic.pose import read_pose
+        from SlicerUSSim.Logic.preset import Preset
         from SlicerUSSim.Logic.probe import probe_from_dict
         from SlicerUSSim.Logic.segmentation import segment_mri
-        from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
         from SlicerUSSim.Logic.simulator import UltrasoundSimulator
         from SlicerUSSim.Logic.tissues import TissueTable, read_json
         from SlicerUSSim.Logic.volume import Volume
 
         # What is cheap to check comes before what takes time.
-        self.display = DisplaySettings(gain_db=gain, dynamic_range_db=dynamic_range, tgc_db_cm_mhz=tgc)
-        settings = SimulationSettings(seed=seed, partial_volume=partial_volume, mri_modulation_db=mri_modulation)
-        self.probe = probe_from_dict(read_json(probe_file), str(probe_file)) if probe_file else PROBES["phased"]
+        preset = Preset.read(preset_file) if preset_file else Preset()
+        preset = preset.changed("display", **_given(gain_db=gain, dynamic_range_db=dynamic_range, tgc_db_cm_mhz=tgc))
+        preset = preset.changed(
+            "settings", **_given(seed=seed, partial_volume=partial_volume, mri_modulation_db=mri_modulation)
+        )
+        self.display, settings = preset.display, preset.settings
+        self.probe = probe_from_dict(read_json(probe_file), str(probe_file)) if probe_file else preset.probe
         matrix = None if pose == "auto" else read_pose(pose)
         volume = Volume.read(mri_or_labels)
         self.is_labels = _looks_like_labels(volume) if is_labels is None else is_labels
@@ -202,7 +214,7 @@ class _Scene:
                 )
             labels, names = volume, ("csf", "grey matter", "white matter", "leptomeninges")
             beside = _tissue_file(Path(mri_or_labels))
-            tissue_file = tissue_file or (beside if beside.exists() else None)
+            tissue_file = tissue_file or (beside if beside.exists() and not preset_file else None)
         else:
             with _share("segment") as progress:
                 result = segment_mri(
@@ -211,7 +223,12 @@ class _Scene:
                 )  # fmt: skip
             labels, names = result.labels, result.tissue_names
             texture = result.texture() if settings.needs_texture else None
-        tissues = TissueTable.read(tissue_file) if tissue_file else TissueTable.brain(names)
+        if tissue_file:
+            tissues = TissueTable.read(tissue_file)
+        elif preset_file and self.is_labels:
+            tissues = preset.tissues
+        else:
+            tissues = preset.tissues.for_names(dict(enumerate(names, 1)))
         self.simulator = UltrasoundSimulator(labels, tissues, settings, device, texture)
         self.pose = craniotomy_pose(labels, self.probe) if matrix is None else matrix
 
@@ -309,6 +326,11 @@ def devices(device: str | None) -> None:
     hint = faster_hint(chosen)
     if hint:
         click.echo(f"faster on this computer: {hint}")
+
+
+def _given(**options) -> dict:
+    """The options that were given."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _looks_like_labels(volume) -> bool:

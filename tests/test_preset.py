@@ -1,0 +1,98 @@
+"""Presets: one value, one file, checked as its parts are."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from SlicerUSSim.Logic import ConvexProbe, LinearProbe, Preset, SimulationError, TissueTable
+from SlicerUSSim.Logic.probe import PROBES
+from SlicerUSSim.Logic.tissues import tissue_named
+
+
+@given(
+    probe=st.sampled_from(sorted(PROBES)),
+    gain=st.floats(-60, 60),
+    noise=st.none() | st.floats(-120, 0),
+    size=st.none() | st.tuples(st.integers(8, 900), st.integers(8, 900)),
+    seed=st.integers(0, 2**32 - 1),
+    mu0=st.floats(0, 2),
+)
+def test_a_preset_survives_its_file(tmp_path_factory, probe, gain, noise, size, seed, mu0):
+    preset = Preset(PROBES[probe], tissues=TissueTable.brain().replace("csf", mu0=mu0))
+    preset = preset.changed("display", gain_db=gain, noise_db=noise, image_size=size).changed("settings", seed=seed)
+    path = tmp_path_factory.mktemp("preset") / "preset.json"
+    preset.write(path)
+    assert Preset.read(path) == preset
+
+
+def test_changing_the_kind_of_probe_keeps_what_both_have():
+    preset = Preset().changed("probe", depth_mm=70.0, frequency_mhz=4.0, focus_mm=30.0)
+    convex = preset.changed("probe", kind="convex").probe
+    assert isinstance(convex, ConvexProbe)
+    assert (convex.depth_mm, convex.frequency_mhz, convex.focus_mm) == (70.0, 4.0, 30.0)
+    assert convex.radius_mm == PROBES["convex"].radius_mm  # which a phased array does not have
+    linear = preset.changed("probe", kind="linear", width_mm=25.0).probe
+    assert isinstance(linear, LinearProbe) and linear.width_mm == 25.0
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"probes": {}}, "has 'probes', expected probe, display"),
+        ({"display": {"gain": 3}}, "display: 'gain' is unknown, expected one of gain_db"),
+        ({"display": {"gain_db": "loud"}}, "gain_db is 'loud', expected a number between -200 and 200"),
+        ({"display": {"image_size": 5}}, "display: a value has the wrong type"),
+        ({"settings": []}, "settings: is a list, expected an object"),
+        ({"probe": {"kind": "sector"}}, "probe: kind is 'sector'"),
+        ({"tissues": {"1": {"name": "x"}}}, "not a tissue table"),
+        ([], "is a list, expected an object"),
+    ],
+)
+def test_a_wrong_preset_is_refused_by_name(tmp_path, values, message):
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps(values))
+    with pytest.raises(SimulationError, match=r"mine\.json") as caught:
+        Preset.read(path)
+    assert message in str(caught.value)
+
+
+def test_changed_refuses_what_it_does_not_know():
+    with pytest.raises(SimulationError, match="no section 'tissue'"):
+        Preset().changed("tissue", mu0=1)
+    with pytest.raises(SimulationError, match="radius_mm is not a parameter of a phased probe"):
+        Preset().changed("probe", radius_mm=3)
+    with pytest.raises(SimulationError, match="kind is 'sector'"):
+        Preset().changed("probe", kind="sector")
+
+
+@pytest.mark.parametrize(
+    ("name", "tissue"),
+    [
+        ("Left-Cerebral-White-Matter", "white matter"),
+        ("ctx-lh-precuneus", "grey matter"),
+        ("3rd-Ventricle", "csf"),
+        ("Left-Thalamus-Proper", "grey matter"),
+        ("blood vessels", "blood"),
+        ("Gray_Matter", "grey matter"),
+    ],
+)
+def test_names_of_other_programs_find_their_tissue(name, tissue):
+    assert tissue_named(name).name == tissue
+
+
+@pytest.mark.parametrize("name", ["abscess", "grass", "Segment_1", "hairy"])
+def test_part_of_a_word_is_not_a_tissue(name):
+    with pytest.raises(SimulationError, match="no preset for tissue"):
+        tissue_named(name)
+
+
+def test_a_table_for_other_labels_keeps_edited_tissues_and_lists_all_it_does_not_know():
+    table = TissueTable.brain().replace("white matter", mu0=0.9)
+    other = table.for_names({7: "White_Matter", 3: "tumor"})
+    assert other[7].mu0 == 0.9 and other[3].name == "tumour" and other.membrane == table.membrane
+    with pytest.raises(SimulationError, match="no tissue for 'Segment_1', 'foo'"):
+        table.for_names({1: "Segment_1", 2: "foo", 3: "csf"})
