@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim import __version__
-from SlicerUSSim.Logic.errors import SimulationError
+from SlicerUSSim.Logic.errors import SimulationError, user_message
 
 
 class _Commands(click.Group):
@@ -19,17 +19,11 @@ class _Commands(click.Group):
     def invoke(self, ctx: click.Context):
         try:
             return super().invoke(ctx)
-        except SimulationError as error:
-            click.echo(f"ussim: {error}", err=True)
-            ctx.exit(2)
-        except MemoryError:
-            click.echo("ussim: not enough memory; use a smaller or coarser volume", err=True)
-            ctx.exit(2)
         except Exception as error:
-            if not type(error).__module__.startswith("pyopencl"):
+            message = user_message(error)
+            if message is None:
                 raise
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            click.echo(f"ussim: the OpenCL device failed ({reason}); choose another with --device", err=True)
+            click.echo(f"ussim: {message}", err=True)
             ctx.exit(2)
 
 

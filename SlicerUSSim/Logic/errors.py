@@ -9,6 +9,13 @@ class SimulationError(Exception):
     """
 
 
+class Cancelled(SimulationError):  # noqa: N818, what the user wanted is no error
+    """Raised by a progress function to stop the work that reports to it; nothing is changed or written."""
+
+    def __init__(self) -> None:
+        super().__init__("cancelled")
+
+
 def require(condition: bool, message: str) -> None:
     """Raise SimulationError(message) unless `condition` holds."""
     if not condition:
@@ -23,3 +30,15 @@ def require_between(owner: str, name: str, value: float, low: float, high: float
         inside = False
     if not inside:
         raise SimulationError(f"{owner}: {name} is {value!r}, expected a number between {low:g} and {high:g}")
+
+
+def user_message(error: Exception) -> str | None:
+    """One line for a user, where the error is one the user or the machine caused; None for a bug of ours."""
+    if isinstance(error, SimulationError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return "not enough memory; use a smaller or coarser volume"
+    if type(error).__module__.startswith("pyopencl"):
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        return f"the OpenCL device failed ({reason}); choose another device"
+    return None

@@ -46,6 +46,14 @@ class ImageGrid:
         matrix[1, 3] = self.top_mm + 0.5 * self.pixel_spacing_mm[1]
         return matrix
 
+    def field(self, probe: Probe) -> np.ndarray:
+        """(rows, columns) bool: which pixels lie in the field that `probe` images."""
+        x, y = self.left_mm, self.top_mm
+        dx, dy = self.pixel_spacing_mm
+        return probe.holds(
+            x + dx * (np.arange(self.columns) + 0.5)[None, :], y + dy * (np.arange(self.rows) + 0.5)[:, None]
+        )
+
 
 class ScanConverter:
     """Interpolates the grey levels of the scan lines at the pixels of an ImageGrid."""

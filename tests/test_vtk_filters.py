@@ -1,0 +1,339 @@
+"""The VTK filters: they execute when they must and only then, and their images are where the probe is."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonDataModel import vtkDataObject, vtkImageData
+from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+from vtkmodules.vtkCommonMath import vtkMatrix4x4
+from vtkmodules.vtkCommonTransforms import vtkTransform
+from vtkmodules.vtkImagingCore import vtkImageReslice
+from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+from SlicerUSSim.Logic import (
+    DisplaySettings,
+    LinearProbe,
+    Preset,
+    SimulationError,
+    SimulationSettings,
+    TissueTable,
+    UltrasoundSimulator,
+    Volume,
+    segment_mri,
+)
+from SlicerUSSim.Logic.phantoms import head_mri
+from SlicerUSSim.Logic.vtk_filters import SegmentationFilter, UltrasoundSimulationFilter, vtk_matrix
+from tests.conftest import FLUID, SPECKLE, block, rigid
+
+PROBE = LinearProbe(20, 30, scan_lines=48, focus_mm=15)
+DISPLAY = DisplaySettings(image_size=(96, 64))
+TISSUES = TissueTable({0: FLUID, 1: SPECKLE, 2: FLUID})
+
+
+def cyst() -> Volume:
+    return block(lambda x, y, z: np.where(x**2 + (y - 5) ** 2 + z**2 < 16, 2, 1), (12, 16, 8))
+
+
+def simulation(labels: Volume | None = None) -> UltrasoundSimulationFilter:
+    """A filter in front of a cyst, that counts its executions."""
+    result = UltrasoundSimulationFilter()
+    result.SetInputData((labels or cyst()).to_vtk())
+    result.SetProbe(PROBE)
+    result.SetDisplay(DISPLAY)
+    result.SetTissues(TISSUES)
+    result.SetProbeTransform(vtk_matrix(rigid(np.eye(3), [0, -15, 0])))
+    result.executions = 0
+
+    def count(*_):
+        result.executions += 1
+
+    result.AddObserver("StartEvent", count)
+    return result
+
+
+def executes(algorithm) -> bool:
+    before = algorithm.executions
+    algorithm.Update()
+    return algorithm.executions > before
+
+
+def test_the_image_is_the_simulators_at_the_probes_place():
+    algorithm = simulation()
+    algorithm.Update()
+    frame = UltrasoundSimulator(cyst(), TISSUES).simulate(PROBE, rigid(np.eye(3), [0, -15, 0]), DISPLAY)
+    volume = Volume.from_vtk(algorithm.GetOutput())
+    np.testing.assert_array_equal(volume.array[0], frame.image)
+    np.testing.assert_allclose(volume.ijk_to_ras, frame.to_volume().ijk_to_ras, atol=1e-12)
+    np.testing.assert_array_equal(algorithm.GetFrame().iq, frame.iq)
+
+
+def test_it_executes_when_something_changes_and_only_then():
+    algorithm = simulation()
+    assert executes(algorithm) and not executes(algorithm)
+    changes = {
+        "probe": lambda: algorithm.SetProbe(LinearProbe(20, 25, scan_lines=48)),
+        "display": lambda: algorithm.SetDisplay(DisplaySettings(gain_db=3, image_size=(96, 64))),
+        "settings": lambda: algorithm.SetSettings(SimulationSettings(seed=2)),
+        "tissues": lambda: algorithm.SetTissues(TISSUES.replace("speckle", mu0=0.5)),
+        "transform": lambda: algorithm.SetProbeTransform(vtk_matrix(rigid(np.eye(3), [1, -15, 0]))),
+        "labels": lambda: algorithm.SetInputData(cyst().to_vtk()),
+        "alpha": lambda: algorithm.SetFieldAlpha(True),
+    }
+    for name, change in changes.items():
+        change()
+        assert executes(algorithm), name
+        if name not in ("transform", "labels"):  # those are other objects each time
+            change()
+        assert not executes(algorithm), f"{name}, set to what it was"
+
+
+def test_a_transform_deep_in_a_chain_moves_the_image():
+    algorithm = simulation()
+    matrix, inner, outer = vtkMatrix4x4(), vtkTransform(), vtkTransform()
+    inner.SetInput(outer)
+    algorithm.SetProbeTransform(inner)
+    assert executes(algorithm)
+    outer.Translate(0, -15, 0)
+    assert executes(algorithm) and not executes(algorithm)
+    assert algorithm.GetOutput().GetOrigin()[1] == pytest.approx(-15 + 30 / 96 / 2)
+    algorithm.SetProbeTransform(matrix)
+    algorithm.Update()
+    matrix.SetElement(1, 3, -10.0)
+    assert executes(algorithm) and not executes(algorithm)
+    assert algorithm.GetOutput().GetOrigin()[1] == pytest.approx(-10 + 30 / 96 / 2)
+    np.testing.assert_allclose(algorithm.GetOutput(1).GetBounds(), (-10, 10, -10, 20, 0, 0), atol=1e-5)  # the outline
+
+
+def test_voxels_that_change_in_place_are_seen():
+    algorithm = simulation()
+    image = cyst().to_vtk()
+    algorithm.SetInputData(image)
+    algorithm.Update()
+    before = vtk_to_numpy(algorithm.GetOutput().GetPointData().GetScalars()).copy()
+    vtk_to_numpy(image.GetPointData().GetScalars())[:] = 1
+    image.Modified()
+    assert executes(algorithm)
+    after = vtk_to_numpy(algorithm.GetOutput().GetPointData().GetScalars())
+    assert after.astype(float).mean() > before.astype(float).mean()  # the cyst is gone
+
+
+@settings(max_examples=10)
+@given(
+    angles=st.tuples(*[st.floats(-180, 180)] * 3),
+    place=st.tuples(*[st.floats(-100, 100)] * 3),
+    first=st.tuples(*[st.integers(-5, 5)] * 3),
+)
+def test_the_information_pass_knows_the_geometry_before_anything_is_computed(angles, place, first):
+    """For any pose, and for labels with any place, direction and first index."""
+    pose = rigid(Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), place)
+    labels = cyst()
+    image = Volume(labels.array, pose @ labels.ijk_to_ras).to_vtk()
+    origin, extent = [0.0] * 3, image.GetExtent()
+    image.TransformIndexToPhysicalPoint(*(-n for n in first), origin)
+    image.SetExtent(*(extent[n] + first[n // 2] for n in range(6)))  # as vtkExtractVOI leaves it
+    image.SetOrigin(origin)
+    algorithm = simulation()
+    algorithm.SetInputData(image)
+    algorithm.SetProbeTransform(vtk_matrix(pose @ rigid(np.eye(3), [0, -15, 0])))
+    algorithm.UpdateInformation()
+    info = algorithm.GetOutputInformation(0)
+    assert algorithm.executions == 0
+    whole = info.Get(vtkStreamingDemandDrivenPipeline.WHOLE_EXTENT())
+    promised = {key: info.Get(getattr(vtkDataObject, key)()) for key in ("SPACING", "ORIGIN", "DIRECTION")}
+    algorithm.Update()
+    output = algorithm.GetOutput()
+    assert whole == output.GetExtent()
+    np.testing.assert_allclose(promised["SPACING"], output.GetSpacing(), rtol=1e-9)
+    np.testing.assert_allclose(promised["ORIGIN"], output.GetOrigin(), atol=1e-9)
+    np.testing.assert_allclose(promised["DIRECTION"], output.GetDirectionMatrix().GetData(), atol=1e-6)
+    # The cyst is seen where it is: black in the middle of the image, whatever the pose.
+    picture = Volume.from_vtk(output).array[0].astype(float)
+    assert picture[58:68, 28:36].mean() < 0.3 * picture[8:24, 10:54].mean()
+
+
+def test_reslicing_the_image_on_another_grid_finds_its_pixels():
+    pose = rigid(Rotation.from_euler("xyz", [20, -30, 50], degrees=True).as_matrix(), [3, -15, 2])
+    algorithm = simulation(Volume(cyst().array, pose @ rigid(np.eye(3), [0, 15, 0]) @ cyst().ijk_to_ras))
+    algorithm.SetProbeTransform(vtk_matrix(pose))
+    algorithm.Update()
+    image = Volume.from_vtk(algorithm.GetOutput())
+    for column, row in ((10, 20), (40, 70), (63, 95)):
+        reslice = vtkImageReslice()
+        reslice.SetInputConnection(algorithm.GetOutputPort())
+        reslice.SetOutputDirection(1, 0, 0, 0, 1, 0, 0, 0, 1)
+        reslice.SetOutputOrigin(*(image.ijk_to_ras @ [column, row, 0, 1])[:3])
+        reslice.SetOutputExtent(0, 0, 0, 0, 0, 0)
+        reslice.Update()
+        assert reslice.GetOutput().GetScalarComponentAsDouble(0, 0, 0, 0) == image.array[0, row, column]
+
+
+def test_a_writer_stores_image_and_place(tmp_path):
+    algorithm = simulation()
+    writer = vtkXMLImageDataWriter()
+    writer.SetInputConnection(algorithm.GetOutputPort())
+    writer.SetFileName(str(tmp_path / "image.vti"))
+    writer.Write()
+    read = Volume.read(tmp_path / "image.vti")
+    np.testing.assert_array_equal(read.array[0], algorithm.GetFrame().image)
+    np.testing.assert_allclose(read.ijk_to_ras, algorithm.GetFrame().to_volume().ijk_to_ras, atol=1e-6)
+
+
+def test_alpha_is_the_imaged_field():
+    algorithm = simulation()
+    algorithm.SetProbe(Preset().probe)
+    algorithm.SetFieldAlpha(True)
+    algorithm.Update()
+    both = vtk_to_numpy(algorithm.GetOutput().GetPointData().GetScalars()).reshape(96, 64, 2)
+    np.testing.assert_array_equal(both[..., 0], algorithm.GetFrame().image)
+    outside = both[..., 1] == 0
+    assert 0.2 < outside.mean() < 0.6 and not algorithm.GetFrame().image[outside].any()
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda f: f.SetInputData(vtkImageData()), "vtkImageData is empty"),
+        (lambda f: f.SetProbeTransform(vtk_matrix(np.diag([2.0, 1, 1, 1]))), "probe transform is not rigid"),
+        (lambda f: f.SetTissues(TissueTable({1: SPECKLE})), "label 2 has no tissue"),
+        (lambda f: f.SetDevice("abacus"), "abacus"),
+    ],
+)
+def test_what_is_wrong_is_one_error_event_and_no_image(break_it, message):
+    algorithm = simulation()
+    algorithm.Update()
+    heard = []
+
+    def hear(caller, event, text=None):
+        heard.append(text)
+
+    hear.CallDataType = "string0"
+    algorithm.AddObserver("ErrorEvent", hear)
+    algorithm.GetExecutive().AddObserver("ErrorEvent", lambda *_: None)  # VTK's own "a request failed"
+    break_it(algorithm)
+    algorithm.Update()
+    assert len(heard) == 1 and message in heard[0] and "\n" not in heard[0]
+    assert algorithm.GetErrorMessage() == heard[0]
+    assert algorithm.GetOutput().GetNumberOfPoints() == 0
+    # And it recovers.
+    mended = simulation()
+    algorithm.SetInputData(mended.GetInputDataObject(0, 0))
+    algorithm.SetProbeTransform(vtkTransform())
+    algorithm.SetTissues(TISSUES)
+    algorithm.SetDevice(None)
+    algorithm.Update()
+    assert algorithm.GetErrorMessage() == "" and algorithm.GetOutput().GetNumberOfPoints() == 96 * 64
+
+
+def test_a_transform_of_another_kind_is_refused_at_once():
+    with pytest.raises(SimulationError, match="probe transform is a str"):
+        UltrasoundSimulationFilter().SetProbeTransform("up")
+
+
+def test_segmentation_labels_as_the_function_does_and_names_travel():
+    mri = head_mri(3.0)
+    segmentation = SegmentationFilter()
+    segmentation.SetInputData(mri.to_vtk())
+    shares = []
+    segmentation.AddObserver("ProgressEvent", lambda caller, _: shares.append(caller.GetProgress()))
+    algorithm = UltrasoundSimulationFilter()
+    algorithm.SetInputConnection(segmentation.GetOutputPort())
+    algorithm.SetProbe(PROBE)
+    algorithm.Update()
+    expected = segment_mri(mri, thin_sulci=True)
+    labels = Volume.from_vtk(segmentation.GetOutput())
+    np.testing.assert_array_equal(labels.array, expected.labels.array)
+    np.testing.assert_allclose(labels.ijk_to_ras, mri.ijk_to_ras, atol=1e-9)
+    assert segmentation.GetSegmentation().tissue_names == expected.tissue_names
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    # With T2, label 1 is white matter; the names, not the numbers, choose the tissues.
+    segmentation.SetContrast("t2")
+    algorithm.Update()
+    assert segmentation.GetSegmentation().tissue_names[0] == "white matter"
+    assert algorithm._simulator._simulator.medium.tissues[1].name == "white matter"
+
+
+def test_segmentation_takes_a_mask_and_can_be_stopped():
+    mri = head_mri(3.0)
+    mask = mri.with_array((np.indices(mri.array.shape)[2] < mri.array.shape[2] // 2).astype(np.uint8))
+    segmentation = SegmentationFilter()
+    segmentation.SetInputData(mri.to_vtk())
+    segmentation.SetMaskData(mask.to_vtk())
+    segmentation.Update()
+    labels = Volume.from_vtk(segmentation.GetOutput()).array
+    assert labels[mask.array > 0].any() and not labels[mask.array == 0].any()
+
+    segmentation.GetExecutive().AddObserver("ErrorEvent", lambda *_: None)
+    stop = segmentation.AddObserver("ProgressEvent", lambda caller, _: caller.SetAbortExecute(1))
+    segmentation.SetClasses(3)
+    segmentation.Modified()
+    segmentation.Update()
+    assert segmentation.GetOutput().GetNumberOfPoints() == 0 and segmentation.GetErrorMessage() == ""
+    segmentation.RemoveObserver(stop)
+    segmentation.SetAbortExecute(0)
+    segmentation.Modified()
+    segmentation.Update()
+    np.testing.assert_array_equal(Volume.from_vtk(segmentation.GetOutput()).array, labels)
+
+
+@pytest.fixture(scope="module")
+def rendered(mni):
+    """The example's scene and the pixels of its window."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+    try:
+        import vtk_pipeline
+    finally:
+        sys.path.pop(0)
+    return vtk_pipeline, vtk_pipeline.build(mni[0])
+
+
+def pixels(example, scene, path) -> np.ndarray:
+    from PIL import Image
+
+    scene.window.Render()
+    example.write_png(scene.window, str(path))
+    return np.asarray(Image.open(path).convert("RGB")).astype(int)
+
+
+def test_the_example_shows_mri_outline_and_ultrasound_in_one_window(rendered, tmp_path):
+    example, scene = rendered
+    picture = pixels(example, scene, tmp_path / "window.png")
+    assert picture.shape == (600, 1200, 3)
+    left = picture[:, :600]
+    yellow = (left[..., 0] > 150) & (left[..., 1] > 120) & (left[..., 2] < 90)
+    assert 800 < yellow.sum() < 6000
+    rows, columns = np.nonzero(yellow)
+    assert rows.min() < 110 and rows.max() > 480 and columns.min() < 40 and columns.max() > 560  # the whole fan
+    # Speckle inside the fan, the smooth MRI outside it.
+    inside, outside = left[300:360, 120:180, 0], left[250:290, 50:80, 0]
+    assert inside.std() > 8 and outside.mean() > 120
+    # In the plane of the probe a pixel of the window shows the pixel of the frame that is there.
+    frame = scene.simulation.GetFrame()
+    mm_per_pixel = 150.0 / 600.0
+    for column in range(200, 420, 20):
+        x, y = (column + 0.5 - 300) * mm_per_pixel, (300.5 - 300) * mm_per_pixel + 50.0
+        shown = left[295:306, column - 5 : column + 6, 0].mean()
+        to_pixel = np.linalg.inv(frame.image_to_probe)
+        at = (to_pixel @ [x, y, 0, 1])[:2].round().astype(int)
+        half = round(5 * mm_per_pixel / frame.pixel_spacing_mm[0])
+        true = frame.image[at[1] - half : at[1] + half + 1, at[0] - half : at[0] + half + 1].mean()
+        assert shown == pytest.approx(true, abs=12), column
+
+
+def test_moving_the_transform_moves_the_picture(rendered, tmp_path):
+    example, scene = rendered
+    before = pixels(example, scene, tmp_path / "before.png")
+    again = pixels(example, scene, tmp_path / "again.png")
+    np.testing.assert_array_equal(before, again)
+    scene.transform.Translate(0, 0, 5)
+    moved = pixels(example, scene, tmp_path / "moved.png")
+    scene.transform.Translate(0, 0, -5)
+    assert np.abs(moved - before)[150:400, 200:400].mean() > 10
+    np.testing.assert_array_equal(pixels(example, scene, tmp_path / "back.png"), before)
