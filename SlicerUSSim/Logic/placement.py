@@ -39,7 +39,7 @@ def surface_point(foreground: Volume, target_ras, outward_ras) -> np.ndarray:
     """
     target, outward = np.asarray(target_ras, float), np.asarray(outward_ras, float)
     outward = outward / np.linalg.norm(outward)
-    distance = np.arange(0.0, 400.0, 0.25)
+    distance = np.arange(0.0, 500.0, 0.25)
     points = target + distance[:, None] * outward
     inside = sample(foreground, points, order=0) > 0
     require(bool(inside.any()), f"no tissue from {target.tolist()} in direction {outward.round(3).tolist()}")
@@ -60,6 +60,23 @@ def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standof
     target = centre + [0.0, 0.0, 2.0]
     face = surface_point(brain, target, outward) + standoff_mm * outward
     return pose_looking_at(face, target, lateral_ras=(1.0, 0.0, 0.0))
+
+
+def pose_in_slice(foreground: Volume, slice_to_ras: np.ndarray, target_ras=None) -> np.ndarray:
+    """(4, 4) probe_to_ras of a probe on the surface whose image lies in a slice view and stands as the view does.
+
+    `slice_to_ras` (4, 4) has the view's right, up and normal as its columns and its middle as its origin, as Slicer's
+    slice nodes have. The probe comes from the top of the view, and its axis runs down through `target_ras` (default:
+    the middle of the view), moved into the slice.
+    Raises SimulationError if no foreground (non-zero voxels) lies above or below the target in the view.
+    """
+    right, up, normal = (slice_to_ras[:3, n] / np.linalg.norm(slice_to_ras[:3, n]) for n in range(3))
+    middle = slice_to_ras[:3, 3]
+    target = middle if target_ras is None else np.asarray(target_ras, float)
+    target = target - ((target - middle) @ normal) * normal
+    # From below everything, so that a target in the coupling medium beneath the patient still meets the surface above.
+    face = surface_point(foreground, target - 200.0 * up, up)
+    return pose_looking_at(face, face - up, lateral_ras=right)
 
 
 def slide_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int) -> list[np.ndarray]:

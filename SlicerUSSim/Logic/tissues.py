@@ -171,6 +171,11 @@ def _plain_name(name: str) -> str:
     return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
 
 
+def same_name(a: str, b: str) -> bool:
+    """Whether two names differ only in case, hyphens and underscores."""
+    return _plain_name(a) == _plain_name(b)
+
+
 def tissue_named(name: str) -> Tissue:
     """The preset for a tissue name: case, usual synonyms, and words in a longer name ("Left-Cerebral-White-Matter").
 

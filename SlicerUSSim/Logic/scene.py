@@ -1,0 +1,293 @@
+"""UltrasoundSceneLogic: the simulator on the nodes of a MRML scene, in 3D Slicer or without it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.frame import Frame
+from SlicerUSSim.Logic.placement import craniotomy_pose, pose_in_slice
+from SlicerUSSim.Logic.preset import Preset
+from SlicerUSSim.Logic.reuse import ReusedSimulator
+from SlicerUSSim.Logic.scene_live import LiveUpdate
+from SlicerUSSim.Logic.scene_nodes import (
+    LabelledTissues,
+    labels_version,
+    named,
+    node_to_world,
+    pose_in_labels,
+    probe_pose,
+    read_labels,
+    read_mask,
+    read_volume,
+    require_node,
+    set_node_to_world,
+    write_image,
+    write_labels,
+    write_outline,
+)
+from SlicerUSSim.Logic.scene_parameters import SceneParameters
+from SlicerUSSim.Logic.segmentation import Segmentation, segment_mri
+from SlicerUSSim.Logic.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.texture import Texture
+from SlicerUSSim.Logic.tissues import TissueTable
+from SlicerUSSim.Logic.volume import Volume, check_rigid
+
+
+class UltrasoundSceneLogic:
+    """Simulates on the nodes of one scene.
+
+    What is set (`preset`, and the nodes the module works with) is kept in the scene, see scene_parameters. Every method
+    raises SimulationError for a node that is missing, empty, of the wrong kind or under a transform that is not linear.
+
+    Parameters
+    ----------
+    scene : vtkMRMLScene.
+    device : see device.choose_device.
+    """
+
+    def __init__(self, scene, device: str | None = None) -> None:
+        self.scene = scene
+        self.device = device
+        self.parameters = SceneParameters(scene)
+        self._simulator = ReusedSimulator()
+        self._labelled: tuple[object, LabelledTissues] | None = None  # of the version before it
+        self._texture: tuple[object, Callable[[], Texture]] | None = None  # of the labels of that version
+        self._preset: tuple[str, Preset] = ("", Preset())
+        self._live: LiveUpdate | None = None
+
+    # ---- what is set -------------------------------------------------------------------------------------------
+
+    @property
+    def preset(self) -> Preset:
+        """Probe, display, settings and tissues; kept in the scene. Raises SimulationError if the scene holds another
+        thing in its place."""
+        text = self.parameters.preset
+        if text != self._preset[0]:
+            try:
+                values = json.loads(text)
+            except ValueError as error:
+                raise SimulationError(f"the scene's preset is not JSON ({error})") from None
+            self._preset = (text, Preset.from_dict(values, "the scene's preset"))
+        return self._preset[1]
+
+    @preset.setter
+    def preset(self, preset: Preset) -> None:
+        text = json.dumps(preset.to_dict())
+        self._preset = (text, preset)
+        self.parameters.preset = text
+
+    def tissues(self, labels_node) -> TissueTable:
+        """The tissues of a label map or segmentation: what the preset says about those names, else the presets."""
+        return self.preset.tissues.for_names(dict(enumerate(self._read_labels(labels_node).names, 1)))
+
+    # ---- once --------------------------------------------------------------------------------------------------
+
+    def segment(
+        self,
+        mri_node,
+        labels_node,
+        *,
+        mask_node=None,
+        classes: int = 3,
+        contrast: str = "t1",
+        filter_radius: int = 1,
+        bias_correction: bool = False,
+        thin_sulci: bool = True,
+        progress: Callable[[float], None] | None = None,
+    ) -> Segmentation:
+        """Label the tissues of a scalar volume into a label map or segmentation node, with names and colours.
+
+        See segmentation.segment_mri; `mask_node` is a label map on the MRI's grid, or a segmentation. `progress` may
+        raise errors.Cancelled; the nodes are then as they were.
+        """
+        require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="output of Segment")
+        require(labels_node is not mri_node, f"input and output are both {named(mri_node)}, expected two nodes")
+        mri = read_volume(mri_node, "MRI")
+        mask = None if mask_node is None else read_mask(mask_node, mri_node)
+        require(mask_node is not labels_node, f"mask and output are both {named(labels_node)}, expected two nodes")
+        result = segment_mri(
+            mri, classes=classes, contrast=contrast, mask=mask, filter_radius=filter_radius,
+            bias_correction=bias_correction, thin_sulci=thin_sulci, device=self.device, progress=progress,
+        )  # fmt: skip
+        require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="output of Segment")
+        write_labels(labels_node, result.labels, result.tissue_names, mri_node)
+        self._texture = (labels_version(labels_node), cache(result.texture))
+        return result
+
+    def simulate(self, labels_node, probe_transform_node, output_node) -> Frame:
+        """The image under the probe, into a scalar volume node that is put under the probe's transform.
+
+        `labels_node` is a label map or a segmentation; its names choose the tissues, see scene_nodes.read_labels.
+        """
+        self._check_output(labels_node, output_node)
+        frame = self._frame(labels_node, probe_pose(probe_transform_node))
+        write_image(output_node, frame, probe_transform_node)
+        return frame
+
+    def simulateSequence(
+        self,
+        labels_node,
+        transforms_node,
+        images_node,
+        *,
+        browser_node=None,
+        progress: Callable[[float], None] | None = None,
+    ) -> int:
+        """A sequence of simulated images from a vtkMRMLSequenceNode of linear transforms; returns how many.
+
+        Images are in the probe frame with the transforms' index values. With the browser of the transforms, its current
+        transform's parents count, and the images are added to it, under that transform. `progress` is told the share
+        done and may raise errors.Cancelled; `images_node` is then as it was.
+        """
+        require_node(transforms_node, "vtkMRMLSequenceNode", use="sequence of transforms")
+        require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
+        require(images_node is not transforms_node, f"input and output are both {named(images_node)}, expected two")
+        count = transforms_node.GetNumberOfDataNodes()
+        require(count > 0, f"sequence {named(transforms_node)} is empty, expected transforms")
+        proxy = None if browser_node is None else browser_node.GetProxyNode(transforms_node)
+        parent = None if proxy is None else proxy.GetParentTransformNode()
+        to_world = np.eye(4) if parent is None else node_to_world(parent)
+
+        images = []
+        for number in range(count):
+            item = transforms_node.GetNthDataNode(number)
+            require_node(item, "vtkMRMLTransformNode", use=f"item {number} of {named(transforms_node)}")
+            pose = check_rigid(f"item {number} of {named(transforms_node)}", to_world @ node_to_world(item))
+            frame = self._frame(labels_node, pose)
+            image = self.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
+            image.UnRegister(None)
+            write_image(image, frame)
+            images.append(image)
+            if progress is not None:
+                progress((number + 1) / count)
+        require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
+
+        images_node.RemoveAllDataNodes()
+        images_node.SetIndexName(transforms_node.GetIndexName())
+        images_node.SetIndexUnit(transforms_node.GetIndexUnit())
+        images_node.SetIndexType(transforms_node.GetIndexType())
+        for number, image in enumerate(images):
+            images_node.SetDataNodeAtValue(image, transforms_node.GetNthIndexValue(number))
+        if browser_node is not None:
+            if not browser_node.IsSynchronizedSequenceNode(images_node, True):
+                browser_node.AddSynchronizedSequenceNode(images_node)
+            shown = browser_node.GetProxyNode(images_node)
+            if shown is not None and proxy is not None:
+                shown.SetAndObserveTransformNodeID(proxy.GetID())
+        return count
+
+    def placeProbe(self, labels_node, probe_transform_node, slice_node=None, target_ras=None) -> None:
+        """Put the probe on the surface of what is labelled, looking inwards.
+
+        With a slice node the image lies in that slice, its depth running down the view, aimed at `target_ras` (the
+        middle of the view by default). Without one it is a coronal view through a parasagittal craniotomy.
+        """
+        require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
+        labelled = self._read_labels(labels_node)
+        to_world = node_to_world(labels_node)
+        surface = Volume(labelled.volume.array, to_world @ labelled.volume.ijk_to_ras)
+        if slice_node is None:
+            pose = craniotomy_pose(surface, self.preset.probe)
+        else:
+            require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
+            matrix = slice_node.GetSliceToRAS()
+            slice_to_ras = np.array([[matrix.GetElement(r, c) for c in range(4)] for r in range(4)])
+            pose = pose_in_slice(surface, slice_to_ras, target_ras)
+        set_node_to_world(probe_transform_node, pose)
+
+    def showOutline(self, model_node, probe_transform_node) -> None:
+        """The outline of the imaged field as a model under the probe's transform."""
+        require_node(model_node, "vtkMRMLModelNode", use="outline")
+        require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
+        write_outline(model_node, self.preset.probe, probe_transform_node)
+
+    # ---- live --------------------------------------------------------------------------------------------------
+
+    @property
+    def isLive(self) -> bool:
+        """Whether images follow the probe."""
+        return self._live is not None and self._live.running
+
+    def startLiveUpdate(
+        self,
+        labels_node,
+        probe_transform_node,
+        output_node,
+        outline_node=None,
+        *,
+        schedule: Callable[[Callable[[], None]], None] | None = None,
+        report: Callable[[str], None] | None = None,
+        stopped: Callable[[], None] | None = None,
+    ) -> None:
+        """Simulate now, and again whenever the transform or its parents, the labels or the preset change.
+
+        `schedule(function)` has to call `function` once, soon, from the event loop (in Slicer: qt.QTimer.singleShot(0,
+        function)). However many changes come before that, one image is computed, of the last. Without an event loop
+        the image is computed within the change itself.
+        `report` is told "" after an image, and otherwise one line about what is wrong; the update goes on, since what
+        is wrong may be mended. `stopped` is called when it ends: by stopLiveUpdate, when one of its nodes or the scene
+        goes away, or when another live update takes over the output.
+        """
+        self.stopLiveUpdate()
+        self._check_output(labels_node, output_node)
+        self.simulate(labels_node, probe_transform_node, output_node)  # raises what is wrong here and now
+        if outline_node is not None:
+            self.showOutline(outline_node, probe_transform_node)
+        self._live = LiveUpdate(
+            self, labels_node, probe_transform_node, output_node, outline_node, schedule, report, stopped
+        )
+
+    def stopLiveUpdate(self) -> None:
+        """Let the image rest; nothing is observed any more."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    # ---- inside ------------------------------------------------------------------------------------------------
+
+    def _check_output(self, labels_node, output_node) -> None:
+        require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
+        require(labels_node is not output_node, f"input and output are both {named(output_node)}, expected two nodes")
+        require(
+            not output_node.IsA("vtkMRMLLabelMapVolumeNode"),
+            f"output is {named(output_node)}, expected a ScalarVolume node",
+        )
+        require(
+            output_node is not self.parameters.mri, f"output is the MRI {named(output_node)}, expected another volume"
+        )
+
+    def _read_labels(self, labels_node) -> LabelledTissues:
+        require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map")
+        known = tuple(tissue.name for tissue in self.preset.tissues.values())
+        version = (labels_version(labels_node), known)
+        if self._labelled is None or self._labelled[0] != version:
+            self._labelled = (version, read_labels(labels_node, self.preset.tissues))
+        return self._labelled[1]
+
+    def _frame(self, labels_node, probe_to_world: np.ndarray) -> Frame:
+        labelled = self._read_labels(labels_node)
+        pose, moved = pose_in_labels(labels_node, probe_to_world)
+        return self._simulator_for(labels_node, labelled, moved).simulate(self.preset.probe, pose, self.preset.display)
+
+    def _simulator_for(self, labels_node, labelled: LabelledTissues, moved: np.ndarray) -> UltrasoundSimulator:
+        preset, texture = self.preset, None
+        if preset.settings.needs_texture:
+            require(
+                self._texture is not None and self._texture[0] == labels_version(labels_node),
+                f"the settings want more of the MRI than {named(labels_node)} holds; segment the MRI again, or set "
+                "partial_volume to false and mri_modulation_db to 0",
+            )
+            texture = self._texture[1]()
+        return self._simulator.get(
+            (self._labelled[0], moved.tobytes()),
+            lambda: Volume(labelled.volume.array, moved @ labelled.volume.ijk_to_ras),
+            preset.tissues.for_names(dict(enumerate(labelled.names, 1))),
+            preset.settings,
+            self.device,
+            texture,
+        )

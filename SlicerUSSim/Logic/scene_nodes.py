@@ -1,0 +1,378 @@
+"""Between MRML nodes and this package's values: volumes, labels and their names, poses, images, outlines.
+
+Only this file and scene.py know the `slicer` namespace, 3D Slicer's or that of the slicer-core wheel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import slicer
+from vtkmodules.vtkCommonCore import vtkIntArray, vtkStringArray
+from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.frame import Frame
+from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.tissues import TISSUES, TissueTable, same_name, tissue_named
+from SlicerUSSim.Logic.volume import Volume, check_rigid
+from SlicerUSSim.Logic.vtk_filters import matrix_array, outline_polydata, set_scalars, vtk_matrix
+
+#: Colours of tissues in label maps and segmentations, red, green, blue from 0 to 1.
+COLOURS = {
+    "csf": (0.17, 0.37, 0.54), "grey matter": (0.55, 0.55, 0.55), "white matter": (0.91, 0.89, 0.85),
+    "leptomeninges": (0.78, 0.35, 0.33), "enhancing": (0.85, 0.64, 0.25), "tumour": (0.37, 0.62, 0.43),
+    "falx": (0.56, 0.42, 0.70), "blood": (0.75, 0.10, 0.10), "skull": (0.95, 0.93, 0.75), "bone": (0.95, 0.93, 0.75),
+    "scalp": (0.87, 0.72, 0.63), "fat": (0.93, 0.83, 0.45), "muscle": (0.70, 0.33, 0.29), "liver": (0.52, 0.23, 0.19),
+    "kidney": (0.65, 0.30, 0.25), "water": (0.30, 0.60, 0.85), "gel": (0.45, 0.75, 0.85), "air": (0.85, 0.95, 1.0),
+}  # fmt: skip
+_OTHER_COLOUR = (0.3, 0.75, 0.8)
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledTissues:
+    """A label map or segmentation as the simulator takes it: one label per tissue."""
+
+    #: uint8 labels in the node's own frame, before its parent transform
+    volume: Volume
+    #: Name of the tissue of label 1, 2, ...
+    names: tuple[str, ...]
+
+
+def named(node) -> str:
+    """How a message calls a node: its kind and name."""
+    if node is None:
+        return "no node"
+    kind = node.GetNodeTagName() if hasattr(node, "GetNodeTagName") else type(node).__name__
+    return f"{kind} {node.GetName()!r}"
+
+
+def require_node(node, *classes: str, use: str) -> None:
+    """Raise SimulationError unless `node` is of one of the classes and still in a scene."""
+    words = " or ".join(name.removeprefix("vtkMRML").removesuffix("Node") for name in classes)
+    require(node is not None, f"no {use} chosen, expected a {words} node")
+    require(
+        hasattr(node, "IsA") and any(node.IsA(name) for name in classes),
+        f"{use} is {named(node)}, expected a {words} node",
+    )
+    require(node.GetScene() is not None, f"{use} {named(node)} is not in a scene any more; choose another")
+
+
+# ---- where nodes are -------------------------------------------------------------------------------------------------
+
+
+def node_to_world(node) -> np.ndarray:
+    """(4, 4) from a node's own frame to the world (RAS): its parent transforms; for a transform node, itself too.
+
+    Raises SimulationError where a transform on the way is not linear.
+    """
+    transform = node if node.IsA("vtkMRMLTransformNode") else node.GetParentTransformNode()
+    if transform is None:
+        return np.eye(4)
+    matrix = vtkMatrix4x4()
+    require(
+        bool(transform.IsTransformToWorldLinear()) and bool(transform.GetMatrixTransformToWorld(matrix)),
+        f"{named(node)} is under a transform that is not linear; harden it or use a linear one",
+    )
+    return matrix_array(matrix)
+
+
+def set_node_to_world(transform_node, matrix: np.ndarray) -> None:
+    """Set a linear transform node so that it and its parents together are `matrix` (4, 4)."""
+    parent = transform_node.GetParentTransformNode()
+    to_parent = matrix if parent is None else np.linalg.inv(node_to_world(parent)) @ matrix
+    transform_node.SetMatrixTransformToParent(vtk_matrix(to_parent))
+
+
+def probe_pose(transform_node) -> np.ndarray:
+    """(4, 4) probe_to_ras of a transform node with all its parents. Raises SimulationError unless it is rigid."""
+    require_node(transform_node, "vtkMRMLTransformNode", use="probe transform")
+    return check_rigid(named(transform_node), node_to_world(transform_node))
+
+
+def pose_in_labels(labels_node, probe_to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(probe pose, what the volume has to be moved by), both (4, 4), in one rigid frame.
+
+    A rigid transform of the labels is taken out of the pose, so that moving them costs nothing; one that scales has to
+    be put into the volume.
+    """
+    labels_to_world = node_to_world(labels_node)
+    try:
+        check_rigid("labels", labels_to_world)
+    except SimulationError:
+        return probe_to_world, labels_to_world
+    return np.linalg.inv(labels_to_world) @ probe_to_world, np.eye(4)
+
+
+# ---- volumes ---------------------------------------------------------------------------------------------------------
+
+
+def ijk_to_ras(volume_node) -> np.ndarray:
+    """(4, 4) of a volume node, in its own frame."""
+    matrix = vtkMatrix4x4()
+    volume_node.GetIJKToRASMatrix(matrix)
+    return matrix_array(matrix)
+
+
+def read_volume(volume_node, use: str = "volume") -> Volume:
+    """The image of a scalar volume node, in its own frame; its voxels are shared, not copied.
+
+    Raises SimulationError for another node, and for one without image data.
+    """
+    require_node(volume_node, "vtkMRMLScalarVolumeNode", use=use)
+    image = volume_node.GetImageData()
+    require(image is not None and image.GetNumberOfPoints() > 0, f"{use} {named(volume_node)} has no image data")
+    try:
+        return Volume.from_vtk(image, ijk_to_ras(volume_node))
+    except SimulationError as error:
+        raise SimulationError(f"{use} {named(volume_node)}: {error}") from None
+
+
+def read_mask(mask_node, mri_node) -> Volume:
+    """A mask on the grid of an MRI: a label map or scalar volume that has it, or a segmentation.
+
+    Raises SimulationError for another node, and for an empty segmentation.
+    """
+    require_node(mask_node, "vtkMRMLScalarVolumeNode", "vtkMRMLSegmentationNode", use="mask")
+    if not mask_node.IsA("vtkMRMLSegmentationNode"):
+        return read_volume(mask_node, "mask")
+    _require_segments(mask_node, "mask")
+    mri = read_volume(mri_node, "MRI")
+    geometry = slicer.vtkOrientedImageData()
+    geometry.SetExtent(*(bound for n in mri.array.shape[::-1] for bound in (0, n - 1)))
+    mri_to_segmentation = np.linalg.inv(node_to_world(mask_node)) @ node_to_world(mri_node)
+    geometry.SetGeometryFromImageToWorldMatrix(vtk_matrix(mri_to_segmentation @ mri.ijk_to_ras))
+    merged = slicer.vtkOrientedImageData()
+    mask_node.GenerateMergedLabelmapForAllSegments(merged, slicer.vtkSegmentation.EXTENT_REFERENCE_GEOMETRY, geometry)
+    return mri.with_array(Volume.from_vtk(merged, np.eye(4)).array)
+
+
+# ---- labels ----------------------------------------------------------------------------------------------------------
+
+
+def labels_version(labels_node) -> Hashable:
+    """Changes when voxels, segments, their names or their place in the node's own frame change."""
+    if labels_node.IsA("vtkMRMLSegmentationNode"):
+        segmentation = labels_node.GetSegmentation()
+        parts = [labels_node.GetID()]
+        for segment_id in segmentation.GetSegmentIDs():
+            segment = segmentation.GetSegment(segment_id)
+            source = segment.GetRepresentation(segmentation.GetSourceRepresentationName())
+            parts.append((segment_id, segment.GetName(), None if source is None else source.GetMTime()))
+        return tuple(parts)
+    image, colours = labels_node.GetImageData(), _colour_node(labels_node)
+    return (
+        labels_node.GetID(),
+        None if image is None else image.GetMTime(),
+        ijk_to_ras(labels_node).tobytes(),
+        None if colours is None else colours.GetMTime(),
+    )
+
+
+def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
+    """What a label map or a segmentation holds, one label for every tissue that its names stand for.
+
+    The names are those of segments, or of a label map's colours; `tissues` are known by name before the presets are.
+    A label whose colour has no tissue's name is the tissue with that label in `tissues`.
+    Raises SimulationError for a node without voxels or segments, and lists names that nobody knows.
+    """
+    require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map")
+    if labels_node.IsA("vtkMRMLSegmentationNode"):
+        volume, names = _read_segmentation(labels_node)
+    else:
+        volume = read_volume(labels_node, "label map")
+        names = _colour_names(labels_node, volume, tissues)
+    known = {label: _tissue_name(name, tissues) for label, name in names.items()}
+    unknown = [names[label] for label, tissue in known.items() if tissue is None]
+    require(
+        not unknown,
+        f"{named(labels_node)}: no tissue is called {', '.join(map(repr, unknown))}; rename to one of: "
+        f"{', '.join([*tissues.names()[1:], *(name for name in TISSUES if name not in tissues.names())])}",
+    )
+    order = tuple(dict.fromkeys(known.values()))
+    table = np.zeros(max(names, default=0) + 1, np.uint8)
+    for label, tissue in known.items():
+        table[label] = order.index(tissue) + 1
+    return LabelledTissues(volume.with_array(table[volume.array]), order)
+
+
+def _tissue_name(name: str, tissues: TissueTable) -> str | None:
+    for tissue in tissues.values():
+        if same_name(tissue.name, name):
+            return tissue.name
+    try:
+        return tissue_named(name).name
+    except SimulationError:
+        return None
+
+
+def _require_segments(segmentation_node, use: str) -> None:
+    require(
+        segmentation_node.GetSegmentation().GetNumberOfSegments() > 0,
+        f"{use} {named(segmentation_node)} is empty, expected at least one segment",
+    )
+
+
+def _read_segmentation(segmentation_node) -> tuple[Volume, dict[int, str]]:
+    _require_segments(segmentation_node, "label map")
+    segmentation = segmentation_node.GetSegmentation()
+    ids, values, names = vtkStringArray(), vtkIntArray(), {}
+    for number, segment_id in enumerate(segmentation.GetSegmentIDs(), 1):
+        ids.InsertNextValue(segment_id)
+        values.InsertNextValue(number)
+        names[number] = segmentation.GetSegment(segment_id).GetName()
+    require(
+        segmentation_node.CreateBinaryLabelmapRepresentation(),
+        f"label map {named(segmentation_node)} has no binary label map and none can be made of it",
+    )
+    merged = slicer.vtkOrientedImageData()
+    segmentation_node.GenerateMergedLabelmapForAllSegments(
+        merged, slicer.vtkSegmentation.EXTENT_UNION_OF_EFFECTIVE_SEGMENTS, None, ids, values
+    )
+    require(
+        min(merged.GetDimensions()) > 0 and merged.GetScalarRange()[1] > 0,
+        f"label map {named(segmentation_node)} is empty, expected a segment with voxels",
+    )
+    matrix = vtkMatrix4x4()
+    merged.GetImageToWorldMatrix(matrix)
+    volume = Volume.from_vtk(merged, matrix_array(matrix))
+    return volume, names
+
+
+def _colour_node(labels_node):
+    display = labels_node.GetDisplayNode()
+    return None if display is None else display.GetColorNode()
+
+
+def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int, str]:
+    values = volume.array
+    require(
+        np.issubdtype(values.dtype, np.integer) and int(values.min()) >= 0 and int(values.max()) < 100_000,
+        f"label map {named(labels_node)} holds {values.dtype} from {values.min()} to {values.max()}, expected whole "
+        "numbers from 0 to 99999",
+    )
+    colours, names = _colour_node(labels_node), {}
+    for label in np.flatnonzero(np.bincount(values.ravel())):
+        label = int(label)
+        if label == 0:
+            continue
+        name = colours.GetColorName(label) if colours is not None and label < colours.GetNumberOfColors() else ""
+        if label in tissues and _tissue_name(name or "", tissues) is None:
+            name = tissues[label].name
+        names[label] = name or f"label {label}"
+    require(bool(names), f"label map {named(labels_node)} is empty, expected voxels that are not 0")
+    return names
+
+
+def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -> None:
+    """Put a label map with named, coloured tissues into a label map or segmentation node, where a volume node is."""
+    parent = like_node.GetParentTransformNode()
+    labels_node.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
+    if labels_node.IsA("vtkMRMLSegmentationNode"):
+        # After the transform: the node translates the reference geometry into its own frame.
+        labels_node.SetReferenceImageGeometryParameterFromVolumeNode(like_node)
+        _write_segmentation(labels_node, labels, tuple(names))
+    else:
+        _write_label_map(labels_node, labels, tuple(names))
+
+
+def _write_label_map(labels_node, labels: Volume, names: tuple[str, ...]) -> None:
+    scene = labels_node.GetScene()
+    labels_node.SetIJKToRASMatrix(vtk_matrix(labels.ijk_to_ras))
+    labels_node.SetAndObserveImageData(_image(labels.array))
+    colours = labels_node.GetNodeReference("tissueColors")
+    if colours is None:
+        colours = scene.AddNewNodeByClass("vtkMRMLColorTableNode", f"{labels_node.GetName()} tissues")
+        labels_node.SetNodeReferenceID("tissueColors", colours.GetID())
+    colours.SetTypeToUser()
+    colours.SetNumberOfColors(len(names) + 1)
+    colours.SetColor(0, "coupling", 0.0, 0.0, 0.0, 0.0)
+    for label, name in enumerate(names, 1):
+        colours.SetColor(label, name, *colour_of(name), 1.0)
+    display = labels_node.GetDisplayNode()
+    if display is None:  # not the default one, which looks for colours that only Slicer's own scene has
+        display = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeDisplayNode")
+        labels_node.SetAndObserveDisplayNodeID(display.GetID())
+    display.SetAndObserveColorNodeID(colours.GetID())
+    labels_node.Modified()
+
+
+def _write_segmentation(segmentation_node, labels: Volume, names: tuple[str, ...]) -> None:
+    segmentation = segmentation_node.GetSegmentation()
+    was_modifying = segmentation_node.StartModify()
+    segmentation.RemoveAllSegments()
+    segmentation_node.SetSourceRepresentationToBinaryLabelmap()
+    for label, name in enumerate(names, 1):
+        mask = slicer.vtkOrientedImageData()
+        mask.ShallowCopy(_image((labels.array == label).astype(np.uint8)))
+        mask.SetImageToWorldMatrix(vtk_matrix(labels.ijk_to_ras))
+        segmentation_node.AddSegmentFromBinaryLabelmapRepresentation(mask, name, colour_of(name), name)
+    segmentation_node.EndModify(was_modifying)
+    if segmentation_node.GetDisplayNode() is None:
+        segmentation_node.CreateDefaultDisplayNodes()
+
+
+def colour_of(tissue_name: str) -> tuple[float, float, float]:
+    """Red, green, blue from 0 to 1."""
+    return COLOURS.get(tissue_name, _OTHER_COLOUR)
+
+
+# ---- what is simulated -----------------------------------------------------------------------------------------------
+
+
+def write_image(volume_node, frame: Frame, transform_node=None) -> None:
+    """Put a frame into a volume node: fixed geometry in the probe frame, under the probe's transform node.
+
+    So the slice moves with the transform at once, and the pixels follow.
+    """
+    geometry = frame.image_to_probe.copy()
+    geometry[:3, 2] *= frame.pixel_spacing_mm[1]  # as thick as a pixel is high
+    was_modifying = volume_node.StartModify()
+    if not np.array_equal(ijk_to_ras(volume_node), geometry):
+        volume_node.SetIJKToRASMatrix(vtk_matrix(geometry))
+    if transform_node is not None and volume_node.GetTransformNodeID() != transform_node.GetID():
+        volume_node.SetAndObserveTransformNodeID(transform_node.GetID())
+    image = volume_node.GetImageData()
+    rows, columns = frame.image.shape
+    if image is None or image.GetDimensions() != (columns, rows, 1) or image.GetScalarTypeAsString() != "unsigned char":
+        volume_node.SetAndObserveImageData(_image(frame.image[None]))
+    else:
+        scalars = image.GetPointData().GetScalars()
+        np.asarray(memoryview(scalars)).reshape(rows, columns)[:] = frame.image
+        scalars.Modified()
+        image.Modified()
+    if volume_node.GetScene() is not None and volume_node.GetDisplayNode() is None:
+        volume_node.CreateDefaultDisplayNodes()
+        display = volume_node.GetDisplayNode()
+        if display is not None:
+            display.SetAutoWindowLevel(False)
+            display.SetWindowLevelMinMax(0, 255)
+    volume_node.EndModify(was_modifying)
+
+
+def write_outline(model_node, probe: Probe, transform_node) -> None:
+    """Put the outline of the imaged field into a model node, under the probe's transform node."""
+    model_node.SetAndObservePolyData(outline_polydata(probe))
+    if model_node.GetTransformNodeID() != transform_node.GetID():
+        model_node.SetAndObserveTransformNodeID(transform_node.GetID())
+    if model_node.GetDisplayNode() is None:
+        model_node.CreateDefaultDisplayNodes()
+        display = model_node.GetDisplayNode()
+        if display is not None:
+            display.SetColor(1.0, 0.85, 0.1)
+            display.SetLineWidth(3)
+            display.SetLighting(False)
+            display.SetVisibility2D(True)
+            display.SetSliceDisplayModeToProjection()
+
+
+def _image(array: np.ndarray):
+    """A vtkImageData of (k, j, i) voxels without geometry, as volume nodes want it."""
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+
+    image = vtkImageData()
+    image.SetDimensions(*array.shape[::-1])
+    set_scalars(image, array)
+    return image

@@ -1,0 +1,632 @@
+"""The scene logic on real MRML nodes: what goes in, where the image lies, what live update does and when it ends."""
+
+from __future__ import annotations
+
+import gc
+import json
+import weakref
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from vtkmodules.vtkCommonCore import vtkCommand
+
+slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
+
+from SlicerUSSim.Logic import (  # noqa: E402
+    DisplaySettings,
+    LinearProbe,
+    Preset,
+    SimulationError,
+    TissueTable,
+    UltrasoundSimulator,
+    Volume,
+)
+from SlicerUSSim.Logic.errors import Cancelled  # noqa: E402
+from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
+from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.scene_nodes import ijk_to_ras, node_to_world, write_labels  # noqa: E402
+from SlicerUSSim.Logic.vtk_filters import vtk_matrix  # noqa: E402
+from tests.conftest import FLUID, SPECKLE, block, rigid  # noqa: E402
+
+PRESET = Preset(
+    LinearProbe(20, 30, scan_lines=48, focus_mm=15),
+    DisplaySettings(image_size=(96, 64)),
+    tissues=TissueTable({0: FLUID, 1: SPECKLE, 2: FLUID}),
+)
+ABOVE = rigid(np.eye(3), [0, -15, 0])
+
+
+def cyst() -> Volume:
+    return block(lambda x, y, z: np.where((x - 3) ** 2 + (y - 5) ** 2 + z**2 < 16, 2, 1), (12, 16, 8))
+
+
+def add(scene, kind: str, name: str = ""):
+    return scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name or kind)
+
+
+def put(node, matrix: np.ndarray):
+    node.SetMatrixTransformToParent(vtk_matrix(matrix))
+    return node
+
+
+def pixels(volume_node) -> np.ndarray:
+    """(rows, columns)"""
+    return Volume.from_vtk(volume_node.GetImageData(), np.eye(4)).array[0].copy()
+
+
+class Bench:
+    """A scene with a cyst in speckle, a probe above it, and a volume for the image."""
+
+    def __init__(self, labels_kind: str = "LabelMapVolume") -> None:
+        self.scene = slicer.vtkMRMLScene()
+        self.logic = UltrasoundSceneLogic(self.scene)
+        self.logic.preset = PRESET
+        self.labels = add(self.scene, labels_kind, "tissues")
+        self.probe = put(add(self.scene, "LinearTransform", "Probe"), ABOVE)
+        self.image = add(self.scene, "ScalarVolume", "ultrasound")
+        volume = cyst()
+        write_labels(self.labels, volume, ("speckle", "fluid"), self.grid())
+
+    def grid(self):
+        """A volume node on the grid of the cyst."""
+        volume = cyst()
+        return volume_node(self.scene, volume.with_array(volume.array.astype(np.float32)), "grid")
+
+    def simulate(self):
+        return self.logic.simulate(self.labels, self.probe, self.image)
+
+    def live(self, **options):
+        self.logic.startLiveUpdate(self.labels, self.probe, self.image, **options)
+
+
+def volume_node(scene, volume: Volume, name: str = "MRI"):
+    node = add(scene, "ScalarVolume", name)
+    node.SetAndObserveImageData(Volume(volume.array, np.eye(4)).to_vtk())
+    node.SetIJKToRASMatrix(vtk_matrix(volume.ijk_to_ras))
+    return node
+
+
+def expected(pose: np.ndarray) -> np.ndarray:
+    return UltrasoundSimulator(cyst(), PRESET.tissues).simulate(PRESET.probe, pose, PRESET.display).image
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+# ---- the image and its place -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
+def test_the_image_is_the_simulators_and_lies_in_the_probe_frame(kind):
+    bench = Bench(kind)
+    frame = bench.simulate()
+    np.testing.assert_array_equal(pixels(bench.image), frame.image)
+    assert np.mean(frame.image != expected(ABOVE)) < 0.001  # a segmentation is cropped to what it holds
+    assert bench.image.GetTransformNodeID() == bench.probe.GetID()
+    in_world = node_to_world(bench.image) @ ijk_to_ras(bench.image)
+    np.testing.assert_allclose(in_world, frame.to_volume().ijk_to_ras, atol=1e-9)
+    geometry = ijk_to_ras(bench.image)
+    put(bench.probe, ABOVE @ rigid(np.eye(3), [1, 2, 3]))
+    bench.simulate()
+    np.testing.assert_array_equal(ijk_to_ras(bench.image), geometry)  # the slice moves with the transform alone
+
+
+def test_any_chain_of_rigid_parents_gives_the_same_image_as_their_product(bench):
+    a = rigid(Rotation.from_euler("xyz", [30, -50, 10], degrees=True).as_matrix(), [20, 5, -9])
+    b = rigid(Rotation.from_euler("xyz", [-80, 15, 60], degrees=True).as_matrix(), [-3, 40, 7])
+    tracker, reference = put(add(bench.scene, "LinearTransform"), a), put(add(bench.scene, "LinearTransform"), b)
+    tracker.SetAndObserveTransformNodeID(reference.GetID())
+    bench.probe.SetAndObserveTransformNodeID(tracker.GetID())
+    put(bench.probe, np.linalg.inv(b @ a) @ ABOVE)
+    image = bench.simulate().image
+    assert np.mean(np.abs(image.astype(int) - expected(ABOVE)) > 2) < 0.01
+
+    # Labels under the same parents as the probe: nothing moves against anything.
+    bench.labels.SetAndObserveTransformNodeID(tracker.GetID())
+    put(bench.probe, ABOVE)
+    moved = bench.simulate()
+    assert np.mean(np.abs(moved.image.astype(int) - expected(ABOVE)) > 2) < 0.01
+    in_world = node_to_world(bench.image) @ ijk_to_ras(bench.image)
+    geometry = moved.image_to_probe.copy()
+    geometry[:3, 2] *= moved.pixel_spacing_mm[1]
+    np.testing.assert_allclose(in_world, b @ a @ ABOVE @ geometry, atol=1e-9)
+
+
+def test_labels_under_a_scaling_transform_are_scaled(bench):
+    scale = put(add(bench.scene, "LinearTransform"), np.diag([1.0, 1.2, 1.0, 1.0]))
+    bench.labels.SetAndObserveTransformNodeID(scale.GetID())
+    image = bench.simulate().image
+    volume = cyst()
+    stretched = Volume(volume.array, np.diag([1.0, 1.2, 1.0, 1.0]) @ volume.ijk_to_ras)
+    true = UltrasoundSimulator(stretched, PRESET.tissues).simulate(PRESET.probe, ABOVE, PRESET.display).image
+    np.testing.assert_array_equal(image, true)
+
+
+def test_the_outline_is_that_of_the_field(bench):
+    model = add(bench.scene, "Model", "fan")
+    bench.logic.showOutline(model, bench.probe)
+    bounds = [0.0] * 6
+    model.GetRASBounds(bounds)
+    np.testing.assert_allclose(bounds, (-10, 10, -15, 15, 0, 0), atol=1e-5)
+    assert model.GetDisplayNode().GetVisibility2D()
+
+
+# ---- segmentation ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
+def test_segment_names_and_colours_tissues_where_the_mri_is(kind):
+    scene = slicer.vtkMRMLScene()
+    logic = UltrasoundSceneLogic(scene)
+    mri, labels = head_mri(3.0), add(scene, kind, "tissues")
+    node = volume_node(scene, mri)
+    moved = put(add(scene, "LinearTransform"), rigid(np.eye(3), [5, 6, 7]))
+    node.SetAndObserveTransformNodeID(moved.GetID())
+    shares = []
+    result = logic.segment(node, labels, progress=shares.append)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    assert labels.GetTransformNodeID() == moved.GetID()
+    table = logic.tissues(labels)
+    assert [table[n].name for n in range(1, 5)] == ["csf", "grey matter", "white matter", "leptomeninges"]
+    if kind == "LabelMapVolume":
+        voxels = Volume.from_vtk(labels.GetImageData(), ijk_to_ras(labels))
+        np.testing.assert_array_equal(voxels.array, result.labels.array)
+        np.testing.assert_allclose(voxels.ijk_to_ras, mri.ijk_to_ras)
+        colours = labels.GetDisplayNode().GetColorNode()
+        names = [colours.GetColorName(n) for n in range(5)]
+        values = [tuple(colours.GetLookupTable().GetTableValue(n)[:3]) for n in range(5)]
+    else:
+        segments = [labels.GetSegmentation().GetNthSegment(n) for n in range(4)]
+        names = ["coupling", *(segment.GetName() for segment in segments)]
+        values = [(0, 0, 0), *(segment.GetColor() for segment in segments)]
+    assert names == ["coupling", "csf", "grey matter", "white matter", "leptomeninges"]
+    assert len(set(values)) == 5
+    # The same MRI, segmented into either kind of node, gives the same picture.
+    probe, image = add(scene, "LinearTransform"), add(scene, "ScalarVolume")
+    logic.placeProbe(labels, probe)
+    frame = logic.simulate(labels, probe, image)
+    direct = UltrasoundSimulator(result.labels, TissueTable.brain(result.tissue_names)).simulate(
+        Preset().probe, np.linalg.inv(node_to_world(moved)) @ node_to_world(probe)
+    )
+    assert frame.image.mean() > 15 and np.mean(frame.image != direct.image) < 0.02
+
+
+def test_a_mask_can_be_a_segmentation_on_another_grid():
+    scene = slicer.vtkMRMLScene()
+    logic, mri = UltrasoundSceneLogic(scene), head_mri(3.0)
+    node, mask = volume_node(scene, mri), add(scene, "Segmentation")
+    half = np.zeros(mri.array.shape, np.uint8)
+    half[..., : half.shape[2] // 2] = 1
+    write_labels(mask, Volume(half[4:-4], mri.ijk_to_ras @ rigid(np.eye(3), [0, 0, 4])), ("brain",), node)
+    labels = add(scene, "LabelMapVolume")
+    result = logic.segment(node, labels, mask_node=mask)
+    inside = result.labels.array > 0
+    assert inside.any() and not inside[..., half.shape[2] // 2 :].any() and not inside[:4].any()
+
+
+def test_cancelling_a_segmentation_leaves_the_node_as_it_was():
+    scene = slicer.vtkMRMLScene()
+    logic = UltrasoundSceneLogic(scene)
+    node, labels = volume_node(scene, head_mri(3.0)), add(scene, "LabelMapVolume")
+
+    def cancel(share):
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        logic.segment(node, labels, progress=cancel)
+    assert labels.GetImageData() is None
+
+
+def test_segment_names_choose_tissues_and_those_nobody_knows_are_listed(bench):
+    segmentation = add(bench.scene, "Segmentation", "painted")
+    write_labels(segmentation, cyst(), ("Left-White-Matter", "Tumor_1"), bench.grid())
+    table = bench.logic.tissues(segmentation)
+    assert [table[n].name for n in (1, 2)] == ["white matter", "tumour"]
+    segmentation.GetSegmentation().GetNthSegment(1).SetName("Segment_2")
+    with pytest.raises(SimulationError, match=r"'painted': no tissue is called 'Segment_2'; rename to one of: speckle"):
+        bench.logic.simulate(segmentation, bench.probe, bench.image)
+    segmentation.GetSegmentation().GetNthSegment(1).SetName("Speckle")  # a tissue of the preset, before all others
+    assert bench.logic.tissues(segmentation)[2].name == "speckle"
+
+
+def test_large_labels_as_freesurfer_has_them_are_told_by_their_colours(bench):
+    volume = cyst()
+    label_map = add(bench.scene, "LabelMapVolume", "aseg")
+    big = volume.with_array(np.where(volume.array == 2, 1035, 2).astype(np.int16))
+    label_map.SetAndObserveImageData(volume_node(bench.scene, big).GetImageData())
+    label_map.SetIJKToRASMatrix(vtk_matrix(volume.ijk_to_ras))
+    with pytest.raises(SimulationError, match="label 1035"):
+        bench.logic.simulate(label_map, bench.probe, bench.image)
+    colours = add(bench.scene, "ColorTable", "FreeSurfer")
+    colours.SetTypeToUser()
+    colours.SetNumberOfColors(1036)
+    colours.SetColor(2, "Left-Cerebral-White-Matter", 1, 1, 1, 1)
+    colours.SetColor(1035, "ctx-lh-insula", 1, 1, 1, 1)
+    label_map.CreateDefaultDisplayNodes()
+    label_map.GetDisplayNode().SetAndObserveColorNodeID(colours.GetID())
+    table = bench.logic.tissues(label_map)
+    assert sorted(tissue.name for label, tissue in table.items() if label) == ["grey matter", "white matter"]
+
+
+def test_a_label_map_without_names_is_told_by_the_labels_of_the_preset(bench):
+    bare = add(bench.scene, "LabelMapVolume", "bare")
+    bare.SetAndObserveImageData(volume_node(bench.scene, cyst()).GetImageData())
+    bare.SetIJKToRASMatrix(vtk_matrix(cyst().ijk_to_ras))
+    bench.logic.simulate(bare, bench.probe, bench.image)
+    np.testing.assert_array_equal(pixels(bench.image), expected(ABOVE))
+
+
+# ---- placing ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_probe_is_placed_on_the_surface_in_a_slice(bench):
+    slice_node = add(bench.scene, "Slice", "Yellow")
+    matrix = slice_node.GetSliceToRAS()
+    x, y = np.array([0, 1.0, 0]), np.array([0, 0, 1.0])
+    view = np.eye(4)
+    view[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
+    view[:3, 3] = [4, 2, 1]
+    matrix.DeepCopy(vtk_matrix(view))
+    parent = put(add(bench.scene, "LinearTransform"), rigid(np.eye(3), [9, 9, 9]))
+    bench.probe.SetAndObserveTransformNodeID(parent.GetID())
+    bench.logic.placeProbe(bench.labels, bench.probe, slice_node)
+    pose = node_to_world(bench.probe)
+    np.testing.assert_allclose(pose[:3, 0], x, atol=1e-9)  # left to right as in the view
+    np.testing.assert_allclose(pose[:3, 1], -y, atol=1e-9)  # depth runs down the view
+    np.testing.assert_allclose(pose[:3, 3], [4, 2, 8.25], atol=0.3)  # on the top of the block
+    bench.logic.placeProbe(bench.labels, bench.probe, slice_node, target_ras=(0, -6, 0))
+    np.testing.assert_allclose(node_to_world(bench.probe)[:3, 3], [4, -6, 8.25], atol=0.3)
+    view[1, 3] = 500.0
+    matrix.DeepCopy(vtk_matrix(view))
+    with pytest.raises(SimulationError, match="no tissue from"):
+        bench.logic.placeProbe(bench.labels, bench.probe, slice_node)
+
+
+# ---- live update -----------------------------------------------------------------------------------------------------
+
+
+class Loop:
+    """An event loop: functions wait until they are run."""
+
+    def __init__(self) -> None:
+        self.waiting = []
+
+    def __call__(self, function) -> None:
+        self.waiting.append(function)
+
+    def run(self) -> int:
+        count = 0
+        while self.waiting:
+            self.waiting.pop(0)()
+            count += 1
+        return count
+
+
+def test_a_burst_of_changes_is_one_image_of_the_last(bench):
+    loop, reports = Loop(), []
+    bench.live(schedule=loop, report=reports.append)
+    for step in range(100):
+        put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 0, 0.02 * step]))
+    assert loop.run() == 1 and reports == [""]
+    np.testing.assert_array_equal(pixels(bench.image), expected(ABOVE @ rigid(np.eye(3), [0, 0, 1.98])))
+    assert loop.run() == 0
+
+
+def test_without_an_event_loop_the_image_follows_at_once(bench):
+    bench.live()
+    for step in range(5):
+        put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 0, 0.5 * step]))
+    np.testing.assert_array_equal(pixels(bench.image), expected(ABOVE @ rigid(np.eye(3), [0, 0, 2.0])))
+
+
+@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
+def test_everything_the_image_depends_on_is_followed(kind):
+    bench, loop = Bench(kind), Loop()
+    parent = put(add(bench.scene, "LinearTransform"), np.eye(4))
+    bench.probe.SetAndObserveTransformNodeID(parent.GetID())
+    outline = add(bench.scene, "Model")
+    bench.live(schedule=loop, outline_node=outline)
+    seen = [pixels(bench.image)]
+
+    def changes(name):
+        assert loop.run() == 1, name
+        now = pixels(bench.image)
+        assert any(now.shape != old.shape or (now != old).mean() > 0.01 for old in seen[-1:]), name
+        seen.append(now)
+
+    put(parent, rigid(np.eye(3), [0, 0, 1]))
+    changes("a parent of the probe")
+    bench.logic.preset = bench.logic.preset.changed("display", gain_db=6)
+    changes("gain")
+    bench.logic.preset = bench.logic.preset.changed("settings", seed=9)
+    changes("seed")
+    tissues = bench.logic.preset.tissues.replace("speckle", mu0=0.1, sigma0=0.05)
+    bench.logic.preset = Preset(*(getattr(bench.logic.preset, n) for n in ("probe", "display", "settings")), tissues)
+    changes("a tissue")
+    bench.logic.preset = bench.logic.preset.changed("probe", depth_mm=25.0)
+    changes("depth")
+    bounds = [0.0] * 6
+    outline.GetRASBounds(bounds)
+    assert bounds[3] == pytest.approx(-15 + 25)
+    other = put(add(bench.scene, "LinearTransform"), rigid(np.eye(3), [0, 1, 0]))
+    bench.labels.SetAndObserveTransformNodeID(other.GetID())
+    changes("the labels' transform")
+    put(other, rigid(np.eye(3), [0, -1, 0]))
+    changes("the labels' transform moved")
+    volume = cyst()
+    write_labels(bench.labels, volume.with_array(np.ones_like(volume.array)), ("speckle",), bench.grid())
+    while loop.waiting:
+        changes("voxels")
+    bench.logic.stopLiveUpdate()
+
+
+def test_what_is_wrong_is_reported_and_can_be_mended(bench):
+    loop, reports = Loop(), []
+    bench.live(schedule=loop, report=reports.append)
+    warp = add(bench.scene, "GridTransform", "Warp")
+    warp.SetAndObserveTransformFromParent(slicer.vtkOrientedGridTransform())
+    displacement = Volume(np.zeros((4, 4, 4), np.float32), np.eye(4)).to_vtk()
+    grid = slicer.vtkOrientedGridTransform()
+    displacement.AllocateScalars(10, 3)
+    grid.SetDisplacementGridData(displacement)
+    warp.SetAndObserveTransformFromParent(grid)
+    bench.probe.SetAndObserveTransformNodeID(warp.GetID())
+    loop.run()
+    assert "'Probe' is under a transform that is not linear" in reports[-1] and bench.logic.isLive
+    bench.probe.SetAndObserveTransformNodeID(None)
+    loop.run()
+    assert reports[-1] == ""
+    put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 500, 0]))
+    loop.run()
+    assert "looks past the volume" in reports[-1]  # a warning is a report too
+    put(bench.probe, np.diag([2.0, 1, 1, 1]))
+    loop.run()
+    assert "'Probe' is not rigid" in reports[-1]
+
+
+@pytest.mark.parametrize("what", ["labels", "probe", "image", "scene", "stop", "logic"])
+def test_live_update_ends_cleanly_with_its_nodes_its_scene_or_its_logic(bench, what):
+    loop, ended = Loop(), []
+    bench.live(schedule=loop, stopped=lambda: ended.append(1))
+    put(bench.probe, ABOVE)  # an image is waiting when the end comes
+    before, probe, observed = pixels(bench.image), bench.probe, (bench.probe, bench.labels, bench.image, bench.scene)
+    if what == "scene":
+        bench.scene.Clear(0)
+    elif what == "stop":
+        bench.logic.stopLiveUpdate()
+    elif what == "logic":
+        live = weakref.ref(bench.logic._live)
+        bench.logic = None
+        loop.waiting.clear()
+        gc.collect()
+        assert live() is None
+    else:
+        bench.scene.RemoveNode(getattr(bench, what))
+    assert what == "logic" or (ended == [1] and not bench.logic.isLive)
+    loop.run()
+    put(probe, ABOVE @ rigid(np.eye(3), [0, 0, 3]))
+    assert not loop.waiting
+    if bench.image.GetImageData() is not None:
+        np.testing.assert_array_equal(pixels(bench.image), before)
+    labels, image, scene = observed[1:]
+    labels.Modified()
+    labels.InvokeEvent(labels.ImageDataModifiedEvent)
+    image.InvokeEvent(vtkCommand.UserEvent + 7301)
+    scene.Clear(0)
+    assert not loop.waiting and len(ended) <= 1
+
+
+def test_two_logics_on_one_scene_share_what_is_set_and_the_newest_owns_an_output(bench):
+    loop, ended = Loop(), []
+    bench.live(schedule=loop, stopped=lambda: ended.append("first"))
+    second = UltrasoundSceneLogic(bench.scene)
+    assert second.preset == bench.logic.preset
+    other = add(bench.scene, "ScalarVolume", "other")
+    second.startLiveUpdate(bench.labels, bench.probe, other, schedule=loop)
+    put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 0, 1]))
+    assert loop.run() == 2 and not ended  # two outputs, both follow
+    np.testing.assert_array_equal(pixels(other), pixels(bench.image))
+    second.startLiveUpdate(bench.labels, bench.probe, bench.image, schedule=loop)
+    assert ended == ["first"] and not bench.logic.isLive and second.isLive
+    put(bench.probe, ABOVE)
+    assert loop.run() == 1
+
+
+def test_nothing_is_computed_while_a_scene_is_loaded(bench):
+    loop = Loop()
+    bench.live(schedule=loop)
+    bench.scene.StartState(bench.scene.BatchProcessState)
+    for step in range(3):
+        put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 0, step]))
+    assert not loop.waiting
+    bench.scene.EndState(bench.scene.BatchProcessState)
+    assert loop.run() == 1
+    np.testing.assert_array_equal(pixels(bench.image), expected(ABOVE @ rigid(np.eye(3), [0, 0, 2])))
+
+
+# ---- sequences -------------------------------------------------------------------------------------------------------
+
+
+def sequence_of(scene, poses):
+    sequence = add(scene, "Sequence", "tracking")
+    sequence.SetIndexName("time")
+    sequence.SetIndexUnit("s")
+    for number, pose in enumerate(poses):
+        item = slicer.vtkMRMLLinearTransformNode()
+        sequence.SetDataNodeAtValue(put(item, pose), str(number / 10))
+    return sequence
+
+
+def test_a_sequence_of_transforms_becomes_one_of_images(bench):
+    poses = [ABOVE @ rigid(np.eye(3), [0, 0, z]) for z in (0, 1, 2)]
+    transforms, images = sequence_of(bench.scene, poses), add(bench.scene, "Sequence", "images")
+    shares = []
+    count = bench.logic.simulateSequence(bench.labels, transforms, images, progress=shares.append)
+    assert count == 3 and shares == [1 / 3, 2 / 3, 1.0] and images.GetIndexName() == "time"
+    for number, pose in enumerate(poses):
+        assert images.GetNthIndexValue(number) == str(number / 10)
+        np.testing.assert_array_equal(pixels(images.GetNthDataNode(number)), expected(pose))
+
+
+def test_with_its_browser_a_sequence_plays_images_under_the_probe(bench):
+    sequences = slicer.vtkSlicerSequencesLogic()
+    sequences.SetMRMLScene(bench.scene)
+    reference = put(add(bench.scene, "LinearTransform"), rigid(np.eye(3), [0, 0, 0.5]))
+    transforms = sequence_of(bench.scene, [ABOVE @ rigid(np.eye(3), [0, 0, z]) for z in (0, 1)])
+    images, browser = add(bench.scene, "Sequence", "images"), add(bench.scene, "SequenceBrowser")
+    browser.SetAndObserveMasterSequenceNodeID(transforms.GetID())
+    sequences.UpdateProxyNodesFromSequences(browser)
+    browser.GetProxyNode(transforms).SetAndObserveTransformNodeID(reference.GetID())
+    bench.logic.simulateSequence(bench.labels, transforms, images, browser_node=browser)
+    browser.SetSelectedItemNumber(1)
+    sequences.UpdateProxyNodesFromSequences(browser)
+    shown = browser.GetProxyNode(images)
+    assert shown.GetParentTransformNode() is browser.GetProxyNode(transforms)
+    np.testing.assert_array_equal(pixels(shown), expected(ABOVE @ rigid(np.eye(3), [0, 0, 1.5])))
+
+
+def test_a_sequence_that_fails_or_is_cancelled_leaves_the_old_images(bench):
+    images = add(bench.scene, "Sequence", "images")
+    good = sequence_of(bench.scene, [ABOVE])
+    bench.logic.simulateSequence(bench.labels, good, images)
+    bad = sequence_of(bench.scene, [ABOVE, np.diag([2.0, 1, 1, 1])])
+    with pytest.raises(SimulationError, match="item 1 of Sequence 'tracking' is not rigid"):
+        bench.logic.simulateSequence(bench.labels, bad, images)
+
+    def cancel(share):
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        bench.logic.simulateSequence(bench.labels, sequence_of(bench.scene, [ABOVE] * 3), images, progress=cancel)
+    assert images.GetNumberOfDataNodes() == 1
+
+    def remove(share):
+        bench.scene.RemoveNode(bench.labels)
+
+    with pytest.raises(SimulationError, match=r"label map .* is not in a scene any more"):
+        bench.logic.simulateSequence(bench.labels, sequence_of(bench.scene, [ABOVE] * 3), images, progress=remove)
+    assert images.GetNumberOfDataNodes() == 1
+
+
+# ---- what is wrong ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda b: b.logic.simulate(None, b.probe, b.image), "no label map chosen, expected a LabelMapVolume or"),
+        (lambda b: b.logic.simulate(b.probe, b.probe, b.image), "label map is LinearTransform 'Probe', expected"),
+        (lambda b: b.logic.simulate(b.labels, None, b.image), "no probe transform chosen"),
+        (lambda b: b.logic.simulate(b.labels, b.probe, None), "no output chosen, expected a ScalarVolume node"),
+        (lambda b: b.logic.simulate(b.labels, b.probe, b.labels), "input and output are both LabelMapVolume 'tissues'"),
+        (lambda b: b.logic.simulate(add(b.scene, "Segmentation", "empty"), b.probe, b.image), "'empty' is empty"),
+        (lambda b: b.logic.simulate(add(b.scene, "LabelMapVolume", "n"), b.probe, b.image), "'n' has no image data"),
+        (lambda b: b.logic.segment(b.image, b.labels), "MRI Volume 'ultrasound' has no image data"),
+        (lambda b: b.logic.segment(b.labels, b.labels), "input and output are both"),
+        (lambda b: b.logic.segment(b.image, b.probe), "output of Segment is LinearTransform 'Probe', expected"),
+        (lambda b: b.logic.placeProbe(b.labels, b.image), "probe transform is Volume 'ultrasound'"),
+        (lambda b: b.logic.showOutline(b.image, b.probe), "outline is Volume 'ultrasound', expected a Model"),
+        (
+            lambda b: b.logic.simulateSequence(b.labels, add(b.scene, "Sequence", "s"), add(b.scene, "Sequence")),
+            "'s' is",
+        ),
+        (lambda b: b.live(outline_node=b.image), "outline is Volume"),
+    ],
+)
+def test_a_wrong_node_is_one_clear_error(bench, call, message):
+    with pytest.raises(SimulationError) as caught:
+        call(bench)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+    assert not bench.logic.isLive
+
+
+def test_a_segmentation_whose_segments_hold_no_voxel_is_empty(bench):
+    hollow = add(bench.scene, "Segmentation", "hollow")
+    write_labels(hollow, cyst().with_array(np.zeros_like(cyst().array)), ("speckle",), bench.grid())
+    with pytest.raises(SimulationError, match="'hollow' is empty, expected a segment with voxels"):
+        bench.logic.simulate(hollow, bench.probe, bench.image)
+
+
+def test_the_mri_is_never_the_output(bench):
+    bench.logic.parameters.mri = bench.image
+    with pytest.raises(SimulationError, match="output is the MRI"):
+        bench.simulate()
+
+
+# ---- what the scene remembers ----------------------------------------------------------------------------------------
+
+
+def test_a_saved_scene_opens_as_it_was_left(bench, tmp_path):
+    names = ("labels", "probe_transform", "output")
+    for name, node in zip(names, (bench.labels, bench.probe, bench.image), strict=True):
+        setattr(bench.logic.parameters, name, node)
+    bench.logic.parameters.contrast = "flair"
+    bench.logic.parameters.thin_sulci = False
+    bench.logic.parameters.classes = 4
+    bench.logic.preset = bench.logic.preset.changed("display", gain_db=7.5)
+    image = bench.simulate().image
+    bench.scene.SetRootDirectory(str(tmp_path))
+    for node in (bench.labels, bench.probe, bench.image):
+        node.AddDefaultStorageNode()
+        storage = node.GetStorageNode()
+        storage.SetFileName(str(tmp_path / f"{node.GetName()}.{storage.GetDefaultWriteFileExtension()}"))
+        assert storage.WriteData(node) == 1
+    bench.scene.SetURL(str(tmp_path / "scene.mrml"))
+    assert bench.scene.Commit()
+
+    scene = slicer.vtkMRMLScene()
+    scene.SetURL(str(tmp_path / "scene.mrml"))
+    assert scene.Connect()
+    logic = UltrasoundSceneLogic(scene)
+    parameters = logic.parameters
+    assert [getattr(parameters, name).GetName() for name in names] == ["tissues", "Probe", "ultrasound"]
+    assert (parameters.contrast, parameters.thin_sulci, parameters.classes) == ("flair", False, 4)
+    assert logic.preset == bench.logic.preset
+    assert parameters.output.GetParentTransformNode() is parameters.probe_transform
+    np.testing.assert_array_equal(pixels(parameters.output), image)
+    again = logic.simulate(parameters.labels, parameters.probe_transform, parameters.output)
+    np.testing.assert_array_equal(again.image, image)
+
+
+def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
+    parameters = bench.logic.parameters
+    parameters.labels = bench.labels
+    parameters.thin_sulci = False
+    parameters.classes = 4
+    node = bench.scene.GetSingletonNode("SlicerUSSim", "vtkMRMLScriptedModuleNode")
+    assert node is parameters.node and node.GetAttribute("ModuleName") == "SlicerUSSim"
+    assert node.GetNodeReference("labels") is bench.labels and node.HasParameter("labels")
+    assert node.GetParameter("thin_sulci") == "False" and node.GetParameter("classes") == "4"
+    assert json.loads(node.GetParameter("preset"))["display"]["image_size"] == [96, 64]
+    parameters.labels = None
+    assert parameters.labels is None
+    with pytest.raises(SimulationError, match="no 'label'"):
+        parameters.label = bench.labels
+    with pytest.raises(SimulationError, match="classes is 'four', expected int"):
+        parameters.classes = "four"
+    with pytest.raises(SimulationError, match=r"mri is a .*LinearTransformNode, expected vtkMRMLScalarVolumeNode"):
+        parameters.mri = bench.probe
+
+
+def test_a_preset_in_the_scene_that_is_none_is_refused(bench):
+    bench.logic.parameters.preset = "{gain: 3}"
+    with pytest.raises(SimulationError, match="the scene's preset is not JSON"):
+        bench.simulate()
+
+
+def test_hybrid_scatterers_take_the_texture_of_the_last_segmentation():
+    scene = slicer.vtkMRMLScene()
+    logic = UltrasoundSceneLogic(scene)
+    node, labels = volume_node(scene, head_mri(3.0)), add(scene, "LabelMapVolume")
+    probe, image = add(scene, "LinearTransform"), add(scene, "ScalarVolume")
+    logic.segment(node, labels)
+    logic.placeProbe(labels, probe)
+    plain = logic.simulate(labels, probe, image).image
+    logic.preset = logic.preset.changed("settings", mri_modulation_db=3.0)
+    assert (logic.simulate(labels, probe, image).image != plain).mean() > 0.1
+    labels.GetImageData().Modified()  # painted on: the texture is not that of these labels any more
+    with pytest.raises(SimulationError, match="segment the MRI again"):
+        logic.simulate(labels, probe, image)
