@@ -27,7 +27,8 @@ class Preset:
         """A preset with values of one section changed: changed("display", gain_db=3).
 
         Sections are "probe", "display" and "settings"; probe values may include its "kind": what the new kind needs
-        and the old one lacks comes from the preset of that kind in PROBES.
+        and the old one lacks comes from the preset of that kind in PROBES. A focus at its default place moves with
+        the depth.
         Raises SimulationError for an unknown section or name and for a value out of range.
         """
         require(
@@ -93,6 +94,9 @@ def _from_dict(kind: type, values: dict, source: str):
 
 def _changed_probe(probe: Probe, values: dict) -> Probe:
     old = probe.to_dict()
+    if "depth_mm" in values:
+        default = type(probe).default_focus_mm(probe.depth_mm)
+        old |= {name: None for name in ("focus_mm", "elevation_focus_mm") if old[name] == default}
     kind = values.get("kind", old["kind"])
     if kind != old["kind"]:
         require(kind in PROBES, f"probe: kind is {kind!r}, expected linear, convex or phased")

@@ -60,9 +60,14 @@ class Probe:
         for name in ("focus_mm", "elevation_focus_mm"):
             value = getattr(self, name)
             if value is None:
-                object.__setattr__(self, name, 0.6 * self.depth_mm)
+                object.__setattr__(self, name, self.default_focus_mm(self.depth_mm))
             else:
                 require_between(owner, name, value, 0.1, 1000)
+
+    @staticmethod
+    def default_focus_mm(depth_mm: float) -> float:
+        """Where a focus lies that is not given."""
+        return 0.6 * depth_mm
 
     # ---- geometry, defined by each kind ------------------------------------------------------------------------
 

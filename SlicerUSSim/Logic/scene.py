@@ -26,6 +26,7 @@ from SlicerUSSim.Logic.scene_nodes import (
     read_volume,
     require_node,
     set_node_to_world,
+    show_in_slice,
     write_image,
     write_labels,
     write_outline,
@@ -206,6 +207,12 @@ class UltrasoundSceneLogic:
         require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         write_outline(model_node, self.preset.probe, probe_transform_node)
 
+    def showInSlice(self, slice_node, output_node, probe_transform_node, fit: bool = True) -> None:
+        """Turn a slice view into the plane of the probe and lay the image over what it shows."""
+        require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
+        require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
+        show_in_slice(slice_node, output_node, probe_pose(probe_transform_node), self.preset.probe, fit)
+
     # ---- live --------------------------------------------------------------------------------------------------
 
     @property
@@ -219,6 +226,7 @@ class UltrasoundSceneLogic:
         probe_transform_node,
         output_node,
         outline_node=None,
+        slice_node=None,
         *,
         schedule: Callable[[Callable[[], None]], None] | None = None,
         report: Callable[[str], None] | None = None,
@@ -226,6 +234,7 @@ class UltrasoundSceneLogic:
     ) -> None:
         """Simulate now, and again whenever the transform or its parents, the labels or the preset change.
 
+        `outline_node` is a model that shows the imaged field, `slice_node` a slice view that stays in its plane.
         `schedule(function)` has to call `function` once, soon, from the event loop (in Slicer: qt.QTimer.singleShot(0,
         function)). However many changes come before that, one image is computed, of the last. Without an event loop
         the image is computed within the change itself.
@@ -238,9 +247,10 @@ class UltrasoundSceneLogic:
         self.simulate(labels_node, probe_transform_node, output_node)  # raises what is wrong here and now
         if outline_node is not None:
             self.showOutline(outline_node, probe_transform_node)
-        self._live = LiveUpdate(
-            self, labels_node, probe_transform_node, output_node, outline_node, schedule, report, stopped
-        )
+        if slice_node is not None:
+            self.showInSlice(slice_node, output_node, probe_transform_node)
+        nodes = (labels_node, probe_transform_node, output_node, outline_node, slice_node)
+        self._live = LiveUpdate(self, nodes, schedule, report, stopped)
 
     def stopLiveUpdate(self) -> None:
         """Let the image rest; nothing is observed any more."""

@@ -16,21 +16,22 @@ _CLAIMED = vtkCommand.UserEvent + 7301
 
 
 class LiveUpdate:
-    """Keeps an output volume up to date with a probe transform, for UltrasoundSceneLogic.startLiveUpdate."""
+    """Keeps an output volume up to date with a probe transform, for UltrasoundSceneLogic.startLiveUpdate.
+
+    `nodes` are labels, probe transform and output volume, then outline model and slice view, which may be None.
+    """
 
     def __init__(
         self,
         logic,
-        labels_node,
-        transform_node,
-        output_node,
-        outline_node,
+        nodes: tuple,
         schedule: Callable[[Callable[[], None]], None] | None,
         report: Callable[[str], None] | None,
         stopped: Callable[[], None] | None,
     ) -> None:
         self._logic = weakref.ref(logic)  # which owns us
-        self._nodes = (labels_node, transform_node, output_node, outline_node)
+        self._nodes = nodes
+        labels_node, transform_node, output_node = nodes[:3]
         self._schedule, self._report, self._stopped = schedule, report, stopped
         self._pending = self._busy = False
         self._outlined = logic.preset.probe
@@ -120,7 +121,7 @@ class LiveUpdate:
         logic = self._logic()
         if logic is None:
             return
-        labels, transform, output, outline = self._nodes
+        labels, transform, output, outline, view = self._nodes
         self._busy = True
         try:
             with warnings.catch_warnings(record=True) as caught:
@@ -129,6 +130,8 @@ class LiveUpdate:
             if outline is not None and logic.preset.probe != self._outlined:
                 logic.showOutline(outline, transform)
                 self._outlined = logic.preset.probe
+            if view is not None:
+                logic.showInSlice(view, output, transform, fit=False)
             message = "; ".join(str(w.message) for w in caught if w.category.__module__.startswith("SlicerUSSim"))
         except Exception as error:
             message = user_message(error)

@@ -368,6 +368,29 @@ def write_outline(model_node, probe: Probe, transform_node) -> None:
             display.SetSliceDisplayModeToProjection()
 
 
+def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Probe, fit: bool) -> None:
+    """Turn a slice view into the plane of the probe, standing as on a scanner, and lay the image over its background.
+
+    `fit` also makes the imaged field fill the view.
+    """
+    left, right, top, bottom = probe.image_bounds_mm()
+    view = probe_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])  # a view's second axis goes up, the probe's goes down
+    view[:3, 3] = (probe_to_world @ [0.5 * (left + right), 0.5 * (top + bottom), 0.0, 1.0])[:3]
+    slice_node.GetSliceToRAS().DeepCopy(vtk_matrix(view))
+    if fit:
+        width, height, thickness = slice_node.GetFieldOfView()
+        scale = max((right - left) / width, (bottom - top) / height) * 1.05
+        slice_node.SetFieldOfView(width * scale, height * scale, thickness)
+    slice_node.UpdateMatrices()
+    scene = slice_node.GetScene()
+    for number in range(scene.GetNumberOfNodesByClass("vtkMRMLSliceCompositeNode")):
+        composite = scene.GetNthNodeByClass(number, "vtkMRMLSliceCompositeNode")
+        is_its = composite.GetLayoutName() == slice_node.GetLayoutName()
+        if is_its and composite.GetForegroundVolumeID() != volume_node.GetID():
+            composite.SetForegroundVolumeID(volume_node.GetID())
+            composite.SetForegroundOpacity(1.0)
+
+
 def _image(array: np.ndarray):
     """A vtkImageData of (k, j, i) voxels without geometry, as volume nodes want it."""
     from vtkmodules.vtkCommonDataModel import vtkImageData

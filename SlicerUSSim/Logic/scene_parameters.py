@@ -25,6 +25,7 @@ VALUE_PARAMETERS: dict[str, str | bool | int] = {
     "classes": 3,
     "thin_sulci": True,
     "bias_correction": False,
+    "show_in_slice": True,
     "preset": "",
 }
 

@@ -120,7 +120,7 @@ def segment_mri(
     foreground = _foreground(intensity) if mask is None else _given_mask(mask, mri)
     report(0.2)
     if bias_correction:
-        intensity = _without_bias(mri.with_array(intensity), foreground)
+        intensity = _without_bias(mri.with_array(intensity), foreground, lambda share: report(0.2 + 0.4 * share))
         report(0.6)
 
     noise = estimate_noise(intensity, foreground)
@@ -384,14 +384,28 @@ def _given_mask(mask: Volume, mri: Volume) -> np.ndarray:
     return inside
 
 
-def _without_bias(mri: Volume, foreground: np.ndarray) -> np.ndarray:
+def _without_bias(mri: Volume, foreground: np.ndarray, report: Callable[[float], None]) -> np.ndarray:
     import SimpleITK as sitk
 
     image = sitk.Cast(mri.to_sitk(), sitk.sitkFloat32)
     mask = mri.with_array(foreground.astype(np.uint8)).to_sitk()
     shrink = [4 if size >= 64 else 1 for size in image.GetSize()]
     corrector = sitk.N4BiasFieldCorrectionImageFilter()
-    corrector.SetMaximumNumberOfIterations([50, 50, 30])
+    iterations = [50, 50, 30]
+    corrector.SetMaximumNumberOfIterations(iterations)
+    raised: list[Exception] = []
+
+    def iterated() -> None:
+        done = sum(iterations[: corrector.GetCurrentLevel()]) + corrector.GetElapsedIterations()
+        try:
+            report(min(done / sum(iterations), 1.0))
+        except Exception as error:  # through C++ it could not pass
+            raised.append(error)
+            corrector.Abort()
+
+    corrector.AddCommand(sitk.sitkIterationEvent, iterated)
     corrector.Execute(sitk.Shrink(image, shrink), sitk.Shrink(mask, shrink))
+    if raised:
+        raise raised[0]
     bias = sitk.GetArrayFromImage(corrector.GetLogBiasFieldAsImage(image))
     return (mri.array / np.exp(bias)).astype(np.float32)

@@ -1,0 +1,392 @@
+"""PanelPresenter: everything the Slicer panel does, without Qt.
+
+The panel (panel.py) tells the presenter what the user did and shows what the presenter knows; the browser and the tests
+do the same. Nothing here raises for what a user did: it is shown, in one line, and everything stays as it was.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Protocol
+
+from SlicerUSSim.Logic.errors import Cancelled, SimulationError, require, user_message
+from SlicerUSSim.Logic.preset import Preset
+from SlicerUSSim.Logic.probe import PROBES
+from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
+from SlicerUSSim.Logic.tissues import MAX_LABEL, TISSUES, Tissue, TissueTable, same_name
+from SlicerUSSim.Widget.fields import field_value, with_field
+
+#: Columns of the tissue table: parameter, heading, unit.
+TISSUE_COLUMNS = (
+    ("speed_of_sound_m_s", "c", "speed of sound [m/s]"),
+    ("impedance_mrayl", "Z", "acoustic impedance [MRayl]"),
+    ("attenuation_db_cm_mhz", "α", "attenuation [dB/(cm MHz)]"),
+    ("mu0", "μ₀", "mean amplitude of scatterers"),
+    ("mu1", "μ₁", "threshold of scatterers: the share 1 - Φ(μ₁) of sites holds one"),
+    ("sigma0", "σ₀", "standard deviation of the scatterers' amplitude"),
+)
+
+
+class PanelView(Protocol):
+    """What the presenter wants of a user interface."""
+
+    def showError(self, message: str) -> None:
+        """Show one line in a message box."""
+
+    def showStatus(self, message: str) -> None:
+        """Show one line in the panel, beside Live."""
+
+    def refresh(self) -> None:
+        """Show everything anew: fields, tissues, what can be done."""
+
+    def progress(self, title: str) -> AbstractContextManager[Callable[[float], None]]:
+        """Show a progress bar; the function is told the share done and raises Cancelled if the user wants."""
+
+    def schedule(self, function: Callable[[], None]) -> None:
+        """Call `function` once, soon, from the event loop."""
+
+    def sliceNode(self):
+        """The vtkMRMLSliceNode of the chosen slice view, or None."""
+
+
+@dataclass(frozen=True)
+class TissueRow:
+    """A line of the tissue table."""
+
+    name: str
+    #: In the order of TISSUE_COLUMNS
+    values: tuple[float, ...]
+    #: Where the numbers come from
+    sources: tuple[str, ...]
+
+
+class PanelPresenter:
+    """Acts on one scene for one view."""
+
+    def __init__(self, logic: UltrasoundSceneLogic, view: PanelView) -> None:
+        self.logic = logic
+        self.view = view
+        self._busy = False
+        self._last_image: float | None = None
+
+    # ---- fields of the preset ----------------------------------------------------------------------------------
+
+    def value(self, field: str):
+        """What to show for a field (see fields.FIELDS), or None where the probe has no such value."""
+        return field_value(self._preset(), field)
+
+    def setValue(self, field: str, value) -> None:
+        """The user gave a field another value."""
+        with self._shown():
+            preset = with_field(self._preset(), field, value)
+            if preset != self._preset():
+                self.logic.preset = preset
+
+    def chooseProbe(self, name: str) -> None:
+        """Take a probe of probe.PROBES."""
+        with self._shown():
+            require(name in PROBES, f"no probe is called {name!r}, expected one of {', '.join(PROBES)}")
+            self.logic.preset = replace(self._preset(), probe=PROBES[name])
+        self.view.refresh()
+
+    def probeName(self) -> str:
+        """Which of probe.PROBES is in use; "" for one of the user's own."""
+        probe = self._preset().probe
+        return next((name for name, known in PROBES.items() if known == probe), "")
+
+    def loadPreset(self, path: str | os.PathLike) -> None:
+        """Take everything from a JSON file, one of the `ussim` command too."""
+        with self._shown():
+            self.logic.preset = Preset.read(path)
+        self.view.refresh()
+
+    def savePreset(self, path: str | os.PathLike) -> None:
+        """Write everything to a JSON file."""
+        with self._shown():
+            self._preset().write(path)
+
+    # ---- tissues -----------------------------------------------------------------------------------------------
+
+    def tissues(self) -> list[TissueRow]:
+        """The tissues of the chosen labels, coupling medium first and membrane last; of the preset without labels."""
+        table = self._table()
+        membrane = [] if table.membrane is None else [table.membrane.tissue]
+        rows = {}
+        for tissue in [*table.values(), *membrane]:
+            names = [parameter for parameter, _, _ in TISSUE_COLUMNS]
+            rows.setdefault(
+                tissue.name,
+                TissueRow(
+                    tissue.name,
+                    tuple(getattr(tissue, name) for name in names),
+                    tuple(tissue.sources.get(name, "set by hand") for name in names),
+                ),
+            )
+        return list(rows.values())
+
+    def setTissue(self, name: str, parameter: str, text: str) -> None:
+        """The user wrote `text` into the tissue table."""
+        with self._shown():
+            try:
+                value = float(text.strip().replace(",", "."))
+            except ValueError:
+                raise SimulationError(f"tissue {name!r}: {parameter} is {text!r}, expected a number") from None
+            require(math.isfinite(value), f"tissue {name!r}: {parameter} is {text!r}, expected a number")
+            self._change_tissue(name, lambda old: replace(old, **{parameter: value}, sources=_without(old, parameter)))
+
+    def assignTissue(self, name: str, preset: str) -> None:
+        """Give the tissue `name` the numbers of the preset tissue `preset`."""
+        with self._shown():
+            require(preset in TISSUES, f"no tissue is called {preset!r}, expected one of {', '.join(TISSUES)}")
+            self._change_tissue(name, lambda old: replace(TISSUES[preset], name=old.name))
+        self.view.refresh()
+
+    def resetTissues(self) -> None:
+        """All numbers back to the presets'."""
+        with self._shown():
+            preset = self._preset()
+            table = {label: TISSUES.get(tissue.name, tissue) for label, tissue in preset.tissues.items()}
+            self.logic.preset = replace(preset, tissues=TissueTable(table, Preset().tissues.membrane))
+        self.view.refresh()
+
+    # ---- what the buttons do -----------------------------------------------------------------------------------
+
+    def canSegment(self) -> tuple[bool, str]:
+        """(whether Segment can be pressed, its tool tip)"""
+        if self._busy:
+            return False, "Wait until the work under way is done"
+        if self.logic.parameters.mri is None:
+            return False, "Choose an MRI first"
+        return True, "Label the tissues of the MRI; takes one or two seconds"
+
+    def canSimulate(self) -> tuple[bool, str]:
+        """(whether Simulate and Live can be pressed, their tool tip)"""
+        if self._busy:
+            return False, "Wait until the work under way is done"
+        if self.logic.parameters.labels is None:
+            return False, "Segment the MRI, or choose a label map or segmentation"
+        return True, "Simulate the image under the probe"
+
+    def segment(self) -> None:
+        """Label the tissues of the MRI into the chosen label map or segmentation, or a new segmentation."""
+        parameters = self.logic.parameters
+        with self._shown(), self._working("Segment") as progress:
+            require(parameters.mri is not None, "no MRI chosen, expected a scalar volume")
+            labels, made = parameters.labels, None
+            if labels is None:
+                labels = made = self._add("Segmentation", f"{parameters.mri.GetName()} tissues")
+            try:
+                self.logic.segment(
+                    parameters.mri,
+                    labels,
+                    mask_node=parameters.mask,
+                    classes=parameters.classes,
+                    contrast=parameters.contrast,
+                    thin_sulci=parameters.thin_sulci,
+                    bias_correction=parameters.bias_correction,
+                    progress=progress,
+                )
+            except BaseException:
+                if made is not None:
+                    self.logic.scene.RemoveNode(made)
+                raise
+            parameters.labels = labels
+        self.view.refresh()
+
+    def placeProbe(self, slice_node=None) -> None:
+        """Put the probe on the surface in a slice view, or where a craniotomy might be; make one if there is none."""
+        with self._shown():
+            parameters = self.logic.parameters
+            require(parameters.labels is not None, "no label map chosen, expected one to put the probe on")
+            probe = parameters.probe_transform or self._add("LinearTransform", "Probe")
+            self.logic.placeProbe(parameters.labels, probe, slice_node)
+            parameters.probe_transform = probe
+            self._show_handles(probe)
+        self.view.refresh()
+
+    def simulate(self) -> None:
+        """One image, into the chosen volume or a new one."""
+        with self._shown():
+            nodes = self._nodes()
+            start = perf_counter()
+            self.logic.simulate(nodes.labels, nodes.probe_transform, nodes.output)
+            self.view.showStatus(f"{(perf_counter() - start) * 1e3:.0f} ms")
+            self.logic.showOutline(nodes.outline, nodes.probe_transform)
+            if self.view.sliceNode() is not None:
+                self.logic.showInSlice(self.view.sliceNode(), nodes.output, nodes.probe_transform)
+        self.view.refresh()
+
+    def isLive(self) -> bool:
+        return self.logic.isLive
+
+    def setLive(self, on: bool) -> None:
+        """Let the image follow the probe, or rest."""
+        if on == self.logic.isLive:
+            return
+        if not on:
+            self.logic.stopLiveUpdate()
+            return
+        with self._shown():
+            nodes = self._nodes()
+            self._last_image = None
+            self.logic.startLiveUpdate(
+                nodes.labels,
+                nodes.probe_transform,
+                nodes.output,
+                nodes.outline,
+                self.view.sliceNode(),
+                schedule=self.view.schedule,
+                report=self._reported,
+                stopped=self._stopped,
+            )
+        self.view.refresh()
+
+    def simulateSequence(self, transforms_node, images_node) -> None:
+        """Images for a recorded sequence of transforms, which the browser of that sequence then plays."""
+        with self._shown(), self._working("Simulate sequence") as progress:
+            if images_node is None and transforms_node is not None:
+                images_node = self._add("Sequence", f"{transforms_node.GetName()} ultrasound")
+            count = self.logic.simulateSequence(
+                self.logic.parameters.labels,
+                transforms_node,
+                images_node,
+                browser_node=self._browser_of(transforms_node),
+                progress=progress,
+            )
+            self.view.showStatus(f"{count} images in {images_node.GetName()!r}")
+        self.view.refresh()
+
+    def chooseDefaultNodes(self) -> None:
+        """Take the first volume of the scene for the MRI, if none was chosen, which saves a few clicks."""
+        parameters, scene = self.logic.parameters, self.logic.scene
+        if parameters.mri is not None:
+            return
+        for number in range(scene.GetNumberOfNodesByClass("vtkMRMLScalarVolumeNode")):
+            node = scene.GetNthNodeByClass(number, "vtkMRMLScalarVolumeNode")
+            if not node.IsA("vtkMRMLLabelMapVolumeNode") and node is not parameters.output:
+                parameters.mri = node
+                return
+
+    def nodesChanged(self) -> None:
+        """The user chose other nodes: live update goes on with those, if it can."""
+        if self.logic.isLive:
+            self.logic.stopLiveUpdate()
+            self.setLive(True)
+        self.view.refresh()
+
+    # ---- inside ------------------------------------------------------------------------------------------------
+
+    def _preset(self) -> Preset:
+        try:
+            return self.logic.preset
+        except SimulationError:  # a scene made by hand or a later version: begin anew, the error was shown
+            return Preset()
+
+    def _table(self) -> TissueTable:
+        labels = self.logic.parameters.labels
+        try:
+            return self.logic.tissues(labels) if labels is not None else self._preset().tissues
+        except SimulationError:  # an empty node, or names nobody knows: simulating will say so
+            return self._preset().tissues
+
+    def _change_tissue(self, name: str, change: Callable[[Tissue], Tissue]) -> None:
+        """Change a tissue of the table in use; one that the preset did not have is added to it."""
+        preset, used = self._preset(), self._table()
+        table = preset.tissues
+        everywhere = [*used.values(), *([] if used.membrane is None else [used.membrane.tissue])]
+        old = next((tissue for tissue in everywhere if same_name(tissue.name, name)), None)
+        require(old is not None, f"no tissue is called {name!r}, expected one of {', '.join(used.names())}")
+        new = change(old)
+        labels = [label for label, tissue in table.items() if tissue.name == old.name]
+        is_membrane = table.membrane is not None and table.membrane.tissue.name == old.name
+        if not labels and not is_membrane:
+            labels = [next(n for n in range(MAX_LABEL + 1) if n not in table)]
+        membrane = replace(table.membrane, tissue=new) if is_membrane else table.membrane
+        self.logic.preset = replace(preset, tissues=TissueTable({**table, **dict.fromkeys(labels, new)}, membrane))
+
+    def _nodes(self):
+        """The parameters, with the nodes that simulating needs; those that were not chosen are made."""
+        parameters = self.logic.parameters
+        require(parameters.labels is not None, "no label map chosen; segment the MRI first")
+        if parameters.probe_transform is None:
+            probe = self._add("LinearTransform", "Probe")
+            try:
+                self.logic.placeProbe(parameters.labels, probe)
+            except SimulationError:
+                self.logic.scene.RemoveNode(probe)
+                raise
+            parameters.probe_transform = probe
+            self._show_handles(probe)
+        if parameters.output is None:
+            parameters.output = self._add("ScalarVolume", "Ultrasound")
+        if parameters.outline is None:
+            parameters.outline = self._add("Model", "Ultrasound outline")
+        return parameters
+
+    def _browser_of(self, sequence_node):
+        scene = self.logic.scene
+        browsers = (
+            scene.GetNthNodeByClass(n, "vtkMRMLSequenceBrowserNode")
+            for n in range(scene.GetNumberOfNodesByClass("vtkMRMLSequenceBrowserNode"))
+        )
+        return next((node for node in browsers if node.IsSynchronizedSequenceNode(sequence_node, True)), None)
+
+    def _add(self, kind: str, name: str):
+        return self.logic.scene.AddNewNodeByClass(f"vtkMRML{kind}Node", self.logic.scene.GenerateUniqueName(name))
+
+    @staticmethod
+    def _show_handles(transform_node) -> None:
+        """Handles in the views, to move and turn the probe by."""
+        if transform_node.GetDisplayNode() is None:
+            transform_node.CreateDefaultDisplayNodes()
+        display = transform_node.GetDisplayNode()
+        if display is not None:
+            display.SetEditorVisibility(True)
+
+    def _reported(self, message: str) -> None:
+        now = perf_counter()
+        if message:
+            self.view.showStatus(message)
+        elif self._last_image is not None and now - self._last_image < 1.0:
+            self.view.showStatus(f"{1.0 / max(now - self._last_image, 1e-3):.0f} images per second")
+        else:
+            self.view.showStatus("")
+        self._last_image = now
+
+    def _stopped(self) -> None:
+        self.view.showStatus("")
+        self.view.refresh()
+
+    @contextmanager
+    def _shown(self):
+        """What the user caused is shown in one line; the panel then shows what really is."""
+        try:
+            yield
+        except Exception as error:
+            message = user_message(error)
+            if message is None:
+                raise
+            if not isinstance(error, Cancelled):
+                self.view.showError(message)
+            self.view.refresh()
+
+    @contextmanager
+    def _working(self, title: str):
+        require(not self._busy, "wait until the work under way is done")
+        self._busy = True
+        self.view.refresh()
+        try:
+            with self.view.progress(title) as progress:
+                yield progress
+        finally:
+            self._busy = False
+
+
+def _without(tissue: Tissue, parameter: str) -> dict[str, str]:
+    """The sources of the other numbers: this one is the user's now."""
+    return {name: source for name, source in tissue.sources.items() if name != parameter}

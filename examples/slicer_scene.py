@@ -1,0 +1,128 @@
+"""A MRML scene without Slicer's window: python examples/slicer_scene.py [OUT.mrb]
+
+Loads the demo brain, segments it, puts the probe on the cortex, lets the image follow the probe while it slides,
+records the sweep as sequences with a browser, and saves a .mrb. Opened in 3D Slicer, the SlicerUSSim module shows
+everything as it was left: tick Live, and move the probe. The file is read back here to show that it is whole.
+
+Needs pip install "SlicerUSSim[slicer,demo]"; in Slicer's own Python console `slicer.mrmlScene` takes the scene's place.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import slicer
+
+from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic.demo import demo_mri
+from SlicerUSSim.Logic.errors import require
+from SlicerUSSim.Logic.placement import slide_sweep
+from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
+from SlicerUSSim.Logic.scene_nodes import node_to_world
+from SlicerUSSim.Logic.vtk_filters import vtk_matrix
+
+
+def new_scene() -> tuple[slicer.vtkMRMLScene, slicer.vtkSlicerSequencesLogic]:
+    """A scene that knows sequence browsers too; Slicer's own does."""
+    scene = slicer.vtkMRMLScene()
+    sequences = slicer.vtkSlicerSequencesLogic()
+    sequences.SetMRMLScene(scene)
+    return scene, sequences
+
+
+def add_volume(scene, volume: Volume, name: str):
+    """What loading a file does in Slicer."""
+    node = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
+    node.SetAndObserveImageData(Volume(volume.array, np.eye(4)).to_vtk())
+    node.SetIJKToRASMatrix(vtk_matrix(volume.ijk_to_ras))
+    return node
+
+
+def build(mri: Volume):
+    """(scene, its logic, the sequences' logic): everything in its place and one image simulated."""
+    scene, sequences = new_scene()
+    logic = UltrasoundSceneLogic(scene)
+    nodes = logic.parameters
+    nodes.mri = add_volume(scene, mri, "MRI")
+    nodes.labels = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Tissues")
+    nodes.probe_transform = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
+    nodes.output = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Ultrasound")
+    nodes.outline = scene.AddNewNodeByClass("vtkMRMLModelNode", "Ultrasound outline")
+    logic.preset = logic.preset.changed("probe", kind="convex").changed("display", gain_db=2.0)
+    logic.segment(nodes.mri, nodes.labels)
+    logic.placeProbe(nodes.labels, nodes.probe_transform)
+    return scene, logic, sequences
+
+
+def sweep_live(logic: UltrasoundSceneLogic, length_mm: float, frames: int) -> tuple[list[np.ndarray], float]:
+    """Slide the probe while the image follows it; (poses, images per second)."""
+    nodes = logic.parameters
+    poses = slide_sweep(node_to_world(nodes.probe_transform), length_mm, frames)
+    logic.startLiveUpdate(nodes.labels, nodes.probe_transform, nodes.output, nodes.outline)
+    start = perf_counter()
+    for pose in poses:
+        nodes.probe_transform.SetMatrixTransformToParent(vtk_matrix(pose))
+    seconds = perf_counter() - start
+    logic.stopLiveUpdate()
+    return poses, frames / seconds
+
+
+def record(scene, logic: UltrasoundSceneLogic, sequences, poses) -> None:
+    """The sweep as a sequence of transforms and one of images, with a browser that plays both."""
+    transforms = scene.AddNewNodeByClass("vtkMRMLSequenceNode", "Sweep")
+    images = scene.AddNewNodeByClass("vtkMRMLSequenceNode", "Sweep images")
+    for number, pose in enumerate(poses):
+        item = slicer.vtkMRMLLinearTransformNode()
+        item.SetMatrixTransformToParent(vtk_matrix(pose))
+        transforms.SetDataNodeAtValue(item, f"{0.05 * number:.2f}")
+    browser = scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", "Sweep browser")
+    browser.SetAndObserveMasterSequenceNodeID(transforms.GetID())
+    sequences.UpdateProxyNodesFromSequences(browser)
+    logic.simulateSequence(logic.parameters.labels, transforms, images, browser_node=browser)
+
+
+def save(scene, path: Path) -> None:
+    """Write a .mrb."""
+    path = path.resolve()
+    with tempfile.TemporaryDirectory() as folder:  # where the scene puts its files together
+        scene.SetURL(str(Path(folder) / "scene.mrml"))
+        scene.SetRootDirectory(folder)
+        require(bool(scene.WriteToMRB(str(path))), f"{path}: cannot be written")
+
+
+def read_back(path: Path):
+    """A new scene from a .mrb."""
+    scene, _sequences = new_scene()
+    with tempfile.TemporaryDirectory() as folder:
+        zipfile.ZipFile(path).extractall(folder)
+        scene.SetURL(str(next(Path(folder).rglob("*.mrml"))))
+        require(bool(scene.Import()), f"{path}: cannot be read")
+    return scene
+
+
+def main(path: Path) -> None:
+    scene, logic, sequences = build(demo_mri()[0])
+    poses, rate = sweep_live(logic, 12.0, 13)
+    print(f"{len(poses)} images followed the probe, {rate:.0f} per second")
+    record(scene, logic, sequences, poses)
+    save(scene, path)
+
+    again = UltrasoundSceneLogic(read_back(path))
+    nodes = again.parameters
+    require(again.preset == logic.preset, "the preset has changed on its way through the file")
+    frame = again.simulate(nodes.labels, nodes.probe_transform, nodes.output)
+    same = float(np.mean(frame.image == logic_image(logic)))
+    print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB); read back, it simulates the same image ({same:.2%})")
+
+
+def logic_image(logic: UltrasoundSceneLogic) -> np.ndarray:
+    return Volume.from_vtk(logic.parameters.output.GetImageData(), np.eye(4)).array[0]
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "ultrasound.mrb"))
