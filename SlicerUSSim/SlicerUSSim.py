@@ -55,8 +55,8 @@ class SlicerUSSim(ScriptedLoadableModule):
         ).format(home=_HOME)
         self.parent.acknowledgementText = _(
             "Implements Salehi et al., Patient-specific 3D Ultrasound Simulation Based on Convolutional Ray-tracing "
-            "and Appearance Optimization, MICCAI 2015. The sample MRI is the ICBM 152 2009a template (© 1993-2009 Louis "
-            "Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute), as nilearn carries it."
+            "and Appearance Optimization, MICCAI 2015. The sample MRI is the ICBM 152 2009a template (© 1993-2009 "
+            "Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute), as nilearn carries it."
         )
         slicer.app.connect("startupCompleted()", registerSampleData)
 
@@ -95,7 +95,7 @@ def _install_missing(path: str) -> None:
     from packaging.requirements import Requirement
 
     with open(path, encoding="utf-8") as file:
-        wanted = [Requirement(line) for line in file if line.strip() and not line.startswith("#")]
+        wanted = [Requirement(line.strip()) for line in file if line.strip() and not line.startswith("#")]
     missing = []
     for requirement in wanted:
         try:
@@ -193,7 +193,7 @@ class SlicerUSSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         if self.panel is not None:
             self.panel.presenter.chooseDefaultNodes()
 
-    def setParameterNode(self, parameterNode) -> None:
+    def setParameterNode(self, parameterNode) -> None:  # noqa: N803, as in Slicer's template
         """Show and observe another parameter node, or none."""
         if self._parameterNode is not None:
             self._parameterNode.disconnectGui(self._parameterNodeGuiTag)
@@ -207,7 +207,7 @@ class SlicerUSSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
     def onParametersModified(self, caller=None, event=None) -> None:
         """Show what the parameters now are."""
         if self.panel is not None:
-            self.panel.refresh()
+            self.panel.presenter.parametersChanged()
 
 
 class SlicerUSSimLogic(ScriptedLoadableModuleLogic):
@@ -239,7 +239,10 @@ class SlicerUSSimTest(ScriptedLoadableModuleTest):
 
     def test_image_follows_probe(self) -> None:
         """An image appears under the probe and follows it."""
-        ensurePackages()
+        try:
+            ensurePackages()
+        except RuntimeError as error:  # in testing mode Slicer installs nothing
+            self.skipTest(str(error))
         from SlicerUSSim.Logic.phantoms import head_mri
 
         self.delayDisplay("Make a head")

@@ -18,7 +18,6 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
-import platformdirs
 
 from SlicerUSSim.Logic.errors import SimulationError
 from SlicerUSSim.Logic.layout import shared_source
@@ -71,6 +70,8 @@ def _register_pip_runtimes() -> None:
             libraries[f"ussim-{name}.icd"] = str(library)
     if "ussim-intel.icd" not in libraries:
         return  # without Intel's wheel the loader finds everything by itself
+    import platformdirs
+
     folder = Path(platformdirs.user_cache_dir("ussim")) / "vendors" / f"{zlib.crc32(sys.prefix.encode()):08x}"
     try:
         for vendor in Path("/etc/OpenCL/vendors").glob("*.icd"):

@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.tissues import TISSUES
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter, TissueRow
 
+_CUSTOM = "custom"
 #: Property that holds a value, and signal that tells of another one, by what a widget has.
 _VALUES = (("value", "valueChanged"), ("checked", "toggled"), ("currentText", "currentTextChanged"))
 
@@ -42,7 +43,7 @@ class Panel:
         self._node_selectors = {w.property("sceneNode"): w for w in vars(ui).values() if w.property("sceneNode")}
 
         ui.progressWidget.setVisible(False)
-        for name in PROBES:
+        for name in (_CUSTOM, *PROBES):
             ui.probePresetComboBox.addItem(name)
         for name in TISSUES:
             ui.tissuePresetComboBox.addItem(name)
@@ -96,7 +97,7 @@ class Panel:
         for role, widget in self._node_selectors.items():
             with _silent(widget):
                 widget.setCurrentNode(getattr(self.logic.parameters, role))
-        self._show(ui.probePresetComboBox, presenter.probeName())
+        self._show(ui.probePresetComboBox, presenter.probeName() or _CUSTOM)
         self._show(ui.liveCheckBox, presenter.isLive())
         self._show_slice_names()
         self._show_tissues()
@@ -122,14 +123,10 @@ class Panel:
 
             def chosen(*_, role=role, widget=widget) -> None:
                 setattr(self.logic.parameters, role, widget.currentNode())
-                presenter.nodesChanged()
 
             widget.currentNodeChanged.connect(chosen)
-        for selector in (ui.transformSelector, ui.outputSelector, ui.outlineSelector):
-            selector.currentNodeChanged.connect(lambda *_: presenter.nodesChanged())
         ui.probePresetComboBox.currentTextChanged.connect(self._probe_chosen)
-        ui.sliceViewComboBox.currentTextChanged.connect(lambda *_: presenter.nodesChanged())
-        ui.followCheckBox.toggled.connect(lambda *_: presenter.nodesChanged())
+        ui.sliceViewComboBox.currentTextChanged.connect(lambda *_: presenter.parametersChanged())
         ui.tissueTable.cellChanged.connect(self._tissue_changed)
 
         for button, action in (
@@ -161,7 +158,9 @@ class Panel:
 
     def _probe_chosen(self, *_) -> None:
         name = self.ui.probePresetComboBox.property("currentText")
-        if name:
+        if name == _CUSTOM:
+            self.refresh()  # one does not choose it, one makes it
+        else:
             self.presenter.chooseProbe(name)
 
     def _place(self) -> None:

@@ -73,6 +73,7 @@ class PanelPresenter:
         self.view = view
         self._busy = False
         self._last_image: float | None = None
+        self._followed: tuple = ()  # the nodes of the live update
 
     # ---- fields of the preset ----------------------------------------------------------------------------------
 
@@ -232,14 +233,11 @@ class PanelPresenter:
             self.logic.stopLiveUpdate()
             return
         with self._shown():
-            nodes = self._nodes()
+            self._nodes()
             self._last_image = None
+            self._followed = self._live_nodes()
             self.logic.startLiveUpdate(
-                nodes.labels,
-                nodes.probe_transform,
-                nodes.output,
-                nodes.outline,
-                self.view.sliceNode(),
+                *self._followed,
                 schedule=self.view.schedule,
                 report=self._reported,
                 stopped=self._stopped,
@@ -272,9 +270,9 @@ class PanelPresenter:
                 parameters.mri = node
                 return
 
-    def nodesChanged(self) -> None:
-        """The user chose other nodes: live update goes on with those, if it can."""
-        if self.logic.isLive:
+    def parametersChanged(self) -> None:
+        """Something in the scene's parameters, or the slice view, is another: show it, and follow with those nodes."""
+        if self.logic.isLive and self._live_nodes() != self._followed:
             self.logic.stopLiveUpdate()
             self.setLive(True)
         self.view.refresh()
@@ -327,6 +325,10 @@ class PanelPresenter:
         if parameters.outline is None:
             parameters.outline = self._add("Model", "Ultrasound outline")
         return parameters
+
+    def _live_nodes(self) -> tuple:
+        nodes = self.logic.parameters
+        return nodes.labels, nodes.probe_transform, nodes.output, nodes.outline, self.view.sliceNode()
 
     def _browser_of(self, sequence_node):
         scene = self.logic.scene

@@ -1,0 +1,450 @@
+"""As much of the Slicer application as the scripted module touches, on PySide6 and slicer-core's MRML libraries.
+
+Slicer's scripted-module base classes, PythonQt and CTK cannot be installed; these stand in for them, so that the panel
+runs, is clicked and is looked at. What they promise is what Slicer's sources do: the loader, the lifecycle, signals and
+properties of the widgets, and the form in which parameterNodeWrapper keeps values in the node.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import types
+import typing
+from pathlib import Path
+
+import slicer
+import vtk
+from PySide6 import QtCore, QtGui, QtUiTools, QtWidgets
+
+MODULE_FILE = Path(__file__).parents[1] / "SlicerUSSim" / "SlicerUSSim.py"
+
+
+# ---- CTK and MRML widgets --------------------------------------------------------------------------------------------
+
+
+class CollapsibleButton(QtWidgets.QGroupBox):
+    """ctkCollapsibleButton: hides what is in it while collapsed."""
+
+    def __init__(self, parent=None) -> None:
+        super().__init__(parent)
+        self._collapsed = False
+
+    def setCollapsed(self, collapsed: bool) -> None:
+        self._collapsed = collapsed
+        for child in self.findChildren(QtWidgets.QWidget, options=QtCore.Qt.FindDirectChildrenOnly):
+            child.setVisible(not collapsed)
+
+    def childEvent(self, event) -> None:
+        super().childEvent(event)
+        if event.added() and event.child().isWidgetType() and self._collapsed:
+            event.child().setVisible(False)
+
+    text = QtCore.Property(str, lambda self: self.title(), lambda self, text: self.setTitle(text))
+    collapsed = QtCore.Property(bool, lambda self: self._collapsed, setCollapsed)
+
+
+class SliderWidget(QtWidgets.QWidget):
+    """ctkSliderWidget: a slider and a spin box side by side."""
+
+    valueChanged = QtCore.Signal(float)  # noqa: N815
+
+    def __init__(self, parent=None) -> None:
+        super().__init__(parent)
+        self._slider = QtWidgets.QSlider(QtCore.Qt.Horizontal, self)
+        self._box = QtWidgets.QDoubleSpinBox(self)
+        layout = QtWidgets.QHBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(self._slider, 1)
+        layout.addWidget(self._box)
+        self._slider.setRange(0, 1000)
+        self._slider.valueChanged.connect(self._slid)
+        self._box.valueChanged.connect(self._typed)
+
+    def _slid(self, position: int) -> None:
+        span = self._box.maximum() - self._box.minimum()
+        self._box.setValue(self._box.minimum() + span * position / 1000)
+
+    def _typed(self, value: float) -> None:
+        span = max(self._box.maximum() - self._box.minimum(), 1e-12)
+        self._slider.blockSignals(True)
+        self._slider.setValue(round(1000 * (value - self._box.minimum()) / span))
+        self._slider.blockSignals(False)
+        self.valueChanged.emit(value)
+
+    def setValue(self, value: float) -> None:
+        self._box.setValue(value)
+
+    def _set_minimum(self, value: float) -> None:
+        self._box.setMinimum(value)
+        self._typed(self._box.value())
+
+    def _set_maximum(self, value: float) -> None:
+        self._box.setMaximum(value)
+        self._typed(self._box.value())
+
+    value = QtCore.Property(float, lambda self: self._box.value(), setValue)
+    minimum = QtCore.Property(float, lambda self: self._box.minimum(), _set_minimum)
+    maximum = QtCore.Property(float, lambda self: self._box.maximum(), _set_maximum)
+    singleStep = QtCore.Property(  # noqa: N815
+        float, lambda self: self._box.singleStep(), lambda self, v: self._box.setSingleStep(v)
+    )
+    pageStep = QtCore.Property(float, lambda self: 1.0, lambda self, v: None)  # noqa: N815
+    decimals = QtCore.Property(int, lambda self: self._box.decimals(), lambda self, v: self._box.setDecimals(v))
+    suffix = QtCore.Property(str, lambda self: self._box.suffix(), lambda self, v: self._box.setSuffix(v))
+
+
+class NodeComboBox(QtWidgets.QComboBox):
+    """qMRMLNodeComboBox: the nodes of some classes in a scene."""
+
+    currentNodeChanged = QtCore.Signal(object)  # noqa: N815
+
+    def __init__(self, parent=None) -> None:
+        super().__init__(parent)
+        self._scene, self._types, self._nodes, self._filling = None, [], [], False
+        self._options = {}
+        self.setSizePolicy(QtWidgets.QSizePolicy.Expanding, QtWidgets.QSizePolicy.Fixed)
+        self.currentIndexChanged.connect(self._changed)
+
+    def setMRMLScene(self, scene) -> None:
+        self._scene = scene
+        scene.AddObserver(scene.NodeAddedEvent, lambda *_: self._fill())
+        scene.AddObserver(scene.NodeRemovedEvent, lambda *_: self._fill())
+        self._fill()
+
+    def _fill(self) -> None:
+        before = self.currentNode()
+        self._filling = True
+        self.clear()
+        self._nodes = [None]
+        self.addItem("None")
+        count = self._scene.GetNumberOfNodes()
+        for node in (self._scene.GetNthNode(n) for n in range(count)):
+            if node.GetClassName() in self._types:
+                self._nodes.append(node)
+                self.addItem(node.GetName())
+        self._filling = False
+        at = self._nodes.index(before) if before in self._nodes else 0
+        self.blockSignals(True)
+        self.setCurrentIndex(at)
+        self.blockSignals(False)
+        if self.currentNode() is not before:
+            self.currentNodeChanged.emit(self.currentNode())
+
+    def _changed(self, *_) -> None:
+        if not self._filling:
+            self.currentNodeChanged.emit(self.currentNode())
+
+    def currentNode(self):
+        at = self.currentIndex()
+        return self._nodes[at] if 0 <= at < len(self._nodes) else None
+
+    def setCurrentNode(self, node) -> None:
+        self.setCurrentIndex(self._nodes.index(node) if node in self._nodes else 0)
+
+    def _set_types(self, types) -> None:
+        self._types = list(types)
+
+    def _option(name):  # noqa: N805
+        return QtCore.Property(
+            bool, lambda self: self._options.get(name, False), lambda self, v: self._options.__setitem__(name, v)
+        )
+
+    nodeTypes = QtCore.Property("QStringList", lambda self: self._types, _set_types)  # noqa: N815
+    noneEnabled, addEnabled = _option("none"), _option("add")  # noqa: N815
+    removeEnabled, renameEnabled = _option("remove"), _option("rename")  # noqa: N815
+    showChildNodeTypes, selectNodeUponCreation = _option("child"), _option("select")  # noqa: N815
+    baseName = QtCore.Property(  # noqa: N815
+        str, lambda self: self._options.get("base", ""), lambda self, v: self._options.__setitem__("base", v)
+    )
+
+
+class MRMLWidget(QtWidgets.QWidget):
+    """qMRMLWidget: hands the scene to the selectors in it, as the .ui file's connections do in Slicer."""
+
+    def setMRMLScene(self, scene) -> None:
+        for selector in self.findChildren(NodeComboBox):
+            selector.setMRMLScene(scene)
+
+
+WIDGETS = {
+    "ctkCollapsibleButton": CollapsibleButton,
+    "ctkSliderWidget": SliderWidget,
+    "qMRMLNodeComboBox": NodeComboBox,
+    "qMRMLWidget": MRMLWidget,
+}
+
+
+class UiLoader(QtUiTools.QUiLoader):
+    """Qt's own loader of .ui files, for those four classes too."""
+
+    def createWidget(self, class_name, parent=None, name=""):
+        if class_name in WIDGETS:
+            widget = WIDGETS[class_name](parent)
+            widget.setObjectName(name)
+            return widget
+        return super().createWidget(class_name, parent, name)
+
+
+def load_ui(path) -> QtWidgets.QWidget:
+    file = QtCore.QFile(str(path))
+    if not file.open(QtCore.QFile.ReadOnly):
+        raise RuntimeError(f"Could not load UI file: {path}")
+    widget = UiLoader().load(file)
+    if widget is None:
+        raise RuntimeError(f"Could not load UI file: {path}")
+    return widget
+
+
+def child_widget_variables(widget):
+    ui = types.SimpleNamespace()
+    for child in widget.findChildren(QtWidgets.QWidget):
+        if child.objectName() and not child.objectName().startswith("qt_"):
+            setattr(ui, child.objectName(), child)
+    return ui
+
+
+# ---- slicer.parameterNodeWrapper -------------------------------------------------------------------------------------
+
+
+class Choice:
+    def __init__(self, choices) -> None:
+        self.choices = choices
+
+
+class WithinRange:
+    def __init__(self, minimum, maximum) -> None:
+        self.minimum, self.maximum = minimum, maximum
+
+
+def parameter_node_wrapper(cls):
+    """Typed attributes kept in a vtkMRMLScriptedModuleNode, and their widgets (SlicerParameterName)."""
+    hints = typing.get_type_hints(cls, include_extras=True)
+    types_ = {name: typing.get_args(hint)[0] if typing.get_args(hint) else hint for name, hint in hints.items()}
+    notes = {name: typing.get_args(hint)[1:] for name, hint in hints.items()}
+    defaults = {name: getattr(cls, name, None) for name in hints}
+
+    def make(name):
+        kind = types_[name]
+
+        def read(self):
+            if issubclass(kind, slicer.vtkMRMLNode):
+                return self.parameterNode.GetNodeReference(name)
+            text = self.parameterNode.GetParameter(name)
+            return text == "True" if kind is bool else kind(text)
+
+        def write(self, value):
+            if issubclass(kind, slicer.vtkMRMLNode):
+                assert value is None or isinstance(value, kind)
+                was = self.parameterNode.StartModify()
+                self.parameterNode.SetParameter(name, "")
+                self.parameterNode.SetNodeReferenceID(name, None if value is None else value.GetID())
+                self.parameterNode.EndModify(was)
+                return
+            assert isinstance(value, kind), (name, value)
+            for note in notes[name]:
+                if isinstance(note, Choice):
+                    assert value in note.choices
+                if isinstance(note, WithinRange):
+                    assert note.minimum <= value <= note.maximum
+            self.parameterNode.SetParameter(name, str(value))
+
+        return property(read, write)
+
+    def init(self, parameter_node) -> None:
+        self.parameterNode = parameter_node
+        self._connected = {}
+        for name, default in defaults.items():
+            if not parameter_node.HasParameter(name):
+                setattr(self, name, default)
+
+    def connect_gui(self, ui) -> int:
+        for widget in vars(ui).values():
+            name = widget.property("SlicerParameterName")
+            if name:
+                assert name in hints, f"{widget.objectName()} is connected to {name!r}, which is no parameter"
+                self._connected[name] = widget
+                _prepare(widget, types_[name], notes[name])
+        _show(self)
+        self._slots = {}
+        for name, widget in self._connected.items():
+            self._slots[name] = lambda *_, n=name, w=widget: setattr(self, n, _read(w))
+            _signal(widget).connect(self._slots[name])
+        self._tag = self.AddObserver(vtk.vtkCommand.ModifiedEvent, lambda *_: _show(self))
+        return 0
+
+    def disconnect_gui(self, tag) -> None:
+        for name, widget in self._connected.items():
+            _signal(widget).disconnect(self._slots[name])
+        self._connected = {}
+        self.RemoveObserver(self._tag)
+
+    for name in hints:
+        setattr(cls, name, make(name))
+    cls.__init__, cls.connectGui, cls.disconnectGui = init, connect_gui, disconnect_gui
+    cls.AddObserver = lambda self, *arguments: self.parameterNode.AddObserver(*arguments)
+    cls.RemoveObserver = lambda self, tag: self.parameterNode.RemoveObserver(tag)
+    cls.names = tuple(hints)
+    return cls
+
+
+def _prepare(widget, kind, notes) -> None:
+    if isinstance(widget, NodeComboBox):
+        widget._types = [kind().GetClassName()]
+    for note in notes:
+        if isinstance(note, Choice):
+            widget.clear()
+            widget.addItems(note.choices)
+        if isinstance(note, WithinRange):
+            widget.setRange(note.minimum, note.maximum)
+
+
+def _signal(widget):
+    if isinstance(widget, NodeComboBox):
+        return widget.currentNodeChanged
+    if isinstance(widget, QtWidgets.QCheckBox):
+        return widget.stateChanged
+    return widget.currentIndexChanged if isinstance(widget, QtWidgets.QComboBox) else widget.valueChanged
+
+
+def _read(widget):
+    if isinstance(widget, NodeComboBox):
+        return widget.currentNode()
+    for name in ("checked", "currentText", "value"):
+        if widget.property(name) is not None:
+            return widget.property(name)
+
+
+def _show(wrapper) -> None:
+    for name, widget in wrapper._connected.items():
+        value = getattr(wrapper, name)
+        if isinstance(widget, NodeComboBox):
+            widget.setCurrentNode(value)
+        elif isinstance(widget, QtWidgets.QCheckBox):
+            widget.setChecked(value)
+        elif isinstance(widget, QtWidgets.QComboBox):
+            widget.setCurrentText(value)
+        else:
+            widget.setValue(value)
+
+
+# ---- slicer.ScriptedLoadableModule -----------------------------------------------------------------------------------
+
+
+class ScriptedLoadableModule:
+    def __init__(self, parent) -> None:
+        self.parent = parent
+
+
+class ScriptedLoadableModuleWidget:
+    def __init__(self, parent) -> None:
+        self.parent = parent
+        self.layout = parent.layout()
+
+    def setup(self) -> None:
+        pass
+
+    def resourcePath(self, name: str) -> str:
+        return str(MODULE_FILE.parent / "Resources" / name)
+
+
+class ScriptedLoadableModuleLogic:
+    def __init__(self, parent=None) -> None:
+        self.moduleName = type(self).__name__.removesuffix("Logic")
+
+    def getParameterNode(self):
+        node = slicer.mrmlScene.GetSingletonNode(self.moduleName, "vtkMRMLScriptedModuleNode")
+        if node is None:
+            node = slicer.mrmlScene.CreateNodeByClass("vtkMRMLScriptedModuleNode")
+            node.UnRegister(None)
+            node.SetSingletonTag(self.moduleName)
+            node.SetAttribute("ModuleName", self.moduleName)
+            node = slicer.mrmlScene.AddNode(node)
+        return node
+
+
+def scripted_loadable_module_test():
+    import unittest
+
+    class ScriptedLoadableModuleTest(unittest.TestCase):
+        def delayDisplay(self, message: str) -> None:
+            pass
+
+        def runTest(self) -> None:
+            pass
+
+    return ScriptedLoadableModuleTest
+
+
+# ---- the application -------------------------------------------------------------------------------------------------
+
+
+class Application:
+    """slicer.app, and what message boxes said."""
+
+    def __init__(self) -> None:
+        self.qt = QtWidgets.QApplication.instance() or QtWidgets.QApplication([])
+        self.errors: list[str] = []
+        self.questions: list[str] = []
+        self.answer = True
+        self.started: list = []
+        self.installed: list[str] = []
+
+    def connect(self, signal: str, function) -> None:
+        assert signal == "startupCompleted()"
+        self.started.append(function)
+
+    def processEvents(self) -> None:
+        self.qt.processEvents()
+
+
+def _qt_name(name: str):
+    """PythonQt keeps all of Qt in one module."""
+    for source in (QtCore, QtGui, QtWidgets):
+        if hasattr(source, name):
+            return getattr(source, name)
+    raise AttributeError(f"qt has no {name}")
+
+
+def start() -> Application:
+    """Put the stand-ins where the module looks for them; pytest's monkeypatch of sys.modules takes them away again."""
+    # The scene's pointer type is PythonQt's: MRMLWidget hands the scene on instead of the .ui file's connections.
+    QtCore.QLoggingCategory.setFilterRules("qt.core.qobject.connect=false")
+    qt = types.ModuleType("qt")
+    qt.__getattr__ = _qt_name
+    app = Application()
+    modules = {
+        "qt": qt,
+        "slicer.i18n": types.SimpleNamespace(tr=lambda text: text, translate=lambda context, text: text),
+        "slicer.parameterNodeWrapper": types.SimpleNamespace(
+            parameterNodeWrapper=parameter_node_wrapper, Choice=Choice, WithinRange=WithinRange
+        ),
+        "slicer.ScriptedLoadableModule": types.SimpleNamespace(
+            ScriptedLoadableModule=ScriptedLoadableModule,
+            ScriptedLoadableModuleWidget=ScriptedLoadableModuleWidget,
+            ScriptedLoadableModuleLogic=ScriptedLoadableModuleLogic,
+            ScriptedLoadableModuleTest=scripted_loadable_module_test(),
+        ),
+    }
+    sys.modules.update(modules)
+    slicer.app = app
+    slicer.util.loadUI = load_ui
+    slicer.util.childWidgetVariables = child_widget_variables
+    slicer.util.errorDisplay = app.errors.append
+    slicer.util.pip_install = app.installed.extend
+
+    def confirm(question: str) -> bool:
+        app.questions.append(question)
+        return app.answer
+
+    slicer.util.confirmOkCancelDisplay = confirm
+    return app
+
+
+def load_module():
+    """What qSlicerScriptedUtils::loadSourceAsModule does."""
+    spec = importlib.util.spec_from_file_location("SlicerUSSim", str(MODULE_FILE))
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["SlicerUSSim"] = module
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,577 @@
+"""The scripted module as Slicer loads and runs it, on stand-ins for what only the Slicer application has."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import pkgutil
+import re
+import subprocess
+import sys
+import textwrap
+import typing
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+from vtkmodules.vtkCommonTransforms import vtkTransform
+
+os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
+pytest.importorskip("PySide6", reason="the panel is tested on Qt for Python: pip install PySide6-Essentials")
+
+from tests import slicer_stand_in as stand_in  # noqa: E402
+
+ROOT = Path(__file__).parents[1]
+UI_FILE = ROOT / "SlicerUSSim" / "Resources" / "UI" / "SlicerUSSim.ui"
+
+
+@pytest.fixture(scope="module")
+def module():
+    """SlicerUSSim.py, loaded as Slicer does; afterwards everything is imported as it was."""
+    before = dict(sys.modules)
+    own = slicer.__dict__.copy(), slicer.util.__dict__.copy()
+    app = stand_in.start()
+    for name in [name for name in sys.modules if name.split(".")[0] == "SlicerUSSim"]:
+        del sys.modules[name]
+    loaded = stand_in.load_module()
+    loaded.app = app
+    yield loaded
+    for name in set(sys.modules) - set(before):
+        if name.split(".")[0] in ("SlicerUSSim", "qt") or name.startswith("slicer."):
+            del sys.modules[name]
+    sys.modules.update(before)
+    for target, values in zip((slicer, slicer.util), own, strict=True):
+        for name in set(vars(target)) - set(values):
+            delattr(target, name)
+        vars(target).update(values)
+
+
+class Session:
+    """A scene, and the module's panel open on it."""
+
+    def __init__(self, module) -> None:
+        self.module, self.app = module, module.app
+        self.app.errors.clear()
+        slicer.mrmlScene = self.scene = slicer.vtkMRMLScene()
+        self.sequences = slicer.vtkSlicerSequencesLogic()
+        self.sequences.SetMRMLScene(self.scene)
+        for name in ("Red", "Yellow"):
+            view = self.add("Slice", name)
+            view.SetLayoutName(name)
+            self.add("SliceComposite", name).SetLayoutName(name)
+        parent = stand_in.QtWidgets.QWidget()
+        stand_in.QtWidgets.QVBoxLayout(parent)
+        parent.isEntered = True
+        self.parent = parent
+        self.widget = module.SlicerUSSimWidget(parent)
+        self.widget.setup()
+        self.widget.enter()
+        self.ui, self.panel = self.widget.ui, self.widget.panel
+        self.logic = self.widget.logic.ultrasound
+        self.parameters = self.logic.parameters
+
+    def add(self, kind: str, name: str):
+        return self.scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
+
+    def head(self):
+        """A small head, as loading an MRI would add it."""
+        mri = self.logic_module("phantoms").head_mri(3.0)
+        node = self.add("ScalarVolume", "Head")
+        volume = self.logic_module("volume").Volume
+        node.SetAndObserveImageData(volume(mri.array, np.eye(4)).to_vtk())
+        node.SetIJKToRASMatrix(self.logic_module("vtk_filters").vtk_matrix(mri.ijk_to_ras))
+        return node
+
+    def segmented(self):
+        """The same with its tissues, a coarse probe for speed, and the first image."""
+        self.parameters.mri = self.head()
+        self.ui.scanLinesSpinBox.setValue(48)
+        self.ui.segmentButton.click()
+        return self
+
+    @staticmethod
+    def logic_module(name: str):
+        return importlib.import_module(f"SlicerUSSim.Logic.{name}")
+
+    def process(self) -> None:
+        self.app.processEvents()
+        self.app.processEvents()
+
+    def image(self) -> np.ndarray:
+        return slicer.util.arrayFromVolume(self.parameters.output)[0].copy()
+
+    def move(self, z: float) -> None:
+        node = self.parameters.probe_transform
+        transform = vtkTransform()
+        transform.SetMatrix(node.GetMatrixTransformToParent())
+        transform.Translate(0, 0, z)
+        node.SetMatrixTransformToParent(transform.GetMatrix())
+
+    def close(self) -> None:
+        self.widget.cleanup()
+        self.parent.deleteLater()
+        self.process()
+
+
+@pytest.fixture
+def session(module):
+    result = Session(module)
+    yield result
+    result.close()
+
+
+# ---- loading ---------------------------------------------------------------------------------------------------------
+
+
+def test_every_submodule_imports_from_the_module_slicer_loaded(module):
+    assert module.__file__.endswith("SlicerUSSim.py") and sys.modules["SlicerUSSim"] is module
+    found = [info.name for info in pkgutil.walk_packages(module.__path__, "SlicerUSSim.")]
+    names = [name for name in found if ".Command" not in name and name != "SlicerUSSim.SlicerUSSim"]
+    assert len(names) > 35 and "SlicerUSSim.Logic.scene" in names and "SlicerUSSim.Widget.panel" in names
+    for name in names:
+        assert importlib.import_module(name).__file__.startswith(module.__path__[0]), name
+
+
+def test_the_module_folder_holds_no_file_that_slicer_would_take_for_a_module():
+    """Slicer runs every .py file beside a module; __main__.py would replace its own main module and quit."""
+    assert {path.name for path in (ROOT / "SlicerUSSim").glob("*.py")} == {"SlicerUSSim.py", "__init__.py"}
+
+
+def test_start_up_imports_nothing_that_takes_time_or_may_be_missing():
+    code = """
+        import os, sys
+        os.environ["QT_QPA_PLATFORM"] = "offscreen"
+        missing = ("pyopencl", "nlopt", "skimage", "platformdirs", "PIL", "tqdm", "click", "matplotlib", "nilearn")
+        class Finder:
+            def find_spec(self, name, path=None, target=None):
+                if name.split(".")[0] in missing:
+                    raise ImportError(name)
+        sys.meta_path.insert(0, Finder())
+        from tests import slicer_stand_in as stand_in
+        app = stand_in.start()
+        module = stand_in.load_module()
+        assert not any(name.startswith(("SlicerUSSim.", "scipy")) for name in sys.modules), "imported at start-up"
+        from tests.test_slicer_module import Session
+        module.app = app
+        session = Session(module)          # the panel opens all the same
+        assert not session.app.errors
+        session.parameters.mri = session.head()
+        app.answer = False                 # the user does not want the packages
+        session.ui.segmentButton.click()
+        assert session.app.errors == [
+            "SlicerUSSim needs Python packages that are not installed (the installation was declined)"
+        ], session.app.errors
+        assert "pyopencl" in app.questions[0] and not app.installed
+        app.answer = True
+        module.ensurePackages()
+        assert any(name.startswith("pyopencl") for name in app.installed), app.installed
+        print("fine")
+    """
+    # Without the distributions' metadata: as if they had never been installed.
+    hide = """
+        import importlib.metadata as metadata
+        real = metadata.version
+        def version(name):
+            if name in ("pyopencl", "scikit-image"):
+                raise metadata.PackageNotFoundError(name)
+            return real(name)
+        metadata.version = version
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(hide) + textwrap.dedent(code)], capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.returncode == 0 and done.stdout.strip().endswith("fine"), done.stderr[-2000:]
+
+
+def test_packages_are_installed_once_and_only_if_missing(module):
+    module.app.installed.clear()
+    module.ensurePackages()
+    assert not module.app.installed  # everything is here
+
+
+def test_requirements_are_those_of_the_package_without_what_slicer_brings():
+    tomllib = pytest.importorskip("tomllib")
+    package = {
+        _distribution(r) for r in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    }
+    lines = (ROOT / "SlicerUSSim" / "Resources" / "requirements.txt").read_text().splitlines()
+    module = {_distribution(line) for line in lines if line and not line.startswith("#")}
+    in_slicer = {"numpy", "vtk", "simpleitk"}
+    for_the_command = {"click", "tqdm", "pillow"}
+    assert module == {entry for entry in package if entry[0] not in in_slicer | for_the_command}
+
+
+def _distribution(requirement: str) -> tuple[str, str]:
+    name, rest = re.match(r"([\w-]+)(.*)", requirement).groups()
+    return name.lower(), rest.replace("'", '"').replace(" ", "")
+
+
+def test_the_module_describes_itself(module):
+    class Parent:
+        path = str(stand_in.MODULE_FILE)
+
+    described = module.SlicerUSSim(Parent())
+    parent = described.parent
+    assert parent.title and parent.categories == ["Ultrasound"] and "Salehi" in parent.acknowledgementText
+    assert "MRI" in parent.helpText and "<a href=" in parent.helpText
+    assert (ROOT / "SlicerUSSim" / "Resources" / "Icons" / "SlicerUSSim.png").exists()
+
+
+def test_sample_data_is_registered_with_a_checksum_and_a_thumbnail(module, monkeypatch):
+    registered = {}
+
+    class Logic:
+        @staticmethod
+        def registerCustomSampleDataSource(**options):
+            registered.update(options)
+
+    monkeypatch.setitem(sys.modules, "SampleData", type(sys)("SampleData"))
+    sys.modules["SampleData"].SampleDataLogic = Logic
+    module.registerSampleData()
+    assert Path(registered["thumbnailFileName"]).exists()
+    assert re.fullmatch(r"SHA256:[0-9a-f]{64}", registered["checksums"])
+    assert registered["uris"].startswith("https://") and registered["fileNames"].endswith(".nii.gz")
+    nilearn = pytest.importorskip("nilearn")
+    import hashlib
+
+    brain = Path(nilearn.__file__).parent / "datasets/data" / registered["uris"].rsplit("/", 1)[1]
+    assert hashlib.sha256(brain.read_bytes()).hexdigest() == registered["checksums"].split(":")[1]
+
+
+def test_the_parameter_node_is_the_scenes(module):
+    hints = typing.get_type_hints(module.SlicerUSSimParameterNode)
+    parameters = importlib.import_module("SlicerUSSim.Logic.scene_parameters")
+    assert set(hints) == {*parameters.NODE_PARAMETERS, *parameters.VALUE_PARAMETERS}
+    for name, default in parameters.VALUE_PARAMETERS.items():
+        assert hints[name] is type(default), name
+    for name, classes in parameters.NODE_PARAMETERS.items():
+        for kind in classes:
+            assert issubclass(getattr(slicer, kind), hints[name]), name
+
+
+def test_the_modules_own_test_passes(module):
+    slicer.mrmlScene = slicer.vtkMRMLScene()
+    module.SlicerUSSimTest().runTest()
+
+
+# ---- the .ui file ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ui(module):
+    widget = stand_in.load_ui(UI_FILE)
+    variables = stand_in.child_widget_variables(widget)
+    variables.root = widget
+    return variables
+
+
+def test_every_widget_the_code_names_is_in_the_ui_file(ui):
+    for file in (ROOT / "SlicerUSSim" / "Widget" / "panel.py", ROOT / "SlicerUSSim" / "SlicerUSSim.py"):
+        names = set(re.findall(r"\bui\.(\w+)", file.read_text()))
+        missing = {name for name in names if not hasattr(ui, name)} - {"__dict__"}
+        assert not missing, file.name
+    used = set(re.findall(r"\bui\.(\w+)", (ROOT / "SlicerUSSim" / "Widget" / "panel.py").read_text()))
+    assert len(used) > 15
+
+
+def test_every_control_has_a_tool_tip_and_numbers_their_unit(ui):
+    kinds = (stand_in.QtWidgets.QAbstractSpinBox, stand_in.QtWidgets.QComboBox, stand_in.QtWidgets.QAbstractButton,
+             stand_in.SliderWidget, stand_in.QtWidgets.QTableWidget)  # fmt: skip
+    controls = [
+        w for w in ui.root.findChildren(stand_in.QtWidgets.QWidget)
+        if isinstance(w, kinds) and w.objectName() in vars(ui) and not isinstance(w, stand_in.CollapsibleButton)
+    ]  # fmt: skip
+    assert len(controls) > 45
+    for widget in controls:
+        assert len(widget.toolTip()) > 10, widget.objectName()
+        suffix = widget.property("suffix")
+        if suffix and suffix.strip() not in ("°",):
+            assert f"{suffix.strip()}" in widget.toolTip(), widget.objectName()
+
+
+def test_every_node_selector_gets_the_scene():
+    tree = ElementTree.parse(UI_FILE)
+    selectors = {w.get("name") for w in tree.iter("widget") if w.get("class") == "qMRMLNodeComboBox"}
+    connected = {c.findtext("receiver") for c in tree.iter("connection")}
+    assert selectors and selectors == connected
+    declared = {c.findtext("class") for c in tree.iter("customwidget")}
+    assert declared == set(stand_in.WIDGETS)
+
+
+def test_every_field_of_the_panel_is_one_of_the_preset_and_accepts_both_ends_of_its_range(ui):
+    fields = importlib.import_module("SlicerUSSim.Widget.fields")
+    preset_module = importlib.import_module("SlicerUSSim.Logic.preset")
+    probes = importlib.import_module("SlicerUSSim.Logic.probe").PROBES
+    seen = set()
+    for widget in vars(ui).values():
+        name = widget.property("presetField")
+        if not name:
+            continue
+        seen.add(name)
+        for probe in probes.values():
+            preset = preset_module.Preset(probe)
+            shown = fields.field_value(preset, name)
+            if shown is None:
+                continue
+            if widget.property("minimum") is not None:
+                low, high = widget.property("minimum"), widget.property("maximum")
+                assert low <= shown <= high, (name, probe)
+                for end in (low, high):
+                    fields.with_field(preset, name, end)
+            again = fields.field_value(fields.with_field(preset, name, shown), name)
+            assert again == pytest.approx(shown) if isinstance(shown, float) else again == shown
+    assert seen == set(fields.FIELDS)
+
+
+# ---- working with it -------------------------------------------------------------------------------------------------
+
+
+def test_the_first_image_takes_a_volume_and_two_clicks(session):
+    session.parameters.mri = None
+    assert not session.ui.segmentButton.isEnabled() and not session.ui.liveCheckBox.isEnabled()
+    session.head()
+    session.widget.enter()  # the only volume is taken for the MRI
+    assert session.parameters.mri.GetName() == "Head" and session.ui.segmentButton.isEnabled()
+    session.ui.segmentButton.click()
+    labels = session.parameters.labels
+    assert labels.GetName() == "Head tissues" and labels.GetSegmentation().GetNumberOfSegments() == 4
+    assert session.ui.labelsSelector.currentNode() is labels
+    session.ui.liveCheckBox.setChecked(True)
+    assert session.logic.isLive and not session.app.errors
+    assert session.image().mean() > 5
+    assert session.parameters.output.GetParentTransformNode() is session.parameters.probe_transform
+    assert session.parameters.outline.GetPolyData().GetNumberOfPoints() > 50
+    assert session.parameters.probe_transform.GetDisplayNode().GetEditorVisibility()
+
+
+def test_the_image_follows_the_probe_and_the_controls_from_the_event_loop(session):
+    session.segmented()
+    session.ui.liveCheckBox.setChecked(True)
+    images = [session.image()]
+    for name, change in {
+        "probe": lambda: [session.move(0.1) for _ in range(50)],
+        "gain": lambda: session.ui.gainSlider.setValue(12.0),
+        "depth": lambda: session.ui.depthSlider.setValue(60.0),
+        "kind": lambda: session.ui.probeKindComboBox.setCurrentText("convex"),
+        "tissue": lambda: session.ui.tissueTable.item(3, 4).setText("0.9"),
+    }.items():
+        change()
+        assert (session.image().shape == images[-1].shape) and (session.image() == images[-1]).all(), "not yet"
+        session.process()
+        now = session.image()
+        assert now.shape != images[-1].shape or (now != images[-1]).mean() > 0.02, name
+        images.append(now)
+    assert not session.app.errors
+    session.ui.liveCheckBox.setChecked(False)
+    session.move(3)
+    session.process()
+    assert (session.image() == images[-1]).all() and not session.logic.isLive
+
+
+def test_the_slice_view_stands_in_the_plane_of_the_probe(session):
+    session.segmented()
+    session.ui.sliceViewComboBox.setCurrentText("Yellow")
+    session.ui.simulateButton.click()
+    view = session.panel.sliceNode()
+    assert view.GetLayoutName() == "Yellow"
+    nodes = importlib.import_module("SlicerUSSim.Logic.scene_nodes")
+    pose = nodes.node_to_world(session.parameters.probe_transform)
+    matrix = np.array(view.GetSliceToRAS().GetData()).reshape(4, 4)
+    np.testing.assert_allclose(matrix[:3, 0], pose[:3, 0], atol=1e-9)
+    np.testing.assert_allclose(matrix[:3, 1], -pose[:3, 1], atol=1e-9)
+    np.testing.assert_allclose((np.linalg.inv(pose) @ matrix)[2, 3], 0, atol=1e-9)
+    composites = [session.scene.GetNthNodeByClass(n, "vtkMRMLSliceCompositeNode") for n in range(2)]
+    ids = {c.GetLayoutName(): c.GetForegroundVolumeID() for c in composites}
+    assert ids["Yellow"] == session.parameters.output.GetID() and ids["Red"] is None
+    session.ui.followCheckBox.setChecked(False)
+    assert session.panel.sliceNode() is None and session.parameters.show_in_slice is False
+
+
+def test_a_wrong_value_is_one_message_and_the_old_one_stays(session):
+    session.segmented()
+    before = session.ui.tissueTable.item(1, 1).text()
+    session.ui.tissueTable.item(1, 1).setText("fast")
+    assert len(session.app.errors) == 1 and "'fast', expected a number" in session.app.errors[0]
+    assert session.ui.tissueTable.item(1, 1).text() == before
+    session.ui.tissueTable.item(1, 1).setText("-3")
+    assert "speed_of_sound_m_s is -3.0, expected a number between 100 and 10000" in session.app.errors[1]
+    assert session.ui.tissueTable.item(1, 1).text() == before
+
+
+def test_tissues_can_be_taken_from_presets_and_reset(session):
+    session.segmented()
+    ui = session.ui
+    names = [ui.tissueTable.item(line, 0).text() for line in range(ui.tissueTable.rowCount())]
+    assert names == ["coupling", "csf", "grey matter", "white matter", "leptomeninges"]
+    line = names.index("grey matter")
+    ui.tissueTable.setCurrentCell(line, 0)
+    ui.tissuePresetComboBox.setCurrentText("liver")
+    ui.assignTissueButton.click()
+    assert ui.tissueTable.item(line, 0).text() == "grey matter" and ui.tissueTable.item(line, 1).text() == "1578"
+    assert "Szabo" in ui.tissueTable.item(line, 1).toolTip()
+    ui.tissueTable.item(line, 4).setText("0,5")  # a comma is a point
+    assert session.logic.preset.tissues.for_names({1: "grey matter"})[1].mu0 == 0.5
+    assert ui.tissueTable.item(line, 4).toolTip() == "set by hand"
+    ui.resetTissuesButton.click()
+    assert ui.tissueTable.item(line, 1).text() == "1541"
+
+
+def test_a_tissue_the_preset_did_not_have_can_be_edited(session):
+    session.segmented()
+    segmentation = session.parameters.labels.GetSegmentation()
+    segmentation.GetNthSegment(1).SetName("My Tumor")
+    session.panel.refresh()
+    names = [session.ui.tissueTable.item(n, 0).text() for n in range(session.ui.tissueTable.rowCount())]
+    line = names.index("tumour")
+    session.ui.tissueTable.item(line, 4).setText("0.77")
+    assert not session.app.errors
+    table = session.logic.tissues(session.parameters.labels)
+    assert [tissue.mu0 for tissue in table.values() if tissue.name == "tumour"] == [0.77]
+
+
+def test_presets_go_through_files_of_the_command(session, tmp_path, monkeypatch):
+    import qt
+
+    file = str(tmp_path / "mine.json")
+    session.ui.probePresetComboBox.setCurrentText("abdominal")
+    session.ui.gainSlider.setValue(7.5)
+    monkeypatch.setattr(qt.QFileDialog, "getSaveFileName", staticmethod(lambda *_: (file, "")))
+    session.ui.savePresetButton.click()
+    saved = json.loads(Path(file).read_text())
+    assert saved["probe"]["radius_mm"] == 60.0 and saved["display"]["gain_db"] == 7.5
+    session.ui.gainSlider.setValue(0.0)
+    session.ui.probePresetComboBox.setCurrentText("linear")
+    assert session.ui.widthSpinBox.isEnabled() and not session.ui.radiusSpinBox.isEnabled()
+    monkeypatch.setattr(qt.QFileDialog, "getOpenFileName", staticmethod(lambda *_: file))
+    session.ui.loadPresetButton.click()
+    assert session.ui.gainSlider.property("value") == 7.5 and session.ui.radiusSpinBox.value() == 60.0
+    assert session.ui.probePresetComboBox.currentText() == "abdominal"
+    Path(file).write_text('{"display": {"gain": 3}}')
+    session.ui.loadPresetButton.click()
+    assert session.app.errors and "mine.json: display: 'gain' is unknown" in session.app.errors[0]
+    assert session.ui.gainSlider.property("value") == 7.5
+    monkeypatch.setattr(qt.QFileDialog, "getSaveFileName", staticmethod(lambda *_: "/nowhere/x.json"))
+    session.ui.savePresetButton.click()
+    assert "/nowhere/x.json: the folder /nowhere does not exist" in session.app.errors[1]
+
+
+def test_cancel_stops_the_segmentation_and_leaves_nothing(session):
+    session.parameters.mri = session.head()
+    shown = []
+
+    def press_cancel():
+        shown.append(session.ui.progressWidget.isVisibleTo(session.parent))
+        shown.append(session.ui.segmentButton.isEnabled())
+        session.ui.cancelButton.click()
+
+    stand_in.QtCore.QTimer.singleShot(0, press_cancel)
+    session.ui.segmentButton.click()
+    assert shown == [True, False]
+    assert session.parameters.labels is None and session.scene.GetNumberOfNodesByClass("vtkMRMLSegmentationNode") == 0
+    assert not session.app.errors  # the user knows
+    assert session.ui.segmentButton.isEnabled() and not session.ui.progressWidget.isVisibleTo(session.parent)
+
+
+def test_errors_of_every_button_are_one_line(session):
+    session.parameters.mri = session.add("ScalarVolume", "hollow")
+    session.ui.segmentButton.click()
+    assert session.app.errors == ["MRI Volume 'hollow' has no image data"]
+    assert session.parameters.labels is None
+    session.parameters.labels = session.add("Segmentation", "empty")
+    session.ui.liveCheckBox.setChecked(True)
+    assert "'empty' is empty" in session.app.errors[1] and not session.ui.liveCheckBox.isChecked()
+    session.ui.simulateButton.click()
+    session.ui.placeButton.click()
+    assert len(session.app.errors) == 4 and not any("\n" in message for message in session.app.errors)
+    session.ui.simulateSequenceButton.click()
+    assert "no sequence of transforms chosen" in session.app.errors[4]
+
+
+def test_a_sequence_is_simulated_and_its_browser_plays_it(session):
+    session.segmented()
+    session.ui.placeButton.click()
+    transforms = session.add("Sequence", "sweep")
+    nodes = importlib.import_module("SlicerUSSim.Logic.scene_nodes")
+    pose = nodes.node_to_world(session.parameters.probe_transform)
+    for number in range(3):
+        item = slicer.vtkMRMLLinearTransformNode()
+        nodes.set_node_to_world(item, pose)
+        transforms.SetDataNodeAtValue(item, str(number))
+    browser = session.add("SequenceBrowser", "browser")
+    browser.SetAndObserveMasterSequenceNodeID(transforms.GetID())
+    session.ui.transformSequenceSelector.setCurrentNode(transforms)
+    session.ui.simulateSequenceButton.click()
+    assert not session.app.errors
+    images = session.scene.GetFirstNodeByName("sweep ultrasound")
+    assert images.GetNumberOfDataNodes() == 3 and browser.IsSynchronizedSequenceNode(images, True)
+    assert session.ui.statusLabel.text() == "3 images in 'sweep ultrasound'"
+
+
+def test_choosing_other_nodes_while_live_goes_on_with_those(session):
+    session.segmented()
+    session.ui.liveCheckBox.setChecked(True)
+    first = session.parameters.output
+    other = session.add("ScalarVolume", "other")
+    session.ui.outputSelector.setCurrentNode(other)
+    session.process()
+    assert session.logic.isLive and session.parameters.output is other
+    assert (slicer.util.arrayFromVolume(other) == slicer.util.arrayFromVolume(first)).all()
+    session.scene.RemoveNode(session.parameters.probe_transform)
+    session.process()
+    assert not session.logic.isLive and not session.ui.liveCheckBox.isChecked()
+
+
+def test_closing_the_scene_and_leaving_the_module_is_survived(session):
+    session.segmented()
+    session.ui.liveCheckBox.setChecked(True)
+    session.widget.exit()
+    session.move(1)
+    session.process()
+    assert session.logic.isLive  # in another module the image still follows
+    session.widget.enter()
+    session.scene.Clear(0)
+    session.process()
+    assert not session.logic.isLive and session.parameters.labels is None
+    session.head()
+    session.widget.enter()
+    session.ui.segmentButton.click()
+    assert session.parameters.labels is not None and not session.app.errors
+
+
+def test_reloading_the_module_brings_new_code(module):
+    scene_before = sys.modules.get("SlicerUSSim.Logic.scene") or importlib.import_module("SlicerUSSim.Logic.scene")
+    again = stand_in.load_module()
+    try:
+        assert importlib.import_module("SlicerUSSim.Logic.scene") is not scene_before
+        assert again.SlicerUSSimLogic is not module.SlicerUSSimLogic
+    finally:
+        module.__dict__.update(again.__dict__ | {"app": module.app})
+
+
+def test_the_panel_looks_as_it_should(session, tmp_path):
+    """A picture of the panel, with every section open, in which every control is visible and none is cut off."""
+    session.segmented()
+    session.ui.simulateButton.click()
+    for button in session.parent.findChildren(stand_in.CollapsibleButton):
+        button.setCollapsed(False)
+    session.parent.resize(520, 1500)
+    session.parent.show()
+    session.process()
+    picture = session.parent.grab().toImage()
+    file = tmp_path / "panel.png"
+    assert picture.save(str(file))
+    for widget in vars(session.ui).values():
+        if isinstance(widget, stand_in.QtWidgets.QAbstractButton | stand_in.SliderWidget | stand_in.NodeComboBox):
+            if widget.objectName() == "cancelButton":
+                continue
+            assert widget.isVisible() and widget.width() > 40 and widget.height() >= 12, widget.objectName()
+    from PIL import Image
+
+    pixels = np.asarray(Image.open(file).convert("L"))
+    assert pixels.shape[0] >= 1400 and pixels.std() > 20
+    keep = os.environ.get("USSIM_PICTURES")
+    if keep:
+        picture.save(str(Path(keep) / "slicer-panel.png"))
