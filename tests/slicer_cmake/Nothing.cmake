@@ -1,0 +1,1 @@
+# Included where Slicer's own build system would have something to say.

@@ -1,0 +1,32 @@
+# Stands in for find_package(Slicer): records what the project asks of Slicer's build system, and copies scripts and
+# resources where slicerMacroBuildScriptedModule would, so that the build tree can be loaded.
+
+set(Slicer_USE_FILE "${CMAKE_CURRENT_LIST_DIR}/Nothing.cmake")
+set(Slicer_EXTENSION_GENERATE_CONFIG "${CMAKE_CURRENT_LIST_DIR}/Nothing.cmake")
+set(Slicer_EXTENSION_CPACK "${CMAKE_CURRENT_LIST_DIR}/Record.cmake")
+set(Slicer_QTSCRIPTEDMODULES_LIB_DIR "lib/Slicer-5.10/qt-scripted-modules")
+set(Slicer_INSTALL_QTSCRIPTEDMODULES_LIB_DIR "lib/Slicer-5.10/qt-scripted-modules")
+set(RECORD "${CMAKE_BINARY_DIR}/record.txt")
+file(WRITE "${RECORD}" "")
+
+macro(slicerMacroBuildScriptedModule)
+  cmake_parse_arguments(MY "WITH_GENERIC_TESTS;WITH_SUBDIR;VERBOSE" "NAME" "SCRIPTS;RESOURCES" ${ARGN})
+  if(MY_UNPARSED_ARGUMENTS)
+    message(FATAL_ERROR "Unknown keywords given to slicerMacroBuildScriptedModule(): ${MY_UNPARSED_ARGUMENTS}")
+  endif()
+  file(APPEND "${RECORD}" "NAME ${MY_NAME}\n")
+  foreach(kind SCRIPTS RESOURCES)
+    foreach(path IN LISTS MY_${kind})
+      if(NOT EXISTS "${CMAKE_CURRENT_SOURCE_DIR}/${path}")
+        message(FATAL_ERROR "slicerMacroBuildScriptedModule(${kind}) given nonexistent file '${path}'")
+      endif()
+      file(APPEND "${RECORD}" "${kind} ${path}\n")
+      configure_file("${path}" "${CMAKE_BINARY_DIR}/${Slicer_QTSCRIPTEDMODULES_LIB_DIR}/${path}" COPYONLY)
+    endforeach()
+  endforeach()
+endmacro()
+
+macro(slicer_add_python_unittest)
+  cmake_parse_arguments(MY "" "SCRIPT" "SLICER_ARGS" ${ARGN})
+  file(APPEND "${RECORD}" "TEST ${MY_SCRIPT}\n")
+endmacro()
