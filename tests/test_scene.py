@@ -630,3 +630,52 @@ def test_hybrid_scatterers_take_the_texture_of_the_last_segmentation():
     labels.GetImageData().Modified()  # painted on: the texture is not that of these labels any more
     with pytest.raises(SimulationError, match="segment the MRI again"):
         logic.simulate(labels, probe, image)
+
+
+def test_slicers_own_slice_view_shows_the_image_upright_and_not_mirrored(bench):
+    """Through vtkMRMLSliceLogic, which is what draws Slicer's slice views."""
+    application = slicer.vtkSlicerApplicationLogic()
+    application.SetMRMLScene(bench.scene)
+    application.GetColorLogic().SetMRMLScene(bench.scene)
+    application.GetColorLogic().AddDefaultColorNodes()
+    view_logic = slicer.vtkMRMLSliceLogic()
+    view_logic.SetMRMLApplicationLogic(application)
+    view_logic.SetMRMLScene(bench.scene)
+    view = view_logic.AddSliceNode("Red")
+    view_logic.ResizeSliceNode(200, 160)
+    put(bench.probe, ABOVE @ rigid(Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix(), [0, 0, 0]))
+    frame = bench.simulate()
+    bench.logic.showInSlice(view, bench.image, bench.probe)
+    assert view_logic.GetSliceCompositeNode().GetForegroundVolumeID() == bench.image.GetID()
+    view_logic.UpdatePipeline()
+    connection = view_logic.GetForegroundLayer().GetImageDataConnection()
+    connection.GetProducer().Update()
+    output = connection.GetProducer().GetOutputDataObject(0)
+    shown = Volume.from_vtk(component(output, 0), np.eye(4)).array[0].astype(int)
+    assert shown.shape == (160, 200)
+    to_pixel = np.linalg.inv(frame.probe_to_ras @ frame.image_to_probe) @ np.array(view.GetXYToRAS().GetData()).reshape(
+        4, 4
+    )
+    compared = 0
+    for x in range(3, 200, 7):
+        for y in range(3, 160, 7):
+            column, row, away, _ = to_pixel @ [x, y, 0, 1]
+            assert abs(away) < 1e-6  # the view lies in the plane of the probe
+            column, row = round(column), round(row)
+            if 1 <= column < 62 and 1 <= row < 94:
+                around = frame.image[row - 1 : row + 2, column - 1 : column + 2].astype(int)
+                assert around.min() - 2 <= shown[y, x] <= around.max() + 2, (x, y)
+                compared += 1
+    assert compared > 100
+    top = shown[np.flatnonzero(shown.any(axis=1))[-1]]  # VTK counts rows from below
+    assert top.mean() > 0 and to_pixel[1, 1] < 0 < to_pixel[0, 0]  # depth runs down, left is left
+
+
+def component(image, number: int):
+    from vtkmodules.vtkImagingCore import vtkImageExtractComponents
+
+    extract = vtkImageExtractComponents()
+    extract.SetInputData(image)
+    extract.SetComponents(number)
+    extract.Update()
+    return extract.GetOutput()
