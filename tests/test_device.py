@@ -10,6 +10,7 @@ import pytest
 
 from SlicerUSSim.Logic import LinearProbe, SimulationError, UltrasoundSimulator, list_devices
 from SlicerUSSim.Logic.device import Device, DeviceInfo, choose_device, faster_hint, kernel_folder
+from SlicerUSSim.Logic.pocl import require_linker
 from tests.conftest import SPECKLE, block, rigid, simulator
 
 
@@ -118,3 +119,15 @@ def test_importing_the_interface_imports_nothing_heavy():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("missing", [("ld",), ("gcc", "cc")])
+def test_pocl_without_a_linker_is_an_error_and_not_the_end_of_the_process(monkeypatch, missing):
+    """PoCL 3 aborts where it cannot link, as on a minimal Debian."""
+    monkeypatch.setattr("shutil.which", lambda name, path=None: None if name in missing else f"/usr/bin/{name}")
+    monkeypatch.setattr("pathlib.Path.glob", lambda self, pattern: iter(()))
+    with pytest.raises(SimulationError, match=r"which are not installed; .* apt-get install gcc libc6-dev"):
+        require_linker("OpenCL 3.0 PoCL 3.0  Linux, Release, RELOC, LLVM 14.0.6")
+    require_linker("OpenCL 3.0 PoCL 6.0  Linux, Release")  # which brings its own
+    monkeypatch.undo()
+    require_linker("OpenCL 3.0 PoCL 3.0  Linux")

@@ -212,8 +212,9 @@ class Device:
         self.cl = cl
         self.info = info
         if "Portable Computing Language" in info.platform:
-            from SlicerUSSim.Logic.pocl import name_unknown_processor
+            from SlicerUSSim.Logic.pocl import name_unknown_processor, require_linker
 
+            require_linker(info.handle.platform.version)
             name_unknown_processor(info.handle)
         try:
             self.context = cl.Context([info.handle])

@@ -1,4 +1,4 @@
-"""A workaround for processors that are newer than the compiler inside PoCL 3.0.
+"""What PoCL 3.0 needs beside itself: a processor name that its compiler knows, and a linker.
 
 LLVM 14 calls a processor it does not know "generic" (AMD Zen 4 and 5, for instance), PoCL hands that name to clang,
 and clang refuses it: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open since 2022). PoCL 3.0 has no setting
@@ -10,8 +10,13 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
+import shutil
 import struct
+import sys
 from pathlib import Path
+
+from SlicerUSSim.Logic.errors import require
 
 # The oldest Intel processor of each of PoCL's x86 kernel libraries, and the /proc/cpuinfo flags it needs.
 # PoCL picks its library by these flags, and the name has to go with the library.
@@ -49,6 +54,23 @@ def name_unknown_processor(handle) -> str | None:
         return None
     ctypes.memmove(address, name.encode() + b"\0", len(name) + 1)
     return name
+
+
+def require_linker(version: str) -> None:
+    """Raise SimulationError where PoCL would end the process: up to version 5 it links every kernel with `ld`, against
+    libgcc and libc, and aborts where it cannot, as on a minimal Debian. `version` is that of the OpenCL platform."""
+    found = re.search(r"PoCL (\d+)", version, re.IGNORECASE)
+    if found is None or int(found.group(1)) > 5 or sys.platform != "linux":
+        return
+    search = os.pathsep.join([os.environ.get("PATH", ""), "/usr/bin", "/bin"])
+    has_libraries = any(shutil.which(name, path=search) for name in ("gcc", "cc")) or any(
+        any(Path("/usr").glob(f"{place}/gcc/*/*/libgcc.a")) for place in ("lib", "lib64")
+    )
+    require(
+        shutil.which("ld", path=search) is not None and has_libraries,
+        "PoCL, the OpenCL runtime in use, links its kernels with `ld` and libgcc, which are not installed; on Debian "
+        "and Ubuntu run: sudo apt-get install gcc libc6-dev",
+    )
 
 
 def _processor_flags() -> set[str]:

@@ -1,0 +1,76 @@
+"""What MRML adds to a frame: the simulator alone against the scene's live update, alternating in one run.
+
+    python benchmarks/live.py [--repeat N] [--device NAME]
+
+Frame A (phased array, 196 scan lines, 73 mm deep) on the MNI152 segmentation. "live" is one change of the probe's
+transform node until the output volume holds the new image, through the observers, with an event loop that runs at once.
+Needs pip install "SlicerUSSim[slicer,demo]".
+"""
+
+from __future__ import annotations
+
+import argparse
+from statistics import median
+from time import perf_counter
+
+import numpy as np
+import slicer
+
+from SlicerUSSim.Logic import PhasedProbe, Volume
+from SlicerUSSim.Logic.demo import demo_mri
+from SlicerUSSim.Logic.placement import slide_sweep
+from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
+from SlicerUSSim.Logic.scene_nodes import node_to_world
+from SlicerUSSim.Logic.vtk_filters import vtk_matrix
+
+PROBE_A = PhasedProbe(75, 73, scan_lines=196)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeat", type=int, default=60, help="frames of each kind")
+    parser.add_argument("--device", help="see `ussim devices`")
+    arguments = parser.parse_args()
+    for kind in ("Segmentation", "LabelMapVolume"):
+        alone, live = measure(kind, arguments.repeat, arguments.device)
+        extra = sorted(b - a for a, b in zip(alone, live, strict=True))
+        print(
+            f"{kind:15s} simulator best {min(alone):6.2f} median {median(alone):6.2f} ms   "
+            f"live best {min(live):6.2f} median {median(live):6.2f} ms   "
+            f"MRML adds {min(live) - min(alone):5.2f} ms (best), {median(extra):5.2f} ms (median of pairs)"
+        )
+
+
+def measure(kind: str, repeat: int, device: str | None) -> tuple[list[float], list[float]]:
+    """(milliseconds of the simulator alone, of the live update) for the same poses."""
+    scene = slicer.vtkMRMLScene()
+    logic = UltrasoundSceneLogic(scene, device)
+    logic.preset = logic.preset.changed("probe", **{**PROBE_A.to_dict(), "kind": "phased"})
+    mri = demo_mri()[0]
+    node = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "MRI")
+    node.SetAndObserveImageData(Volume(mri.array, np.eye(4)).to_vtk())
+    node.SetIJKToRASMatrix(vtk_matrix(mri.ijk_to_ras))
+    labels = scene.AddNewNodeByClass(f"vtkMRML{kind}Node", "Tissues")
+    probe = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
+    output = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Ultrasound")
+    outline = scene.AddNewNodeByClass("vtkMRMLModelNode", "Outline")
+    logic.segment(node, labels)
+    logic.placeProbe(labels, probe)
+    logic.startLiveUpdate(labels, probe, output, outline)
+    labelled = logic._read_labels(labels)
+    simulator = logic._simulator_for(labels, labelled, node_to_world(labels))
+    poses = slide_sweep(node_to_world(probe), 10.0, repeat)
+    alone, live = [], []
+    for pose in poses:
+        start = perf_counter()
+        simulator.simulate(logic.preset.probe, pose, logic.preset.display)
+        middle = perf_counter()
+        probe.SetMatrixTransformToParent(vtk_matrix(pose))
+        end = perf_counter()
+        alone.append(1e3 * (middle - start))
+        live.append(1e3 * (end - middle))
+    return alone, live
+
+
+if __name__ == "__main__":
+    main()
