@@ -13,15 +13,22 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MODULES = "lib/Slicer-5.10/qt-scripted-modules"
-BESIDE = shutil.which("cmake", path=str(Path(sys.executable).parent)) or shutil.which("cmake")
-pytestmark = pytest.mark.skipif(BESIDE is None, reason="CMake is not installed: pip install cmake")
+
+
+def tool(name: str) -> str | None:
+    """The program of a pip package, beside this Python, or of the system."""
+    return shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
+
+
+CMAKE, NINJA = tool("cmake"), tool("ninja")
+pytestmark = pytest.mark.skipif(None in (CMAKE, NINJA), reason="CMake is missing: pip install cmake ninja")
 
 
 @pytest.fixture(scope="module")
 def build(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("build")
     subprocess.run(
-        [BESIDE, "-S", ROOT, "-B", folder, f"-DSlicer_DIR={ROOT / 'tests/slicer_cmake'}", "-DBUILD_TESTING=ON",
+        [CMAKE, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={NINJA}", "-S", ROOT, "-B", folder, f"-DSlicer_DIR={ROOT / 'tests/slicer_cmake'}", "-DBUILD_TESTING=ON",
          f"-DCMAKE_INSTALL_PREFIX={folder / 'installed'}"],
         check=True, capture_output=True, text=True,
     )  # fmt: skip
@@ -54,7 +61,7 @@ def test_every_script_and_resource_of_the_package_is_listed(record):
 def test_every_kernel_is_beside_the_module_in_the_build_and_the_installed_tree(build):
     kernels = files(ROOT / "kernels", "*")
     assert len(kernels) > 8 and files(build / MODULES / "kernels", "*") == kernels
-    subprocess.run([BESIDE, "--install", build], check=True, capture_output=True)
+    subprocess.run([CMAKE, "--install", build], check=True, capture_output=True)
     assert files(build / "installed" / MODULES / "kernels", "*") == kernels
 
 
