@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.demo import demo_mri
 from SlicerUSSim.Logic.placement import slide_sweep
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.scene_nodes import node_to_world
-from SlicerUSSim.Logic.vtk_filters import vtk_matrix
+from SlicerUSSim.Logic.vtk_data import vtk_matrix
 
 PROBE_A = PhasedProbe(75, 73, scan_lines=196)
 

@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.errors import require
 from SlicerUSSim.Logic.placement import slide_sweep
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.scene_nodes import node_to_world
-from SlicerUSSim.Logic.vtk_filters import vtk_matrix
+from SlicerUSSim.Logic.vtk_data import vtk_matrix
 
 
 def new_scene() -> tuple[slicer.vtkMRMLScene, slicer.vtkSlicerSequencesLogic]:

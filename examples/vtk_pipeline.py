@@ -30,7 +30,8 @@ from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.demo import demo_mri
 from SlicerUSSim.Logic.placement import craniotomy_pose
 from SlicerUSSim.Logic.probe import PROBES
-from SlicerUSSim.Logic.vtk_filters import SegmentationFilter, UltrasoundSimulationFilter, vtk_matrix
+from SlicerUSSim.Logic.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.vtk_filters import SegmentationFilter, UltrasoundSimulationFilter
 
 
 @dataclass

@@ -28,10 +28,15 @@ pytestmark = pytest.mark.skipif(None in (CMAKE, NINJA), reason="CMake is missing
 def build(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("build")
     subprocess.run(
-        [CMAKE, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={NINJA}", "-S", ROOT, "-B", folder, f"-DSlicer_DIR={ROOT / 'tests/slicer_cmake'}", "-DBUILD_TESTING=ON",
-         f"-DCMAKE_INSTALL_PREFIX={folder / 'installed'}"],
-        check=True, capture_output=True, text=True,
-    )  # fmt: skip
+        [
+            *(CMAKE, "-S", ROOT, "-B", folder, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={NINJA}"),
+            *(f"-DSlicer_DIR={ROOT / 'tests/slicer_cmake'}", "-DBUILD_TESTING=ON"),
+            f"-DCMAKE_INSTALL_PREFIX={folder / 'installed'}",
+        ],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     return folder
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import json
+import sys
 import weakref
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ from SlicerUSSim.Logic.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.scene_nodes import ijk_to_ras, node_to_world, write_labels  # noqa: E402
-from SlicerUSSim.Logic.vtk_filters import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.vtk_data import vtk_matrix  # noqa: E402
 from tests.conftest import FLUID, SPECKLE, block, rigid  # noqa: E402
 
 PRESET = Preset(
@@ -679,3 +681,22 @@ def component(image, number: int):
     extract.SetComponents(number)
     extract.Update()
     return extract.GetOutput()
+
+
+@pytest.mark.slow
+def test_the_example_builds_a_scene_and_saves_it_so_that_it_opens(mni, tmp_path, capsys):
+    sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+    try:
+        import slicer_scene
+    finally:
+        sys.path.pop(0)
+    slicer_scene.main(tmp_path / "brain.mrb")
+    said = capsys.readouterr().out
+    assert "13 images followed the probe" in said and "the same image (100.00%)" in said
+    scene = slicer_scene.read_back(tmp_path / "brain.mrb")
+    browser = scene.GetFirstNodeByClass("vtkMRMLSequenceBrowserNode")
+    assert browser.GetNumberOfItems() == 13 and browser.GetNumberOfSynchronizedSequenceNodes(True) == 2
+    nodes = UltrasoundSceneLogic(scene).parameters
+    assert nodes.mri.GetImageData().GetDimensions() == (197, 233, 189)
+    assert nodes.labels.GetSegmentation().GetNumberOfSegments() == 4
+    assert nodes.output.GetParentTransformNode() is nodes.probe_transform and pixels(nodes.output).mean() > 10

@@ -82,7 +82,7 @@ class Session:
         node = self.add("ScalarVolume", "Head")
         volume = self.logic_module("volume").Volume
         node.SetAndObserveImageData(volume(mri.array, np.eye(4)).to_vtk())
-        node.SetIJKToRASMatrix(self.logic_module("vtk_filters").vtk_matrix(mri.ijk_to_ras))
+        node.SetIJKToRASMatrix(self.logic_module("vtk_data").vtk_matrix(mri.ijk_to_ras))
         return node
 
     def segmented(self):

@@ -30,7 +30,8 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.phantoms import head_mri
-from SlicerUSSim.Logic.vtk_filters import SegmentationFilter, UltrasoundSimulationFilter, vtk_matrix
+from SlicerUSSim.Logic.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.vtk_filters import SegmentationFilter, UltrasoundSimulationFilter
 from tests.conftest import FLUID, SPECKLE, block, rigid
 
 PROBE = LinearProbe(20, 30, scan_lines=48, focus_mm=15)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import slicer
 from vtkmodules.vtkCommonCore import vtkIntArray, vtkStringArray
+from vtkmodules.vtkCommonDataModel import vtkImageData
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
 from SlicerUSSim.Logic.errors import SimulationError, require
@@ -18,7 +19,7 @@ from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.tissues import TISSUES, TissueTable, same_name, tissue_named
 from SlicerUSSim.Logic.volume import Volume, check_rigid
-from SlicerUSSim.Logic.vtk_filters import matrix_array, outline_polydata, set_scalars, vtk_matrix
+from SlicerUSSim.Logic.vtk_data import matrix_array, outline_polydata, set_scalars, vtk_matrix
 
 #: Colours of tissues in label maps and segmentations, red, green, blue from 0 to 1.
 COLOURS = {
@@ -393,8 +394,6 @@ def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Pr
 
 def _image(array: np.ndarray):
     """A vtkImageData of (k, j, i) voxels without geometry, as volume nodes want it."""
-    from vtkmodules.vtkCommonDataModel import vtkImageData
-
     image = vtkImageData()
     image.SetDimensions(*array.shape[::-1])
     set_scalars(image, array)

@@ -158,8 +158,9 @@ class Volume:
 
     def to_vtk(self):
         """A vtkImageData in RAS with a direction matrix; it has its own copy of the voxels."""
-        from vtkmodules.util.numpy_support import numpy_to_vtk
         from vtkmodules.vtkCommonDataModel import vtkImageData
+
+        from SlicerUSSim.Logic.vtk_data import set_scalars
 
         direction, spacing, origin = self._direction_spacing_origin(self.ijk_to_ras)
         array = self.array.astype(np.uint8) if self.array.dtype == bool else self.array
@@ -168,9 +169,7 @@ class Volume:
         image.SetSpacing(*spacing)
         image.SetOrigin(*origin)
         image.SetDirectionMatrix(*direction.ravel())
-        scalars = numpy_to_vtk(np.ascontiguousarray(array).ravel(), deep=True)
-        scalars.SetName("ImageScalars")
-        image.GetPointData().SetScalars(scalars)
+        set_scalars(image, array)
         return image
 
     def _direction_spacing_origin(self, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

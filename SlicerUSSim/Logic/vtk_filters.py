@@ -14,10 +14,9 @@ ErrorEvent with one line, and the text of GetErrorMessage; the output is then em
 from __future__ import annotations
 
 import numpy as np
-from vtkmodules.util.numpy_support import numpy_to_vtk
 from vtkmodules.util.vtkAlgorithm import VTKPythonAlgorithmBase
-from vtkmodules.vtkCommonCore import VTK_UNSIGNED_CHAR, vtkCommand, vtkOutputWindow, vtkPoints, vtkStringArray
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkDataObject, vtkImageData, vtkPolyData
+from vtkmodules.vtkCommonCore import VTK_UNSIGNED_CHAR, vtkCommand, vtkOutputWindow, vtkStringArray
+from vtkmodules.vtkCommonDataModel import vtkDataObject, vtkImageData, vtkPolyData
 from vtkmodules.vtkCommonExecutionModel import vtkAlgorithm, vtkStreamingDemandDrivenPipeline
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 from vtkmodules.vtkCommonTransforms import vtkLinearTransform, vtkMatrixToLinearTransform, vtkTransform
@@ -34,6 +33,7 @@ from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.texture import Texture
 from SlicerUSSim.Logic.tissues import TissueTable
 from SlicerUSSim.Logic.volume import Volume, check_rigid
+from SlicerUSSim.Logic.vtk_data import matrix_array, outline_polydata, set_scalars
 
 _WHOLE_EXTENT = vtkStreamingDemandDrivenPipeline.WHOLE_EXTENT
 
@@ -306,39 +306,6 @@ class UltrasoundSimulationFilter(_ImageFilter):
 
     def _pose(self) -> np.ndarray:
         return check_rigid("probe transform", matrix_array(self._transform.GetMatrix()))
-
-
-def outline_polydata(probe: Probe) -> vtkPolyData:
-    """The outline of the imaged field in the probe frame (mm), one closed line."""
-    corners = probe.outline_mm()
-    points = vtkPoints()
-    points.SetData(numpy_to_vtk(np.ascontiguousarray(corners), deep=True))
-    lines = vtkCellArray()
-    lines.InsertNextCell(len(corners), list(range(len(corners))))
-    outline = vtkPolyData()
-    outline.SetPoints(points)
-    outline.SetLines(lines)
-    return outline
-
-
-def matrix_array(matrix: vtkMatrix4x4) -> np.ndarray:
-    """(4, 4) float64 copy of a vtkMatrix4x4."""
-    return np.array(matrix.GetData()).reshape(4, 4)
-
-
-def vtk_matrix(array: np.ndarray) -> vtkMatrix4x4:
-    """A vtkMatrix4x4 of a (4, 4) array."""
-    matrix = vtkMatrix4x4()
-    matrix.DeepCopy(np.asarray(array, float).ravel().tolist())
-    return matrix
-
-
-def set_scalars(image: vtkImageData, array: np.ndarray) -> None:
-    """Give `image` its own copy of (k, j, i) voxels, or of (..., j, i, components)."""
-    components = array.size // image.GetNumberOfPoints()
-    scalars = numpy_to_vtk(np.ascontiguousarray(array).reshape(-1, components).squeeze(), deep=True)
-    scalars.SetName("ImageScalars")
-    image.GetPointData().SetScalars(scalars)
 
 
 def set_tissue_names(image: vtkImageData, names) -> None:

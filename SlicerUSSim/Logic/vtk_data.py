@@ -1,0 +1,44 @@
+"""Small things between numpy and VTK: matrices, voxels, the outline of a field."""
+
+from __future__ import annotations
+
+import numpy as np
+from vtkmodules.util.numpy_support import numpy_to_vtk
+from vtkmodules.vtkCommonCore import vtkPoints
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkImageData, vtkPolyData
+from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+from SlicerUSSim.Logic.probe import Probe
+
+
+def outline_polydata(probe: Probe) -> vtkPolyData:
+    """The outline of the imaged field in the probe frame (mm), one closed line."""
+    corners = probe.outline_mm()
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(corners), deep=True))
+    lines = vtkCellArray()
+    lines.InsertNextCell(len(corners), list(range(len(corners))))
+    outline = vtkPolyData()
+    outline.SetPoints(points)
+    outline.SetLines(lines)
+    return outline
+
+
+def matrix_array(matrix: vtkMatrix4x4) -> np.ndarray:
+    """(4, 4) float64 copy of a vtkMatrix4x4."""
+    return np.array(matrix.GetData()).reshape(4, 4)
+
+
+def vtk_matrix(array: np.ndarray) -> vtkMatrix4x4:
+    """A vtkMatrix4x4 of a (4, 4) array."""
+    matrix = vtkMatrix4x4()
+    matrix.DeepCopy(np.asarray(array, float).ravel().tolist())
+    return matrix
+
+
+def set_scalars(image: vtkImageData, array: np.ndarray) -> None:
+    """Give `image` its own copy of (k, j, i) voxels, or of (..., j, i, components)."""
+    components = array.size // image.GetNumberOfPoints()
+    scalars = numpy_to_vtk(np.ascontiguousarray(array).reshape(-1, components).squeeze(), deep=True)
+    scalars.SetName("ImageScalars")
+    image.GetPointData().SetScalars(scalars)
