@@ -29,6 +29,9 @@ from slicer.ScriptedLoadableModule import (
 )
 from slicer.util import VTKObservationMixin
 
+if sys.version_info < (3, 10):  # noqa: UP036, Slicer runs this file whatever its Python is
+    raise RuntimeError(f"SlicerUSSim needs Slicer 5.10 or newer: Python 3.10, and this is {sys.version.split()[0]}")
+
 __path__ = [os.path.dirname(os.path.abspath(__file__))]
 # "Reload" runs this file again; the rest of the package has to be new then too.
 for _name in [name for name in sys.modules if name.startswith("SlicerUSSim.")]:

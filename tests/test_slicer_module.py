@@ -510,6 +510,18 @@ def test_a_sequence_is_simulated_and_its_browser_plays_it(session):
     assert session.ui.statusLabel.text() == "3 images in 'sweep ultrasound'"
 
 
+def test_a_sequence_that_fails_leaves_no_node_behind(session):
+    session.segmented()
+    transforms = session.add("Sequence", "scaled")
+    item = slicer.vtkMRMLLinearTransformNode()
+    item.ApplyTransformMatrix(importlib.import_module("SlicerUSSim.Logic.vtk_data").vtk_matrix(np.diag([2.0, 1, 1, 1])))
+    transforms.SetDataNodeAtValue(item, "0")
+    session.ui.transformSequenceSelector.setCurrentNode(transforms)
+    session.ui.simulateSequenceButton.click()
+    assert "item 0 of Sequence 'scaled' is not rigid" in session.app.errors[0]
+    assert session.scene.GetNumberOfNodesByClass("vtkMRMLSequenceNode") == 1
+
+
 def test_choosing_other_nodes_while_live_goes_on_with_those(session):
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
@@ -575,3 +587,10 @@ def test_the_panel_looks_as_it_should(session, tmp_path):
     keep = os.environ.get("USSIM_PICTURES")
     if keep:
         picture.save(str(Path(keep) / "slicer-panel.png"))
+
+
+def test_a_preset_beyond_the_sliders_is_shown_as_it_is(session, tmp_path):
+    file = tmp_path / "deep.json"
+    file.write_text(json.dumps({"probe": {"kind": "phased", "field_of_view_deg": 60, "depth_mm": 350}}))
+    session.panel.presenter.loadPreset(file)
+    assert session.ui.depthSlider.property("value") == 350.0 and not session.app.errors

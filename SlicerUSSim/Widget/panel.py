@@ -255,8 +255,10 @@ class Panel:
         with _silent(widget):
             if prop == "value":
                 # A preset from elsewhere may go beyond what a slider offers.
-                widget.setProperty("maximum", max(value, widget.property("maximum")))
-                widget.setProperty("minimum", min(value, widget.property("minimum")))
+                if value > widget.property("maximum"):
+                    widget.setProperty("maximum", value)
+                if value < widget.property("minimum"):
+                    widget.setProperty("minimum", value)
             if prop == "currentText":
                 widget.setCurrentIndex(widget.findText(value))
             else:

@@ -178,10 +178,7 @@ class PanelPresenter:
         parameters = self.logic.parameters
         with self._shown(), self._working("Segment") as progress:
             require(parameters.mri is not None, "no MRI chosen, expected a scalar volume")
-            labels, made = parameters.labels, None
-            if labels is None:
-                labels = made = self._add("Segmentation", f"{parameters.mri.GetName()} tissues")
-            try:
+            with self._made(parameters.labels, "Segmentation", f"{parameters.mri.GetName()} tissues") as labels:
                 self.logic.segment(
                     parameters.mri,
                     labels,
@@ -192,10 +189,6 @@ class PanelPresenter:
                     bias_correction=parameters.bias_correction,
                     progress=progress,
                 )
-            except BaseException:
-                if made is not None:
-                    self.logic.scene.RemoveNode(made)
-                raise
             parameters.labels = labels
         self.view.refresh()
 
@@ -204,8 +197,8 @@ class PanelPresenter:
         with self._shown():
             parameters = self.logic.parameters
             require(parameters.labels is not None, "no label map chosen, expected one to put the probe on")
-            probe = parameters.probe_transform or self._add("LinearTransform", "Probe")
-            self.logic.placeProbe(parameters.labels, probe, slice_node)
+            with self._made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
+                self.logic.placeProbe(parameters.labels, probe, slice_node)
             parameters.probe_transform = probe
             self._show_handles(probe)
         self.view.refresh()
@@ -247,16 +240,16 @@ class PanelPresenter:
     def simulateSequence(self, transforms_node, images_node) -> None:
         """Images for a recorded sequence of transforms, which the browser of that sequence then plays."""
         with self._shown(), self._working("Simulate sequence") as progress:
-            if images_node is None and transforms_node is not None:
-                images_node = self._add("Sequence", f"{transforms_node.GetName()} ultrasound")
-            count = self.logic.simulateSequence(
-                self.logic.parameters.labels,
-                transforms_node,
-                images_node,
-                browser_node=self._browser_of(transforms_node),
-                progress=progress,
-            )
-            self.view.showStatus(f"{count} images in {images_node.GetName()!r}")
+            require(transforms_node is not None, "no sequence of transforms chosen, expected a Sequence node")
+            with self._made(images_node, "Sequence", f"{transforms_node.GetName()} ultrasound") as images:
+                count = self.logic.simulateSequence(
+                    self.logic.parameters.labels,
+                    transforms_node,
+                    images,
+                    browser_node=self._browser_of(transforms_node),
+                    progress=progress,
+                )
+            self.view.showStatus(f"{count} images in {images.GetName()!r}")
         self.view.refresh()
 
     def chooseDefaultNodes(self) -> None:
@@ -282,7 +275,7 @@ class PanelPresenter:
     def _preset(self) -> Preset:
         try:
             return self.logic.preset
-        except SimulationError:  # a scene made by hand or a later version: begin anew, the error was shown
+        except SimulationError:  # a scene made by hand: simulating says what is wrong, here one can begin anew
             return Preset()
 
     def _table(self) -> TissueTable:
@@ -312,12 +305,8 @@ class PanelPresenter:
         parameters = self.logic.parameters
         require(parameters.labels is not None, "no label map chosen; segment the MRI first")
         if parameters.probe_transform is None:
-            probe = self._add("LinearTransform", "Probe")
-            try:
+            with self._made(None, "LinearTransform", "Probe") as probe:
                 self.logic.placeProbe(parameters.labels, probe)
-            except SimulationError:
-                self.logic.scene.RemoveNode(probe)
-                raise
             parameters.probe_transform = probe
             self._show_handles(probe)
         if parameters.output is None:
@@ -340,6 +329,19 @@ class PanelPresenter:
 
     def _add(self, kind: str, name: str):
         return self.logic.scene.AddNewNodeByClass(f"vtkMRML{kind}Node", self.logic.scene.GenerateUniqueName(name))
+
+    @contextmanager
+    def _made(self, node, kind: str, name: str):
+        """`node`, or a new one, which goes again if the work with it fails."""
+        made = node is None
+        if made:
+            node = self._add(kind, name)
+        try:
+            yield node
+        except BaseException:
+            if made:
+                self.logic.scene.RemoveNode(node)
+            raise
 
     @staticmethod
     def _show_handles(transform_node) -> None:
