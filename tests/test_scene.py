@@ -6,10 +6,13 @@ import gc
 import json
 import sys
 import weakref
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from vtkmodules.vtkCommonCore import vtkCommand
 
@@ -26,8 +29,15 @@ from SlicerUSSim.Logic import (  # noqa: E402
 )
 from SlicerUSSim.Logic.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
+from SlicerUSSim.Logic.placement import pose_in_slice  # noqa: E402
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.scene_nodes import ijk_to_ras, node_to_world, write_labels  # noqa: E402
+from SlicerUSSim.Logic.scene_nodes import (  # noqa: E402
+    ijk_to_ras,
+    node_to_world,
+    pose_in_labels,
+    set_node_to_world,
+    write_labels,
+)
 from SlicerUSSim.Logic.vtk_data import vtk_matrix  # noqa: E402
 from tests.conftest import FLUID, SPECKLE, block, rigid  # noqa: E402
 
@@ -154,6 +164,44 @@ def test_the_outline_is_that_of_the_field(bench):
     model.GetRASBounds(bounds)
     np.testing.assert_allclose(bounds, (-10, 10, -15, 15, 0, 0), atol=1e-5)
     assert model.GetDisplayNode().GetVisibility2D()
+
+
+ANGLES = st.tuples(*[st.floats(-180, 180)] * 3)
+OFFSETS = st.tuples(*[st.floats(-200, 200)] * 3)
+RIGID = st.builds(
+    lambda angles, offset: rigid(Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), offset), ANGLES, OFFSETS
+)
+
+
+@given(chain=st.lists(RIGID, min_size=1, max_size=4), wanted=RIGID)
+def test_a_node_in_any_chain_of_parents_is_where_their_product_puts_it(chain, wanted):
+    scene = slicer.vtkMRMLScene()
+    nodes = [put(add(scene, "LinearTransform"), matrix) for matrix in chain]
+    for child, parent in pairwise(nodes):
+        child.SetAndObserveTransformNodeID(parent.GetID())
+    product = np.eye(4)
+    for matrix in chain:
+        product = matrix @ product
+    np.testing.assert_allclose(node_to_world(nodes[0]), product, atol=1e-6)
+    set_node_to_world(nodes[0], wanted)
+    np.testing.assert_allclose(node_to_world(nodes[0]), wanted, atol=1e-6)
+    volume = add(scene, "ScalarVolume")
+    volume.SetAndObserveTransformNodeID(nodes[0].GetID())
+    pose, moved = pose_in_labels(volume, wanted)  # labels and probe under the same transform: nothing between them
+    np.testing.assert_allclose(pose, np.eye(4), atol=1e-6)
+    np.testing.assert_array_equal(moved, np.eye(4))
+
+
+@given(view=RIGID, along=st.floats(-8, 8), across=st.floats(-8, 8))
+def test_a_probe_placed_in_any_slice_lies_in_it_and_looks_down_it(view, along, across):
+    """In a ball, so that every view has a surface above its middle."""
+    ball = block(lambda x, y, z: x**2 + y**2 + z**2 < 20**2, (24, 24, 24), 2.0)
+    view = rigid(view[:3, :3], [along, across, 3.0])
+    pose = pose_in_slice(ball, view)
+    np.testing.assert_allclose(pose[:3, 0], view[:3, 0], atol=1e-9)
+    np.testing.assert_allclose(pose[:3, 1], -view[:3, 1], atol=1e-9)
+    assert abs((np.linalg.inv(view) @ pose)[2, 3]) < 1e-9 and abs((np.linalg.inv(view) @ pose)[0, 3]) < 1e-9
+    assert np.linalg.norm(pose[:3, 3]) == pytest.approx(20, abs=2.5)  # on the surface, to a voxel
 
 
 # ---- segmentation ----------------------------------------------------------------------------------------------------
@@ -312,7 +360,8 @@ def test_a_burst_of_changes_is_one_image_of_the_last(bench):
     bench.live(schedule=loop, report=reports.append)
     for step in range(100):
         put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 0, 0.02 * step]))
-    assert loop.run() == 1 and reports == [""]
+    assert reports == [""]  # the first image, at once
+    assert loop.run() == 1 and reports == ["", ""]
     np.testing.assert_array_equal(pixels(bench.image), expected(ABOVE @ rigid(np.eye(3), [0, 0, 1.98])))
     assert loop.run() == 0
 

@@ -594,3 +594,15 @@ def test_a_preset_beyond_the_sliders_is_shown_as_it_is(session, tmp_path):
     file.write_text(json.dumps({"probe": {"kind": "phased", "field_of_view_deg": 60, "depth_mm": 350}}))
     session.panel.presenter.loadPreset(file)
     assert session.ui.depthSlider.property("value") == 350.0 and not session.app.errors
+
+
+def test_a_probe_that_looks_away_is_told_beside_the_tick_box(session):
+    session.segmented()
+    session.ui.placeButton.click()
+    for start in (session.ui.simulateButton.click, lambda: session.ui.liveCheckBox.setChecked(True)):
+        session.move(500.0)
+        start()
+        assert "looks past the volume" in session.ui.statusLabel.text() and not session.app.errors
+        session.move(-500.0)
+    session.process()
+    assert "looks past" not in session.ui.statusLabel.text()

@@ -1,4 +1,10 @@
-"""The one exception a user of this package has to know."""
+"""The one exception a user of this package has to know, and what to tell users."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class SimulationError(Exception):
@@ -42,3 +48,13 @@ def user_message(error: Exception) -> str | None:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         return f"the OpenCL device failed ({reason}); choose another device"
     return None
+
+
+@contextmanager
+def collected_warnings() -> Iterator[list[str]]:
+    """A list that holds, after the block, what this package warned of in it; for those who show it themselves."""
+    messages: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield messages
+    messages += [str(w.message) for w in caught if w.category.__module__.startswith("SlicerUSSim")]

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.errors import SimulationError, collected_warnings, require
 from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.placement import craniotomy_pose, pose_in_slice
 from SlicerUSSim.Logic.preset import Preset
@@ -244,13 +244,16 @@ class UltrasoundSceneLogic:
         """
         self.stopLiveUpdate()
         self._check_output(labels_node, output_node)
-        self.simulate(labels_node, probe_transform_node, output_node)  # raises what is wrong here and now
+        with collected_warnings() as messages:
+            self.simulate(labels_node, probe_transform_node, output_node)  # raises what is wrong here and now
         if outline_node is not None:
             self.showOutline(outline_node, probe_transform_node)
         if slice_node is not None:
             self.showInSlice(slice_node, output_node, probe_transform_node)
         nodes = (labels_node, probe_transform_node, output_node, outline_node, slice_node)
         self._live = LiveUpdate(self, nodes, schedule, report, stopped)
+        if report is not None:
+            report("; ".join(messages))
 
     def stopLiveUpdate(self) -> None:
         """Let the image rest; nothing is observed any more."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 import weakref
 from collections.abc import Callable
 
 import slicer
 from vtkmodules.vtkCommonCore import VTK_OBJECT, vtkCommand
 
-from SlicerUSSim.Logic.errors import user_message
+from SlicerUSSim.Logic.errors import collected_warnings, user_message
 
 #: Event of an output volume: another live update now writes to it.
 _CLAIMED = vtkCommand.UserEvent + 7301
@@ -20,6 +19,8 @@ class LiveUpdate:
 
     `nodes` are labels, probe transform and output volume, then outline model and slice view, which may be None.
     """
+
+    running = False
 
     def __init__(
         self,
@@ -124,15 +125,14 @@ class LiveUpdate:
         labels, transform, output, outline, view = self._nodes
         self._busy = True
         try:
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
+            with collected_warnings() as messages:
                 logic.simulate(labels, transform, output)
             if outline is not None and logic.preset.probe != self._outlined:
                 logic.showOutline(outline, transform)
                 self._outlined = logic.preset.probe
             if view is not None:
                 logic.showInSlice(view, output, transform, fit=False)
-            message = "; ".join(str(w.message) for w in caught if w.category.__module__.startswith("SlicerUSSim"))
+            message = "; ".join(messages)
         except Exception as error:
             message = user_message(error)
             if message is None:
