@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import vtkmodules.vtkRenderingOpenGL2  # noqa: F401, makes rendering work at all
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -17,6 +18,14 @@ from vtkmodules.vtkCommonMath import vtkMatrix4x4
 from vtkmodules.vtkCommonTransforms import vtkTransform
 from vtkmodules.vtkImagingCore import vtkImageReslice
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+from vtkmodules.vtkRenderingCore import (
+    vtkImageActor,
+    vtkImageSlice,
+    vtkImageSliceMapper,
+    vtkRenderer,
+    vtkRenderWindow,
+    vtkWindowToImageFilter,
+)
 
 from SlicerUSSim.Logic import (
     DisplaySettings,
@@ -338,3 +347,42 @@ def test_moving_the_transform_moves_the_picture(rendered, tmp_path):
     scene.transform.Translate(0, 0, -5)
     assert np.abs(moved - before)[150:400, 200:400].mean() > 10
     np.testing.assert_array_equal(pixels(example, scene, tmp_path / "back.png"), before)
+
+
+def test_an_image_actor_shows_it_where_it_is():
+    """vtkImageActor and vtkImageSlice, seen along the elevational axis of a turned probe: the pixels of the frame."""
+    pose = rigid(Rotation.from_euler("xyz", [20, -30, 50], degrees=True).as_matrix(), [30, -15, 2])
+    algorithm = simulation(Volume(cyst().array, pose @ rigid(np.eye(3), [0, 15, 0]) @ cyst().ijk_to_ras))
+    algorithm.SetProbeTransform(vtk_matrix(pose))
+    algorithm.Update()
+    for actor in (vtkImageActor(), vtkImageSlice()):
+        mapper = vtkImageSliceMapper()
+        mapper.SetInputConnection(algorithm.GetOutputPort())
+        mapper.BorderOn()  # draw the outermost pixels whole
+        actor.SetMapper(mapper)
+        actor.GetProperty().SetInterpolationTypeToNearest()
+        shown = seen_along_z(actor, pose, size=(192, 288))  # nine pixels of the window for one of the image
+        np.testing.assert_array_equal(shown[1::3, 1::3], algorithm.GetFrame().image)
+
+
+def seen_along_z(actor, pose: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """(rows, columns) of a window that just holds the image plane of PROBE, 20 mm wide and 30 mm deep."""
+    renderer, window = vtkRenderer(), vtkRenderWindow()
+    renderer.AddViewProp(actor)
+    camera = renderer.GetActiveCamera()
+    camera.ParallelProjectionOn()
+    camera.SetFocalPoint(*(pose @ [0, 15, 0, 1])[:3])
+    camera.SetPosition(*(pose @ [0, 15, -100, 1])[:3])
+    camera.SetViewUp(*-pose[:3, 1])
+    camera.SetParallelScale(15.0)
+    camera.SetClippingRange(1, 200)
+    window.SetOffScreenRendering(1)
+    window.SetMultiSamples(0)
+    window.SetSize(*size)
+    window.AddRenderer(renderer)
+    window.Render()
+    grab = vtkWindowToImageFilter()
+    grab.SetInput(window)
+    grab.Update()
+    scalars = grab.GetOutput().GetPointData().GetScalars()
+    return vtk_to_numpy(scalars).reshape(size[1], size[0], 3)[::-1, :, 0]
