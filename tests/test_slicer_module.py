@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import json
 import os
 import pkgutil
@@ -138,6 +139,15 @@ def test_every_submodule_imports_from_the_module_slicer_loaded(module):
 def test_the_module_folder_holds_no_file_that_slicer_would_take_for_a_module():
     """Slicer runs every .py file beside a module; __main__.py would replace its own main module and quit."""
     assert {path.name for path in (ROOT / "SlicerUSSim").glob("*.py")} == {"SlicerUSSim.py", "__init__.py"}
+
+
+def test_slicer_may_try_the_packages_own_file_as_a_module():
+    """It finds no module in it, and says so; nothing else may happen."""
+    spec = importlib.util.spec_from_file_location("__init__", ROOT / "SlicerUSSim" / "__init__.py")
+    tried = importlib.util.module_from_spec(spec)
+    before = list(sys.path)
+    spec.loader.exec_module(tried)
+    assert sys.path == before and not hasattr(tried, "__path__")
 
 
 def test_start_up_imports_nothing_that_takes_time_or_may_be_missing():
