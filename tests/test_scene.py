@@ -26,6 +26,7 @@ from SlicerUSSim.Logic import (  # noqa: E402
     TissueTable,
     UltrasoundSimulator,
     Volume,
+    segment_mri,
 )
 from SlicerUSSim.Logic.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
@@ -307,6 +308,28 @@ def test_a_label_map_without_names_is_told_by_the_labels_of_the_preset(bench):
     bare.SetIJKToRASMatrix(vtk_matrix(cyst().ijk_to_ras))
     bench.logic.simulate(bare, bench.probe, bench.image)
     np.testing.assert_array_equal(pixels(bench.image), expected(ABOVE))
+
+
+def test_slicers_default_colours_do_not_make_bone_of_grey_matter(bench):
+    """A label map that Slicer loads gets GenericAnatomyColors, where label 2 is "bone" and 3 is "skin"."""
+    labels = add(bench.scene, "LabelMapVolume", "labels.nii")
+    labels.SetAndObserveImageData(bench.labels.GetImageData())
+    labels.SetIJKToRASMatrix(vtk_matrix(cyst().ijk_to_ras))
+    colours = add(bench.scene, "ColorTable", "GenericAnatomyColors")
+    colours.SetTypeToUser()
+    colours.SetNumberOfColors(3)
+    colours.SetColor(1, "tissue", 1, 1, 1, 1)
+    colours.SetColor(2, "bone", 1, 1, 1, 1)
+    display = add(bench.scene, "LabelMapVolumeDisplay")
+    labels.SetAndObserveDisplayNodeID(display.GetID())
+    display.SetAndObserveColorNodeID(colours.GetID())
+    assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["speckle", "fluid"]
+    colours.SetName("mine")  # a table somebody chose means what it says
+    with pytest.raises(SimulationError, match="no tissue is called"):
+        bench.logic.preset = Preset(tissues=TissueTable({}))
+        bench.logic.tissues(labels)
+    colours.SetColorName(1, "liver")
+    assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["liver", "bone"]
 
 
 # ---- placing ---------------------------------------------------------------------------------------------------------
@@ -668,17 +691,28 @@ def test_a_preset_in_the_scene_that_is_none_is_refused(bench):
         bench.simulate()
 
 
-def test_hybrid_scatterers_take_the_texture_of_the_last_segmentation():
+@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
+def test_hybrid_scatterers_take_the_texture_of_the_last_segmentation(kind):
     scene = slicer.vtkMRMLScene()
     logic = UltrasoundSceneLogic(scene)
-    node, labels = volume_node(scene, head_mri(3.0)), add(scene, "LabelMapVolume")
+    node, labels = volume_node(scene, head_mri(3.0)), add(scene, kind)
     probe, image = add(scene, "LinearTransform"), add(scene, "ScalarVolume")
     logic.segment(node, labels)
     logic.placeProbe(labels, probe)
     plain = logic.simulate(labels, probe, image).image
     logic.preset = logic.preset.changed("settings", mri_modulation_db=3.0)
-    assert (logic.simulate(labels, probe, image).image != plain).mean() > 0.1
-    labels.GetImageData().Modified()  # painted on: the texture is not that of these labels any more
+    hybrid = logic.simulate(labels, probe, image).image
+    assert (hybrid != plain).mean() > 0.1
+    segmentation = segment_mri(head_mri(3.0), thin_sulci=True)
+    direct = UltrasoundSimulator(
+        segmentation.labels, logic.preset.tissues, logic.preset.settings, texture=segmentation.texture()
+    )
+    true = direct.simulate(logic.preset.probe, node_to_world(probe), logic.preset.display).image
+    assert (hybrid != true).mean() < 0.01
+    if kind == "Segmentation":
+        labels.GetSegmentation().GetNthSegment(0).SetName("Cerebrospinal fluid")
+    else:
+        labels.GetImageData().Modified()  # painted on: the texture is not that of these labels any more
     with pytest.raises(SimulationError, match="segment the MRI again"):
         logic.simulate(labels, probe, image)
 

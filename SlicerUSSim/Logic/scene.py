@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from functools import cache
 
 import numpy as np
 
@@ -37,6 +36,7 @@ from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.texture import Texture
 from SlicerUSSim.Logic.tissues import TissueTable
 from SlicerUSSim.Logic.volume import Volume, check_rigid
+from SlicerUSSim.Logic.vtk_data import matrix_array
 
 
 class UltrasoundSceneLogic:
@@ -57,7 +57,8 @@ class UltrasoundSceneLogic:
         self.parameters = SceneParameters(scene)
         self._simulator = ReusedSimulator()
         self._labelled: tuple[object, LabelledTissues] | None = None  # of the version before it
-        self._texture: tuple[object, Callable[[], Texture]] | None = None  # of the labels of that version
+        self._segmented: tuple[object, Segmentation] | None = None  # labels of that version came from it
+        self._texture: tuple[LabelledTissues, Texture] | None = None  # of those labels
         self._preset: tuple[str, Preset] = ("", Preset())
         self._live: LiveUpdate | None = None
 
@@ -117,7 +118,7 @@ class UltrasoundSceneLogic:
         )  # fmt: skip
         require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="output of Segment")
         write_labels(labels_node, result.labels, result.tissue_names, mri_node)
-        self._texture = (labels_version(labels_node), cache(result.texture))
+        self._segmented = (labels_version(labels_node), result)
         return result
 
     def simulate(self, labels_node, probe_transform_node, output_node) -> Frame:
@@ -196,9 +197,7 @@ class UltrasoundSceneLogic:
             pose = craniotomy_pose(surface, self.preset.probe)
         else:
             require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
-            matrix = slice_node.GetSliceToRAS()
-            slice_to_ras = np.array([[matrix.GetElement(r, c) for c in range(4)] for r in range(4)])
-            pose = pose_in_slice(surface, slice_to_ras, target_ras)
+            pose = pose_in_slice(surface, matrix_array(slice_node.GetSliceToRAS()), target_ras)
         set_node_to_world(probe_transform_node, pose)
 
     def showOutline(self, model_node, probe_transform_node) -> None:
@@ -243,7 +242,6 @@ class UltrasoundSceneLogic:
         goes away, or when another live update takes over the output.
         """
         self.stopLiveUpdate()
-        self._check_output(labels_node, output_node)
         with collected_warnings() as messages:
             self.simulate(labels_node, probe_transform_node, output_node)  # raises what is wrong here and now
         if outline_node is not None:
@@ -288,19 +286,24 @@ class UltrasoundSceneLogic:
         return self._simulator_for(labels_node, labelled, moved).simulate(self.preset.probe, pose, self.preset.display)
 
     def _simulator_for(self, labels_node, labelled: LabelledTissues, moved: np.ndarray) -> UltrasoundSimulator:
-        preset, texture = self.preset, None
-        if preset.settings.needs_texture:
-            require(
-                self._texture is not None and self._texture[0] == labels_version(labels_node),
-                f"the settings want more of the MRI than {named(labels_node)} holds; segment the MRI again, or set "
-                "partial_volume to false and mri_modulation_db to 0",
-            )
-            texture = self._texture[1]()
+        preset = self.preset
         return self._simulator.get(
             (self._labelled[0], moved.tobytes()),
             lambda: Volume(labelled.volume.array, moved @ labelled.volume.ijk_to_ras),
             preset.tissues.for_names(dict(enumerate(labelled.names, 1))),
             preset.settings,
             self.device,
-            texture,
+            self._texture_of(labels_node, labelled) if preset.settings.needs_texture else None,
         )
+
+    def _texture_of(self, labels_node, labelled: LabelledTissues) -> Texture:
+        require(
+            self._segmented is not None and self._segmented[0] == labels_version(labels_node),
+            f"the settings want more of the MRI than {named(labels_node)} holds; segment the MRI again, or set "
+            "partial_volume to false and mri_modulation_db to 0",
+        )
+        if self._texture is None or self._texture[0] is not labelled:
+            segmentation = self._segmented[1]
+            # A segmentation node gives its labels cropped to what it holds.
+            self._texture = (labelled, segmentation.texture().on_grid_of(labelled.volume, segmentation.labels))
+        return self._texture[1]

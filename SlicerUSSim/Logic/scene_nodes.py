@@ -176,7 +176,8 @@ def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
     """What a label map or a segmentation holds, one label for every tissue that its names stand for.
 
     The names are those of segments, or of a label map's colours; `tissues` are known by name before the presets are.
-    A label whose colour has no tissue's name is the tissue with that label in `tissues`.
+    A label whose colour has no tissue's name, or only the one of Slicer's default table, is the tissue with that label
+    in `tissues`.
     Raises SimulationError for a node without voxels or segments, and lists names that nobody knows.
     """
     require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map")
@@ -255,14 +256,18 @@ def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int
         "numbers from 0 to 99999",
     )
     colours, names = _colour_node(labels_node), {}
-    for label in np.flatnonzero(np.bincount(values.ravel())):
-        label = int(label)
+    known_colours = 0 if colours is None else colours.GetNumberOfColors()
+    # Slicer gives every label map this table, in which 2 is bone and 3 is skin, whatever they are.
+    is_default = colours is not None and colours.GetName() == "GenericAnatomyColors"
+    for label in map(int, np.flatnonzero(np.bincount(values.ravel()))):
         if label == 0:
             continue
-        name = colours.GetColorName(label) if colours is not None and label < colours.GetNumberOfColors() else ""
-        if label in tissues and _tissue_name(name or "", tissues) is None:
+        name = colours.GetColorName(label) if label < known_colours else None
+        if name in (None, "", "(none)"):
+            name = f"label {label}"
+        if label in tissues and (is_default or _tissue_name(name, tissues) is None):
             name = tissues[label].name
-        names[label] = name or f"label {label}"
+        names[label] = name
     require(bool(names), f"label map {named(labels_node)} is empty, expected voxels that are not 0")
     return names
 

@@ -60,6 +60,23 @@ class Texture:
         nothing = np.zeros(labels.array.shape, np.uint8)
         return cls(nothing, nothing.astype(np.float32), tissue_deviation(mri.array, labels.array))
 
+    def on_grid_of(self, labels: Volume, whole: Volume) -> Texture:
+        """The part of this texture of `whole` that lies on the voxels of `labels`, a label map cropped from it.
+
+        Raises SimulationError if those voxels are not among those of `whole`.
+        """
+        offset = (whole.ras_to_ijk @ labels.ijk_to_ras)[:3]
+        first = np.rint(offset[:, 3]).astype(int)[::-1]
+        last = first + labels.array.shape
+        require(
+            np.allclose(offset[:, :3], np.eye(3), atol=1e-3)
+            and np.allclose(offset[::-1, 3], first, atol=1e-2)
+            and bool((first >= 0).all() and (last <= whole.array.shape).all()),
+            "the labels lie on another grid than the MRI they came from; segment the MRI again",
+        )
+        part = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
+        return Texture(self.second_label[part], self.second_share[part], self.deviation[part])
+
     def packed(self, labels: np.ndarray, partial_volume: bool, modulation_db: float) -> np.ndarray:
         """(k, j, i) uint32 as kernels/scattering.cl reads it: second label | share in 1/255 << 8 | gain << 16.
 
