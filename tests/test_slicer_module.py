@@ -616,3 +616,13 @@ def test_a_probe_that_looks_away_is_told_beside_the_tick_box(session):
         session.move(-500.0)
     session.process()
     assert "looks past" not in session.ui.statusLabel.text()
+
+
+def test_a_slicer_that_has_pip_ensure_is_left_to_it(module, monkeypatch):
+    asked = []
+    packaging = type(sys)("slicer.packaging")
+    packaging.load_requirements = lambda path: [line for line in Path(path).read_text().splitlines() if line[0] != "#"]
+    packaging.pip_ensure = lambda requirements, requester: asked.append((requester, requirements))
+    monkeypatch.setitem(sys.modules, "slicer.packaging", packaging)
+    module.ensurePackages()
+    assert asked[0][0] == "SlicerUSSim" and any(line.startswith("pyopencl") for line in asked[0][1])
