@@ -158,6 +158,18 @@ def test_labels_under_a_scaling_transform_are_scaled(bench):
     np.testing.assert_array_equal(image, true)
 
 
+def test_the_image_is_shown_from_black_to_white_whatever_is_in_it(bench):
+    bench.image.CreateDefaultDisplayNodes()
+    display = bench.image.GetDisplayNode()
+    assert display.GetAutoWindowLevel()  # which would change brightness from frame to frame
+    bench.simulate()
+    assert (display.GetWindowLevelMin(), display.GetWindowLevelMax()) == (0, 255) and not display.GetAutoWindowLevel()
+    display.SetWindowLevelMinMax(0, 180)  # the user's own stays
+    put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 0, 1]))
+    bench.simulate()
+    assert display.GetWindowLevelMax() == 180
+
+
 def test_the_outline_is_that_of_the_field(bench):
     model = add(bench.scene, "Model", "fan")
     bench.logic.showOutline(model, bench.probe)

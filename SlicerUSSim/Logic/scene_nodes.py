@@ -344,18 +344,25 @@ def write_image(volume_node, frame: Frame, transform_node=None) -> None:
     rows, columns = frame.image.shape
     if image is None or image.GetDimensions() != (columns, rows, 1) or image.GetScalarTypeAsString() != "unsigned char":
         volume_node.SetAndObserveImageData(_image(frame.image[None]))
+        _show_all_greys(volume_node)
     else:
         scalars = image.GetPointData().GetScalars()
         np.asarray(memoryview(scalars)).reshape(rows, columns)[:] = frame.image
         scalars.Modified()
         image.Modified()
-    if volume_node.GetScene() is not None and volume_node.GetDisplayNode() is None:
-        volume_node.CreateDefaultDisplayNodes()
-        display = volume_node.GetDisplayNode()
-        if display is not None:
-            display.SetAutoWindowLevel(False)
-            display.SetWindowLevelMinMax(0, 255)
     volume_node.EndModify(was_modifying)
+
+
+def _show_all_greys(volume_node) -> None:
+    """Black at 0 and white at 255, as on a scanner: an automatic window would change brightness from frame to frame."""
+    if volume_node.GetScene() is None:  # an item of a sequence
+        return
+    if volume_node.GetDisplayNode() is None:
+        volume_node.CreateDefaultDisplayNodes()
+    display = volume_node.GetDisplayNode()
+    if display is not None and display.GetAutoWindowLevel():
+        display.SetAutoWindowLevel(False)
+        display.SetWindowLevelMinMax(0, 255)
 
 
 def write_outline(model_node, probe: Probe, transform_node) -> None:
