@@ -118,6 +118,8 @@ def test_a_transform_deep_in_a_chain_moves_the_image():
     algorithm.Update()
     matrix.SetElement(1, 3, -10.0)
     assert executes(algorithm) and not executes(algorithm)
+    algorithm.SetProbeTransform(matrix)  # the same one again
+    assert not executes(algorithm)
     assert algorithm.GetOutput().GetOrigin()[1] == pytest.approx(-10 + 30 / 96 / 2)
     np.testing.assert_allclose(algorithm.GetOutput(1).GetBounds(), (-10, 10, -10, 20, 0, 0), atol=1e-5)  # the outline
 

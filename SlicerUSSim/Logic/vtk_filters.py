@@ -227,6 +227,8 @@ class UltrasoundSimulationFilter(_ImageFilter):
             f"probe transform is a {type(transform).__name__}, expected a vtkLinearTransform or a vtkMatrix4x4",
         )
         if isinstance(transform, vtkMatrix4x4):
+            if getattr(self._transform, "GetInput", lambda: None)() is transform:
+                return
             matrix, transform = transform, vtkMatrixToLinearTransform()
             transform.SetInput(matrix)
         self._placed_outline.SetTransform(transform)
