@@ -92,7 +92,7 @@ def test_part_of_a_word_is_not_a_tissue(name):
 
 def test_a_table_for_other_labels_keeps_edited_tissues_and_lists_all_it_does_not_know():
     table = TissueTable.brain().replace("white matter", mu0=0.9)
-    other = table.for_names({7: "White_Matter", 3: "tumor"})
-    assert other[7].mu0 == 0.9 and other[3].name == "tumour" and other.membrane == table.membrane
+    other = table.for_names(["White_Matter", "tumor"])
+    assert other[1].mu0 == 0.9 and other[2].name == "tumour" and other.membrane == table.membrane
     with pytest.raises(SimulationError, match="no tissue for 'Segment_1', 'foo'"):
-        table.for_names({1: "Segment_1", 2: "foo", 3: "csf"})
+        table.for_names(["Segment_1", "foo", "csf"])

@@ -423,7 +423,7 @@ def test_tissues_can_be_taken_from_presets_and_reset(session):
     assert ui.tissueTable.item(line, 0).text() == "grey matter" and ui.tissueTable.item(line, 1).text() == "1578"
     assert "Szabo" in ui.tissueTable.item(line, 1).toolTip()
     ui.tissueTable.item(line, 4).setText("0,5")  # a comma is a point
-    assert session.logic.preset.tissues.for_names({1: "grey matter"})[1].mu0 == 0.5
+    assert session.logic.preset.tissues.for_names(["grey matter"])[1].mu0 == 0.5
     assert ui.tissueTable.item(line, 4).toolTip() == "set by hand"
     ui.resetTissuesButton.click()
     assert ui.tissueTable.item(line, 1).text() == "1541"

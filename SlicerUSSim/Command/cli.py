@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim import __version__
-from SlicerUSSim.Logic.errors import SimulationError, user_message
+from SlicerUSSim.Logic.errors import SimulationError, is_our_warning, user_message
 
 
 class _Commands(click.Group):
@@ -36,7 +36,7 @@ def main() -> None:
 
 def _show_warning(message, category, *_, **__) -> None:
     """Our own warnings are one line; those of the libraries are not for the user of a command."""
-    if category.__module__.startswith("SlicerUSSim"):
+    if is_our_warning(category):
         click.echo(f"ussim: warning: {message}", err=True)
 
 
@@ -167,7 +167,7 @@ _SCENE_OPTIONS = (
 
 
 def _scene_options(command):
-    """What every command that simulates takes; _Scene.open makes a simulator, a probe and a pose of it."""
+    """What every command that simulates takes; _Scene makes a simulator, a probe and a pose of it."""
     for option in reversed(_SCENE_OPTIONS):
         command = option(command)
     return command
@@ -206,7 +206,7 @@ class _Scene:
                 raise SimulationError(
                     f"{mri_or_labels}: is a label map; --partial-volume and --mri-modulation need the MRI it came from"
                 )
-            labels, names = volume, ("csf", "grey matter", "white matter", "leptomeninges")
+            labels, tissues = volume, preset.tissues
             beside = _tissue_file(Path(mri_or_labels))
             tissue_file = tissue_file or (beside if beside.exists() and not preset_file else None)
         else:
@@ -215,14 +215,10 @@ class _Scene:
                     volume, contrast=contrast, mask=Volume.read(mask) if mask else None, thin_sulci=thin_sulci,
                     device=device, progress=progress,
                 )  # fmt: skip
-            labels, names = result.labels, result.tissue_names
+            labels, tissues = result.labels, preset.tissues.for_names(result.tissue_names)
             texture = result.texture() if settings.needs_texture else None
         if tissue_file:
             tissues = TissueTable.read(tissue_file)
-        elif preset_file and self.is_labels:
-            tissues = preset.tissues
-        else:
-            tissues = preset.tissues.for_names(dict(enumerate(names, 1)))
         self.simulator = UltrasoundSimulator(labels, tissues, settings, device, texture)
         self.pose = craniotomy_pose(labels, self.probe) if matrix is None else matrix
 

@@ -46,8 +46,13 @@ def user_message(error: Exception) -> str | None:
         return "not enough memory; use a smaller or coarser volume"
     if type(error).__module__.startswith("pyopencl"):
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        return f"the OpenCL device failed ({reason}); choose another device"
+        return f"the OpenCL device failed ({reason}); choose another device (`ussim devices` lists them)"
     return None
+
+
+def is_our_warning(category: type[Warning]) -> bool:
+    """Whether a warning is one for the user, and not one of a library's for its developers."""
+    return category.__module__.startswith("SlicerUSSim")
 
 
 @contextmanager
@@ -57,4 +62,4 @@ def collected_warnings() -> Iterator[list[str]]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield messages
-    messages += [str(w.message) for w in caught if w.category.__module__.startswith("SlicerUSSim")]
+    messages += [str(w.message) for w in caught if is_our_warning(w.category)]

@@ -51,9 +51,7 @@ class Frame:
 
     def to_volume(self) -> Volume:
         """The image as a Volume of one slice in patient space; the slice is as thick as a pixel is high."""
-        ijk_to_ras = self.probe_to_ras @ self.image_to_probe
-        ijk_to_ras[:3, 2] *= self.pixel_spacing_mm[1]
-        return Volume(self.image[None], ijk_to_ras)
+        return Volume(self.image[None], self.probe_to_ras @ self.grid.slice_to_probe)
 
     def to_vtk(self):
         """The image as a vtkImageData of one slice in patient space (RAS)."""

@@ -33,11 +33,10 @@ class ReusedSimulator:
         Raises SimulationError as UltrasoundSimulator does; the next call then starts from nothing.
         """
         # Only how scatterers use the texture concerns what is on the device; other settings count per frame.
-        wanted = (labels_version, id(texture), device, settings.partial_volume, settings.mri_modulation_db)
+        wanted = (labels_version, texture, device, settings.partial_volume, settings.mri_modulation_db)
         if self._simulator is None or self._built_for != wanted:
             self.forget()
             self._simulator = UltrasoundSimulator(labels(), tissues, settings, device, texture)
-            self._texture = texture  # held, so that its id stays its own
             self._built_for = wanted
         elif self._simulator.medium.tissues != tissues:
             self._simulator.set_tissues(tissues)
@@ -46,4 +45,4 @@ class ReusedSimulator:
 
     def forget(self) -> None:
         """Give the device's memory back."""
-        self._simulator = self._built_for = self._texture = None
+        self._simulator = self._built_for = None

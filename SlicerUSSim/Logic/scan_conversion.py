@@ -46,6 +46,13 @@ class ImageGrid:
         matrix[1, 3] = self.top_mm + 0.5 * self.pixel_spacing_mm[1]
         return matrix
 
+    @property
+    def slice_to_probe(self) -> np.ndarray:
+        """(4, 4) the same for the image as a volume of one slice, which is as thick as a pixel is high."""
+        matrix = self.image_to_probe
+        matrix[2, 2] = self.pixel_spacing_mm[1]
+        return matrix
+
     def field(self, probe: Probe) -> np.ndarray:
         """(rows, columns) bool: which pixels lie in the field that `probe` images."""
         x, y = self.left_mm, self.top_mm

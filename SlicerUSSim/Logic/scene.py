@@ -85,7 +85,7 @@ class UltrasoundSceneLogic:
 
     def tissues(self, labels_node) -> TissueTable:
         """The tissues of a label map or segmentation: what the preset says about those names, else the presets."""
-        return self.preset.tissues.for_names(dict(enumerate(self._read_labels(labels_node).names, 1)))
+        return self.preset.tissues.for_names(self._read_labels(labels_node).names)
 
     # ---- once --------------------------------------------------------------------------------------------------
 
@@ -290,7 +290,7 @@ class UltrasoundSceneLogic:
         return self._simulator.get(
             (self._labelled[0], moved.tobytes()),
             lambda: Volume(labelled.volume.array, moved @ labelled.volume.ijk_to_ras),
-            preset.tissues.for_names(dict(enumerate(labelled.names, 1))),
+            preset.tissues.for_names(labelled.names),
             preset.settings,
             self.device,
             self._texture_of(labels_node, labelled) if preset.settings.needs_texture else None,

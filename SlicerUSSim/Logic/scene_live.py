@@ -41,8 +41,8 @@ class LiveUpdate:
 
         scene = logic.scene
         output_node.InvokeEvent(_CLAIMED)  # whoever wrote to it before stops
-        self._observe(output_node, _CLAIMED, self._end)
-        self._observe(scene, scene.StartCloseEvent, self._end)
+        self._observe(output_node, _CLAIMED, self.stop)
+        self._observe(scene, scene.StartCloseEvent, self.stop)
         self._observe(scene, scene.NodeAboutToBeRemovedEvent, self._node_goes, call_data=VTK_OBJECT)
         self._observe(scene, scene.EndBatchProcessEvent, self._batch_ended)
         self._observe(transform_node, transform_node.TransformModifiedEvent, self._request)
@@ -89,9 +89,6 @@ class LiveUpdate:
         if call_data is not None:
             callback.CallDataType = call_data
         self._observed.append((subject, subject.AddObserver(event, callback)))
-
-    def _end(self) -> None:
-        self.stop()
 
     def _node_goes(self, node) -> None:
         if any(node is mine for mine in self._nodes):

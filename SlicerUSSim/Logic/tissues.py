@@ -262,15 +262,15 @@ class TissueTable(Mapping):
         label = self.label_of(name)
         return TissueTable({**self, label: replace(self[label], **changes)}, self.membrane)
 
-    def for_names(self, names: Mapping[int, str]) -> TissueTable:
-        """A table for other labels: every tissue by its name, from this table if it has one of that name, else from the
-        presets; coupling medium and membrane stay.
+    def for_names(self, names: Iterable[str]) -> TissueTable:
+        """A table for labels 1, 2, ... named `names`: every tissue from this table if it has one of that name, else
+        from the presets; coupling medium and membrane stay.
 
         Raises SimulationError that lists the names nobody knows.
         """
         mine = {_plain_name(tissue.name): tissue for tissue in self.values()}
         table, unknown = {0: self[0]}, []
-        for label, name in names.items():
+        for label, name in enumerate(names, 1):
             try:
                 table[label] = mine.get(_plain_name(name)) or tissue_named(name)
             except SimulationError:

@@ -47,6 +47,11 @@ class _ImageFilter(VTKPythonAlgorithmBase):
     def __init__(self, **ports) -> None:
         super().__init__(inputType="vtkImageData", outputType="vtkImageData", **ports)
         self._message = ""
+        self._device: str | None = None
+
+    def SetDevice(self, device: str | None) -> None:
+        """OpenCL device (see device.choose_device)."""
+        self._change("_device", device)
 
     def SetInputData(self, image: vtkImageData | None) -> None:
         """The input itself, where no filter makes it."""
@@ -112,7 +117,6 @@ class SegmentationFilter(_ImageFilter):
         super().__init__(nInputPorts=2)
         self._classes, self._contrast = 3, "t1"
         self._filter_radius, self._bias_correction, self._thin_sulci = 1, False, True
-        self._device: str | None = None
         self._segmentation: Segmentation | None = None
 
     def SetClasses(self, classes: int) -> None:
@@ -134,10 +138,6 @@ class SegmentationFilter(_ImageFilter):
     def SetThinSulci(self, on: bool) -> None:
         """Label sulci too narrow to reach CSF intensity as leptomeninges; on."""
         self._change("_thin_sulci", bool(on))
-
-    def SetDevice(self, device: str | None) -> None:
-        """OpenCL device (see device.choose_device)."""
-        self._change("_device", device)
 
     def SetMaskConnection(self, port) -> None:
         """Where the mask comes from: an image on the MRI's grid, not zero inside."""
@@ -201,14 +201,14 @@ class UltrasoundSimulationFilter(_ImageFilter):
         super().__init__(nInputPorts=2, nOutputPorts=2)
         preset = Preset()
         self._probe, self._display, self._settings = preset.probe, preset.display, preset.settings
-        self._tissues, self._texture, self._device = preset.tissues, None, None
+        self._tissues, self._texture = preset.tissues, None
         self._field_alpha = False
-        self._transform: vtkLinearTransform = vtkTransform()
+        self._probe_transform: vtkLinearTransform | vtkMatrix4x4 = vtkTransform()  # as it was given
         self._simulator = ReusedSimulator()
         self._frame: Frame | None = None
         self._placed_outline = vtkTransformPolyDataFilter()
         self._placed_outline.SetInputData(outline_polydata(self._probe))
-        self._placed_outline.SetTransform(self._transform)
+        self._placed_outline.SetTransform(self._probe_transform)
         self.SetInputConnection(1, self._placed_outline.GetOutputPort())
 
     def SetProbe(self, probe: Probe) -> None:
@@ -226,13 +226,13 @@ class UltrasoundSimulationFilter(_ImageFilter):
             isinstance(transform, vtkLinearTransform | vtkMatrix4x4),
             f"probe transform is a {type(transform).__name__}, expected a vtkLinearTransform or a vtkMatrix4x4",
         )
+        if transform is self._probe_transform:
+            return
+        self._change("_probe_transform", transform)
         if isinstance(transform, vtkMatrix4x4):
-            if getattr(self._transform, "GetInput", lambda: None)() is transform:
-                return
             matrix, transform = transform, vtkMatrixToLinearTransform()
             transform.SetInput(matrix)
         self._placed_outline.SetTransform(transform)
-        self._change("_transform", transform)
 
     def SetTissues(self, tissues: TissueTable) -> None:
         """Acoustic parameters of the labels; brain presets until set."""
@@ -257,10 +257,6 @@ class UltrasoundSimulationFilter(_ImageFilter):
         """What the MRI knows beyond labels, where the settings ask for it (Segmentation.texture)."""
         self._change("_texture", texture)
 
-    def SetDevice(self, device: str | None) -> None:
-        """OpenCL device (see device.choose_device)."""
-        self._change("_device", device)
-
     def SetFieldAlpha(self, on: bool) -> None:
         """Give the image a second component, 255 in the imaged field and 0 outside, for laying it over others; off."""
         self._change("_field_alpha", bool(on))
@@ -279,13 +275,13 @@ class UltrasoundSimulationFilter(_ImageFilter):
 
     def RequestInformation(self, request, inInfo, outInfo):  # noqa: N803
         grid = ImageGrid.for_probe(self._probe, self._display.image_size)
-        image_to_ras = self._pose() @ grid.image_to_probe
-        column_mm, row_mm = grid.pixel_spacing_mm
+        pose = self._pose()
+        slice_to_ras = pose @ grid.slice_to_probe
         info = outInfo.GetInformationObject(0)
         info.Set(_WHOLE_EXTENT(), (0, grid.columns - 1, 0, grid.rows - 1, 0, 0), 6)
-        info.Set(vtkDataObject.SPACING(), (column_mm, row_mm, row_mm), 3)
-        info.Set(vtkDataObject.ORIGIN(), tuple(image_to_ras[:3, 3]), 3)
-        info.Set(vtkDataObject.DIRECTION(), tuple(self._pose()[:3, :3].ravel()), 9)
+        info.Set(vtkDataObject.SPACING(), tuple(np.linalg.norm(slice_to_ras[:3, :3], axis=0)), 3)
+        info.Set(vtkDataObject.ORIGIN(), tuple(slice_to_ras[:3, 3]), 3)
+        info.Set(vtkDataObject.DIRECTION(), tuple(pose[:3, :3].ravel()), 9)
         vtkDataObject.SetPointDataActiveScalarInfo(info, VTK_UNSIGNED_CHAR, 2 if self._field_alpha else 1)
         return 1
 
@@ -293,7 +289,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._frame = None
         labels = vtkImageData.GetData(inInfo[0])
         names = tissue_names(labels)
-        tissues = self._tissues.for_names(dict(enumerate(names, 1))) if names else self._tissues
+        tissues = self._tissues.for_names(names) if names else self._tissues
         simulator = self._simulator.get(
             labels.GetMTime(), lambda: Volume.from_vtk(labels), tissues, self._settings, self._device, self._texture
         )
@@ -307,7 +303,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         return 1
 
     def _pose(self) -> np.ndarray:
-        return check_rigid("probe transform", matrix_array(self._transform.GetMatrix()))
+        return check_rigid("probe transform", matrix_array(self._placed_outline.GetTransform().GetMatrix()))
 
 
 def set_tissue_names(image: vtkImageData, names) -> None:
