@@ -9,11 +9,10 @@ import numpy as np
 
 from SlicerUSSim.Logic.errors import SimulationError
 from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.tissues import colour_of
 from SlicerUSSim.Logic.volume import written_whole
 
 _BACKGROUND, _INK, _FAN = "#111111", "#dddddd", "#ffc83d"
-# Quiet, distinguishable colours for labels 1, 2, ...; 0 is black.
-_LABEL_COLOURS = ("#000000", "#2c5f8a", "#8c8c8c", "#e8e4d8", "#c85a54", "#d9a441", "#5f9e6e", "#8f6bb0", "#4fb0c6")
 
 
 def draw_views(
@@ -29,7 +28,7 @@ def draw_views(
     ----------
     views : (title, image (rows, columns), kind) with kind "mri", "labels" or "bmode".
     bounds_mm : (left, right, top, bottom) of all of them in the probe frame.
-    tissue_names : of labels 1, 2, ...; shown as a legend beside labels.
+    tissue_names : of labels 1, 2, ...; their colours, and the legend beside labels.
 
     Raises SimulationError without matplotlib and for an unwritable path.
     """
@@ -48,12 +47,9 @@ def draw_views(
         if kind == "labels":
             from matplotlib.colors import ListedColormap
 
-            axis.imshow(image, cmap=ListedColormap(_LABEL_COLOURS), vmin=-0.5, vmax=len(_LABEL_COLOURS) - 0.5,
-                        extent=extent, interpolation="nearest")  # fmt: skip
-            handles = [
-                patches.Patch(color=_LABEL_COLOURS[n % len(_LABEL_COLOURS)], label=name)
-                for n, name in enumerate(tissue_names, 1)
-            ]
+            colours = ListedColormap(["black", *map(colour_of, tissue_names)])
+            axis.imshow(image, cmap=colours, vmin=-0.5, vmax=colours.N - 0.5, extent=extent, interpolation="nearest")
+            handles = [patches.Patch(color=colour_of(name), label=name) for name in tissue_names]
             axis.legend(
                 handles=handles, loc="lower left", fontsize=7, framealpha=0.6, facecolor=_BACKGROUND, labelcolor=_INK
             )

@@ -11,25 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 import slicer
 from vtkmodules.vtkCommonCore import vtkIntArray, vtkStringArray
-from vtkmodules.vtkCommonDataModel import vtkImageData
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
 from SlicerUSSim.Logic.errors import SimulationError, require
 from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.probe import Probe
-from SlicerUSSim.Logic.tissues import TISSUES, TissueTable, same_name, tissue_named
+from SlicerUSSim.Logic.tissues import TISSUES, TissueTable, colour_of, same_name, tissue_named
 from SlicerUSSim.Logic.volume import Volume, check_rigid
-from SlicerUSSim.Logic.vtk_data import matrix_array, outline_polydata, set_scalars, vtk_matrix
-
-#: Colours of tissues in label maps and segmentations, red, green, blue from 0 to 1.
-COLOURS = {
-    "csf": (0.17, 0.37, 0.54), "grey matter": (0.55, 0.55, 0.55), "white matter": (0.91, 0.89, 0.85),
-    "leptomeninges": (0.78, 0.35, 0.33), "enhancing": (0.85, 0.64, 0.25), "tumour": (0.37, 0.62, 0.43),
-    "falx": (0.56, 0.42, 0.70), "blood": (0.75, 0.10, 0.10), "skull": (0.95, 0.93, 0.75), "bone": (0.95, 0.93, 0.75),
-    "scalp": (0.87, 0.72, 0.63), "fat": (0.93, 0.83, 0.45), "muscle": (0.70, 0.33, 0.29), "liver": (0.52, 0.23, 0.19),
-    "kidney": (0.65, 0.30, 0.25), "water": (0.30, 0.60, 0.85), "gel": (0.45, 0.75, 0.85), "air": (0.85, 0.95, 1.0),
-}  # fmt: skip
-_OTHER_COLOUR = (0.3, 0.75, 0.8)
+from SlicerUSSim.Logic.vtk_data import matrix_array, outline_polydata, vtk_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +48,18 @@ def require_node(node, *classes: str, use: str) -> None:
         f"{use} is {named(node)}, expected a {words} node",
     )
     require(node.GetScene() is not None, f"{use} {named(node)} is not in a scene any more; choose another")
+
+
+def nodes_of_class(scene, name: str) -> list:
+    """All nodes of a class, subclasses too, in the order of the scene."""
+    return [scene.GetNthNodeByClass(number, name) for number in range(scene.GetNumberOfNodesByClass(name))]
+
+
+def display_of(node):
+    """A node's display node, the default one if it has none; None where even that cannot be."""
+    if node.GetDisplayNode() is None:
+        node.CreateDefaultDisplayNodes()
+    return node.GetDisplayNode()
 
 
 # ---- where nodes are -------------------------------------------------------------------------------------------------
@@ -129,6 +130,12 @@ def read_volume(volume_node, use: str = "volume") -> Volume:
         return Volume.from_vtk(image, ijk_to_ras(volume_node))
     except SimulationError as error:
         raise SimulationError(f"{use} {named(volume_node)}: {error}") from None
+
+
+def write_volume(volume_node, volume: Volume) -> None:
+    """Put a volume into a volume node, as loading a file does; the node has its own copy of the voxels."""
+    volume_node.SetIJKToRASMatrix(vtk_matrix(volume.ijk_to_ras))
+    volume_node.SetAndObserveImageData(Volume(volume.array, np.eye(4)).to_vtk())
 
 
 def read_mask(mask_node, mri_node) -> Volume:
@@ -286,8 +293,7 @@ def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -
 
 def _write_label_map(labels_node, labels: Volume, names: tuple[str, ...]) -> None:
     scene = labels_node.GetScene()
-    labels_node.SetIJKToRASMatrix(vtk_matrix(labels.ijk_to_ras))
-    labels_node.SetAndObserveImageData(_image(labels.array))
+    write_volume(labels_node, labels)
     colours = labels_node.GetNodeReference("tissueColors")
     if colours is None:
         colours = scene.AddNewNodeByClass("vtkMRMLColorTableNode", f"{labels_node.GetName()} tissues")
@@ -312,17 +318,11 @@ def _write_segmentation(segmentation_node, labels: Volume, names: tuple[str, ...
     segmentation_node.SetSourceRepresentationToBinaryLabelmap()
     for label, name in enumerate(names, 1):
         mask = slicer.vtkOrientedImageData()
-        mask.ShallowCopy(_image((labels.array == label).astype(np.uint8)))
+        mask.ShallowCopy(Volume(labels.array == label, np.eye(4)).to_vtk())
         mask.SetImageToWorldMatrix(vtk_matrix(labels.ijk_to_ras))
         segmentation_node.AddSegmentFromBinaryLabelmapRepresentation(mask, name, colour_of(name), name)
     segmentation_node.EndModify(was_modifying)
-    if segmentation_node.GetDisplayNode() is None:
-        segmentation_node.CreateDefaultDisplayNodes()
-
-
-def colour_of(tissue_name: str) -> tuple[float, float, float]:
-    """Red, green, blue from 0 to 1."""
-    return COLOURS.get(tissue_name, _OTHER_COLOUR)
+    display_of(segmentation_node)
 
 
 # ---- what is simulated -----------------------------------------------------------------------------------------------
@@ -333,19 +333,18 @@ def write_image(volume_node, frame: Frame, transform_node=None) -> None:
 
     So the slice moves with the transform at once, and the pixels follow.
     """
-    geometry = frame.image_to_probe.copy()
-    geometry[:3, 2] *= frame.pixel_spacing_mm[1]  # as thick as a pixel is high
+    in_probe = Volume(frame.image[None], frame.grid.slice_to_probe)
     was_modifying = volume_node.StartModify()
-    if not np.array_equal(ijk_to_ras(volume_node), geometry):
-        volume_node.SetIJKToRASMatrix(vtk_matrix(geometry))
     if transform_node is not None and volume_node.GetTransformNodeID() != transform_node.GetID():
         volume_node.SetAndObserveTransformNodeID(transform_node.GetID())
     image = volume_node.GetImageData()
     rows, columns = frame.image.shape
     if image is None or image.GetDimensions() != (columns, rows, 1) or image.GetScalarTypeAsString() != "unsigned char":
-        volume_node.SetAndObserveImageData(_image(frame.image[None]))
+        write_volume(volume_node, in_probe)
         _show_all_greys(volume_node)
     else:
+        if not np.array_equal(ijk_to_ras(volume_node), in_probe.ijk_to_ras):
+            volume_node.SetIJKToRASMatrix(vtk_matrix(in_probe.ijk_to_ras))
         scalars = image.GetPointData().GetScalars()
         np.asarray(memoryview(scalars)).reshape(rows, columns)[:] = frame.image
         scalars.Modified()
@@ -357,9 +356,7 @@ def _show_all_greys(volume_node) -> None:
     """Black at 0 and white at 255, as on a scanner: an automatic window would change brightness from frame to frame."""
     if volume_node.GetScene() is None:  # an item of a sequence
         return
-    if volume_node.GetDisplayNode() is None:
-        volume_node.CreateDefaultDisplayNodes()
-    display = volume_node.GetDisplayNode()
+    display = display_of(volume_node)
     if display is not None and display.GetAutoWindowLevel():
         display.SetAutoWindowLevel(False)
         display.SetWindowLevelMinMax(0, 255)
@@ -370,15 +367,14 @@ def write_outline(model_node, probe: Probe, transform_node) -> None:
     model_node.SetAndObservePolyData(outline_polydata(probe))
     if model_node.GetTransformNodeID() != transform_node.GetID():
         model_node.SetAndObserveTransformNodeID(transform_node.GetID())
-    if model_node.GetDisplayNode() is None:
-        model_node.CreateDefaultDisplayNodes()
-        display = model_node.GetDisplayNode()
-        if display is not None:
-            display.SetColor(1.0, 0.85, 0.1)
-            display.SetLineWidth(3)
-            display.SetLighting(False)
-            display.SetVisibility2D(True)
-            display.SetSliceDisplayModeToProjection()
+    is_new = model_node.GetDisplayNode() is None
+    display = display_of(model_node)
+    if is_new and display is not None:
+        display.SetColor(1.0, 0.85, 0.1)
+        display.SetLineWidth(3)
+        display.SetLighting(False)
+        display.SetVisibility2D(True)
+        display.SetSliceDisplayModeToProjection()
 
 
 def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Probe, fit: bool) -> None:
@@ -395,18 +391,8 @@ def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Pr
         scale = max((right - left) / width, (bottom - top) / height) * 1.05
         slice_node.SetFieldOfView(width * scale, height * scale, thickness)
     slice_node.UpdateMatrices()
-    scene = slice_node.GetScene()
-    for number in range(scene.GetNumberOfNodesByClass("vtkMRMLSliceCompositeNode")):
-        composite = scene.GetNthNodeByClass(number, "vtkMRMLSliceCompositeNode")
+    for composite in nodes_of_class(slice_node.GetScene(), "vtkMRMLSliceCompositeNode"):
         is_its = composite.GetLayoutName() == slice_node.GetLayoutName()
         if is_its and composite.GetForegroundVolumeID() != volume_node.GetID():
             composite.SetForegroundVolumeID(volume_node.GetID())
             composite.SetForegroundOpacity(1.0)
-
-
-def _image(array: np.ndarray):
-    """A vtkImageData of (k, j, i) voxels without geometry, as volume nodes want it."""
-    image = vtkImageData()
-    image.SetDimensions(*array.shape[::-1])
-    set_scalars(image, array)
-    return image

@@ -190,6 +190,22 @@ def tissue_named(name: str) -> Tissue:
     return TISSUES[key]
 
 
+#: Colours of tissues in pictures, label maps and segmentations: quiet and distinguishable; red, green, blue, 0 to 1.
+_COLOURS = {
+    "csf": (0.17, 0.37, 0.54), "grey matter": (0.55, 0.55, 0.55), "white matter": (0.91, 0.89, 0.85),
+    "leptomeninges": (0.78, 0.35, 0.33), "enhancing": (0.85, 0.64, 0.25), "tumour": (0.37, 0.62, 0.43),
+    "falx": (0.56, 0.42, 0.70), "blood": (0.75, 0.10, 0.10), "skull": (0.95, 0.93, 0.75), "bone": (0.95, 0.93, 0.75),
+    "scalp": (0.87, 0.72, 0.63), "fat": (0.93, 0.83, 0.45), "muscle": (0.70, 0.33, 0.29), "liver": (0.52, 0.23, 0.19),
+    "kidney": (0.65, 0.30, 0.25), "water": (0.30, 0.60, 0.85), "gel": (0.45, 0.75, 0.85), "air": (0.85, 0.95, 1.0),
+}  # fmt: skip
+_OTHER_COLOUR = (0.3, 0.75, 0.8)
+
+
+def colour_of(tissue_name: str) -> tuple[float, float, float]:
+    """Red, green, blue from 0 to 1 of a tissue in pictures, label maps and segmentations."""
+    return _COLOURS.get(tissue_name, _OTHER_COLOUR)
+
+
 class TissueTable(Mapping):
     """Which tissue every label stands for: a read-only mapping {label: Tissue}, and the membrane, if any.
 
@@ -248,6 +264,20 @@ class TissueTable(Mapping):
     def names(self) -> list[str]:
         """Tissue names in the order of their labels."""
         return [tissue.name for tissue in self.values()]
+
+    def all_tissues(self) -> list[Tissue]:
+        """Tissues in the order of their labels, the membrane's last."""
+        return [*self.values(), *([] if self.membrane is None else [self.membrane.tissue])]
+
+    def with_tissue(self, tissue: Tissue) -> TissueTable:
+        """A new table in which everything of that name, the membrane too, is `tissue`; added if nothing is."""
+        labels = [label for label, old in self.items() if old.name == tissue.name]
+        membrane = self.membrane
+        if membrane is not None and membrane.tissue.name == tissue.name:
+            membrane = replace(membrane, tissue=tissue)
+        elif not labels:
+            labels = [next(label for label in range(MAX_LABEL + 1) if label not in self)]
+        return TissueTable({**self, **dict.fromkeys(labels, tissue)}, membrane)
 
     def replace(self, name: str, **changes) -> TissueTable:
         """A new table in which the tissue `name` (the membrane's too) has the given parameters changed."""

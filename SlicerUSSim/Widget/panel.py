@@ -14,6 +14,7 @@ import slicer
 from SlicerUSSim.Logic.errors import Cancelled
 from SlicerUSSim.Logic.probe import PROBES
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
+from SlicerUSSim.Logic.scene_nodes import nodes_of_class
 from SlicerUSSim.Logic.tissues import TISSUES
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter, TissueRow
 
@@ -175,16 +176,17 @@ class Panel:
         self._cancelled = True
 
     def _load_preset(self, *_) -> None:
-        path = qt.QFileDialog.getOpenFileName(None, "Load preset", "", "Presets (*.json)")
-        path = path if isinstance(path, str) else path[0]
-        if path:
-            self.presenter.loadPreset(path)
+        self._with_file(qt.QFileDialog.getOpenFileName, "Load preset", "", self.presenter.loadPreset)
 
     def _save_preset(self, *_) -> None:
-        path = qt.QFileDialog.getSaveFileName(None, "Save preset", "preset.json", "Presets (*.json)")
-        path = path if isinstance(path, str) else path[0]
+        self._with_file(qt.QFileDialog.getSaveFileName, "Save preset", "preset.json", self.presenter.savePreset)
+
+    @staticmethod
+    def _with_file(ask, title: str, proposal: str, action: Callable[[str], None]) -> None:
+        path = ask(None, title, proposal, "Presets (*.json)")
+        path = path if isinstance(path, str) else path[0]  # with the chosen filter, where it is not PythonQt
         if path:
-            self.presenter.savePreset(path)
+            action(path)
 
     # ---- the tissue table --------------------------------------------------------------------------------------
 
@@ -230,11 +232,7 @@ class Panel:
     # ---- small things ------------------------------------------------------------------------------------------
 
     def _slice_nodes(self) -> list:
-        scene = self.logic.scene
-        return [
-            scene.GetNthNodeByClass(n, "vtkMRMLSliceNode")
-            for n in range(scene.GetNumberOfNodesByClass("vtkMRMLSliceNode"))
-        ]
+        return nodes_of_class(self.logic.scene, "vtkMRMLSliceNode")
 
     def _show_slice_names(self) -> None:
         combo, names = self.ui.sliceViewComboBox, [node.GetLayoutName() for node in self._slice_nodes()]

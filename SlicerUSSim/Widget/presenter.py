@@ -18,7 +18,8 @@ from SlicerUSSim.Logic.errors import Cancelled, SimulationError, collected_warni
 from SlicerUSSim.Logic.preset import Preset
 from SlicerUSSim.Logic.probe import PROBES
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
-from SlicerUSSim.Logic.tissues import MAX_LABEL, TISSUES, Tissue, TissueTable, same_name
+from SlicerUSSim.Logic.scene_nodes import display_of, nodes_of_class
+from SlicerUSSim.Logic.tissues import TISSUES, Tissue, TissueTable, same_name
 from SlicerUSSim.Widget.fields import field_value, with_field
 
 #: Columns of the tissue table: parameter, heading, unit.
@@ -115,19 +116,11 @@ class PanelPresenter:
 
     def tissues(self) -> list[TissueRow]:
         """The tissues of the chosen labels, coupling medium first and membrane last; of the preset without labels."""
-        table = self._table()
-        membrane = [] if table.membrane is None else [table.membrane.tissue]
-        rows = {}
-        for tissue in [*table.values(), *membrane]:
-            names = [parameter for parameter, _, _ in TISSUE_COLUMNS]
-            rows.setdefault(
-                tissue.name,
-                TissueRow(
-                    tissue.name,
-                    tuple(getattr(tissue, name) for name in names),
-                    tuple(tissue.sources.get(name, "set by hand") for name in names),
-                ),
-            )
+        rows: dict[str, TissueRow] = {}
+        for tissue in self._table().all_tissues():
+            values = tuple(getattr(tissue, parameter) for parameter, _, _ in TISSUE_COLUMNS)
+            sources = tuple(tissue.sources.get(parameter, "set by hand") for parameter, _, _ in TISSUE_COLUMNS)
+            rows.setdefault(tissue.name, TissueRow(tissue.name, values, sources))
         return list(rows.values())
 
     def setTissue(self, name: str, parameter: str, text: str) -> None:
@@ -136,7 +129,7 @@ class PanelPresenter:
             try:
                 value = float(text.strip().replace(",", "."))
             except ValueError:
-                raise SimulationError(f"tissue {name!r}: {parameter} is {text!r}, expected a number") from None
+                value = math.nan
             require(math.isfinite(value), f"tissue {name!r}: {parameter} is {text!r}, expected a number")
             self._change_tissue(name, lambda old: replace(old, **{parameter: value}, sources=_without(old, parameter)))
 
@@ -195,12 +188,8 @@ class PanelPresenter:
     def placeProbe(self, slice_node=None) -> None:
         """Put the probe on the surface in a slice view, or where a craniotomy might be; make one if there is none."""
         with self._shown():
-            parameters = self.logic.parameters
-            require(parameters.labels is not None, "no label map chosen, expected one to put the probe on")
-            with self._made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
-                self.logic.placeProbe(parameters.labels, probe, slice_node)
-            parameters.probe_transform = probe
-            self._show_handles(probe)
+            require(self.logic.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
+            self._put_probe(slice_node)
         self.view.refresh()
 
     def simulate(self) -> None:
@@ -255,11 +244,10 @@ class PanelPresenter:
 
     def chooseDefaultNodes(self) -> None:
         """Take the first volume of the scene for the MRI, if none was chosen, which saves a few clicks."""
-        parameters, scene = self.logic.parameters, self.logic.scene
+        parameters = self.logic.parameters
         if parameters.mri is not None:
             return
-        for number in range(scene.GetNumberOfNodesByClass("vtkMRMLScalarVolumeNode")):
-            node = scene.GetNthNodeByClass(number, "vtkMRMLScalarVolumeNode")
+        for node in nodes_of_class(self.logic.scene, "vtkMRMLScalarVolumeNode"):
             if not node.IsA("vtkMRMLLabelMapVolumeNode") and node is not parameters.output:
                 parameters.mri = node
                 return
@@ -289,43 +277,38 @@ class PanelPresenter:
     def _change_tissue(self, name: str, change: Callable[[Tissue], Tissue]) -> None:
         """Change a tissue of the table in use; one that the preset did not have is added to it."""
         preset, used = self._preset(), self._table()
-        table = preset.tissues
-        everywhere = [*used.values(), *([] if used.membrane is None else [used.membrane.tissue])]
-        old = next((tissue for tissue in everywhere if same_name(tissue.name, name)), None)
+        old = next((tissue for tissue in used.all_tissues() if same_name(tissue.name, name)), None)
         require(old is not None, f"no tissue is called {name!r}, expected one of {', '.join(used.names())}")
-        new = change(old)
-        labels = [label for label, tissue in table.items() if tissue.name == old.name]
-        is_membrane = table.membrane is not None and table.membrane.tissue.name == old.name
-        if not labels and not is_membrane:
-            labels = [next(n for n in range(MAX_LABEL + 1) if n not in table)]
-        membrane = replace(table.membrane, tissue=new) if is_membrane else table.membrane
-        self.logic.preset = replace(preset, tissues=TissueTable({**table, **dict.fromkeys(labels, new)}, membrane))
+        self.logic.preset = replace(preset, tissues=preset.tissues.with_tissue(change(old)))
 
     def _nodes(self):
         """The parameters, with the nodes that simulating needs; those that were not chosen are made."""
         parameters = self.logic.parameters
         require(parameters.labels is not None, "no label map chosen; segment the MRI first")
         if parameters.probe_transform is None:
-            with self._made(None, "LinearTransform", "Probe") as probe:
-                self.logic.placeProbe(parameters.labels, probe)
-            parameters.probe_transform = probe
-            self._show_handles(probe)
+            self._put_probe()
         if parameters.output is None:
             parameters.output = self._add("ScalarVolume", "Ultrasound")
         if parameters.outline is None:
             parameters.outline = self._add("Model", "Ultrasound outline")
         return parameters
 
+    def _put_probe(self, slice_node=None) -> None:
+        """Place the probe's transform, a new one if none was chosen, and show handles to move and turn it by."""
+        parameters = self.logic.parameters
+        with self._made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
+            self.logic.placeProbe(parameters.labels, probe, slice_node)
+        parameters.probe_transform = probe
+        display = display_of(probe)
+        if display is not None:
+            display.SetEditorVisibility(True)
+
     def _live_nodes(self) -> tuple:
         nodes = self.logic.parameters
         return nodes.labels, nodes.probe_transform, nodes.output, nodes.outline, self.view.sliceNode()
 
     def _browser_of(self, sequence_node):
-        scene = self.logic.scene
-        browsers = (
-            scene.GetNthNodeByClass(n, "vtkMRMLSequenceBrowserNode")
-            for n in range(scene.GetNumberOfNodesByClass("vtkMRMLSequenceBrowserNode"))
-        )
+        browsers = nodes_of_class(self.logic.scene, "vtkMRMLSequenceBrowserNode")
         return next((node for node in browsers if node.IsSynchronizedSequenceNode(sequence_node, True)), None)
 
     def _add(self, kind: str, name: str):
@@ -343,15 +326,6 @@ class PanelPresenter:
             if made:
                 self.logic.scene.RemoveNode(node)
             raise
-
-    @staticmethod
-    def _show_handles(transform_node) -> None:
-        """Handles in the views, to move and turn the probe by."""
-        if transform_node.GetDisplayNode() is None:
-            transform_node.CreateDefaultDisplayNodes()
-        display = transform_node.GetDisplayNode()
-        if display is not None:
-            display.SetEditorVisibility(True)
 
     def _reported(self, message: str) -> None:
         now = perf_counter()
