@@ -13,14 +13,13 @@ import argparse
 from statistics import median
 from time import perf_counter
 
-import numpy as np
 import slicer
 
-from SlicerUSSim.Logic import PhasedProbe, Volume
+from SlicerUSSim.Logic import PhasedProbe
 from SlicerUSSim.Logic.demo import demo_mri
 from SlicerUSSim.Logic.placement import slide_sweep
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
-from SlicerUSSim.Logic.scene_nodes import node_to_world
+from SlicerUSSim.Logic.scene_nodes import node_to_world, write_volume
 from SlicerUSSim.Logic.vtk_data import vtk_matrix
 
 PROBE_A = PhasedProbe(75, 73, scan_lines=196)
@@ -46,10 +45,8 @@ def measure(kind: str, repeat: int, device: str | None) -> tuple[list[float], li
     scene = slicer.vtkMRMLScene()
     logic = UltrasoundSceneLogic(scene, device)
     logic.preset = logic.preset.changed("probe", **{**PROBE_A.to_dict(), "kind": "phased"})
-    mri = demo_mri()[0]
     node = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "MRI")
-    node.SetAndObserveImageData(Volume(mri.array, np.eye(4)).to_vtk())
-    node.SetIJKToRASMatrix(vtk_matrix(mri.ijk_to_ras))
+    write_volume(node, demo_mri()[0])
     labels = scene.AddNewNodeByClass(f"vtkMRML{kind}Node", "Tissues")
     probe = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
     output = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Ultrasound")

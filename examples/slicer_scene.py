@@ -23,7 +23,7 @@ from SlicerUSSim.Logic.demo import demo_mri
 from SlicerUSSim.Logic.errors import require
 from SlicerUSSim.Logic.placement import slide_sweep
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
-from SlicerUSSim.Logic.scene_nodes import node_to_world
+from SlicerUSSim.Logic.scene_nodes import node_to_world, read_volume, write_volume
 from SlicerUSSim.Logic.vtk_data import vtk_matrix
 
 
@@ -38,8 +38,7 @@ def new_scene() -> tuple[slicer.vtkMRMLScene, slicer.vtkSlicerSequencesLogic]:
 def add_volume(scene, volume: Volume, name: str):
     """What loading a file does in Slicer."""
     node = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
-    node.SetAndObserveImageData(Volume(volume.array, np.eye(4)).to_vtk())
-    node.SetIJKToRASMatrix(vtk_matrix(volume.ijk_to_ras))
+    write_volume(node, volume)
     return node
 
 
@@ -116,12 +115,8 @@ def main(path: Path) -> None:
     nodes = again.parameters
     require(again.preset == logic.preset, "the preset has changed on its way through the file")
     frame = again.simulate(nodes.labels, nodes.probe_transform, nodes.output)
-    same = float(np.mean(frame.image == logic_image(logic)))
+    same = float(np.mean(frame.image == read_volume(logic.parameters.output).array[0]))
     print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB); read back, it simulates the same image ({same:.2%})")
-
-
-def logic_image(logic: UltrasoundSceneLogic) -> np.ndarray:
-    return Volume.from_vtk(logic.parameters.output.GetImageData(), np.eye(4)).array[0]
 
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,6 +46,15 @@ def simulator(
     """A simulator for labels 1, 2, ... with `coupling` around them."""
     table = TissueTable({0: coupling, **dict(enumerate(tissues, 1))}, membrane)
     return UltrasoundSimulator(labels, table, SimulationSettings(**settings))
+
+
+def example(name: str):
+    """The module examples/`name`.py."""
+    path = Path(__file__).parents[1] / "examples" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="session")

@@ -273,6 +273,11 @@ def test_a_preset_gives_the_same_image_and_options_go_before_it(head, labels, tm
     assert quieter.mean() < whole.mean()
 
 
+def test_the_command_offers_every_probe_there_is():
+    options = {option.name: option for option in main.commands["demo"].params}
+    assert list(options["kind"].type.choices) == list(PROBES)
+
+
 def test_python_m_is_the_command():
     done = subprocess.run([sys.executable, "-m", "SlicerUSSim", "--version"], capture_output=True, text=True)
     assert done.returncode == 0 and "ussim, version" in done.stdout

@@ -6,15 +6,13 @@ import subprocess
 import sys
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
-from SlicerUSSim.Logic import Volume  # noqa: E402
 from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.scene_nodes import write_volume  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 
 
@@ -47,10 +45,8 @@ class PlainView:
 @pytest.fixture
 def presenter():
     scene = slicer.vtkMRMLScene()
-    mri = head_mri(3.0)
     node = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Head")
-    node.SetAndObserveImageData(Volume(mri.array, np.eye(4)).to_vtk())
-    node.SetIJKToRASMatrix(vtk_matrix(mri.ijk_to_ras))
+    write_volume(node, head_mri(3.0))
     result = PanelPresenter(UltrasoundSceneLogic(scene), PlainView())
     result.chooseDefaultNodes()
     return result

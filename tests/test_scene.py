@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import gc
 import json
-import sys
 import weakref
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,9 +36,10 @@ from SlicerUSSim.Logic.scene_nodes import (  # noqa: E402
     pose_in_labels,
     set_node_to_world,
     write_labels,
+    write_volume,
 )
 from SlicerUSSim.Logic.vtk_data import vtk_matrix  # noqa: E402
-from tests.conftest import FLUID, SPECKLE, block, rigid  # noqa: E402
+from tests.conftest import FLUID, SPECKLE, block, example, rigid  # noqa: E402
 
 PRESET = Preset(
     LinearProbe(20, 30, scan_lines=48, focus_mm=15),
@@ -95,8 +94,7 @@ class Bench:
 
 def volume_node(scene, volume: Volume, name: str = "MRI"):
     node = add(scene, "ScalarVolume", name)
-    node.SetAndObserveImageData(Volume(volume.array, np.eye(4)).to_vtk())
-    node.SetIJKToRASMatrix(vtk_matrix(volume.ijk_to_ras))
+    write_volume(node, volume)
     return node
 
 
@@ -299,8 +297,7 @@ def test_large_labels_as_freesurfer_has_them_are_told_by_their_colours(bench):
     volume = cyst()
     label_map = add(bench.scene, "LabelMapVolume", "aseg")
     big = volume.with_array(np.where(volume.array == 2, 1035, 2).astype(np.int16))
-    label_map.SetAndObserveImageData(volume_node(bench.scene, big).GetImageData())
-    label_map.SetIJKToRASMatrix(vtk_matrix(volume.ijk_to_ras))
+    write_volume(label_map, big)
     with pytest.raises(SimulationError, match="label 1035"):
         bench.logic.simulate(label_map, bench.probe, bench.image)
     colours = add(bench.scene, "ColorTable", "FreeSurfer")
@@ -316,8 +313,7 @@ def test_large_labels_as_freesurfer_has_them_are_told_by_their_colours(bench):
 
 def test_a_label_map_without_names_is_told_by_the_labels_of_the_preset(bench):
     bare = add(bench.scene, "LabelMapVolume", "bare")
-    bare.SetAndObserveImageData(volume_node(bench.scene, cyst()).GetImageData())
-    bare.SetIJKToRASMatrix(vtk_matrix(cyst().ijk_to_ras))
+    write_volume(bare, cyst())
     bench.logic.simulate(bare, bench.probe, bench.image)
     np.testing.assert_array_equal(pixels(bench.image), expected(ABOVE))
 
@@ -325,8 +321,7 @@ def test_a_label_map_without_names_is_told_by_the_labels_of_the_preset(bench):
 def test_slicers_default_colours_do_not_make_bone_of_grey_matter(bench):
     """A label map that Slicer loads gets GenericAnatomyColors, where label 2 is "bone" and 3 is "skin"."""
     labels = add(bench.scene, "LabelMapVolume", "labels.nii")
-    labels.SetAndObserveImageData(bench.labels.GetImageData())
-    labels.SetIJKToRASMatrix(vtk_matrix(cyst().ijk_to_ras))
+    write_volume(labels, cyst())
     colours = add(bench.scene, "ColorTable", "GenericAnatomyColors")
     colours.SetTypeToUser()
     colours.SetNumberOfColors(3)
@@ -780,11 +775,7 @@ def component(image, number: int):
 
 @pytest.mark.slow
 def test_the_example_builds_a_scene_and_saves_it_so_that_it_opens(mni, tmp_path, capsys):
-    sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
-    try:
-        import slicer_scene
-    finally:
-        sys.path.pop(0)
+    slicer_scene = example("slicer_scene")
     slicer_scene.main(tmp_path / "brain.mrb")
     said = capsys.readouterr().out
     assert "13 images followed the probe" in said and "the same image (100.00%)" in said

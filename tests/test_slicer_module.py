@@ -79,11 +79,8 @@ class Session:
 
     def head(self):
         """A small head, as loading an MRI would add it."""
-        mri = self.logic_module("phantoms").head_mri(3.0)
         node = self.add("ScalarVolume", "Head")
-        volume = self.logic_module("volume").Volume
-        node.SetAndObserveImageData(volume(mri.array, np.eye(4)).to_vtk())
-        node.SetIJKToRASMatrix(self.logic_module("vtk_data").vtk_matrix(mri.ijk_to_ras))
+        self.logic_module("scene_nodes").write_volume(node, self.logic_module("phantoms").head_mri(3.0))
         return node
 
     def segmented(self):

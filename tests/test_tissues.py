@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -129,3 +130,14 @@ def test_tables_refuse_labels_and_files_they_cannot_use(tmp_path):
 def test_settings_check_themselves(settings, message):
     with pytest.raises(SimulationError, match=message):
         settings()
+
+
+def test_a_tissue_replaces_all_of_its_name_and_a_new_one_gets_a_free_label():
+    table = TissueTable.brain(("csf", "leptomeninges"))
+    louder = replace(TISSUES["leptomeninges"], mu0=1.5)
+    changed = table.with_tissue(louder)
+    assert changed[2] == louder == changed.membrane.tissue and changed[1] == table[1]
+    assert [tissue.name for tissue in changed.all_tissues()] == ["coupling", "csf", "leptomeninges", "leptomeninges"]
+    more = changed.with_tissue(TISSUES["tumour"])
+    assert more[3].name == "tumour" and more.membrane == changed.membrane and len(more) == len(changed) + 1
+    assert TissueTable({}).all_tissues() == [TISSUES["coupling"]]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import vtkmodules.vtkRenderingOpenGL2  # noqa: F401, makes rendering work at all
@@ -41,7 +38,7 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.phantoms import head_mri
 from SlicerUSSim.Logic.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.vtk_filters import SegmentationFilter, UltrasoundSimulationFilter
-from tests.conftest import FLUID, SPECKLE, block, rigid
+from tests.conftest import FLUID, SPECKLE, block, example, rigid
 
 PROBE = LinearProbe(20, 30, scan_lines=48, focus_mm=15)
 DISPLAY = DisplaySettings(image_size=(96, 64))
@@ -298,11 +295,7 @@ def test_segmentation_takes_a_mask_and_can_be_stopped():
 @pytest.fixture(scope="module")
 def rendered(mni):
     """The example's scene and the pixels of its window."""
-    sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
-    try:
-        import vtk_pipeline
-    finally:
-        sys.path.pop(0)
+    vtk_pipeline = example("vtk_pipeline")
     return vtk_pipeline, vtk_pipeline.build(mni[0])
 
 
