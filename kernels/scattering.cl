@@ -16,10 +16,27 @@
 // With TEXTURE defined, scatterers know more of the MRI than labels (texture.py): a scatterer takes the second tissue
 // of its voxel with that one's probability, and its amplitude follows the intensity.
 //
+// With VARIED defined, the echoes are written in PARTS parts, of which every image of this pose is a linear combination
+// whatever mu0, sigma0 and mu1 of one tissue are (appearance.py). Part 0 is everything else. The tissue's scatterers
+// come to exist in bands of T1, one after the other: band b has part 1 + 2 b, its scatterers with amplitude 1, and part
+// 2 + 2 b, with amplitude T0.
+//
 // Buffers: voxels, tissues, segments as in raytracing.cl; texture uint [k][j][i] (one element without TEXTURE); re, im
-// float [2 traced line + side][stride].
+// float [2 traced line + side][stride]; with VARIED also [part] before these, role int [label] (ROLE_...) and
+// band_top float [BANDS], the share of sites up to and with each band.
 
 #include "common.clh"
+
+#ifdef VARIED
+#define VARIED_PARAMETERS , __global const int *role, __global const float *band_top
+#define VARIED_ARGUMENTS , role, band_top
+#else
+#define VARIED_PARAMETERS
+#define VARIED_ARGUMENTS
+#undef PARTS
+#define PARTS 1
+#endif
+#define PART (CHUNK + 2)  // one more sample at either end: echoes lie between samples
 
 #define BATCH 256  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
@@ -40,9 +57,18 @@ typedef struct {
 // The hash counts cells by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
+// Adds an echo of this strength to one part.
+inline void add_echo(float4 *sum, int bin, float between, float right, float strength, float re, float im) {
+  const float to_right = right * strength, to_left = strength - to_right;
+  const float4 echo = (float4)(to_left, to_left, to_right, to_right) * (float4)(re, im, re, im);
+  // Bins count from -1, so that the first and last sample of the chunk get their share from scatterers beyond.
+  sum[bin + 1] += echo * (1.0f - between);
+  sum[bin + 2] += echo * between;
+}
+
 inline void scatter_batch(__constant const Scene *scene, __global const ushort *voxels, __global const uint *texture,
                           __global const Tissue *tissues, const Piece *piece, const int *cell_u, const uint *row_key,
-                          const float *row_v, const float *row_w, int count, float4 *sum) {
+                          const float *row_v, const float *row_w, int count, float4 *sum VARIED_PARAMETERS) {
   const float cell = scene->cell_mm, grain = cell / 1024.0f;
   const float cutoff2 = 0.5f * LOG2_E * scene->beam_cutoff * scene->beam_cutoff;
   const float inverse_sample = 1.0f / scene->sample_mm;
@@ -139,17 +165,27 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
           if (fabs(mix(near_z, far_z, fz) - 127.5f) < scene->membrane_reach) label = MEMBRANE_LABEL;
         }
       }
+#ifdef TEXTURE
+      if (label == MEMBRANE_LABEL) gain = 1.0f;
+#else
+      const float gain = 1.0f;
+#endif
+#ifdef VARIED
+      if (role[label] == ROLE_SILENT) continue;
+      if (role[label] == ROLE_VARIED) {
+        const float site = ((random >> 16) + 0.5f) / 65536.0f;
+        int band = 0;
+        while (band < BANDS - 1 && site >= band_top[band]) band++;
+        float4 *part = sum + (1 + 2 * band) * PART;
+        add_echo(part, b, part_[j], right_[j], gain, re_[j], im_[j]);
+        add_echo(part + PART, b, part_[j], right_[j], gain * t0_[j], re_[j], im_[j]);
+        continue;
+      }
+#endif
       const float p = tissues[label].share;
       const int exists = (random >> 16) + 0.5f < p * 65536.0f;
-      float strength = tissues[label].mu0 * (exists - p) + tissues[label].sigma0 * t0_[j] * exists;
-#ifdef TEXTURE
-      if (label != MEMBRANE_LABEL) strength *= gain;
-#endif
-      const float to_right = right_[j] * strength, to_left = strength - to_right;
-      const float4 echo = (float4)(to_left, to_left, to_right, to_right) * (float4)(re_[j], im_[j], re_[j], im_[j]);
-      // Bins count from -1, so that the first and last sample of the chunk get their share from scatterers beyond.
-      sum[b + 1] += echo * (1.0f - part_[j]);
-      sum[b + 2] += echo * part_[j];
+      const float strength = tissues[label].mu0 * (exists - p) + tissues[label].sigma0 * t0_[j] * exists;
+      add_echo(sum, b, part_[j], right_[j], gain * strength, re_[j], im_[j]);
     }
   }
 }
@@ -158,7 +194,7 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
 // start, `low` and `high` are the piece's ends along it, `radius_l` and `radius_e` how far it reaches to either side.
 inline void scatter_piece(__constant const Scene *scene, __global const ushort *voxels, __global const uint *texture,
                           __global const Tissue *tissues, const Piece *piece, float3 start, float low, float high,
-                          float radius_l, float radius_e, float4 *sum) {
+                          float radius_l, float radius_e, float4 *sum VARIED_PARAMETERS) {
   int cell_u[BATCH + LANES];
   uint row_key[BATCH + LANES];
   float row_v[BATCH + LANES], row_w[BATCH + LANES];
@@ -213,7 +249,8 @@ inline void scatter_piece(__constant const Scene *scene, __global const ushort *
         STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
         waiting += min(LANES, u_high - cu + 1);
         if (waiting >= BATCH) {
-          scatter_batch(scene, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, BATCH, sum);
+          scatter_batch(scene, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, BATCH,
+                        sum VARIED_ARGUMENTS);
           waiting -= BATCH;
           for (int i = 0; i < waiting; i++) {
             cell_u[i] = cell_u[BATCH + i];
@@ -225,7 +262,7 @@ inline void scatter_piece(__constant const Scene *scene, __global const ushort *
       }
     }
   }
-  scatter_batch(scene, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, waiting, sum);
+  scatter_batch(scene, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, waiting, sum VARIED_ARGUMENTS);
 }
 
 #ifdef NO_IMPLICIT_VECTORS
@@ -234,11 +271,11 @@ __attribute__((intel_vec_len_hint(1)))
 __kernel void
 scatter(__constant const Scene *scene, __global const ushort *voxels, __global const uint *texture,
         __global const Tissue *tissues, __global const Segment *segments, __global const int *segment_counts,
-        __global float *re, __global float *im, int stride) {
+        __global float *re, __global float *im, int stride VARIED_PARAMETERS) {
   int chunk = get_global_id(0), line = get_global_id(1);
   int first = chunk * CHUNK;
-  float4 sum[CHUNK + 2];  // left re, im, right re, im
-  for (int i = 0; i < CHUNK + 2; i++) sum[i] = (float4)(0.0f);
+  float4 sum[PARTS * PART];  // left re, im, right re, im
+  for (int i = 0; i < PARTS * PART; i++) sum[i] = (float4)(0.0f);
   const float depth_low = (first - 1) * scene->sample_mm, depth_high = (first + CHUNK) * scene->sample_mm;
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
@@ -302,14 +339,17 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
                     log2(apart_high) - piece.gain0;
 
       scatter_piece(scene, voxels, texture, tissues, &piece, start, low, high, 0.5f * fmax(apart_low, apart_high),
-                    scene->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum);
+                    scene->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum VARIED_ARGUMENTS);
     }
   }
-  int left = 2 * line * stride + LINE_PAD + first, right = left + stride;
-  for (int i = 0; i < CHUNK; i++) {
-    re[left + i] = sum[i + 1].x;
-    im[left + i] = sum[i + 1].y;
-    re[right + i] = sum[i + 1].z;
-    im[right + i] = sum[i + 1].w;
+  for (int part = 0; part < PARTS; part++) {
+    const float4 *echoes = sum + part * PART + 1;
+    const int left = 2 * (part * (int)get_global_size(1) + line) * stride + LINE_PAD + first, right = left + stride;
+    for (int i = 0; i < CHUNK; i++) {
+      re[left + i] = echoes[i].x;
+      im[left + i] = echoes[i].y;
+      re[right + i] = echoes[i].z;
+      im[right + i] = echoes[i].w;
+    }
   }
 }

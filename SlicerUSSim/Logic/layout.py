@@ -20,6 +20,12 @@ CONSTANTS = {
     "MAX_HITS": 96,  # per traced ray
     "MAX_STACK": 24,  # reflected rays waiting to be followed
     "CHUNK": 64,  # samples one work-item of the scatter kernel owns
+    "BANDS": 4,  # of T1, by which a tissue's scatterers come to exist as mu1 is varied (appearance.py)
+    "PARTS": 9,  # 1 + 2 BANDS
+    "ROLE_FIXED": 0,  # of a tissue while the parts are computed: in part 0, ...
+    "ROLE_VARIED": 1,  # ... in the parts of its own, ...
+    "ROLE_SILENT": 2,  # ... or in none
+    "MAX_BINS": 256,  # of the histograms in similarity.cl
     "LINE_PAD": 448,  # zeros on either side of a line: the longest pulse filter (bandwidth 0.05, 16 samples per cycle)
 }
 

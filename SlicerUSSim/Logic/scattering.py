@@ -39,9 +39,15 @@ class Scatterers:
     def __init__(self, device: Device) -> None:
         self.device = device
 
-    def run(self, scene_buffer, scene: np.ndarray, medium: Medium, tree: RayTracer, lines: EchoLines) -> None:
-        """Enqueue the speckle of one frame; it overwrites `lines`."""
-        variant = ("TEXTURE",) if medium.has_texture else ()
+    def run(
+        self, scene_buffer, scene: np.ndarray, medium: Medium, tree: RayTracer, lines: EchoLines, varied: tuple = ()
+    ) -> None:
+        """Enqueue the speckle of one frame; it overwrites `lines`.
+
+        With `varied`, the device buffers of roles (MAX_TISSUES,) int32 and band tops (BANDS,) float32, it comes in
+        CONSTANTS["PARTS"] parts one after the other: see kernels/scattering.cl and appearance.py.
+        """
+        variant = (["TEXTURE"] if medium.has_texture else []) + (["VARIED"] if varied else [])
         self.device.run(
             self.device.kernels("scattering.cl", self.device.lanes, *variant)["scatter"],
             (int(scene["samples"]) // CONSTANTS["CHUNK"], int(scene["traced_lines"])),
@@ -54,6 +60,7 @@ class Scatterers:
             lines.re,
             lines.im,
             np.int32(lines.stride),
+            *varied,
             heavy=True,
         )
 

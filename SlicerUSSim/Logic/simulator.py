@@ -104,7 +104,7 @@ class UltrasoundSimulator:
             self.scan_lines.prepare(probe.scan_lines, samples)
             self.beam.run(self._scene_buffer, scene, self.traced_lines, self.scan_lines)
         with self._stage("pulse", timings):
-            self.pulse.run(scene, self._axial_sigma_mm(probe), self.scan_lines)
+            self.pulse.run(scene, self.axial_sigma_mm(probe), self.scan_lines)
         with self._stage("B-mode", timings):
             self.compressor.run(scene, display, self.pulse)
         with self._stage("scan conversion", timings):
@@ -179,10 +179,16 @@ class UltrasoundSimulator:
     # ---- the scene record --------------------------------------------------------------------------------------
 
     def _upload_scene(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
+        scene = self.scene(probe, pose)
+        self.device.write(self._scene_buffer, scene)
+        return scene
+
+    def scene(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
+        """The record (layout.SCENE) of what the stages need to know of one frame."""
         settings, medium = self.settings, self.medium
         chunk = CONSTANTS["CHUNK"]
         transmit, elevation = probe.transmit_waist(), probe.elevation_waist()
-        axial_sigma = self._axial_sigma_mm(probe)
+        axial_sigma = self.axial_sigma_mm(probe)
         scene = np.zeros((), SCENE)
         scene["ras_to_voxel"] = medium.ras_to_voxel.ravel()
         scene["dims"] = medium.dims
@@ -221,13 +227,13 @@ class UltrasoundSimulator:
         scene["beam_cutoff"] = settings.beam_cutoff
         # The integral of the squared point spread function is pi^1.5 times the product of the three sigmas.
         scene["speckle_scale"] = (settings.scatterers_per_mm3 * np.pi**1.5 * axial_sigma) ** -0.5
-        self.device.write(self._scene_buffer, scene)
         return scene
 
     def _cycles_per_mm(self, probe: Probe) -> float:
         return probe.cycles_per_mm * NOMINAL_SPEED_M_S / self.settings.reference_speed_m_s
 
-    def _axial_sigma_mm(self, probe: Probe) -> float:
+    def axial_sigma_mm(self, probe: Probe) -> float:
+        """Standard deviation of the pulse in depth as the scanner reckons it, millimetres."""
         return probe.axial_sigma_mm * self.settings.reference_speed_m_s / NOMINAL_SPEED_M_S
 
     def _sample_mm(self, probe: Probe) -> float:

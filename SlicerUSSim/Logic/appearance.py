@@ -1,0 +1,309 @@
+"""AppearanceModel: images of fixed poses as a function of the parameters that an optimiser varies.
+
+What does not change is not computed again (PHYSICS section 6). The ray tree depends on none of these parameters. The
+echoes of a tissue are linear in mu0 and sigma0, so a few baseband images, its *bases*, hold them for all values:
+
+    iq = [ base + sum over varied tissues (mu0 M + sigma0 S) ] exp(-sum over tissues (alpha - alpha_0) path)
+
+- M and S for another mu1 are sums over bands of T1, by which a tissue's scatterers come to exist one after the other. A
+  band that exists in part is weighted so that the variance p (1 - p) mu0^2 + p sigma0^2, which alone is seen in
+  developed speckle, is kept exactly.
+- Another attenuation changes the amplitude by what the direct path to each sample loses, an approximation where the
+  beam straddles the edge of a shadow, and for echoes of reflected rays. At the anchor alpha_0 nothing is approximated,
+  and `anchor` moves it.
+
+So one image costs a weighted sum, compression and scan conversion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from SlicerUSSim.Logic.bmode import Compressor
+from SlicerUSSim.Logic.device import Device, Workspace
+from SlicerUSSim.Logic.errors import SimulationError
+from SlicerUSSim.Logic.layout import CONSTANTS, SCENE
+from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.scan_conversion import ImageGrid, ScanConverter
+from SlicerUSSim.Logic.scattering import EchoLines
+from SlicerUSSim.Logic.settings import DisplaySettings
+from SlicerUSSim.Logic.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.tissues import Tissue, TissueTable
+from SlicerUSSim.Logic.volume import check_rigid
+
+#: Parameters of a tissue that a model can vary.
+VARIABLE = ("attenuation_db_cm_mhz", "mu0", "mu1", "sigma0")
+_BANDS = CONSTANTS["BANDS"]
+#: Attenuation over the whole depth with which path lengths are measured: large against the tracer's tolerance, small
+#: against its threshold.
+_PROBING_DB = 100.0
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A baseband signal on the device, as Compressor takes it."""
+
+    iq: object
+    lines: int
+    samples: int
+
+
+class AppearanceModel:
+    """The images of one patient at some poses, for any display and for any value of the varied tissue parameters.
+
+    Parameters
+    ----------
+    simulator : its labels, tissues and settings; the tissues are the first anchor.
+    probe, poses : the probe and its (4, 4) probe_to_ras, one per image.
+    varied : {tissue name: parameter names among VARIABLE}.
+
+    Raises SimulationError for a tissue the simulator does not have and a pose that is not rigid.
+    """
+
+    def __init__(
+        self,
+        simulator: UltrasoundSimulator,
+        probe: Probe,
+        poses: Iterable[np.ndarray],
+        varied: dict[str, Iterable[str]],
+    ) -> None:
+        self.simulator, self.probe = simulator, probe
+        self.device: Device = simulator.device
+        self.poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
+        self.varied = {name: frozenset(parameters) for name, parameters in varied.items()}
+        for name in self.varied:
+            _tissue(simulator.medium.tissues, name)
+        #: Tissues whose scatterers vary, and whose attenuation does, in the order of the bases and of the paths
+        self.scattering = [n for n, p in self.varied.items() if p & {"mu0", "mu1", "sigma0"}]
+        self.attenuating = [n for n, p in self.varied.items() if "attenuation_db_cm_mhz" in p]
+        device = self.device
+        mixing = device.kernels("appearance.cl", device.lanes)
+        self._mix_parts, self._mix_bases = mixing["mix_parts"], mixing["mix_bases"]
+        self._direct_path = device.kernels("appearance.cl")["direct_path"]
+        self._parts, self._mixed, self._lines = EchoLines(device), EchoLines(device), EchoLines(device)
+        self._compressor, self._converter = Compressor(device), ScanConverter(device)
+        self._workspace = Workspace(device)
+        self._weights = device.empty(4 * max(self._base_count, CONSTANTS["PARTS"]))
+        self._decays = device.empty(4 * max(len(self.attenuating), 1))
+        self.anchor(simulator.medium.tissues)
+
+    def anchor(self, tissues: TissueTable) -> None:
+        """Compute the bases anew for these tissues, for which the model is then exact."""
+        simulator = self.simulator
+        self.tissues = tissues
+        self._scenes = [simulator.scene(self.probe, pose) for pose in self.poses]
+        self._scene_buffers = [self.device.empty(SCENE.itemsize) for _ in self.poses]
+        for scene, buffer in zip(self._scenes, self._scene_buffers, strict=True):
+            self.device.write(buffer, scene)
+        before = simulator.medium.tissues
+        try:
+            for number in range(len(self.poses)):
+                self._measure_paths(number)
+                simulator.set_tissues(tissues)
+                self._compute_bases(number)
+        finally:
+            simulator.set_tissues(before)
+
+    def image(self, number: int, tissues: TissueTable, display: DisplaySettings) -> np.ndarray:
+        """(rows, columns) uint8 image at pose `number`."""
+        self.run(number, tissues, display)
+        return self._converter.download()
+
+    def run(self, number: int, tissues: TissueTable, display: DisplaySettings):
+        """Enqueue the image at pose `number`; returns its device buffer, which the next image overwrites."""
+        scene, scene_buffer = self._scenes[number], self._scene_buffers[number]
+        lines, samples = int(scene["scan_lines"]), int(scene["samples"])
+        self.device.write(self._weights, self._base_weights(tissues))
+        self.device.write(self._decays, self._path_weights(tissues))
+        iq = self._workspace.get("iq", lines * samples * 8)
+        self.device.run(
+            self._mix_bases,
+            (samples // self.device.lanes, lines),
+            self._buffer("bases", number),
+            self._weights,
+            np.int32(self._base_count),
+            self._buffer("paths", number),
+            self._decays,
+            np.int32(len(self.attenuating)),
+            iq,
+            np.int32(samples),
+        )
+        self._compressor.run(scene, display, Signal(iq, lines, samples))
+        grid = ImageGrid.for_probe(self.probe, display.image_size)
+        self._converter.run(scene_buffer, scene, grid, self._compressor)
+        return self._converter.image
+
+    # ---- bases -------------------------------------------------------------------------------------------------
+
+    @property
+    def _base_count(self) -> int:
+        return 1 + sum(self._bases_of(name) for name in self.scattering)
+
+    def _bases_of(self, name: str) -> int:
+        return 2 * _BANDS if "mu1" in self.varied[name] else 2
+
+    def _buffer(self, kind: str, number: int):
+        scene = self._scenes[number]
+        values = int(scene["scan_lines"]) * int(scene["samples"])
+        count = 2 * self._base_count if kind == "bases" else max(len(self.attenuating), 1)
+        return self._workspace.get(f"{kind} {number}", 4 * count * values)
+
+    def _compute_bases(self, number: int) -> None:
+        """Trace, scatter tissue by tissue, and bring what is to be mixed later through beam and pulse."""
+        simulator, device = self.simulator, self.device
+        scene, scene_buffer, medium = self._scenes[number], self._scene_buffers[number], simulator.medium
+        simulator.tracer.run(scene_buffer, scene, medium)
+        lines, samples = 2 * int(scene["traced_lines"]), int(scene["samples"])
+        self._parts.prepare(CONSTANTS["PARTS"] * lines, samples)
+        self._mixed.prepare(lines, samples)
+        done = 0
+        for place in range(max(len(self.scattering), 1)):
+            name = self.scattering[place] if self.scattering else None
+            if simulator.settings.scattering:
+                roles, tops = device.upload(self._roles(place)), device.upload(self._band_tops(name))
+                simulator.scatterers.run(
+                    scene_buffer, scene, medium, simulator.tracer, self._parts, varied=(roles, tops)
+                )
+            else:
+                self._parts.clear()
+            if place == 0:
+                self._keep(number, done, _only(0), with_interfaces=True)
+                done += 1
+            if name is not None:
+                for weights in self._part_weights(name):
+                    self._keep(number, done, weights)
+                    done += 1
+
+    def _keep(self, number: int, base: int, weights: np.ndarray, with_interfaces: bool = False) -> None:
+        """One base from the parts: a weighted sum, the beam, the pulse."""
+        simulator, device = self.simulator, self.device
+        scene, scene_buffer = self._scenes[number], self._scene_buffers[number]
+        values = self._mixed.stride * 2 * int(scene["traced_lines"])
+        device.write(self._weights, weights)
+        for parts, mixed in ((self._parts.re, self._mixed.re), (self._parts.im, self._mixed.im)):
+            device.run(
+                self._mix_parts, (values // device.lanes,), parts, self._weights, np.int32(weights.size),
+                np.int32(values), mixed,
+            )  # fmt: skip
+        if with_interfaces and simulator.settings.interfaces:
+            simulator.interfaces.run(scene_buffer, scene, simulator.tracer, self._mixed)
+        self._lines.prepare(int(scene["scan_lines"]), int(scene["samples"]))
+        simulator.beam.run(scene_buffer, scene, self._mixed, self._lines)
+        simulator.pulse.run(scene, simulator.axial_sigma_mm(self.probe), self._lines)
+        nbytes = int(scene["scan_lines"]) * int(scene["samples"]) * 8
+        device.cl.enqueue_copy(
+            device.queue, self._buffer("bases", number), simulator.pulse.iq, byte_count=nbytes, dst_offset=base * nbytes
+        )
+
+    def _roles(self, place: int) -> np.ndarray:
+        """(MAX_TISSUES,) int32: what scatters in which part while tissue `place` is computed."""
+        # What is fixed is computed once, with the first tissue.
+        fixed = CONSTANTS["ROLE_FIXED" if place == 0 else "ROLE_SILENT"]
+        roles = np.full(CONSTANTS["MAX_TISSUES"], fixed, np.int32)
+        members = dict(self.tissues)
+        if self.tissues.membrane is not None:
+            members[CONSTANTS["MEMBRANE_LABEL"]] = self.tissues.membrane.tissue
+        for label, tissue in members.items():
+            if tissue.name in self.scattering:
+                is_its = tissue.name == self.scattering[place]
+                roles[label] = CONSTANTS["ROLE_VARIED" if is_its else "ROLE_SILENT"]
+        return roles
+
+    def _band_tops(self, name: str | None) -> np.ndarray:
+        """(BANDS,) float32; the share at the anchor is one of them, so that no band exists in part there."""
+        tops = np.ones(_BANDS, np.float32)
+        if name is not None:
+            share = _tissue(self.tissues, name).scatterer_share
+            half = _BANDS // 2
+            tops[:half] = share * np.arange(1, half + 1) / half
+            tops[half:] = share + (1.0 - share) * np.arange(1, _BANDS - half + 1) / (_BANDS - half)
+        return tops
+
+    def _part_weights(self, name: str) -> list[np.ndarray]:
+        """Which sums of parts are the bases of a tissue: all its parts if mu1 varies, else M and S for its mu1."""
+        parts = CONSTANTS["PARTS"]
+        if "mu1" in self.varied[name]:
+            return [_only(part) for part in range(1, parts)]
+        mean, deviation = np.zeros(parts, np.float32), np.zeros(parts, np.float32)
+        mean[1::2], deviation[2::2] = self._band_weights(name, _tissue(self.tissues, name))
+        return [mean, deviation]
+
+    def _band_weights(self, name: str, tissue: Tissue) -> tuple[np.ndarray, np.ndarray]:
+        """((BANDS,), (BANDS,)) weights of the bands' scatterers of amplitude 1 and of amplitude T0."""
+        share = tissue.scatterer_share
+        tops = self._band_tops(name).astype(float)
+        widths = np.diff(tops, prepend=0.0)
+        exists = np.clip((share - (tops - widths)) / np.maximum(widths, 1e-12), 0.0, 1.0)
+        variance = float(widths @ exists**2 - (widths @ exists) ** 2)
+        kept = np.sqrt(share * (1.0 - share) / variance) if variance > 1e-9 else 1.0
+        return kept * (exists - share), np.sqrt(exists)
+
+    def _base_weights(self, tissues: TissueTable) -> np.ndarray:
+        weights = [1.0]
+        for name in self.scattering:
+            tissue = _tissue(tissues, name)
+            if "mu1" in self.varied[name]:
+                mean, deviation = self._band_weights(name, tissue)
+                weights += np.stack([tissue.mu0 * mean, tissue.sigma0 * deviation], axis=1).ravel().tolist()
+            else:
+                weights += [tissue.mu0, tissue.sigma0]
+        return np.array(weights, np.float32)
+
+    # ---- paths -------------------------------------------------------------------------------------------------
+
+    @property
+    def _probing_db_cm_mhz(self) -> float:
+        return _PROBING_DB / (2.0 * self.probe.frequency_mhz * 0.1 * self.probe.depth_mm)
+
+    def _measure_paths(self, number: int) -> None:
+        """Nepers lost in each attenuating tissue on the way to every sample, had it the probing attenuation."""
+        simulator, device = self.simulator, self.device
+        scene, scene_buffer = self._scenes[number], self._scene_buffers[number]
+        paths = self._buffer("paths", number)
+        nbytes = int(scene["scan_lines"]) * int(scene["samples"]) * 4
+        one = self._workspace.get("path", nbytes)
+        for place, name in enumerate(self.attenuating):
+            simulator.set_tissues(_with_attenuation(self.tissues, {name: self._probing_db_cm_mhz}, others=0.0))
+            simulator.tracer.run(scene_buffer, scene, simulator.medium)
+            tracer = simulator.tracer
+            device.run(
+                self._direct_path,
+                (int(scene["scan_lines"]),),
+                scene_buffer,
+                tracer.segments,
+                tracer.segment_counts,
+                one,
+            )
+            device.cl.enqueue_copy(device.queue, paths, one, byte_count=nbytes, dst_offset=place * nbytes)
+
+    def _path_weights(self, tissues: TissueTable) -> np.ndarray:
+        """(attenuating tissues,) exponent of two per neper of the paths."""
+        change = [
+            _tissue(tissues, name).attenuation_db_cm_mhz - _tissue(self.tissues, name).attenuation_db_cm_mhz
+            for name in self.attenuating
+        ]
+        return -np.array(change or [0.0], np.float32) / np.float32(self._probing_db_cm_mhz * np.log(2.0))
+
+
+def _only(part: int) -> np.ndarray:
+    weights = np.zeros(CONSTANTS["PARTS"], np.float32)
+    weights[part] = 1.0
+    return weights
+
+
+def _tissue(tissues: TissueTable, name: str) -> Tissue:
+    for tissue in tissues.all_tissues():
+        if tissue.name == name:
+            return tissue
+    names = dict.fromkeys(tissue.name for tissue in tissues.all_tissues())
+    raise SimulationError(f"no tissue named {name!r}, expected one of: {', '.join(names)}")
+
+
+def _with_attenuation(tissues: TissueTable, attenuations: dict[str, float], others: float) -> TissueTable:
+    for tissue in tissues.all_tissues():
+        value = attenuations.get(tissue.name, others)
+        tissues = tissues.replace(tissue.name, attenuation_db_cm_mhz=value)
+    return tissues
