@@ -18,7 +18,7 @@ So one image costs a weighted sum, compression and scan conversion.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -305,5 +305,5 @@ def _tissue(tissues: TissueTable, name: str) -> Tissue:
 def _with_attenuation(tissues: TissueTable, attenuations: dict[str, float], others: float) -> TissueTable:
     for tissue in tissues.all_tissues():
         value = attenuations.get(tissue.name, others)
-        tissues = tissues.replace(tissue.name, attenuation_db_cm_mhz=value)
+        tissues = tissues.with_tissue(replace(tissue, attenuation_db_cm_mhz=value))
     return tissues
