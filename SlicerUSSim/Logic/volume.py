@@ -74,7 +74,7 @@ class Volume:
 
     @classmethod
     def read(cls, path: str | os.PathLike) -> Volume:
-        """Read NIfTI, NRRD, MetaImage, MINC 2, VTI, or a folder with one DICOM series.
+        """Read NIfTI, NRRD, MetaImage, MINC 1 and 2, VTI, or a folder with one DICOM series.
 
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
@@ -82,8 +82,13 @@ class Volume:
         require(path.exists(), f"{path}: no such file or folder")
         if path.suffix.lower() == ".vti":
             return cls._read_vti(path)
-        image = _read_dicom_series(path) if path.is_dir() else _read_image(path)
-        return cls.from_sitk(image, name=str(path))
+        if path.is_dir():
+            return cls.from_sitk(_read_dicom_series(path), name=str(path))
+        if not is_minc1(path):
+            return cls.from_sitk(read_itk_image(path), name=str(path))
+        array, ijk_to_ras = _read_minc1(path)
+        _require_volume(array.shape[::-1], str(path))
+        return cls(array, ijk_to_ras)
 
     @classmethod
     def from_sitk(cls, image, name: str = "image") -> Volume:
@@ -92,17 +97,10 @@ class Volume:
 
         if image.GetDimension() == 4 and image.GetSize()[3] == 1:
             image = image[..., 0]  # NIfTI files often carry a time axis of length one
-        size = image.GetSize()
-        require(
-            image.GetDimension() == 3 and min(size) > 1,
-            f"{name}: is a {'x'.join(map(str, size))} image, expected three dimensions with two or more samples each",
-        )
+        _require_volume(image.GetSize(), name)
         channels = image.GetNumberOfComponentsPerPixel()
         require(channels == 1, f"{name}: has {channels} components per voxel, expected 1")
-        index_to_lps = np.eye(4)
-        index_to_lps[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * np.array(image.GetSpacing())
-        index_to_lps[:3, 3] = image.GetOrigin()
-        return cls(sitk.GetArrayFromImage(image), LPS_TO_RAS @ index_to_lps)
+        return cls(sitk.GetArrayFromImage(image), _itk_ijk_to_ras(image))
 
     def to_sitk(self):
         """A SimpleITK image (LPS). Raises SimulationError if the axes are not perpendicular (ITK cannot store that)."""
@@ -264,7 +262,24 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
         os.rmdir(folder)
 
 
-def _read_image(path: Path):
+def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """((k, j, i) voxels, (4, 4) ijk_to_ras) of an image file that may hold one slice only.
+
+    Raises SimulationError for a missing or unreadable file and for one that has not three dimensions.
+    """
+    path = Path(path)
+    require(path.is_file(), f"{path}: no such file")
+    if is_minc1(path):
+        return _read_minc1(path)
+    import SimpleITK as sitk
+
+    image = read_itk_image(path)
+    require(image.GetDimension() == 3, f"{path}: has {image.GetDimension()} dimensions, expected 3")
+    return sitk.GetArrayFromImage(image), _itk_ijk_to_ras(image)
+
+
+def read_itk_image(path: Path):
+    """A SimpleITK image of whatever ITK reads. Raises SimulationError, naming the file, for what it does not."""
     import SimpleITK as sitk
 
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
@@ -273,6 +288,44 @@ def _read_image(path: Path):
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1]
         raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
+
+
+def _require_volume(size, name: str) -> None:
+    require(
+        len(size) == 3 and min(size) > 1,
+        f"{name}: is a {'x'.join(map(str, size))} image, expected three dimensions with two or more samples each",
+    )
+
+
+def _itk_ijk_to_ras(image) -> np.ndarray:
+    index_to_lps = np.eye(4)
+    index_to_lps[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * np.array(image.GetSpacing())
+    index_to_lps[:3, 3] = image.GetOrigin()
+    return LPS_TO_RAS @ index_to_lps
+
+
+def is_minc1(path: Path) -> bool:
+    """Whether a file is MINC 1, which is NetCDF (MINC 2 is HDF5, which ITK reads)."""
+    with open(path, "rb") as file:
+        return path.suffix.lower() == ".mnc" and file.read(3) == b"CDF"
+
+
+def _read_minc1(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    import nibabel
+
+    try:
+        image = nibabel.Minc1Image.from_filename(path)
+        values = np.asarray(image.dataobj)
+    except Exception as error:  # scipy's NetCDF reader and nibabel raise whatever comes up in a damaged file
+        raise SimulationError(
+            f"{path}: cannot be read as MINC 1 ({str(error).strip() or type(error).__name__})"
+        ) from None
+    require(values.ndim == 3, f"{path}: has {values.ndim} dimensions, expected 3")
+    whole = values.round()
+    if np.issubdtype(image.get_data_dtype(), np.integer) and np.abs(values - whole).max() < 1e-3:
+        values = whole.astype(np.int32)  # nibabel scales to floating point whatever the file holds
+    # nibabel counts (z, y, x) as the file does, in millimetres of the MNI's world, which is RAS.
+    return values, np.array(image.affine)[:, [2, 1, 0, 3]]
 
 
 def _read_dicom_series(folder: Path):
