@@ -127,11 +127,11 @@ def segment(mri, out, contrast, classes, mask, radius, bias_correction, thin_sul
     click.echo(f"wrote {out} and {_tissue_file(out)}")
 
 
+_pose_option = click.option(
+    "--pose", required=True, help='File with probe_to_ras (JSON, 16 numbers, or a Slicer transform), or "auto".'
+)
 _SCENE_OPTIONS = (
     click.argument("mri_or_labels", type=click.Path()),
-    click.option(
-        "--pose", required=True, help='File with probe_to_ras (JSON, 16 numbers, or a Slicer transform), or "auto".'
-    ),
     click.option(
         "--labels/--mri", "is_labels", default=None, help="What the input is (default: few whole numbers are labels)."
     ),
@@ -174,11 +174,11 @@ def _scene_options(command):
 
 
 class _Scene:
-    """A simulator for one patient, a probe, where it is, and how its images are shown."""
+    """A simulator for one patient, a probe, where it is (unless a sequence says it), and how its images are shown."""
 
     def __init__(
-        self, mri_or_labels, pose, is_labels, preset_file, probe_file, tissue_file, contrast, mask, thin_sulci,
-        partial_volume, mri_modulation, gain, dynamic_range, tgc, seed, device,
+        self, mri_or_labels, is_labels, preset_file, probe_file, tissue_file, contrast, mask, thin_sulci,
+        partial_volume, mri_modulation, gain, dynamic_range, tgc, seed, device, pose=None,
     ) -> None:  # fmt: skip
         from SlicerUSSim.Logic.placement import craniotomy_pose
         from SlicerUSSim.Logic.pose import read_pose
@@ -189,6 +189,7 @@ class _Scene:
         from SlicerUSSim.Logic.tissues import TissueTable, read_json
         from SlicerUSSim.Logic.volume import Volume
 
+        self.source = os.path.abspath(mri_or_labels)
         # What is cheap to check comes before what takes time.
         preset = Preset.read(preset_file) if preset_file else Preset()
         preset = preset.changed("display", **_given(gain_db=gain, dynamic_range_db=dynamic_range, tgc_db_cm_mhz=tgc))
@@ -197,7 +198,8 @@ class _Scene:
         )
         self.display, settings = preset.display, preset.settings
         self.probe = probe_from_dict(read_json(probe_file), str(probe_file)) if probe_file else preset.probe
-        matrix = None if pose == "auto" else read_pose(pose)
+        self.probe_is_given = bool(probe_file or preset_file)
+        self.pose = None if pose in (None, "auto") else read_pose(pose)
         volume = Volume.read(mri_or_labels)
         self.is_labels = _looks_like_labels(volume) if is_labels is None else is_labels
         texture = None
@@ -220,11 +222,13 @@ class _Scene:
         if tissue_file:
             tissues = TissueTable.read(tissue_file)
         self.simulator = UltrasoundSimulator(labels, tissues, settings, device, texture)
-        self.pose = craniotomy_pose(labels, self.probe) if matrix is None else matrix
+        if pose == "auto":
+            self.pose = craniotomy_pose(labels, self.probe)
 
 
 @main.command()
 @_scene_options
+@_pose_option
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), required=True, help="Image: .png .mha .nrrd .nii.gz or .vti"
 )
@@ -245,6 +249,7 @@ def simulate(out: Path, **scene_options) -> None:
 
 @main.command()
 @_scene_options
+@_pose_option
 @click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Volume: .nrrd .nii.gz .mha or .vti")
 @click.option("--tilt", type=float, help="Tilt the image plane about the probe's face by this many degrees in all.")
 @click.option("--slide", type=float, help="Slide the probe across its image plane by this many millimetres in all.")
@@ -271,6 +276,205 @@ def volume(
         )  # fmt: skip
     result.write(out)
     click.echo(f"wrote {out} ({'x'.join(map(str, result.array.shape[::-1]))} voxels from {frames} images)")
+
+
+_SEQUENCE_OPTIONS = (
+    click.option(
+        "--sequence", "sequence_file", type=click.Path(), required=True,
+        help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer), or a folder of MINC slices.",
+    ),
+    click.option("--frames", help="Which images: 0,5,10 or 0:20:5 (default: all that were tracked)."),
+    click.option(
+        "--transform", "path", default="ImageToReference", show_default=True,
+        help="From pixels to where the patient lies; composed of what the sequence has.",
+    ),
+    click.option(
+        "--calibration", type=click.Path(),
+        help="What the sequence lacks: a Plus configuration (XML), or a file with the 4x4 ImageToProbe.",
+    ),
+    click.option(
+        "--to-mri", type=click.Path(),
+        help="From there to the MRI: a pose file, .xfm, or .tag with landmarks in MRI and ultrasound.",
+    ),
+)  # fmt: skip
+
+
+def _sequence_options(command):
+    """What every command takes that reads tracked images; _tracked makes TrackedImages of it."""
+    for option in reversed(_SEQUENCE_OPTIONS):
+        command = option(command)
+    return command
+
+
+def _read_sequence(sequence_file, calibration):
+    from SlicerUSSim.Logic.pose import read_matrix
+    from SlicerUSSim.Logic.sequence import TrackedSequence, read_coordinate_definitions
+
+    source = Path(sequence_file)
+    if source.is_dir():
+        sequence = TrackedSequence.from_slices(sorted(source.glob("*.mnc")))
+    else:
+        sequence = TrackedSequence.read(source)
+    if calibration:
+        is_xml = Path(calibration).suffix.lower() == ".xml"
+        constant = read_coordinate_definitions(calibration) if is_xml else {"ImageToProbe": read_matrix(calibration)}
+        sequence = sequence.with_transforms(constant)
+    return sequence
+
+
+def _tracked(sequence, frames, path, to_mri, probe):
+    from SlicerUSSim.Logic.pose import read_tags, read_transform, rigid_between
+    from SlicerUSSim.Logic.tracked import TrackedImages
+
+    to_ras = None
+    if to_mri and Path(to_mri).suffix.lower() == ".tag":
+        in_mri, in_ultrasound = read_tags(to_mri)
+        if in_ultrasound is None:
+            raise SimulationError(f"{to_mri}: has points of one volume, expected pairs in MRI and ultrasound")
+        to_ras, left = rigid_between(in_ultrasound, in_mri)
+        click.echo(f"{len(in_mri)} landmarks agree to {left:.2f} mm (root mean square)")
+    elif to_mri:
+        to_ras = read_transform(to_mri)
+    numbers = None if frames is None else _frame_numbers(frames, len(sequence))
+    return TrackedImages.of(sequence, numbers, path=path, reference_to_ras=to_ras, probe=probe)
+
+
+def _frame_numbers(text: str, count: int) -> list[int]:
+    """0,5,10 or from:to:step as in Python, or both."""
+    numbers: list[int] = []
+    for part in text.split(","):
+        try:
+            ends = [int(end) if end.strip() else None for end in part.split(":")]
+            if not 1 <= len(ends) <= 3 or (len(ends) == 1 and ends[0] is None) or (len(ends) == 3 and ends[2] == 0):
+                raise ValueError
+        except ValueError:
+            raise SimulationError(f"--frames is {text!r}, expected such as 0,5,10 or 0:20:5") from None
+        numbers += [ends[0]] if len(ends) == 1 else list(range(count))[slice(*ends)]
+    if not numbers:
+        raise SimulationError(f"--frames {text} chooses none of the {count} images, expected at least one")
+    return numbers
+
+
+@main.command()
+@_scene_options
+@_sequence_options
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path), required=True, help="Sequence: .igs.mha .seq.mha .mhd or .nrrd"
+)
+def sweep(out: Path, sequence_file, frames, path, calibration, to_mri, **scene_options) -> None:
+    """Simulate the images of a tracked sequence: what its probe saw, on the same pixels."""
+    import numpy as np
+
+    from SlicerUSSim.Logic.sequence import require_sequence_name
+    from SlicerUSSim.Logic.volume import require_place
+
+    require_sequence_name(out)
+    require_place(out)
+    sequence = _read_sequence(sequence_file, calibration)
+    scene = _Scene(**scene_options)
+    tracked = _tracked(sequence, frames, path, to_mri, scene.probe if scene.probe_is_given else None)
+    images = np.zeros((len(tracked.poses), *tracked.fan.mask.shape), np.uint8)
+    rows, columns = (np.flatnonzero(tracked.fan.mask.any(axis=axis)) for axis in (1, 0))
+    with _share("sweep") as progress:
+        for number, pose in enumerate(tracked.poses):
+            frame = scene.simulator.simulate(tracked.probe, pose, scene.display, tracked.grid)
+            images[number, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = frame.image
+            progress((number + 1) / len(tracked.poses))
+    sequence.with_images(tracked.numbers, images).write(out)
+    click.echo(f"wrote {out} ({len(images)} images of {images.shape[2]}x{images.shape[1]})")
+
+
+@main.command()
+@_scene_options
+@_sequence_options
+@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Result: .json")
+@click.option(
+    "--free",
+    multiple=True,
+    metavar="NAME[=LOW:HIGH]",
+    help='Free parameters: "display", a tissue, one of either ("gain_db", "white matter.mu0"), with bounds if wanted; '
+    'may be repeated (default: display and "white matter").',
+)
+@click.option("--evaluations", type=click.IntRange(1), default=500, show_default=True, help="Of the cost, at most.")
+@click.option("--restarts", type=click.IntRange(0), default=2, show_default=True, help="For what fits equally well.")
+@click.option("--report", type=click.Path(path_type=Path), help="Self-contained report: .html")
+@click.option("--save-preset", type=click.Path(path_type=Path), help="Preset with what was found: .json")
+@click.option(
+    "--state",
+    type=click.Path(path_type=Path),
+    help="Keep what was evaluated here, and go on from there when run again: .json",
+)
+@click.option("--register", is_flag=True, help="Also refine where the ultrasound lies in the MRI (rigid).")
+@click.option("--save-transform", type=click.Path(path_type=Path), help="With --register: ultrasound to MRI, .json")
+def optimize(
+    out: Path, sequence_file, frames, path, calibration, to_mri, free, evaluations, restarts, report, save_preset,
+    state, register, save_transform, **scene_options,
+) -> None:  # fmt: skip
+    """Fit display and tissue parameters until simulated and tracked real ultrasound agree."""
+    from SlicerUSSim.Logic.figures import require_matplotlib
+    from SlicerUSSim.Logic.fitting import fit
+    from SlicerUSSim.Logic.pose import write_pose
+    from SlicerUSSim.Logic.preset import Preset
+    from SlicerUSSim.Logic.report import write_report
+    from SlicerUSSim.Logic.tissues import read_json, write_json
+    from SlicerUSSim.Logic.volume import require_place
+
+    for place in filter(None, (out, report, save_preset, state, save_transform)):
+        require_place(place)
+    if report:
+        require_matplotlib()
+    if save_transform and not register:
+        raise SimulationError("--save-transform needs --register")
+    names = dict(_free_parameter(text) for text in free) or dict.fromkeys(("display", "white matter"))
+    sequence = _read_sequence(sequence_file, calibration)
+    scene = _Scene(**scene_options)
+    tracked = _tracked(sequence, frames, path, to_mri, scene.probe if scene.probe_is_given else None)
+    earlier = read_json(state) if state and state.exists() else None
+    simulator = scene.simulator
+    with _Curve("optimize") as curve:
+        found = fit(
+            simulator, tracked, free=names, display=scene.display, register=register, max_evaluations=evaluations,
+            restarts=restarts, progress=curve, resume=earlier,
+            checkpoint=(lambda reached: write_json(state, reached)) if state else None,
+        )  # fmt: skip
+    result = found.appearance
+    write_json(out, found.to_dict())
+    if save_preset:
+        Preset(tracked.probe, result.display, simulator.settings, result.tissues).write(save_preset)
+    if save_transform:
+        write_pose(save_transform, found.registration.correction)
+    if report:
+        provenance = (
+            f"SlicerUSSim {__version__}, {simulator.device.info}. MRI or labels: {scene.source}. Sequence: "
+            f"{sequence_file}, images {', '.join(map(str, tracked.numbers))}. Probe: {tracked.probe}. Settings: "
+            f"{simulator.settings}."
+        )
+        write_report(
+            report, result, found.tracked, found.before, found.after, simulator,
+            subtitle=f"{Path(sequence_file).name} on {Path(scene.source).name}", provenance=provenance,
+        )  # fmt: skip
+    if found.registration:
+        moved = found.registration
+        click.echo(f"moved by {moved.shift_mm:.2f} mm and {moved.turn_deg:.2f} degrees")
+    click.echo(f"cost {result.cost_before:.4f} -> {result.cost_after:.4f} ({result.evaluations} evaluations)")
+    for parameter in result.parameters:
+        spread = result.identifiability[parameter.name]
+        note = "" if spread.is_determined else f"  not determined: {spread.low:.3g} to {spread.high:.3g} fit as well"
+        before, after = result.before[parameter.name], result.after[parameter.name]
+        click.echo(f"{parameter.name:42s} {before:8.3f} -> {after:8.3f}{note}")
+    click.echo("wrote " + ", ".join(map(str, filter(None, (out, report, save_preset, save_transform, state)))))
+
+
+def _free_parameter(text: str) -> tuple[str, tuple[float, float] | None]:
+    """A name, or name=low:high."""
+    name, equals, bounds = text.partition("=")
+    if not equals:
+        return name.strip(), None
+    try:
+        low, high = (float(end) for end in bounds.split(":"))
+    except ValueError:
+        raise SimulationError(f"--free is {text!r}, expected such as white matter.mu0=0.1:0.8") from None
+    return name.strip(), (low, high)
 
 
 @main.command()
@@ -370,6 +574,18 @@ class _steps:  # noqa: N801
 
     def __exit__(self, *_) -> None:
         self.bar.close()
+
+
+class _Curve(_steps):
+    """The same for an optimisation: its stage and the best cost so far."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(100)
+        self.bar.set_description_str(name)
+
+    def __call__(self, progress) -> None:
+        self.bar.set_description_str(f"{progress.stage}: cost {progress.best_cost:.4f}", refresh=False)
+        self.bar.update(int(100 * progress.share) - self.bar.n)
 
 
 class _share(_steps):  # noqa: N801

@@ -59,6 +59,7 @@ class AppearanceModel:
     simulator : its labels, tissues and settings; the tissues are the first anchor.
     probe, poses : the probe and its (4, 4) probe_to_ras, one per image.
     varied : {tissue name: parameter names among VARIABLE}.
+    grid : the pixels of the images (default: what just holds the imaged field, as many as display.image_size says).
 
     Raises SimulationError for a tissue the simulator does not have and a pose that is not rigid.
     """
@@ -69,8 +70,9 @@ class AppearanceModel:
         probe: Probe,
         poses: Iterable[np.ndarray],
         varied: dict[str, Iterable[str]],
+        grid: ImageGrid | None = None,
     ) -> None:
-        self.simulator, self.probe = simulator, probe
+        self.simulator, self.probe, self._grid = simulator, probe, grid
         self.device: Device = simulator.device
         self.poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
         self.varied = {name: frozenset(parameters) for name, parameters in varied.items()}
@@ -98,19 +100,19 @@ class AppearanceModel:
         self._scene_buffers = [self.device.empty(SCENE.itemsize) for _ in self.poses]
         for scene, buffer in zip(self._scenes, self._scene_buffers, strict=True):
             self.device.write(buffer, scene)
-        before = simulator.medium.tissues
-        try:
+        with simulator.with_tissues(tissues):
             for number in range(len(self.poses)):
                 self._measure_paths(number)
-                simulator.set_tissues(tissues)
                 self._compute_bases(number)
-        finally:
-            simulator.set_tissues(before)
 
     def image(self, number: int, tissues: TissueTable, display: DisplaySettings) -> np.ndarray:
         """(rows, columns) uint8 image at pose `number`."""
         self.run(number, tissues, display)
         return self._converter.download()
+
+    def grid(self, display: DisplaySettings) -> ImageGrid:
+        """The pixels of the images."""
+        return self._grid or ImageGrid.for_probe(self.probe, display.image_size)
 
     def run(self, number: int, tissues: TissueTable, display: DisplaySettings):
         """Enqueue the image at pose `number`; returns its device buffer, which the next image overwrites."""
@@ -132,8 +134,7 @@ class AppearanceModel:
             np.int32(samples),
         )
         self._compressor.run(scene, display, Signal(iq, lines, samples))
-        grid = ImageGrid.for_probe(self.probe, display.image_size)
-        self._converter.run(scene_buffer, scene, grid, self._compressor)
+        self._converter.run(scene_buffer, scene, self.grid(display), self._compressor)
         return self._converter.image
 
     # ---- bases -------------------------------------------------------------------------------------------------
@@ -266,9 +267,9 @@ class AppearanceModel:
         nbytes = int(scene["scan_lines"]) * int(scene["samples"]) * 4
         one = self._workspace.get("path", nbytes)
         for place, name in enumerate(self.attenuating):
-            simulator.set_tissues(_with_attenuation(self.tissues, {name: self._probing_db_cm_mhz}, others=0.0))
-            simulator.tracer.run(scene_buffer, scene, simulator.medium)
             tracer = simulator.tracer
+            with simulator.with_tissues(_only_attenuating(self.tissues, name, self._probing_db_cm_mhz)):
+                tracer.run(scene_buffer, scene, simulator.medium)
             device.run(
                 self._direct_path,
                 (int(scene["scan_lines"]),),
@@ -302,8 +303,9 @@ def _tissue(tissues: TissueTable, name: str) -> Tissue:
     raise SimulationError(f"no tissue named {name!r}, expected one of: {', '.join(names)}")
 
 
-def _with_attenuation(tissues: TissueTable, attenuations: dict[str, float], others: float) -> TissueTable:
+def _only_attenuating(tissues: TissueTable, name: str, attenuation_db_cm_mhz: float) -> TissueTable:
+    """The same tissues, of which only one attenuates."""
     for tissue in tissues.all_tissues():
-        value = attenuations.get(tissue.name, others)
+        value = attenuation_db_cm_mhz if tissue.name == name else 0.0
         tissues = tissues.with_tissue(replace(tissue, attenuation_db_cm_mhz=value))
     return tissues

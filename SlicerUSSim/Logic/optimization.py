@@ -16,53 +16,23 @@ from time import perf_counter
 import numpy as np
 
 from SlicerUSSim.Logic.appearance import AppearanceModel
-from SlicerUSSim.Logic.errors import SimulationError, require, require_between
+from SlicerUSSim.Logic.errors import require, require_between
 from SlicerUSSim.Logic.identifiability import Identifiability, quantities_of
 from SlicerUSSim.Logic.parameters import Bounds, FreeParameters
 from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
+from SlicerUSSim.Logic.search import GLOBAL_ALGORITHM, LOCAL_ALGORITHM, Evaluation, Progress, Search, history_from
 from SlicerUSSim.Logic.settings import DisplaySettings
 from SlicerUSSim.Logic.similarity import PatchComparison, Similarity, SimilaritySettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import TissueTable
 
-#: nlopt's names. The choice is justified in docs/optimization.md by benchmarks/optimization.py.
-GLOBAL_ALGORITHM, LOCAL_ALGORITHM = "GN_CRS2_LM", "LN_SBPLX"
-#: Shares of the evaluations: global search, local search; the rest is for the search after the anchor has moved.
+#: The search for the best, stage by stage; afterwards come "redraw n" and "restart n".
+STAGES = ("global", "local", "polish")
+#: Shares of the evaluations of the first two; the rest is for the search after the anchor has moved.
 _SHARES = (0.6, 0.25)
-#: Between 0 and 1 across the bounds: how exactly the best is wanted, and the first step of local searches.
-_UNIT_TOLERANCE, _FIRST_STEP = 1e-3, 0.1
-#: Standard deviation of the starts of restarts around the best, likewise.
+#: Standard deviation of the starts of restarts around the best, between 0 and 1 across the bounds.
 _RESTART_SPREAD = 0.15
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """One evaluation of the cost."""
-
-    stage: str
-    #: (parameters,) between 0 and 1 within the bounds
-    units: tuple[float, ...]
-    cost: float
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a progress function is told after every evaluation."""
-
-    stage: str
-    evaluations: int
-    #: How many there will be at most
-    limit: int
-    cost: float
-    best_cost: float
-    #: {parameter name: value} of the best so far
-    best: dict[str, float]
-
-    @property
-    def share(self) -> float:
-        """Share done, 0 to 1."""
-        return min(self.evaluations / self.limit, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +87,7 @@ class AppearanceCost:
     Parameters
     ----------
     model : AppearanceModel with one pose per reference.
-    references : (rows, columns) uint8 each, on the grid of the probe's image.
+    references : (rows, columns) uint8 each, on the model's grid.
     masks : (rows, columns) bool each, where the reference shows its field; None is everywhere.
 
     Raises SimulationError where shapes or counts differ, fields do not overlap, or a reference is black.
@@ -134,7 +104,7 @@ class AppearanceCost:
         settings: SimilaritySettings,
     ) -> None:
         self.model, self.parameters, self.tissues, self.display = model, parameters, tissues, display
-        grid = ImageGrid.for_probe(model.probe, display.image_size)
+        grid = model.grid(display)
         seen = grid.field(model.probe)
         require(len(references) > 0, "no reference image, expected at least one")
         require(
@@ -150,7 +120,7 @@ class AppearanceCost:
             reference = np.asarray(reference)
             require(
                 reference.shape == (grid.rows, grid.columns),
-                f"reference image {number} has shape {reference.shape}, expected that of the probe's image, "
+                f"reference image {number} has shape {reference.shape}, expected that of the simulated ones, "
                 f"{(grid.rows, grid.columns)}",
             )
             inside = seen if masks is None else seen & np.asarray(masks[number], bool)
@@ -181,6 +151,7 @@ def optimize_appearance(
     *,
     free: Iterable[str] | Mapping[str, Bounds | None],
     display: DisplaySettings | None = None,
+    grid: ImageGrid | None = None,
     masks: Sequence[np.ndarray] | None = None,
     max_evaluations: int = 600,
     restarts: int = 2,
@@ -189,6 +160,7 @@ def optimize_appearance(
     algorithms: tuple[str | None, str] = (GLOBAL_ALGORITHM, LOCAL_ALGORITHM),
     progress: Callable[[Progress], None] | None = None,
     resume: dict | None = None,
+    checkpoint: Callable[[dict], None] | None = None,
 ) -> AppearanceResult:
     """Fit display and tissue parameters to real images.
 
@@ -196,9 +168,10 @@ def optimize_appearance(
     ----------
     simulator : of the patient; its tissues and settings are where the search starts, and it is left as it is.
     probe, poses : what saw the references, and its (4, 4) probe_to_ras for each.
-    references : (rows, columns) uint8 images on the grid of the probe's image (ImageGrid.for_probe).
+    references : (rows, columns) uint8 images.
     free : names of free parameters, or names with (low, high); see parameters.py.
     display : where the search starts.
+    grid : the pixels of the references in the probe frame (default: those of simulated images).
     masks : (rows, columns) bool each, the field that a reference shows; only pixels inside both fields count.
     max_evaluations : of the cost of all images, in the search for the best.
     restarts : searches from other starts with other scatterers, for the spread of what fits equally well.
@@ -206,6 +179,7 @@ def optimize_appearance(
     algorithms : nlopt's names of the global algorithm (None for none) and the local one.
     progress : told after every evaluation; may raise errors.Cancelled.
     resume : the state of an earlier, shorter run on the same problem.
+    checkpoint : told the state at the end, and when something ends the run before (Cancelled, an interrupt).
 
     Raises SimulationError for what FreeParameters, AppearanceModel and AppearanceCost refuse, and for the state of
     another problem.
@@ -218,33 +192,38 @@ def optimize_appearance(
     parameters = FreeParameters.of(free, tissues, display)
     settings = settings or SimilaritySettings()
     poses, references = list(poses), [np.asarray(reference) for reference in references]
-    model = AppearanceModel(simulator, probe, poses, parameters.varied())
+    model = AppearanceModel(simulator, probe, poses, parameters.varied(), grid)
     cost = AppearanceCost(model, parameters, references, masks, tissues, display, settings)
-    problem = _fingerprint(parameters, probe, poses, references, masks, tissues, display, settings, simulator, seed)
+    problem = _fingerprint(
+        parameters, probe, poses, references, masks, grid, tissues, display, settings, simulator, seed
+    )
     limit = max_evaluations + restarts * int(_SHARES[1] * max_evaluations)
-    search = _Search(cost, limit, seed, progress, _replayed(resume, problem))
+
+    def describe(units: np.ndarray) -> dict[str, float]:
+        return dict(zip(parameters.names, parameters.values(units).tolist(), strict=True))
+
+    search = Search(cost, describe, limit, seed, progress, history_from(resume, problem))
 
     start = parameters.units(tissues, display)
     before = cost.of_each(tissues, display)
-    global_name, local_name = algorithms
-    best = start
-    if global_name is not None:
-        best = search.minimise(global_name, "global", best, int(_SHARES[0] * max_evaluations))
-    best = search.minimise(local_name, "local", best, int(_SHARES[1] * max_evaluations))
-    # What the model approximates away from its anchor is exact again once the anchor is here.
-    model.anchor(parameters.apply(best, tissues, display)[0])
-    best = search.minimise(local_name, "polish", best, max_evaluations - len(search.history))
-
-    fitted_tissues, fitted_display = parameters.apply(best, tissues, display)
-    model.anchor(fitted_tissues)
-    after = cost.of_each(fitted_tissues, fitted_display)
-    identifiability = _identifiability(search, simulator, best, restarts, int(_SHARES[1] * max_evaluations))
+    try:
+        best = _searched(search, cost, start, algorithms, max_evaluations)
+        fitted_tissues, fitted_display = parameters.apply(best, tissues, display)
+        model.anchor(fitted_tissues)
+        after = cost.of_each(fitted_tissues, fitted_display)
+        identifiability = _identifiability(
+            cost, search, simulator, best, restarts, int(_SHARES[1] * max_evaluations), algorithms[1]
+        )
+    finally:
+        state = {"problem": problem, "history": search.state()}
+        if checkpoint is not None:
+            checkpoint(state)
     return AppearanceResult(
         tissues=_with_source(fitted_tissues, parameters),
         display=fitted_display,
         parameters=parameters,
         before=dict(zip(parameters.names, parameters.current(tissues, display).tolist(), strict=True)),
-        after=dict(zip(parameters.names, parameters.values(best).tolist(), strict=True)),
+        after=describe(best),
         cost_before=float(np.mean([one.total for one in before])),
         cost_after=float(np.mean([one.total for one in after])),
         similarity_before=before,
@@ -253,95 +232,38 @@ def optimize_appearance(
         evaluations=search.computed,
         seconds=perf_counter() - started,
         identifiability=identifiability,
-        state={"problem": problem, "history": [[e.stage, list(e.units), e.cost] for e in search.history]},
+        state=state,
     )
 
 
-class _Search:
-    """Runs nlopt on the cost, stage by stage, and keeps what it evaluated."""
-
-    def __init__(
-        self,
-        cost: AppearanceCost,
-        limit: int,
-        seed: int,
-        progress: Callable[[Progress], None] | None,
-        replayed: list[Evaluation],
-    ) -> None:
-        self.cost, self.limit, self.seed, self.progress, self.replayed = cost, limit, seed, progress, replayed
-        self.history: list[Evaluation] = []
-        self.computed = 0
-
-    def minimise(self, algorithm: str, stage: str, start: np.ndarray, budget: int) -> np.ndarray:
-        """The best of at most `budget` evaluations from `start` on, (parameters,) between 0 and 1."""
-        import nlopt
-
-        first = len(self.history)
-        failure: list[BaseException] = []
-
-        def evaluate(units: np.ndarray, _gradient) -> float:
-            try:
-                return self._evaluate(stage, units)
-            except BaseException as error:  # through nlopt's C++, which would lose what kind it was
-                failure.append(error)
-                search.force_stop()
-                return float("inf")
-
-        try:
-            search = nlopt.opt(getattr(nlopt, algorithm), len(start))
-        except (AttributeError, TypeError):
-            raise SimulationError(f"nlopt has no algorithm {algorithm!r}, expected such as {LOCAL_ALGORITHM}") from None
-        self._evaluate(stage, start)
-        if budget > 1:
-            nlopt.srand(self.seed + 1)
-            search.set_min_objective(evaluate)
-            search.set_lower_bounds(np.zeros(len(start)))
-            search.set_upper_bounds(np.ones(len(start)))
-            search.set_maxeval(budget - 1)
-            search.set_xtol_abs(_UNIT_TOLERANCE)
-            search.set_initial_step(_FIRST_STEP)
-            if algorithm.startswith(("G_MLSL", "GN_MLSL", "AUGLAG")):
-                local = nlopt.opt(getattr(nlopt, LOCAL_ALGORITHM), len(start))
-                local.set_xtol_abs(10 * _UNIT_TOLERANCE)
-                local.set_initial_step(_FIRST_STEP)
-                search.set_local_optimizer(local)
-            try:
-                search.optimize(start)
-            except (nlopt.ForcedStop, nlopt.RoundoffLimited):
-                pass
-            except (RuntimeError, ValueError) as error:
-                if not failure:
-                    raise SimulationError(f"nlopt's {algorithm} cannot be used here ({error})") from None
-            if failure:
-                raise failure[0]
-        return np.array(min(self.history[first:], key=lambda entry: entry.cost).units)
-
-    def _evaluate(self, stage: str, units: np.ndarray) -> float:
-        place = len(self.history)
-        key = tuple(np.clip(units, 0.0, 1.0).tolist())
-        known = self.replayed[place] if place < len(self.replayed) else None
-        if known is not None and known.stage == stage and known.units == key:
-            cost = known.cost
-        else:
-            cost = self.cost(np.array(key))
-            self.computed += 1
-        self.history.append(Evaluation(stage, key, cost))
-        if self.progress is not None:
-            best = min(self.history, key=lambda entry: entry.cost)
-            parameters = self.cost.parameters
-            values = dict(zip(parameters.names, parameters.values(best.units).tolist(), strict=True))
-            self.progress(Progress(stage, len(self.history), self.limit, cost, best.cost, values))
-        return cost
+def _searched(
+    search: Search, cost: AppearanceCost, start: np.ndarray, algorithms: tuple[str | None, str], evaluations: int
+) -> np.ndarray:
+    """The best positions: globally, locally, and locally with the bases computed anew there."""
+    global_name, local_name = algorithms
+    best = start
+    if global_name is not None:
+        best = search.minimise(global_name, STAGES[0], best, int(_SHARES[0] * evaluations))
+    best = search.minimise(local_name, STAGES[1], best, int(_SHARES[1] * evaluations))
+    # What the model approximates away from its anchor is exact again once the anchor is here.
+    cost.model.anchor(cost.parameters.apply(best, cost.tissues, cost.display)[0])
+    return search.minimise(local_name, STAGES[2], best, evaluations - len(search.history))
 
 
 def _identifiability(
-    search: _Search, simulator: UltrasoundSimulator, best: np.ndarray, restarts: int, budget: int
+    cost: AppearanceCost,
+    search: Search,
+    simulator: UltrasoundSimulator,
+    best: np.ndarray,
+    restarts: int,
+    budget: int,
+    algorithm: str,
 ) -> Identifiability:
     """What fits as well: searches with other scatterers from starts around the best, and what was met on the way."""
-    cost, parameters = search.cost, search.cost.parameters
+    parameters = cost.parameters
     random = np.random.default_rng(search.seed)
-    best_cost = min(entry.cost for entry in search.history if entry.stage == "polish")
-    met = [entry for entry in search.history if entry.stage in ("local", "polish")]
+    best_cost = search.best_cost(STAGES[2])
+    met = [entry for entry in search.history if entry.stage in STAGES[1:]]
     settings = simulator.settings
     costs_of_best, found = [best_cost], []
     try:
@@ -350,10 +272,9 @@ def _identifiability(
             cost.model.anchor(parameters.apply(best, cost.tissues, cost.display)[0])
             stage = f"restart {number}"
             start = np.clip(best + random.normal(0.0, _RESTART_SPREAD, len(best)), 0.0, 1.0)
-            costs_of_best.append(search._evaluate(stage, best))
-            units = search.minimise(LOCAL_ALGORITHM, stage, start, budget)
-            reached = min(entry.cost for entry in search.history if entry.stage == stage)
-            found.append((units, reached - costs_of_best[-1]))
+            costs_of_best.append(search.evaluate(f"redraw {number}", best))
+            units = search.minimise(algorithm, stage, start, budget)
+            found.append((units, search.best_cost(stage) - costs_of_best[-1]))
     finally:
         simulator.settings = settings
     # How much the cost changes from one draw of the speckle to the next: less cannot tell two fits apart.
@@ -379,27 +300,10 @@ def _with_source(tissues: TissueTable, parameters: FreeParameters) -> TissueTabl
     return tissues
 
 
-def _replayed(state: dict | None, problem: str) -> list[Evaluation]:
-    """The evaluations of an earlier run. Raises SimulationError if it was on another problem."""
-    if state is None:
-        return []
-    try:
-        known, history = (
-            state["problem"],
-            [Evaluation(str(s), tuple(map(float, u)), float(c)) for s, u, c in state["history"]],
-        )
-    except (KeyError, TypeError, ValueError):
-        raise SimulationError(
-            "the state to resume is not one of an optimisation, expected problem and history"
-        ) from None
-    require(known == problem, "the state to resume is of another problem: other images, poses, parameters or settings")
-    return history
-
-
-def _fingerprint(parameters, probe, poses, references, masks, tissues, display, settings, simulator, seed) -> str:
+def _fingerprint(parameters, probe, poses, references, masks, grid, tissues, display, settings, simulator, seed) -> str:
     """What makes two problems the same one."""
     digest = hashlib.sha256()
-    plain = (list(parameters), probe, tissues.to_dict(), display, settings, simulator.settings, seed)
+    plain = (list(parameters), probe, grid, tissues.to_dict(), display, settings, simulator.settings, seed)
     digest.update(repr(plain).encode())
     for array in (
         *poses,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -31,12 +32,34 @@ def read_pose(path: str | os.PathLike) -> np.ndarray:
         return check_rigid(f"{path}: probe_to_ras", values)
     if path.suffix.lower() in _ITK_SUFFIXES or _starts_like_itk(path):
         return _read_itk(path)
+    return check_rigid(f"{path}: probe_to_ras", _numbers(path))
+
+
+def read_matrix(path: str | os.PathLike) -> np.ndarray:
+    """(4, 4) affine matrix from a text file of sixteen numbers by rows, or JSON rows; it may scale, as calibrations do.
+
+    Raises SimulationError for anything else.
+    """
+    path = Path(path)
+    require(path.is_file(), f"{path}: no such file")
+    try:
+        matrix = np.array(read_json(path), float) if path.suffix.lower() == ".json" else _numbers(path)
+    except (TypeError, ValueError):
+        raise SimulationError(f"{path}: is not a matrix, expected four rows of four numbers") from None
+    require(matrix.shape == (4, 4), f"{path}: has shape {matrix.shape}, expected (4, 4)")
+    require(bool(np.isfinite(matrix).all()), f"{path}: holds a value that is not finite")
+    require(np.allclose(matrix[3], [0, 0, 0, 1]), f"{path}: has last row {matrix[3].tolist()}, expected 0 0 0 1")
+    return matrix
+
+
+def _numbers(path: Path) -> np.ndarray:
+    """(4, 4) of sixteen numbers in a text file."""
     try:
         numbers = np.array(path.read_text().replace(",", " ").split(), float)
     except (ValueError, UnicodeDecodeError):
         raise SimulationError(f"{path}: is not a pose, expected 16 numbers by rows, JSON or an ITK transform") from None
     require(numbers.size == 16, f"{path}: holds {numbers.size} numbers, expected 16 (a 4x4 matrix by rows)")
-    return check_rigid(f"{path}: probe_to_ras", numbers.reshape(4, 4))
+    return numbers.reshape(4, 4)
 
 
 def write_pose(path: str | os.PathLike, probe_to_ras: np.ndarray) -> None:
@@ -69,3 +92,88 @@ def _read_itk(path: Path) -> np.ndarray:
         abs(np.linalg.det(world_to_probe[:3, :3])) > 1e-9, f"{path}: the transform is singular, expected a rigid one"
     )
     return check_rigid(f"{path}: transform", LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS)
+
+
+def read_transform(path: str | os.PathLike) -> np.ndarray:
+    """(4, 4) affine map from a file: whatever read_pose reads, or a linear MNI .xfm, which may scale.
+
+    Raises SimulationError for anything else.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".xfm":
+        return _read_xfm(path)
+    return read_pose(path)
+
+
+def read_tags(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray | None]:
+    """((n, 3), (n, 3) or None) RAS points of an MNI .tag file, as BITE and RESECT mark landmarks in one or two volumes.
+
+    Raises SimulationError for a file that is none.
+    """
+    path = Path(path)
+    text = _mni_text(path, "MNI Tag Point File")
+    volumes = re.search(r"Volumes\s*=\s*(\d+)", text)
+    points = re.search(r"Points\s*=(.*)", text, re.DOTALL)
+    require(
+        volumes is not None and int(volumes.group(1)) in (1, 2) and points is not None,
+        f"{path}: has no points of one or two volumes, expected an MNI tag file",
+    )
+    per_point = 3 * int(volumes.group(1))
+    rows = []
+    for line in points.group(1).split("\n"):
+        numbers = re.findall(r"[-+]?\d*\.?\d+(?:[eE][-+]?\d+)?", line.split('"')[0])
+        if len(numbers) >= per_point:
+            rows.append([float(number) for number in numbers[:per_point]])
+        else:
+            require(not numbers, f"{path}: a point has {len(numbers)} numbers, expected {per_point}")
+    require(bool(rows), f"{path}: holds no points")
+    array = np.array(rows)
+    return array[:, :3], (array[:, 3:] if per_point == 6 else None)
+
+
+def rigid_between(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, float]:
+    """((4, 4) rigid map that takes points (n, 3) onto others best, root mean square distance left, mm).
+
+    Arun et al., IEEE PAMI 9(5) 1987. Raises SimulationError for fewer than three points or different numbers of them.
+    """
+    points, onto = np.asarray(points, float), np.asarray(onto, float)
+    require(
+        points.shape == onto.shape and points.ndim == 2 and points.shape[1] == 3 and len(points) >= 3,
+        f"landmarks have shapes {points.shape} and {onto.shape}, expected three or more pairs of 3D points",
+    )
+    middle, goal = points.mean(axis=0), onto.mean(axis=0)
+    u, _, vt = np.linalg.svd((points - middle).T @ (onto - goal))
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    matrix = np.eye(4)
+    matrix[:3, :3] = vt.T @ mirror @ u.T
+    matrix[:3, 3] = goal - matrix[:3, :3] @ middle
+    left = points @ matrix[:3, :3].T + matrix[:3, 3] - onto
+    return matrix, float(np.sqrt((left**2).sum(axis=1).mean()))
+
+
+def _read_xfm(path: Path) -> np.ndarray:
+    text = _mni_text(path, "MNI Transform File")
+    kind = re.search(r"Transform_Type\s*=\s*(\w+)", text)
+    name = kind.group(1) if kind else "none"
+    require(name == "Linear", f"{path}: holds a transform of type {name}, expected Linear")
+    match = re.search(r"Linear_Transform\s*=([^;]*);", text)
+    numbers = match.group(1).split() if match else []
+    require(len(numbers) == 12, f"{path}: holds {len(numbers)} numbers, expected 12 (a 3x4 matrix by rows)")
+    matrix = np.eye(4)
+    try:
+        matrix[:3] = np.array(numbers, float).reshape(3, 4)
+    except ValueError:
+        raise SimulationError(f"{path}: Linear_Transform is not made of numbers") from None
+    if re.search(r"Invert_Flag\s*=\s*True", text):
+        matrix = np.linalg.inv(matrix)
+    return matrix
+
+
+def _mni_text(path: Path, first_words: str) -> str:
+    require(path.is_file(), f"{path}: no such file")
+    try:
+        text = path.read_text()
+    except UnicodeDecodeError:
+        text = ""
+    require(text.lstrip().startswith(first_words), f"{path}: does not start with {first_words!r}")
+    return re.sub(r"^%.*$", "", text, flags=re.MULTILINE)  # comments

@@ -143,6 +143,10 @@ class TrackedSequence:
             frame_fields=tuple(self.frame_fields[n] for n in pick),
         )
 
+    def with_images(self, numbers: Sequence[int], images: np.ndarray) -> TrackedSequence:
+        """The images `numbers` with other pixels [n, row, column]; transforms and times stay theirs."""
+        return replace(self.select(numbers), images=images)
+
     def _asked_ends(self, name: str, known: set[str]) -> tuple[str, str]:
         splits = [(name[: m.start()], name[m.end() :]) for m in re.finditer("To", name)]
         splits = [(start, end) for start, end in splits if start and end]

@@ -75,17 +75,55 @@ class UltrasoundSimulator:
         #: Measure every stage (Frame.timings_ms); each stage is then waited for.
         self.profiling = False
 
-    def simulate(self, probe: Probe, probe_to_ras: np.ndarray, display: DisplaySettings | None = None) -> Frame:
+    def simulate(
+        self,
+        probe: Probe,
+        probe_to_ras: np.ndarray,
+        display: DisplaySettings | None = None,
+        grid: ImageGrid | None = None,
+    ) -> Frame:
         """The image that `probe` sees at the pose `probe_to_ras` (4, 4).
 
+        `grid` are its pixels, those of a real image to compare with, say; by default they just hold the imaged field,
+        as many as display.image_size says.
         Warns with EmptyViewWarning (and gives a black image) if the field misses the volume.
         Raises SimulationError for a pose that is not rigid.
         """
         display = display or DisplaySettings()
+        grid = grid or ImageGrid.for_probe(probe, display.image_size)
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self._warn_if_empty(probe, pose)
         timings: dict[str, float] = {}
+        self.render(probe, pose, display, grid, timings)
+        with self._stage("download", timings):
+            samples = self._sample_count(probe)
+            iq = self.pulse.download(samples)
+            envelope, bmode = self.compressor.download(samples)
+            image = self.converter.download()
+            self._warn_if_overflown()
 
+        return Frame(
+            iq=iq,
+            envelope=envelope,
+            bmode=bmode,
+            image=image,
+            sample_interval_mm=self._sample_mm(probe),
+            cycles_per_mm=self._cycles_per_mm(probe),
+            grid=grid,
+            probe_to_ras=pose,
+            timings_ms=timings,
+        )
+
+    def render(
+        self,
+        probe: Probe,
+        pose: np.ndarray,
+        display: DisplaySettings,
+        grid: ImageGrid,
+        timings: dict[str, float] | None = None,
+    ):
+        """Enqueue all stages of one frame; returns the device buffer of its image, which the next frame overwrites."""
+        timings = {} if timings is None else timings
         with self._stage("upload", timings):
             scene = self._upload_scene(probe, pose)
         with self._stage("ray tree", timings):
@@ -108,26 +146,8 @@ class UltrasoundSimulator:
         with self._stage("B-mode", timings):
             self.compressor.run(scene, display, self.pulse)
         with self._stage("scan conversion", timings):
-            grid = ImageGrid.for_probe(probe, display.image_size)
             self.converter.run(self._scene_buffer, scene, grid, self.compressor)
-        with self._stage("download", timings):
-            samples = self._sample_count(probe)
-            iq = self.pulse.download(samples)
-            envelope, bmode = self.compressor.download(samples)
-            image = self.converter.download()
-            self._warn_if_overflown()
-
-        return Frame(
-            iq=iq,
-            envelope=envelope,
-            bmode=bmode,
-            image=image,
-            sample_interval_mm=self._sample_mm(probe),
-            cycles_per_mm=self._cycles_per_mm(probe),
-            grid=grid,
-            probe_to_ras=pose,
-            timings_ms=timings,
-        )
+        return self.converter.image
 
     def trace(self, probe: Probe, probe_to_ras: np.ndarray) -> RayTree:
         """The ray tree alone, on the host: segments along the beam axes and interface hits."""
@@ -175,6 +195,16 @@ class UltrasoundSimulator:
     def set_tissues(self, tissues: TissueTable) -> None:
         """Change tissue parameters without building the medium anew."""
         self.medium.set_tissues(tissues)
+
+    @contextmanager
+    def with_tissues(self, tissues: TissueTable) -> Iterator[None]:
+        """Simulate with other tissues for as long as the block lasts."""
+        before = self.medium.tissues
+        try:
+            self.set_tissues(tissues)
+            yield
+        finally:
+            self.set_tissues(before)
 
     # ---- the scene record --------------------------------------------------------------------------------------
 

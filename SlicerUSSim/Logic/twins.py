@@ -13,8 +13,10 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.device import Device
-from SlicerUSSim.Logic.placement import craniotomy_pose, elevational_motion, tilt_sweep
+from SlicerUSSim.Logic.placement import craniotomy_pose, pose_looking_at, surface_point, tilt_sweep
 from SlicerUSSim.Logic.probe import PhasedProbe, Probe
+from SlicerUSSim.Logic.scan_conversion import ImageGrid
+from SlicerUSSim.Logic.sequence import TrackedSequence
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import Tissue, TissueTable
@@ -25,6 +27,10 @@ TISSUE = "white matter"
 #: The paper's 196 lines and 73 mm.
 TWIN_PROBE = PhasedProbe(field_of_view_deg=75.0, depth_mm=73.0, scan_lines=196)
 _OFFSET_MM = 0.5
+#: (tissue, sigma in voxels of its smoothed indicator, how far from 1/2 it is cut): a flat border moves by 0.39 voxels for
+#: white matter, and for CSF by so little that sulci and the midline of one voxel stay.
+_MISTAKES = ((TISSUE, 1.0, 0.15), ("csf", 0.6, 0.08))
+_PRESSED_MM = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +49,12 @@ class Twin:
     labels: Volume
     true_tissues: TissueTable
     true_display: DisplaySettings
+
+    def sequence(self) -> TrackedSequence:
+        """The references as a tracked sequence, as a tracker would have recorded them."""
+        to_probe = ImageGrid.for_probe(self.probe, self.true_display.image_size).image_to_probe
+        transforms = tuple({"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in self.poses)
+        return TrackedSequence(np.stack(self.references), transforms, 0.1 * np.arange(len(self.poses)))
 
 
 def make_twin(
@@ -65,9 +77,7 @@ def make_twin(
     true_tissues = tissues.with_tissue(_own_tissue(random, next(t for t in tissues.values() if t.name == TISSUE)))
     own_display = _own_display(random, display)
     true_display = display if display_is_known else own_display
-    pose = craniotomy_pose(labels, probe, tilt_deg=random.uniform(22.0, 40.0))
-    pose = pose @ elevational_motion(random.uniform(-8.0, 8.0), random.uniform(-6.0, 6.0))
-    poses = tilt_sweep(pose, 24.0, frames)
+    poses = tilt_sweep(_own_view(random, labels, probe), 24.0, frames)
     real = UltrasoundSimulator(labels, true_tissues, SimulationSettings(seed=50_000 + seed), device)
     references = [frame.image for frame in real.sweep(probe, poses, true_display)]
     mistaken = mistaken_labels(labels, tissues, random)
@@ -76,19 +86,28 @@ def make_twin(
 
 
 def mistaken_labels(labels: Volume, tissues: TissueTable, random: np.random.Generator) -> Volume:
-    """A segmentation as it may come out: borders of white matter and CSF moved by about 0.4 voxels, 0.5 mm off."""
+    """A segmentation as it may come out: white matter and CSF a little grown or shrunk into grey matter, 0.5 mm off."""
     array = labels.array.copy()
-    for name in (TISSUE, "csf"):
-        label, other = tissues.label_of(name), tissues.label_of("grey matter")
-        share = ndimage.gaussian_filter((labels.array == label).astype(np.float32), 1.0)
-        threshold = 0.5 + random.choice([-0.15, 0.15])  # a border moves by 0.39 sigma
-        movable = np.isin(labels.array, (label, other))
-        array[movable & (share > threshold)] = label
-        array[movable & (share <= threshold) & (labels.array == label)] = other
+    other = tissues.label_of("grey matter")
+    for name, sigma, step in _MISTAKES:
+        label = tissues.label_of(name)
+        share = ndimage.gaussian_filter((labels.array == label).astype(np.float32), sigma)
+        threshold = 0.5 + random.choice([-step, step])
+        array[(labels.array == other) & (share > threshold)] = label
+        array[(labels.array == label) & (share <= threshold)] = other
     direction = random.normal(size=3)
     shift = np.eye(4)
     shift[:3, 3] = _OFFSET_MM * direction / np.linalg.norm(direction)
     return Volume(array, shift @ labels.ijk_to_ras)
+
+
+def _own_view(random: np.random.Generator, labels: Volume, probe: Probe) -> np.ndarray:
+    """A craniotomy view a little elsewhere, in contact: where a gap opens, the surface of the brain casts shadows."""
+    pose = craniotomy_pose(labels, probe, tilt_deg=random.uniform(22.0, 40.0))
+    target = pose @ [random.uniform(-4.0, 4.0), 0.5 * probe.depth_mm, random.uniform(-10.0, 10.0), 1.0]
+    outward = -pose[:3, 1]
+    face = surface_point(labels, target[:3], outward) - _PRESSED_MM * outward
+    return pose_looking_at(face, target[:3], lateral_ras=pose[:3, 0])
 
 
 def _own_tissue(random: np.random.Generator, tissue: Tissue) -> Tissue:

@@ -1,0 +1,94 @@
+"""fit: simulated to tracked images, with or without registration, and the images before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from SlicerUSSim.Logic.optimization import AppearanceResult, optimize_appearance
+from SlicerUSSim.Logic.parameters import Bounds
+from SlicerUSSim.Logic.registration import Registration, register_poses
+from SlicerUSSim.Logic.search import Progress
+from SlicerUSSim.Logic.settings import DisplaySettings
+from SlicerUSSim.Logic.similarity import SimilaritySettings
+from SlicerUSSim.Logic.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.tissues import TissueTable
+from SlicerUSSim.Logic.tracked import TrackedImages
+
+#: Of the evaluations, how many a first fit takes before registration.
+_FIRST_SHARE = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What was fitted, and how it looks."""
+
+    appearance: AppearanceResult
+    #: None where none was asked for
+    registration: Registration | None
+    #: At the registered poses
+    tracked: TrackedImages
+    #: (rows, columns) uint8, simulated with what was and with what was found, at the poses that were and are
+    before: list[np.ndarray] = field(repr=False)
+    after: list[np.ndarray] = field(repr=False)
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON."""
+        found = {} if self.registration is None else {"registration": self.registration.to_dict()}
+        return {**self.appearance.to_dict(), **found, "numbers": self.tracked.numbers}
+
+
+def fit(
+    simulator: UltrasoundSimulator,
+    tracked: TrackedImages,
+    *,
+    free: Iterable[str] | Mapping[str, Bounds | None],
+    display: DisplaySettings | None = None,
+    register: bool = False,
+    max_evaluations: int = 500,
+    restarts: int = 2,
+    seed: int = 0,
+    settings: SimilaritySettings | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    resume: dict | None = None,
+    checkpoint: Callable[[dict], None] | None = None,
+) -> Fit:
+    """Fit display and tissue parameters (optimization.optimize_appearance) and, with `register`, the poses.
+
+    Registration needs images that look alike and the fit needs poses: so a short fit comes first, then registration,
+    then the whole fit at the poses found. `resume` and `checkpoint` are those of the whole fit.
+    Raises SimulationError as those do.
+    """
+    display = display or DisplaySettings()
+    masks = [tracked.mask] * len(tracked.images)
+    given = tracked
+    common = dict(free=free, masks=masks, grid=tracked.grid, seed=seed, settings=settings, progress=progress)
+    registration = None
+    if register:
+        first = optimize_appearance(
+            simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=0,
+            max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1), **common,
+        )  # fmt: skip
+        with simulator.with_tissues(first.tissues):
+            registration = register_poses(
+                simulator, tracked.probe, tracked.poses, tracked.images, display=first.display, grid=tracked.grid,
+                masks=masks, settings=settings, progress=progress,
+            )  # fmt: skip
+        tracked = replace(tracked, poses=registration.poses)
+    appearance = optimize_appearance(
+        simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=restarts,
+        max_evaluations=max_evaluations, resume=resume, checkpoint=checkpoint, **common,
+    )  # fmt: skip
+    before = simulated(simulator, given, simulator.medium.tissues, display)
+    after = simulated(simulator, tracked, appearance.tissues, appearance.display)
+    return Fit(appearance, registration, tracked, before, after)
+
+
+def simulated(
+    simulator: UltrasoundSimulator, tracked: TrackedImages, tissues: TissueTable, display: DisplaySettings
+) -> list[np.ndarray]:
+    """(rows, columns) uint8 simulated images on the pixels of the tracked ones."""
+    with simulator.with_tissues(tissues):
+        return [simulator.simulate(tracked.probe, pose, display, tracked.grid).image for pose in tracked.poses]

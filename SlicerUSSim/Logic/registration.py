@@ -1,0 +1,194 @@
+"""register_poses: where the ultrasound lies in the MRI, refined with the cost of the appearance optimisation.
+
+A rigid correction of all poses together, six parameters: millimetres along and degrees about the axes of the middle
+image, about the middle of what the images see, where translations and rotations disturb each other least. Every
+evaluation traces and scatters anew, so the search first runs on a coarse simulation (fewer scan lines, pixels,
+scatterers and rays), then on the full one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from SlicerUSSim.Logic.errors import require, require_between
+from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.scan_conversion import ImageGrid
+from SlicerUSSim.Logic.search import Evaluation, Progress, Search
+from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.similarity import PatchComparison, SimilaritySettings
+from SlicerUSSim.Logic.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.volume import check_rigid
+
+NAMES = ("x_mm", "y_mm", "z_mm", "about_x_deg", "about_y_deg", "about_z_deg")
+#: nlopt's names. Simplices step over the ripple that speckle gives the cost; quadratic models fall into it.
+_COARSE_ALGORITHM, _FINE_ALGORITHM = "LN_NELDERMEAD", "LN_NELDERMEAD"
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A rigid correction and what it brought."""
+
+    #: (4, 4) rigid; corrected poses are correction @ pose
+    correction: np.ndarray
+    poses: list[np.ndarray] = field(repr=False)
+    #: {name: value} of the correction's parameters (NAMES)
+    values: dict[str, float]
+    cost_before: float
+    cost_after: float
+    history: list[Evaluation] = field(repr=False)
+
+    @property
+    def shift_mm(self) -> float:
+        """How far the middle of what the images see was moved."""
+        return float(np.linalg.norm([self.values[name] for name in NAMES[:3]]))
+
+    @property
+    def turn_deg(self) -> float:
+        """By how much the images were turned."""
+        return rotation_deg(self.correction)
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON."""
+        return {
+            "correction": self.correction.tolist(),
+            "values": self.values,
+            "cost_before": self.cost_before,
+            "cost_after": self.cost_after,
+            "evaluations": len(self.history),
+        }
+
+
+def register_poses(
+    simulator: UltrasoundSimulator,
+    probe: Probe,
+    poses: Sequence[np.ndarray],
+    references: Sequence[np.ndarray],
+    *,
+    display: DisplaySettings,
+    grid: ImageGrid | None = None,
+    masks: Sequence[np.ndarray] | None = None,
+    range_mm: float = 8.0,
+    range_deg: float = 8.0,
+    max_evaluations: int = 600,
+    settings: SimilaritySettings | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Registration:
+    """Move all poses together until simulated and real images agree.
+
+    Parameters are those of optimization.optimize_appearance; tissues and display are taken as they are, so fit them
+    first. `range_mm` and `range_deg` are the bounds of each parameter.
+
+    Raises SimulationError for poses that are not rigid and references that do not fit.
+    """
+    require_between("register_poses", "range_mm", range_mm, 0.01, 100)
+    require_between("register_poses", "range_deg", range_deg, 0.01, 90)
+    poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
+    require(
+        len(poses) == len(references) > 0,
+        f"{len(references)} reference images and {len(poses)} poses, expected as many",
+    )
+    settings = settings or SimilaritySettings()
+    grid = grid or ImageGrid.for_probe(probe, display.image_size)
+    inside = grid.field(probe)
+    masks = [inside if masks is None else inside & np.asarray(mask, bool) for mask in masks or poses]
+    ranges = np.array([range_mm] * 3 + [range_deg] * 3)
+    frame = _middle_frame(probe, poses)
+
+    def correction(units: np.ndarray) -> np.ndarray:
+        return frame @ rigid_from((2.0 * np.asarray(units) - 1.0) * ranges) @ np.linalg.inv(frame)
+
+    def describe(units: np.ndarray) -> dict[str, float]:
+        return dict(zip(NAMES, ((2.0 * np.asarray(units) - 1.0) * ranges).tolist(), strict=True))
+
+    full = _PoseCost(simulator, probe, poses, references, masks, grid, display, settings, correction)
+    coarse_probe, coarse_grid, coarse_references, coarse_masks = _coarser(probe, grid, references, masks)
+    coarse = _PoseCost(
+        simulator, coarse_probe, poses, coarse_references, coarse_masks, coarse_grid, display, settings, correction,
+        _coarser_settings(simulator.settings),
+    )  # fmt: skip
+    search = Search(coarse, describe, max_evaluations, 0, progress)
+    here = np.full(6, 0.5)
+    before = full(here)
+    best = search.minimise(_COARSE_ALGORITHM, "coarse", here, int(0.8 * max_evaluations), step=0.12)
+    search.cost = full
+    best = search.minimise(_FINE_ALGORITHM, "fine", best, max_evaluations - len(search.history), step=0.04)
+    after = search.best_cost("fine")
+    if after > before:  # the start was the best after all
+        best, after = here, before
+    matrix = correction(best)
+    return Registration(matrix, [matrix @ pose for pose in poses], describe(best), before, after, search.history)
+
+
+def rigid_from(values: Sequence[float]) -> np.ndarray:
+    """(4, 4) from three translations (mm) and a rotation vector (degrees)."""
+    from scipy.spatial.transform import Rotation
+
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(np.deg2rad(values[3:])).as_matrix()
+    matrix[:3, 3] = values[:3]
+    return matrix
+
+
+def rotation_deg(matrix: np.ndarray) -> float:
+    """The angle of a rigid matrix's rotation."""
+    return float(np.rad2deg(np.arccos(np.clip((np.trace(matrix[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))))
+
+
+class _PoseCost:
+    """The mean cost at corrected poses, as a function of the correction's positions between 0 and 1."""
+
+    def __init__(
+        self, simulator, probe, poses, references, masks, grid, display, settings, correction,
+        simulation: SimulationSettings | None = None,
+    ) -> None:  # fmt: skip
+        self.simulator, self.probe, self.poses, self.grid, self.display = simulator, probe, poses, grid, display
+        self.correction, self.simulation = correction, simulation or simulator.settings
+        self.comparisons = [
+            PatchComparison(simulator.device, reference, mask, grid.pixel_spacing_mm, settings)
+            for reference, mask in zip(references, masks, strict=True)
+        ]
+
+    def __call__(self, units: np.ndarray) -> float:
+        matrix, before = self.correction(units), self.simulator.settings
+        self.simulator.settings = self.simulation
+        try:
+            for pose, comparison in zip(self.poses, self.comparisons, strict=True):
+                comparison.run(self.simulator.render(self.probe, matrix @ pose, self.display, self.grid))
+            return float(np.mean([comparison.result().total for comparison in self.comparisons]))
+        finally:
+            self.simulator.settings = before
+
+
+def _middle_frame(probe: Probe, poses: list[np.ndarray]) -> np.ndarray:
+    """(4, 4) the axes of the middle image, at the middle of what all images see."""
+    centres = [(pose @ [0.0, 0.5 * probe.depth_mm, 0.0, 1.0])[:3] for pose in poses]
+    frame = np.array(poses[len(poses) // 2])
+    frame[:3, 3] = np.mean(centres, axis=0)
+    return frame
+
+
+def _coarser(probe: Probe, grid: ImageGrid, references, masks):
+    """Half the scan lines, and pixels twice as large in both directions."""
+    rows, columns = grid.rows // 2, grid.columns // 2
+    spacing = 2.0 * grid.pixel_spacing_mm[0], 2.0 * grid.pixel_spacing_mm[1]
+
+    def shrunk(image: np.ndarray) -> np.ndarray:
+        return np.asarray(image, float)[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
+
+    images = [np.ascontiguousarray(shrunk(image).round().astype(np.uint8)) for image in references]
+    insides = [shrunk(mask) > 0.99 for mask in masks]
+    coarse_probe = replace(probe, scan_lines=max(probe.scan_lines // 2, 2))
+    return coarse_probe, ImageGrid(rows, columns, grid.left_mm, grid.top_mm, spacing), images, insides
+
+
+def _coarser_settings(settings: SimulationSettings) -> SimulationSettings:
+    """Fewer scatterers (of the same variance) and rays; no mirror images."""
+    return replace(
+        settings,
+        scatterers_per_mm3=min(settings.scatterers_per_mm3, 8.0),
+        elevational_rays=min(settings.elevational_rays, 3),
+        max_ray_depth=min(settings.max_ray_depth, 1),
+    )
