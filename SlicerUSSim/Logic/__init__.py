@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 
 _HOMES = {
+    "AppearanceResult": "optimization",
     "ConvexProbe": "probe",
     "DisplaySettings": "settings",
     "Frame": "frame",
@@ -18,10 +19,13 @@ _HOMES = {
     "Texture": "texture",
     "Tissue": "tissues",
     "TissueTable": "tissues",
+    "TrackedSequence": "sequence",
     "UltrasoundSimulator": "simulator",
     "Volume": "volume",
     "list_devices": "device",
+    "optimize_appearance": "optimization",
     "segment_mri": "segmentation",
+    "similarity": "similarity",
 }
 __all__ = list(_HOMES)
 

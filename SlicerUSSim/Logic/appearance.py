@@ -88,7 +88,8 @@ class AppearanceModel:
         self._parts, self._mixed, self._lines = EchoLines(device), EchoLines(device), EchoLines(device)
         self._compressor, self._converter = Compressor(device), ScanConverter(device)
         self._workspace = Workspace(device)
-        self._weights = device.empty(4 * max(self._base_count, CONSTANTS["PARTS"]))
+        self._part_weights_buffer = device.empty(4 * CONSTANTS["PARTS"])
+        self._weights = device.empty(4 * self._base_count)
         self._decays = device.empty(4 * max(len(self.attenuating), 1))
         self.anchor(simulator.medium.tissues)
 
@@ -96,6 +97,7 @@ class AppearanceModel:
         """Compute the bases anew for these tissues, for which the model is then exact."""
         simulator = self.simulator
         self.tissues = tissues
+        self._weighted: TissueTable | None = None  # the weights on the device are for these tissues
         self._scenes = [simulator.scene(self.probe, pose) for pose in self.poses]
         self._scene_buffers = [self.device.empty(SCENE.itemsize) for _ in self.poses]
         for scene, buffer in zip(self._scenes, self._scene_buffers, strict=True):
@@ -118,8 +120,10 @@ class AppearanceModel:
         """Enqueue the image at pose `number`; returns its device buffer, which the next image overwrites."""
         scene, scene_buffer = self._scenes[number], self._scene_buffers[number]
         lines, samples = int(scene["scan_lines"]), int(scene["samples"])
-        self.device.write(self._weights, self._base_weights(tissues))
-        self.device.write(self._decays, self._path_weights(tissues))
+        if tissues is not self._weighted:  # a write waits for the images before it
+            self.device.write(self._weights, self._base_weights(tissues))
+            self.device.write(self._decays, self._path_weights(tissues))
+            self._weighted = tissues
         iq = self._workspace.get("iq", lines * samples * 8)
         self.device.run(
             self._mix_bases,
@@ -183,10 +187,10 @@ class AppearanceModel:
         simulator, device = self.simulator, self.device
         scene, scene_buffer = self._scenes[number], self._scene_buffers[number]
         values = self._mixed.stride * 2 * int(scene["traced_lines"])
-        device.write(self._weights, weights)
+        device.write(self._part_weights_buffer, weights)
         for parts, mixed in ((self._parts.re, self._mixed.re), (self._parts.im, self._mixed.im)):
             device.run(
-                self._mix_parts, (values // device.lanes,), parts, self._weights, np.int32(weights.size),
+                self._mix_parts, (values // device.lanes,), parts, self._part_weights_buffer, np.int32(weights.size),
                 np.int32(values), mixed,
             )  # fmt: skip
         if with_interfaces and simulator.settings.interfaces:

@@ -100,13 +100,12 @@ def _trio(number: int, real: np.ndarray, before: np.ndarray, after: np.ndarray, 
         f"Image {number}: cost {was.total:.4f} → {is_now.total:.4f} (histograms {was.bhattacharyya:.3f} → "
         f"{is_now.bhattacharyya:.3f}, difference {was.sad:.3f} → {is_now.sad:.3f})"
     )
-    return f"""<figure>
+    return f"""<figure class="case">
 <figcaption>{caption}</figcaption>
 <div class="trio"><figure><img alt="before" src="{before_png}"><figcaption>simulated, before</figcaption></figure>
 <figure><img alt="after" src="{after_png}"><figcaption>simulated, after</figcaption></figure>
 <figure><img alt="real" src="{real_png}"><figcaption>real</figcaption></figure></div>
-<div class="compare" data-before="{before_png}" data-after="{after_png}"><img alt="simulated" src="{after_png}">
-<div class="top"><img alt="real" src="{real_png}"></div><div class="edge"></div>
+<div class="compare"><img alt="simulated"><div class="top"><img alt="real"></div><div class="edge"></div>
 <span class="name l">after</span><span class="name r">real</span></div>
 <div class="controls"><input type="range" min="0" max="100" value="50" aria-label="divide simulated and real">
 <select aria-label="simulated image"><option>after</option><option>before</option></select><button>Blink</button></div>

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.device import Device
-from SlicerUSSim.Logic.placement import craniotomy_pose, pose_looking_at, surface_point, tilt_sweep
+from SlicerUSSim.Logic.placement import craniotomy_pose, pose_looking_at, sample, surface_point, tilt_sweep
 from SlicerUSSim.Logic.probe import PhasedProbe, Probe
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.sequence import TrackedSequence
@@ -27,10 +27,12 @@ TISSUE = "white matter"
 #: The paper's 196 lines and 73 mm.
 TWIN_PROBE = PhasedProbe(field_of_view_deg=75.0, depth_mm=73.0, scan_lines=196)
 _OFFSET_MM = 0.5
-#: (tissue, sigma in voxels of its smoothed indicator, how far from 1/2 it is cut): a flat border moves by 0.39 voxels for
-#: white matter, and for CSF by so little that sulci and the midline of one voxel stay.
+#: (tissue, sigma in voxels of its smoothed indicator, how far from 1/2 it is cut): a flat border moves by 0.39 voxels
+#: for white matter, and for CSF by so little that sulci and the midline of one voxel stay.
 _MISTAKES = ((TISSUE, 1.0, 0.15), ("csf", 0.6, 0.08))
 _PRESSED_MM = 3.0
+#: Places tried for a good window, and how deep it reaches.
+_PLACES, _WINDOW_MM = 8, 15.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,7 @@ def make_twin(
     display_is_known: bool = False,
     device: str | Device | None = None,
 ) -> Twin:
-    """Patient number `seed` on true `labels`, seen in `frames` images of a tilted probe.
+    """Patient number `seed` on true `labels` (1 is CSF), seen in `frames` images of a tilted probe.
 
     `display` is where the optimisation starts; with `display_is_known` the references have it too.
     """
@@ -77,7 +79,7 @@ def make_twin(
     true_tissues = tissues.with_tissue(_own_tissue(random, next(t for t in tissues.values() if t.name == TISSUE)))
     own_display = _own_display(random, display)
     true_display = display if display_is_known else own_display
-    poses = tilt_sweep(_own_view(random, labels, probe), 24.0, frames)
+    poses = _own_view(random, labels, probe, frames)
     real = UltrasoundSimulator(labels, true_tissues, SimulationSettings(seed=50_000 + seed), device)
     references = [frame.image for frame in real.sweep(probe, poses, true_display)]
     mistaken = mistaken_labels(labels, tissues, random)
@@ -101,13 +103,31 @@ def mistaken_labels(labels: Volume, tissues: TissueTable, random: np.random.Gene
     return Volume(array, shift @ labels.ijk_to_ras)
 
 
-def _own_view(random: np.random.Generator, labels: Volume, probe: Probe) -> np.ndarray:
-    """A craniotomy view a little elsewhere, in contact: where a gap opens, the surface of the brain casts shadows."""
-    pose = craniotomy_pose(labels, probe, tilt_deg=random.uniform(22.0, 40.0))
-    target = pose @ [random.uniform(-4.0, 4.0), 0.5 * probe.depth_mm, random.uniform(-10.0, 10.0), 1.0]
-    outward = -pose[:3, 1]
-    face = surface_point(labels, target[:3], outward) - _PRESSED_MM * outward
-    return pose_looking_at(face, target[:3], lateral_ras=pose[:3, 0])
+def _own_view(random: np.random.Generator, labels: Volume, probe: Probe, frames: int) -> list[np.ndarray]:
+    """A tilt about a craniotomy view a little elsewhere, in contact with a gyrus.
+
+    Over a sulcus the CSF in front of the face mirrors and bends what passes it, and half a voxel decides where to: a
+    surgeon slides the probe until the window is good.
+    """
+    best: tuple[float, list[np.ndarray]] | None = None
+    for _ in range(_PLACES):
+        pose = craniotomy_pose(labels, probe, tilt_deg=random.uniform(24.0, 42.0))
+        target = pose @ [random.uniform(-4.0, 4.0), 0.5 * probe.depth_mm, random.uniform(-12.0, 12.0), 1.0]
+        outward = -pose[:3, 1]
+        face = surface_point(labels, target[:3], outward) - _PRESSED_MM * outward
+        poses = tilt_sweep(pose_looking_at(face, target[:3], lateral_ras=pose[:3, 0]), 24.0, frames)
+        blocked = float(np.mean([_fluid_before(labels, pose, probe) for pose in poses]))
+        if best is None or blocked < best[0]:
+            best = blocked, poses
+    return best[1]
+
+
+def _fluid_before(labels: Volume, pose: np.ndarray, probe: Probe) -> float:
+    """The share of coupling and CSF in the first part of the field."""
+    lines, along = np.meshgrid(np.linspace(probe.first_line, -probe.first_line, 41), np.linspace(0.5, _WINDOW_MM, 24))
+    origin, direction = probe.line_at(lines)
+    points = origin + along[..., None] * direction
+    return float((sample(labels, points @ pose[:3, :3].T + pose[:3, 3], order=0) <= 1).mean())
 
 
 def _own_tissue(random: np.random.Generator, tissue: Tissue) -> Tissue:
