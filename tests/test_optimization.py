@@ -1,0 +1,257 @@
+"""The optimisation on twins, whose parameters are known: what it recovers, what it says of the rest, and mistakes."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from SlicerUSSim.Logic import (
+    DisplaySettings,
+    PhasedProbe,
+    SimulationError,
+    TissueTable,
+    optimize_appearance,
+    segment_mri,
+)
+from SlicerUSSim.Logic.errors import Cancelled
+from SlicerUSSim.Logic.identifiability import variance_db
+from SlicerUSSim.Logic.phantoms import head_mri
+from SlicerUSSim.Logic.scan_conversion import ImageGrid
+from SlicerUSSim.Logic.search import Search
+from SlicerUSSim.Logic.twins import make_twin
+
+SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
+
+
+@pytest.fixture(scope="module")
+def brain():
+    segmentation = segment_mri(head_mri(2.0))
+    return segmentation.labels, TissueTable.brain(segmentation.tissue_names)
+
+
+@pytest.fixture(scope="module")
+def twin(brain):
+    return make_twin(*brain, 3, probe=SMALL, frames=2)
+
+
+def optimise(twin, free, **options):
+    options = {"max_evaluations": 200, "restarts": 0, "display": twin.display, **options}
+    return optimize_appearance(twin.simulator, twin.probe, twin.poses, twin.references, free=free, **options)
+
+
+def white(tissues):
+    return tissues[tissues.label_of("white matter")]
+
+
+@pytest.fixture(scope="module")
+def result(twin):
+    return optimise(twin, ["display", "white matter"], max_evaluations=300, restarts=2)
+
+
+# ---- what it finds ---------------------------------------------------------------------------------------------------
+
+
+def test_images_become_alike(twin, result):
+    assert result.cost_after < 0.75 * result.cost_before
+    with twin.simulator.with_tissues(result.tissues):
+        images = [twin.simulator.simulate(twin.probe, pose, result.display).image for pose in twin.poses]
+    field = ImageGrid.for_probe(twin.probe, None).field(twin.probe)
+    for image, reference, before in zip(images, twin.references, result.similarity_before, strict=True):
+        assert abs(image[field].mean() - reference[field].mean()) < 5.0
+        assert before.total > 0.0
+
+
+def test_costs_are_those_of_whole_simulations(twin, result):
+    from SlicerUSSim.Logic import similarity
+
+    field = ImageGrid.for_probe(twin.probe, None).field(twin.probe)
+    for tissues, display, cost in (
+        (twin.simulator.medium.tissues, twin.display, result.cost_before),
+        (result.tissues, result.display, result.cost_after),
+    ):
+        with twin.simulator.with_tissues(tissues):
+            frames = [twin.simulator.simulate(twin.probe, pose, display) for pose in twin.poses]
+        costs = [
+            similarity(f.image, r, f.pixel_spacing_mm, mask=field).total
+            for f, r in zip(frames, twin.references, strict=True)
+        ]
+        assert cost == pytest.approx(np.mean(costs), abs=2e-3)
+
+
+def test_net_fall_with_depth_and_relative_echogenicity_are_recovered(twin, result):
+    found, true = white(result.tissues), white(twin.true_tissues)
+    fall = found.attenuation_db_cm_mhz - result.display.tgc_db_cm_mhz
+    true_fall = true.attenuation_db_cm_mhz - twin.true_display.tgc_db_cm_mhz
+    assert fall == pytest.approx(true_fall, abs=0.1)
+    assert variance_db(found) == pytest.approx(variance_db(true), abs=1.5)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_attenuation_and_echogenicity_are_recovered_when_the_display_is_known(brain, seed):
+    twin = make_twin(*brain, seed, probe=SMALL, frames=2, display_is_known=True)
+    result = optimise(twin, ["white matter"])
+    found, true = white(result.tissues), white(twin.true_tissues)
+    assert found.attenuation_db_cm_mhz == pytest.approx(true.attenuation_db_cm_mhz, abs=0.1)
+    assert variance_db(found) == pytest.approx(variance_db(true), abs=1.5)
+
+
+def test_it_says_what_cannot_be_known(result):
+    found = result.identifiability
+    assert not found["white matter.mu1"].is_determined  # only Var shows
+    assert found["Var of white matter re grey matter"].is_determined
+    for spread in found.spreads:
+        assert spread.low <= spread.value <= spread.high
+    mu1, var = found["white matter.mu1"], found["Var of white matter re grey matter"]
+    assert (mu1.high - mu1.low) / mu1.tolerance > 2.0 * (var.high - var.low) / var.tolerance
+    assert found.restarts == 2 and 0 <= found.restarts_as_good <= 2 and found.solutions > 0
+    assert json.loads(json.dumps(result.to_dict()))["identifiability"]["cost_tolerance"] > 0
+
+
+def test_sources_say_what_was_fitted(result):
+    sources = white(result.tissues).sources
+    assert sources["mu0"] == "fitted to tracked ultrasound" and "Szabo" in sources["speed_of_sound_m_s"]
+
+
+def test_simulator_is_left_as_it_was(twin, result):
+    assert white(twin.simulator.medium.tissues).mu0 == 0.33
+    assert twin.simulator.settings.seed == 3
+
+
+@pytest.mark.parametrize(
+    "algorithms", [("GN_DIRECT_L", "LN_SBPLX"), ("GN_CRS2_LM", "LN_NELDERMEAD"), (None, "LN_COBYLA")]
+)
+def test_other_algorithms_find_it_too(twin, result, algorithms):
+    other = optimise(twin, ["display", "white matter"], max_evaluations=300, algorithms=algorithms)
+    assert other.cost_after < 1.25 * result.cost_after
+
+
+def test_a_single_parameter_can_be_free(twin):
+    assert optimise(twin, ["gain_db"], max_evaluations=40).cost_after < optimise(twin, ["gain_db"]).cost_before
+
+
+def test_bounds_are_kept(twin):
+    result = optimise(twin, {"gain_db": (-1, 1), "white matter.mu0": (0.2, 0.3)}, max_evaluations=60)
+    assert -1 <= result.after["gain_db"] <= 1 and 0.2 <= result.after["white matter.mu0"] <= 0.3
+
+
+# ---- the same again, and going on ------------------------------------------------------------------------------------
+
+
+def test_the_same_problem_gives_the_same_answer(twin):
+    one, other = (optimise(twin, ["display"], max_evaluations=60, restarts=1) for _ in range(2))
+    assert one.after == other.after and one.history == other.history
+
+
+def test_an_interrupted_run_is_resumed_without_computing_again(twin):
+    reached = []
+
+    def stop(progress):
+        if progress.evaluations == 45:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        optimise(twin, ["display"], max_evaluations=80, progress=stop, checkpoint=reached.append)
+    state = json.loads(json.dumps(reached[-1]))
+    assert len(state["history"]) == 45
+    whole = optimise(twin, ["display"], max_evaluations=80)
+    resumed = optimise(twin, ["display"], max_evaluations=80, resume=state)
+    assert resumed.after == whole.after and resumed.history == whole.history
+    assert resumed.evaluations == whole.evaluations - 45
+    assert optimise(twin, ["display"], max_evaluations=80, resume=resumed.state).evaluations == 0
+    with pytest.raises(SimulationError, match="another problem"):
+        optimise(twin, ["gain_db"], resume=state)
+    with pytest.raises(SimulationError, match="not one of an optimisation"):
+        optimise(twin, ["gain_db"], resume={"hello": 1})
+
+
+def test_progress_tells_the_best_and_ends_at_one(twin):
+    told = []
+    result = optimise(twin, ["display"], max_evaluations=60, restarts=1, progress=told.append)
+    assert [p.evaluations for p in told] == list(range(1, len(told) + 1))
+    assert all(0 < p.share <= 1 for p in told) and len(told) <= told[0].limit
+    polish = [p for p in told if p.stage == "polish"]
+    assert polish[-1].best_cost == min(p.cost for p in polish)
+    assert polish[-1].best.keys() == result.after.keys()
+
+
+def test_what_a_progress_function_raises_comes_through(twin):
+    def fail(progress):
+        raise ZeroDivisionError("mine")
+
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        optimise(twin, ["display"], progress=fail)
+
+
+@pytest.mark.parametrize("algorithm", ["GN_CRS2_LM", "GN_DIRECT_L", "G_MLSL_LDS", "LN_BOBYQA", "LN_NELDERMEAD"])
+def test_search_finds_the_lowest_point_and_keeps_its_history(algorithm):
+    goal = np.array([0.3, 0.8, 0.5])
+    search = Search(lambda units: float(((units - goal) ** 2).sum()), lambda units: {}, 400)
+    best = search.minimise(algorithm, "here", np.full(3, 0.1), 400)
+    assert np.abs(best - goal).max() < 0.05
+    assert search.computed == len(search.history) <= 400
+    assert search.best_cost("here") == min(entry.cost for entry in search.history)
+
+
+# ---- mistakes --------------------------------------------------------------------------------------------------------
+
+
+def test_bad_input_is_one_clear_line(twin):
+    black = [twin.references[0], np.zeros_like(twin.references[1])]
+    outside = [~ImageGrid.for_probe(twin.probe, None).field(twin.probe)] * 2
+    for change, message in (
+        ({"references": black}, "reference image 1 is black inside the field"),
+        ({"references": []}, "no reference image"),
+        ({"references": twin.references[:1]}, "1 reference images and 2 poses"),
+        ({"references": [r[:-1] for r in twin.references]}, "reference image 0 has shape"),
+        ({"masks": outside}, "do not overlap"),
+        ({"masks": outside[:1]}, "1 masks and 2 reference images"),
+        ({"free": ["brilliance"]}, "no free parameter 'brilliance'"),
+        ({"free": {"gain_db": (2, 1)}}, "bounds of gain_db"),
+        ({"max_evaluations": 0}, "max_evaluations is 0"),
+        ({"algorithms": ("GN_MAGIC", "LN_BOBYQA")}, "nlopt has no algorithm 'GN_MAGIC'"),
+        ({"poses": [np.diag([2.0, 1, 1, 1])] * 2}, "pose 0"),
+    ):
+        arguments = {
+            "simulator": twin.simulator, "probe": twin.probe, "poses": twin.poses, "references": twin.references,
+            "free": ["display"], "display": DisplaySettings(), **change,
+        }  # fmt: skip
+        with pytest.raises(SimulationError) as caught:
+            optimize_appearance(**arguments)
+        assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+# ---- fourteen patients -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def real_brain(mni):
+    segmentation = segment_mri(mni[0])
+    return segmentation.labels, TissueTable.brain(segmentation.tissue_names)
+
+
+PATIENTS = PhasedProbe(75.0, 60.0, scan_lines=128)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(14))
+def test_fourteen_patients_with_a_known_display(real_brain, seed):
+    twin = make_twin(*real_brain, seed, probe=PATIENTS, display_is_known=True)
+    result = optimise(twin, ["white matter"], max_evaluations=150)
+    found, true = white(result.tissues), white(twin.true_tissues)
+    assert result.cost_after < result.cost_before
+    assert found.attenuation_db_cm_mhz == pytest.approx(true.attenuation_db_cm_mhz, abs=0.1)
+    assert variance_db(found) == pytest.approx(variance_db(true), abs=1.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(14))
+def test_fourteen_patients_with_everything_free(real_brain, seed):
+    twin = make_twin(*real_brain, seed, probe=PATIENTS)
+    result = optimise(twin, ["display", "white matter"], max_evaluations=300)
+    found, true = white(result.tissues), white(twin.true_tissues)
+    assert result.cost_after < result.cost_before
+    fall = found.attenuation_db_cm_mhz - result.display.tgc_db_cm_mhz
+    assert fall == pytest.approx(true.attenuation_db_cm_mhz - twin.true_display.tgc_db_cm_mhz, abs=0.1)
+    assert variance_db(found) == pytest.approx(variance_db(true), abs=1.5)  # grey matter is as it was

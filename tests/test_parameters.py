@@ -1,0 +1,77 @@
+"""Free parameters: names, bounds, and the way from positions to tissues and display and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from SlicerUSSim.Logic import DisplaySettings, SimulationError, TissueTable
+from SlicerUSSim.Logic.parameters import DISPLAY_BOUNDS, TISSUE_BOUNDS, FreeParameters
+
+TISSUES, DISPLAY = TissueTable.brain(), DisplaySettings()
+
+
+def of(free) -> FreeParameters:
+    return FreeParameters.of(free, TISSUES, DISPLAY)
+
+
+def test_groups_stand_for_all_of_their_own():
+    assert of(["display"]).names == list(DISPLAY_BOUNDS)
+    assert of(["White-Matter"]).names == [f"white matter.{name}" for name in TISSUE_BOUNDS]
+    assert of(["gain_db", "leptomeninges.mu0"]).names == ["gain_db", "leptomeninges.mu0"]
+    assert of("gain_db").names == ["gain_db"]
+    mixed = of({"display": None, "gain_db": (-3, 3)})
+    assert len(mixed) == 4 and (mixed[0].low, mixed[0].high) == (-3.0, 3.0)
+
+
+@given(st.lists(st.floats(0, 1), min_size=8, max_size=8))
+def test_positions_and_values_are_inverse(units):
+    parameters = of(["display", "white matter"])
+    tissues, display = parameters.apply(np.array(units), TISSUES, DISPLAY)
+    assert np.allclose(parameters.units(tissues, display), units, atol=1e-9)
+    values = parameters.values(np.array(units))
+    assert np.allclose(parameters.current(tissues, display), values)
+    for parameter, value in zip(parameters, values, strict=True):
+        assert parameter.low <= value <= parameter.high
+
+
+@given(st.floats(-1, 2), st.floats(-1, 2))
+def test_positions_outside_are_moved_to_the_nearest_bound(a, b):
+    parameters = of({"gain_db": (-10, 10), "white matter.mu0": (0.1, 0.5)})
+    tissues, display = parameters.apply(np.array([a, b]), TISSUES, DISPLAY)
+    assert -10 <= display.gain_db <= 10 and 0.1 <= tissues[3].mu0 <= 0.5
+
+
+def test_other_parameters_stay_as_they_are():
+    tissues, display = of(["white matter.mu0"]).apply(np.array([0.5]), TISSUES, DISPLAY)
+    assert display == DISPLAY and tissues[2] == TISSUES[2] and tissues.membrane == TISSUES.membrane
+    assert tissues[3].sigma0 == TISSUES[3].sigma0 and tissues[3].mu0 != TISSUES[3].mu0
+
+
+def test_no_noise_starts_at_the_lowest_level():
+    parameters = of(["noise_db"])
+    assert parameters.units(TISSUES, DisplaySettings(noise_db=None)).tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    "free, message",
+    [
+        ([], "no free parameter"),
+        (["brightness"], "no free parameter 'brightness', expected display, gain_db"),
+        (["white matter.speed_of_sound_m_s"], "no free parameter 'white matter.speed_of_sound_m_s'"),
+        (["liver.mu0"], "no free parameter 'liver.mu0'"),
+        ({"gain_db": (3, -3)}, "bounds of gain_db are 3.0 to -3.0, expected two numbers, the smaller one first"),
+        ({"gain_db": (0, 0)}, "the smaller one first"),
+        ({"gain_db": (0, float("nan"))}, "the smaller one first"),
+        ({"gain_db": 5}, "bounds of gain_db are 5, expected two numbers"),
+        ({"gain_db": ("a", "b")}, "expected two numbers"),
+        ({"dynamic_range_db": (-5, 60)}, "dynamic_range_db is -5.0"),
+        ({"white matter.mu1": (-30, 0)}, "mu1 is -30.0"),
+    ],
+)
+def test_what_is_no_parameter_or_no_range_is_refused_in_one_line(free, message):
+    with pytest.raises(SimulationError) as caught:
+        of(free)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
