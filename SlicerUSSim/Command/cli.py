@@ -459,7 +459,8 @@ def optimize(
     click.echo(f"cost {result.cost_before:.4f} -> {result.cost_after:.4f} ({result.evaluations} evaluations)")
     for parameter in result.parameters:
         spread = result.identifiability[parameter.name]
-        note = "" if spread.is_determined else f"  not determined: {spread.low:.3g} to {spread.high:.3g} fit as well"
+        note = f"  not determined: {spread.low:.3g} to {spread.high:.3g} fit as well"
+        note = note if spread.is_determined is False else ""
         before, after = result.before[parameter.name], result.after[parameter.name]
         click.echo(f"{parameter.name:42s} {before:8.3f} -> {after:8.3f}{note}")
     click.echo("wrote " + ", ".join(map(str, filter(None, (out, report, save_preset, save_transform, state)))))

@@ -54,11 +54,15 @@ class Spread:
     mean: float
     standard_deviation: float
     tolerance: float
+    #: Whether a search from elsewhere found the same cost, without which agreement means nothing
+    was_tested: bool
 
     @property
-    def is_determined(self) -> bool:
-        """Whether the equally good solutions agree within the tolerance."""
-        return self.high - self.low <= 2.0 * self.tolerance
+    def is_determined(self) -> bool | None:
+        """Whether the equally good solutions agree within the tolerance; None if nothing else was found to compare."""
+        if self.high - self.low > 2.0 * self.tolerance:
+            return False
+        return True if self.was_tested else None
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,7 @@ class Identifiability:
         restarts: int,
         cost_tolerance: float,
     ) -> Identifiability:
-        """From the best solution, equally good ones met on the way, and those that restarts found."""
+        """From the best solution, equally good ones met or drawn, and those that restarts found."""
         at_best = state_of(best)
         met, found = [state_of(units) for units in as_good], [state_of(units) for units in again]
         spreads = []
@@ -103,6 +107,7 @@ class Identifiability:
                     float(restarted.mean()) if has_restarts else float("nan"),
                     float(restarted.std(ddof=1)) if has_restarts else float("nan"),
                     quantity.tolerance,
+                    has_restarts,
                 )
             )
         return cls(tuple(spreads), len(met) + len(found), len(found), restarts, cost_tolerance)
@@ -122,6 +127,37 @@ class Identifiability:
             "restarts": self.restarts,
             "cost_tolerance": self.cost_tolerance,
         }
+
+
+def equal_variance_draws(
+    parameters: FreeParameters, best: np.ndarray, tissues: TissueTable, display: DisplaySettings, random, count: int
+) -> list[np.ndarray]:
+    """Positions with the Var of every tissue as at `best` and its mu0, sigma0 and mu1 drawn anew within the bounds."""
+    groups: dict[str, dict[str, int]] = {}
+    for place, parameter in enumerate(parameters):
+        if parameter.tissue is not None and parameter.attribute in ("mu0", "mu1", "sigma0"):
+            groups.setdefault(parameter.tissue, {})[parameter.attribute] = place
+    draws = []
+    for name, places in groups.items():
+        if len(places) < 2:
+            continue
+        wanted = variance_db(_named(parameters.apply(best, tissues, display)[0], name))
+        for _ in range(20 * count):
+            units = np.array(best)
+            units[list(places.values())] = random.random(len(places))
+            amplitudes = [place for attribute, place in places.items() if attribute != "mu1"]
+            for _ in range(3):  # amplitudes are logarithmic: a shift of all of them is a factor
+                tissue = _named(parameters.apply(units, tissues, display)[0], name)
+                factor = 10.0 ** ((wanted - variance_db(tissue)) / 20.0)
+                for place in amplitudes:
+                    parameter = parameters[place]
+                    units[place] = parameter.unit(parameter.value(units[place]) * factor)
+            tissue = _named(parameters.apply(units, tissues, display)[0], name)
+            if abs(variance_db(tissue) - wanted) < 0.05:
+                draws.append(units)
+            if len(draws) >= count:
+                break
+    return draws[:count]
 
 
 def variance_db(tissue: Tissue) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.appearance import AppearanceModel
 from SlicerUSSim.Logic.errors import require, require_between
-from SlicerUSSim.Logic.identifiability import Identifiability, quantities_of
+from SlicerUSSim.Logic.identifiability import Identifiability, equal_variance_draws, quantities_of
 from SlicerUSSim.Logic.parameters import Bounds, FreeParameters
 from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
@@ -27,12 +27,14 @@ from SlicerUSSim.Logic.similarity import PatchComparison, Similarity, Similarity
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import TissueTable
 
-#: The search for the best, stage by stage; afterwards come "redraw n" and "restart n".
+#: The search for the best, stage by stage; afterwards come "redraw n", "restart n" and "draw".
 STAGES = ("global", "local", "polish")
 #: Shares of the evaluations of the first two; the rest is for the search after the anchor has moved.
 _SHARES = (0.6, 0.25)
 #: Standard deviation of the starts of restarts around the best, between 0 and 1 across the bounds.
 _RESTART_SPREAD = 0.15
+#: Solutions drawn with the same variance of the scatterers, which should fit as well.
+_DRAWS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +199,7 @@ def optimize_appearance(
     problem = _fingerprint(
         parameters, probe, poses, references, masks, grid, tissues, display, settings, simulator, seed
     )
-    limit = max_evaluations + restarts * int(_SHARES[1] * max_evaluations)
+    limit = max_evaluations + restarts * (int(_SHARES[1] * max_evaluations) + 1) + _DRAWS
 
     def describe(units: np.ndarray) -> dict[str, float]:
         return dict(zip(parameters.names, parameters.values(units).tolist(), strict=True))
@@ -279,6 +281,10 @@ def _identifiability(
         simulator.settings = settings
     # How much the cost changes from one draw of the speckle to the next: less cannot tell two fits apart.
     tolerance = max(float(np.std(costs_of_best)), 0.01 * best_cost)
+    cost.model.anchor(parameters.apply(best, cost.tissues, cost.display)[0])
+    for units in equal_variance_draws(parameters, best, cost.tissues, cost.display, random, _DRAWS):
+        search.evaluate("draw", units)
+    met += [entry for entry in search.history if entry.stage == "draw"]
     as_good = [entry.units for entry in met if entry.cost <= best_cost + tolerance]
     again = [units for units, excess in found if excess <= tolerance]
 

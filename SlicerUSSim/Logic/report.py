@@ -129,7 +129,9 @@ def _combination_row(spread: Spread) -> str:
 
 def _spread_cells(spread: Spread) -> str:
     restarts = "–" if np.isnan(spread.mean) else f"{spread.mean:.3f} ± {spread.standard_deviation:.3f}"
-    answer = '<td class="yes">yes</td>' if spread.is_determined else '<td class="no">no</td>'
+    answer = {True: '<td class="yes">yes</td>', False: '<td class="no">no</td>', None: "<td>?</td>"}[
+        spread.is_determined
+    ]
     return f"<td>{spread.low:.3f} to {spread.high:.3f}</td><td>{restarts}</td>{answer}"
 
 

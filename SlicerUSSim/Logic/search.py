@@ -89,6 +89,9 @@ class Search:
         failure: list[BaseException] = []
 
         def evaluate(units: np.ndarray, _gradient) -> float:
+            if len(self.history) - first >= budget:  # some algorithms take a few more than they are allowed
+                weak().force_stop()
+                return float("inf")
             try:
                 return self.evaluate(stage, units)
             except BaseException as error:  # through nlopt's C++, which would lose what kind it was

@@ -31,6 +31,7 @@ _OFFSET_MM = 0.5
 #: for white matter, and for CSF by so little that sulci and the midline of one voxel stay.
 _MISTAKES = ((TISSUE, 1.0, 0.15), ("csf", 0.6, 0.08))
 _PRESSED_MM = 3.0
+_TILT_DEG = 24.0
 #: Places tried for a good window, and how deep it reaches.
 _PLACES, _WINDOW_MM = 8, 15.0
 
@@ -66,12 +67,14 @@ def make_twin(
     *,
     probe: Probe = TWIN_PROBE,
     frames: int = 3,
+    crossing: bool = False,
     display: DisplaySettings | None = None,
     display_is_known: bool = False,
     device: str | Device | None = None,
 ) -> Twin:
     """Patient number `seed` on true `labels` (1 is CSF), seen in `frames` images of a tilted probe.
 
+    With `crossing` come as many again of the probe turned by 90 degrees about its axis.
     `display` is where the optimisation starts; with `display_is_known` the references have it too.
     """
     random = np.random.default_rng(1000 + seed)
@@ -80,6 +83,9 @@ def make_twin(
     own_display = _own_display(random, display)
     true_display = display if display_is_known else own_display
     poses = _own_view(random, labels, probe, frames)
+    if crossing:
+        turned = poses[frames // 2] @ np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
+        poses += tilt_sweep(turned, _TILT_DEG, frames)
     real = UltrasoundSimulator(labels, true_tissues, SimulationSettings(seed=50_000 + seed), device)
     references = [frame.image for frame in real.sweep(probe, poses, true_display)]
     mistaken = mistaken_labels(labels, tissues, random)
@@ -115,7 +121,7 @@ def _own_view(random: np.random.Generator, labels: Volume, probe: Probe, frames:
         target = pose @ [random.uniform(-4.0, 4.0), 0.5 * probe.depth_mm, random.uniform(-12.0, 12.0), 1.0]
         outward = -pose[:3, 1]
         face = surface_point(labels, target[:3], outward) - _PRESSED_MM * outward
-        poses = tilt_sweep(pose_looking_at(face, target[:3], lateral_ras=pose[:3, 0]), 24.0, frames)
+        poses = tilt_sweep(pose_looking_at(face, target[:3], lateral_ras=pose[:3, 0]), _TILT_DEG, frames)
         blocked = float(np.mean([_fluid_before(labels, pose, probe) for pose in poses]))
         if best is None or blocked < best[0]:
             best = blocked, poses
