@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from SlicerUSSim.Logic.errors import SimulationError, collected_warnings, require
+from SlicerUSSim.Logic.fitting import Fit, fit
 from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.placement import craniotomy_pose, pose_in_slice
 from SlicerUSSim.Logic.preset import Preset
 from SlicerUSSim.Logic.reuse import ReusedSimulator
+from SlicerUSSim.Logic.scene_fit import CostPlot, tracked_images, write_compared
 from SlicerUSSim.Logic.scene_live import LiveUpdate
 from SlicerUSSim.Logic.scene_nodes import (
     LabelledTissues,
@@ -31,6 +34,7 @@ from SlicerUSSim.Logic.scene_nodes import (
     write_outline,
 )
 from SlicerUSSim.Logic.scene_parameters import SceneParameters
+from SlicerUSSim.Logic.search import Progress
 from SlicerUSSim.Logic.segmentation import Segmentation, segment_mri
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.texture import Texture
@@ -211,6 +215,83 @@ class UltrasoundSceneLogic:
         require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
         show_in_slice(slice_node, output_node, probe_pose(probe_transform_node), self.preset.probe, fit)
+
+    # ---- fit to real ultrasound --------------------------------------------------------------------------------
+
+    def optimize(
+        self,
+        labels_node,
+        images_node,
+        *,
+        probe_transform_node=None,
+        frames: Sequence[int] | None = None,
+        free: Iterable[str] | Mapping[str, tuple[float, float] | None] = ("display", "white matter"),
+        register: bool = False,
+        estimate_geometry: bool = False,
+        max_evaluations: int = 500,
+        restarts: int = 2,
+        plot: bool = True,
+        progress: Callable[[Progress], None] | None = None,
+    ) -> Fit:
+        """Fit display and tissue parameters, and with `register` the poses, to real images; see fitting.fit.
+
+        `images_node` is a sequence of images with its browser's transforms, a volume of one slice, or a 3D ultrasound
+        volume, cut where the probe is. `frames` are numbers of images (default: all). The cost is drawn as plot nodes,
+        live. Nothing else in the scene changes: applyFit takes the result over. `progress` may raise errors.Cancelled.
+        """
+        labelled = self._read_labels(labels_node)
+        preset = self.preset
+        pose = None if probe_transform_node is None else probe_pose(probe_transform_node)
+        tracked = tracked_images(
+            images_node, frames, preset.probe, probe_to_world=pose, estimate_geometry=estimate_geometry
+        )
+        poses = [pose_in_labels(labels_node, pose) for pose in tracked.poses]
+        tracked = replace(tracked, poses=[pose for pose, _ in poses])
+        simulator = self._simulator_for(labels_node, labelled, poses[0][1])
+        cost_plot = CostPlot(self.scene) if plot else None
+
+        def told(step: Progress) -> None:
+            if cost_plot is not None:
+                cost_plot.add(step)
+            if progress is not None:
+                progress(step)
+
+        try:
+            return fit(
+                simulator, tracked, free=free, display=preset.display, register=register, restarts=restarts,
+                max_evaluations=max_evaluations, progress=told,
+            )  # fmt: skip
+        finally:
+            if cost_plot is not None:
+                cost_plot.draw()
+
+    def applyFit(self, found: Fit) -> Preset:
+        """Take probe, display and tissues of a fit into the preset; returns the preset that was, to revert to."""
+        before = self.preset
+        tissues = before.tissues
+        for name in found.appearance.parameters.varied():
+            fitted = next(tissue for tissue in found.appearance.tissues.all_tissues() if tissue.name == name)
+            tissues = tissues.with_tissue(fitted)
+        self.preset = replace(before, probe=found.tracked.probe, display=found.appearance.display, tissues=tissues)
+        return before
+
+    def writeRegistration(self, found: Fit, labels_node, transform_node) -> None:
+        """Put what registration moved the ultrasound by into a linear transform: the last parent of its tracking."""
+        require_node(transform_node, "vtkMRMLLinearTransformNode", use="registration")
+        require(found.registration is not None, "the fit was made without registration")
+        to_world = self._fit_to_world(labels_node)
+        set_node_to_world(transform_node, to_world @ found.registration.correction @ np.linalg.inv(to_world))
+
+    def showFit(self, found: Fit, labels_node, nodes: Mapping[str, object], number: int | None = None) -> None:
+        """Put one image of a fit, the first by default, into volume nodes: {"real": ..., "before": ..., "after": ...,
+        "difference": ...}, any of them."""
+        number = found.tracked.numbers[0] if number is None else number
+        write_compared(dict(nodes), found, number, self._fit_to_world(labels_node))
+
+    def _fit_to_world(self, labels_node) -> np.ndarray:
+        """(4, 4) from the frame that poses of a fit are in, that of the labels unless they scale."""
+        in_labels, _ = pose_in_labels(labels_node, np.eye(4))
+        return np.linalg.inv(in_labels)
 
     # ---- live --------------------------------------------------------------------------------------------------
 

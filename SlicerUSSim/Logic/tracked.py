@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -44,6 +44,7 @@ class TrackedImages:
         path: str = "ImageToReference",
         reference_to_ras: np.ndarray | None = None,
         probe: Probe | None = None,
+        beam: Probe | None = None,
     ) -> TrackedImages:
         """The images of a sequence as a simulator would see them.
 
@@ -70,7 +71,7 @@ class TrackedImages:
         for number, image in zip(kept, images, strict=True):
             require(int(image.max()) > 0, f"image {number} of the sequence is black")
         spacing = _pixel_spacing(matrices[0], path)
-        fan = _fan(sequence, images, spacing, probe)
+        fan = _fan(sequence, images, spacing, probe, beam)
         to_ras = np.eye(4) if reference_to_ras is None else check_rigid("reference_to_ras", reference_to_ras)
         poses = [to_ras @ _probe_pose(matrix, fan, path) for matrix in matrices]
         rows, columns = (np.flatnonzero(fan.mask.any(axis=axis)) for axis in (1, 0))
@@ -104,9 +105,17 @@ def _pixel_spacing(image_to_world: np.ndarray, path: str) -> tuple[float, float]
     return size
 
 
-def _fan(sequence: TrackedSequence, images: np.ndarray, spacing: tuple[float, float], probe: Probe | None) -> Fan:
+def _fan(
+    sequence: TrackedSequence,
+    images: np.ndarray,
+    spacing: tuple[float, float],
+    probe: Probe | None,
+    beam: Probe | None,
+) -> Fan:
     if probe is None:
-        return estimate_fan(images, spacing)
+        shared = {field.name for field in fields(Probe)}
+        known = {} if beam is None else {name: v for name, v in beam.to_dict().items() if name in shared}
+        return estimate_fan(images, spacing, **known)
     if all("ImageToProbe" in entry for entry in sequence.transforms):
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
         # In this package's probe frame it is upright and lies in the plane; a tracker's marker is anywhere.

@@ -1,0 +1,249 @@
+"""Fitting in a MRML scene: tracked sequences, single images and volumes as nodes; plot, result, images to compare."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+slicer = pytest.importorskip("slicer", reason="Slicer's MRML libraries: pip install '.[slicer]'")
+
+from vtkmodules.util.numpy_support import vtk_to_numpy  # noqa: E402
+
+from SlicerUSSim.Logic import PhasedProbe, Preset, SimulationError, TissueTable, Volume, segment_mri  # noqa: E402
+from SlicerUSSim.Logic.errors import Cancelled  # noqa: E402
+from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
+from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.scene_nodes import (  # noqa: E402
+    ijk_to_ras,
+    node_to_world,
+    nodes_of_class,
+    read_volume,
+    write_labels,
+    write_volume,
+)
+from SlicerUSSim.Logic.twins import make_twin  # noqa: E402
+from SlicerUSSim.Logic.vtk_data import vtk_matrix  # noqa: E402
+
+PROBE = PhasedProbe(70.0, 50.0, scan_lines=80)
+
+
+@pytest.fixture(scope="module")
+def brain():
+    segmentation = segment_mri(head_mri(2.0))
+    return segmentation, make_twin(
+        segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=PROBE, frames=3
+    )
+
+
+class Scene:
+    """A patient with a tracked sequence: image under ImageToProbe (fixed) under ProbeToReference (recorded)."""
+
+    def __init__(self, brain, moved: np.ndarray | None = None) -> None:
+        segmentation, twin = brain
+        self.twin = twin
+        self.scene = scene = slicer.vtkMRMLScene()
+        self.sequences = slicer.vtkSlicerSequencesLogic()  # which also registers the browser's class
+        self.sequences.SetMRMLScene(scene)
+        self.logic = UltrasoundSceneLogic(scene)
+        self.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "Tissues")
+        mri = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "MRI")
+        write_volume(mri, head_mri(4.0))
+        write_labels(self.labels, twin.simulator.medium.labels, segmentation.tissue_names, mri)
+        self.logic.preset = Preset(
+            probe=PROBE, display=twin.display, settings=twin.simulator.settings, tissues=twin.simulator.medium.tissues
+        )
+        tracked = twin.sequence()
+        self.calibration = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "ImageToProbe")
+        self.calibration.SetMatrixTransformToParent(vtk_matrix(tracked.transforms[0]["ImageToProbe"]))
+        self.images = scene.AddNewNodeByClass("vtkMRMLSequenceNode", "Images")
+        self.poses = scene.AddNewNodeByClass("vtkMRMLSequenceNode", "ProbeToReference")
+        for number, image in enumerate(tracked.images):
+            item = slicer.vtkMRMLScalarVolumeNode()
+            write_volume(item, Volume(image[None], np.eye(4)))
+            self.images.SetDataNodeAtValue(item, f"{0.5 * number}")
+            pose = slicer.vtkMRMLLinearTransformNode()
+            pose.SetMatrixTransformToParent(vtk_matrix(tracked.transforms[number]["ProbeToReference"]))
+            self.poses.SetDataNodeAtValue(pose, f"{0.5 * number}")
+        self.browser = scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", "Sweep")
+        self.browser.SetAndObserveMasterSequenceNodeID(self.images.GetID())
+        self.browser.AddSynchronizedSequenceNodeID(self.poses.GetID())
+        shown = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Image")
+        probe = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "ProbeToReference now")
+        self.browser.AddProxyNode(shown, self.images, False)
+        self.browser.AddProxyNode(probe, self.poses, False)
+        shown.SetAndObserveTransformNodeID(self.calibration.GetID())
+        self.calibration.SetAndObserveTransformNodeID(probe.GetID())
+
+    def optimize(self, images=None, **options):
+        options = {"max_evaluations": 60, "restarts": 0, "free": ["display"], **options}
+        return self.logic.optimize(self.labels, images or self.images, **options)
+
+    def volume(self, name: str):
+        return self.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
+
+
+@pytest.fixture(scope="module")
+def scene(brain):
+    return Scene(brain)
+
+
+@pytest.fixture(scope="module")
+def found(scene):
+    return scene.optimize()
+
+
+def test_a_tracked_sequence_is_fitted_where_its_transforms_say(scene, found):
+    assert found.tracked.numbers == [0, 1, 2]
+    for pose, expected in zip(found.tracked.poses, scene.twin.poses, strict=True):
+        assert np.allclose(pose[:3, 3], expected[:3, 3], atol=0.5)  # to a pixel or two: the face is found in the image
+        assert np.allclose(pose[:3, :3], expected[:3, :3], atol=1e-5)
+    assert found.appearance.cost_after < found.appearance.cost_before
+
+
+def test_frames_are_chosen_by_number(scene):
+    assert scene.optimize(frames=[2], max_evaluations=10).tracked.numbers == [2]
+    with pytest.raises(SimulationError, match="image 9 does not exist, expected 0 to 2"):
+        scene.optimize(frames=[9])
+
+
+def test_cost_is_plotted_in_the_scene(scene, found):
+    (chart,) = nodes_of_class(scene.scene, "vtkMRMLPlotChartNode")
+    assert chart.GetNumberOfPlotSeriesNodes() == 2
+    table = chart.GetNthPlotSeriesNode(0).GetTableNode().GetTable()
+    scene.optimize(max_evaluations=30)  # again: the same nodes
+    assert len(nodes_of_class(scene.scene, "vtkMRMLPlotChartNode")) == 1
+    table = chart.GetNthPlotSeriesNode(0).GetTableNode().GetTable()
+    best = vtk_to_numpy(table.GetColumnByName("best"))
+    assert table.GetNumberOfRows() >= 20 and table.GetNumberOfColumns() == 3
+    assert vtk_to_numpy(table.GetColumnByName("cost")).min() == pytest.approx(best.min())
+
+
+def test_a_fit_changes_the_preset_only_when_applied_and_can_be_reverted(brain):
+    own = Scene(brain)
+    before = own.logic.preset
+    found = own.optimize(free=["gain_db", "white matter.mu0"])
+    assert own.logic.preset == before
+    was = own.logic.applyFit(found)
+    assert was == before
+    after = own.logic.preset
+    assert after.display.gain_db == found.appearance.after["gain_db"]
+    assert after.tissues[3].mu0 == found.appearance.after["white matter.mu0"]
+    assert after.tissues[2] == before.tissues[2]
+    own.logic.preset = was
+    assert own.logic.preset == before
+
+
+def test_images_to_compare_lie_where_the_real_one_does(scene, found):
+    nodes = {name: scene.volume(name) for name in ("real", "before", "after", "difference")}
+    scene.logic.showFit(found, scene.labels, nodes, 1)
+    real = read_volume(nodes["real"]).array[0]
+    assert np.array_equal(real, np.where(found.tracked.mask, found.tracked.images[1], 0))
+    assert np.array_equal(read_volume(nodes["after"]).array[0], found.after[1])
+    # A pixel of the real image is where the tracked one is.
+    whole, cropped = scene.twin.references[1], np.argwhere(real == real.max())[0]
+    at = ijk_to_ras(nodes["real"]) @ [cropped[1], cropped[0], 0, 1]
+    pose = scene.twin.sequence().pose(1, "ImageToReference")
+    pixel = np.linalg.inv(pose) @ at
+    assert whole[round(pixel[1]), round(pixel[0])] == real.max()
+    with pytest.raises(SimulationError, match="image 7 was not fitted, expected one of 0, 1, 2"):
+        scene.logic.showFit(found, scene.labels, nodes, 7)
+
+
+def test_moved_patient_and_tracking_together_change_nothing(brain, found):
+    moved = np.array([[0, -1, 0, 10], [1, 0, 0, -20], [0, 0, 1, 30], [0, 0, 0, 1.0]])
+    own = Scene(brain)
+    room = own.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Room")
+    room.SetMatrixTransformToParent(vtk_matrix(moved))
+    own.labels.SetAndObserveTransformNodeID(room.GetID())
+    own.calibration.GetParentTransformNode().SetAndObserveTransformNodeID(room.GetID())
+    again = own.optimize()
+    assert again.appearance.after == pytest.approx(found.appearance.after, abs=0.05)
+    nodes = {"real": own.volume("real")}
+    own.logic.showFit(again, own.labels, nodes, 0)
+    other = {"real": own.volume("other")}
+    still = Scene(brain)
+    other = {"real": still.volume("real")}
+    still.logic.showFit(found, still.labels, other, 0)
+    assert np.allclose(ijk_to_ras(nodes["real"]), moved @ ijk_to_ras(other["real"]), atol=1e-3)
+
+
+def test_a_single_image_is_fitted_where_it_lies(scene):
+    image = scene.volume("single")
+    tracked = scene.twin.sequence()
+    write_volume(image, Volume(tracked.images[0][None], tracked.pose(0, "ImageToReference")))
+    found = scene.optimize(image, max_evaluations=20)
+    assert np.allclose(found.tracked.poses[0][:3, 3], scene.twin.poses[0][:3, 3], atol=0.5)
+
+
+def test_a_3d_volume_is_cut_where_the_probe_is(scene):
+    volume = scene.volume("3D ultrasound")
+    simulator = scene.twin.simulator
+    write_volume(volume, simulator.volume(PROBE, scene.twin.poses, scene.twin.display, spacing_mm=1.0))
+    with pytest.raises(SimulationError, match="is a 3D volume; choose a probe transform"):
+        scene.optimize(volume)
+    probe = scene.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
+    probe.SetMatrixTransformToParent(vtk_matrix(scene.twin.poses[1]))
+    found = scene.optimize(volume, probe_transform_node=probe, max_evaluations=20)
+    assert np.allclose(found.tracked.poses[0], scene.twin.poses[1], atol=1e-6)
+
+
+def test_geometry_can_be_estimated(scene):
+    scene_preset = scene.logic.preset
+    try:
+        scene.logic.preset = replace(scene_preset, probe=replace(PROBE, depth_mm=90.0, frequency_mhz=4.0))
+        with pytest.raises(SimulationError, match="mm deep, but the probe given sees 90 mm"):
+            scene.optimize()
+        found = scene.optimize(estimate_geometry=True, max_evaluations=20)
+        assert found.tracked.probe.depth_mm == pytest.approx(50.0, abs=1.0)
+        assert found.tracked.probe.frequency_mhz == 4.0 and found.tracked.probe.scan_lines == 80
+    finally:
+        scene.logic.preset = scene_preset
+
+
+def test_registration_is_written_as_a_transform_of_the_tracking(brain):
+    own = Scene(brain)
+    away = np.eye(4)
+    away[:3, 3] = 1.5, -1.0, 2.0
+    first = own.calibration.GetParentTransformNode()
+    room = own.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "off")
+    room.SetMatrixTransformToParent(vtk_matrix(away))
+    first.SetAndObserveTransformNodeID(room.GetID())
+    found = own.optimize(register=True, max_evaluations=60)
+    registration = own.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "registration")
+    own.logic.writeRegistration(found, own.labels, registration)
+    assert np.allclose(node_to_world(registration), found.registration.correction)
+    assert found.registration.cost_after <= found.registration.cost_before
+    with pytest.raises(SimulationError, match="without registration"):
+        own.logic.writeRegistration(own.optimize(max_evaluations=5), own.labels, registration)
+
+
+def test_cancelling_leaves_the_scene_as_it_was(brain):
+    own = Scene(brain)
+    before = own.logic.preset
+
+    def stop(progress):
+        if progress.evaluations == 5:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        own.optimize(progress=stop)
+    assert own.logic.preset == before
+    assert own.optimize(max_evaluations=10).appearance.cost_before > 0
+
+
+def test_bad_nodes_are_one_clear_line(scene):
+    empty = scene.scene.AddNewNodeByClass("vtkMRMLSequenceNode", "empty")
+    transforms = scene.scene.AddNewNodeByClass("vtkMRMLSequenceNode", "transforms")
+    transforms.SetDataNodeAtValue(slicer.vtkMRMLLinearTransformNode(), "0")
+    for images, message in (
+        (None, "no real images chosen"),
+        (empty, "is empty, expected images"),
+        (transforms, "item 0 of"),
+        (scene.labels, "3D volume"),
+        (scene.volume("nothing"), "has no image data"),
+    ):
+        with pytest.raises(SimulationError) as caught:
+            scene.logic.optimize(scene.labels, images)
+        assert message in str(caught.value) and "\n" not in str(caught.value)
