@@ -119,7 +119,7 @@ def _install_missing(path: str) -> None:
 class SlicerUSSimParameterNode:
     """What a scene remembers of the module; the names are those of Logic/scene_parameters.py.
 
-    mask and labels may be label maps or segmentations, which the panel sees to.
+    mask and labels may be label maps or segmentations, real a sequence or a volume, which the panel sees to.
     """
 
     mri: vtkMRMLScalarVolumeNode
@@ -128,12 +128,18 @@ class SlicerUSSimParameterNode:
     probe_transform: vtkMRMLLinearTransformNode
     output: vtkMRMLScalarVolumeNode
     outline: vtkMRMLModelNode
+    real: vtkMRMLNode
     contrast: Annotated[str, Choice(["t1", "t1gd", "t2", "flair"])] = "t1"
     classes: Annotated[int, WithinRange(3, 4)] = 3
     thin_sulci: bool = True
     bias_correction: bool = False
     show_in_slice: bool = True
     preset: str = ""
+    fit_frames: str = ""
+    fit_free: str = "display, white matter"
+    fit_estimate: bool = False
+    fit_register: bool = False
+    fit_evaluations: int = 500
 
 
 class SlicerUSSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):

@@ -15,6 +15,7 @@ from SlicerUSSim.Logic import PhasedProbe, Preset, SimulationError, TissueTable,
 from SlicerUSSim.Logic.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.scene_fit import CostPlot  # noqa: E402
 from SlicerUSSim.Logic.scene_nodes import (  # noqa: E402
     ijk_to_ras,
     node_to_world,
@@ -91,7 +92,7 @@ def scene(brain):
 
 @pytest.fixture(scope="module")
 def found(scene):
-    return scene.optimize()
+    return scene.optimize(plot=CostPlot(scene.scene))
 
 
 def test_a_tracked_sequence_is_fitted_where_its_transforms_say(scene, found):
@@ -112,7 +113,7 @@ def test_cost_is_plotted_in_the_scene(scene, found):
     (chart,) = nodes_of_class(scene.scene, "vtkMRMLPlotChartNode")
     assert chart.GetNumberOfPlotSeriesNodes() == 2
     table = chart.GetNthPlotSeriesNode(0).GetTableNode().GetTable()
-    scene.optimize(max_evaluations=30)  # again: the same nodes
+    scene.optimize(max_evaluations=30, plot=CostPlot(scene.scene))  # again: the same nodes
     assert len(nodes_of_class(scene.scene, "vtkMRMLPlotChartNode")) == 1
     table = chart.GetNthPlotSeriesNode(0).GetTableNode().GetTable()
     best = vtk_to_numpy(table.GetColumnByName("best"))

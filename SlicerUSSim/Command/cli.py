@@ -324,6 +324,7 @@ def _read_sequence(sequence_file, calibration):
 
 def _tracked(sequence, frames, path, to_mri, probe):
     from SlicerUSSim.Logic.pose import read_tags, read_transform, rigid_between
+    from SlicerUSSim.Logic.sequence import frame_numbers
     from SlicerUSSim.Logic.tracked import TrackedImages
 
     to_ras = None
@@ -335,24 +336,8 @@ def _tracked(sequence, frames, path, to_mri, probe):
         click.echo(f"{len(in_mri)} landmarks agree to {left:.2f} mm (root mean square)")
     elif to_mri:
         to_ras = read_transform(to_mri)
-    numbers = None if frames is None else _frame_numbers(frames, len(sequence))
+    numbers = None if frames is None else frame_numbers(frames, len(sequence))
     return TrackedImages.of(sequence, numbers, path=path, reference_to_ras=to_ras, probe=probe)
-
-
-def _frame_numbers(text: str, count: int) -> list[int]:
-    """0,5,10 or from:to:step as in Python, or both."""
-    numbers: list[int] = []
-    for part in text.split(","):
-        try:
-            ends = [int(end) if end.strip() else None for end in part.split(":")]
-            if not 1 <= len(ends) <= 3 or (len(ends) == 1 and ends[0] is None) or (len(ends) == 3 and ends[2] == 0):
-                raise ValueError
-        except ValueError:
-            raise SimulationError(f"--frames is {text!r}, expected such as 0,5,10 or 0:20:5") from None
-        numbers += [ends[0]] if len(ends) == 1 else list(range(count))[slice(*ends)]
-    if not numbers:
-        raise SimulationError(f"--frames {text} chooses none of the {count} images, expected at least one")
-    return numbers
 
 
 @main.command()

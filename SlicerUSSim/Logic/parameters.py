@@ -145,6 +145,12 @@ class FreeParameters(tuple):
         return tissues, display
 
 
+def all_names(tissues: TissueTable) -> list[str]:
+    """Everything that can be free: the display's, then those of every tissue that scatters."""
+    scattering = dict.fromkeys(t.name for t in tissues.all_tissues() if t.scatterer_variance > 0.0)
+    return [*DISPLAY_BOUNDS, *(f"{tissue}.{attribute}" for tissue in scattering for attribute in TISSUE_BOUNDS)]
+
+
 def _meant_by(name: str, tissues: TissueTable) -> list[tuple[str, Bounds]]:
     """(full name, default bounds) of every parameter that `name` stands for."""
     known = list(dict.fromkeys(tissue.name for tissue in tissues.all_tissues()))

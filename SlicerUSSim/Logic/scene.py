@@ -230,14 +230,14 @@ class UltrasoundSceneLogic:
         estimate_geometry: bool = False,
         max_evaluations: int = 500,
         restarts: int = 2,
-        plot: bool = True,
+        plot: CostPlot | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> Fit:
         """Fit display and tissue parameters, and with `register` the poses, to real images; see fitting.fit.
 
         `images_node` is a sequence of images with its browser's transforms, a volume of one slice, or a 3D ultrasound
-        volume, cut where the probe is. `frames` are numbers of images (default: all). The cost is drawn as plot nodes,
-        live. Nothing else in the scene changes: applyFit takes the result over. `progress` may raise errors.Cancelled.
+        volume, cut where the probe is. `frames` are numbers of images (default: all). `plot` draws the cost, live.
+        Nothing else in the scene changes: applyFit takes the result over. `progress` may raise errors.Cancelled.
         """
         labelled = self._read_labels(labels_node)
         preset = self.preset
@@ -248,11 +248,10 @@ class UltrasoundSceneLogic:
         poses = [pose_in_labels(labels_node, pose) for pose in tracked.poses]
         tracked = replace(tracked, poses=[pose for pose, _ in poses])
         simulator = self._simulator_for(labels_node, labelled, poses[0][1])
-        cost_plot = CostPlot(self.scene) if plot else None
 
         def told(step: Progress) -> None:
-            if cost_plot is not None:
-                cost_plot.add(step)
+            if plot is not None:
+                plot.add(step)
             if progress is not None:
                 progress(step)
 
@@ -262,8 +261,8 @@ class UltrasoundSceneLogic:
                 max_evaluations=max_evaluations, progress=told,
             )  # fmt: skip
         finally:
-            if cost_plot is not None:
-                cost_plot.draw()
+            if plot is not None:
+                plot.draw()
 
     def applyFit(self, found: Fit) -> Preset:
         """Take probe, display and tissues of a fit into the preset; returns the preset that was, to revert to."""
@@ -287,6 +286,12 @@ class UltrasoundSceneLogic:
         "difference": ...}, any of them."""
         number = found.tracked.numbers[0] if number is None else number
         write_compared(dict(nodes), found, number, self._fit_to_world(labels_node))
+
+    def showFitInSlice(self, slice_node, found: Fit, labels_node, shown_node, real_node, number: int) -> None:
+        """Turn a slice view into the plane of an image of a fit: `shown_node` before `real_node`, to fade between."""
+        require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
+        pose = self._fit_to_world(labels_node) @ found.tracked.poses[found.tracked.numbers.index(number)]
+        show_in_slice(slice_node, shown_node, pose, found.tracked.probe, fit=True, behind=real_node)
 
     def _fit_to_world(self, labels_node) -> np.ndarray:
         """(4, 4) from the frame that poses of a fit are in, that of the labels unless they scale."""

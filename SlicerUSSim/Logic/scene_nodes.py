@@ -377,10 +377,10 @@ def write_outline(model_node, probe: Probe, transform_node) -> None:
         display.SetSliceDisplayModeToProjection()
 
 
-def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Probe, fit: bool) -> None:
+def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Probe, fit: bool, behind=None) -> None:
     """Turn a slice view into the plane of the probe, standing as on a scanner, and lay the image over its background.
 
-    `fit` also makes the imaged field fill the view.
+    `fit` also makes the imaged field fill the view; `behind` is another volume to put into the background.
     """
     left, right, top, bottom = probe.image_bounds_mm()
     view = probe_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])  # a view's second axis goes up, the probe's goes down
@@ -391,8 +391,17 @@ def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Pr
         scale = max((right - left) / width, (bottom - top) / height) * 1.05
         slice_node.SetFieldOfView(width * scale, height * scale, thickness)
     slice_node.UpdateMatrices()
-    for composite in nodes_of_class(slice_node.GetScene(), "vtkMRMLSliceCompositeNode"):
-        is_its = composite.GetLayoutName() == slice_node.GetLayoutName()
-        if is_its and composite.GetForegroundVolumeID() != volume_node.GetID():
-            composite.SetForegroundVolumeID(volume_node.GetID())
-            composite.SetForegroundOpacity(1.0)
+    composite = composite_of(slice_node)
+    if composite is None:
+        return
+    if behind is not None:
+        composite.SetBackgroundVolumeID(behind.GetID())
+    if composite.GetForegroundVolumeID() != volume_node.GetID():
+        composite.SetForegroundVolumeID(volume_node.GetID())
+        composite.SetForegroundOpacity(1.0)
+
+
+def composite_of(slice_node):
+    """The vtkMRMLSliceCompositeNode that says what a slice view shows, or None."""
+    composites = nodes_of_class(slice_node.GetScene(), "vtkMRMLSliceCompositeNode")
+    return next((node for node in composites if node.GetLayoutName() == slice_node.GetLayoutName()), None)

@@ -18,8 +18,10 @@ NODE_PARAMETERS: dict[str, tuple[str, ...]] = {
     "probe_transform": ("vtkMRMLLinearTransformNode",),
     "output": ("vtkMRMLScalarVolumeNode",),
     "outline": ("vtkMRMLModelNode",),
+    "real": ("vtkMRMLSequenceNode", "vtkMRMLScalarVolumeNode"),
 }
-#: Values with their defaults; "preset" is the JSON text of a Preset, empty for the default.
+#: Values with their defaults; "preset" is the JSON text of a Preset, empty for the default; fit_frames are numbers of
+#: images as sequence.frame_numbers reads them, empty for all; fit_free names of parameters.py, with commas between.
 VALUE_PARAMETERS: dict[str, str | bool | int] = {
     "contrast": "t1",
     "classes": 3,
@@ -27,6 +29,11 @@ VALUE_PARAMETERS: dict[str, str | bool | int] = {
     "bias_correction": False,
     "show_in_slice": True,
     "preset": "",
+    "fit_frames": "",
+    "fit_free": "display, white matter",
+    "fit_estimate": False,
+    "fit_register": False,
+    "fit_evaluations": 500,
 }
 
 

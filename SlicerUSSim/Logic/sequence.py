@@ -242,6 +242,24 @@ def require_sequence_name(path: Path) -> None:
     )
 
 
+def frame_numbers(text: str, count: int) -> list[int]:
+    """Numbers of images from text: 0,5,10, or from:to:step as in Python, or both.
+
+    Raises SimulationError for text that is neither and for a choice of none of `count` images.
+    """
+    numbers: list[int] = []
+    for part in text.split(","):
+        try:
+            ends = [int(end) if end.strip() else None for end in part.split(":")]
+            if not 1 <= len(ends) <= 3 or ends == [None] or (len(ends) == 3 and ends[2] == 0):
+                raise ValueError
+        except ValueError:
+            raise SimulationError(f"frames are {text!r}, expected such as 0,5,10 or 0:20:5") from None
+        numbers += [ends[0]] if len(ends) == 1 else list(range(count))[slice(*ends)]
+    require(bool(numbers), f"frames {text} choose none of the {count} images, expected at least one")
+    return numbers
+
+
 def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """{"ImageToProbe": (4, 4), ...} of the <CoordinateDefinitions> in a Plus configuration file (XML).
 

@@ -14,13 +14,18 @@ import slicer
 from SlicerUSSim.Logic.errors import Cancelled
 from SlicerUSSim.Logic.probe import PROBES
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
+from SlicerUSSim.Logic.scene_fit import COMPARED
 from SlicerUSSim.Logic.scene_nodes import nodes_of_class
 from SlicerUSSim.Logic.tissues import TISSUES
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter, TissueRow
 
 _CUSTOM = "custom"
 #: Property that holds a value, and signal that tells of another one, by what a widget has.
-_VALUES = (("value", "valueChanged"), ("checked", "toggled"), ("currentText", "currentTextChanged"))
+_VALUES = (
+    ("value", "valueChanged"), ("checked", "toggled"), ("currentText", "currentTextChanged"),
+    ("text", "editingFinished"),
+)  # fmt: skip
+_BLINK_MS = 500
 
 
 class Panel:
@@ -42,12 +47,17 @@ class Panel:
         self._rows: list[TissueRow] = []
         self._fields = {w.property("presetField"): w for w in vars(ui).values() if w.property("presetField")}
         self._node_selectors = {w.property("sceneNode"): w for w in vars(ui).values() if w.property("sceneNode")}
+        self._values = {w.property("sceneValue"): w for w in vars(ui).values() if w.property("sceneValue")}
 
         ui.progressWidget.setVisible(False)
         for name in (_CUSTOM, *PROBES):
             ui.probePresetComboBox.addItem(name)
         for name in TISSUES:
             ui.tissuePresetComboBox.addItem(name)
+        for name in COMPARED:
+            ui.compareComboBox.addItem(name)
+        self._show(ui.compareComboBox, "after")
+        self._blinking = False
         self._prepare_table()
         self._connect()
         self.refresh()
@@ -68,6 +78,11 @@ class Panel:
         if not self.logic.parameters.show_in_slice:
             return None
         return next((node for node in self._slice_nodes() if node.GetLayoutName() == wanted), None)
+
+    def showChart(self, chart_node) -> None:
+        plots = getattr(getattr(slicer, "modules", None), "plots", None)  # not where Slicer runs without windows
+        if plots is not None:
+            plots.logic().ShowChartInLayout(chart_node)
 
     @contextmanager
     def progress(self, title: str):
@@ -98,6 +113,8 @@ class Panel:
         for role, widget in self._node_selectors.items():
             with _silent(widget):
                 widget.setCurrentNode(getattr(self.logic.parameters, role))
+        for name, widget in self._values.items():
+            self._show(widget, getattr(self.logic.parameters, name))
         self._show(ui.probePresetComboBox, presenter.probeName() or _CUSTOM)
         self._show(ui.liveCheckBox, presenter.isLive())
         self._show_slice_names()
@@ -108,6 +125,7 @@ class Panel:
         self._enable(can, tip, ui.simulateButton)
         for widget in (ui.liveCheckBox, ui.placeButton, ui.simulateSequenceButton):
             widget.setEnabled(can)
+        self._show_fit()
 
     # ---- wiring ------------------------------------------------------------------------------------------------
 
@@ -126,6 +144,13 @@ class Panel:
                 setattr(self.logic.parameters, role, widget.currentNode())
 
             widget.currentNodeChanged.connect(chosen)
+        for name, widget in self._values.items():
+            prop, signal = _value_of(widget)
+
+            def written(*_, name=name, widget=widget, prop=prop) -> None:
+                setattr(self.logic.parameters, name, widget.property(prop))
+
+            getattr(widget, signal).connect(written)
         ui.probePresetComboBox.currentTextChanged.connect(self._probe_chosen)
         ui.sliceViewComboBox.currentTextChanged.connect(lambda *_: presenter.parametersChanged())
         ui.tissueTable.cellChanged.connect(self._tissue_changed)
@@ -135,6 +160,7 @@ class Panel:
             (ui.simulateButton, presenter.simulate),
             (ui.placeButton, self._place),
             (ui.simulateSequenceButton, self._simulate_sequence),
+            (ui.fitButton, presenter.fits.fit),
         ):
             button.clicked.connect(lambda *_, action=action: self._with_packages(action))
         ui.liveCheckBox.toggled.connect(self._live_toggled)
@@ -143,6 +169,12 @@ class Panel:
         ui.resetTissuesButton.clicked.connect(lambda *_: presenter.resetTissues())
         ui.loadPresetButton.clicked.connect(self._load_preset)
         ui.savePresetButton.clicked.connect(self._save_preset)
+        ui.applyFitButton.clicked.connect(lambda *_: presenter.fits.apply())
+        ui.revertFitButton.clicked.connect(lambda *_: presenter.fits.revert())
+        ui.freeList.itemChanged.connect(self._free_changed)
+        ui.compareComboBox.currentTextChanged.connect(self._compare)
+        ui.compareNumberComboBox.currentTextChanged.connect(self._compare)
+        ui.blinkCheckBox.toggled.connect(self._blink)
 
     def _with_packages(self, action: Callable[[], None]) -> None:
         try:
@@ -229,13 +261,59 @@ class Panel:
         if 0 <= line < len(self._rows):
             self.presenter.assignTissue(self._rows[line].name, self.ui.tissuePresetComboBox.property("currentText"))
 
+    # ---- fit to real ultrasound --------------------------------------------------------------------------------
+
+    def _show_fit(self) -> None:
+        ui, fits = self.ui, self.presenter.fits
+        can, tip = fits.canFit()
+        self._enable(can, tip, ui.fitButton)
+        ui.applyFitButton.setEnabled(fits.canApply)
+        ui.revertFitButton.setEnabled(fits.canRevert)
+        ui.fitLabel.setText(fits.summary)
+        numbers = [str(number) for number in fits.comparedNumbers()]
+        self._fill(ui.compareNumberComboBox, numbers)
+        for widget in (ui.compareComboBox, ui.compareNumberComboBox, ui.blinkCheckBox):
+            widget.setEnabled(bool(numbers))
+        free = fits.freeParameters()
+        with _silent(ui.freeList):
+            if [ui.freeList.item(n).text() for n in range(ui.freeList.property("count"))] != [name for name, _ in free]:
+                ui.freeList.clear()
+                for name, _ in free:
+                    ui.freeList.addItem(name)
+            for n, (_, on) in enumerate(free):
+                item = ui.freeList.item(n)
+                item.setFlags(qt.Qt.ItemIsUserCheckable | qt.Qt.ItemIsEnabled | qt.Qt.ItemIsSelectable)
+                item.setCheckState(qt.Qt.Checked if on else qt.Qt.Unchecked)
+
+    def _free_changed(self, item) -> None:
+        self.presenter.fits.setFree(item.text(), item.checkState() == qt.Qt.Checked)
+
+    def _compare(self, *_) -> None:
+        number = self.ui.compareNumberComboBox.property("currentText")
+        if number:
+            self.presenter.fits.compare(self.ui.compareComboBox.property("currentText"), int(number))
+
+    def _blink(self, *_) -> None:
+        if self.ui.blinkCheckBox.property("checked") and not self._blinking:
+            self._blinking = True
+            qt.QTimer.singleShot(_BLINK_MS, self._blinked)
+
+    def _blinked(self) -> None:
+        self._blinking = False
+        if self.ui.blinkCheckBox.property("checked"):
+            self.presenter.fits.blink()
+            self._blink()
+
     # ---- small things ------------------------------------------------------------------------------------------
 
     def _slice_nodes(self) -> list:
         return nodes_of_class(self.logic.scene, "vtkMRMLSliceNode")
 
     def _show_slice_names(self) -> None:
-        combo, names = self.ui.sliceViewComboBox, [node.GetLayoutName() for node in self._slice_nodes()]
+        self._fill(self.ui.sliceViewComboBox, [node.GetLayoutName() for node in self._slice_nodes()])
+
+    @staticmethod
+    def _fill(combo, names: list[str]) -> None:
         if [combo.itemText(n) for n in range(combo.property("count"))] != names:
             with _silent(combo):
                 combo.clear()

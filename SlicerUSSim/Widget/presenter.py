@@ -21,6 +21,7 @@ from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.scene_nodes import display_of, nodes_of_class
 from SlicerUSSim.Logic.tissues import TISSUES, Tissue, TissueTable, same_name
 from SlicerUSSim.Widget.fields import field_value, with_field
+from SlicerUSSim.Widget.fit_presenter import FitPresenter
 
 #: Columns of the tissue table: parameter, heading, unit.
 TISSUE_COLUMNS = (
@@ -54,6 +55,9 @@ class PanelView(Protocol):
     def sliceNode(self):
         """The vtkMRMLSliceNode of the chosen slice view, or None."""
 
+    def showChart(self, chart_node) -> None:
+        """Show a vtkMRMLPlotChartNode where plots are shown."""
+
 
 @dataclass(frozen=True)
 class TissueRow:
@@ -75,6 +79,8 @@ class PanelPresenter:
         self._busy = False
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
+        #: The part that fits simulated to real ultrasound
+        self.fits = FitPresenter(self)
 
     # ---- fields of the preset ----------------------------------------------------------------------------------
 
@@ -84,14 +90,14 @@ class PanelPresenter:
 
     def setValue(self, field: str, value) -> None:
         """The user gave a field another value."""
-        with self._shown():
+        with self.shown():
             preset = with_field(self._preset(), field, value)
             if preset != self._preset():
                 self.logic.preset = preset
 
     def chooseProbe(self, name: str) -> None:
         """Take a probe of probe.PROBES."""
-        with self._shown():
+        with self.shown():
             require(name in PROBES, f"no probe is called {name!r}, expected one of {', '.join(PROBES)}")
             self.logic.preset = replace(self._preset(), probe=PROBES[name])
         self.view.refresh()
@@ -103,13 +109,13 @@ class PanelPresenter:
 
     def loadPreset(self, path: str | os.PathLike) -> None:
         """Take everything from a JSON file, one of the `ussim` command too."""
-        with self._shown():
+        with self.shown():
             self.logic.preset = Preset.read(path)
         self.view.refresh()
 
     def savePreset(self, path: str | os.PathLike) -> None:
         """Write everything to a JSON file."""
-        with self._shown():
+        with self.shown():
             self._preset().write(path)
 
     # ---- tissues -----------------------------------------------------------------------------------------------
@@ -117,7 +123,7 @@ class PanelPresenter:
     def tissues(self) -> list[TissueRow]:
         """The tissues of the chosen labels, coupling medium first and membrane last; of the preset without labels."""
         rows: dict[str, TissueRow] = {}
-        for tissue in self._table().all_tissues():
+        for tissue in self.tissueTable().all_tissues():
             values = tuple(getattr(tissue, parameter) for parameter, _, _ in TISSUE_COLUMNS)
             sources = tuple(tissue.sources.get(parameter, "set by hand") for parameter, _, _ in TISSUE_COLUMNS)
             rows.setdefault(tissue.name, TissueRow(tissue.name, values, sources))
@@ -125,7 +131,7 @@ class PanelPresenter:
 
     def setTissue(self, name: str, parameter: str, text: str) -> None:
         """The user wrote `text` into the tissue table."""
-        with self._shown():
+        with self.shown():
             try:
                 value = float(text.strip().replace(",", "."))
             except ValueError:
@@ -135,14 +141,14 @@ class PanelPresenter:
 
     def assignTissue(self, name: str, preset: str) -> None:
         """Give the tissue `name` the numbers of the preset tissue `preset`."""
-        with self._shown():
+        with self.shown():
             require(preset in TISSUES, f"no tissue is called {preset!r}, expected one of {', '.join(TISSUES)}")
             self._change_tissue(name, lambda old: replace(TISSUES[preset], name=old.name))
         self.view.refresh()
 
     def resetTissues(self) -> None:
         """All numbers back to the presets'."""
-        with self._shown():
+        with self.shown():
             preset = self._preset()
             table = {label: TISSUES.get(tissue.name, tissue) for label, tissue in preset.tissues.items()}
             self.logic.preset = replace(preset, tissues=TissueTable(table, Preset().tissues.membrane))
@@ -169,7 +175,7 @@ class PanelPresenter:
     def segment(self) -> None:
         """Label the tissues of the MRI into the chosen label map or segmentation, or a new segmentation."""
         parameters = self.logic.parameters
-        with self._shown(), self._working("Segment") as progress:
+        with self.shown(), self.working("Segment") as progress:
             require(parameters.mri is not None, "no MRI chosen, expected a scalar volume")
             with self._made(parameters.labels, "Segmentation", f"{parameters.mri.GetName()} tissues") as labels:
                 self.logic.segment(
@@ -187,14 +193,14 @@ class PanelPresenter:
 
     def placeProbe(self, slice_node=None) -> None:
         """Put the probe on the surface in a slice view, or where a craniotomy might be; make one if there is none."""
-        with self._shown():
+        with self.shown():
             require(self.logic.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
             self._put_probe(slice_node)
         self.view.refresh()
 
     def simulate(self) -> None:
         """One image, into the chosen volume or a new one."""
-        with self._shown():
+        with self.shown():
             nodes = self._nodes()
             start = perf_counter()
             with collected_warnings() as messages:
@@ -215,7 +221,7 @@ class PanelPresenter:
         if not on:
             self.logic.stopLiveUpdate()
             return
-        with self._shown():
+        with self.shown():
             self._nodes()
             self._last_image = None
             self._followed = self._live_nodes()
@@ -229,7 +235,7 @@ class PanelPresenter:
 
     def simulateSequence(self, transforms_node, images_node) -> None:
         """Images for a recorded sequence of transforms, which the browser of that sequence then plays."""
-        with self._shown(), self._working("Simulate sequence") as progress:
+        with self.shown(), self.working("Simulate sequence") as progress:
             require(transforms_node is not None, "no sequence of transforms chosen, expected a Sequence node")
             with self._made(images_node, "Sequence", f"{transforms_node.GetName()} ultrasound") as images:
                 count = self.logic.simulateSequence(
@@ -248,7 +254,7 @@ class PanelPresenter:
         if parameters.mri is not None:
             return
         for node in nodes_of_class(self.logic.scene, "vtkMRMLScalarVolumeNode"):
-            if not node.IsA("vtkMRMLLabelMapVolumeNode") and node is not parameters.output:
+            if not node.IsA("vtkMRMLLabelMapVolumeNode") and node not in (parameters.output, parameters.real):
                 parameters.mri = node
                 return
 
@@ -267,7 +273,8 @@ class PanelPresenter:
         except SimulationError:  # a scene made by hand: simulating says what is wrong, here one can begin anew
             return Preset()
 
-    def _table(self) -> TissueTable:
+    def tissueTable(self) -> TissueTable:
+        """The tissues of the chosen labels, or of the preset."""
         labels = self.logic.parameters.labels
         try:
             return self.logic.tissues(labels) if labels is not None else self._preset().tissues
@@ -276,7 +283,7 @@ class PanelPresenter:
 
     def _change_tissue(self, name: str, change: Callable[[Tissue], Tissue]) -> None:
         """Change a tissue of the table in use; one that the preset did not have is added to it."""
-        preset, used = self._preset(), self._table()
+        preset, used = self._preset(), self.tissueTable()
         old = next((tissue for tissue in used.all_tissues() if same_name(tissue.name, name)), None)
         require(old is not None, f"no tissue is called {name!r}, expected one of {', '.join(used.names())}")
         self.logic.preset = replace(preset, tissues=preset.tissues.with_tissue(change(old)))
@@ -342,7 +349,7 @@ class PanelPresenter:
         self.view.refresh()
 
     @contextmanager
-    def _shown(self):
+    def shown(self):
         """What the user caused is shown in one line; the panel then shows what really is."""
         try:
             yield
@@ -355,7 +362,7 @@ class PanelPresenter:
             self.view.refresh()
 
     @contextmanager
-    def _working(self, title: str):
+    def working(self, title: str):
         require(not self._busy, "wait until the work under way is done")
         self._busy = True
         self.view.refresh()

@@ -1,0 +1,181 @@
+"""FitPresenter: the part of the panel that fits simulated to real ultrasound, without Qt."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.fitting import Fit
+from SlicerUSSim.Logic.parameters import FreeParameters, all_names
+from SlicerUSSim.Logic.preset import Preset
+from SlicerUSSim.Logic.scene_fit import COMPARED, CostPlot
+from SlicerUSSim.Logic.scene_nodes import composite_of, nodes_of_class, require_node
+from SlicerUSSim.Logic.search import Progress
+from SlicerUSSim.Logic.sequence import frame_numbers
+from SlicerUSSim.Logic.settings import DisplaySettings
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Widget.presenter import PanelPresenter
+
+_REGISTRATION = "Ultrasound registration"
+
+
+class FitPresenter:
+    """Chooses, runs, applies and shows fits for one PanelPresenter."""
+
+    def __init__(self, panel: PanelPresenter) -> None:
+        self._panel = panel
+        self._fit: tuple[Fit, object] | None = None  # and the labels it is of
+        self._before: Preset | None = None  # what Apply replaced
+        #: What the last fit found, for the panel
+        self.summary = ""
+
+    # ---- what is free ------------------------------------------------------------------------------------------
+
+    def freeParameters(self) -> list[tuple[str, bool]]:
+        """(name, whether it is free) of all that could be, for the tissues in use."""
+        tissues, free = self._panel.tissueTable(), set(self._free())
+        return [(name, name in free) for name in all_names(tissues)]
+
+    def setFree(self, name: str, on: bool) -> None:
+        """The user ticked a parameter, or took the tick away."""
+        names = [known for known, is_free in self.freeParameters() if (on if known == name else is_free)]
+        self._parameters.fit_free = ", ".join(names)
+
+    def _free(self) -> list[str]:
+        names = [name.strip() for name in self._parameters.fit_free.split(",") if name.strip()]
+        tissues = self._panel.tissueTable()
+        known: list[str] = []
+        for name in names:
+            try:
+                known += FreeParameters.of([name], tissues, DisplaySettings()).names
+            except SimulationError:  # a tissue that these labels do not have
+                continue
+        return list(dict.fromkeys(known))
+
+    # ---- fit ---------------------------------------------------------------------------------------------------
+
+    def canFit(self) -> tuple[bool, str]:
+        """(whether Fit can be pressed, its tool tip)"""
+        can, tip = self._panel.canSimulate()
+        if not can:
+            return False, tip
+        if self._parameters.real is None:
+            return False, "Choose real images first"
+        return True, "Change the free parameters until simulated and real images agree"
+
+    def fit(self) -> None:
+        """Fit to the chosen real images; Apply takes the result over."""
+        panel, parameters = self._panel, self._parameters
+        with panel.shown(), panel.working("Fit") as progress:
+            require(parameters.real is not None, "no real images chosen, expected a sequence or a volume")
+            free = self._free()
+            require(bool(free), "nothing is free, tick at least one parameter")
+            plot = CostPlot(panel.logic.scene)
+            panel.view.showChart(plot.chart)
+
+            def told(step: Progress) -> None:
+                panel.view.showStatus(f"{step.stage}: cost {step.best_cost:.4f}")
+                progress(step.share)
+
+            labels = parameters.labels
+            found = panel.logic.optimize(
+                labels, parameters.real, probe_transform_node=parameters.probe_transform, frames=self._frames(),
+                free=free, register=parameters.fit_register, estimate_geometry=parameters.fit_estimate,
+                max_evaluations=parameters.fit_evaluations, plot=plot, progress=told,
+            )  # fmt: skip
+            self._fit, self._before = (found, labels), None
+            self.summary = _in_words(found)
+            panel.view.showStatus("")
+            self._show("after", found.tracked.numbers[0])
+        panel.view.refresh()
+
+    def _frames(self) -> list[int] | None:
+        text, real = self._parameters.fit_frames.strip(), self._parameters.real
+        if not text or not real.IsA("vtkMRMLSequenceNode"):
+            return None
+        return frame_numbers(text, real.GetNumberOfDataNodes())
+
+    # ---- apply and revert --------------------------------------------------------------------------------------
+
+    @property
+    def canApply(self) -> bool:
+        return self._fit is not None and self._before is None
+
+    @property
+    def canRevert(self) -> bool:
+        return self._before is not None
+
+    def apply(self) -> None:
+        """Take the result into the preset; what registration found becomes a transform to put above the tracking."""
+        panel = self._panel
+        with panel.shown():
+            require(self._fit is not None, "nothing to apply, fit first")
+            found, labels = self._fit
+            before = panel.logic.applyFit(found)
+            if found.registration is not None:
+                transform = self._node("LinearTransform", _REGISTRATION)
+                panel.logic.writeRegistration(found, labels, transform)
+            self._before = before
+        panel.view.refresh()
+
+    def revert(self) -> None:
+        """Back to what was before Apply."""
+        with self._panel.shown():
+            require(self._before is not None, "nothing to revert to, apply a fit first")
+            self._panel.logic.preset, self._before = self._before, None
+        self._panel.view.refresh()
+
+    # ---- compare -----------------------------------------------------------------------------------------------
+
+    def comparedNumbers(self) -> list[int]:
+        """Numbers of the fitted images."""
+        return [] if self._fit is None else list(self._fit[0].tracked.numbers)
+
+    def compare(self, kind: str, number: int) -> None:
+        """Show one image of the fit in the slice view: one of scene_fit.COMPARED."""
+        with self._panel.shown():
+            require(self._fit is not None, "nothing to show, fit first")
+            require(kind in COMPARED, f"nothing is called {kind!r}, expected one of {', '.join(COMPARED)}")
+            self._show(kind, number)
+
+    def blink(self) -> None:
+        """Switch the slice view between the real image and the one before it."""
+        view = self._panel.view.sliceNode()
+        composite = None if view is None else composite_of(view)
+        if composite is not None:
+            composite.SetForegroundOpacity(0.0 if composite.GetForegroundOpacity() > 0.5 else 1.0)
+
+    def _show(self, kind: str, number: int) -> None:
+        found, labels = self._fit
+        logic = self._panel.logic
+        require_node(labels, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map of the fit")
+        nodes = {name: self._node("ScalarVolume", f"Fit: {name}") for name in COMPARED}
+        logic.showFit(found, labels, nodes, number)
+        view = self._panel.view.sliceNode()
+        if view is not None:
+            logic.showFitInSlice(view, found, labels, nodes[kind], nodes["real"], number)
+
+    @property
+    def _parameters(self):
+        return self._panel.logic.parameters
+
+    def _node(self, kind: str, name: str):
+        """The node of that name from an earlier fit, or a new one."""
+        scene = self._panel.logic.scene
+        known = (node for node in nodes_of_class(scene, f"vtkMRML{kind}Node") if node.GetName() == name)
+        return next(known, None) or scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
+
+
+def _in_words(found: Fit) -> str:
+    result = found.appearance
+    lines = [f"cost {result.cost_before:.3f} → {result.cost_after:.3f}, {len(found.tracked.images)} images"]
+    if found.registration is not None:
+        lines.append(f"moved by {found.registration.shift_mm:.1f} mm and {found.registration.turn_deg:.1f}°")
+    for name, value in result.after.items():
+        spread = result.identifiability[name]
+        line = f"{name}: {result.before[name]:.3g} → {value:.3g}"
+        if spread.is_determined is False:
+            line += f" (not determined: {spread.low:.3g} to {spread.high:.3g} fit as well)"
+        lines.append(line)
+    return "\n".join(lines)
