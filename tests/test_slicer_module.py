@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 import textwrap
+import time
 import typing
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -541,6 +542,113 @@ def test_choosing_other_nodes_while_live_goes_on_with_those(session):
     session.scene.RemoveNode(session.parameters.probe_transform)
     session.process()
     assert not session.logic.isLive and not session.ui.liveCheckBox.isChecked()
+
+
+# ---- fit to real ultrasound ------------------------------------------------------------------------------------------
+
+
+def with_real_image(session, gain_db: float = 9.0):
+    """A "real" image of the segmented head: brighter than simulated, other speckle, in a volume of its own."""
+    session.segmented()
+    session.ui.simulateButton.click()
+    preset = session.logic.preset
+    session.logic.preset = preset.changed("display", gain_db=gain_db).changed("settings", seed=77)
+    session.ui.simulateButton.click()
+    real = session.add("ScalarVolume", "Real")
+    module = session.logic_module("scene_nodes")
+    shown = module.read_volume(session.parameters.output)
+    volume = session.logic_module("volume").Volume
+    place = module.node_to_world(session.parameters.output) @ shown.ijk_to_ras
+    module.write_volume(real, volume(shown.array.copy(), place))
+    session.logic.preset = preset
+    session.parameters.real = real
+    session.ui.fitEvaluationsSpinBox.setValue(40)
+    for n in range(session.ui.freeList.count()):
+        item = session.ui.freeList.item(n)
+        item.setCheckState(stand_in.QtCore.Qt.Checked if item.text() == "gain_db" else stand_in.QtCore.Qt.Unchecked)
+    return session
+
+
+def test_the_panel_fits_compares_applies_and_reverts(session):
+    assert not session.ui.fitButton.isEnabled() and "Segment" in session.ui.fitButton.toolTip()
+    with_real_image(session)
+    ui = session.ui
+    assert session.parameters.fit_free == "gain_db" and session.parameters.fit_evaluations == 40
+    assert ui.fitButton.isEnabled() and not ui.applyFitButton.isEnabled()
+    before = session.logic.preset
+    ui.fitButton.click()
+    assert not session.app.errors
+    assert "cost" in ui.fitLabel.text() and "gain_db: 0" in ui.fitLabel.text()
+    assert session.logic.preset == before  # until Apply
+    # What can be compared lies in the scene, and the slice view shows it before the real image.
+    composite = session.scene.GetFirstNodeByClass("vtkMRMLSliceCompositeNode")
+    shown = session.scene.GetNodeByID(composite.GetForegroundVolumeID())
+    behind = session.scene.GetNodeByID(composite.GetBackgroundVolumeID())
+    assert (shown.GetName(), behind.GetName()) == ("Fit: after", "Fit: real")
+    after, real = (slicer.util.arrayFromVolume(node).astype(int) for node in (shown, behind))
+    assert abs(after.mean() - real.mean()) < 3
+    ui.compareComboBox.setCurrentText("before")
+    assert session.scene.GetNodeByID(composite.GetForegroundVolumeID()).GetName() == "Fit: before"
+    composite.SetForegroundOpacity(1.0)
+    session.panel.presenter.fits.blink()
+    assert composite.GetForegroundOpacity() == 0.0
+    # The cost is in the scene's plot.
+    assert session.scene.GetFirstNodeByClass("vtkMRMLPlotChartNode").GetNumberOfPlotSeriesNodes() == 2
+
+    ui.applyFitButton.click()
+    assert session.logic.preset.display.gain_db == pytest.approx(9.0, abs=1.5)
+    assert ui.gainSlider.property("value") == pytest.approx(session.logic.preset.display.gain_db)
+    assert ui.revertFitButton.isEnabled() and not ui.applyFitButton.isEnabled()
+    ui.revertFitButton.click()
+    assert session.logic.preset == before and ui.applyFitButton.isEnabled()
+    ui.compareNumberComboBox.setCurrentText("0")
+    assert not session.app.errors
+
+
+def test_blinking_goes_on_until_it_is_switched_off(session):
+    with_real_image(session).ui.fitButton.click()
+    composite = session.scene.GetFirstNodeByClass("vtkMRMLSliceCompositeNode")
+    session.ui.blinkCheckBox.setChecked(True)
+    seen = set()
+    deadline = time.monotonic() + 3.0
+    while len(seen) < 2 and time.monotonic() < deadline:
+        session.app.processEvents()
+        seen.add(composite.GetForegroundOpacity())
+    assert seen == {0.0, 1.0}
+    session.ui.blinkCheckBox.setChecked(False)
+
+
+def test_cancel_stops_a_fit_and_changes_nothing(session):
+    with_real_image(session)
+    before = session.logic.preset
+    stand_in.QtCore.QTimer.singleShot(0, session.ui.cancelButton.click)
+    session.ui.fitButton.click()
+    assert session.logic.preset == before and not session.app.errors
+    assert session.ui.fitLabel.text() == "" and session.ui.fitButton.isEnabled()
+
+
+def test_errors_of_a_fit_are_one_line(session):
+    with_real_image(session)
+    session.panel.presenter.fits.setFree("gain_db", False)
+    session.ui.fitButton.click()
+    assert session.app.errors == ["nothing is free, tick at least one parameter"]
+    session.panel.presenter.fits.setFree("noise_db", True)
+    assert session.parameters.fit_free == "noise_db"
+    images = session.add("Sequence", "images")
+    images.SetDataNodeAtValue(session.parameters.real, "0")
+    session.parameters.real = images
+    session.ui.fitFramesLineEdit.setText("7")
+    session.ui.fitFramesLineEdit.editingFinished.emit()
+    session.ui.fitButton.click()
+    assert "image 7 does not exist, expected 0 to 0" in session.app.errors[1]
+    session.ui.fitFramesLineEdit.setText("first")
+    session.ui.fitFramesLineEdit.editingFinished.emit()
+    session.ui.fitButton.click()
+    assert "frames are 'first', expected such as 0,5,10" in session.app.errors[2]
+    session.panel.presenter.fits.apply()
+    session.panel.presenter.fits.revert()
+    session.panel.presenter.fits.compare("after", 0)
+    assert len(session.app.errors) == 6 and not any("\n" in message for message in session.app.errors)
 
 
 def test_closing_the_scene_and_leaving_the_module_is_survived(session):

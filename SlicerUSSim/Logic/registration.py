@@ -23,8 +23,11 @@ from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.volume import check_rigid
 
 NAMES = ("x_mm", "y_mm", "z_mm", "about_x_deg", "about_y_deg", "about_z_deg")
-#: nlopt's names. Simplices step over the ripple that speckle gives the cost; quadratic models fall into it.
-_COARSE_ALGORITHM, _FINE_ALGORITHM = "LN_NELDERMEAD", "LN_NELDERMEAD"
+#: nlopt's name. A simplex steps over the ripple that speckle gives the cost; quadratic models fall into it.
+_ALGORITHM = "LN_NELDERMEAD"
+#: Of the evaluations, how many are coarse; first steps of the simplices, in units of the range.
+_COARSE_SHARE = 0.85
+_STEPS, _FINE_STEP = (0.12, 0.25, 0.12, 0.2, 0.12, 0.06), 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +75,7 @@ def register_poses(
     masks: Sequence[np.ndarray] | None = None,
     range_mm: float = 8.0,
     range_deg: float = 8.0,
-    max_evaluations: int = 600,
+    max_evaluations: int = 900,
     settings: SimilaritySettings | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Registration:
@@ -112,9 +115,18 @@ def register_poses(
     search = Search(coarse, describe, max_evaluations, 0, progress)
     here = np.full(6, 0.5)
     before = full(here)
-    best = search.minimise(_COARSE_ALGORITHM, "coarse", here, int(0.8 * max_evaluations), step=0.12)
+    random = np.random.default_rng(0)
+    best, coarse_budget = here, int(_COARSE_SHARE * max_evaluations)
+    for step in _STEPS:
+        # A simplex that has shrunk in a dip of the speckle's making is spread out again.
+        start = best if step == _STEPS[0] else best + random.normal(0.0, 0.3 * step, 6)
+        search.minimise(_ALGORITHM, "coarse", start, coarse_budget - len(search.history), step=step)
+        costs = [entry for entry in search.history if entry.stage == "coarse"]
+        best = np.array(min(costs, key=lambda entry: entry.cost).units)
+        if len(search.history) >= coarse_budget:
+            break
     search.cost = full
-    best = search.minimise(_FINE_ALGORITHM, "fine", best, max_evaluations - len(search.history), step=0.04)
+    best = search.minimise(_ALGORITHM, "fine", best, max_evaluations - len(search.history), step=_FINE_STEP)
     after = search.best_cost("fine")
     if after > before:  # the start was the best after all
         best, after = here, before

@@ -40,7 +40,7 @@ class FitPresenter:
     def setFree(self, name: str, on: bool) -> None:
         """The user ticked a parameter, or took the tick away."""
         names = [known for known, is_free in self.freeParameters() if (on if known == name else is_free)]
-        self._parameters.fit_free = ", ".join(names)
+        self._parameters.fit_free = ", ".join(names) or "none"  # an empty text would be the default
 
     def _free(self) -> list[str]:
         names = [name.strip() for name in self._parameters.fit_free.split(",") if name.strip()]
