@@ -1,0 +1,172 @@
+"""ussim sweep and ussim optimize: what they write, and that a mistake is one line, exit 2, and nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from SlicerUSSim.cli import main
+from SlicerUSSim.Logic import PhasedProbe, Preset, TissueTable, TrackedSequence, segment_mri
+from SlicerUSSim.Logic.phantoms import head_mri
+from SlicerUSSim.Logic.tissues import write_json
+from SlicerUSSim.Logic.twins import make_twin
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+
+
+def ussim(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A twin on disk, as examples/write_twin.py writes one."""
+    place = tmp_path_factory.mktemp("twin")
+    segmentation = segment_mri(head_mri(2.0))
+    probe = PhasedProbe(70.0, 50.0, scan_lines=80)
+    twin = make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
+    twin.simulator.medium.labels.write(place / "labels.nii.gz")
+    twin.simulator.medium.tissues.write(place / "labels.json")
+    twin.sequence().write(place / "tracked.igs.mha")
+    write_json(place / "probe.json", probe.to_dict())
+    return place
+
+
+def optimize(folder, *options):
+    return ussim(
+        "optimize", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe",
+        folder / "probe.json", "-o", folder / "result.json", *options,
+    )  # fmt: skip
+
+
+def test_optimize_writes_result_report_preset_and_state(folder):
+    pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
+    done = optimize(
+        folder, "--evaluations", 60, "--restarts", 1, "--report", folder / "report.html", "--save-preset",
+        folder / "preset.json", "--state", folder / "state.json", "--free", "display", "--free",
+        "white matter.mu0=0.1:0.9",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    result = json.loads((folder / "result.json").read_text())
+    assert result["cost_after"] < result["cost_before"] and len(result["images"]) == 3
+    names = [parameter["name"] for parameter in result["parameters"]]
+    assert names[-1] == "white matter.mu0" and len(names) == 5
+    assert result["parameters"][-1]["low"] == 0.1
+    assert re.search(r"cost [\d.]+ -> [\d.]+", done.output) and "wrote" in done.output
+    preset = Preset.read(folder / "preset.json")
+    assert preset.display.gain_db == result["display"]["gain_db"]
+    assert preset.tissues[3].sources["mu0"] == "fitted to tracked ultrasound"
+
+    report = (folder / "report.html").read_text()
+    assert report.count("data:image/png;base64,") >= 3 * 4 + 3
+    assert not re.search(r"(src|href)=\"(?!data:)", report)  # nothing outside the file
+    for words in ("simulated, before", "real", "Blink", "white matter.mu0", "net fall", "Var of white matter"):
+        assert words in report
+
+    again = optimize(
+        folder, "--evaluations", 60, "--restarts", 1, "--state", folder / "state.json", "--free", "display", "--free",
+        "white matter.mu0=0.1:0.9",
+    )  # fmt: skip
+    assert "(0 evaluations)" in again.output
+
+
+def test_sweep_draws_the_same_images_on_the_same_pixels(folder):
+    done = ussim(
+        "sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe", folder / "probe.json",
+        "--frames", "2,0", "-o", folder / "simulated.seq.nrrd",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    real, simulated = (TrackedSequence.read(folder / name) for name in ("tracked.igs.mha", "simulated.seq.nrrd"))
+    assert simulated.images.shape == (2, *real.images.shape[1:])
+    assert simulated.timestamps.tolist() == [pytest.approx(0.2), 0.0]
+    assert np.allclose(simulated.pose(0, "ImageToReference"), real.pose(2, "ImageToReference"), atol=1e-5)
+    # The anatomy is the same: where the real image is dark and bright, so is the simulated one.
+    blocks = [
+        s.images[n][:480, :480].reshape(24, 20, 24, 20).mean(axis=(1, 3)).ravel()
+        for s, n in ((real, 2), (simulated, 0))
+    ]
+    assert np.corrcoef(blocks)[0, 1] > 0.9
+
+
+def test_register_finds_a_way_back_and_writes_the_transform(folder):
+    done = optimize(
+        folder, "--register", "--evaluations", 40, "--restarts", 0, "--free", "display", "--save-transform",
+        folder / "moved.json",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert re.search(r"moved by [\d.]+ mm and [\d.]+ degrees", done.output)
+    matrix = np.array(json.loads((folder / "moved.json").read_text())["probe_to_ras"])
+    assert np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6)
+    found = json.loads((folder / "result.json").read_text())["registration"]
+    assert found["cost_after"] <= found["cost_before"] and np.allclose(found["correction"], matrix)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (["--frames", "9"], "image 9 does not exist, expected 0 to 2"),
+        (["--frames", "one"], "frames are 'one', expected such as 0,5,10 or 0:20:5"),
+        (["--frames", "5:9"], "choose none of the 3 images"),
+        (["--transform", "ImageToPatient"], "no path from Image to Patient"),
+        (["--free", "brightness"], "no free parameter 'brightness'"),
+        (["--free", "gain_db=5:1"], "bounds of gain_db are 5.0 to 1.0, expected two numbers, the smaller one first"),
+        (["--free", "gain_db=5"], "expected such as white matter.mu0=0.1:0.8"),
+        (["--free", "liver.mu0"], "no free parameter 'liver.mu0'"),
+        (["--calibration", "nowhere.xml"], "nowhere.xml: cannot be read"),
+        (["--to-mri", "nowhere.tag"], "nowhere.tag: no such file"),
+        (["--save-transform", "there.json"], "--save-transform needs --register"),
+        (["--report", "/nowhere/report.html"], "the folder /nowhere does not exist"),
+        (["--state", "probe.json"], "is not one of an optimisation"),
+    ],
+)
+def test_mistakes_are_one_line_and_write_nothing(folder, options, message, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "result.json").unlink(missing_ok=True)
+    before = sorted(path.name for path in folder.iterdir())
+    done = optimize(folder, "--evaluations", 5, *options)
+    assert done.exit_code == 2
+    lines = [line for line in done.output.splitlines() if line.startswith("ussim:")]
+    assert len(lines) == 1 and message in lines[0]
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_black_images_and_a_sequence_that_is_none_are_refused(folder, tmp_path):
+    sequence = TrackedSequence.read(folder / "tracked.igs.mha")
+    sequence.with_images([0, 1, 2], np.zeros_like(sequence.images)).write(tmp_path / "black.igs.mha")
+    (tmp_path / "none.igs.mha").write_text("no sequence")
+    for name, message in (("black", "image 0 of the sequence is black"), ("none", "cannot be read")):
+        done = ussim(
+            "optimize", folder / "labels.nii.gz", "--sequence", tmp_path / f"{name}.igs.mha", "--probe",
+            folder / "probe.json", "-o", tmp_path / "result.json",
+        )  # fmt: skip
+        assert done.exit_code == 2 and message in done.output and not (tmp_path / "result.json").exists()
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the real sequences of ../shared/data are not here")
+def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
+    """Image geometry found in real images, tracking from Plus: a block of muscle stands in for the unknown phantom."""
+    from SlicerUSSim.Logic import Volume
+
+    (tmp_path / "plus.xml").write_text(
+        '<PlusConfiguration><CoordinateDefinitions><Transform From="Image" To="Probe" '
+        'Matrix="0.0854 0 0 -35 0 0.0854 0 -1.2 0 0 0.0854 0 0 0 0 1"/></CoordinateDefinitions></PlusConfiguration>'
+    )
+    sequence = TrackedSequence.read(SHARED / "BoneUltrasound_L14.igs.mha")
+    centre = sequence.pose(0, "ProbeToReference") @ [0, 25, 0, 1]
+    place = np.eye(4)
+    place[:3, 3] = centre[:3] - 60
+    Volume(np.full((120, 120, 120), 1, np.uint8), place).write(tmp_path / "block.nii.gz")
+    TissueTable.named(["muscle"]).write(tmp_path / "block.json")
+    done = ussim(
+        "optimize", tmp_path / "block.nii.gz", "--labels", "--sequence", SHARED / "BoneUltrasound_L14.igs.mha",
+        "--calibration", tmp_path / "plus.xml", "--frames", "0,10", "--free", "display", "--free", "muscle",
+        "--evaluations", 60, "--restarts", 0, "-o", tmp_path / "result.json",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["cost_after"] < 0.8 * result["cost_before"]
