@@ -23,11 +23,11 @@ import numpy as np
 from SlicerUSSim.Logic import DisplaySettings, TissueTable, Volume, optimize_appearance, segment_mri
 from SlicerUSSim.Logic.appearance import AppearanceModel
 from SlicerUSSim.Logic.demo import demo_mri
-from SlicerUSSim.Logic.fitting import simulated
+from SlicerUSSim.Logic.fitting import fit, simulated
 from SlicerUSSim.Logic.identifiability import variance_db
 from SlicerUSSim.Logic.optimization import AppearanceCost
 from SlicerUSSim.Logic.parameters import FreeParameters
-from SlicerUSSim.Logic.registration import register_poses, rigid_from, rotation_deg
+from SlicerUSSim.Logic.registration import rigid_from, rotation_deg
 from SlicerUSSim.Logic.report import grey_levels_per_tissue
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.similarity import SimilaritySettings
@@ -186,13 +186,11 @@ def registration(labels: Volume, tissues: TissueTable, patients: int, device) ->
         about[:3, 3] = middle
         offset = about @ rigid_from([*shift, *turn]) @ np.linalg.inv(about)
         moved = [np.linalg.inv(offset) @ pose for pose in twin.poses]
+        tracked = replace(as_tracked(twin), poses=moved)
         start = perf_counter()
-        first = optimize_appearance(
-            twin.simulator, twin.probe, moved, twin.references, free=["display", TISSUE], display=twin.display,
-            max_evaluations=200, restarts=0,
-        )  # fmt: skip
-        with twin.simulator.with_tissues(first.tissues):
-            found = register_poses(twin.simulator, twin.probe, moved, twin.references, display=first.display)
+        found = fit(
+            twin.simulator, tracked, free=["display", TISSUE], display=twin.display, register=True, restarts=0
+        ).registration
         left = found.correction @ np.linalg.inv(offset)
         error_mm = float(np.linalg.norm((left @ [*middle, 1.0])[:3] - middle))
         result = {

@@ -17,8 +17,11 @@ from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import TissueTable
 from SlicerUSSim.Logic.tracked import TrackedImages
 
-#: Of the evaluations, how many a first fit takes before registration.
+#: Of the evaluations, how many a fit takes before registration.
 _FIRST_SHARE = 0.4
+#: Registrations one after the other: bounds (mm and degrees) and evaluations. A fit at wrong poses is biased, and so is
+#: the registration after it; the next ones start closer.
+_ROUNDS = ((8.0, 500), (4.0, 300))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +60,8 @@ def fit(
 ) -> Fit:
     """Fit display and tissue parameters (optimization.optimize_appearance) and, with `register`, the poses.
 
-    Registration needs images that look alike and the fit needs poses: so a short fit comes first, then registration,
-    then the whole fit at the poses found. `resume` and `checkpoint` are those of the whole fit.
+    Registration needs images that look alike and the fit needs poses: so short fits and registrations alternate, and
+    the whole fit comes at the poses found. `resume` and `checkpoint` are those of the whole fit.
     Raises SimulationError as those do.
     """
     display = display or DisplaySettings()
@@ -66,17 +69,19 @@ def fit(
     given = tracked
     common = dict(free=free, masks=masks, grid=tracked.grid, seed=seed, settings=settings, progress=progress)
     registration = None
-    if register:
+    for bound, evaluations in _ROUNDS if register else ():
         first = optimize_appearance(
             simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=0,
             max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1), **common,
         )  # fmt: skip
         with simulator.with_tissues(first.tissues):
-            registration = register_poses(
+            moved = register_poses(
                 simulator, tracked.probe, tracked.poses, tracked.images, display=first.display, grid=tracked.grid,
-                masks=masks, settings=settings, progress=progress,
+                masks=masks, settings=settings, range_mm=bound, range_deg=bound, max_evaluations=evaluations,
+                progress=progress,
             )  # fmt: skip
-        tracked = replace(tracked, poses=registration.poses)
+        registration = moved if registration is None else moved.after(registration)
+        tracked = replace(tracked, poses=moved.poses)
     appearance = optimize_appearance(
         simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=restarts,
         max_evaluations=max_evaluations, resume=resume, checkpoint=checkpoint, **common,

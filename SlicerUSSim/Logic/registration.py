@@ -37,27 +37,33 @@ class Registration:
     #: (4, 4) rigid; corrected poses are correction @ pose
     correction: np.ndarray
     poses: list[np.ndarray] = field(repr=False)
-    #: {name: value} of the correction's parameters (NAMES)
-    values: dict[str, float]
+    #: (3,) the middle of what the images saw before, and how far it was moved
+    centre: np.ndarray = field(repr=False)
+    shift_mm: float
     cost_before: float
     cost_after: float
     history: list[Evaluation] = field(repr=False)
-
-    @property
-    def shift_mm(self) -> float:
-        """How far the middle of what the images see was moved."""
-        return float(np.linalg.norm([self.values[name] for name in NAMES[:3]]))
 
     @property
     def turn_deg(self) -> float:
         """By how much the images were turned."""
         return rotation_deg(self.correction)
 
+    def after(self, earlier: Registration) -> Registration:
+        """Both, one after the other."""
+        correction = self.correction @ earlier.correction
+        shift = (correction @ [*earlier.centre, 1.0])[:3] - earlier.centre
+        return replace(
+            self, correction=correction, centre=earlier.centre, shift_mm=float(np.linalg.norm(shift)),
+            cost_before=earlier.cost_before, history=[*earlier.history, *self.history],
+        )  # fmt: skip
+
     def to_dict(self) -> dict:
         """Plain values for JSON."""
         return {
             "correction": self.correction.tolist(),
-            "values": self.values,
+            "shift_mm": self.shift_mm,
+            "turn_deg": self.turn_deg,
             "cost_before": self.cost_before,
             "cost_after": self.cost_after,
             "evaluations": len(self.history),
@@ -131,7 +137,9 @@ def register_poses(
     if after > before:  # the start was the best after all
         best, after = here, before
     matrix = correction(best)
-    return Registration(matrix, [matrix @ pose for pose in poses], describe(best), before, after, search.history)
+    centre = frame[:3, 3]
+    shift = float(np.linalg.norm((matrix @ [*centre, 1.0])[:3] - centre))
+    return Registration(matrix, [matrix @ pose for pose in poses], centre, shift, before, after, search.history)
 
 
 def rigid_from(values: Sequence[float]) -> np.ndarray:
