@@ -2,28 +2,48 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Protocol
 
 from SlicerUSSim.Logic.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting import Fit
 from SlicerUSSim.Logic.parameters import FreeParameters, all_names
 from SlicerUSSim.Logic.preset import Preset
+from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.scene_fit import COMPARED, CostPlot
 from SlicerUSSim.Logic.scene_nodes import composite_of, nodes_of_class, require_node
 from SlicerUSSim.Logic.search import Progress
 from SlicerUSSim.Logic.sequence import frame_numbers
 from SlicerUSSim.Logic.settings import DisplaySettings
-
-if TYPE_CHECKING:
-    from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Logic.tissues import TissueTable
 
 _REGISTRATION = "Ultrasound registration"
 
 
-class FitPresenter:
-    """Chooses, runs, applies and shows fits for one PanelPresenter."""
+class FitHost(Protocol):
+    """What it needs of the panel's presenter."""
 
-    def __init__(self, panel: PanelPresenter) -> None:
+    logic: UltrasoundSceneLogic
+    view: object
+
+    def tissueTable(self) -> TissueTable:
+        """The tissues in use."""
+
+    def canSimulate(self) -> tuple[bool, str]:
+        """(whether there is something to simulate, why not)"""
+
+    def shown(self) -> AbstractContextManager[None]:
+        """Show what the user caused in one line."""
+
+    def working(self, title: str) -> AbstractContextManager[Callable[[float], None]]:
+        """Show progress, and let nothing else begin."""
+
+
+class FitPresenter:
+    """Chooses, runs, applies and shows fits for the panel."""
+
+    def __init__(self, panel: FitHost) -> None:
         self._panel = panel
         self._fit: tuple[Fit, object] | None = None  # and the labels it is of
         self._before: Preset | None = None  # what Apply replaced

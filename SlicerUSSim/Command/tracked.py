@@ -1,0 +1,196 @@
+"""`ussim sweep` and `ussim optimize`: simulated against tracked ultrasound."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from SlicerUSSim import __version__
+from SlicerUSSim.Command.options import Scene, scene_options
+from SlicerUSSim.Command.progress import Curve, Share
+from SlicerUSSim.Logic.errors import SimulationError
+
+_SEQUENCE_OPTIONS = (
+    click.option(
+        "--sequence", "sequence_file", type=click.Path(), required=True,
+        help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer), or a folder of MINC slices.",
+    ),
+    click.option("--frames", help="Which images: 0,5,10 or 0:20:5 (default: all that were tracked)."),
+    click.option(
+        "--transform", "path", default="ImageToReference", show_default=True,
+        help="From pixels to where the patient lies; composed of what the sequence has.",
+    ),
+    click.option(
+        "--calibration", type=click.Path(),
+        help="What the sequence lacks: a Plus configuration (XML), or a file with the 4x4 ImageToProbe.",
+    ),
+    click.option(
+        "--to-mri", type=click.Path(),
+        help="From there to the MRI: a pose file, .xfm, or .tag with landmarks in MRI and ultrasound.",
+    ),
+)  # fmt: skip
+
+
+def _sequence_options(command):
+    """What every command takes that reads tracked images; _tracked makes TrackedImages of it."""
+    for option in reversed(_SEQUENCE_OPTIONS):
+        command = option(command)
+    return command
+
+
+def _read_sequence(sequence_file, calibration):
+    from SlicerUSSim.Logic.pose import read_matrix
+    from SlicerUSSim.Logic.sequence import TrackedSequence, read_coordinate_definitions
+
+    source = Path(sequence_file)
+    if source.is_dir():
+        sequence = TrackedSequence.from_slices(sorted(source.glob("*.mnc")))
+    else:
+        sequence = TrackedSequence.read(source)
+    if calibration:
+        is_xml = Path(calibration).suffix.lower() == ".xml"
+        constant = read_coordinate_definitions(calibration) if is_xml else {"ImageToProbe": read_matrix(calibration)}
+        sequence = sequence.with_transforms(constant)
+    return sequence
+
+
+def _tracked(sequence, frames, path, to_mri, probe):
+    from SlicerUSSim.Logic.pose import read_tags, read_transform, rigid_between
+    from SlicerUSSim.Logic.sequence import frame_numbers
+    from SlicerUSSim.Logic.tracked import TrackedImages
+
+    to_ras = None
+    if to_mri and Path(to_mri).suffix.lower() == ".tag":
+        in_mri, in_ultrasound = read_tags(to_mri)
+        if in_ultrasound is None:
+            raise SimulationError(f"{to_mri}: has points of one volume, expected pairs in MRI and ultrasound")
+        to_ras, left = rigid_between(in_ultrasound, in_mri)
+        click.echo(f"{len(in_mri)} landmarks agree to {left:.2f} mm (root mean square)")
+    elif to_mri:
+        to_ras = read_transform(to_mri)
+    numbers = None if frames is None else frame_numbers(frames, len(sequence))
+    return TrackedImages.of(sequence, numbers, path=path, reference_to_ras=to_ras, probe=probe)
+
+
+@click.command()
+@scene_options
+@_sequence_options
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path), required=True, help="Sequence: .igs.mha .seq.mha .mhd or .nrrd"
+)
+def sweep(out: Path, sequence_file, frames, path, calibration, to_mri, **of_scene) -> None:
+    """Simulate the images of a tracked sequence: what its probe saw, on the same pixels."""
+    import numpy as np
+
+    from SlicerUSSim.Logic.sequence import require_sequence_name
+    from SlicerUSSim.Logic.volume import require_place
+
+    require_sequence_name(out)
+    require_place(out)
+    sequence = _read_sequence(sequence_file, calibration)
+    scene = Scene(**of_scene)
+    tracked = _tracked(sequence, frames, path, to_mri, scene.probe if scene.probe_is_given else None)
+    images = np.zeros((len(tracked.poses), *tracked.fan.mask.shape), np.uint8)
+    rows, columns = (np.flatnonzero(tracked.fan.mask.any(axis=axis)) for axis in (1, 0))
+    with Share("sweep") as progress:
+        for number, pose in enumerate(tracked.poses):
+            frame = scene.simulator.simulate(tracked.probe, pose, scene.display, tracked.grid)
+            images[number, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = frame.image
+            progress((number + 1) / len(tracked.poses))
+    sequence.with_images(tracked.numbers, images).write(out)
+    click.echo(f"wrote {out} ({len(images)} images of {images.shape[2]}x{images.shape[1]})")
+
+
+@click.command()
+@scene_options
+@_sequence_options
+@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Result: .json")
+@click.option(
+    "--free",
+    multiple=True,
+    metavar="NAME[=LOW:HIGH]",
+    help='Free parameters: "display", a tissue, one of either ("gain_db", "white matter.mu0"), with bounds if wanted; '
+    'may be repeated (default: display and "white matter").',
+)
+@click.option("--evaluations", type=click.IntRange(1), default=500, show_default=True, help="Of the cost, at most.")
+@click.option("--restarts", type=click.IntRange(0), default=2, show_default=True, help="For what fits equally well.")
+@click.option("--report", type=click.Path(path_type=Path), help="Self-contained report: .html")
+@click.option("--save-preset", type=click.Path(path_type=Path), help="Preset with what was found: .json")
+@click.option(
+    "--state",
+    type=click.Path(path_type=Path),
+    help="Keep what was evaluated here, and go on from there when run again: .json",
+)
+@click.option("--register", is_flag=True, help="Also refine where the ultrasound lies in the MRI (rigid).")
+@click.option("--save-transform", type=click.Path(path_type=Path), help="With --register: ultrasound to MRI, .json")
+def optimize(
+    out: Path, sequence_file, frames, path, calibration, to_mri, free, evaluations, restarts, report, save_preset,
+    state, register, save_transform, **of_scene,
+) -> None:  # fmt: skip
+    """Fit display and tissue parameters until simulated and tracked real ultrasound agree."""
+    from SlicerUSSim.Logic.figures import require_matplotlib
+    from SlicerUSSim.Logic.fitting import fit
+    from SlicerUSSim.Logic.pose import write_pose
+    from SlicerUSSim.Logic.preset import Preset
+    from SlicerUSSim.Logic.report import write_report
+    from SlicerUSSim.Logic.tissues import read_json, write_json
+    from SlicerUSSim.Logic.volume import require_place
+
+    for place in filter(None, (out, report, save_preset, state, save_transform)):
+        require_place(place)
+    if report:
+        require_matplotlib()
+    if save_transform and not register:
+        raise SimulationError("--save-transform needs --register")
+    names = dict(_free_parameter(text) for text in free) or dict.fromkeys(("display", "white matter"))
+    sequence = _read_sequence(sequence_file, calibration)
+    scene = Scene(**of_scene)
+    tracked = _tracked(sequence, frames, path, to_mri, scene.probe if scene.probe_is_given else None)
+    earlier = read_json(state) if state and state.exists() else None
+    simulator = scene.simulator
+    with Curve("optimize") as curve:
+        found = fit(
+            simulator, tracked, free=names, display=scene.display, register=register, max_evaluations=evaluations,
+            restarts=restarts, progress=curve, resume=earlier,
+            checkpoint=(lambda reached: write_json(state, reached)) if state else None,
+        )  # fmt: skip
+    result = found.appearance
+    write_json(out, found.to_dict())
+    if save_preset:
+        Preset(tracked.probe, result.display, simulator.settings, result.tissues).write(save_preset)
+    if save_transform:
+        write_pose(save_transform, found.registration.correction)
+    if report:
+        provenance = (
+            f"SlicerUSSim {__version__}, {simulator.device.info}. MRI or labels: {scene.source}. Sequence: "
+            f"{sequence_file}, images {', '.join(map(str, tracked.numbers))}. Probe: {tracked.probe}. Settings: "
+            f"{simulator.settings}."
+        )
+        write_report(
+            report, result, found.tracked, found.before, found.after, simulator,
+            subtitle=f"{Path(sequence_file).name} on {Path(scene.source).name}", provenance=provenance,
+        )  # fmt: skip
+    if found.registration:
+        moved = found.registration
+        click.echo(f"moved by {moved.shift_mm:.2f} mm and {moved.turn_deg:.2f} degrees")
+    click.echo(f"cost {result.cost_before:.4f} -> {result.cost_after:.4f} ({result.evaluations} evaluations)")
+    for parameter in result.parameters:
+        spread = result.identifiability[parameter.name]
+        note = f"  not determined: {spread.low:.3g} to {spread.high:.3g} fit as well"
+        note = note if spread.is_determined is False else ""
+        before, after = result.before[parameter.name], result.after[parameter.name]
+        click.echo(f"{parameter.name:42s} {before:8.3f} -> {after:8.3f}{note}")
+    click.echo("wrote " + ", ".join(map(str, filter(None, (out, report, save_preset, save_transform, state)))))
+
+
+def _free_parameter(text: str) -> tuple[str, tuple[float, float] | None]:
+    """A name, or name=low:high."""
+    name, equals, bounds = text.partition("=")
+    if not equals:
+        return name.strip(), None
+    try:
+        low, high = (float(end) for end in bounds.split(":"))
+    except ValueError:
+        raise SimulationError(f"--free is {text!r}, expected such as white matter.mu0=0.1:0.8") from None
+    return name.strip(), (low, high)
