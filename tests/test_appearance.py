@@ -13,8 +13,7 @@ from SlicerUSSim.Logic import DisplaySettings, LinearProbe, Membrane, Simulation
 from SlicerUSSim.Logic.appearance import AppearanceModel
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.tissues import TISSUES
-
-from .conftest import block, simulator
+from tests.conftest import block, simulator
 
 UPPER = Tissue("upper", 1540.0, 1.60, 0.5, 0.33, 0.0, 0.15)
 LOWER = Tissue("lower", 1540.0, 1.60, 0.7, 0.20, 0.3, 0.30)

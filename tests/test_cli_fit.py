@@ -15,6 +15,7 @@ from SlicerUSSim.Logic import PhasedProbe, Preset, TissueTable, TrackedSequence,
 from SlicerUSSim.Logic.phantoms import head_mri
 from SlicerUSSim.Logic.tissues import write_json
 from SlicerUSSim.Logic.twins import make_twin
+from tests.conftest import example
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 
@@ -170,3 +171,29 @@ def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
     assert done.exit_code == 0, done.output
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["cost_after"] < 0.8 * result["cost_before"]
+
+
+def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["write_twin.py", str(tmp_path), "--seed", "4"])
+    example("write_twin").main()
+    assert "tracked.igs.mha" in capsys.readouterr().out
+    done = ussim(
+        "optimize", tmp_path / "labels.nii.gz", "--sequence", tmp_path / "tracked.igs.mha", "--probe",
+        tmp_path / "probe.json", "--frames", "1", "--free", "display", "--evaluations", 30, "--restarts", 0, "-o",
+        tmp_path / "result.json",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    truth, result = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("truth", "result"))
+    assert result["cost_after"] < result["cost_before"]
+    assert abs(result["display"]["dynamic_range_db"] - truth["display"]["dynamic_range_db"]) < 15
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the real sequences of ../shared/data are not here")
+def test_real_speckle_and_noise_can_be_fitted(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib", reason="the example draws: pip install '.[demo]'")
+    monkeypatch.setattr("sys.argv", ["fit_real_speckle.py", str(SHARED), "--out", str(tmp_path)])
+    example("fit_real_speckle").main()
+    costs = re.findall(r"cost ([\d.]+) -> ([\d.]+)", capsys.readouterr().out)
+    assert len(costs) == 2 and all(float(after) < 0.55 * float(before) for before, after in costs)
+    assert {path.name for path in tmp_path.iterdir()} == {"real-speckle.png", "real-noise.png"}

@@ -134,6 +134,8 @@ def test_a_single_parameter_can_be_free(twin):
 def test_bounds_are_kept(twin):
     result = optimise(twin, {"gain_db": (-1, 1), "white matter.mu0": (0.2, 0.3)}, max_evaluations=60)
     assert -1 <= result.after["gain_db"] <= 1 and 0.2 <= result.after["white matter.mu0"] <= 0.3
+    narrow = optimise(twin, {"gain_db": (20, 21)}, max_evaluations=30)
+    assert narrow.at_bounds == ["gain_db"] and narrow.to_dict()["at_bounds"] == ["gain_db"]
 
 
 # ---- the same again, and going on ------------------------------------------------------------------------------------

@@ -9,8 +9,7 @@ from hypothesis.extra.numpy import arrays
 from SlicerUSSim.Logic import LinearProbe, SimulationError, similarity
 from SlicerUSSim.Logic.device import Device
 from SlicerUSSim.Logic.similarity import PatchComparison, SimilaritySettings
-
-from .conftest import SPECKLE, block, simulator
+from tests.conftest import SPECKLE, block, simulator
 
 images = arrays(np.uint8, st.tuples(st.integers(4, 40), st.integers(4, 40)))
 

@@ -179,6 +179,7 @@ def optimize(
         spread = result.identifiability[parameter.name]
         note = f"  not determined: {spread.low:.3g} to {spread.high:.3g} fit as well"
         note = note if spread.is_determined is False else ""
+        note = "  at its bound" if parameter.name in result.at_bounds else note
         before, after = result.before[parameter.name], result.after[parameter.name]
         click.echo(f"{parameter.name:42s} {before:8.3f} -> {after:8.3f}{note}")
     click.echo("wrote " + ", ".join(map(str, filter(None, (out, report, save_preset, save_transform, state)))))

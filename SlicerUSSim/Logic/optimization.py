@@ -61,9 +61,15 @@ class AppearanceResult:
     #: What a later run needs to go on: pass it as `resume`
     state: dict = field(repr=False)
 
+    @property
+    def at_bounds(self) -> list[str]:
+        """Names of parameters that ended at one of their bounds, beyond which the images might fit better."""
+        return [p.name for p in self.parameters if not 0.005 < p.unit(self.after[p.name]) < 0.995]
+
     def to_dict(self) -> dict:
         """Plain values for JSON."""
         return {
+            "at_bounds": self.at_bounds,
             "parameters": [
                 {"name": p.name, "low": p.low, "high": p.high, "before": self.before[p.name],
                  "after": self.after[p.name]}

@@ -116,8 +116,9 @@ def _trio(number: int, real: np.ndarray, before: np.ndarray, after: np.ndarray, 
 
 def _parameter_row(result: AppearanceResult, parameter) -> str:
     spread = result.identifiability[parameter.name]
+    note = ' <span class="no">at its bound</span>' if parameter.name in result.at_bounds else ""
     return (
-        f"<tr><td>{html.escape(parameter.name)}</td><td>{parameter.low:g} to {parameter.high:g}</td>"
+        f"<tr><td>{html.escape(parameter.name)}{note}</td><td>{parameter.low:g} to {parameter.high:g}</td>"
         f"<td>{result.before[parameter.name]:.3f}</td><td>{result.after[parameter.name]:.3f}</td>{_spread_cells(spread)}</tr>"
     )
 

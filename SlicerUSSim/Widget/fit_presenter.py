@@ -195,7 +195,9 @@ def _in_words(found: Fit) -> str:
     for name, value in result.after.items():
         spread = result.identifiability[name]
         line = f"{name}: {result.before[name]:.3g} → {value:.3g}"
-        if spread.is_determined is False:
+        if name in result.at_bounds:
+            line += " (at its bound)"
+        elif spread.is_determined is False:
             line += f" (not determined: {spread.low:.3g} to {spread.high:.3g} fit as well)"
         lines.append(line)
     return "\n".join(lines)
