@@ -59,10 +59,9 @@ def fit_speckle(sequence: TrackedSequence):
     # The scanner's settings were not recorded; with these speckle is about as large as in the image.
     beam = {"frequency_mhz": 6.6, "fractional_bandwidth": 0.35, "aperture_mm": 9.0}
     fan = estimate_fan(sequence.images, width_mm=WIDTH_MM, scan_lines=256, **beam)
-    rows, columns = (np.flatnonzero(fan.mask.any(axis=axis)) for axis in (1, 0))
-    window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    window = rows, columns = fan.window
     pixel = fan.image_to_probe[0, 0], fan.image_to_probe[1, 1]
-    left, top = (fan.image_to_probe @ [columns[0] - 0.5, rows[0] - 0.5, 0, 1])[:2]
+    left, top = (fan.image_to_probe @ [columns.start - 0.5, rows.start - 0.5, 0, 1])[:2]
     real = np.ascontiguousarray(sequence.images[20][window])
     grid = ImageGrid(*real.shape, float(left), float(top), (float(pixel[0]), float(pixel[1])))
     region = np.zeros(real.shape, bool)

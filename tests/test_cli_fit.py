@@ -11,8 +11,18 @@ import pytest
 from click.testing import CliRunner
 
 from SlicerUSSim.cli import main
-from SlicerUSSim.Logic import PhasedProbe, Preset, TissueTable, TrackedSequence, segment_mri
+from SlicerUSSim.Logic import (
+    PhasedProbe,
+    Preset,
+    TissueTable,
+    TrackedSequence,
+    UltrasoundSimulator,
+    Volume,
+    segment_mri,
+)
 from SlicerUSSim.Logic.phantoms import head_mri
+from SlicerUSSim.Logic.placement import tilt_sweep
+from SlicerUSSim.Logic.pose import write_pose
 from SlicerUSSim.Logic.tissues import write_json
 from SlicerUSSim.Logic.twins import make_twin
 from tests.conftest import example
@@ -107,6 +117,39 @@ def test_register_finds_a_way_back_and_writes_the_transform(folder):
     assert found["cost_after"] <= found["cost_before"] and np.allclose(found["correction"], matrix)
 
 
+def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path):
+    """As RESECT has it: ultrasound as NIfTI in its own frame, landmarks in MRI and ultrasound as .tag."""
+    sequence = TrackedSequence.read(folder / "tracked.igs.mha")
+    probe = PhasedProbe(70.0, 50.0, scan_lines=80)
+    labels, tissues = Volume.read(folder / "labels.nii.gz"), TissueTable.read(folder / "labels.json")
+    pose = sequence.pose(1, "ProbeToReference")
+    ultrasound = UltrasoundSimulator(labels, tissues).volume(probe, tilt_sweep(pose, 20.0, 15), spacing_mm=0.5)
+    shift = np.array([30.0, -12.0, 7.0])
+    place = np.eye(4)
+    place[:3, 3] = shift
+    Volume(ultrasound.array, place @ ultrasound.ijk_to_ras).write(tmp_path / "us.nii.gz")
+    write_pose(tmp_path / "probe-pose.json", place @ pose)
+    points = [[0, 0, 0], [30, 5, 2], [-4, 25, 9], [3, -8, 31]]
+    rows = "\n".join(" ".join(map(str, [*p, *(np.array(p) + shift)])) + ' "x"' for p in points)
+    (tmp_path / "case.tag").write_text(f"MNI Tag Point File\nVolumes = 2;\n\nPoints =\n{rows};\n")
+    common = (
+        folder / "labels.nii.gz", "--sequence", tmp_path / "us.nii.gz", "--cut", tmp_path / "probe-pose.json",
+        "--probe", folder / "probe.json", "--to-mri", tmp_path / "case.tag",
+    )  # fmt: skip
+    done = ussim(
+        "optimize", *common, "--cut-tilt", 12, "--cuts", 2, "--free", "display", "--evaluations", 60, "--restarts", 0,
+        "-o", tmp_path / "result.json",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "4 landmarks agree to 0.00 mm" in done.output
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert len(result["images"]) == 2 and result["cost_after"] < 0.35  # in place; elsewhere it is above
+    done = ussim("sweep", *common, "-o", tmp_path / "cut.igs.mha")
+    assert done.exit_code == 0 and len(TrackedSequence.read(tmp_path / "cut.igs.mha")) == 1
+    both = ussim("sweep", *common, "--cut-tilt", 5, "--cut-slide", 5, "-o", tmp_path / "no.igs.mha")
+    assert both.exit_code == 2 and "either --cut-tilt DEGREES or --cut-slide" in both.output
+
+
 @pytest.mark.parametrize(
     "options, message",
     [
@@ -151,8 +194,6 @@ def test_black_images_and_a_sequence_that_is_none_are_refused(folder, tmp_path):
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real sequences of ../shared/data are not here")
 def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
     """Image geometry found in real images, tracking from Plus: a block of muscle stands in for the unknown phantom."""
-    from SlicerUSSim.Logic import Volume
-
     (tmp_path / "plus.xml").write_text(
         '<PlusConfiguration><CoordinateDefinitions><Transform From="Image" To="Probe" '
         'Matrix="0.0854 0 0 -35 0 0.0854 0 -1.2 0 0 0.0854 0 0 0 0 1"/></CoordinateDefinitions></PlusConfiguration>'

@@ -121,11 +121,11 @@ def test_poses_and_pixels_follow_from_calibration_and_field():
     found = TrackedImages.of(sequence)
     # Pixels of the cropped image lie where those of the whole one do.
     row, column = 100, 120
-    rows, columns = (np.flatnonzero(found.fan.mask.any(axis=axis)) for axis in (1, 0))
+    rows, columns = found.fan.window
     there = found.poses[0] @ found.grid.image_to_probe @ [column, row, 0, 1]
-    expected = sequence.pose(0, "ImageToReference") @ [column + columns[0], row + rows[0], 0, 1]
+    expected = sequence.pose(0, "ImageToReference") @ [column + columns.start, row + rows.start, 0, 1]
     assert np.allclose(there, expected, atol=1e-6)
-    assert np.array_equal(found.images[1], sequence.images[1][rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+    assert np.array_equal(found.images[1], sequence.images[1][rows, columns])
     assert np.allclose(found.poses[0][:3, :3], np.eye(3), atol=1e-6)
 
 

@@ -14,7 +14,8 @@ from SlicerUSSim.Logic.errors import SimulationError
 _SEQUENCE_OPTIONS = (
     click.option(
         "--sequence", "sequence_file", type=click.Path(), required=True,
-        help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer), or a folder of MINC slices.",
+        help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer), a folder of MINC slices, or with --cut a "
+        "3D ultrasound volume.",
     ),
     click.option("--frames", help="Which images: 0,5,10 or 0:20:5 (default: all that were tracked)."),
     click.option(
@@ -29,14 +30,47 @@ _SEQUENCE_OPTIONS = (
         "--to-mri", type=click.Path(),
         help="From there to the MRI: a pose file, .xfm, or .tag with landmarks in MRI and ultrasound.",
     ),
+    click.option("--cut", type=click.Path(), help="Cut a volume where a probe at this pose would look, and beside it:"),
+    click.option("--cut-tilt", type=float, help="tilted by this many degrees in all,"),
+    click.option("--cut-slide", type=float, help="or slid by this many millimetres in all,"),
+    click.option("--cuts", type=click.IntRange(1), default=3, show_default=True, help="in as many images."),
+)  # fmt: skip
+
+
+_SEQUENCE_NAMES = (
+    "sequence_file", "frames", "path", "calibration", "to_mri", "cut", "cut_tilt", "cut_slide", "cuts",
 )  # fmt: skip
 
 
 def _sequence_options(command):
-    """What every command takes that reads tracked images; _tracked makes TrackedImages of it."""
+    """What every command takes that reads tracked images; _open makes a scene and TrackedImages of it."""
     for option in reversed(_SEQUENCE_OPTIONS):
         command = option(command)
     return command
+
+
+def _open(options: dict):
+    """(Scene, TrackedSequence, TrackedImages) of the options of a command; what is cheap to check comes first."""
+    from SlicerUSSim.Logic.sequence import frame_numbers
+    from SlicerUSSim.Logic.tracked import TrackedImages
+
+    wanted = {name: options.pop(name) for name in _SEQUENCE_NAMES}
+    to_ras = _to_mri(wanted["to_mri"])
+    probe = None
+    if wanted["cut"] is None:
+        sequence = _read_sequence(wanted["sequence_file"], wanted["calibration"])
+        scene = Scene(**options)
+        probe = scene.probe if scene.probe_is_given else None
+    else:
+        cut = _read_cuts(wanted)
+        scene = Scene(**options)
+        probe = scene.probe
+        sequence = cut(probe)
+    numbers = None if wanted["frames"] is None else frame_numbers(wanted["frames"], len(sequence))
+    tracked = TrackedImages.of(
+        sequence, numbers, path=wanted["path"], reference_to_ras=to_ras, probe=probe, beam=scene.probe
+    )
+    return scene, sequence, tracked
 
 
 def _read_sequence(sequence_file, calibration):
@@ -55,22 +89,39 @@ def _read_sequence(sequence_file, calibration):
     return sequence
 
 
-def _tracked(sequence, frames, path, to_mri, probe):
-    from SlicerUSSim.Logic.pose import read_tags, read_transform, rigid_between
-    from SlicerUSSim.Logic.sequence import frame_numbers
-    from SlicerUSSim.Logic.tracked import TrackedImages
+def _read_cuts(wanted: dict):
+    """A function of the probe that cuts the volume into a sequence."""
+    from SlicerUSSim.Logic.placement import slide_sweep, tilt_sweep
+    from SlicerUSSim.Logic.pose import read_pose
+    from SlicerUSSim.Logic.sequence import TrackedSequence
+    from SlicerUSSim.Logic.volume import Volume
 
-    to_ras = None
-    if to_mri and Path(to_mri).suffix.lower() == ".tag":
-        in_mri, in_ultrasound = read_tags(to_mri)
-        if in_ultrasound is None:
-            raise SimulationError(f"{to_mri}: has points of one volume, expected pairs in MRI and ultrasound")
-        to_ras, left = rigid_between(in_ultrasound, in_mri)
-        click.echo(f"{len(in_mri)} landmarks agree to {left:.2f} mm (root mean square)")
-    elif to_mri:
-        to_ras = read_transform(to_mri)
-    numbers = None if frames is None else frame_numbers(frames, len(sequence))
-    return TrackedImages.of(sequence, numbers, path=path, reference_to_ras=to_ras, probe=probe)
+    pose, tilt, slide = read_pose(wanted["cut"]), wanted["cut_tilt"], wanted["cut_slide"]
+    if tilt is not None and slide is not None:
+        raise SimulationError("expected either --cut-tilt DEGREES or --cut-slide MILLIMETRES, for cuts of one kind")
+    poses = [pose]
+    if tilt is not None:
+        poses = tilt_sweep(pose, tilt, wanted["cuts"])
+    elif slide is not None:
+        poses = slide_sweep(pose, slide, wanted["cuts"])
+    volume = Volume.read(wanted["sequence_file"])
+    return lambda probe: TrackedSequence.from_volume(volume, probe, poses)
+
+
+def _to_mri(file):
+    """(4, 4) rigid of --to-mri, or None."""
+    from SlicerUSSim.Logic.pose import read_tags, read_transform, rigid_between
+
+    if not file:
+        return None
+    if Path(file).suffix.lower() != ".tag":
+        return read_transform(file)
+    in_mri, in_ultrasound = read_tags(file)
+    if in_ultrasound is None:
+        raise SimulationError(f"{file}: has points of one volume, expected pairs in MRI and ultrasound")
+    to_ras, left = rigid_between(in_ultrasound, in_mri)
+    click.echo(f"{len(in_mri)} landmarks agree to {left:.2f} mm (root mean square)")
+    return to_ras
 
 
 @click.command()
@@ -79,7 +130,7 @@ def _tracked(sequence, frames, path, to_mri, probe):
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), required=True, help="Sequence: .igs.mha .seq.mha .mhd or .nrrd"
 )
-def sweep(out: Path, sequence_file, frames, path, calibration, to_mri, **of_scene) -> None:
+def sweep(out: Path, **options) -> None:
     """Simulate the images of a tracked sequence: what its probe saw, on the same pixels."""
     import numpy as np
 
@@ -88,15 +139,12 @@ def sweep(out: Path, sequence_file, frames, path, calibration, to_mri, **of_scen
 
     require_sequence_name(out)
     require_place(out)
-    sequence = _read_sequence(sequence_file, calibration)
-    scene = Scene(**of_scene)
-    tracked = _tracked(sequence, frames, path, to_mri, scene.probe if scene.probe_is_given else None)
+    scene, sequence, tracked = _open(options)
     images = np.zeros((len(tracked.poses), *tracked.fan.mask.shape), np.uint8)
-    rows, columns = (np.flatnonzero(tracked.fan.mask.any(axis=axis)) for axis in (1, 0))
     with Share("sweep") as progress:
         for number, pose in enumerate(tracked.poses):
             frame = scene.simulator.simulate(tracked.probe, pose, scene.display, tracked.grid)
-            images[number, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = frame.image
+            images[number][tracked.fan.window] = frame.image
             progress((number + 1) / len(tracked.poses))
     sequence.with_images(tracked.numbers, images).write(out)
     click.echo(f"wrote {out} ({len(images)} images of {images.shape[2]}x{images.shape[1]})")
@@ -125,9 +173,8 @@ def sweep(out: Path, sequence_file, frames, path, calibration, to_mri, **of_scen
 @click.option("--register", is_flag=True, help="Also refine where the ultrasound lies in the MRI (rigid).")
 @click.option("--save-transform", type=click.Path(path_type=Path), help="With --register: ultrasound to MRI, .json")
 def optimize(
-    out: Path, sequence_file, frames, path, calibration, to_mri, free, evaluations, restarts, report, save_preset,
-    state, register, save_transform, **of_scene,
-) -> None:  # fmt: skip
+    out: Path, free, evaluations, restarts, report, save_preset, state, register, save_transform, **options
+) -> None:
     """Fit display and tissue parameters until simulated and tracked real ultrasound agree."""
     from SlicerUSSim.Logic.figures import require_matplotlib
     from SlicerUSSim.Logic.fitting import fit
@@ -144,9 +191,8 @@ def optimize(
     if save_transform and not register:
         raise SimulationError("--save-transform needs --register")
     names = dict(_free_parameter(text) for text in free) or dict.fromkeys(("display", "white matter"))
-    sequence = _read_sequence(sequence_file, calibration)
-    scene = Scene(**of_scene)
-    tracked = _tracked(sequence, frames, path, to_mri, scene.probe if scene.probe_is_given else None)
+    sequence_file = options["sequence_file"]
+    scene, _, tracked = _open(options)
     earlier = read_json(state) if state and state.exists() else None
     simulator = scene.simulator
     with Curve("optimize") as curve:

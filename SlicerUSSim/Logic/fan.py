@@ -46,6 +46,13 @@ class Fan:
         y = image_to_probe[1, 0] * columns + image_to_probe[1, 1] * rows + image_to_probe[1, 3]
         return cls(probe, image_to_probe, probe.holds(x, y), overlap)
 
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns that just hold the field. Raises SimulationError if it lies outside the image."""
+        rows, columns = (np.flatnonzero(self.mask.any(axis=axis)) for axis in (1, 0))
+        require(rows.size > 0, "the probe's field lies outside the images")
+        return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
     def outline_pixels(self) -> np.ndarray:
         """(points, 2) closed outline as (column, row), for drawing."""
         outline = self.probe.outline_mm()

@@ -207,8 +207,7 @@ def _dark(axis):
 
 def _geometry(tracked: TrackedImages) -> str:
     whole = np.zeros(tracked.fan.mask.shape, np.uint8)
-    rows, columns = (np.flatnonzero(tracked.fan.mask.any(axis=axis)) for axis in (1, 0))
-    whole[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = tracked.images[0]
+    whole[tracked.fan.window] = tracked.images[0]
     with TemporaryDirectory() as folder:
         picture = Path(folder) / "fan.png"
         draw_fan(picture, whole, tracked.fan)

@@ -74,10 +74,8 @@ class TrackedImages:
         fan = _fan(sequence, images, spacing, probe, beam)
         to_ras = np.eye(4) if reference_to_ras is None else check_rigid("reference_to_ras", reference_to_ras)
         poses = [to_ras @ _probe_pose(matrix, fan, path) for matrix in matrices]
-        rows, columns = (np.flatnonzero(fan.mask.any(axis=axis)) for axis in (1, 0))
-        require(rows.size > 0, "the probe's field lies outside the images")
-        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        left, top = (fan.image_to_probe @ [columns[0] - 0.5, rows[0] - 0.5, 0.0, 1.0])[:2]
+        window = rows, columns = fan.window
+        left, top = (fan.image_to_probe @ [columns.start - 0.5, rows.start - 0.5, 0.0, 1.0])[:2]
         size = fan.image_to_probe[0, 0], fan.image_to_probe[1, 1]
         mask = fan.mask[window]
         grid = ImageGrid(*mask.shape, float(left), float(top), (float(size[0]), float(size[1])))
