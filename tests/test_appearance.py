@@ -161,3 +161,8 @@ def test_without_scattering_only_interfaces_are_left(layers):
 def test_a_tissue_that_is_not_there_is_named(layers):
     with pytest.raises(SimulationError, match=r"no tissue named 'liver', expected one of: fluid, upper, lower, plate"):
         AppearanceModel(layers[0], PROBE, layers[1], {"liver": ("mu0",)})
+
+
+def test_more_images_than_memory_holds_are_refused(layers):
+    with pytest.raises(SimulationError, match=r"2000 images with 11 parts each need [\d.]+ GB, expected at most 4"):
+        AppearanceModel(layers[0], PROBE, layers[1] * 1000, VARIED)

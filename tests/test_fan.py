@@ -141,6 +141,17 @@ def test_a_given_probe_keeps_its_beam_and_gets_the_place_of_the_field():
         TrackedImages.of(sequence, probe=ConvexProbe(40, 60, 120))
 
 
+def test_images_are_spread_over_those_that_were_tracked():
+    sequence = tracked_screen(LinearProbe(40, 50))
+    many = TrackedSequence(
+        np.concatenate([sequence.images] * 6), [t if n != 0 else {} for n, t in enumerate(sequence.transforms * 6)],
+        np.arange(12.0),
+    )  # fmt: skip
+    assert TrackedImages.of(many).numbers == list(range(1, 12))
+    assert TrackedImages.of(many, most=3).numbers == [1, 6, 11]
+    assert TrackedImages.of(many, [2, 3, 4, 5], most=3).numbers == [2, 3, 4, 5]
+
+
 def test_registration_moves_the_poses():
     sequence = tracked_screen(ConvexProbe(40, 60, 80))
     moved = np.eye(4)

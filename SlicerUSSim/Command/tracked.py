@@ -17,7 +17,9 @@ _SEQUENCE_OPTIONS = (
         help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer), a folder of MINC slices, or with --cut a "
         "3D ultrasound volume.",
     ),
-    click.option("--frames", help="Which images: 0,5,10 or 0:20:5 (default: all that were tracked)."),
+    click.option(
+        "--frames", help="Which images: 0,5,10 or 0:20:5 (default: all that were tracked; to fit, six of them)."
+    ),
     click.option(
         "--transform", "path", default="ImageToReference", show_default=True,
         help="From pixels to where the patient lies; composed of what the sequence has.",
@@ -49,8 +51,11 @@ def _sequence_options(command):
     return command
 
 
-def _open(options: dict):
-    """(Scene, TrackedSequence, TrackedImages) of the options of a command; what is cheap to check comes first."""
+def _open(options: dict, most: int | None = None):
+    """(Scene, TrackedSequence, TrackedImages) of the options of a command; what is cheap to check comes first.
+
+    `most` is how many images are taken if none are chosen.
+    """
     from SlicerUSSim.Logic.sequence import frame_numbers
     from SlicerUSSim.Logic.tracked import TrackedImages
 
@@ -68,7 +73,7 @@ def _open(options: dict):
         sequence = cut(probe)
     numbers = None if wanted["frames"] is None else frame_numbers(wanted["frames"], len(sequence))
     tracked = TrackedImages.of(
-        sequence, numbers, path=wanted["path"], reference_to_ras=to_ras, probe=probe, beam=scene.probe
+        sequence, numbers, path=wanted["path"], reference_to_ras=to_ras, probe=probe, beam=scene.probe, most=most
     )
     return scene, sequence, tracked
 
@@ -192,7 +197,7 @@ def optimize(
         raise SimulationError("--save-transform needs --register")
     names = dict(_free_parameter(text) for text in free) or dict.fromkeys(("display", "white matter"))
     sequence_file = options["sequence_file"]
-    scene, _, tracked = _open(options)
+    scene, _, tracked = _open(options, most=6)
     earlier = read_json(state) if state and state.exists() else None
     simulator = scene.simulator
     with Curve("optimize") as curve:

@@ -24,7 +24,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.bmode import Compressor
 from SlicerUSSim.Logic.device import Device, Workspace
-from SlicerUSSim.Logic.errors import SimulationError
+from SlicerUSSim.Logic.errors import SimulationError, require
 from SlicerUSSim.Logic.layout import CONSTANTS, SCENE
 from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.scan_conversion import ImageGrid, ScanConverter
@@ -37,6 +37,8 @@ from SlicerUSSim.Logic.volume import check_rigid
 #: Parameters of a tissue that a model can vary.
 VARIABLE = ("attenuation_db_cm_mhz", "mu0", "mu1", "sigma0")
 _BANDS = CONSTANTS["BANDS"]
+#: Memory that bases and paths of all images may take; more is asked for by mistake.
+_MOST_BYTES = 4 * 2**30
 #: Attenuation over the whole depth with which path lengths are measured: large against the tracer's tolerance, small
 #: against its threshold.
 _PROBING_DB = 100.0
@@ -61,7 +63,8 @@ class AppearanceModel:
     varied : {tissue name: parameter names among VARIABLE}.
     grid : the pixels of the images (default: what just holds the imaged field, as many as display.image_size says).
 
-    Raises SimulationError for a tissue the simulator does not have and a pose that is not rigid.
+    Raises SimulationError for a tissue the simulator does not have, a pose that is not rigid, and for more images and
+    parameters than fit into memory.
     """
 
     def __init__(
@@ -81,6 +84,7 @@ class AppearanceModel:
         #: Tissues whose scatterers vary, and whose attenuation does, in the order of the bases and of the paths
         self.scattering = [n for n, p in self.varied.items() if p & {"mu0", "mu1", "sigma0"}]
         self.attenuating = [n for n, p in self.varied.items() if "attenuation_db_cm_mhz" in p]
+        self._check_memory()
         device = self.device
         mixing = device.kernels("appearance.cl", device.lanes)
         self._mix_parts, self._mix_bases = mixing["mix_parts"], mixing["mix_bases"]
@@ -149,6 +153,19 @@ class AppearanceModel:
 
     def _bases_of(self, name: str) -> int:
         return 2 * _BANDS if "mu1" in self.varied[name] else 2
+
+    def _check_memory(self) -> None:
+        simulator = self.simulator
+        if not self.poses:
+            return
+        scene = simulator.scene(self.probe, self.poses[0])
+        values = int(scene["scan_lines"]) * int(scene["samples"])
+        needed = 4 * values * (2 * self._base_count + len(self.attenuating)) * len(self.poses)
+        require(
+            needed <= _MOST_BYTES,
+            f"{len(self.poses)} images with {self._base_count} parts each need {needed / 2**30:.1f} GB, expected at "
+            f"most {_MOST_BYTES / 2**30:.0f}; choose fewer images or free parameters",
+        )
 
     def _buffer(self, kind: str, number: int):
         scene = self._scenes[number]

@@ -236,8 +236,8 @@ class UltrasoundSceneLogic:
         """Fit display and tissue parameters, and with `register` the poses, to real images; see fitting.fit.
 
         `images_node` is a sequence of images with its browser's transforms, a volume of one slice, or a 3D ultrasound
-        volume, cut where the probe is. `frames` are numbers of images (default: all). `plot` draws the cost, live.
-        Nothing else in the scene changes: applyFit takes the result over. `progress` may raise errors.Cancelled.
+        volume, cut where the probe is. `frames` are numbers of images (default: six, spread). `plot` draws the cost,
+        live. Nothing else in the scene changes: applyFit takes the result over. `progress` may raise errors.Cancelled.
         """
         labelled = self._read_labels(labels_node)
         preset = self.preset

@@ -30,6 +30,8 @@ from SlicerUSSim.Logic.vtk_data import matrix_array
 
 #: Images that a fit leaves to be compared, by what they show.
 COMPARED = ("real", "before", "after", "difference")
+#: How many images of a sequence are taken if none are chosen, evenly spread.
+MOST_IMAGES = 6
 #: Seconds between two drawings of the plot.
 _PLOT_EVERY = 0.25
 
@@ -63,7 +65,7 @@ def tracked_images(
             return TrackedImages.of(sequence, numbers, probe=probe)
         sequence = _of_slices([(volume.array[0], node_to_world(images_node) @ volume.ijk_to_ras)], [0.0])
     known = None if estimate_geometry else probe
-    return TrackedImages.of(sequence, numbers, probe=known, beam=probe)
+    return TrackedImages.of(sequence, numbers, probe=known, beam=probe, most=MOST_IMAGES)
 
 
 def _sequence(sequence_node) -> TrackedSequence:

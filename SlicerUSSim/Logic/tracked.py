@@ -45,12 +45,13 @@ class TrackedImages:
         reference_to_ras: np.ndarray | None = None,
         probe: Probe | None = None,
         beam: Probe | None = None,
+        most: int | None = None,
     ) -> TrackedImages:
         """The images of a sequence as a simulator would see them.
 
         Parameters
         ----------
-        numbers : which images (default: all whose pose is known).
+        numbers : which images (default: all whose pose is known, or `most` of them, evenly spread).
         path : transform from pixels to the reference frame, in which the patient lies.
         reference_to_ras : (4, 4) rigid, where that frame is in the MRI (default: the same).
         probe : known; its place in the image is then taken from ImageToProbe, if the sequence has one in that probe's
@@ -64,6 +65,8 @@ class TrackedImages:
             f"the sequence holds {sequence.image_type} data, expected B-mode images (BRIGHTNESS)",
         )
         kept = [n for n in range(len(sequence)) if sequence.has_pose(n, path)] if numbers is None else list(numbers)
+        if numbers is None and most is not None and len(kept) > most:
+            kept = [kept[place] for place in np.linspace(0, len(kept) - 1, most).round().astype(int)]
         # With none tracked, the first says what is missing.
         matrices = [sequence.pose(number, path) for number in kept or [0]]
         chosen = sequence.select(kept)
