@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.tracked import TrackedImages
 _FIRST_SHARE = 0.4
 #: Registrations one after the other: bounds (mm and degrees) and evaluations. A fit at wrong poses is biased, and so is
 #: the registration after it; the next ones start closer.
-_ROUNDS = ((8.0, 500), (4.0, 300))
+_ROUNDS = ((8.0, 500), (4.0, 300), (2.0, 250))
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ NAMES = ("x_mm", "y_mm", "z_mm", "about_x_deg", "about_y_deg", "about_z_deg")
 #: nlopt's name. A simplex steps over the ripple that speckle gives the cost; quadratic models fall into it.
 _ALGORITHM = "LN_NELDERMEAD"
 #: Of the evaluations, how many are coarse; first steps of the simplices, in units of the range.
-_COARSE_SHARE = 0.85
+_COARSE_SHARE = 0.75
 _STEPS, _FINE_STEP = (0.12, 0.25, 0.12, 0.2, 0.12, 0.06), 0.03
 
 
