@@ -69,19 +69,10 @@ def fit(
     given = tracked
     common = dict(free=free, masks=masks, grid=tracked.grid, seed=seed, settings=settings, progress=progress)
     registration = None
-    for bound, evaluations in _ROUNDS if register else ():
-        first = optimize_appearance(
-            simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=0,
-            max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1), **common,
-        )  # fmt: skip
-        with simulator.with_tissues(first.tissues):
-            moved = register_poses(
-                simulator, tracked.probe, tracked.poses, tracked.images, display=first.display, grid=tracked.grid,
-                masks=masks, settings=settings, range_mm=bound, range_deg=bound, max_evaluations=evaluations,
-                progress=progress,
-            )  # fmt: skip
-        registration = moved if registration is None else moved.after(registration)
-        tracked = replace(tracked, poses=moved.poses)
+    if register:
+        tracked, registration = _registered(
+            simulator, tracked, display, max(int(_FIRST_SHARE * max_evaluations), 1), common
+        )
     appearance = optimize_appearance(
         simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=restarts,
         max_evaluations=max_evaluations, resume=resume, checkpoint=checkpoint, **common,
@@ -89,6 +80,36 @@ def fit(
     before = simulated(simulator, given, simulator.medium.tissues, display)
     after = simulated(simulator, tracked, appearance.tissues, appearance.display)
     return Fit(appearance, registration, tracked, before, after)
+
+
+def _registered(
+    simulator: UltrasoundSimulator, tracked: TrackedImages, display: DisplaySettings, evaluations: int, common: dict
+) -> tuple[TrackedImages, Registration]:
+    """The images at the poses where a short fit comes closest, and how they were moved there; its costs are theirs."""
+    candidates: list[tuple[float, TrackedImages, Registration]] = []
+    moved = Registration.none(tracked.poses)
+
+    def fitted() -> AppearanceResult:
+        result = optimize_appearance(
+            simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=0,
+            max_evaluations=evaluations, **common,
+        )  # fmt: skip
+        candidates.append((result.cost_after, tracked, moved))
+        return result
+
+    for bound, most in _ROUNDS:
+        first = fitted()
+        with simulator.with_tissues(first.tissues):
+            step = register_poses(
+                simulator, tracked.probe, tracked.poses, tracked.images, display=first.display, grid=tracked.grid,
+                masks=common["masks"], settings=common["settings"], range_mm=bound, range_deg=bound,
+                max_evaluations=most, progress=common["progress"],
+            )  # fmt: skip
+        moved = step.after(moved)
+        tracked = replace(tracked, poses=step.poses)
+    fitted()
+    cost, best, registration = min(candidates, key=lambda candidate: candidate[0])
+    return best, replace(registration, cost_before=candidates[0][0], cost_after=cost)
 
 
 def simulated(

@@ -49,12 +49,18 @@ class Registration:
         """By how much the images were turned."""
         return rotation_deg(self.correction)
 
+    @classmethod
+    def none(cls, poses: Sequence[np.ndarray]) -> Registration:
+        """Poses that stay where they are."""
+        return cls(np.eye(4), list(poses), np.mean([pose[:3, 3] for pose in poses], axis=0), 0.0, 0.0, 0.0, [])
+
     def after(self, earlier: Registration) -> Registration:
         """Both, one after the other."""
         correction = self.correction @ earlier.correction
-        shift = (correction @ [*earlier.centre, 1.0])[:3] - earlier.centre
+        start = (np.linalg.inv(earlier.correction) @ [*self.centre, 1.0])[:3]
+        moved = (correction @ [*start, 1.0])[:3] - start
         return replace(
-            self, correction=correction, centre=earlier.centre, shift_mm=float(np.linalg.norm(shift)),
+            self, correction=correction, centre=start, shift_mm=float(np.linalg.norm(moved)),
             cost_before=earlier.cost_before, history=[*earlier.history, *self.history],
         )  # fmt: skip
 
