@@ -89,9 +89,10 @@ def test_optimize_writes_result_report_preset_and_state(folder):
 def test_sweep_draws_the_same_images_on_the_same_pixels(folder):
     done = ussim(
         "sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe", folder / "probe.json",
-        "--frames", "2,0", "-o", folder / "simulated.seq.nrrd",
+        "--frames", "2,0", "-o", folder / "simulated.seq.nrrd", "--field", folder / "field.png",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
+    assert (folder / "field.png").stat().st_size > 1000
     real, simulated = (TrackedSequence.read(folder / name) for name in ("tracked.igs.mha", "simulated.seq.nrrd"))
     assert simulated.images.shape == (2, *real.images.shape[1:])
     assert simulated.timestamps.tolist() == [pytest.approx(0.2), 0.0]

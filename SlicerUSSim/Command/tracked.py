@@ -15,7 +15,7 @@ _SEQUENCE_OPTIONS = (
     click.option(
         "--sequence", "sequence_file", type=click.Path(), required=True,
         help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer), a folder of MINC slices, or with --cut a "
-        "3D ultrasound volume.",
+        "3D ultrasound volume. Without --probe or --preset, the probe's geometry is found in the images.",
     ),
     click.option(
         "--frames", help="Which images: 0,5,10 or 0:20:5 (default: all that were tracked; to fit, six of them)."
@@ -36,11 +36,12 @@ _SEQUENCE_OPTIONS = (
     click.option("--cut-tilt", type=float, help="tilted by this many degrees in all,"),
     click.option("--cut-slide", type=float, help="or slid by this many millimetres in all,"),
     click.option("--cuts", type=click.IntRange(1), default=3, show_default=True, help="in as many images."),
+    click.option("--field", type=click.Path(path_type=Path), help="Picture of the imaged field, to check it: .png"),
 )  # fmt: skip
 
 
 _SEQUENCE_NAMES = (
-    "sequence_file", "frames", "path", "calibration", "to_mri", "cut", "cut_tilt", "cut_slide", "cuts",
+    "sequence_file", "frames", "path", "calibration", "to_mri", "cut", "cut_tilt", "cut_slide", "cuts", "field",
 )  # fmt: skip
 
 
@@ -56,10 +57,14 @@ def _open(options: dict, most: int | None = None):
 
     `most` is how many images are taken if none are chosen.
     """
+    from SlicerUSSim.Logic.fan import draw_fan
     from SlicerUSSim.Logic.sequence import frame_numbers
     from SlicerUSSim.Logic.tracked import TrackedImages
+    from SlicerUSSim.Logic.volume import require_place
 
     wanted = {name: options.pop(name) for name in _SEQUENCE_NAMES}
+    if wanted["field"]:
+        require_place(wanted["field"])
     to_ras = _to_mri(wanted["to_mri"])
     probe = None
     if wanted["cut"] is None:
@@ -75,6 +80,8 @@ def _open(options: dict, most: int | None = None):
     tracked = TrackedImages.of(
         sequence, numbers, path=wanted["path"], reference_to_ras=to_ras, probe=probe, beam=scene.probe, most=most
     )
+    if wanted["field"]:
+        draw_fan(wanted["field"], sequence.images[tracked.numbers[0]], tracked.fan)
     return scene, sequence, tracked
 
 
