@@ -24,8 +24,9 @@ import numpy as np
 
 from SlicerUSSim.Logic.bmode import Compressor
 from SlicerUSSim.Logic.device import Device, Workspace
-from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.errors import require
 from SlicerUSSim.Logic.layout import CONSTANTS, SCENE
+from SlicerUSSim.Logic.parameters import SCATTERING
 from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.scan_conversion import ImageGrid, ScanConverter
 from SlicerUSSim.Logic.scattering import EchoLines
@@ -34,8 +35,6 @@ from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import Tissue, TissueTable
 from SlicerUSSim.Logic.volume import check_rigid
 
-#: Parameters of a tissue that a model can vary.
-VARIABLE = ("attenuation_db_cm_mhz", "mu0", "mu1", "sigma0")
 _BANDS = CONSTANTS["BANDS"]
 #: Memory that bases and paths of all images may take; more is asked for by mistake.
 _MOST_BYTES = 4 * 2**30
@@ -60,7 +59,7 @@ class AppearanceModel:
     ----------
     simulator : its labels, tissues and settings; the tissues are the first anchor.
     probe, poses : the probe and its (4, 4) probe_to_ras, one per image.
-    varied : {tissue name: parameter names among VARIABLE}.
+    varied : {tissue name: parameter names among parameters.TISSUE_BOUNDS}.
     grid : the pixels of the images (default: what just holds the imaged field, as many as display.image_size says).
 
     Raises SimulationError for a tissue the simulator does not have, a pose that is not rigid, and for more images and
@@ -80,9 +79,9 @@ class AppearanceModel:
         self.poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
         self.varied = {name: frozenset(parameters) for name, parameters in varied.items()}
         for name in self.varied:
-            _tissue(simulator.medium.tissues, name)
+            simulator.medium.tissues.tissue(name)
         #: Tissues whose scatterers vary, and whose attenuation does, in the order of the bases and of the paths
-        self.scattering = [n for n, p in self.varied.items() if p & {"mu0", "mu1", "sigma0"}]
+        self.scattering = [n for n, p in self.varied.items() if p & SCATTERING]
         self.attenuating = [n for n, p in self.varied.items() if "attenuation_db_cm_mhz" in p]
         self._check_memory()
         device = self.device
@@ -238,7 +237,7 @@ class AppearanceModel:
         """(BANDS,) float32; the share at the anchor is one of them, so that no band exists in part there."""
         tops = np.ones(_BANDS, np.float32)
         if name is not None:
-            share = _tissue(self.tissues, name).scatterer_share
+            share = self.tissues.tissue(name).scatterer_share
             half = _BANDS // 2
             tops[:half] = share * np.arange(1, half + 1) / half
             tops[half:] = share + (1.0 - share) * np.arange(1, _BANDS - half + 1) / (_BANDS - half)
@@ -250,7 +249,7 @@ class AppearanceModel:
         if "mu1" in self.varied[name]:
             return [_only(part) for part in range(1, parts)]
         mean, deviation = np.zeros(parts, np.float32), np.zeros(parts, np.float32)
-        mean[1::2], deviation[2::2] = self._band_weights(name, _tissue(self.tissues, name))
+        mean[1::2], deviation[2::2] = self._band_weights(name, self.tissues.tissue(name))
         return [mean, deviation]
 
     def _band_weights(self, name: str, tissue: Tissue) -> tuple[np.ndarray, np.ndarray]:
@@ -266,7 +265,7 @@ class AppearanceModel:
     def _base_weights(self, tissues: TissueTable) -> np.ndarray:
         weights = [1.0]
         for name in self.scattering:
-            tissue = _tissue(tissues, name)
+            tissue = tissues.tissue(name)
             if "mu1" in self.varied[name]:
                 mean, deviation = self._band_weights(name, tissue)
                 weights += np.stack([tissue.mu0 * mean, tissue.sigma0 * deviation], axis=1).ravel().tolist()
@@ -304,7 +303,7 @@ class AppearanceModel:
     def _path_weights(self, tissues: TissueTable) -> np.ndarray:
         """(attenuating tissues,) exponent of two per neper of the paths."""
         change = [
-            _tissue(tissues, name).attenuation_db_cm_mhz - _tissue(self.tissues, name).attenuation_db_cm_mhz
+            tissues.tissue(name).attenuation_db_cm_mhz - self.tissues.tissue(name).attenuation_db_cm_mhz
             for name in self.attenuating
         ]
         return -np.array(change or [0.0], np.float32) / np.float32(self._probing_db_cm_mhz * np.log(2.0))
@@ -314,14 +313,6 @@ def _only(part: int) -> np.ndarray:
     weights = np.zeros(CONSTANTS["PARTS"], np.float32)
     weights[part] = 1.0
     return weights
-
-
-def _tissue(tissues: TissueTable, name: str) -> Tissue:
-    for tissue in tissues.all_tissues():
-        if tissue.name == name:
-            return tissue
-    names = dict.fromkeys(tissue.name for tissue in tissues.all_tissues())
-    raise SimulationError(f"no tissue named {name!r}, expected one of: {', '.join(names)}")
 
 
 def _only_attenuating(tissues: TissueTable, name: str, attenuation_db_cm_mhz: float) -> TissueTable:

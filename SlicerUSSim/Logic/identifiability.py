@@ -13,7 +13,7 @@ from math import log10
 
 import numpy as np
 
-from SlicerUSSim.Logic.parameters import FreeParameters
+from SlicerUSSim.Logic.parameters import SCATTERING, FreeParameters
 from SlicerUSSim.Logic.settings import FULL_SCALE_DB, DisplaySettings
 from SlicerUSSim.Logic.tissues import Tissue, TissueTable
 
@@ -135,24 +135,24 @@ def equal_variance_draws(
     """Positions with the Var of every tissue as at `best` and its mu0, sigma0 and mu1 drawn anew within the bounds."""
     groups: dict[str, dict[str, int]] = {}
     for place, parameter in enumerate(parameters):
-        if parameter.tissue is not None and parameter.attribute in ("mu0", "mu1", "sigma0"):
+        if parameter.tissue is not None and parameter.attribute in SCATTERING:
             groups.setdefault(parameter.tissue, {})[parameter.attribute] = place
     draws = []
     for name, places in groups.items():
         if len(places) < 2:
             continue
-        wanted = variance_db(_named(parameters.apply(best, tissues, display)[0], name))
+        wanted = variance_db(parameters.apply(best, tissues, display)[0].tissue(name))
         for _ in range(20 * count):
             units = np.array(best)
             units[list(places.values())] = random.random(len(places))
             amplitudes = [place for attribute, place in places.items() if attribute != "mu1"]
             for _ in range(3):  # amplitudes are logarithmic: a shift of all of them is a factor
-                tissue = _named(parameters.apply(units, tissues, display)[0], name)
+                tissue = parameters.apply(units, tissues, display)[0].tissue(name)
                 factor = 10.0 ** ((wanted - variance_db(tissue)) / 20.0)
                 for place in amplitudes:
                     parameter = parameters[place]
                     units[place] = parameter.unit(parameter.value(units[place]) * factor)
-            tissue = _named(parameters.apply(units, tissues, display)[0], name)
+            tissue = parameters.apply(units, tissues, display)[0].tissue(name)
             if abs(variance_db(tissue) - wanted) < 0.05:
                 draws.append(units)
             if len(draws) >= count:
@@ -172,7 +172,7 @@ def quantities_of(parameters: FreeParameters, frequency_mhz: float, tissues: Tis
         for p in parameters
     ]
     varied = parameters.varied()
-    brightened = [name for name, names in varied.items() if names & {"mu0", "mu1", "sigma0"}]
+    brightened = [name for name, names in varied.items() if names & SCATTERING]
     display = {p.attribute for p in parameters if p.tissue is None}
     dampened = [name for name, names in varied.items() if "attenuation_db_cm_mhz" in names]
     if "tgc_db_cm_mhz" in display:
@@ -201,38 +201,34 @@ def _scattering(tissues: TissueTable) -> list[str]:
     return list(dict.fromkeys(tissue.name for tissue in tissues.values() if tissue.scatterer_variance > 1e-8))
 
 
-def _named(tissues: TissueTable, name: str) -> Tissue:
-    return next(tissue for tissue in tissues.all_tissues() if tissue.name == name)
-
-
 def _reader(tissue: str | None, attribute: str):
     if tissue is None:
         return lambda tissues, display: getattr(display, attribute)
-    return lambda tissues, display: getattr(_named(tissues, tissue), attribute)
+    return lambda tissues, display: getattr(tissues.tissue(tissue), attribute)
 
 
 def _fall(name: str, frequency_mhz: float):
     def fall(tissues: TissueTable, display: DisplaySettings) -> float:
-        return 2.0 * frequency_mhz * (_named(tissues, name).attenuation_db_cm_mhz - display.tgc_db_cm_mhz)
+        return 2.0 * frequency_mhz * (tissues.tissue(name).attenuation_db_cm_mhz - display.tgc_db_cm_mhz)
 
     return fall
 
 
 def _echogenicity(name: str):
-    return lambda tissues, display: variance_db(_named(tissues, name))
+    return lambda tissues, display: variance_db(tissues.tissue(name))
 
 
 def _relative(name: str, other: str):
-    return lambda tissues, display: variance_db(_named(tissues, name)) - variance_db(_named(tissues, other))
+    return lambda tissues, display: variance_db(tissues.tissue(name)) - variance_db(tissues.tissue(other))
 
 
 def _with_gain(name: str):
-    return lambda tissues, display: variance_db(_named(tissues, name)) + display.gain_db
+    return lambda tissues, display: variance_db(tissues.tissue(name)) + display.gain_db
 
 
 def _grey_level(name: str):
     def grey(tissues: TissueTable, display: DisplaySettings) -> float:
-        level = variance_db(_named(tissues, name)) + display.gain_db - FULL_SCALE_DB
+        level = variance_db(tissues.tissue(name)) + display.gain_db - FULL_SCALE_DB
         return 255.0 * (1.0 + level / display.dynamic_range_db)
 
     return grey

@@ -32,6 +32,8 @@ TISSUE_BOUNDS: dict[str, Bounds] = {
     "mu1": (-1.0, 1.5),
     "sigma0": (0.02, 1.0),
 }
+#: Those of them that make a tissue's scatterers.
+SCATTERING = frozenset(("mu0", "mu1", "sigma0"))
 #: Echo amplitudes are compared by their ratios.
 _LOGARITHMIC = ("mu0", "sigma0")
 _NO_NOISE_DB = -120.0

@@ -133,8 +133,7 @@ def register_poses(
         # A simplex that has shrunk in a dip of the speckle's making is spread out again.
         start = best if step == _STEPS[0] else best + random.normal(0.0, 0.3 * step, 6)
         search.minimise(_ALGORITHM, "coarse", start, coarse_budget - len(search.history), step=step)
-        costs = [entry for entry in search.history if entry.stage == "coarse"]
-        best = np.array(min(costs, key=lambda entry: entry.cost).units)
+        best = np.array(search.best("coarse").units)
         if len(search.history) >= coarse_budget:
             break
     search.cost = full

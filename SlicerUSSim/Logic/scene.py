@@ -269,8 +269,7 @@ class UltrasoundSceneLogic:
         before = self.preset
         tissues = before.tissues
         for name in found.appearance.parameters.varied():
-            fitted = next(tissue for tissue in found.appearance.tissues.all_tissues() if tissue.name == name)
-            tissues = tissues.with_tissue(fitted)
+            tissues = tissues.with_tissue(found.appearance.tissues.tissue(name))
         self.preset = replace(before, probe=found.tracked.probe, display=found.appearance.display, tissues=tissues)
         return before
 

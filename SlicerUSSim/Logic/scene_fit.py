@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.scene_nodes import (
     display_of,
     ijk_to_ras,
     named,
+    node_called,
     node_to_world,
     nodes_of_class,
     read_volume,
@@ -125,8 +126,8 @@ class CostPlot:
     """The cost of an optimisation as a table, two series and a chart in the scene, drawn as it runs."""
 
     def __init__(self, scene, name: str = "Fit to real ultrasound") -> None:
-        self.chart = self._node(scene, "PlotChart", name)
-        self.table = self._node(scene, "Table", f"{name} costs")
+        self.chart = node_called(scene, "PlotChart", name)
+        self.table = node_called(scene, "Table", f"{name} costs")
         self._columns = []
         for title in ("evaluation", "cost", "best"):
             column = vtkDoubleArray()
@@ -137,7 +138,7 @@ class CostPlot:
             self.table.AddColumn(column)
         self.chart.RemoveAllPlotSeriesNodeIDs()
         for title, colour in (("cost", (0.55, 0.55, 0.55)), ("best", (0.85, 0.55, 0.0))):
-            series = self._node(scene, "PlotSeries", f"{name} {title}")
+            series = node_called(scene, "PlotSeries", f"{name} {title}")
             series.SetAndObserveTableNodeID(self.table.GetID())
             series.SetXColumnName("evaluation")
             series.SetYColumnName(title)
@@ -151,12 +152,6 @@ class CostPlot:
         self.chart.SetXAxisTitle("evaluation")
         self.chart.SetYAxisTitle("cost")
         self._drawn = 0.0
-
-    @staticmethod
-    def _node(scene, kind: str, name: str):
-        """The node of an earlier fit, or a new one."""
-        known = (node for node in nodes_of_class(scene, f"vtkMRML{kind}Node") if node.GetName() == name)
-        return next(known, None) or scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
 
     def add(self, progress: Progress) -> None:
         """One more evaluation; the views are told a few times a second."""

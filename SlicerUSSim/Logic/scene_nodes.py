@@ -55,6 +55,12 @@ def nodes_of_class(scene, name: str) -> list:
     return [scene.GetNthNodeByClass(number, name) for number in range(scene.GetNumberOfNodesByClass(name))]
 
 
+def node_called(scene, kind: str, name: str):
+    """The first vtkMRML`kind`Node of that name, or a new one."""
+    known = (node for node in nodes_of_class(scene, f"vtkMRML{kind}Node") if node.GetName() == name)
+    return next(known, None) or scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
+
+
 def display_of(node):
     """A node's display node, the default one if it has none; None where even that cannot be."""
     if node.GetDisplayNode() is None:

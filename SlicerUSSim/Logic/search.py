@@ -138,9 +138,13 @@ class Search:
             self.progress(Progress(stage, len(self.history), self.limit, cost, best.cost, values))
         return cost
 
+    def best(self, stage: str) -> Evaluation:
+        """The evaluation of lowest cost in one stage."""
+        return min((entry for entry in self.history if entry.stage == stage), key=lambda entry: entry.cost)
+
     def best_cost(self, stage: str) -> float:
         """The lowest cost of one stage."""
-        return min(entry.cost for entry in self.history if entry.stage == stage)
+        return self.best(stage).cost
 
     def state(self) -> list:
         """The history as plain values; `history_from` reads it back."""

@@ -269,6 +269,14 @@ class TissueTable(Mapping):
         """Tissues in the order of their labels, the membrane's last."""
         return [*self.values(), *([] if self.membrane is None else [self.membrane.tissue])]
 
+    def tissue(self, name: str) -> Tissue:
+        """The tissue of that name, the membrane's too. Raises SimulationError that lists the names if there is none."""
+        for tissue in self.all_tissues():
+            if tissue.name == name:
+                return tissue
+        names = dict.fromkeys(tissue.name for tissue in self.all_tissues())
+        raise SimulationError(f"no tissue named {name!r}, expected one of: {', '.join(names)}")
+
     def with_tissue(self, tissue: Tissue) -> TissueTable:
         """A new table in which everything of that name, the membrane too, is `tissue`; added if nothing is."""
         labels = [label for label, old in self.items() if old.name == tissue.name]

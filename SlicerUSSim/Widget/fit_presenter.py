@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.parameters import FreeParameters, all_names
 from SlicerUSSim.Logic.preset import Preset
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.scene_fit import COMPARED, CostPlot
-from SlicerUSSim.Logic.scene_nodes import composite_of, nodes_of_class, require_node
+from SlicerUSSim.Logic.scene_nodes import composite_of, node_called, require_node
 from SlicerUSSim.Logic.search import Progress
 from SlicerUSSim.Logic.sequence import frame_numbers
 from SlicerUSSim.Logic.settings import DisplaySettings
@@ -134,7 +134,7 @@ class FitPresenter:
             found, labels = self._fit
             before = panel.logic.applyFit(found)
             if found.registration is not None:
-                transform = self._node("LinearTransform", _REGISTRATION)
+                transform = node_called(self._panel.logic.scene, "LinearTransform", _REGISTRATION)
                 panel.logic.writeRegistration(found, labels, transform)
             self._before = before
         panel.view.refresh()
@@ -170,7 +170,7 @@ class FitPresenter:
         found, labels = self._fit
         logic = self._panel.logic
         require_node(labels, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map of the fit")
-        nodes = {name: self._node("ScalarVolume", f"Fit: {name}") for name in COMPARED}
+        nodes = {name: node_called(self._panel.logic.scene, "ScalarVolume", f"Fit: {name}") for name in COMPARED}
         logic.showFit(found, labels, nodes, number)
         view = self._panel.view.sliceNode()
         if view is not None:
@@ -179,12 +179,6 @@ class FitPresenter:
     @property
     def _parameters(self):
         return self._panel.logic.parameters
-
-    def _node(self, kind: str, name: str):
-        """The node of that name from an earlier fit, or a new one."""
-        scene = self._panel.logic.scene
-        known = (node for node in nodes_of_class(scene, f"vtkMRML{kind}Node") if node.GetName() == name)
-        return next(known, None) or scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
 
 
 def _in_words(found: Fit) -> str:
