@@ -17,6 +17,10 @@ from SlicerUSSim.Logic.tissues import TISSUES
 hypothesis.settings.register_profile("ussim", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("ussim")
 
+#: Real sequences, where a checkout has them beside it.
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="the real sequences of ../shared/data are not here")
+
 #: Speckle without attenuation, so that statistics do not change with depth; and fluids without scatterers.
 SPECKLE = replace(TISSUES["white matter"], name="speckle", attenuation_db_cm_mhz=0.0)
 FLUID = Tissue("fluid", 1540.0, 1.54, 0.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,9 +24,7 @@ from SlicerUSSim.Logic.placement import tilt_sweep
 from SlicerUSSim.Logic.pose import write_pose
 from SlicerUSSim.Logic.tissues import write_json
 from SlicerUSSim.Logic.twins import make_twin
-from tests.conftest import example
-
-SHARED = Path(__file__).parents[2] / "shared" / "data"
+from tests.conftest import SHARED, example, needs_shared
 
 
 def ussim(*arguments):
@@ -196,7 +193,7 @@ def test_black_images_and_a_sequence_that_is_none_are_refused(folder, tmp_path):
         assert done.exit_code == 2 and message in done.output and not (tmp_path / "result.json").exists()
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the real sequences of ../shared/data are not here")
+@needs_shared
 def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
     """Image geometry found in real images, tracking from Plus: a block of muscle stands in for the unknown phantom."""
     (tmp_path / "plus.xml").write_text(
@@ -235,7 +232,7 @@ def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatc
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the real sequences of ../shared/data are not here")
+@needs_shared
 def test_real_speckle_and_noise_can_be_fitted(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib", reason="the example draws: pip install '.[demo]'")
     monkeypatch.setattr("sys.argv", ["fit_real_speckle.py", str(SHARED), "--out", str(tmp_path)])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,9 +12,7 @@ from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationE
 from SlicerUSSim.Logic.fan import Fan, draw_fan, estimate_fan
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.tracked import TrackedImages
-
-SHARED = Path(__file__).parents[2] / "shared" / "data"
-needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="the real sequences of ../shared/data are not here")
+from tests.conftest import SHARED, needs_shared
 
 
 def screen(probe, left: int = 60, top: int = 15, seed: int = 0) -> tuple[np.ndarray, ImageGrid]:

@@ -16,9 +16,7 @@ from SlicerUSSim.Logic import LinearProbe, SimulationError, TrackedSequence, Vol
 from SlicerUSSim.Logic.pose import read_matrix, read_tags, read_transform, rigid_between
 from SlicerUSSim.Logic.sequence import read_coordinate_definitions
 from SlicerUSSim.Logic.tracked import TrackedImages
-
-SHARED = Path(__file__).parents[2] / "shared" / "data"
-needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="the real sequences of ../shared/data are not here")
+from tests.conftest import SHARED, needs_shared
 
 names = st.sampled_from(["ImageToProbe", "ProbeToTracker", "ReferenceToTracker", "ReferenceToRas"])
 
