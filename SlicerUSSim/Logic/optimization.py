@@ -16,14 +16,15 @@ from time import perf_counter
 import numpy as np
 
 from SlicerUSSim.Logic.appearance import AppearanceModel
-from SlicerUSSim.Logic.errors import require, require_between
+from SlicerUSSim.Logic.errors import require_between
 from SlicerUSSim.Logic.identifiability import Identifiability, equal_variance_draws, quantities_of
 from SlicerUSSim.Logic.parameters import Bounds, FreeParameters
 from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.references import mean_cost, reference_comparisons
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.search import GLOBAL_ALGORITHM, LOCAL_ALGORITHM, Evaluation, Progress, Search, history_from
 from SlicerUSSim.Logic.settings import DisplaySettings
-from SlicerUSSim.Logic.similarity import PatchComparison, Similarity, SimilaritySettings
+from SlicerUSSim.Logic.similarity import Similarity, SimilaritySettings
 from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissues import TissueTable
 
@@ -113,31 +114,9 @@ class AppearanceCost:
     ) -> None:
         self.model, self.parameters, self.tissues, self.display = model, parameters, tissues, display
         grid = model.grid(display)
-        seen = grid.field(model.probe)
-        require(len(references) > 0, "no reference image, expected at least one")
-        require(
-            len(references) == len(model.poses),
-            f"{len(references)} reference images and {len(model.poses)} poses, expected as many",
+        self.comparisons = reference_comparisons(
+            model.device, model.probe, grid, references, masks, len(model.poses), settings
         )
-        require(
-            masks is None or len(masks) == len(references),
-            f"{len(masks or ())} masks and {len(references)} reference images, expected as many",
-        )
-        self.comparisons = []
-        for number, reference in enumerate(references):
-            reference = np.asarray(reference)
-            require(
-                reference.shape == (grid.rows, grid.columns),
-                f"reference image {number} has shape {reference.shape}, expected that of the simulated ones, "
-                f"{(grid.rows, grid.columns)}",
-            )
-            inside = seen if masks is None else seen & np.asarray(masks[number], bool)
-            require(
-                bool(inside.any()),
-                f"reference image {number}: its field and the probe's do not overlap; check the geometry",
-            )
-            require(int(reference[inside].max()) > 0, f"reference image {number} is black inside the field")
-            self.comparisons.append(PatchComparison(model.device, reference, inside, grid.pixel_spacing_mm, settings))
 
     def of_each(self, tissues: TissueTable, display: DisplaySettings) -> list[Similarity]:
         """The similarity of every image."""
@@ -148,7 +127,7 @@ class AppearanceCost:
     def __call__(self, units: np.ndarray) -> float:
         """The mean cost at (parameters,) positions between the bounds."""
         tissues, display = self.parameters.apply(units, self.tissues, self.display)
-        return float(np.mean([one.total for one in self.of_each(tissues, display)]))
+        return mean_cost(self.of_each(tissues, display))
 
 
 def optimize_appearance(
@@ -232,8 +211,8 @@ def optimize_appearance(
         parameters=parameters,
         before=dict(zip(parameters.names, parameters.current(tissues, display).tolist(), strict=True)),
         after=describe(best),
-        cost_before=float(np.mean([one.total for one in before])),
-        cost_after=float(np.mean([one.total for one in after])),
+        cost_before=mean_cost(before),
+        cost_after=mean_cost(after),
         similarity_before=before,
         similarity_after=after,
         history=search.history,

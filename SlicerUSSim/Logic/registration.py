@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from SlicerUSSim.Logic.errors import require, require_between
+from SlicerUSSim.Logic.errors import require_between
 from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.references import mean_cost, reference_comparisons
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.search import Evaluation, Progress, Search
 from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
@@ -101,16 +102,9 @@ def register_poses(
     require_between("register_poses", "range_mm", range_mm, 0.01, 100)
     require_between("register_poses", "range_deg", range_deg, 0.01, 90)
     poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
-    require(
-        len(poses) == len(references) > 0,
-        f"{len(references)} reference images and {len(poses)} poses, expected as many",
-    )
     settings = settings or SimilaritySettings()
     grid = grid or ImageGrid.for_probe(probe, display.image_size)
-    inside = grid.field(probe)
-    masks = [inside if masks is None else inside & np.asarray(mask, bool) for mask in masks or poses]
     ranges = np.array([range_mm] * 3 + [range_deg] * 3)
-    frame = _middle_frame(probe, poses)
 
     def correction(units: np.ndarray) -> np.ndarray:
         return frame @ rigid_from((2.0 * np.asarray(units) - 1.0) * ranges) @ np.linalg.inv(frame)
@@ -118,10 +112,16 @@ def register_poses(
     def describe(units: np.ndarray) -> dict[str, float]:
         return dict(zip(NAMES, ((2.0 * np.asarray(units) - 1.0) * ranges).tolist(), strict=True))
 
-    full = _PoseCost(simulator, probe, poses, references, masks, grid, display, settings, correction)
+    comparisons = reference_comparisons(simulator.device, probe, grid, references, masks, len(poses), settings)
+    frame = _middle_frame(probe, poses)
+    full = _PoseCost(simulator, probe, poses, comparisons, grid, display, correction)
     coarse_probe, coarse_grid, coarse_references, coarse_masks = _coarser(probe, grid, references, masks)
+    coarse_comparisons = [
+        PatchComparison(simulator.device, reference, mask, coarse_grid.pixel_spacing_mm, settings)
+        for reference, mask in zip(coarse_references, coarse_masks, strict=True)
+    ]
     coarse = _PoseCost(
-        simulator, coarse_probe, poses, coarse_references, coarse_masks, coarse_grid, display, settings, correction,
+        simulator, coarse_probe, poses, coarse_comparisons, coarse_grid, display, correction,
         _coarser_settings(simulator.settings),
     )  # fmt: skip
     search = Search(coarse, describe, max_evaluations, 0, progress)
@@ -166,15 +166,12 @@ class _PoseCost:
     """The mean cost at corrected poses, as a function of the correction's positions between 0 and 1."""
 
     def __init__(
-        self, simulator, probe, poses, references, masks, grid, display, settings, correction,
+        self, simulator, probe, poses, comparisons: list[PatchComparison], grid, display, correction,
         simulation: SimulationSettings | None = None,
     ) -> None:  # fmt: skip
         self.simulator, self.probe, self.poses, self.grid, self.display = simulator, probe, poses, grid, display
         self.correction, self.simulation = correction, simulation or simulator.settings
-        self.comparisons = [
-            PatchComparison(simulator.device, reference, mask, grid.pixel_spacing_mm, settings)
-            for reference, mask in zip(references, masks, strict=True)
-        ]
+        self.comparisons = comparisons
 
     def __call__(self, units: np.ndarray) -> float:
         matrix, before = self.correction(units), self.simulator.settings
@@ -182,7 +179,7 @@ class _PoseCost:
         try:
             for pose, comparison in zip(self.poses, self.comparisons, strict=True):
                 comparison.run(self.simulator.render(self.probe, matrix @ pose, self.display, self.grid))
-            return float(np.mean([comparison.result().total for comparison in self.comparisons]))
+            return mean_cost(comparison.result() for comparison in self.comparisons)
         finally:
             self.simulator.settings = before
 
@@ -204,7 +201,8 @@ def _coarser(probe: Probe, grid: ImageGrid, references, masks):
         return np.asarray(image, float)[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
 
     images = [np.ascontiguousarray(shrunk(image).round().astype(np.uint8)) for image in references]
-    insides = [shrunk(mask) > 0.99 for mask in masks]
+    field = grid.field(probe)
+    insides = [shrunk(field if masks is None else field & masks[n]) > 0.99 for n in range(len(images))]
     coarse_probe = replace(probe, scan_lines=max(probe.scan_lines // 2, 2))
     return coarse_probe, ImageGrid(rows, columns, grid.left_mm, grid.top_mm, spacing), images, insides
 
