@@ -38,7 +38,7 @@
 #endif
 #define PART (CHUNK + 2)  // one more sample at either end: echoes lie between samples
 
-#define BATCH 256  // cells waiting to be computed; rows are packed end to end so that every lane has work
+#define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
 // What is the same for all scatterers beside one piece of a segment. Vectors are in the order u, v, w of lattice axes.
 typedef struct {
@@ -66,6 +66,35 @@ inline void add_echo(float4 *sum, int bin, float between, float right, float str
   sum[bin + 2] += echo * between;
 }
 
+// The label of a scatterer at fraction (fx, fy, fz) of the cell of voxels at `corner`, which has a border or the membrane
+// in it; `random` are bits of the scatterer's own. With TEXTURE, also its gain.
+inline int drawn_label(__constant const Scene *scene, __global const ushort *corner, __global const uint *texture,
+                       float fx, float fy, float fz, uint random, float *gain) {
+  const int nx = scene->dims[0], nxy = nx * scene->dims[1];
+  // Partial volume without blending: the scatterer takes the label of one corner, drawn with that corner's trilinear
+  // weight. The border is soft on average and fixed in the patient.
+  const int dx = fx * 32.0f > (random & 31u) + 0.5f, dy = fy * 32.0f > ((random >> 5) & 31u) + 0.5f,
+            dz = fz * 32.0f > ((random >> 10) & 31u) + 0.5f;
+  const int drawn = dx + nx * dy + nxy * dz;
+  int label = corner[drawn] & LABEL_MASK;
+#ifdef TEXTURE
+  const uint known = texture[drawn];
+  *gain = exp(LN10_OVER_20 * TEXTURE_STEP_DB * ((int)((known >> 16) & 255u) - 128));
+  if ((hash_mix(random) & 255u) < ((known >> 8) & 255u)) label = known & LABEL_MASK;
+#endif
+  if (corner[0] & NO_MEMBRANE) return label;
+  const float near_z = mix(mix((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
+                           mix((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
+  corner += nxy;
+  const float far_z = mix(mix((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
+                          mix((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
+  if (fabs(mix(near_z, far_z, fz) - 127.5f) >= scene->membrane_reach) return label;
+  *gain = 1.0f;
+  return MEMBRANE_LABEL;
+}
+
+// Three passes over a batch, each without a branch to guess wrong: vectors of all cells; labels of those that count;
+// their echoes, one after the other.
 inline void scatter_batch(__constant const Scene *scene, __global const ushort *voxels, __global const uint *texture,
                           __global const Tissue *tissues, const Piece *piece, const int *cell_u, const uint *row_key,
                           const float *row_v, const float *row_w, int count, float4 *sum VARIED_PARAMETERS) {
@@ -78,6 +107,11 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
   const uint step_u = axis_step(u);
   const float3 d = piece->direction, l = piece->lateral, e = piece->elevational;
 
+  float part_[BATCH], right_[BATCH], re_[BATCH], im_[BATCH], t0_[BATCH], fx_[BATCH], fy_[BATCH], fz_[BATCH];
+  int bin_[BATCH], voxel_[BATCH];
+  uint random_[BATCH];
+  ushort chosen[BATCH + 1];
+  int n = 0;
   for (int begin = 0; begin < count; begin += LANES) {
     const intn cells = LOAD_LANES(cell_u + begin);
     const uintn key = hash_mixn((LOAD_LANES(row_key + begin) + TO_UINTN(cells) * step_u) ^ scene->seed);
@@ -99,6 +133,14 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
     const floatn depth = piece->depth0 + range * piece->slope;
     const floatn place = depth * inverse_sample;
     const floatn bin = floor(place);
+    const intn bins = TO_INTN(bin) - piece->first;
+    const intn counts = (right >= 0.0f) & (right < 1.0f) & (r2 <= cutoff2) & (bins >= -1) & (bins < CHUNK) &
+                        (along >= piece->from_mm) & (along < piece->to_mm) & (LANE_INDEX < count - begin);
+    SPREAD(int, counts_, counts);
+    for (int j = 0; j < LANES; j++) {
+      chosen[n] = begin + j;
+      n += counts_[j] & 1;
+    }
     const floatn amplitude = exp2_fast(clamp(piece->gain0 + t * piece->gain1 - r2, -100.0f, 100.0f));
     floatn cosine, sine;
     turn(depth * scene->cycles_per_mm, &cosine, &sine);
@@ -107,86 +149,67 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
     const floatn vy = clamp(at.y + pu * rj.x + pv * rj.y + pw * rj.z, 0.0f, voxel_top.y);
     const floatn vz = clamp(at.z + pu * rk.x + pv * rk.y + pw * rk.z, 0.0f, voxel_top.z);
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
+    STORE_LANES(bins, bin_ + begin);
+    STORE_LANES(place - bin, part_ + begin);
+    STORE_LANES(right, right_ + begin);
+    STORE_LANES(amplitude * cosine, re_ + begin);
+    STORE_LANES(amplitude * -sine, im_ + begin);
+    STORE_LANES(gaussian(key1), t0_ + begin);
+    STORE_LANES(key2, random_ + begin);
+    STORE_LANES((iz * ny + iy) * nx + ix, voxel_ + begin);
+    STORE_LANES(vx - TO_FLOATN(ix), fx_ + begin);
+    STORE_LANES(vy - TO_FLOATN(iy), fy_ + begin);
+    STORE_LANES(vz - TO_FLOATN(iz), fz_ + begin);
+  }
 
-    const intn bins = TO_INTN(bin) - piece->first;
-    const intn counts = (right >= 0.0f) & (right < 1.0f) & (r2 <= cutoff2) & (bins >= -1) & (bins < CHUNK) &
-                        (along >= piece->from_mm) & (along < piece->to_mm);
-    SPREAD(int, counts_, counts);
-    SPREAD(int, bin_, bins);
-    SPREAD(float, part_, place - bin);
-    SPREAD(float, right_, right);
-    SPREAD(float, re_, amplitude *cosine);
-    SPREAD(float, im_, amplitude * -sine);
-    SPREAD(float, t0_, gaussian(key1));
-    SPREAD(uint, random_, key2);
-    SPREAD(int, voxel_, (iz * ny + iy) * nx + ix);
-    SPREAD(float, fx_, vx - TO_FLOATN(ix));
-    SPREAD(float, fy_, vy - TO_FLOATN(iy));
-    SPREAD(float, fz_, vz - TO_FLOATN(iz));
+  uchar label_[BATCH];
+  ushort mixed[BATCH + 1];
+  int several = 0;
+  for (int i = 0; i < n; i++) {
+    const int word = voxels[voxel_[chosen[i]]];
+    label_[i] = word & LABEL_MASK;
+    mixed[several] = i;
+#ifdef TEXTURE
+    several++;  // texture varies inside tissues too
+#else
+    several += (word & PLAIN_CELL) != PLAIN_CELL;
+#endif
+  }
+#ifdef TEXTURE
+  float gain_[BATCH];
+#endif
+  for (int k = 0; k < several; k++) {
+    const int i = mixed[k], j = chosen[i], here = voxel_[j];
+    float gain = 1.0f;
+    label_[i] = drawn_label(scene, voxels + here, texture + here, fx_[j], fy_[j], fz_[j], random_[j], &gain);
+#ifdef TEXTURE
+    gain_[i] = gain;
+#endif
+  }
 
-    // First gather the lanes that count, then work on them: a branch per lane would be guessed wrong every third time.
-    const int lanes = min(LANES, count - begin);
-    int chosen[LANES], n = 0;
-    for (int j = 0; j < lanes; j++) {
-      chosen[n] = j;
-      n += counts_[j] & 1;
-    }
-    for (int i = 0; i < n; i++) {
-      const int j = chosen[i], b = bin_[j];
-      const uint random = random_[j];
-      const uint word = voxels[voxel_[j]];
-      int label = word & LABEL_MASK;
+  for (int i = 0; i < n; i++) {
+    const int j = chosen[i], b = bin_[j], label = label_[i];
 #ifdef TEXTURE
-      float gain = 1.0f;
-      const int is_plain = 0;  // texture varies inside tissues too
+    const float gain = gain_[i];
 #else
-      const int is_plain = word & PLAIN_CELL;
-#endif
-      if (!is_plain) {
-        const float fx = fx_[j], fy = fy_[j], fz = fz_[j];
-        // Partial volume without blending: the scatterer takes the label of one corner, drawn with that corner's
-        // trilinear weight from bits of its own. The border is soft on average and fixed in the patient.
-        const int dx = fx * 32.0f > (random & 31u) + 0.5f, dy = fy * 32.0f > ((random >> 5) & 31u) + 0.5f,
-                  dz = fz * 32.0f > ((random >> 10) & 31u) + 0.5f;
-        __global const ushort *corner = voxels + voxel_[j];
-        const int drawn = dx + nx * (dy + ny * dz);
-        label = corner[drawn] & LABEL_MASK;
-#ifdef TEXTURE
-        const uint known = texture[voxel_[j] + drawn];
-        gain = native_exp(LN10_OVER_20 * TEXTURE_STEP_DB * ((int)((known >> 16) & 255u) - 128));
-        if ((hash_mix(random) & 255u) < ((known >> 8) & 255u)) label = known & LABEL_MASK;
-#endif
-        if (scene->membrane_reach >= 0.0f) {
-          const float near_z = mix(mix((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
-                                   mix((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
-          corner += nx * ny;
-          const float far_z = mix(mix((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
-                                  mix((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
-          if (fabs(mix(near_z, far_z, fz) - 127.5f) < scene->membrane_reach) label = MEMBRANE_LABEL;
-        }
-      }
-#ifdef TEXTURE
-      if (label == MEMBRANE_LABEL) gain = 1.0f;
-#else
-      const float gain = 1.0f;
+    const float gain = 1.0f;
 #endif
 #ifdef VARIED
-      if (role[label] == ROLE_SILENT) continue;
-      if (role[label] == ROLE_VARIED) {
-        const float site = ((random >> 16) + 0.5f) / 65536.0f;
-        int band = 0;
-        while (band < BANDS - 1 && site >= band_top[band]) band++;
-        float4 *part = sum + (1 + 2 * band) * PART;
-        add_echo(part, b, part_[j], right_[j], gain, re_[j], im_[j]);
-        add_echo(part + PART, b, part_[j], right_[j], gain * t0_[j], re_[j], im_[j]);
-        continue;
-      }
-#endif
-      const float p = tissues[label].share;
-      const int exists = (random >> 16) + 0.5f < p * 65536.0f;
-      const float strength = tissues[label].mu0 * (exists - p) + tissues[label].sigma0 * t0_[j] * exists;
-      add_echo(sum, b, part_[j], right_[j], gain * strength, re_[j], im_[j]);
+    if (role[label] == ROLE_SILENT) continue;
+    if (role[label] == ROLE_VARIED) {
+      const float site = ((random_[j] >> 16) + 0.5f) / 65536.0f;
+      int band = 0;
+      while (band < BANDS - 1 && site >= band_top[band]) band++;
+      float4 *part = sum + (1 + 2 * band) * PART;
+      add_echo(part, b, part_[j], right_[j], gain, re_[j], im_[j]);
+      add_echo(part + PART, b, part_[j], right_[j], gain * t0_[j], re_[j], im_[j]);
+      continue;
     }
+#endif
+    const float p = tissues[label].share;
+    const int exists = (random_[j] >> 16) + 0.5f < p * 65536.0f;
+    const float strength = tissues[label].mu0 * (exists - p) + tissues[label].sigma0 * t0_[j] * exists;
+    add_echo(sum, b, part_[j], right_[j], gain * strength, re_[j], im_[j]);
   }
 }
 

@@ -11,7 +11,8 @@ import numpy as np
 CONSTANTS = {
     "LABEL_MASK": 0x3F,  # low byte of a medium voxel: six bits of label, ...
     "SAME_LABEL": 0x40,  # ... one that says that all eight voxels of this cell have one label, ...
-    "PLAIN_CELL": 0x80,  # ... and one that says that they do and no membrane passes between them
+    "NO_MEMBRANE": 0x80,  # ... and one that says that no membrane passes between them
+    "PLAIN_CELL": 0xC0,  # both
     "MEMBRANE_LABEL": 63,
     "MAX_TISSUES": 64,
     "WIDE_SIGMA": 3.0,  # of the Gaussian that smooths the indicators of acoustic groups (medium.py), voxels

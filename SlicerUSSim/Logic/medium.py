@@ -108,12 +108,12 @@ class Medium:
         distance, self.membrane_reach = self._fluid_distance(padded, tissues)
         words = padded.astype(np.uint16)
         lowest, highest = _cell_extremes(padded)
-        plain = same = lowest == highest
+        same, no_membrane = lowest == highest, True
         if distance is not None:
             words |= distance.astype(np.uint16) << 8
             lowest, highest = _cell_extremes(distance)
-            plain = same & ((lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach))
-        words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["PLAIN_CELL"]) * plain
+            no_membrane = (lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach)
+        words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["NO_MEMBRANE"]) * no_membrane
         self.voxel_buffer = self.device.upload(words)
 
     def _upload_smooth(self, padded: np.ndarray) -> None:
