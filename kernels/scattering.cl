@@ -249,37 +249,45 @@ inline void scatter_piece(__constant const Scene *scene, __global const ushort *
       fabs(e.z) < 0.02f ? 1e6f
                         : 0.5f * (high - low) * fabs(d.y - along_band * d.z) + radius_l * fabs(l.y - along_band * l.z);
 
+  const float base_u = 0.5f * cell - start.x;
   int waiting = 0;
   for (int cw = w_low; cw <= w_high; cw++) {
     const float v_here = band_v + along_band * cw * cell, v_next = v_here + along_band * cell;
     const int v_first = max(v_low, (int)floor((fmin(v_here, v_next) - band_reach) * inverse_cell));
     const int v_last = min(v_high, (int)floor((fmax(v_here, v_next) + band_reach) * inverse_cell));
-    for (int cv = v_first; cv <= v_last; cv++) {
-      const float3 base = (float3)(0.5f * cell, (cv + 0.5f) * cell, (cw + 0.5f) * cell) - start;
-      const float base_d = dot(base, d), base_l = dot(base, l), base_e = dot(base, e);
-      const float d0 = (low - slack_d - base_d) * per_d, d1 = (high + slack_d - base_d) * per_d;
-      const float l0 = (-limit_l - base_l) * per_l, l1 = (limit_l - base_l) * per_l;
-      const float e0 = (-limit_e - base_e) * per_e, e1 = (limit_e - base_e) * per_e;
-      const float from = fmax(fmax(fmin(d0, d1), fmin(l0, l1)), fmax(fmin(e0, e1), box_low.x - 1.0f));
-      const float to = fmin(fmin(fmax(d0, d1), fmax(l0, l1)), fmin(fmax(e0, e1), box_high.x + 1.0f));
-      if (from > to) continue;
-      const int u_low = (int)ceil(from), u_high = (int)floor(to);
-      const uint key = (uint)cv * step_v + (uint)cw * step_w;
-      for (int cu = u_low; cu <= u_high; cu += LANES) {
-        STORE_LANES(cu + LANE_INDEX, cell_u + waiting);
-        STORE_LANES((uintn)(key), row_key + waiting);
-        STORE_LANES((floatn)(cv * cell - start.y), row_v + waiting);
-        STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
-        waiting += min(LANES, u_high - cu + 1);
-        if (waiting >= BATCH) {
-          scatter_batch(scene, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, BATCH,
-                        sum VARIED_ARGUMENTS);
-          waiting -= BATCH;
-          for (int i = 0; i < waiting; i++) {
-            cell_u[i] = cell_u[BATCH + i];
-            row_key[i] = row_key[BATCH + i];
-            row_v[i] = row_v[BATCH + i];
-            row_w[i] = row_w[BATCH + i];
+    const float base_w = (cw + 0.5f) * cell - start.z;
+    const float rest_d = base_u * d.x + base_w * d.z, rest_l = base_u * l.x + base_w * l.z,
+                rest_e = base_u * e.x + base_w * e.z;
+    for (int cv = v_first; cv <= v_last; cv += LANES) {
+      const floatn base_v = (TO_FLOATN(cv + LANE_INDEX) + 0.5f) * cell - start.y;
+      const floatn base_d = rest_d + base_v * d.y, base_l = rest_l + base_v * l.y, base_e = rest_e + base_v * e.y;
+      const floatn d0 = (low - slack_d - base_d) * per_d, d1 = (high + slack_d - base_d) * per_d;
+      const floatn l0 = (-limit_l - base_l) * per_l, l1 = (limit_l - base_l) * per_l;
+      const floatn e0 = (-limit_e - base_e) * per_e, e1 = (limit_e - base_e) * per_e;
+      const floatn from = max(max(min(d0, d1), min(l0, l1)), max(min(e0, e1), box_low.x - 1.0f));
+      const floatn to = min(min(max(d0, d1), max(l0, l1)), min(max(e0, e1), box_high.x + 1.0f));
+      const intn u_low = TO_INTN(ceil(from));
+      SPREAD(int, u_low_, u_low);
+      SPREAD(int, cells_, TO_INTN(floor(to)) - u_low + 1);
+      for (int j = 0; j < min(LANES, v_last - cv + 1); j++) {
+        const uint key = (uint)(cv + j) * step_v + (uint)cw * step_w;
+        const float place_v = (cv + j) * cell - start.y;
+        for (int cu = 0; cu < cells_[j]; cu += LANES) {
+          STORE_LANES(u_low_[j] + cu + LANE_INDEX, cell_u + waiting);
+          STORE_LANES((uintn)(key), row_key + waiting);
+          STORE_LANES((floatn)(place_v), row_v + waiting);
+          STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
+          waiting += min(LANES, cells_[j] - cu);
+          if (waiting >= BATCH) {
+            scatter_batch(scene, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, BATCH,
+                          sum VARIED_ARGUMENTS);
+            waiting -= BATCH;
+            for (int i = 0; i < waiting; i++) {
+              cell_u[i] = cell_u[BATCH + i];
+              row_key[i] = row_key[BATCH + i];
+              row_v[i] = row_v[BATCH + i];
+              row_w[i] = row_w[BATCH + i];
+            }
           }
         }
       }
@@ -312,11 +320,14 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
     const float segment_high = fmin(segment->length_mm, (depth_high - piece.depth0) / piece.slope);
     if (segment_low >= segment_high) continue;
 
-    // Lattice axes in an order that puts the beam's elevational width, the longest, along u, where the lanes run.
+    // Lattice axes in an order that puts the beam's elevational width, the longest, along u, whose cells lie side by
+    // side in the lanes, and depth along v, whose rows do.
     float wide[3];
     for (int a = 0; a < 3; a++) wide[a] = fabs(segment->elevational[a]);
     const int u = wide[0] >= wide[1] ? (wide[0] >= wide[2] ? 0 : 2) : (wide[1] >= wide[2] ? 1 : 2);
-    const int v = u == 2 ? 0 : u + 1, w = v == 2 ? 0 : v + 1;
+    const int next = u == 2 ? 0 : u + 1, after = next == 2 ? 0 : next + 1;
+    const int is_deep = fabs(segment->direction[next]) >= fabs(segment->direction[after]);
+    const int v = is_deep ? next : after, w = is_deep ? after : next;
     const float3 d = (float3)(segment->direction[u], segment->direction[v], segment->direction[w]);
     const float3 l = (float3)(segment->lateral[u], segment->lateral[v], segment->lateral[w]);
     const float3 e = (float3)(segment->elevational[u], segment->elevational[v], segment->elevational[w]);
