@@ -6,10 +6,10 @@
 //   echo has the beam's elevational width. The lateral width comes from the neighbouring lines (beam.cl).
 // Lines are traced at least as finely as they are scanned (lateral_rays per scan line), and a few beyond the edges.
 //
-// Buffers: voxels ushort [k][j][i] and smooth ushort [group][k][j][i] (medium.py); tissues Tissue [label]; quantiles
-// float [traced line][elevational ray], offsets in units of the elevational sigma; segments Segment [traced
-// line][MAX_SEGMENTS] with segment_counts; hits Hit [traced line][elevational ray][MAX_HITS] with hit_counts; cut float
-// [traced line][1 + elevational ray], the weight of the branches that were not followed.
+// Buffers: voxels ushort [k][j][i], groups uchar [k][j][i] and smooth ushort [group][k][j][i] (medium.py); tissues
+// Tissue [label]; quantiles float [traced line][elevational ray], offsets in units of the elevational sigma; segments
+// Segment [traced line][MAX_SEGMENTS] with segment_counts; hits Hit [traced line][elevational ray][MAX_HITS] with
+// hit_counts; cut float [traced line][1 + elevational ray], the weight of the branches that were not followed.
 
 #include "borders.clh"
 
@@ -28,52 +28,49 @@ typedef struct {
   int label;
 } Ray;
 
-// The label at `voxel` (padded voxel indices): the acoustic group with the largest trilinear weight, so that borders
-// are sub-voxel and without stairs, and within it the label of the nearest corner. Voting by group keeps the border of
-// fluid against brain smooth wherever grey, white and other brain labels change along it.
-inline int label_at(__global const ushort *voxels, __constant const Scene *scene, __constant const Tissue *tissues,
-                    float3 voxel) {
-  int nx = scene->dims[0], ny = scene->dims[1], nz = scene->dims[2];
-  voxel = clamp(voxel, (float3)(0.0f), (float3)(nx - 1.001f, ny - 1.001f, nz - 1.001f));
-  int3 base = convert_int3(voxel);
-  int here = (base.z * ny + base.y) * nx + base.x;
-  uint word = voxels[here];
+// The label at fraction f of the cell of voxels at index `here`: the acoustic group with the largest trilinear weight,
+// so that borders are sub-voxel and without stairs, and within it the label of the nearest corner. Voting by group
+// keeps the border of fluid against brain smooth wherever grey, white and other brain labels change along it.
+inline int label_in_cell(__global const ushort *voxels, __global const uchar *groups, __constant const Scene *scene,
+                         int here, float3 f) {
+  const int word = voxels[here];
   if (word & SAME_LABEL) return word & LABEL_MASK;
-  float3 f = voxel - convert_float3(base), g = 1.0f - f;
-  int labels[8], groups[8];
-  float weights[8];
-  for (int c = 0; c < 8; c++) {
-    labels[c] = voxels[here + (c & 1) + ((c >> 1) & 1) * nx + (c >> 2) * nx * ny] & LABEL_MASK;
-    groups[c] = tissues[labels[c]].group;
-    weights[c] = ((c & 1) ? f.x : g.x) * ((c & 2) ? f.y : g.y) * ((c & 4) ? f.z : g.z);
-  }
+  const int nx = scene->dims[0], nxy = nx * scene->dims[1];
+  if (groups[here] & SAME_GROUP)
+    return voxels[here + (f.x > 0.5f) + (f.y > 0.5f ? nx : 0) + (f.z > 0.5f ? nxy : 0)] & LABEL_MASK;
+  __global const uchar *far = groups + here + nxy;
+  const uchar8 corners =
+      (uchar8)(vload2(0, groups + here), vload2(0, groups + here + nx), vload2(0, far), vload2(0, far + nx));
+  const int8 group = convert_int8(corners) & GROUP_MASK;
+  const float3 g = 1.0f - f;
+  const float4 plane = (float4)(g.x * g.y, f.x * g.y, g.x * f.y, f.x * f.y);
+  const float8 weights = (float8)(plane * g.z, plane * f.z);
   // Nearly every border cell holds two groups: the first corner's and another one.
-  int first = groups[0], second = first;
-  float first_weight = 0.0f, second_weight = 0.0f;
-  for (int c = 0; c < 8; c++) second = groups[c] != first ? groups[c] : second;
-  for (int c = 0; c < 8; c++) {
-    first_weight += groups[c] == first ? weights[c] : 0.0f;
-    second_weight += groups[c] == second ? weights[c] : 0.0f;
-  }
+  const int first = group.s0, second = max_int8(select(group, (int8)(-1), group == first));
+  const float first_weight = sum8(where8(group == first, weights));
+  const float second_weight = sum8(where8(group == second, weights));
   int best = first_weight >= second_weight ? first : second;
-  float best_weight = fmax(first_weight, second_weight);
+  float best_weight = max(first_weight, second_weight);
   if (best_weight < 1.0f - first_weight - second_weight)
-    for (int c = 0; c < 8; c++) {
-      float total = 0.0f;
-      for (int e = 0; e < 8; e++) total += groups[e] == groups[c] ? weights[e] : 0.0f;
-      if (total > best_weight) {
-        best_weight = total;
-        best = groups[c];
+    for (int other = 0; other < second; other++) {
+      const float weight = sum8(where8(group == other, weights));
+      if (weight > best_weight) {
+        best_weight = weight;
+        best = other;
       }
     }
-  int label = 0;
-  float nearest = -1.0f;
-  for (int c = 0; c < 8; c++)
-    if (groups[c] == best && weights[c] > nearest) {
-      nearest = weights[c];
-      label = labels[c];
-    }
-  return label;
+  const float8 of_best = where8(group == best, weights);
+  const int corner = max_int8(select((int8)(0), (int8)(0, 1, 2, 3, 4, 5, 6, 7), of_best == max8(of_best)));
+  return voxels[here + (corner & 1) + ((corner >> 1) & 1) * nx + (corner >> 2) * nxy] & LABEL_MASK;
+}
+
+// The label at `voxel` (padded voxel indices).
+inline int label_at(__global const ushort *voxels, __global const uchar *groups, __constant const Scene *scene,
+                    float3 voxel) {
+  const int nx = scene->dims[0], ny = scene->dims[1], nz = scene->dims[2];
+  voxel = clamp(voxel, (float3)(0.0f), (float3)(nx - 1.001f, ny - 1.001f, nz - 1.001f));
+  const int3 base = convert_int3(voxel);
+  return label_in_cell(voxels, groups, scene, (base.z * ny + base.y) * nx + base.x, voxel - convert_float3(base));
 }
 
 // Carry a vector perpendicular to `from` along the smallest rotation that takes `from` to `to`.
@@ -107,24 +104,49 @@ inline float2 volume_span(__constant const Scene *scene, const Course *course, f
 
 // March from `inside` until the label is no longer `label`, then bisect. Returns the first length found to be in
 // another tissue, whose label goes to `other`; or -1 if there is none up to `last`. Nothing before `blind_until`
-// counts.
-inline float next_border(__global const ushort *voxels, __constant const Scene *scene, __constant const Tissue *tissues,
-                         const Course *course, int label, float inside, float last, float blind_until, int *other) {
+// counts. Eight steps of half a voxel are looked up at once.
+inline float next_border(__global const ushort *voxels, __global const uchar *groups, __constant const Scene *scene,
+                         __constant const Tissue *tissues, const Course *course, int label, float inside, float last,
+                         float blind_until, int *other) {
   const float stride = 0.5f * scene->voxel_mm;
+  const int nx = scene->dims[0], ny = scene->dims[1];
+  const float3 top = (float3)(nx - 1.001f, ny - 1.001f, scene->dims[2] - 1.001f);
   float beyond = -1.0f;
-  while (inside < last) {
-    float next = fmin(inside + stride, last + 1e-4f);
-    *other = label_at(voxels, scene, tissues, course_at(scene, course, next));
-    if (*other != label && course->path + next > blind_until) {
-      beyond = next;
-      break;
+  while (inside < last && beyond < 0.0f) {
+    const float8 ahead = min(inside + stride * (float8)(1, 2, 3, 4, 5, 6, 7, 8), last + 1e-4f);
+    const float8 sigma = elevation_sigma8(scene, course->path + ahead);
+    const float8 x = clamp(course->start.x + ahead * course->step.x + sigma * course->aside.x, 0.0f, top.x);
+    const float8 y = clamp(course->start.y + ahead * course->step.y + sigma * course->aside.y, 0.0f, top.y);
+    const float8 z = clamp(course->start.z + ahead * course->step.z + sigma * course->aside.z, 0.0f, top.z);
+    const int8 i = convert_int8(x), j = convert_int8(y), k = convert_int8(z);
+    int here[8], differs = 0;
+    vstore8((k * ny + j) * nx + i, 0, here);
+    for (int n = 0; n < 8; n++) differs |= (voxels[here[n]] & (LABEL_MASK | SAME_LABEL)) ^ (label | SAME_LABEL);
+    float length[8];
+    vstore8(ahead, 0, length);
+    if (differs) {
+      float fx[8], fy[8], fz[8];
+      vstore8(x - convert_float8(i), 0, fx);
+      vstore8(y - convert_float8(j), 0, fy);
+      vstore8(z - convert_float8(k), 0, fz);
+      for (int n = 0; n < 8; n++) {
+        *other = label_in_cell(voxels, groups, scene, here[n], (float3)(fx[n], fy[n], fz[n]));
+        if (*other != label && course->path + length[n] > blind_until) {
+          beyond = length[n];
+          break;
+        }
+        inside = length[n];
+      }
+    } else {
+      inside = length[7];
     }
-    inside = next;
   }
   if (beyond < 0.0f) return beyond;
-  for (int iteration = 0; iteration < 8; iteration++) {
+  // Where only attenuation changes, a sixteenth of a voxel is enough.
+  const int group = tissues[label].group;
+  for (int iteration = 0; iteration < 8 && (iteration < 3 || tissues[*other].group != group); iteration++) {
     float middle = 0.5f * (inside + beyond);
-    int found = label_at(voxels, scene, tissues, course_at(scene, course, middle));
+    int found = label_at(voxels, groups, scene, course_at(scene, course, middle));
     if (found == label) {
       inside = middle;
     } else {
@@ -142,15 +164,14 @@ inline float decay_in(__constant const Scene *scene, Tissue tissue) {
 
 // The tube (tube_after) behind a mirror of curvature k, met under the angle of incidence i in the plane of the offset:
 // a ray beside this one meets a normal turned by k / cos i per mm of offset, and is turned by twice that.
-inline float4 tube_reflected(__global const ushort *voxels, __global const ushort *smooth,
-                             __constant const Scene *scene, __constant const Tissue *tissues, float4 tube, Ray ray,
-                             float3 point, float3 normal, int before, int behind) {
+inline float4 tube_reflected(__global const uchar *groups, __global const ushort *smooth, __constant const Scene *scene,
+                             float4 tube, Ray ray, float3 point, float3 normal, int before, int behind) {
   for (int axis = 0; axis < 2; axis++) {
     const float3 offset = axis == 0 ? ray.lateral : ray.elevational;
     // Along the ray onto the surface, so longer by 1 / cos i.
     const float3 along = offset - dot(normal, offset) / fmin(dot(normal, ray.direction), -0.2f) * ray.direction;
     const float longer = fmax(length(along), 1e-3f);
-    const float curvature = border_curvature(voxels, smooth, scene, tissues, point, along / longer, before, behind);
+    const float curvature = border_curvature(groups, smooth, scene, point, along / longer, before, behind);
     // Concave mirrors focus; taken from voxels that would make random bright spots, so they count as flat.
     const float growth = 2.0f * fmax(curvature, 0.0f) * longer;
     if (axis == 0)
@@ -232,20 +253,21 @@ inline Ray root_of(__constant const Scene *scene, int line) {
 // parts. Without it, walls seen aslant show as one thin line per ray.
 inline float stratum_coherence(__constant const Scene *scene, Ray ray, float3 normal, float quantile, float path,
                                float depth_per_mm) {
-  const float density = 0.39894228f * native_exp(-0.5f * quantile * quantile);  // of N(0, 1)
+  const float density = 0.39894228f * exp(-0.5f * quantile * quantile);  // of N(0, 1)
   const float width = elevation_sigma(scene, path) / (scene->elevational_rays * density);
   const float slope = dot(normal, ray.elevational) / fmin(dot(normal, ray.direction), -0.05f);
   const float turns = scene->cycles_per_mm * depth_per_mm * width * slope;
-  return native_exp(-1.6449341f * turns * turns);  // the main lobe of sin(pi t) / (pi t), to second order
+  return exp(-1.6449341f * turns * turns);  // the main lobe of sin(pi t) / (pi t), to second order
 }
 
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
 __kernel void
-trace(__constant const Scene *scene, __global const ushort *voxels, __global const ushort *smooth,
-      __constant const Tissue *tissues, __global const float *quantiles, __global Segment *segments,
-      __global int *segment_counts, __global Hit *hits, __global int *hit_counts, __global float *cut) {
+trace(__constant const Scene *scene, __global const ushort *voxels, __global const uchar *groups,
+      __global const ushort *smooth, __constant const Tissue *tissues, __global const float *quantiles,
+      __global Segment *segments, __global int *segment_counts, __global Hit *hits, __global int *hit_counts,
+      __global float *cut) {
   const int line = get_global_id(0), ray_of_line = get_global_id(1), rays = scene->elevational_rays;
   const int on_axis = ray_of_line == 0;
   const int slot = line * rays + ray_of_line - 1;
@@ -271,7 +293,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       course.step = affine_vector(scene->ras_to_voxel, ray.direction);
       course.aside = affine_vector(scene->ras_to_voxel, ray.elevational) * quantile;
       course.path = ray.path;
-      if (ray.label < 0) ray.label = label_at(voxels, scene, tissues, course_at(scene, &course, 0.0f));
+      if (ray.label < 0) ray.label = label_at(voxels, groups, scene, course_at(scene, &course, 0.0f));
       Tissue here = tissues[ray.label], behind = here;
       const float depth_per_mm = scene->reference_speed_m_s / here.speed_m_s;
       const float to_depth = (scene->depth_mm - ray.depth) / depth_per_mm;
@@ -288,8 +310,8 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
         const float to_silence = since + fmax(reserve, 0.0f) / fmax(decay, 1e-9f);
         is_silenced = to_silence < to_depth;
         const float longest = fmin(to_depth, to_silence);
-        border = next_border(voxels, scene, tissues, &course, ray.label, inside, fmin(span.y, longest), ray.blind_until,
-                             &other);
+        border = next_border(voxels, groups, scene, tissues, &course, ray.label, inside, fmin(span.y, longest),
+                             ray.blind_until, &other);
         const float until = border < 0.0f ? longest : border;
         const float spent_until = spent + decay * (until - since);
         if (border >= 0.0f) behind = tissues[other];
@@ -322,8 +344,8 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       }
 
       float overshoot;
-      const float3 normal = interface_normal(voxels, smooth, scene, tissues, course_at(scene, &course, border),
-                                             here.group, behind.group, ray.direction, course.step, &overshoot);
+      const float3 normal = interface_normal(groups, smooth, scene, course_at(scene, &course, border), here.group,
+                                             behind.group, ray.direction, course.step, &overshoot);
       overshoot = fmin(overshoot, border - since);
       border -= overshoot;
       spent -= overshoot * decay_in(scene, here);
@@ -369,8 +391,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
         child.elevational = mirror(ray.elevational, normal);
         child.axis = hit_point - mirror(aside, normal);
         if (scene->reflection_spreading)
-          child.tube =
-              tube_reflected(voxels, smooth, scene, tissues, tube, ray, hit_point, normal, here.group, behind.group);
+          child.tube = tube_reflected(groups, smooth, scene, tube, ray, hit_point, normal, here.group, behind.group);
         child.path = path;
         child.depth = depth;
         child.log_attenuation = log_attenuation;

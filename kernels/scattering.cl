@@ -66,8 +66,8 @@ inline void add_echo(float4 *sum, int bin, float between, float right, float str
   sum[bin + 2] += echo * between;
 }
 
-// The label of a scatterer at fraction (fx, fy, fz) of the cell of voxels at `corner`, which has a border or the membrane
-// in it; `random` are bits of the scatterer's own. With TEXTURE, also its gain.
+// The label of a scatterer at fraction (fx, fy, fz) of the cell of voxels at `corner`, which has a border or the
+// membrane in it; `random` are bits of the scatterer's own. With TEXTURE, also its gain.
 inline int drawn_label(__constant const Scene *scene, __global const ushort *corner, __global const uint *texture,
                        float fx, float fy, float fz, uint random, float *gain) {
   const int nx = scene->dims[0], nxy = nx * scene->dims[1];

@@ -1,4 +1,4 @@
-"""The acoustic medium as the device sees it: labels, membrane, smoothed borders and tissue numbers in three buffers.
+"""The acoustic medium as the device sees it: labels, membrane, smoothed borders and tissue numbers in buffers.
 
 A voxel takes two bytes. The low byte holds the label and flags for cells (the cube between eight voxel centres) whose
 corners agree, so that most look-ups need one load. The high byte holds the *fluid distance*: how far inside the
@@ -49,7 +49,7 @@ class Medium:
         padded = np.pad(array, _PAD)
         self._rows = self._tissue_rows(tissues)
         self._upload(padded, tissues)
-        self._upload_smooth(padded)
+        self._upload_groups(padded)
         self.has_texture = texture is not None
         no_texture = np.zeros(1, np.uint32)
         self.texture_buffer = device.upload(
@@ -73,7 +73,7 @@ class Medium:
         groups_before = self._rows["group"]
         self._rows = self._tissue_rows(tissues)
         if not np.array_equal(self._rows["group"], groups_before):
-            self._upload_smooth(np.pad(as_labels(self.labels.array), _PAD))
+            self._upload_groups(np.pad(as_labels(self.labels.array), _PAD))
         self.device.write(self.tissue_buffer, self._rows)
         self.tissues = tissues
 
@@ -116,16 +116,21 @@ class Medium:
         words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["NO_MEMBRANE"]) * no_membrane
         self.voxel_buffer = self.device.upload(words)
 
-    def _upload_smooth(self, padded: np.ndarray) -> None:
-        """Indicators of the first acoustic groups, smoothed: where interfaces are flat, they know normals best."""
+    def _upload_groups(self, padded: np.ndarray) -> None:
+        """The acoustic group of every voxel, and the indicators of the first groups, smoothed: where interfaces are flat,
+        they know normals best."""
         group_of = self._rows["group"].astype(np.uint8)
+        group = group_of[padded]
+        lowest, highest = _cell_extremes(group)
+        words = group | np.uint8(CONSTANTS["SAME_GROUP"]) * (lowest == highest)
+        # Rows are read eight voxels at a time, the last one too.
+        self.group_buffer = self.device.upload(np.pad(words.ravel(), (0, 8)))
         # The coupling medium lies around the volume even where its label does not occur.
         groups = {int(group_of[label]) for label in (0, *self.present)}
         room = max(_SMOOTHED_VOXELS // padded.size, 2)
         self.smooth_groups = min(max(groups) + 1, _MOST_SMOOTHED_GROUPS, room)
         fields = np.zeros((self.smooth_groups, *padded.shape), np.uint16)
         if len(groups) > 1:
-            group = group_of[padded]
             rest = np.full(padded.shape, 65535, np.uint16)  # indicators sum to one, which saves the last one's Gaussian
             *all_but_last, last = sorted(groups)
             for n in all_but_last[: len(fields)]:

@@ -61,6 +61,7 @@ class RayTracer:
             (traced, rays + 1),
             scene_buffer,
             medium.voxel_buffer,
+            medium.group_buffer,
             medium.smooth_buffer,
             medium.tissue_buffer,
             self._quantiles,
