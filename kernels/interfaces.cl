@@ -20,9 +20,9 @@ __kernel void interface_echoes(__constant const Scene *scene, __global const Hit
       float place = depth / scene->sample_mm;
       int bin = (int)floor(place);
       if (bin < 0 || bin + 1 >= scene->samples) continue;
-      float part = place - bin, turns = depth * scene->cycles_per_mm;
-      turns -= floor(turns);
-      float c = echo * native_cos(TWO_PI * turns), s = -echo * native_sin(TWO_PI * turns);
+      float part = place - bin, c, s;
+      turn(depth * scene->cycles_per_mm, &c, &s);
+      c *= echo, s *= -echo;
       for (int side = 0; side < 2; side++) {
         int at = side * stride + bin;
         left_re[at] += c * (1.0f - part);

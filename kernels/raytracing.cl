@@ -74,9 +74,11 @@ inline int label_at(__global const ushort *voxels, __global const uchar *groups,
 }
 
 // Carry a vector perpendicular to `from` along the smallest rotation that takes `from` to `to`.
-inline float3 carry(float3 v, float3 from, float3 to) { return v - dot(v, to) / (1.0f + dot(from, to)) * (from + to); }
+inline float3 carry(float3 v, float3 from, float3 to) {
+  return v - dot3(v, to) / (1.0f + dot3(from, to)) * (from + to);
+}
 
-inline float3 mirror(float3 v, float3 normal) { return v - 2.0f * dot(v, normal) * normal; }
+inline float3 mirror(float3 v, float3 normal) { return v - 2.0f * dot3(v, normal) * normal; }
 
 // The ray beside its axis, in padded voxel indices: start + l step + sigma(l) aside at length l from the node's start.
 typedef struct {
@@ -169,8 +171,8 @@ inline float4 tube_reflected(__global const uchar *groups, __global const ushort
   for (int axis = 0; axis < 2; axis++) {
     const float3 offset = axis == 0 ? ray.lateral : ray.elevational;
     // Along the ray onto the surface, so longer by 1 / cos i.
-    const float3 along = offset - dot(normal, offset) / fmin(dot(normal, ray.direction), -0.2f) * ray.direction;
-    const float longer = fmax(length(along), 1e-3f);
+    const float3 along = offset - dot3(normal, offset) / fmin(dot3(normal, ray.direction), -0.2f) * ray.direction;
+    const float longer = fmax(length3(along), 1e-3f);
     const float curvature = border_curvature(groups, smooth, scene, point, along / longer, before, behind);
     // Concave mirrors focus; taken from voxels that would make random bright spots, so they count as flat.
     const float growth = 2.0f * fmax(curvature, 0.0f) * longer;
@@ -195,7 +197,7 @@ inline Segment segment_of(Ray ray, float from, float to, float spent_from, float
   segment.depth_mm = ray.depth + from * depth_per_mm;
   segment.depth_per_mm = depth_per_mm;
   segment.weight = ray.weight;
-  segment.attenuation = exp(ray.log_attenuation - spent_from);
+  segment.attenuation = exp_fast(ray.log_attenuation - spent_from);
   segment.decay_per_mm = (spent_to - spent_from) / (to - from);
   segment.reflections = ray.reflections;
   segment.label = ray.label;
@@ -211,7 +213,7 @@ typedef struct {
 
 inline Interface interface_between(Tissue here, Tissue behind, float3 direction, float3 normal) {
   Interface result;
-  result.cos_in = clamp(-dot(direction, normal), 0.01f, 1.0f);
+  result.cos_in = clamp(-dot3(direction, normal), 0.01f, 1.0f);
   result.speed_ratio = behind.speed_m_s / here.speed_m_s;
   float sin2_out = result.speed_ratio * result.speed_ratio * (1.0f - result.cos_in * result.cos_in);
   result.is_total = sin2_out >= 1.0f;
@@ -222,21 +224,14 @@ inline Interface interface_between(Tissue here, Tissue behind, float3 direction,
 }
 
 // The root of a traced line: the beam frame at the probe face, taken from the probe frame to RAS.
-inline Ray root_of(__constant const Scene *scene, int line) {
-  float position = scene->first_line + scene->line_spacing * (line - scene->guard_lines) / scene->lateral_rays;
-  float3 origin = (float3)(position, 0.0f, 0.0f), direction = (float3)(0.0f, 1.0f, 0.0f);
-  float3 across = (float3)(1.0f, 0.0f, 0.0f);
-  if (!scene->linear) {
-    float c = cos(position), s = sin(position);
-    origin = scene->apex_radius_mm * (float3)(s, c - 1.0f, 0.0f);
-    direction = (float3)(s, c, 0.0f);
-    across = (float3)(c, -s, 0.0f);
-  }
+// `origin_and_direction` are (x, y) each.
+inline Ray root_of(__constant const Scene *scene, float4 origin_and_direction) {
+  const float2 origin = origin_and_direction.lo, direction = origin_and_direction.hi;
   Ray root;
-  root.axis = affine_point(scene->probe_to_ras, origin);
-  root.direction = normalize(affine_vector(scene->probe_to_ras, direction));
-  root.lateral = normalize(affine_vector(scene->probe_to_ras, across));
-  root.elevational = normalize(affine_vector(scene->probe_to_ras, (float3)(0.0f, 0.0f, 1.0f)));
+  root.axis = affine_point(scene->probe_to_ras, (float3)(origin, 0.0f));
+  root.direction = unit3(affine_vector(scene->probe_to_ras, (float3)(direction, 0.0f)));
+  root.lateral = unit3(affine_vector(scene->probe_to_ras, (float3)(direction.y, -direction.x, 0.0f)));
+  root.elevational = unit3(affine_vector(scene->probe_to_ras, (float3)(0.0f, 0.0f, 1.0f)));
   root.path = 0.0f;
   root.depth = 0.0f;
   root.log_attenuation = 0.0f;
@@ -253,11 +248,11 @@ inline Ray root_of(__constant const Scene *scene, int line) {
 // parts. Without it, walls seen aslant show as one thin line per ray.
 inline float stratum_coherence(__constant const Scene *scene, Ray ray, float3 normal, float quantile, float path,
                                float depth_per_mm) {
-  const float density = 0.39894228f * exp(-0.5f * quantile * quantile);  // of N(0, 1)
+  const float density = 0.39894228f * exp_fast(-0.5f * quantile * quantile);  // of N(0, 1)
   const float width = elevation_sigma(scene, path) / (scene->elevational_rays * density);
-  const float slope = dot(normal, ray.elevational) / fmin(dot(normal, ray.direction), -0.05f);
+  const float slope = dot3(normal, ray.elevational) / fmin(dot3(normal, ray.direction), -0.05f);
   const float turns = scene->cycles_per_mm * depth_per_mm * width * slope;
-  return exp(-1.6449341f * turns * turns);  // the main lobe of sin(pi t) / (pi t), to second order
+  return exp_fast(-1.6449341f * turns * turns);  // the main lobe of sin(pi t) / (pi t), to second order
 }
 
 #ifdef NO_IMPLICIT_VECTORS
@@ -265,9 +260,9 @@ __attribute__((intel_vec_len_hint(1)))
 #endif
 __kernel void
 trace(__constant const Scene *scene, __global const ushort *voxels, __global const uchar *groups,
-      __global const ushort *smooth, __constant const Tissue *tissues, __global const float *quantiles,
-      __global Segment *segments, __global int *segment_counts, __global Hit *hits, __global int *hit_counts,
-      __global float *cut) {
+      __global const ushort *smooth, __constant const Tissue *tissues, __global const float *roots,
+      __global const float *quantiles, __global Segment *segments, __global int *segment_counts, __global Hit *hits,
+      __global int *hit_counts, __global float *cut) {
   const int line = get_global_id(0), ray_of_line = get_global_id(1), rays = scene->elevational_rays;
   const int on_axis = ray_of_line == 0;
   const int slot = line * rays + ray_of_line - 1;
@@ -279,7 +274,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
   float cut_weight = 0.0f;
 
   Ray stack[MAX_STACK];
-  stack[0] = root_of(scene, line);
+  stack[0] = root_of(scene, vload4(line, roots));
   int waiting = 1;
   while (waiting > 0) {
     Ray ray = stack[--waiting];
@@ -306,7 +301,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       int other = ray.label, is_silenced;
       while (1) {
         const float decay = decay_in(scene, here);
-        const float reserve = log(ray.weight / scene->intensity_threshold) + ray.log_attenuation - spent;
+        const float reserve = log_fast(ray.weight / scene->intensity_threshold) + ray.log_attenuation - spent;
         const float to_silence = since + fmax(reserve, 0.0f) / fmax(decay, 1e-9f);
         is_silenced = to_silence < to_depth;
         const float longest = fmin(to_depth, to_silence);
@@ -352,7 +347,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       if (on_axis && count > 0 && count <= room) my_segments[count - 1].length_mm -= overshoot;
       const float path = ray.path + border, depth = ray.depth + border * depth_per_mm;
       if (depth >= scene->depth_mm) break;  // with the overshoot taken back, the border lies beyond the field: a leaf
-      const float log_attenuation = ray.log_attenuation - spent, attenuation = exp(log_attenuation);
+      const float log_attenuation = ray.log_attenuation - spent, attenuation = exp_fast(log_attenuation);
       const float3 aside = quantile * elevation_sigma(scene, path) * ray.elevational;
       const float3 hit_point = ray.axis + border * ray.direction + aside;
       const float4 tube = tube_after(ray.tube, border);
@@ -371,7 +366,8 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
           hit.cos_incidence = surface.cos_in;
           hit.reflectance = reflectance;
           hit.echo = ray.weight * attenuation * (scene->interface_is_energy ? reflectance : fabs(surface.pressure)) *
-                     pow(surface.cos_in, scene->specular_exponent) * scene->interface_gain / (rays * tube.x * tube.z) *
+                     exp2_scalar(max(scene->specular_exponent * log2_scalar(surface.cos_in), -100.0f)) *
+                     scene->interface_gain / (rays * tube.x * tube.z) *
                      stratum_coherence(scene, ray, normal, quantile, path, depth_per_mm);
           hit.reflections = ray.reflections;
           hit.label_before = ray.label;
@@ -386,7 +382,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       if (ray.reflections < scene->max_ray_depth && reflected_weight >= scene->reflection_threshold &&
           reflected_weight * attenuation >= scene->intensity_threshold && waiting < MAX_STACK) {
         Ray child = ray;
-        child.direction = normalize(mirror(ray.direction, normal));
+        child.direction = unit3(mirror(ray.direction, normal));
         child.lateral = mirror(ray.lateral, normal);
         child.elevational = mirror(ray.elevational, normal);
         child.axis = hit_point - mirror(aside, normal);
@@ -410,7 +406,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
         break;
       }
       const float ratio = surface.speed_ratio;
-      const float3 bent = normalize(ratio * ray.direction + (ratio * surface.cos_in - surface.cos_out) * normal);
+      const float3 bent = unit3(ratio * ray.direction + (ratio * surface.cos_in - surface.cos_out) * normal);
       ray.lateral = carry(ray.lateral, ray.direction, bent);
       ray.elevational = carry(ray.elevational, ray.direction, bent);
       ray.direction = bent;

@@ -79,16 +79,16 @@ inline int drawn_label(__constant const Scene *scene, __global const ushort *cor
   int label = corner[drawn] & LABEL_MASK;
 #ifdef TEXTURE
   const uint known = texture[drawn];
-  *gain = exp(LN10_OVER_20 * TEXTURE_STEP_DB * ((int)((known >> 16) & 255u) - 128));
+  *gain = exp_fast(LN10_OVER_20 * TEXTURE_STEP_DB * ((int)((known >> 16) & 255u) - 128));
   if ((hash_mix(random) & 255u) < ((known >> 8) & 255u)) label = known & LABEL_MASK;
 #endif
   if (corner[0] & NO_MEMBRANE) return label;
-  const float near_z = mix(mix((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
-                           mix((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
+  const float near_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
+                             blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
   corner += nxy;
-  const float far_z = mix(mix((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
-                          mix((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
-  if (fabs(mix(near_z, far_z, fz) - 127.5f) >= scene->membrane_reach) return label;
+  const float far_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
+                            blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
+  if (fabs(blend(near_z, far_z, fz) - 127.5f) >= scene->membrane_reach) return label;
   *gain = 1.0f;
   return MEMBRANE_LABEL;
 }
@@ -346,8 +346,8 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
     const float waist = fmin(scene->transmit_rayleigh, scene->elevation_rayleigh);
     const int pieces = max(1, (int)ceil((segment_high - segment_low) / (0.4f * waist)));
     for (int n = 0; n < pieces; n++) {
-      const float low = mix(segment_low, segment_high, (float)n / pieces);
-      const float high = mix(segment_low, segment_high, (float)(n + 1) / pieces);
+      const float low = blend(segment_low, segment_high, (float)n / pieces);
+      const float high = blend(segment_low, segment_high, (float)(n + 1) / pieces);
       piece.from_mm = n == 0 ? 0.0f : low;
       piece.to_mm = n == pieces - 1 ? segment->length_mm : high;
       const float path_low = segment->path_mm + low, path_high = segment->path_mm + high;

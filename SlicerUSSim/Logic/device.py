@@ -241,7 +241,9 @@ class Device:
         key = (file_name, lanes, *defines)
         if key not in self._kernels:
             source = shared_source() + "\n" + _with_includes(kernel_folder(), file_name)
-            options = ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-no-signed-zeros", f"-DLANES={lanes}"]
+            options = ["-cl-std=CL1.2", "-cl-no-signed-zeros", f"-DLANES={lanes}"]
+            if self.info.handle.single_fp_config & self.cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
+                options.append("-cl-fp32-correctly-rounded-divide-sqrt")
             options += [f"-D{name}" for name in defines]
             if self.lanes > 1 and "Intel" in self.info.platform:
                 options.append("-DNO_IMPLICIT_VECTORS")

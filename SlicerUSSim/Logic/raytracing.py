@@ -41,6 +41,7 @@ class RayTracer:
         self.kernel = device.kernels("raytracing.cl")["trace"]
         self.workspace = Workspace(device)
         self._quantile_key: tuple | None = None
+        self._root_key: tuple | None = None
 
     def run(self, scene_buffer, scene: np.ndarray, medium: Medium) -> None:
         """Enqueue the tracing of one frame. `scene` is a layout.SCENE record, `scene_buffer` the same on the device."""
@@ -56,6 +57,10 @@ class RayTracer:
         if self._quantile_key != (traced, rays):
             self._quantiles = self.device.upload(_beam_quantiles(traced, rays))
             self._quantile_key = (traced, rays)
+        array = tuple(scene[name].item() for name in _ARRAY_FIELDS)
+        if self._root_key != array:
+            self._roots = self.device.upload(_roots(scene))
+            self._root_key = array
         self.device.run(
             self.kernel,
             (traced, rays + 1),
@@ -64,6 +69,7 @@ class RayTracer:
             medium.group_buffer,
             medium.smooth_buffer,
             medium.tissue_buffer,
+            self._roots,
             self._quantiles,
             self.segments,
             self.segment_counts,
@@ -96,6 +102,28 @@ class RayTracer:
         """How many traced lines had more segments than there is room for."""
         counts = self.device.download(self.segment_counts, self.shape[0], np.int32)
         return int((counts > CONSTANTS["MAX_SEGMENTS"]).sum())
+
+
+#: What places the traced lines in the probe frame
+_ARRAY_FIELDS = (
+    "linear", "apex_radius_mm", "first_line", "line_spacing", "lateral_rays", "guard_lines", "traced_lines"
+)  # fmt: skip
+
+
+def _roots(scene: np.ndarray) -> np.ndarray:
+    """(traced lines, 4) float32: origin (x, y) and direction (x, y) of every traced line in the probe frame.
+
+    The guard lines go on beyond the edges of the array, so they are not lines that the probe knows.
+    """
+    line = np.arange(int(scene["traced_lines"])) - int(scene["guard_lines"])
+    position = float(scene["first_line"]) + float(scene["line_spacing"]) * line / int(scene["lateral_rays"])
+    roots = np.zeros((len(position), 4), np.float32)
+    if scene["linear"]:
+        roots[:, 0], roots[:, 3] = position, 1.0
+    else:
+        radius, sine, cosine = float(scene["apex_radius_mm"]), np.sin(position), np.cos(position)
+        roots[:] = np.stack([radius * sine, radius * (cosine - 1.0), sine, cosine], axis=1)
+    return roots
 
 
 @lru_cache(maxsize=16)
