@@ -23,17 +23,27 @@ __kernel void lateral_beam(__constant const Scene *scene, __global const float *
   floatn step2 = step * step;
   floatn narrow2 = fmax(1.0f - step2 / 6.0f, 0.25f);  // (sigma of these weights / sigma of the beam)^2
   floatn exponent = -0.5f * LOG2_E * step2 / narrow2;
-  int reach = (int)ceil(scene->beam_cutoff * widest / line_distance(scene, s0));
-  // Edge `edge` lies half a step before traced line `edge`; the strips on both its sides contribute.
-  int first = max(centre - reach, 1), last = min(centre + reach + 1, scene->traced_lines - 1);
+  const int farthest = max(centre, scene->traced_lines - 1 - centre);
+  const int reach = min((int)ceil(scene->beam_cutoff * widest / line_distance(scene, s0)), farthest);
+  // Edge `edge` lies half a step before traced line `edge`; the strips on both its sides contribute. Edges come in
+  // pairs n + 1/2 lines to either side, whose weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
+  const floatn fall = exp2_fast(max(2.0f * exponent, -60.0f));
+  floatn weight = exp2_fast(max(0.25f * exponent, -60.0f)), ratio = fall;
   int here = LINE_PAD + sample;
   floatn sum_re = 0.0f, sum_im = 0.0f;
-  for (int edge = first; edge <= last; edge++) {
-    float away = edge - 0.5f - centre;
-    floatn weight = exp2_fast(fmax(exponent * (away * away), -60.0f));
-    int before = (2 * edge - 1) * stride + here, behind = before + stride;
-    sum_re += weight * (LOAD_LANES(from_re + before) + LOAD_LANES(from_re + behind));
-    sum_im += weight * (LOAD_LANES(from_im + before) + LOAD_LANES(from_im + behind));
+  for (int n = 0; n <= reach; n++) {
+    floatn pair_re = 0.0f, pair_im = 0.0f;
+    const int edges[2] = {centre - n, centre + n + 1};
+    for (int side = 0; side < 2; side++) {
+      if (edges[side] < 1 || edges[side] >= scene->traced_lines) continue;
+      const int before = (2 * edges[side] - 1) * stride + here, behind = before + stride;
+      pair_re += LOAD_LANES(from_re + before) + LOAD_LANES(from_re + behind);
+      pair_im += LOAD_LANES(from_im + before) + LOAD_LANES(from_im + behind);
+    }
+    sum_re += weight * pair_re;
+    sum_im += weight * pair_im;
+    weight *= ratio;
+    ratio *= fall;
   }
   floatn scale = step * rsqrt(narrow2) * 0.39894228f;  // 1 / sqrt(2 pi)
   STORE_LANES(sum_re * scale, to_re + line * stride + here);

@@ -20,7 +20,9 @@ class EchoLines:
 
     def prepare(self, lines: int, samples: int) -> None:
         """Make room for a frame. Kernels write every sample between the pads, so only a new shape is cleared."""
-        self.stride = samples + 2 * CONSTANTS["LINE_PAD"]
+        # An odd number of cache lines: the same sample of many lines then does not fall into the same few sets.
+        self.stride = (samples + 2 * CONSTANTS["LINE_PAD"]) // 16 * 16 + 16
+        self.stride += self.stride % 32 == 0 and 16
         nbytes = lines * self.stride * 4
         self.re, self.im = self.workspace.get("re", nbytes), self.workspace.get("im", nbytes)
         if self._shape != (lines, samples):
