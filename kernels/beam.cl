@@ -15,23 +15,26 @@ __kernel void lateral_beam(__constant const Scene *scene, __global const float *
                            __global float *to_re, __global float *to_im, int stride) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int centre = scene->guard_lines + line * scene->lateral_rays;
-  float s0 = sample * scene->sample_mm, s1 = (sample + LANES) * scene->sample_mm;
-  float widest = fmax(lateral_sigma(scene, s0), lateral_sigma(scene, s1));
   // Lane by lane: near a tight focus the width changes from sample to sample.
   const floatn s = (TO_FLOATN(LANE_INDEX) + sample) * scene->sample_mm;
-  floatn step = line_distance_lanes(scene, s) / lateral_sigma_lanes(scene, s);  // between traced lines, in sigmas
+  const floatn apart = line_distance_lanes(scene, s), sigma = lateral_sigma_lanes(scene, s);
+  floatn step = apart / sigma;  // between traced lines, in sigmas
   floatn step2 = step * step;
   floatn narrow2 = fmax(1.0f - step2 / 6.0f, 0.25f);  // (sigma of these weights / sigma of the beam)^2
   floatn exponent = -0.5f * LOG2_E * step2 / narrow2;
-  const int farthest = max(centre, scene->traced_lines - 1 - centre);
-  const int reach = min((int)ceil(scene->beam_cutoff * widest / line_distance(scene, s0)), farthest);
+  const floatn reach = ceil(scene->beam_cutoff * sigma / apart);
+  SPREAD(float, reach_, reach);
+  float longest = 0.0f;
+  for (int n = 0; n < LANES; n++) longest = fmax(longest, reach_[n]);
+  const int last = min((int)longest, max(centre, scene->traced_lines - 1 - centre));
   // Edge `edge` lies half a step before traced line `edge`; the strips on both its sides contribute. Edges come in
   // pairs n + 1/2 lines to either side, whose weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
   const floatn fall = exp2_fast(max(2.0f * exponent, -60.0f));
   floatn weight = exp2_fast(max(0.25f * exponent, -60.0f)), ratio = fall;
   int here = LINE_PAD + sample;
   floatn sum_re = 0.0f, sum_im = 0.0f;
-  for (int n = 0; n <= reach; n++) {
+  for (int n = 0; n <= last; n++) {
+    weight = (float)n <= reach ? weight : (floatn)(0.0f);
     floatn pair_re = 0.0f, pair_im = 0.0f;
     const int edges[2] = {centre - n, centre + n + 1};
     for (int side = 0; side < 2; side++) {

@@ -51,14 +51,21 @@ __kernel void compress(__global const float *iq, int samples, float noise, uint 
 }
 
 // Mean grey level over `width` samples about each sample: what one pixel of the image covers in depth. Picking single
-// samples instead would alias the speckle into black dashes. Samples near the end of a line repeat its last values.
+// samples instead would alias the speckle into black dashes. Beyond its ends a line repeats its first and last sample.
 __kernel void average_depth(__global const uchar *grey, __global uchar *smooth, int samples, int width) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   __global const uchar *row = grey + line * samples;
+  const int first = sample - width / 2;
   floatn sum = 0.0f;
-  for (int k = 0; k < width; k++) {
-    int from = clamp(sample + k - width / 2, 0, samples - LANES);
-    sum += GREY_LANES(row + from);
+  if (first >= 0 && first + width - 1 + LANES <= samples) {
+    for (int k = 0; k < width; k++) sum += GREY_LANES(row + first + k);
+  } else {
+    float ends[LANES];
+    for (int lane = 0; lane < LANES; lane++) {
+      ends[lane] = 0.0f;
+      for (int k = 0; k < width; k++) ends[lane] += row[clamp(first + k + lane, 0, samples - 1)];
+    }
+    sum = LOAD_LANES(ends);
   }
   STORE_GREY(sum / width + 0.5f, smooth + line * samples + sample);
 }

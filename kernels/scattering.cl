@@ -36,6 +36,9 @@
 #undef PARTS
 #define PARTS 1
 #endif
+#ifndef CHUNK
+#define CHUNK BLOCK
+#endif
 #define PART (CHUNK + 2)  // one more sample at either end: echoes lie between samples
 
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
@@ -308,6 +311,10 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
   float4 sum[PARTS * PART];  // left re, im, right re, im
   for (int i = 0; i < PARTS * PART; i++) sum[i] = (float4)(0.0f);
   const float depth_low = (first - 1) * scene->sample_mm, depth_high = (first + CHUNK) * scene->sample_mm;
+  // Widths and gains are taken as linear over BLOCK samples, of which CHUNK is a part, so that the image does not
+  // depend on how the work is split.
+  const int block = first / BLOCK * BLOCK;
+  const float block_low = (block - 1) * scene->sample_mm, block_high = (block + BLOCK) * scene->sample_mm;
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int index = 0; index < count; index++) {
@@ -316,9 +323,11 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
     piece.first = first;
     piece.slope = segment->depth_per_mm;
     piece.depth0 = segment->depth_mm;
-    const float segment_low = fmax(0.0f, (depth_low - piece.depth0) / piece.slope);
-    const float segment_high = fmin(segment->length_mm, (depth_high - piece.depth0) / piece.slope);
-    if (segment_low >= segment_high) continue;
+    const float segment_low = fmax(0.0f, (block_low - piece.depth0) / piece.slope);
+    const float segment_high = fmin(segment->length_mm, (block_high - piece.depth0) / piece.slope);
+    const float chunk_low = (depth_low - piece.depth0) / piece.slope;
+    const float chunk_high = (depth_high - piece.depth0) / piece.slope;
+    if (fmax(segment_low, chunk_low) >= fmin(segment_high, chunk_high)) continue;
 
     // Lattice axes in an order that puts the beam's elevational width, the longest, along u, whose cells lie side by
     // side in the lanes, and depth along v, whose rows do.
@@ -372,7 +381,11 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
       piece.gain1 = gain - decay * high + 0.5f * log2(sigma_high.x / (sigma_high.y * tube_high.x * tube_high.z)) -
                     log2(apart_high) - piece.gain0;
 
-      scatter_piece(scene, voxels, texture, tissues, &piece, start, low, high, 0.5f * fmax(apart_low, apart_high),
+      // Beside the axis of a curved array the same range is reached a little earlier.
+      const float radius_l = 0.5f * fmax(apart_low, apart_high), early = piece.bend * radius_l * radius_l;
+      const float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
+      if (begin >= end) continue;
+      scatter_piece(scene, voxels, texture, tissues, &piece, start, begin, end, radius_l,
                     scene->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum VARIED_ARGUMENTS);
     }
   }

@@ -99,14 +99,15 @@ def test_profiles_name_every_kernel():
     assert sim.device.take_profile() == {}
 
 
-@pytest.mark.parametrize("lanes", [1, 8, 16])
-def test_vector_width_does_not_change_the_image(lanes):
+@pytest.mark.parametrize(("lanes", "chunk"), [(1, 64), (1, 16), (8, 64), (16, 64)])
+def test_how_a_device_splits_the_work_does_not_change_the_image(lanes, chunk):
+    """GPUs take one value and 16 samples at a time, processors vectors and 64."""
     solid = block(lambda x, y, z: np.where(y > 3, 0, 1), half_mm=(12, 12, 12))
     probe, pose = LinearProbe(10, 15, scan_lines=32), rigid(np.eye(3), [0, -8, 0])
     usual = simulator(solid, SPECKLE)
     reference = usual.simulate(probe, pose)
     other = Device(usual.device.info)
-    other.lanes = lanes
+    other.lanes, other.chunk = lanes, chunk
     found = UltrasoundSimulator(solid, usual.medium.tissues, device=other).simulate(probe, pose)
     difference = np.abs(found.image.astype(int) - reference.image)
     assert (difference <= 1).mean() > 0.999

@@ -23,7 +23,7 @@ class PulseFilter:
         """Enqueue the convolution of every line."""
         sigma = axial_sigma_mm / float(scene["sample_mm"])
         if sigma != self._sigma:
-            taps = _pulse_taps(sigma)
+            taps = pulse_taps(sigma)
             self._pulse, self._reach, self._sigma = self.device.upload(taps), taps.size // 2, sigma
         self.lines, self.samples = int(scene["scan_lines"]), int(scene["samples"])
         nbytes = self.lines * self.samples * 8
@@ -69,7 +69,7 @@ class Compressor:
             signal.iq,
             np.int32(self.samples),
             np.float32(noise),
-            np.uint32((int(scene["seed"]) * 0x9E3779B1 + 0x7F4A7C15) % 2**32),
+            np.uint32(noise_seed(scene)),
             np.float32(tgc),
             np.float32(FULL_SCALE_DB - display.gain_db),
             np.float32(display.dynamic_range_db),
@@ -84,7 +84,12 @@ class Compressor:
         return envelope, self.device.download(self.grey, shape, np.uint8)[:, :samples]
 
 
-def _pulse_taps(sigma: float) -> np.ndarray:
+def noise_seed(scene: np.ndarray) -> int:
+    """What starts the hash of the amplifier noise: it has nothing in common with that of the scatterers."""
+    return (int(scene["seed"]) * 0x9E3779B1 + 0x7F4A7C15) % 2**32
+
+
+def pulse_taps(sigma: float) -> np.ndarray:
     """(2 reach + 1,) float32 Gaussian of standard deviation `sigma` samples and height 1.
 
     Impulses are placed between samples by linear interpolation, which convolves them with a triangle of variance 1/6 on

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.errors import SimulationError
-from SlicerUSSim.Logic.layout import shared_source
+from SlicerUSSim.Logic.layout import CONSTANTS, shared_source
 
 INTEL_HINT = 'pip install "SlicerUSSim[intel]"'
 
@@ -222,6 +222,9 @@ class Device:
         except cl.Error as error:
             raise SimulationError(f"OpenCL device {info} cannot be opened: {error}") from None
         self.lanes = _vector_lanes(info)
+        #: Samples of a line that one work-item fills with scatterers: long for a few cores, so that little is looked at
+        #: twice; short for a GPU, which one frame shall fill. A divisor of CONSTANTS["BLOCK"]
+        self.chunk = 16 if info.kind == "GPU" else CONSTANTS["BLOCK"]
         self.profiling = False
         self._events: list[tuple[str, object]] = []
         self._kernels: dict[tuple, dict[str, object]] = {}

@@ -21,7 +21,7 @@ CONSTANTS = {
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
     "MAX_STACK": 24,  # reflected rays waiting to be followed
-    "CHUNK": 64,  # samples one work-item of the scatter kernel owns
+    "BLOCK": 64,  # samples over which beam widths and gains are taken as linear; lines are whole blocks long
     "BANDS": 4,  # of T1, by which a tissue's scatterers come to exist as mu1 is varied (appearance.py)
     "PARTS": 9,  # 1 + 2 BANDS
     "ROLE_FIXED": 0,  # of a tissue while the parts are computed: in part 0, ...

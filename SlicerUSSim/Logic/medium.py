@@ -47,7 +47,8 @@ class Medium:
         self.dims = np.array(array.shape[::-1]) + 2 * _PAD
         self._check(tissues)
         padded = np.pad(array, _PAD)
-        self._rows = self._tissue_rows(tissues)
+        #: layout.TISSUE per label, as the device has it
+        self.rows = self._tissue_rows(tissues)
         self._upload(padded, tissues)
         self._upload_groups(padded)
         self.has_texture = texture is not None
@@ -55,7 +56,7 @@ class Medium:
         self.texture_buffer = device.upload(
             np.pad(texture, _PAD, constant_values=128 << 16) if self.has_texture else no_texture
         )
-        self.tissue_buffer = device.upload(self._rows)
+        self.tissue_buffer = device.upload(self.rows)
         self.tissues = tissues
 
     @property
@@ -70,11 +71,11 @@ class Medium:
         self._check(tissues)
         if _membrane_shape(tissues) != _membrane_shape(self.tissues):
             self._upload(np.pad(as_labels(self.labels.array), _PAD), tissues)
-        groups_before = self._rows["group"]
-        self._rows = self._tissue_rows(tissues)
-        if not np.array_equal(self._rows["group"], groups_before):
+        groups_before = self.rows["group"]
+        self.rows = self._tissue_rows(tissues)
+        if not np.array_equal(self.rows["group"], groups_before):
             self._upload_groups(np.pad(as_labels(self.labels.array), _PAD))
-        self.device.write(self.tissue_buffer, self._rows)
+        self.device.write(self.tissue_buffer, self.rows)
         self.tissues = tissues
 
     def _check(self, tissues: TissueTable) -> None:
@@ -117,9 +118,9 @@ class Medium:
         self.voxel_buffer = self.device.upload(words)
 
     def _upload_groups(self, padded: np.ndarray) -> None:
-        """The acoustic group of every voxel, and the indicators of the first groups, smoothed: where interfaces are flat,
-        they know normals best."""
-        group_of = self._rows["group"].astype(np.uint8)
+        """The acoustic group of every voxel, and smoothed indicators of the first groups: on flat interfaces they know
+        normals best."""
+        group_of = self.rows["group"].astype(np.uint8)
         group = group_of[padded]
         lowest, highest = _cell_extremes(group)
         words = group | np.uint8(CONSTANTS["SAME_GROUP"]) * (lowest == highest)

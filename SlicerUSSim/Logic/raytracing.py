@@ -55,11 +55,11 @@ class RayTracer:
         self.hit_counts = get("hit_counts", traced * rays * 4)
         self.cut = get("cut", traced * (rays + 1) * 4)
         if self._quantile_key != (traced, rays):
-            self._quantiles = self.device.upload(_beam_quantiles(traced, rays))
+            self._quantiles = self.device.upload(beam_quantiles(traced, rays))
             self._quantile_key = (traced, rays)
         array = tuple(scene[name].item() for name in _ARRAY_FIELDS)
         if self._root_key != array:
-            self._roots = self.device.upload(_roots(scene))
+            self._roots = self.device.upload(line_roots(scene))
             self._root_key = array
         self.device.run(
             self.kernel,
@@ -110,7 +110,7 @@ _ARRAY_FIELDS = (
 )  # fmt: skip
 
 
-def _roots(scene: np.ndarray) -> np.ndarray:
+def line_roots(scene: np.ndarray) -> np.ndarray:
     """(traced lines, 4) float32: origin (x, y) and direction (x, y) of every traced line in the probe frame.
 
     The guard lines go on beyond the edges of the array, so they are not lines that the probe knows.
@@ -127,7 +127,7 @@ def _roots(scene: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def _beam_quantiles(traced: int, rays: int) -> np.ndarray:
+def beam_quantiles(traced: int, rays: int) -> np.ndarray:
     """(traced, rays) float32 offsets in elevational sigmas: stratified quantiles of the beam profile.
 
     Equal weights then reproduce the profile. Each line shifts the strata by a golden-ratio sequence, so that an

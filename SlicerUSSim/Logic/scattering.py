@@ -50,9 +50,10 @@ class Scatterers:
         CONSTANTS["PARTS"] parts one after the other: see kernels/scattering.cl and appearance.py.
         """
         variant = (["TEXTURE"] if medium.has_texture else []) + (["VARIED"] if varied else [])
+        variant.append(f"CHUNK={self.device.chunk}")
         self.device.run(
             self.device.kernels("scattering.cl", self.device.lanes, *variant)["scatter"],
-            (int(scene["samples"]) // CONSTANTS["CHUNK"], int(scene["traced_lines"])),
+            (int(scene["samples"]) // self.device.chunk, int(scene["traced_lines"])),
             scene_buffer,
             medium.voxel_buffer,
             medium.texture_buffer,

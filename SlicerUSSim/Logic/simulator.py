@@ -216,7 +216,7 @@ class UltrasoundSimulator:
     def scene(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
         """The record (layout.SCENE) of what the stages need to know of one frame."""
         settings, medium = self.settings, self.medium
-        chunk = CONSTANTS["CHUNK"]
+        block = CONSTANTS["BLOCK"]
         transmit, elevation = probe.transmit_waist(), probe.elevation_waist()
         axial_sigma = self.axial_sigma_mm(probe)
         scene = np.zeros((), SCENE)
@@ -236,7 +236,7 @@ class UltrasoundSimulator:
         scene["reference_speed_m_s"] = settings.reference_speed_m_s
         scene["cycles_per_mm"] = self._cycles_per_mm(probe)
         scene["sample_mm"] = self._sample_mm(probe)
-        scene["samples"] = -(-self._sample_count(probe) // chunk) * chunk
+        scene["samples"] = -(-self._sample_count(probe) // block) * block
         scene["transmit_sigma"], scene["transmit_focus"], scene["transmit_rayleigh"] = transmit
         scene["receive_sigma_min"], scene["receive_sigma_slope"] = probe.receive_beam()
         scene["elevation_sigma"] = elevation[0] / np.sqrt(2.0)
