@@ -61,6 +61,7 @@ def measure(kind: str, repeat: int, device: str | None) -> tuple[list[float], li
     for pose in poses:
         start = perf_counter()
         simulator.simulate(logic.preset.probe, pose, logic.preset.display)
+        simulator.forget_echoes()  # it is the live update's, too
         middle = perf_counter()
         probe.SetMatrixTransformToParent(vtk_matrix(pose))
         end = perf_counter()

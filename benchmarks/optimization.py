@@ -210,7 +210,12 @@ def evaluation(labels: Volume, tissues: TissueTable, patients: int, device) -> d
     twin = make_twin(labels, tissues, 0, frames=1, device=device)
     simulator, cases = twin.simulator, {"display": ["display"], "display, mu0, sigma0": ["display", "white matter.mu0",
         "white matter.sigma0"], "display, mu0, sigma0, mu1, alpha": ["display", TISSUE]}  # fmt: skip
-    results = {"frame": best_ms(lambda: simulator.simulate(twin.probe, twin.poses[0], twin.display))}
+
+    def frame() -> None:
+        simulator.forget_echoes()
+        simulator.simulate(twin.probe, twin.poses[0], twin.display)
+
+    results = {"frame": best_ms(frame)}
     for name, free in cases.items():
         parameters = FreeParameters.of(free, tissues, twin.display)
         model = AppearanceModel(simulator, twin.probe, twin.poses, parameters.varied())

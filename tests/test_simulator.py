@@ -282,6 +282,48 @@ def test_a_sweep_is_the_frames_of_its_poses(solid):
         np.testing.assert_array_equal(frame.image, solid.simulate(PROBES["linear"], pose, QUIET).image)
 
 
+def kernels_of(sim, *arguments) -> set[str]:
+    """Names of the kernels that an image takes."""
+    sim.device.profiling = True
+    try:
+        sim.simulate(*arguments)
+        return set(sim.device.take_profile())
+    finally:
+        sim.device.profiling = False
+
+
+def test_what_did_not_change_is_not_computed_again(solid):
+    probe, pose = PROBES["linear"], rigid(np.eye(3), [0, -25, 0])
+    solid.simulate(probe, pose, QUIET)
+    bright = replace(QUIET, gain_db=6.0)
+    assert kernels_of(solid, probe, pose, bright) == {"compress", "average_depth", "scan_convert"}
+    assert "trace" in kernels_of(solid, probe, rigid(np.eye(3), [0, -25, 0.1]), bright)
+    assert "trace" in kernels_of(solid, replace(probe, frequency_mhz=4.0), pose, bright)
+    assert "trace" in kernels_of(solid, replace(probe, fractional_bandwidth=0.3), pose, bright)
+    assert "trace" not in kernels_of(solid, replace(probe, fractional_bandwidth=0.3), pose, QUIET)
+
+
+def test_a_changed_display_tissue_or_setting_gives_the_image_of_a_new_simulator():
+    labels = block(lambda x, y, z: np.where(y > 0, 2, 1), half_mm=(20, 20, 10))
+    probe, pose = PROBES["convex"], rigid(np.eye(3), [0, -18, 0])
+    louder = replace(SPECKLE, name="louder", mu0=0.0, sigma0=2.0)
+    sim = simulator(labels, SPECKLE, louder)
+    tables = [sim.medium.tissues, sim.medium.tissues.replace("louder", sigma0=0.4)]
+    changes = [
+        (tables[0], sim.settings, QUIET),
+        (tables[0], sim.settings, DisplaySettings(gain_db=-5, noise_db=-10)),
+        (tables[1], sim.settings, QUIET),
+        (tables[1], replace(sim.settings, seed=3), QUIET),
+        (tables[1], replace(sim.settings, interfaces=False), QUIET),
+        (tables[0], sim.settings, replace(QUIET, image_size=(100, 90))),
+    ]
+    for tissues, simulation, display in changes:
+        sim.set_tissues(tissues)
+        sim.settings = simulation
+        fresh = UltrasoundSimulator(labels, tissues, simulation).simulate(probe, pose, display)
+        np.testing.assert_array_equal(sim.simulate(probe, pose, display).image, fresh.image)
+
+
 def test_stages_are_timed_on_request(solid):
     solid.profiling = True
     try:

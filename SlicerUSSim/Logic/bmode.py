@@ -18,9 +18,12 @@ class PulseFilter:
         self.kernel = device.kernels("bmode.cl", device.lanes)["convolve_pulse"]
         self.workspace = Workspace(device)
         self._sigma: float | None = None
+        #: What the signal was made for, if whoever made it says so (UltrasoundSimulator.render)
+        self.made_for: object = None
 
     def run(self, scene: np.ndarray, axial_sigma_mm: float, lines: EchoLines) -> None:
         """Enqueue the convolution of every line."""
+        self.made_for = None
         sigma = axial_sigma_mm / float(scene["sample_mm"])
         if sigma != self._sigma:
             taps = pulse_taps(sigma)

@@ -57,6 +57,8 @@ class Medium:
             np.pad(texture, _PAD, constant_values=128 << 16) if self.has_texture else no_texture
         )
         self.tissue_buffer = device.upload(self.rows)
+        #: Counts the changes of tissues
+        self.version = 0
         self.tissues = tissues
 
     @property
@@ -76,6 +78,7 @@ class Medium:
         if not np.array_equal(self.rows["group"], groups_before):
             self._upload_groups(np.pad(as_labels(self.labels.array), _PAD))
         self.device.write(self.tissue_buffer, self.rows)
+        self.version += 1
         self.tissues = tissues
 
     def _check(self, tissues: TissueTable) -> None:

@@ -68,7 +68,7 @@ class ScanConverter:
     def __init__(self, device: Device) -> None:
         self.device = device
         self.average = device.kernels("bmode.cl", device.lanes)["average_depth"]
-        self.convert = device.kernels("scan_conversion.cl")["scan_convert"]
+        self.convert = device.kernels("scan_conversion.cl", device.lanes)["scan_convert"]
         self.workspace = Workspace(device)
 
     def run(self, scene_buffer, scene: np.ndarray, grid: ImageGrid, lines: Compressor) -> None:
@@ -86,13 +86,14 @@ class ScanConverter:
         )
         self.device.run(
             self.convert,
-            (grid.columns, grid.rows),
+            (-(-grid.columns // self.device.lanes), grid.rows),
             scene_buffer,
             smooth,
             np.float32(grid.left_mm),
             np.float32(grid.top_mm),
             np.float32(grid.pixel_spacing_mm[0]),
             np.float32(grid.pixel_spacing_mm[1]),
+            np.int32(grid.columns),
             self.image,
         )
 

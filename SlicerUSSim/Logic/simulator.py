@@ -72,7 +72,7 @@ class UltrasoundSimulator:
         self.compressor = Compressor(self.device)
         self.converter = ScanConverter(self.device)
         self._scene_buffer = self.device.empty(SCENE.itemsize)
-        #: Measure every stage (Frame.timings_ms); each stage is then waited for.
+        #: Measure every stage (Frame.timings_ms); each stage is then computed and waited for.
         self.profiling = False
 
     def simulate(
@@ -122,10 +122,29 @@ class UltrasoundSimulator:
         grid: ImageGrid,
         timings: dict[str, float] | None = None,
     ):
-        """Enqueue all stages of one frame; returns the device buffer of its image, which the next frame overwrites."""
+        """Enqueue all stages of one frame; returns the device buffer of its image, which the next frame overwrites.
+
+        Where only the display or the pixels have changed since the last frame, its echoes are used again.
+        """
         timings = {} if timings is None else timings
         with self._stage("upload", timings):
             scene = self._upload_scene(probe, pose)
+        inputs = (scene.tobytes(), self.settings, self.medium.version)
+        if self.profiling or self.pulse.made_for != inputs:
+            self._echoes(probe, scene, timings)
+            self.pulse.made_for = inputs
+        with self._stage("B-mode", timings):
+            self.compressor.run(scene, display, self.pulse)
+        with self._stage("scan conversion", timings):
+            self.converter.run(self._scene_buffer, scene, grid, self.compressor)
+        return self.converter.image
+
+    def forget_echoes(self) -> None:
+        """Have the next frame computed from its rays on, though nothing may have changed (for measurements)."""
+        self.pulse.made_for = None
+
+    def _echoes(self, probe: Probe, scene: np.ndarray, timings: dict[str, float]) -> None:
+        """Enqueue the stages up to the baseband signal, which depend on neither display nor pixels."""
         with self._stage("ray tree", timings):
             self.tracer.run(self._scene_buffer, scene, self.medium)
         with self._stage("scatterers", timings):
@@ -143,11 +162,6 @@ class UltrasoundSimulator:
             self.beam.run(self._scene_buffer, scene, self.traced_lines, self.scan_lines)
         with self._stage("pulse", timings):
             self.pulse.run(scene, self.axial_sigma_mm(probe), self.scan_lines)
-        with self._stage("B-mode", timings):
-            self.compressor.run(scene, display, self.pulse)
-        with self._stage("scan conversion", timings):
-            self.converter.run(self._scene_buffer, scene, grid, self.compressor)
-        return self.converter.image
 
     def trace(self, probe: Probe, probe_to_ras: np.ndarray) -> RayTree:
         """The ray tree alone, on the host: segments along the beam axes and interface hits."""
