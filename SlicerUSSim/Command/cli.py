@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim import __version__
+from SlicerUSSim.Command.bench import bench
 from SlicerUSSim.Command.options import (
     PROBE_NAMES,
     Scene,
@@ -219,6 +220,7 @@ def devices(device: str | None) -> None:
         click.echo(f"faster on this computer: {hint}")
 
 
+main.add_command(bench)
 main.add_command(sweep)
 main.add_command(optimize)
 

@@ -1,0 +1,41 @@
+"""`ussim bench`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from SlicerUSSim.Command.options import device_option
+from SlicerUSSim.Command.progress import Steps
+
+
+@click.command()
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Keep the numbers in this file.")
+@click.option("--repeat", default=30, show_default=True, help="Calls per measurement; best and median are shown.")
+@click.option("--brief", is_flag=True, help="Frame A and the segmentation only, a few calls each.")
+@device_option
+@click.pass_context
+def bench(ctx: click.Context, json_file: Path | None, repeat: int, brief: bool, device: str | None) -> None:
+    """Time per stage and per frame on every OpenCL device found, against what memory and arithmetic allow.
+
+    The image is checked too, against the same model in numpy and between the devices: exit status 1 if it is wrong.
+    Never because of a time.
+    """
+    from SlicerUSSim.Logic.benchmark.suite import run_benchmark
+    from SlicerUSSim.Logic.benchmark.tables import table_of
+    from SlicerUSSim.Logic.device import choose_device, list_devices
+    from SlicerUSSim.Logic.tissues import write_json
+    from SlicerUSSim.Logic.volume import require_place
+
+    if json_file:
+        require_place(json_file)
+    chosen = [choose_device(device)[0]]
+    devices = chosen if device else [info for info in list_devices() if info.rank < 9] or chosen
+    steps = len(devices) * (3 if brief else 6) + 1
+    with Steps(steps) as step:
+        result = run_benchmark(devices, repeat=min(repeat, 5) if brief else repeat, brief=brief, progress=step)
+    click.echo(table_of(result))
+    if json_file:
+        write_json(json_file, result)
+    ctx.exit(1 if result["wrong"] else 0)
