@@ -12,7 +12,8 @@ __kernel void move_memory(__global const float *from, __global float *to) {
 #define CHAINS 16
 __kernel void multiply_add(__global float *to, float factor, float term, int rounds) {
   floatn chain[CHAINS];
-  for (int n = 0; n < CHAINS; n++) chain[n] = TO_FLOATN(LANE_INDEX) + (float)(n + get_global_id(0));  // nothing in common
+  for (int n = 0; n < CHAINS; n++)
+    chain[n] = TO_FLOATN(LANE_INDEX) + (float)(n + get_global_id(0));  // nothing in common
   for (int round = 0; round < rounds; round++)
     for (int n = 0; n < CHAINS; n++) chain[n] = mad(chain[n], (floatn)(factor), (floatn)(term));
   floatn sum = 0.0f;

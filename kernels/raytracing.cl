@@ -7,9 +7,11 @@
 // Lines are traced at least as finely as they are scanned (lateral_rays per scan line), and a few beyond the edges.
 //
 // Buffers: voxels ushort [k][j][i], groups uchar [k][j][i] and smooth ushort [group][k][j][i] (medium.py); tissues
-// Tissue [label]; quantiles float [traced line][elevational ray], offsets in units of the elevational sigma; segments
-// Segment [traced line][MAX_SEGMENTS] with segment_counts; hits Hit [traced line][elevational ray][MAX_HITS] with
-// hit_counts; cut float [traced line][1 + elevational ray], the weight of the branches that were not followed.
+// Tissue [label]; roots float4 [traced line], origin and direction (x, y) in the probe frame; quantiles float [traced
+// line][elevational ray], offsets in units of the elevational sigma; segments Segment [traced line][MAX_SEGMENTS] with
+// segment_counts; hits Hit [traced line][elevational ray][MAX_HITS] with hit_counts; cut float [traced line][1 +
+// elevational ray], the weight of the branches that were not followed; overflown int [1], to which traced lines with
+// more segments than there is room for are added.
 
 #include "borders.clh"
 
@@ -262,7 +264,7 @@ __kernel void
 trace(__constant const Scene *scene, __global const ushort *voxels, __global const uchar *groups,
       __global const ushort *smooth, __constant const Tissue *tissues, __global const float *roots,
       __global const float *quantiles, __global Segment *segments, __global int *segment_counts, __global Hit *hits,
-      __global int *hit_counts, __global float *cut) {
+      __global int *hit_counts, __global float *cut, __global int *overflown) {
   const int line = get_global_id(0), ray_of_line = get_global_id(1), rays = scene->elevational_rays;
   const int on_axis = ray_of_line == 0;
   const int slot = line * rays + ray_of_line - 1;
@@ -422,8 +424,10 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
     }
   }
   cut[line * (rays + 1) + ray_of_line] = cut_weight;
-  if (on_axis)
-    segment_counts[line] = count;
-  else
+  if (!on_axis) {
     hit_counts[slot] = count;
+    return;
+  }
+  segment_counts[line] = count;
+  if (count > MAX_SEGMENTS) atomic_inc(overflown);
 }

@@ -8,9 +8,11 @@ from collections.abc import Iterable
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.device import Device
 from SlicerUSSim.Logic.errors import require, require_between
 from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.volume import Volume, check_rigid
 
 _MOST_VOXELS = 400_000_000
@@ -48,47 +50,54 @@ class Compounder:
     ----------
     grid : the volume to fill; its array is not looked at.
     probe : which took the images.
+    device : see device.choose_device.
     """
 
-    def __init__(self, grid: Volume, probe: Probe) -> None:
+    def __init__(self, grid: Volume, probe: Probe, device: str | Device | None = None) -> None:
         self.grid = grid
         self.probe = probe
-        self._sum = np.zeros(grid.array.shape, np.float32)
-        self._weight = np.zeros(grid.array.shape, np.float32)
-        self._field: np.ndarray | None = None  # 1 where a pixel lies in the imaged field, and its mean over a voxel
-        self._field_share: np.ndarray | None = None
+        self.device = Device.get(device)
+        kernels = self.device.kernels("compounding.cl")
+        self._mean_in_field, self._add_image = kernels["mean_in_field"], kernels["add_image"]
+        self._size = np.array(grid.array.shape[::-1])
+        self._sum, self._weight = (self.device.zeros(4 * grid.array.size) for _ in range(2))
+        self._to_image = self.device.empty(12 * 4)
+        self._pixels: ImageGrid | None = None
         self._poses: list[np.ndarray] = []
 
     def add(self, frame: Frame) -> None:
         """Put one image into the volume."""
-        image = self._averaged(frame)
-        voxel_to_image = np.linalg.inv(frame.probe_to_ras @ frame.image_to_probe) @ self.grid.ijk_to_ras
-        self._poses.append(frame.probe_to_ras)
-        # The plane is taken column by column of voxels along the axis that it crosses most steeply.
+        self.add_buffer(self.device.upload(frame.image), frame.grid, frame.probe_to_ras)
+
+    def add_buffer(self, image, pixels: ImageGrid, probe_to_ras: np.ndarray) -> None:
+        """The same for an image that is on the device already (UltrasoundSimulator.render)."""
+        self._prepare(pixels)
+        shape = pixels.columns, pixels.rows
+        window = [max(round(float(self.grid.spacing_mm.min()) / s), 1) for s in pixels.pixel_spacing_mm]
+        self.device.run(self._mean_in_field, shape, image, self._field, _int2(window), self._mean)
+        voxel_to_image = np.linalg.inv(probe_to_ras @ pixels.image_to_probe) @ self.grid.ijk_to_ras
+        self._poses.append(probe_to_ras)
         across = voxel_to_image[2, :3]
         axis = int(np.argmax(np.abs(across)))
         others = [a for a in range(3) if a != axis]
-        size = np.array(self.grid.array.shape[::-1])
-        low, high = self._reach(frame, size)
-        index = np.empty((3, high[others[0]] - low[others[0]], high[others[1]] - low[others[1]]))
-        index[others[0]] = np.arange(low[others[0]], high[others[0]])[:, None]
-        index[others[1]] = np.arange(low[others[1]], high[others[1]])[None, :]
-        index[axis] = 0.0
-        distance = np.tensordot(across, index, 1) + voxel_to_image[2, 3]  # millimetres from the plane, at index 0
-        reach = float(np.abs(self.grid.ijk_to_ras[:3, :3].T @ frame.probe_to_ras[:3, 2]).max())  # one voxel
-        first = np.ceil((-distance - np.sign(across[axis]) * reach) / across[axis])
-        for step in range(int(np.ceil(2.0 * reach / abs(across[axis]))) + 1):
-            index[axis] = first + step
-            column, row, off = (np.tensordot(voxel_to_image[r, :3], index, 1) + voxel_to_image[r, 3] for r in range(3))
-            weight = 1.0 - np.abs(off) / reach
-            near = (weight > 0) & (index[axis] >= 0) & (index[axis] < size[axis])
-            places = np.stack([row[near], column[near]])
-            inside = ndimage.map_coordinates(self._field, places, order=0, mode="constant", cval=0) > 0
-            grey = ndimage.map_coordinates(image, places[:, inside], order=1, mode="nearest")
-            at = tuple(index[a][near][inside].astype(int) for a in (2, 1, 0))
-            weight = weight[near][inside].astype(np.float32)
-            self._sum[at] += weight * grey  # a voxel occurs once per image and step, so += is enough
-            self._weight[at] += weight
+        low, high = self._reach(probe_to_ras)
+        if (high <= low)[others].any():
+            return
+        self.device.write(self._to_image, np.ascontiguousarray(voxel_to_image[:3], np.float32))
+        self.device.run(
+            self._add_image,
+            tuple(int(n) for n in (high - low)[others]),
+            self._mean,
+            self._field,
+            _int2(shape),
+            self._to_image,
+            _int4([*others, axis]),
+            _int4(low),
+            _int4(self._size),
+            np.float32(np.abs(self.grid.ijk_to_ras[:3, :3].T @ probe_to_ras[:3, 2]).max()),  # one voxel
+            self._sum,
+            self._weight,
+        )
 
     def volume(self, hole_mm: float | None = None) -> Volume:
         """The compounded uint8 volume; voxels that no image came near are 0, but for holes.
@@ -99,34 +108,42 @@ class Compounder:
         if hole_mm is None:
             hole_mm = min(self._widest_gap_mm(), _WIDEST_GAP_MM)
         require_between("Compounder.volume", "hole_mm", hole_mm, 0, 1000)
-        known = self._weight > 0
-        values = np.divide(self._sum, self._weight, out=np.zeros_like(self._sum), where=known)
+        total, weight = (
+            self.device.download(buffer, self.grid.array.shape, np.float32) for buffer in (self._sum, self._weight)
+        )
+        known = weight > 0
+        values = np.divide(total, weight, out=np.zeros_like(total), where=known)
         if hole_mm > 0 and known.any():
             values = _filled(values, known, hole_mm / self.grid.spacing_mm[::-1])
         return self.grid.with_array(np.clip(np.rint(values), 0, 255).astype(np.uint8))
 
-    def _averaged(self, frame: Frame) -> np.ndarray:
-        """The image averaged over what a voxel covers, within the field: single pixels would alias speckle."""
-        size = [max(round(float(self.grid.spacing_mm.min()) / s), 1) for s in frame.pixel_spacing_mm[::-1]]
-        if self._field is None or self._field.shape != frame.image.shape:
-            rows, columns = frame.image.shape
-            pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
-            places = pixels @ frame.image_to_probe[:2, :2].T + frame.image_to_probe[:2, 3]
-            self._field = self.probe.holds(places[..., 0], places[..., 1]).astype(np.float32)
-            self._field_share = ndimage.uniform_filter(self._field, size, mode="constant")
-        image = ndimage.uniform_filter(frame.image * self._field, size, mode="constant")
-        return np.divide(image, self._field_share, out=np.zeros_like(image), where=self._field_share > 1e-3)
+    def _prepare(self, pixels: ImageGrid) -> None:
+        """The imaged field of images with these pixels, and room for their means."""
+        if pixels != self._pixels:
+            self._field = self.device.upload(pixels.field(self.probe).astype(np.uint8))
+            self._mean = self.device.empty(4 * pixels.rows * pixels.columns)
+            self._pixels = pixels
 
-    def _reach(self, frame: Frame, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _reach(self, probe_to_ras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """First and one past the last voxel of the box around the imaged field, within the grid."""
-        index = _outline(self.probe, self.grid.ras_to_ijk @ frame.probe_to_ras)
-        low = np.clip(np.floor(index.min(axis=0)).astype(int) - 1, 0, size)
-        return low, np.maximum(np.clip(np.ceil(index.max(axis=0)).astype(int) + 2, 0, size), low)
+        index = _outline(self.probe, self.grid.ras_to_ijk @ probe_to_ras)
+        low = np.clip(np.floor(index.min(axis=0)).astype(int) - 1, 0, self._size)
+        return low, np.maximum(np.clip(np.ceil(index.max(axis=0)).astype(int) + 2, 0, self._size), low)
 
     def _widest_gap_mm(self) -> float:
         """How far any point of the field moves between neighbouring images at most."""
         places = [_outline(self.probe, pose) for pose in self._poses]
         return max((float(np.linalg.norm(b - a, axis=1).max()) for a, b in itertools.pairwise(places)), default=0.0)
+
+
+def _int2(values) -> np.ndarray:
+    """An OpenCL int2."""
+    return np.array(values, np.int32)
+
+
+def _int4(values) -> np.ndarray:
+    """An OpenCL int4 of three values."""
+    return np.array([*values, 0], np.int32)
 
 
 def _outline(probe: Probe, matrix: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import re
 import sys
 import warnings
 import zlib
+from collections import deque
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
@@ -227,6 +228,7 @@ class Device:
         self.chunk = 16 if info.kind == "GPU" else CONSTANTS["BLOCK"]
         self.profiling = False
         self._events: list[tuple[str, object]] = []
+        self._writes: deque = deque(maxlen=64)
         self._kernels: dict[tuple, dict[str, object]] = {}
 
     @staticmethod
@@ -285,9 +287,23 @@ class Device:
         self._check_size(nbytes)
         return self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size=max(int(nbytes), 4))
 
+    def zeros(self, nbytes: int):
+        """A new device buffer of zeros; `nbytes` is a multiple of four."""
+        buffer = self.empty(nbytes)
+        self.cl.enqueue_fill_buffer(self.queue, buffer, np.float32(0), 0, buffer.size)
+        return buffer
+
     def write(self, buffer, array: np.ndarray) -> None:
-        """Copy `array` into a buffer that is at least as large."""
-        self.cl.enqueue_copy(self.queue, buffer, array, is_blocking=True)
+        """Copy `array` into a buffer that is at least as large, in its turn; nothing is waited for."""
+        # An event keeps its array alive, and waits for the copy when it is dropped itself.
+        event = self.cl.enqueue_copy(self.queue, buffer, array.copy(), is_blocking=False)
+        self._writes.append(event)
+
+    def mark(self):
+        """An event that completes when everything enqueued so far has; its wait() waits for that."""
+        marker = self.cl.enqueue_marker(self.queue)
+        self.queue.flush()
+        return marker
 
     def download(self, buffer, shape, dtype) -> np.ndarray:
         """A new host array with the buffer's content; waits for everything enqueued before."""

@@ -42,6 +42,7 @@ class RayTracer:
         self.workspace = Workspace(device)
         self._quantile_key: tuple | None = None
         self._root_key: tuple | None = None
+        self._overflown = device.zeros(4)
 
     def run(self, scene_buffer, scene: np.ndarray, medium: Medium) -> None:
         """Enqueue the tracing of one frame. `scene` is a layout.SCENE record, `scene_buffer` the same on the device."""
@@ -76,6 +77,7 @@ class RayTracer:
             self.hits,
             self.hit_counts,
             self.cut,
+            self._overflown,
             heavy=True,
         )
 
@@ -99,9 +101,11 @@ class RayTracer:
         )
 
     def overflown_lines(self) -> int:
-        """How many traced lines had more segments than there is room for."""
-        counts = self.device.download(self.segment_counts, self.shape[0], np.int32)
-        return int((counts > CONSTANTS["MAX_SEGMENTS"]).sum())
+        """How many traced lines since the last call had more segments than there is room for."""
+        lines = int(self.device.download(self._overflown, 1, np.int32)[0])
+        if lines:
+            self.device.write(self._overflown, np.zeros(1, np.int32))
+        return lines
 
 
 #: What places the traced lines in the probe frame

@@ -201,9 +201,21 @@ class UltrasoundSimulator:
         """
         poses = list(poses)
         grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
-        compounder = Compounder(grid, probe)
-        for frame in self.sweep(probe, poses, display, progress):
-            compounder.add(frame)
+        compounder = Compounder(grid, probe, self.device)
+        display = display or DisplaySettings()
+        pixels = ImageGrid.for_probe(probe, display.image_size)
+        marks = []
+        for count, pose in enumerate(poses, 1):
+            pose = check_rigid("probe_to_ras", pose)
+            self._warn_if_empty(probe, pose)
+            compounder.add_buffer(self.render(probe, pose, display, pixels), pixels, pose)
+            marks.append(self.device.mark())
+            # One image is prepared while the device computes the one before: neither ever waits for the other.
+            if count > 1:
+                marks[count - 2].wait()
+            if progress is not None:
+                progress(count)
+        self._warn_if_overflown(len(poses))
         return compounder.volume(hole_mm)
 
     def set_tissues(self, tissues: TissueTable) -> None:
@@ -295,8 +307,8 @@ class UltrasoundSimulator:
         if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
             warnings.warn("the probe looks past the volume: the image is black", EmptyViewWarning, stacklevel=3)
 
-    def _warn_if_overflown(self) -> None:
-        lines, traced = self.tracer.overflown_lines(), self.tracer.shape[0]
+    def _warn_if_overflown(self, frames: int = 1) -> None:
+        lines, traced = self.tracer.overflown_lines(), frames * self.tracer.shape[0]
         if lines > 0.01 * traced:  # a single chaotic line is lost among its neighbours
             warnings.warn(
                 f"{lines} of {traced} traced lines have more than {CONSTANTS['MAX_SEGMENTS']} ray segments, "

@@ -1,0 +1,83 @@
+"""The first frame of a fresh process with empty kernel caches, from interpreter start to image, and its peak memory.
+
+    python benchmarks/cold_start.py [--json FILE]
+
+Frame A of `ussim bench`, once from a label map in a file and once from the MRI, on every OpenCL device found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from time import perf_counter
+
+from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume, list_devices, segment_mri
+from SlicerUSSim.Logic.benchmark.suite import FRAMES
+from SlicerUSSim.Logic.demo import demo_mri
+from SlicerUSSim.Logic.placement import craniotomy_pose
+
+NAMES = ("csf", "grey matter", "white matter")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="keep the numbers in this file")
+    parser.add_argument("--first-frame", metavar="DEVICE", help=argparse.SUPPRESS)
+    parser.add_argument("--labels", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.first_frame:
+        return first_frame(arguments.first_frame, arguments.labels)
+    results = {}
+    segmentation = segment_mri(demo_mri()[0])
+    with tempfile.TemporaryDirectory() as folder:
+        labels = Path(folder) / "labels.nii.gz"
+        segmentation.labels.write(labels)
+        for info in (info for info in list_devices() if info.rank < 9):
+            for start, extra in (("label map", ["--labels", str(labels)]), ("MRI", [])):
+                results[f"{info.platform}, from {start}"] = cold = run_first_frame(info.index, extra)
+                print(f"{info.platform:26s} from {start:10s} {cold['seconds']:5.1f} s, peak {cold['peak_mb']:5.0f} MB")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
+
+
+def run_first_frame(device: str, extra: list[str]) -> dict[str, float]:
+    """Seconds to the first image and peak memory, in a process of its own with empty caches."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "XDG_CACHE_HOME": folder, "POCL_CACHE_DIR": folder, "HOME": folder}
+        environment.pop("OCL_ICD_VENDORS", None)
+        command = [sys.executable, __file__, "--first-frame", device, *extra]
+        start = perf_counter()
+        output = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+        return {"seconds": perf_counter() - start, "peak_mb": float(output)}
+
+
+def first_frame(device: str, label_file: Path | None) -> None:
+    """Simulate frame A once, from a label map or from the MRI; print the peak memory in MB."""
+    if label_file:
+        labels, names = Volume.read(label_file), NAMES
+    else:
+        segmentation = segment_mri(demo_mri()[0], device=device)
+        labels, names = segmentation.labels, segmentation.tissue_names
+    simulator = UltrasoundSimulator(labels, TissueTable.brain(names), device=device)
+    simulator.simulate(FRAMES["A"], craniotomy_pose(labels, FRAMES["A"]))
+    print(peak_memory_mb())
+
+
+def peak_memory_mb() -> float:
+    """Peak resident memory of this process since it was started."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+    except OSError:
+        # Counts what the parent held when it started us, too.
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""`ussim bench`: floors, tables, comparison, and that a wrong image is told. No test looks at a time."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from SlicerUSSim.cli import main
+from SlicerUSSim.Logic import ConvexProbe, SimulationError
+from SlicerUSSim.Logic.benchmark import suite
+from SlicerUSSim.Logic.benchmark.machine import Machine, Work
+from SlicerUSSim.Logic.benchmark.suite import run_benchmark
+from SlicerUSSim.Logic.benchmark.tables import comparison
+from SlicerUSSim.Logic.benchmark.work import frame_work, scatterer_counts
+from SlicerUSSim.Logic.device import choose_device
+from SlicerUSSim.Logic.scan_conversion import ImageGrid
+from tests.conftest import SPECKLE, block, rigid, simulator
+
+STAGES = {"ray tree", "scatterers", "interfaces", "beam", "pulse", "B-mode", "scan conversion"}
+
+
+@pytest.fixture(scope="module")
+def solid():
+    return simulator(block(lambda x, y, z: np.ones_like(x), half_mm=(25, 25, 25)), SPECKLE, interfaces=False)
+
+
+def test_the_floor_is_what_takes_longer_moving_or_computing():
+    machine = Machine(bytes_per_s=1e9, operations_per_s=1e10)
+    assert machine.floor_ms(Work(bytes=2e6, operations=1e6)) == pytest.approx(2.0)
+    assert machine.floor_ms(Work(bytes=2e3, operations=5e7)) == pytest.approx(5.0)
+
+
+def test_a_machine_is_measured_within_what_machines_can_do(solid):
+    machine = Machine.measure(solid.device, repeat=2)
+    assert 1e8 < machine.bytes_per_s < 1e14
+    assert 1e8 < machine.operations_per_s < 1e16
+
+
+def test_the_work_of_a_frame_grows_with_its_depth(solid):
+    pose = rigid(np.eye(3), [0, -20, 0])
+    probe, deeper = (ConvexProbe(30, 50, depth, scan_lines=64) for depth in (20.0, 40.0))
+    work, more = (frame_work(solid, p, pose, ImageGrid.for_probe(p, None)) for p in (probe, deeper))
+    assert set(work) == STAGES
+    for stage in STAGES - {"interfaces", "scan conversion"}:  # nothing reflects; an image has as many rows
+        assert work[stage].bytes > 0
+        assert more[stage].operations > 1.5 * work[stage].operations > 0
+
+
+def test_scatterers_are_counted_by_the_volume_of_the_beam(solid):
+    """Without refraction the strips of all lines fill the field: area between arcs times height times density."""
+    probe, pose = ConvexProbe(30, 50, 30, scan_lines=64), rigid(np.eye(3), [0, -20, 0])
+    tree = solid.trace(probe, pose)
+    inside = (tree.segment_line >= 0) & (tree.segment_line <= 63)
+    found, looked_at = scatterer_counts(solid, probe, solid.scene(probe, pose), tree.segments[inside])
+    depth = np.linspace(0, 30, 1001)
+    height = 2 * solid.settings.beam_cutoff * probe.beam_sigma_mm(depth)[1]
+    width = np.deg2rad(50) * (30 + depth) * 64 / 63  # half a strip beyond either edge
+    expected = solid.settings.scatterers_per_mm3 * np.trapezoid(width * height, depth)
+    assert found == pytest.approx(expected, rel=0.02)
+    assert 1.2 * found < looked_at < 6 * found
+
+
+def result(frame_ms: float) -> dict:
+    times = {"best_ms": frame_ms, "median_ms": frame_ms + 1}
+    frame = {"whole": times, "display changed": times, "stages": {"beam": times}}
+    return {"devices": {"PoCL": {"frames": {"A": frame}, "segmentation": times}}}
+
+
+def test_two_results_are_compared_row_by_row():
+    text = comparison(result(30.0), result(12.0))
+    assert re.search(r"frame A: beam +30.00 ms +12.00 ms +2.50x", text)
+    assert re.search(r"segmentation +30.00 ms +12.00 ms +2.50x", text)
+
+
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bench") / "bench.json"
+    outcome = CliRunner().invoke(main, ["bench", "--brief", "--device", choose_device()[0].index, "--json", str(path)])
+    return outcome, path
+
+
+def test_the_command_prints_every_stage_and_keeps_the_numbers(brief):
+    outcome, path = brief
+    assert outcome.exit_code == 0, outcome.output
+    numbers = json.loads(path.read_text())
+    (device,) = numbers["devices"].values()
+    assert set(device["frames"]) == {"A"} and set(device["frames"]["A"]["stages"]) >= STAGES
+    for stage in STAGES:
+        row = device["frames"]["A"]["stages"][stage]
+        assert row["floor_ms"] > 0 and 0 < row["best_ms"] <= row["median_ms"]
+        assert re.search(rf"{stage} +[\d.]+ ms", outcome.output)
+    assert numbers["numpy"]["frame A"]["same"] > 0.99
+    assert numbers["wrong"] == [] and "WRONG" not in outcome.output
+
+
+def test_a_wrong_image_is_told_and_exits_with_1(monkeypatch, tmp_path):
+    class Wrong:
+        timings_ms: dict = {"ray tree": 1.0}  # noqa: RUF012
+
+        def __init__(self, simulator) -> None:
+            pass
+
+        def simulate(self, probe, pose):
+            return np.full(ImageGrid.for_probe(probe, None).field(probe).shape, 7, np.uint8)
+
+    monkeypatch.setattr(suite, "NumpyModel", Wrong)
+    outcome = CliRunner().invoke(main, ["bench", "--brief", "--repeat", "1", "--device", choose_device()[0].index])
+    assert outcome.exit_code == 1
+    assert re.search(r"WRONG: .*: frame A: \d+.\d+% of pixels as in numpy, expected 99%", outcome.output)
+
+
+def test_bad_input_is_refused_before_anything_is_measured(tmp_path):
+    with pytest.raises(SimulationError, match="repeat is 0, expected a number between 1 and 10000"):
+        run_benchmark([choose_device()[0]], repeat=0)
+    outcome = CliRunner().invoke(main, ["bench", "--json", str(tmp_path / "nowhere" / "bench.json")])
+    assert outcome.exit_code == 2 and outcome.output.startswith("ussim: ") and "nowhere" in outcome.output
