@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from SlicerUSSim import __version__
 from SlicerUSSim.Command.options import device_option
 from SlicerUSSim.Command.progress import Steps
 
@@ -35,6 +36,7 @@ def bench(ctx: click.Context, json_file: Path | None, repeat: int, brief: bool, 
     steps = len(devices) * (3 if brief else 6) + 1
     with Steps(steps) as step:
         result = run_benchmark(devices, repeat=min(repeat, 5) if brief else repeat, brief=brief, progress=step)
+    result = {"version": __version__, **result}
     click.echo(table_of(result))
     if json_file:
         write_json(json_file, result)

@@ -12,7 +12,6 @@ from dataclasses import asdict
 
 import numpy as np
 
-from SlicerUSSim import __version__
 from SlicerUSSim.Logic.appearance import AppearanceModel
 from SlicerUSSim.Logic.benchmark.machine import Machine
 from SlicerUSSim.Logic.benchmark.timing import measured, summary
@@ -54,7 +53,6 @@ def run_benchmark(
     require_between("run_benchmark", "repeat", repeat, 1, 10_000)
     mri, source = demo_mri()
     result = {
-        "version": __version__,
         "machine": {"system": platform.platform(), "processor": _processor(), "python": platform.python_version()},
         "mri": f"{source}, {'x'.join(map(str, mri.array.shape[::-1]))} voxels",
         "devices": {},

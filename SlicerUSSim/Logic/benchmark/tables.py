@@ -11,7 +11,7 @@ def table_of(result: dict) -> str:
 
 
 def _lines(result: dict) -> Iterator[str]:
-    yield f"SlicerUSSim {result['version']} on {result['machine']['processor']}, {result['mri']}"
+    yield f"SlicerUSSim {result.get('version', '')} on {result['machine']['processor']}, {result['mri']}"
     for name, numbers in result["devices"].items():
         yield ""
         yield (
