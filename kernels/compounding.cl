@@ -8,7 +8,7 @@
 // share in the window it is 0. Buffers: image, field uchar [row][column] (field: 0 or 1); mean float [row][column].
 __kernel void mean_in_field(__global const uchar *image, __global const uchar *field, int2 size, __global float *mean) {
   const int2 pixel = (int2)(get_global_id(0), get_global_id(1)), count = (int2)(get_global_size(0), get_global_size(1));
-  const int2 low = max(pixel - size / 2, 0), high = min(pixel - size / 2 + size, count);
+  const int2 low = max(pixel - size / 2, (int2)(0)), high = min(pixel - size / 2 + size, count);
   int sum = 0, inside = 0;
   for (int row = low.y; row < high.y; row++)
     for (int column = low.x; column < high.x; column++) {

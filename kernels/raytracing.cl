@@ -117,11 +117,14 @@ inline float next_border(__global const ushort *voxels, __global const uchar *gr
   const float3 top = (float3)(nx - 1.001f, ny - 1.001f, scene->dims[2] - 1.001f);
   float beyond = -1.0f;
   while (inside < last && beyond < 0.0f) {
-    const float8 ahead = min(inside + stride * (float8)(1, 2, 3, 4, 5, 6, 7, 8), last + 1e-4f);
+    const float8 ahead = min(inside + stride * (float8)(1, 2, 3, 4, 5, 6, 7, 8), (float8)(last + 1e-4f));
     const float8 sigma = elevation_sigma8(scene, course->path + ahead);
-    const float8 x = clamp(course->start.x + ahead * course->step.x + sigma * course->aside.x, 0.0f, top.x);
-    const float8 y = clamp(course->start.y + ahead * course->step.y + sigma * course->aside.y, 0.0f, top.y);
-    const float8 z = clamp(course->start.z + ahead * course->step.z + sigma * course->aside.z, 0.0f, top.z);
+    const float8 x =
+        clamp(course->start.x + ahead * course->step.x + sigma * course->aside.x, (float8)(0.0f), (float8)(top.x));
+    const float8 y =
+        clamp(course->start.y + ahead * course->step.y + sigma * course->aside.y, (float8)(0.0f), (float8)(top.y));
+    const float8 z =
+        clamp(course->start.z + ahead * course->step.z + sigma * course->aside.z, (float8)(0.0f), (float8)(top.z));
     const int8 i = convert_int8(x), j = convert_int8(y), k = convert_int8(z);
     int here[8], differs = 0;
     vstore8((k * ny + j) * nx + i, 0, here);

@@ -31,7 +31,7 @@ __kernel void scan_convert(__constant const Scene *scene, __global const uchar *
   }
   const floatn place = (lateral - scene->first_line) / scene->line_spacing, sample = depth / scene->sample_mm;
   const intn inside = (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) & (depth < scene->depth_mm);
-  const intn bin = clamp(TO_INTN(sample), 0, samples - 2);
+  const intn bin = clamp(TO_INTN(sample), (intn)(0), (intn)(samples - 2));
   const floatn on_line = clamp(place, 0.0f, scan_lines - 1.0f);
   const intn line = TO_INTN(on_line);
   SPREAD(int, inside_, inside);

@@ -144,13 +144,14 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
       chosen[n] = begin + j;
       n += counts_[j] & 1;
     }
-    const floatn amplitude = exp2_fast(clamp(piece->gain0 + t * piece->gain1 - r2, -100.0f, 100.0f));
+    const floatn amplitude =
+        exp2_fast(clamp(piece->gain0 + t * piece->gain1 - r2, (floatn)(-100.0f), (floatn)(100.0f)));
     floatn cosine, sine;
     turn(depth * scene->cycles_per_mm, &cosine, &sine);
     const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
-    const floatn vx = clamp(at.x + pu * ri.x + pv * ri.y + pw * ri.z, 0.0f, voxel_top.x);
-    const floatn vy = clamp(at.y + pu * rj.x + pv * rj.y + pw * rj.z, 0.0f, voxel_top.y);
-    const floatn vz = clamp(at.z + pu * rk.x + pv * rk.y + pw * rk.z, 0.0f, voxel_top.z);
+    const floatn vx = clamp(at.x + pu * ri.x + pv * ri.y + pw * ri.z, (floatn)(0.0f), (floatn)(voxel_top.x));
+    const floatn vy = clamp(at.y + pu * rj.x + pv * rj.y + pw * rj.z, (floatn)(0.0f), (floatn)(voxel_top.y));
+    const floatn vz = clamp(at.z + pu * rk.x + pv * rk.y + pw * rk.z, (floatn)(0.0f), (floatn)(voxel_top.z));
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
     STORE_LANES(bins, bin_ + begin);
     STORE_LANES(place - bin, part_ + begin);
@@ -267,8 +268,8 @@ inline void scatter_piece(__constant const Scene *scene, __global const ushort *
       const floatn d0 = (low - slack_d - base_d) * per_d, d1 = (high + slack_d - base_d) * per_d;
       const floatn l0 = (-limit_l - base_l) * per_l, l1 = (limit_l - base_l) * per_l;
       const floatn e0 = (-limit_e - base_e) * per_e, e1 = (limit_e - base_e) * per_e;
-      const floatn from = max(max(min(d0, d1), min(l0, l1)), max(min(e0, e1), box_low.x - 1.0f));
-      const floatn to = min(min(max(d0, d1), max(l0, l1)), min(max(e0, e1), box_high.x + 1.0f));
+      const floatn from = max(max(min(d0, d1), min(l0, l1)), max(min(e0, e1), (floatn)(box_low.x - 1.0f)));
+      const floatn to = min(min(max(d0, d1), max(l0, l1)), min(max(e0, e1), (floatn)(box_high.x + 1.0f)));
       const intn u_low = TO_INTN(ceil(from));
       SPREAD(int, u_low_, u_low);
       SPREAD(int, cells_, TO_INTN(floor(to)) - u_low + 1);
