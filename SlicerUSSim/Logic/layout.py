@@ -13,6 +13,7 @@ CONSTANTS = {
     "SAME_LABEL": 0x40,  # ... one that says that all eight voxels of this cell have one label, ...
     "NO_MEMBRANE": 0x80,  # ... and one that says that no membrane passes between them
     "PLAIN_CELL": 0xC0,  # both
+    "GROUP_MASK": 0x7F,
     "SAME_GROUP": 0x80,  # beside the acoustic group of a voxel: all eight of this cell have the same
     "MEMBRANE_LABEL": 63,
     "MAX_TISSUES": 64,

@@ -15,6 +15,7 @@ from scipy import ndimage, special
 from SlicerUSSim.Logic.device import Device
 from SlicerUSSim.Logic.errors import SimulationError, require
 from SlicerUSSim.Logic.layout import CONSTANTS, TISSUE
+from SlicerUSSim.Logic.smoothing import smoothed_indicators
 from SlicerUSSim.Logic.tissues import MAX_LABEL, Membrane, TissueTable
 from SlicerUSSim.Logic.volume import Volume
 
@@ -133,19 +134,7 @@ class Medium:
         groups = {int(group_of[label]) for label in (0, *self.present)}
         room = max(_SMOOTHED_VOXELS // padded.size, 2)
         self.smooth_groups = min(max(groups) + 1, _MOST_SMOOTHED_GROUPS, room)
-        fields = np.zeros((self.smooth_groups, *padded.shape), np.uint16)
-        if len(groups) > 1:
-            rest = np.full(padded.shape, 65535, np.uint16)  # indicators sum to one, which saves the last one's Gaussian
-            *all_but_last, last = sorted(groups)
-            for n in all_but_last[: len(fields)]:
-                indicator = np.where(group == n, np.float32(65535), np.float32(0))
-                sigma = CONSTANTS["WIDE_SIGMA"]
-                ndimage.gaussian_filter(indicator, sigma, output=indicator, mode="nearest", truncate=2.5)
-                fields[n] = indicator
-                rest -= np.minimum(fields[n], rest)
-            if last < len(fields):
-                fields[last] = rest
-        self.smooth_buffer = self.device.upload(fields)
+        self.smooth_buffer = smoothed_indicators(self.device, self.group_buffer, self.dims, groups, self.smooth_groups)
 
     def _fluid_distance(self, padded: np.ndarray, tissues: TissueTable) -> tuple[np.ndarray | None, float]:
         """(distance as uint8 about 127.5, half the membrane in that unit), or (None, -1) without a membrane."""

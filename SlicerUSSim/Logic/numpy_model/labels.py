@@ -22,7 +22,7 @@ class Labels:
         download = medium.device.download
         self.dims = medium.dims.astype(np.int64)
         self.voxels = download(medium.voxel_buffer, int(np.prod(shape)), np.uint16)
-        self.groups = download(medium.group_buffer, int(np.prod(shape)) + 8, np.uint8) & 0x7F
+        self.groups = download(medium.group_buffer, int(np.prod(shape)) + 8, np.uint8) & CONSTANTS["GROUP_MASK"]
         self.smooth_groups = medium.smooth_groups
         self.smooth = download(medium.smooth_buffer, (medium.smooth_groups, int(np.prod(shape))), np.uint16)
         self.steps = np.array([1, self.dims[0], self.dims[0] * self.dims[1]])

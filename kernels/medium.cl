@@ -1,0 +1,69 @@
+// The indicators of acoustic groups, smoothed (Logic/medium.py): a separable Gaussian whose ends repeat the border
+// voxels. One work-item computes LANES voxels of a row; global size (columns / LANES rounded up, rows, planes).
+//
+// Buffers: groups uchar [k][j][i] with flags; taps float [2 reach + 1] of unit sum; partial float [plane][j][i]; smooth
+// ushort [k][j][i], 65535 for 1. `columns` and `rows` are the voxels along i and j.
+
+#include "common.clh"
+
+#if LANES == 1
+#define LOAD_BYTES(pointer) ((float)*(pointer))
+#define STORE_SMOOTH(value, pointer) (*(pointer) = (ushort)((value)*65535.0f + 0.5f))
+#else
+#define LOAD_BYTES(pointer) TO_FLOATN(JOIN(vload, LANES)(0, pointer))
+#define STORE_SMOOTH(value, pointer) \
+  JOIN(vstore, LANES)(JOIN(JOIN(convert_ushort, LANES), _sat)((value)*65535.0f + 0.5f), 0, pointer)
+#endif
+
+// Along i, from groups: planes from `first` on, each clamped into the volume.
+__kernel void smooth_rows(__global const uchar *groups, int group, __constant const float *taps, int reach, int columns,
+                          int rows, int planes, int first, __global float *partial) {
+  // The last vector of a row begins earlier: what it shares with the one before is computed twice.
+  const int column = min((int)get_global_id(0) * LANES, columns - LANES), row = get_global_id(1);
+  const int plane = clamp((int)get_global_id(2) + first, 0, planes - 1);
+  __global const uchar *from = groups + ((size_t)plane * rows + row) * columns;
+  const int is_inside = column >= reach && column + LANES + reach <= columns;
+  floatn sum = 0.0f;
+  for (int k = -reach; k <= reach; k++) {
+    floatn words;  // the flag counts 128
+    if (is_inside) {
+      words = LOAD_BYTES(from + column + k);
+    } else {
+      float at_the_ends[LANES];
+      for (int n = 0; n < LANES; n++) at_the_ends[n] = from[clamp(column + n + k, 0, columns - 1)];
+      words = LOAD_LANES(at_the_ends);
+    }
+    const floatn found = words >= (floatn)SAME_GROUP ? words - (floatn)SAME_GROUP : words;
+    sum += found == (floatn)group ? (floatn)taps[k + reach] : (floatn)(0.0f);
+  }
+  STORE_LANES(sum, partial + ((size_t)get_global_id(2) * rows + row) * columns + column);
+}
+
+// Along j, within planes.
+__kernel void smooth_columns(__global const float *from, __constant const float *taps, int reach, int columns, int rows,
+                             __global float *to) {
+  const int column = min((int)get_global_id(0) * LANES, columns - LANES), row = get_global_id(1);
+  const size_t plane = (size_t)get_global_id(2) * rows;
+  floatn sum = 0.0f;
+  for (int k = -reach; k <= reach; k++)
+    sum += taps[k + reach] * LOAD_LANES(from + (plane + clamp(row + k, 0, rows - 1)) * columns + column);
+  STORE_LANES(sum, to + (plane + row) * columns + column);
+}
+
+// Along k: `from` begins `reach` planes before the plane `first` of the volume.
+__kernel void smooth_planes(__global const float *from, __constant const float *taps, int reach, int columns, int rows,
+                            int first, ulong offset, __global ushort *smooth) {
+  const int column = min((int)get_global_id(0) * LANES, columns - LANES), row = get_global_id(1);
+  const size_t plane = get_global_id(2), size = (size_t)rows * columns, here = (size_t)row * columns + column;
+  floatn sum = 0.0f;
+  for (int k = 0; k <= 2 * reach; k++) sum += taps[k] * LOAD_LANES(from + (plane + k) * size + here);
+  STORE_SMOOTH(min(sum, (floatn)(1.0f)), smooth + offset + (plane + first) * size + here);
+}
+
+// Indicators sum to one, which saves the last group's Gaussian. One work-item computes one voxel.
+__kernel void smooth_rest(__global ushort *smooth, int group, int groups) {
+  const size_t voxel = get_global_id(0), voxels = get_global_size(0);
+  int rest = 65535;
+  for (int n = 0; n < groups; n++) rest -= n == group ? 0 : smooth[n * voxels + voxel];
+  smooth[group * voxels + voxel] = (ushort)max(rest, 0);
+}
