@@ -106,18 +106,33 @@ inline float2 volume_span(__constant const Scene *scene, const Course *course, f
   return (float2)(fmin(enter, longest), leave);
 }
 
-// March from `inside` until the label is no longer `label`, then bisect. Returns the first length found to be in
-// another tissue, whose label goes to `other`; or -1 if there is none up to `last`. Nothing before `blind_until`
-// counts. Eight steps of half a voxel are looked up at once.
+// Halve the stretch from `inside`, in `label`, to `beyond`, in `other`.
+inline void bisect(__global const ushort *voxels, __global const uchar *groups, __constant const Scene *scene,
+                   const Course *course, int label, int times, float *inside, float *beyond, int *other) {
+  for (int n = 0; n < times; n++) {
+    const float middle = 0.5f * (*inside + *beyond);
+    const int found = label_at(voxels, groups, scene, course_at(scene, course, middle));
+    if (found == label) {
+      *inside = middle;
+    } else {
+      *beyond = middle;
+      *other = found;
+    }
+  }
+}
+
+// March from `*inside` until the label is no longer `label`, then bisect. Returns the first length found to be in
+// another tissue, whose label goes to `other`, and the last one before it in `inside`; or -1 if there is none up to
+// `last`. Nothing before `blind_until` counts. Eight steps of half a voxel are looked up at once.
 inline float next_border(__global const ushort *voxels, __global const uchar *groups, __constant const Scene *scene,
-                         __constant const Tissue *tissues, const Course *course, int label, float inside, float last,
+                         __constant const Tissue *tissues, const Course *course, int label, float *inside, float last,
                          float blind_until, int *other) {
   const float stride = 0.5f * scene->voxel_mm;
   const int nx = scene->dims[0], ny = scene->dims[1];
   const float3 top = (float3)(nx - 1.001f, ny - 1.001f, scene->dims[2] - 1.001f);
   float beyond = -1.0f;
-  while (inside < last && beyond < 0.0f) {
-    const float8 ahead = min(inside + stride * (float8)(1, 2, 3, 4, 5, 6, 7, 8), (float8)(last + 1e-4f));
+  while (*inside < last && beyond < 0.0f) {
+    const float8 ahead = min(*inside + stride * (float8)(1, 2, 3, 4, 5, 6, 7, 8), (float8)(last + 1e-4f));
     const float8 sigma = elevation_sigma8(scene, course->path + ahead);
     const float8 x =
         clamp(course->start.x + ahead * course->step.x + sigma * course->aside.x, (float8)(0.0f), (float8)(top.x));
@@ -142,25 +157,18 @@ inline float next_border(__global const ushort *voxels, __global const uchar *gr
           beyond = length[n];
           break;
         }
-        inside = length[n];
+        *inside = length[n];
       }
     } else {
-      inside = length[7];
+      *inside = length[7];
     }
   }
   if (beyond < 0.0f) return beyond;
-  // Where only attenuation changes, a sixteenth of a voxel is enough.
-  const int group = tissues[label].group;
-  for (int iteration = 0; iteration < 8 && (iteration < 3 || tissues[*other].group != group); iteration++) {
-    float middle = 0.5f * (inside + beyond);
-    int found = label_at(voxels, groups, scene, course_at(scene, course, middle));
-    if (found == label) {
-      inside = middle;
-    } else {
-      beyond = middle;
-      *other = found;
-    }
-  }
+  // Where only attenuation changes, a sixteenth of a voxel is enough, and where a smoothed border tells the rest, half
+  // of that.
+  bisect(voxels, groups, scene, course, label, 3, inside, &beyond, other);
+  if (tissues[*other].group != tissues[label].group)
+    bisect(voxels, groups, scene, course, label, 2, inside, &beyond, other);
   return beyond;
 }
 
@@ -310,7 +318,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
         const float to_silence = since + fmax(reserve, 0.0f) / fmax(decay, 1e-9f);
         is_silenced = to_silence < to_depth;
         const float longest = fmin(to_depth, to_silence);
-        border = next_border(voxels, groups, scene, tissues, &course, ray.label, inside, fmin(span.y, longest),
+        border = next_border(voxels, groups, scene, tissues, &course, ray.label, &inside, fmin(span.y, longest),
                              ray.blind_until, &other);
         const float until = border < 0.0f ? longest : border;
         const float spent_until = spent + decay * (until - since);
@@ -347,9 +355,16 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       const float3 normal = interface_normal(groups, smooth, scene, course_at(scene, &course, border), here.group,
                                              behind.group, ray.direction, course.step, &overshoot);
       overshoot = fmin(overshoot, border - since);
-      border -= overshoot;
-      spent -= overshoot * decay_in(scene, here);
-      if (on_axis && count > 0 && count <= room) my_segments[count - 1].length_mm -= overshoot;
+      float back = overshoot;
+      if (overshoot == 0.0f) {  // the labels alone have to tell
+        float beyond = border;
+        bisect(voxels, groups, scene, &course, ray.label, 3, &inside, &beyond, &other);
+        back = border - beyond;
+        behind = tissues[other];
+      }
+      border -= back;
+      spent -= back * decay_in(scene, here);
+      if (on_axis && count > 0 && count <= room) my_segments[count - 1].length_mm -= back;
       const float path = ray.path + border, depth = ray.depth + border * depth_per_mm;
       if (depth >= scene->depth_mm) break;  // with the overshoot taken back, the border lies beyond the field: a leaf
       const float log_attenuation = ray.log_attenuation - spent, attenuation = exp_fast(log_attenuation);

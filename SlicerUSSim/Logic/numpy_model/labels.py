@@ -107,38 +107,62 @@ class Labels:
     def _wide(self, voxel, before, behind):
         """By the indicators smoothed beforehand; confidence 0 where they do not know."""
         towards, overshoot, confidence = np.zeros_like(voxel), *np.zeros((2, len(voxel)), np.float32)
+        if self.dims.min() < 4:
+            return towards, overshoot, confidence
         known = np.flatnonzero((before < self.smooth_groups) & (behind < self.smooth_groups))
-        here = self._smooth_difference(voxel[known], before[known], behind[known])
-        fits = (here[1] >= f32(0.97)) & (np.abs(here[0]) <= f32(0.5))
-        known, (difference, both) = known[fits], (here[0][fits], here[1][fits])
-        gradient, laplacian = [], f32(0)
-        for axis in np.eye(3, dtype=np.float32):
-            up, down = (
-                self._smooth_difference(voxel[known] + side * axis, before[known], behind[known])[0] for side in (1, -1)
-            )
-            gradient.append(f32(0.5) * (up - down))
-            laplacian = laplacian + (up + down - f32(2) * difference)
-        slope = np.stack(gradient, axis=-1)
+        difference, both, up, down = self._stencil(voxel[known], before[known], behind[known])
+        fits = (both >= f32(0.97)) & (np.abs(difference) <= f32(0.5))
+        known, difference, both, up, down = known[fits], difference[fits], both[fits], up[fits], down[fits]
+        slope, bends = f32(0.5) * (up - down), up + down - (f32(2) * difference)[:, None]
+        laplacian = bends[:, 0] + bends[:, 1] + bends[:, 2]
         wide = f32(CONSTANTS["WIDE_SIGMA"])
         variance = wide * wide + f32(1) / f32(6)
         steepness, sigma = np.maximum(length(slope), f32(1e-6)), np.sqrt(variance)
-        share = f32(0.5) - f32(0.5) * difference / np.maximum(both, f32(1e-3))
+        share = f32(0.5) - f32(0.5) * difference / both
         distance = _border_distance(sigma, share, variance * laplacian / steepness)
         of_plane = f32(0.79788456) / sigma * exp(f32(-0.5) * distance * distance / variance)
         towards[known], overshoot[known] = slope / steepness[:, None], distance
         confidence[known] = ramp(0.95, 0.99, steepness / of_plane)
         return towards, overshoot, confidence
 
-    def _smooth_difference(self, voxel, before, behind):
-        """(D, [before] + [behind]) of the smoothed indicators, trilinear."""
-        here, f = self.cells(voxel)
-        weights = self.trilinear_weights(f)
-        first = second = f32(0)
-        for corner, step in enumerate(self.corner_steps):
-            first = first + weights[:, corner] * f32(self.smooth[before, here + step])
-            second = second + weights[:, corner] * f32(self.smooth[behind, here + step])
-        scale = f32(1.0 / 65535.0)
-        return (first - second) * scale, (first + second) * scale
+    def _stencil(self, voxel, before, behind):
+        """(D, [before] + [behind]) of the smoothed indicators at voxel positions, and D a voxel up and down each axis.
+
+        (n,), (n,), (n, 3), (n, 3). Trilinear; the outermost cells are extrapolated from the next.
+        """
+        voxel = np.clip(voxel, f32(0), f32(self.dims) - f32(1.001))
+        base = np.clip(voxel.astype(np.int32), 1, self.dims - 3)
+        (fx, fy, fz), (gx, gy, gz) = (w.T for w in (voxel - f32(base), f32(1) - (voxel - f32(base))))
+        here = base @ self.steps
+
+        def node(i, j, k):
+            at = here + np.array([i, j, k]) @ self.steps
+            return f32(self.smooth[before, at]), f32(self.smooth[behind, at])
+
+        def row(j, k, shift=0):
+            """D at the position's i + shift on a row of the stencil."""
+            (a0, b0), (a1, b1) = node(shift, j, k), node(shift + 1, j, k)
+            return gx * (a0 - b0) + fx * (a1 - b1)
+
+        rows = {(j, k): row(j, k) for k in (0, 1) for j in (0, 1)}
+        wy, wz = (gy, fy), (gz, fz)
+        difference = both = right = left = f32(0)
+        for k in (0, 1):
+            for j in (0, 1):
+                weight = wy[j] * wz[k]
+                difference = difference + weight * rows[j, k]
+                right, left = right + weight * row(j, k, 1), left + weight * row(j, k, -1)
+                (a0, b0), (a1, b1) = node(0, j, k), node(1, j, k)
+                both = both + weight * (gx * (a0 + b0) + fx * (a1 + b1))
+        ahead = behind_ = above = below = f32(0)
+        for n in (0, 1):
+            ahead = ahead + wz[n] * (gy * rows[1, n] + fy * row(2, n))
+            behind_ = behind_ + wz[n] * (gy * row(-1, n) + fy * rows[0, n])
+            above = above + wy[n] * (gz * rows[n, 1] + fz * row(n, 2))
+            below = below + wy[n] * (gz * row(n, -1) + fz * rows[n, 0])
+        unit = f32(1.0 / 65535.0)
+        up, down = np.stack([right, ahead, above], -1) * unit, np.stack([left, behind_, below], -1) * unit
+        return difference * unit, both * unit, up, down
 
 
 def _border_distance(sigma, share, bend):

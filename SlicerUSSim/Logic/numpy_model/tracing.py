@@ -140,8 +140,8 @@ class Tracer:
         start, step, aside = (v.reshape(*shape, 3) for v in (rays.start, rays.step, rays.aside))
         return start + at[..., None] * step + sigma * aside
 
-    def _next_border(self, rays: Rays, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(length, label behind) of each ray's next change of label; length -1 where there is none up to `last`."""
+    def _next_border(self, rays: Rays, last: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(last length before, first behind, label behind) of each ray's next change of label; -1 if none to `last`."""
         inside, beyond, other = rays.inside.copy(), np.full(len(rays), -1, np.float32), rays.label.copy()
         stride = f32(0.5) * self.voxel_mm
         left = np.flatnonzero(inside < last)
@@ -159,18 +159,23 @@ class Tracer:
             beyond[left] = np.where(found, ahead[row, first], beyond[left])
             other[left] = np.where(found, labels[row, first], labels[:, -1])
             left = left[~found & (inside[left] < last[left])]
+        found = np.flatnonzero(beyond >= 0)
+        self._bisect(rays, found, 3, inside, beyond, other)
         group = self.tissues["group"]
-        for iteration in range(8):
-            left = np.flatnonzero((beyond >= 0) & ((iteration < 3) | (group[other] != group[rays.label])))
-            if not len(left):
-                break
-            middle = f32(0.5) * (inside[left] + beyond[left])
-            found = self.labels.at(self._place(rays.of(left), middle))
-            same = found == rays.label[left]
-            inside[left] = np.where(same, middle, inside[left])
-            beyond[left] = np.where(same, beyond[left], middle)
-            other[left] = np.where(same, other[left], found)
-        return beyond, other
+        found = found[group[other[found]] != group[rays.label[found]]]
+        self._bisect(rays, found, 2, inside, beyond, other)
+        return inside, beyond, other
+
+    def _bisect(self, rays: Rays, which: np.ndarray, times: int, inside, beyond, other) -> None:
+        """Halve the stretch between `inside` and `beyond` of some rays, in place."""
+        some = rays.of(which)
+        for _ in range(times if len(which) else 0):
+            middle = f32(0.5) * (inside[which] + beyond[which])
+            found = self.labels.at(self._place(some, middle))
+            same = found == some.label
+            inside[which] = np.where(same, middle, inside[which])
+            beyond[which] = np.where(same, beyond[which], middle)
+            other[which] = np.where(same, other[which], found)
 
     def _advance(self, rays: Rays) -> Rays:
         """Every ray to its next change of tissue; the rays that go on from there."""
@@ -179,7 +184,7 @@ class Tracer:
         reserve = log(rays.weight / scene["intensity_threshold"]) + rays.log_attenuation - rays.spent
         to_silence = rays.since + np.maximum(reserve, f32(0)) / np.maximum(decay, f32(1e-9))
         longest = np.minimum(rays.to_depth, to_silence)
-        border, other = self._next_border(rays, np.minimum(rays.leave, longest))
+        rays.inside, border, other = self._next_border(rays, np.minimum(rays.leave, longest))
         until = np.where(border < 0, longest, border)
         spent_until = rays.spent + decay * (until - rays.since)
         ends = (border < 0) | (group[other] != group[rays.label])
@@ -231,10 +236,13 @@ class Tracer:
         before, behind = tissues["group"][rays.label], tissues["group"][other]
         normal, overshoot = self._normals(rays, border, before, behind)
         overshoot = np.minimum(overshoot, border - rays.since)
-        border = border - overshoot
-        rays.spent = rays.spent - overshoot * self.decay[rays.label]
+        beyond = border.copy()
+        self._bisect(rays, np.flatnonzero(overshoot == 0), 3, rays.inside, beyond, other)
+        back = np.where(overshoot == 0, border - beyond, overshoot)
+        border = border - back
+        rays.spent = rays.spent - back * self.decay[rays.label]
         shortened = written >= 0
-        self._segments[-1]["length_mm"][written[shortened]] -= overshoot[shortened]
+        self._segments[-1]["length_mm"][written[shortened]] -= back[shortened]
         keep = rays.depth + border * rays.depth_per_mm < scene["depth_mm"]
         rays, border, other, normal, overshoot = rays.of(keep), border[keep], other[keep], normal[keep], overshoot[keep]
         before, behind = before[keep], behind[keep]
