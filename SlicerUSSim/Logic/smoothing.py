@@ -1,4 +1,4 @@
-"""Host side of kernels/medium.cl: indicators of acoustic groups, smoothed on the device."""
+"""Host side of kernels/smoothing.cl: indicators of acoustic groups, smoothed on the device."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def smoothed_indicators(device: Device, group_buffer, dims, present: set[int], f
     if len(present) < 2:
         return smooth
     lanes = device.lanes if columns >= device.lanes else 1
-    kernels = device.kernels("medium.cl", lanes)
+    kernels = device.kernels("smoothing.cl", lanes)
     taps = gaussian_taps(CONSTANTS["WIDE_SIGMA"])
     reach, tap_buffer = np.int32(len(taps) // 2), device.upload(taps)
     workspace, slab = Workspace(device), min(_SLAB, planes)
