@@ -22,6 +22,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, list_devices, segment_mri
 from SlicerUSSim.Logic.benchmark.suite import FRAMES
@@ -78,7 +79,7 @@ def scatterers_in_beam(density: float, cutoff: float) -> float:
     """Mean number inside the beam of one scan line of frame A."""
     depth = np.linspace(0.0, PROBE.depth_mm, 257)
     lateral, elevation = PROBE.beam_sigma_mm(depth)
-    return float(density * np.trapezoid(4.0 * cutoff**2 * lateral * elevation, depth))
+    return float(density * trapezoid(4.0 * cutoff**2 * lateral * elevation, depth))
 
 
 def scaled(transmission: Callable[[int], Callable[[], object]], in_beam: float) -> dict:

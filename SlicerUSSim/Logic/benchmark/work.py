@@ -8,6 +8,7 @@ estimate to a few tens of percent, enough to tell a stage that is twice off its 
 from __future__ import annotations
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from SlicerUSSim.Logic.benchmark.machine import Work
 from SlicerUSSim.Logic.bmode import pulse_taps
@@ -72,6 +73,6 @@ def scatterer_counts(simulator: UltrasoundSimulator, probe: Probe, scene, segmen
     chunk = simulator.device.chunk * float(scene["sample_mm"]) / segments["depth_per_mm"]
     along = 1.0 + deep / np.minimum(chunk, np.maximum(segments["length_mm"], 1e-3))
     density = settings.scatterers_per_mm3
-    inside = np.trapezoid(width * height, path, axis=0)
-    looked_at = along * np.trapezoid((width + slack["lateral"]) * (height + slack["elevational"]), path, axis=0)
+    inside = trapezoid(width * height, path, axis=0)
+    looked_at = along * trapezoid((width + slack["lateral"]) * (height + slack["elevational"]), path, axis=0)
     return float(density * inside.sum()), float(density * looked_at.sum())
