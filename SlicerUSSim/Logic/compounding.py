@@ -159,8 +159,8 @@ def _filled(values: np.ndarray, known: np.ndarray, hole_voxels: np.ndarray) -> n
     pad = [int(np.ceil(h / 2)) + 1 for h in hole_voxels]
     sampling = tuple(2.0 / np.maximum(hole_voxels, 1e-3))  # distances in half holes
     around = np.pad(known, [(p, p) for p in pad])
-    around = ndimage.distance_transform_edt(~around, sampling) <= 1.0
-    around = ndimage.distance_transform_edt(around, sampling) > 1.0
+    around = _distance_to(around, sampling) <= 1.0 + 1e-4
+    around = _distance_to(~around, sampling) > 1.0 + 1e-4
     inner = tuple(slice(p, -p) for p in pad)
     missing = around[inner] & ~known
     result = values.copy()
@@ -173,3 +173,13 @@ def _filled(values: np.ndarray, known: np.ndarray, hole_voxels: np.ndarray) -> n
         missing &= ~reached
         sigma *= 2.0
     return result
+
+
+def _distance_to(places: np.ndarray, sampling: tuple[float, float, float]) -> np.ndarray:
+    """Distance of every voxel (k, j, i) to the nearest of `places`, 0 there; voxels are `sampling` apart."""
+    import SimpleITK as sitk  # on all cores: four times as fast as scipy's
+
+    image = sitk.GetImageFromArray(places.astype(np.uint8))
+    image.SetSpacing(tuple(float(step) for step in sampling[::-1]))
+    signed = sitk.SignedMaurerDistanceMap(image, squaredDistance=False, useImageSpacing=True)
+    return np.maximum(sitk.GetArrayViewFromImage(signed), 0.0)
