@@ -8,7 +8,6 @@ Frame A of `ussim bench`, once from a label map in a file and once from the MRI,
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import resource
 import subprocess
@@ -17,17 +16,20 @@ import tempfile
 from pathlib import Path
 from time import perf_counter
 
-from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume, list_devices, segment_mri
+from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume, segment_mri
+from SlicerUSSim.Logic.benchmark.files import output_file
 from SlicerUSSim.Logic.benchmark.suite import FRAMES
 from SlicerUSSim.Logic.demo import demo_mri
+from SlicerUSSim.Logic.device import devices_to_measure
 from SlicerUSSim.Logic.placement import craniotomy_pose
+from SlicerUSSim.Logic.tissues import write_json
 
 NAMES = ("csf", "grey matter", "white matter")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="keep the numbers in this file")
+    parser.add_argument("--json", type=output_file, help="keep the numbers in this file")
     parser.add_argument("--first-frame", metavar="DEVICE", help=argparse.SUPPRESS)
     parser.add_argument("--labels", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -38,12 +40,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         labels = Path(folder) / "labels.nii.gz"
         segmentation.labels.write(labels)
-        for info in (info for info in list_devices() if info.rank < 9):
+        for info in devices_to_measure():
             for start, extra in (("label map", ["--labels", str(labels)]), ("MRI", [])):
                 results[f"{info.platform}, from {start}"] = cold = run_first_frame(info.index, extra)
                 print(f"{info.platform:26s} from {start:10s} {cold['seconds']:5.1f} s, peak {cold['peak_mb']:5.0f} MB")
     if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
+        write_json(arguments.json, results)
 
 
 def run_first_frame(device: str, extra: list[str]) -> dict[str, float]:

@@ -8,18 +8,21 @@ Times of two runs are as comparable as the machine was idle; compare stages by t
 from __future__ import annotations
 
 import argparse
-import json
-from pathlib import Path
 
+from SlicerUSSim.Logic.benchmark.files import result_file
 from SlicerUSSim.Logic.benchmark.tables import comparison
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("before", type=Path)
-    parser.add_argument("after", type=Path)
+    parser.add_argument("before", type=result_file)
+    parser.add_argument("after", type=result_file)
     arguments = parser.parse_args()
-    print(comparison(*(json.loads(path.read_text()) for path in (arguments.before, arguments.after))))
+    if not arguments.before["devices"].keys() & arguments.after["devices"].keys():
+        parser.error(
+            f"no device in common: {', '.join(arguments.before['devices'])}; {', '.join(arguments.after['devices'])}"
+        )
+    print(comparison(arguments.before, arguments.after))
 
 
 if __name__ == "__main__":

@@ -12,16 +12,16 @@ Every table is markdown; --patients N takes the first N, --device chooses the de
 from __future__ import annotations
 
 import argparse
-import json
 import warnings
 from dataclasses import replace
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 
 from SlicerUSSim.Logic import DisplaySettings, TissueTable, Volume, optimize_appearance, segment_mri
 from SlicerUSSim.Logic.appearance import AppearanceModel
+from SlicerUSSim.Logic.benchmark.files import output_file
+from SlicerUSSim.Logic.benchmark.timing import measured
 from SlicerUSSim.Logic.demo import demo_mri
 from SlicerUSSim.Logic.fitting import fit, simulated
 from SlicerUSSim.Logic.identifiability import variance_db
@@ -32,6 +32,7 @@ from SlicerUSSim.Logic.report import grey_levels_per_tissue
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.similarity import SimilaritySettings
 from SlicerUSSim.Logic.simulator import TreeOverflowWarning
+from SlicerUSSim.Logic.tissues import write_json
 from SlicerUSSim.Logic.tracked import TrackedImages
 from SlicerUSSim.Logic.twins import TISSUE, Twin, make_twin
 
@@ -58,7 +59,7 @@ def main() -> None:
     parser.add_argument("what", choices=["twins", "algorithms", "ablation", "registration", "evaluation"])
     parser.add_argument("--patients", type=int, default=14)
     parser.add_argument("--device")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=output_file)
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", TreeOverflowWarning)
     segmentation = segment_mri(demo_mri()[0], device=arguments.device)
@@ -69,7 +70,7 @@ def main() -> None:
     }[arguments.what]  # fmt: skip
     result = run(segmentation.labels, tissues, arguments.patients, arguments.device)
     if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
+        write_json(arguments.json, result)
 
 
 def twins(labels: Volume, tissues: TissueTable, patients: int, device) -> dict:
@@ -230,15 +231,9 @@ def evaluation(labels: Volume, tissues: TissueTable, patients: int, device) -> d
     return results
 
 
-def best_ms(function, repeat: int = 40) -> tuple[float, float]:
+def best_ms(function, repeat: int = 40) -> tuple[float, ...]:
     """(best, median) milliseconds."""
-    function()
-    times = []
-    for _ in range(repeat):
-        start = perf_counter()
-        function()
-        times.append((perf_counter() - start) * 1e3)
-    return round(min(times), 2), round(sorted(times)[len(times) // 2], 2)
+    return tuple(measured(function, repeat).values())
 
 
 def white(tissues: TissueTable):

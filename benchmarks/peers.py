@@ -16,21 +16,21 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import json
 import os
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from scipy.integrate import trapezoid
 
-from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, list_devices, segment_mri
+from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, segment_mri
+from SlicerUSSim.Logic.benchmark.files import output_file
 from SlicerUSSim.Logic.benchmark.suite import FRAMES
 from SlicerUSSim.Logic.benchmark.timing import measured, timed
 from SlicerUSSim.Logic.demo import demo_mri
-from SlicerUSSim.Logic.device import choose_device
+from SlicerUSSim.Logic.device import devices_to_measure
 from SlicerUSSim.Logic.numpy_model import NumpyModel
 from SlicerUSSim.Logic.placement import craniotomy_pose
+from SlicerUSSim.Logic.tissues import write_json
 
 PROBE = FRAMES["A"]
 ELEMENTS, PITCH_M, WIDTH_M, SPEED, FREQUENCY = 64, 0.15e-3, 0.14e-3, 1540.0, 5e6
@@ -40,9 +40,9 @@ COUNTS = (250, 500, 1000, 2000)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", help="see `ussim devices` (default: every one)")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=output_file)
     arguments = parser.parse_args()
-    devices = [choose_device(arguments.device)[0]] if arguments.device else [d for d in list_devices() if d.rank < 9]
+    devices = devices_to_measure(arguments.device)
     segmentation = segment_mri(demo_mri()[0], device=devices[0])
     tissues, pose = TissueTable.brain(segmentation.tissue_names), craniotomy_pose(segmentation.labels, PROBE)
     rows: dict[str, dict] = {}
@@ -72,7 +72,7 @@ def main() -> None:
         single = f"{row['transmission_ms']:.0f} ms" if "transmission_ms" in row else ""
         print(f"| {name} | {single} | {row['frame_ms'] / 1e3:.3g} s | {row['frame_ms'] / ours:.3g} |")
     if arguments.json:
-        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+        write_json(arguments.json, rows)
 
 
 def scatterers_in_beam(density: float, cutoff: float) -> float:

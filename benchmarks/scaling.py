@@ -10,7 +10,6 @@ logarithms, 1 is linear) is printed beside it.
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,8 +23,10 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     Volume,
 )
+from SlicerUSSim.Logic.benchmark.files import output_file
 from SlicerUSSim.Logic.benchmark.timing import measured, timed
 from SlicerUSSim.Logic.placement import pose_looking_at
+from SlicerUSSim.Logic.tissues import write_json
 
 PROBE = ConvexProbe(40, 60, 80, scan_lines=128)
 POSE = pose_looking_at((0.0, 0.0, 60.0), (0.0, 0.0, 0.0))
@@ -37,8 +38,8 @@ SIDES = (64, 128, 256, 512)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", help="see `ussim devices`")
-    parser.add_argument("--out", type=Path, default=Path("docs/images/scaling.png"))
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--out", type=output_file, default=Path("docs/images/scaling.png"))
+    parser.add_argument("--json", type=output_file)
     arguments = parser.parse_args()
     curves = measure(arguments.device)
     print("| what grows | from | to | time from | time to | slope |\n|---|---|---|---|---|---|")
@@ -49,7 +50,7 @@ def main() -> None:
         print(f"a label map of {side}³ is made ready in {readiness(side, arguments.device):.2f} s")
     draw(curves, arguments.out)
     if arguments.json:
-        arguments.json.write_text(json.dumps(curves, indent=2) + "\n")
+        write_json(arguments.json, curves)
 
 
 def measure(device: str | None) -> dict[str, list[tuple[float, float]]]:

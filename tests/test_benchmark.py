@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 
@@ -13,6 +14,7 @@ from scipy.integrate import trapezoid
 from SlicerUSSim.cli import main
 from SlicerUSSim.Logic import ConvexProbe, SimulationError
 from SlicerUSSim.Logic.benchmark import suite
+from SlicerUSSim.Logic.benchmark.files import output_file, result_file
 from SlicerUSSim.Logic.benchmark.machine import Machine, Work
 from SlicerUSSim.Logic.benchmark.suite import run_benchmark
 from SlicerUSSim.Logic.benchmark.tables import comparison
@@ -119,3 +121,16 @@ def test_bad_input_is_refused_before_anything_is_measured(tmp_path):
         run_benchmark([choose_device()[0]], repeat=0)
     outcome = CliRunner().invoke(main, ["bench", "--json", str(tmp_path / "nowhere" / "bench.json")])
     assert outcome.exit_code == 2 and outcome.output.startswith("ussim: ") and "nowhere" in outcome.output
+
+
+def test_files_of_the_scripts_are_refused_before_anything_is_measured(tmp_path):
+    assert output_file(str(tmp_path / "new.json")) == tmp_path / "new.json"
+    with pytest.raises(argparse.ArgumentTypeError, match=r"nowhere does not exist"):
+        output_file(str(tmp_path / "nowhere" / "new.json"))
+    kept = tmp_path / "kept.json"
+    kept.write_text(json.dumps(result(1.0)))
+    assert result_file(str(kept)) == result(1.0)
+    for text, message in (("{", "cannot be read"), ("[1]", "holds no devices"), ('{"a": 1}', "holds no devices")):
+        kept.write_text(text)
+        with pytest.raises(argparse.ArgumentTypeError, match=message):
+            result_file(str(kept))

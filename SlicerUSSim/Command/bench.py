@@ -25,14 +25,13 @@ def bench(ctx: click.Context, json_file: Path | None, repeat: int, brief: bool, 
     """
     from SlicerUSSim.Logic.benchmark.suite import run_benchmark
     from SlicerUSSim.Logic.benchmark.tables import table_of
-    from SlicerUSSim.Logic.device import choose_device, list_devices
+    from SlicerUSSim.Logic.device import devices_to_measure
     from SlicerUSSim.Logic.tissues import write_json
     from SlicerUSSim.Logic.volume import require_place
 
     if json_file:
         require_place(json_file)
-    chosen = [choose_device(device)[0]]
-    devices = chosen if device else [info for info in list_devices() if info.rank < 9] or chosen
+    devices = devices_to_measure(device)
     steps = len(devices) * (3 if brief else 6) + 1
     with Steps(steps) as step:
         result = run_benchmark(devices, repeat=min(repeat, 5) if brief else repeat, brief=brief, progress=step)

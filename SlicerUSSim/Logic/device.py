@@ -23,6 +23,7 @@ import numpy as np
 from SlicerUSSim.Logic.errors import SimulationError
 from SlicerUSSim.Logic.layout import CONSTANTS, shared_source
 
+_EMULATOR_RANK = 9
 INTEL_HINT = 'pip install "SlicerUSSim[intel]"'
 
 
@@ -38,6 +39,11 @@ class DeviceInfo:
     memory_mb: int
     rank: int
     handle: object = field(repr=False, compare=False)
+
+    @property
+    def is_emulator(self) -> bool:
+        """Whether it emulates other hardware, for that hardware's developers."""
+        return self.rank == _EMULATOR_RANK
 
     def __str__(self) -> str:
         return f"{self.index}  {self.name} ({self.kind}, {self.platform}, {self.compute_units} compute units)"
@@ -134,7 +140,7 @@ def _describe(cl, index, cl_platform, handle) -> DeviceInfo:
     is_cpu = bool(handle.type & cl.device_type.CPU)
     platform_name = cl_platform.name.strip()
     if "FPGA" in platform_name or "FPGA" in handle.name:
-        rank = 9  # Intel's FPGA emulator also lists itself; it is for FPGA developers
+        rank = _EMULATOR_RANK  # Intel's FPGA emulator also lists itself; it is for FPGA developers
     elif is_gpu:
         rank = 0
     elif is_cpu and "Intel" in platform_name:
@@ -192,6 +198,15 @@ def _find(devices: list[DeviceInfo], choice: str, source: str) -> DeviceInfo:
             return device
     known = "; ".join(f"{device.index} {device.platform}" for device in devices)
     raise SimulationError(f"{source}: no OpenCL device fits {choice!r}, expected one of: {known}")
+
+
+def devices_to_measure(device: str | None = None) -> list[DeviceInfo]:
+    """The device chosen by `device`, or without a choice all that are no emulators, best first.
+
+    Raises SimulationError as choose_device does.
+    """
+    chosen = [choose_device(device)[0]]
+    return chosen if device else [info for info in list_devices() if not info.is_emulator] or chosen
 
 
 def faster_hint(device: DeviceInfo) -> str | None:

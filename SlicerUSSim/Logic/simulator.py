@@ -204,15 +204,16 @@ class UltrasoundSimulator:
         compounder = Compounder(grid, probe, self.device)
         display = display or DisplaySettings()
         pixels = ImageGrid.for_probe(probe, display.image_size)
-        marks = []
+        before = None
         for count, pose in enumerate(poses, 1):
             pose = check_rigid("probe_to_ras", pose)
             self._warn_if_empty(probe, pose)
             compounder.add_buffer(self.render(probe, pose, display, pixels), pixels, pose)
-            marks.append(self.device.mark())
-            # One image is prepared while the device computes the one before: neither ever waits for the other.
-            if count > 1:
-                marks[count - 2].wait()
+            # One image is prepared while the device computes the one before, and no more than one.
+            done = self.device.mark()
+            if before is not None:
+                before.wait()
+            before = done
             if progress is not None:
                 progress(count)
         self._warn_if_overflown(len(poses))

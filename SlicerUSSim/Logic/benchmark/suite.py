@@ -86,6 +86,7 @@ class _DeviceBenchmark:
         self._tell("segmentation")
         numbers = {"kind": self.info.kind, **asdict(machine), "frames": {}}
         numbers["segmentation"] = measured(self._segment, min(self.repeat, 5))
+        self.poses = {name: craniotomy_pose(self.segmentation.labels, probe) for name, probe in FRAMES.items()}
         names = self.segmentation.tissue_names
         self.simulator = UltrasoundSimulator(self.segmentation.labels, TissueTable.brain(names), device=self.device)
         for name in ["A"] if brief else FRAMES:
@@ -98,10 +99,6 @@ class _DeviceBenchmark:
             numbers |= self._evaluations()
         return numbers
 
-    def pose(self, name: str) -> np.ndarray:
-        """Where frame `name` is taken from."""
-        return craniotomy_pose(self.segmentation.labels, FRAMES[name])
-
     def _tell(self, what: str) -> None:
         self.progress(f"{self.info.index} {what}")
 
@@ -109,7 +106,7 @@ class _DeviceBenchmark:
         self.segmentation: Segmentation = segment_mri(self.mri, device=self.device)
 
     def _frame(self, name: str, machine: Machine) -> dict:
-        probe, pose, simulator = FRAMES[name], self.pose(name), self.simulator
+        probe, pose, simulator = FRAMES[name], self.poses[name], self.simulator
 
         def whole() -> None:
             simulator.forget_echoes()
@@ -136,7 +133,7 @@ class _DeviceBenchmark:
         return numbers
 
     def _sweep(self) -> None:
-        self.simulator.volume(FRAMES["A"], tilt_sweep(self.pose("A"), SWEEP_DEG, SWEEP_IMAGES))
+        self.simulator.volume(FRAMES["A"], tilt_sweep(self.poses["A"], SWEEP_DEG, SWEEP_IMAGES))
 
     def _evaluations(self) -> dict:
         """One evaluation of the cost of frame A against itself, by what is free."""
@@ -144,7 +141,7 @@ class _DeviceBenchmark:
         numbers = {}
         for name, free in _FREE.items():
             parameters = FreeParameters.of(free, tissues, display)
-            model = AppearanceModel(self.simulator, FRAMES["A"], [self.pose("A")], parameters.varied())
+            model = AppearanceModel(self.simulator, FRAMES["A"], [self.poses["A"]], parameters.varied())
             images, settings = [self.images["A"]], SimilaritySettings()
             cost = AppearanceCost(model, parameters, images, None, tissues, display, settings)
             numbers[name] = measured(_at_random(cost, len(parameters)), self.repeat)
@@ -173,7 +170,7 @@ def _compare(numbers: dict, images: dict[str, np.ndarray], reference: dict[str, 
 def _numpy(measurement: _DeviceBenchmark) -> tuple[dict, list[str]]:
     """(times of frame A in numpy and how much of it is the same, what is wrong with that)."""
     model = NumpyModel(measurement.simulator)
-    image = model.simulate(FRAMES["A"], measurement.pose("A"))
+    image = model.simulate(FRAMES["A"], measurement.poses["A"])
     same = _same(image, measurement.images["A"])
     numbers = {"frame A": {"whole_ms": sum(model.timings_ms.values()), "stages_ms": model.timings_ms, "same": same}}
     expected = f"frame A: {same:.2%} of pixels as in numpy, expected {SAME_AS_NUMPY:.0%}"

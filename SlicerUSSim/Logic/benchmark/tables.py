@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 def table_of(result: dict) -> str:
     """The whole result of run_benchmark, a table per device."""
-    return "\n".join(line for line in _lines(result))
+    return "\n".join(_lines(result))
 
 
 def _lines(result: dict) -> Iterator[str]:

@@ -19,7 +19,8 @@ from SlicerUSSim.Logic.simulator import UltrasoundSimulator
 
 # Operations counted in the kernels
 _PER_STEP = 35  # a look-up on the way: position, beam offset, clamp, index
-_PER_BORDER = 9 * 60 + 7 * 8 * 6 + 49 * 8 * 10  # bisection; wide indicators; 7 x 7 rows of eight voxels
+_PER_BORDER = 5 * 60 + 12 * 15 + 49 * 8 * 10  # bisection; stencil of 12 rows; 7 x 7 rows of eight voxels
+_BORDER_BYTES = 12 * 4 * 2 * 2 + 49 * 8  # the stencil's rows of two smoothed indicators; the voxels' groups
 _PER_CELL = 180  # a lattice cell that is looked at: three hashes, place, pulse phase, amplitude
 _PER_SCATTERER = 40  # one that counts: label, strength, four impulses
 _PER_EDGE_PAIR = 16  # of the lateral beam, per sample
@@ -43,10 +44,7 @@ def frame_work(simulator: UltrasoundSimulator, probe: Probe, pose: np.ndarray, g
     pixels, averaged = grid.rows * grid.columns, grid.pixel_spacing_mm[1] / float(scene["sample_mm"])
     return {
         "ray tree": Work(
-            2 * steps
-            + (49 * 8 + 7 * 8 * 4) * borders
-            + SEGMENT.itemsize * len(tree.segments)
-            + HIT.itemsize * len(tree.hits),
+            2 * steps + _BORDER_BYTES * borders + SEGMENT.itemsize * len(tree.segments) + HIT.itemsize * len(tree.hits),
             _PER_STEP * steps + _PER_BORDER * borders,
         ),
         "scatterers": Work(

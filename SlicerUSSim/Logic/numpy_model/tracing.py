@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from SlicerUSSim.Logic.layout import HIT, SEGMENT
+from SlicerUSSim.Logic.numpy_model.beam import Beam
 from SlicerUSSim.Logic.numpy_model.elementary import (
     LN10_OVER_20,
     affine_point,
@@ -18,6 +19,7 @@ from SlicerUSSim.Logic.numpy_model.elementary import (
     length,
     log,
     log2,
+    ramp,
     unit,
 )  # fmt: skip
 from SlicerUSSim.Logic.numpy_model.labels import Labels, border_normals
@@ -72,6 +74,7 @@ class Tracer:
 
     def __init__(self, scene: np.ndarray, labels: Labels, tissues: np.ndarray) -> None:
         self.scene, self.labels, self.tissues = scene, labels, tissues
+        self.elevation_sigma = Beam(scene).elevation_sigma
         self.to_voxel = scene["ras_to_voxel"]
         self.voxel_mm = scene["voxel_mm"]
         self.decay = tissues["attenuation"] * scene["frequency_mhz"] * f32(0.2) * LN10_OVER_20
@@ -129,14 +132,10 @@ class Tracer:
         rays.since = rays.spent = rays.open = rays.spent_open = zero
         return rays
 
-    def _elevation_sigma(self, path: np.ndarray) -> np.ndarray:
-        b = (path - self.scene["elevation_focus"]) / self.scene["elevation_rayleigh"]
-        return self.scene["elevation_sigma"] * np.sqrt(f32(1) + b * b)
-
     def _place(self, rays: Rays, at: np.ndarray) -> np.ndarray:
         """(n, [m,] 3) voxel positions at lengths (n, [m]) of the nodes."""
         shape = (len(rays),) + (1,) * (at.ndim - 1)
-        sigma = self._elevation_sigma(rays.path.reshape(shape) + at)[..., None]
+        sigma = self.elevation_sigma(rays.path.reshape(shape) + at)[..., None]
         start, step, aside = (v.reshape(*shape, 3) for v in (rays.start, rays.step, rays.aside))
         return start + at[..., None] * step + sigma * aside
 
@@ -250,7 +249,7 @@ class Tracer:
         path, depth = rays.path + border, rays.depth + border * rays.depth_per_mm
         log_attenuation = rays.log_attenuation - rays.spent
         attenuation = exp(log_attenuation)
-        aside = (rays.quantile * self._elevation_sigma(path))[:, None] * rays.elevational
+        aside = (rays.quantile * self.elevation_sigma(path))[:, None] * rays.elevational
         point = rays.axis + border[:, None] * rays.direction + aside
         tube = _tube_after(rays.tube, border)
         cos_in = np.clip(-dot(rays.direction, normal), f32(0.01), f32(1))
@@ -288,7 +287,7 @@ class Tracer:
         bent.lateral = _carried(bent.lateral, bent.direction, towards)
         bent.elevational = _carried(bent.elevational, bent.direction, towards)
         bent.direction = towards
-        bent.axis = point[refracts] - (bent.quantile * self._elevation_sigma(path))[:, None] * bent.elevational
+        bent.axis = point[refracts] - (bent.quantile * self.elevation_sigma(path))[:, None] * bent.elevational
         bent.tube, bent.path, bent.depth = tube[refracts], path, depth[refracts]
         bent.log_attenuation, bent.weight = log_attenuation[refracts], refracted_weight[refracts]
         bent.label = other[refracts]
@@ -320,9 +319,7 @@ class Tracer:
                 place = affine_point(self.to_voxel, point + side * tangent)
                 sides.append(border_normals(self.to_voxel, self.labels.borders(place, before, behind)[0]))
             curvature = dot(sides[1] - sides[0], tangent) / (f32(2) * reach)
-            size = np.abs(curvature) * self.voxel_mm
-            t = np.clip((size - f32(0.004)) / (f32(0.008) - f32(0.004)), f32(0), f32(1))
-            curvature = curvature * (t * t * (f32(3) - f32(2) * t))
+            curvature = curvature * ramp(0.004, 0.008, np.abs(curvature) * self.voxel_mm)
             tube[:, width + 1] += f32(2) * np.maximum(curvature, f32(0)) * longer * tube[:, width]
         return tube
 
@@ -330,7 +327,7 @@ class Tracer:
         scene, beside = self.scene, rays.ray > 0
         count = scene["elevational_rays"].astype(np.float32)
         density = f32(0.39894228) * exp(f32(-0.5) * rays.quantile * rays.quantile)
-        width = self._elevation_sigma(path) / (count * density)
+        width = self.elevation_sigma(path) / (count * density)
         slope = dot(normal, rays.elevational) / np.minimum(dot(normal, rays.direction), f32(-0.05))
         turns = scene["cycles_per_mm"] * rays.depth_per_mm * width * slope
         coherence = exp(f32(-1.6449341) * turns * turns)
