@@ -56,10 +56,15 @@ def is_our_warning(category: type[Warning]) -> bool:
 
 
 @contextmanager
-def collected_warnings() -> Iterator[list[str]]:
+def collected_warnings() -> Iterator[list[Warning]]:
     """A list that holds, after the block, what this package warned of in it; for those who show it themselves."""
-    messages: list[str] = []
+    ours: list[Warning] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        yield messages
-    messages += [str(w.message) for w in caught if is_our_warning(w.category)]
+        yield ours
+    ours += [w.message for w in caught if is_our_warning(w.category)]
+
+
+def warn_again(warning: Warning) -> None:
+    """Issue a warning that was collected."""
+    warnings.warn(warning, stacklevel=3)

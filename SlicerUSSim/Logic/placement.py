@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic.errors import require
 from SlicerUSSim.Logic.probe import Probe
@@ -77,6 +78,62 @@ def pose_in_slice(foreground: Volume, slice_to_ras: np.ndarray, target_ras=None)
     # From below everything, so that a target in the coupling medium beneath the patient still meets the surface above.
     face = surface_point(foreground, target - 200.0 * up, up)
     return pose_looking_at(face, face - up, lateral_ras=right)
+
+
+def turned(probe_to_ras: np.ndarray, *, rock_deg=0.0, tilt_deg=0.0, rotate_deg=0.0) -> np.ndarray:
+    """(4, 4) probe_to_ras turned about the middle of the probe's face, which stays where it is.
+
+    Rocking stays in the image plane (about z), tilting leaves it (about the lateral axis x), rotating is about the
+    probe's own axis (y); positive as rotations about these axes. The names are AIUM's.
+    """
+    motion = np.eye(4)
+    angles = [("z", rock_deg), ("x", tilt_deg), ("y", rotate_deg)]
+    motion[:3, :3] = Rotation.from_euler("ZXY", [angle for _, angle in angles], degrees=True).as_matrix()
+    return probe_to_ras @ motion
+
+
+def carried(probe_to_ras: np.ndarray, face_ras, outward_from, outward_to) -> np.ndarray:
+    """(4, 4) probe_to_ras with its face at `face_ras` (mm), turned as little as takes one direction onto another.
+
+    From the outward normal of a surface here to the one there, the probe keeps its angles to the surface; from its own
+    axis, reversed, to the normal, it comes to stand upright.
+    Raises SimulationError for a direction of no length.
+    """
+    start, end = (np.asarray(v, float) for v in (outward_from, outward_to))
+    require(
+        min(np.linalg.norm(start), np.linalg.norm(end)) > 1e-9,
+        f"directions are {start.tolist()} and {end.tolist()}, expected two of some length",
+    )
+    start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
+    axis = np.cross(start, end)
+    angle = np.arctan2(np.linalg.norm(axis), start @ end)
+    if np.linalg.norm(axis) < 1e-9:  # the same direction, or the opposite one: then about any axis across it
+        axis = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
+    axis = axis / np.linalg.norm(axis)
+    turn = Rotation.from_rotvec(angle * axis)
+    pose = np.eye(4)
+    pose[:3, :3] = turn.as_matrix() @ probe_to_ras[:3, :3]
+    pose[:3, 3] = face_ras
+    return pose
+
+
+def aimed_at(probe_to_ras: np.ndarray, target_ras) -> np.ndarray:
+    """(4, 4) probe_to_ras turned as little as makes the probe's axis point to `target_ras` (mm).
+
+    Raises SimulationError if the target is on the face.
+    """
+    face = probe_to_ras[:3, 3]
+    return carried(probe_to_ras, face, probe_to_ras[:3, 1], np.asarray(target_ras, float) - face)
+
+
+def angles_to_surface(probe_to_ras: np.ndarray, outward_ras) -> tuple[float, float]:
+    """(rock, tilt) in degrees that turned() gives an upright probe, its axis along the normal, to stand as this one."""
+    inward = probe_to_ras[:3, :3].T @ (-np.asarray(outward_ras, float))
+    inward = inward / np.linalg.norm(inward)
+    # (Rz(rock) Rx(tilt))^-1 takes y to (sin rock, cos rock cos tilt, -cos rock sin tilt).
+    tilt = -np.arctan2(inward[2], inward[1])
+    rock = np.arcsin(np.clip(inward[0], -1.0, 1.0))
+    return float(np.rad2deg(rock)), float(np.rad2deg(tilt))
 
 
 def slide_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int) -> list[np.ndarray]:

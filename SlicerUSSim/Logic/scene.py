@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
-from SlicerUSSim.Logic.errors import SimulationError, collected_warnings, require
+from SlicerUSSim.Logic.errors import SimulationError, collected_warnings, require, warn_again
 from SlicerUSSim.Logic.fitting import Fit, fit
 from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.placement import craniotomy_pose, pose_in_slice
@@ -42,6 +43,13 @@ from SlicerUSSim.Logic.tissues import TissueTable
 from SlicerUSSim.Logic.volume import Volume, check_rigid
 from SlicerUSSim.Logic.vtk_data import matrix_array
 
+T = TypeVar("T")
+
+
+def at_once(function: Callable[[], T]) -> T:
+    """Do work here and now: what a program with one thread wants."""
+    return function()
+
 
 class UltrasoundSceneLogic:
     """Simulates on the nodes of one scene.
@@ -53,11 +61,14 @@ class UltrasoundSceneLogic:
     ----------
     scene : vtkMRMLScene.
     device : see device.choose_device.
+    work : does what takes time and touches no node, one thing after the other, and returns its result. A program with
+        an event loop may do it in another thread, and serve events and other calls of these methods until it is done.
     """
 
-    def __init__(self, scene, device: str | None = None) -> None:
+    def __init__(self, scene, device: str | None = None, work: Callable[[Callable[[], T]], T] = at_once) -> None:
         self.scene = scene
         self.device = device
+        self._work = work
         self.parameters = SceneParameters(scene)
         self._simulator = ReusedSimulator()
         self._labelled: tuple[object, LabelledTissues] | None = None  # of the version before it
@@ -116,22 +127,29 @@ class UltrasoundSceneLogic:
         mri = read_volume(mri_node, "MRI")
         mask = None if mask_node is None else read_mask(mask_node, mri_node)
         require(mask_node is not labels_node, f"mask and output are both {named(labels_node)}, expected two nodes")
-        result = segment_mri(
-            mri, classes=classes, contrast=contrast, mask=mask, filter_radius=filter_radius,
-            bias_correction=bias_correction, thin_sulci=thin_sulci, device=self.device, progress=progress,
+        result = self._work(
+            lambda: segment_mri(
+                mri, classes=classes, contrast=contrast, mask=mask, filter_radius=filter_radius,
+                bias_correction=bias_correction, thin_sulci=thin_sulci, device=self.device, progress=progress,
+            )
         )  # fmt: skip
         require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="output of Segment")
         write_labels(labels_node, result.labels, result.tissue_names, mri_node)
         self._segmented = (labels_version(labels_node), result)
         return result
 
-    def simulate(self, labels_node, probe_transform_node, output_node) -> Frame:
+    def simulate(
+        self, labels_node, probe_transform_node, output_node, *, warned: Callable[[Warning], None] = warn_again
+    ) -> Frame:
         """The image under the probe, into a scalar volume node that is put under the probe's transform.
 
         `labels_node` is a label map or a segmentation; its names choose the tissues, see scene_nodes.read_labels.
+        `warned` is told what there is to warn of.
         """
         self._check_output(labels_node, output_node)
-        frame = self._frame(labels_node, probe_pose(probe_transform_node))
+        frame = self._frame(labels_node, probe_pose(probe_transform_node), warned)
+        self._check_output(labels_node, output_node)  # much may have happened meanwhile
+        require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         write_image(output_node, frame, probe_transform_node)
         return frame
 
@@ -256,9 +274,11 @@ class UltrasoundSceneLogic:
                 progress(step)
 
         try:
-            return fit(
-                simulator, tracked, free=free, display=preset.display, register=register, restarts=restarts,
-                max_evaluations=max_evaluations, progress=told,
+            return self._work(
+                lambda: fit(
+                    simulator(), tracked, free=free, display=preset.display, register=register, restarts=restarts,
+                    max_evaluations=max_evaluations, progress=told,
+                )
             )  # fmt: skip
         finally:
             if plot is not None:
@@ -327,8 +347,8 @@ class UltrasoundSceneLogic:
         goes away, or when another live update takes over the output.
         """
         self.stopLiveUpdate()
-        with collected_warnings() as messages:
-            self.simulate(labels_node, probe_transform_node, output_node)  # raises what is wrong here and now
+        caught: list[Warning] = []
+        self.simulate(labels_node, probe_transform_node, output_node, warned=caught.append)  # raises what is wrong now
         if outline_node is not None:
             self.showOutline(outline_node, probe_transform_node)
         if slice_node is not None:
@@ -336,7 +356,7 @@ class UltrasoundSceneLogic:
         nodes = (labels_node, probe_transform_node, output_node, outline_node, slice_node)
         self._live = LiveUpdate(self, nodes, schedule, report, stopped)
         if report is not None:
-            report("; ".join(messages))
+            report("; ".join(map(str, caught)))
 
     def stopLiveUpdate(self) -> None:
         """Let the image rest; nothing is observed any more."""
@@ -365,20 +385,34 @@ class UltrasoundSceneLogic:
             self._labelled = (version, read_labels(labels_node, self.preset.tissues))
         return self._labelled[1]
 
-    def _frame(self, labels_node, probe_to_world: np.ndarray) -> Frame:
+    def _frame(self, labels_node, probe_to_world: np.ndarray, warned: Callable[[Warning], None] = warn_again) -> Frame:
         labelled = self._read_labels(labels_node)
         pose, moved = pose_in_labels(labels_node, probe_to_world)
-        return self._simulator_for(labels_node, labelled, moved).simulate(self.preset.probe, pose, self.preset.display)
+        simulator, preset = self._simulator_for(labels_node, labelled, moved), self.preset
 
-    def _simulator_for(self, labels_node, labelled: LabelledTissues, moved: np.ndarray) -> UltrasoundSimulator:
-        preset = self.preset
-        return self._simulator.get(
-            (self._labelled[0], moved.tobytes()),
+        def compute() -> tuple[Frame, list[Warning]]:
+            # Collected within the work: Python can do that for one thing at a time only.
+            with collected_warnings() as caught:
+                return simulator().simulate(preset.probe, pose, preset.display), caught
+
+        frame, caught = self._work(compute)
+        for warning in caught:
+            warned(warning)
+        return frame
+
+    def _simulator_for(
+        self, labels_node, labelled: LabelledTissues, moved: np.ndarray
+    ) -> Callable[[], UltrasoundSimulator]:
+        """What gives the simulator, to be called in the work itself: it may have to be built, or is still in use."""
+        preset, version = self.preset, (self._labelled[0], moved.tobytes())
+        texture = self._texture_of(labels_node, labelled) if preset.settings.needs_texture else None
+        return lambda: self._simulator.get(
+            version,
             lambda: Volume(labelled.volume.array, moved @ labelled.volume.ijk_to_ras),
             preset.tissues.for_names(labelled.names),
             preset.settings,
             self.device,
-            self._texture_of(labels_node, labelled) if preset.settings.needs_texture else None,
+            texture,
         )
 
     def _texture_of(self, labels_node, labelled: LabelledTissues) -> Texture:

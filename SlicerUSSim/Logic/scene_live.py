@@ -8,7 +8,7 @@ from collections.abc import Callable
 import slicer
 from vtkmodules.vtkCommonCore import VTK_OBJECT, vtkCommand
 
-from SlicerUSSim.Logic.errors import collected_warnings, user_message
+from SlicerUSSim.Logic.errors import user_message
 
 #: Event of an output volume: another live update now writes to it.
 _CLAIMED = vtkCommand.UserEvent + 7301
@@ -113,8 +113,8 @@ class LiveUpdate:
                 self._run()
 
     def _run(self) -> None:
-        if not (self._pending and self.running):
-            return
+        if self._busy or not (self._pending and self.running):
+            return  # where work is done elsewhere, changes come while it is
         self._pending = False
         logic = self._logic()
         if logic is None:
@@ -122,14 +122,14 @@ class LiveUpdate:
         labels, transform, output, outline, view = self._nodes
         self._busy = True
         try:
-            with collected_warnings() as messages:
-                logic.simulate(labels, transform, output)
+            caught: list[Warning] = []
+            logic.simulate(labels, transform, output, warned=caught.append)
             if outline is not None and logic.preset.probe != self._outlined:
                 logic.showOutline(outline, transform)
                 self._outlined = logic.preset.probe
             if view is not None:
                 logic.showInSlice(view, output, transform, fit=False)
-            message = "; ".join(messages)
+            message = "; ".join(map(str, caught))
         except Exception as error:
             message = user_message(error)
             if message is None:
@@ -139,3 +139,5 @@ class LiveUpdate:
             self._busy = False
         if self._report is not None:
             self._report(message)
+        if self._pending and self._schedule is not None and self.running:
+            self._schedule(self._run)

@@ -16,9 +16,10 @@ from vtkmodules.vtkCommonMath import vtkMatrix4x4
 from SlicerUSSim.Logic.errors import SimulationError, require
 from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.probe_shape import outline_polydata
 from SlicerUSSim.Logic.tissues import TISSUES, TissueTable, colour_of, same_name, tissue_named
 from SlicerUSSim.Logic.volume import Volume, check_rigid
-from SlicerUSSim.Logic.vtk_data import matrix_array, outline_polydata, vtk_matrix
+from SlicerUSSim.Logic.vtk_data import matrix_array, vtk_matrix
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,27 +1,11 @@
-"""Small things between numpy and VTK: matrices, voxels, the outline of a field."""
+"""Small things between numpy and VTK: matrices and voxels."""
 
 from __future__ import annotations
 
 import numpy as np
 from vtkmodules.util.numpy_support import numpy_to_vtk
-from vtkmodules.vtkCommonCore import vtkPoints
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkImageData, vtkPolyData
+from vtkmodules.vtkCommonDataModel import vtkImageData
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
-
-from SlicerUSSim.Logic.probe import Probe
-
-
-def outline_polydata(probe: Probe) -> vtkPolyData:
-    """The outline of the imaged field in the probe frame (mm), one closed line."""
-    corners = probe.outline_mm()
-    points = vtkPoints()
-    points.SetData(numpy_to_vtk(np.ascontiguousarray(corners), deep=True))
-    lines = vtkCellArray()
-    lines.InsertNextCell(len(corners), list(range(len(corners))))
-    outline = vtkPolyData()
-    outline.SetPoints(points)
-    outline.SetLines(lines)
-    return outline
 
 
 def matrix_array(matrix: vtkMatrix4x4) -> np.ndarray:

@@ -26,6 +26,7 @@ from SlicerUSSim.Logic.errors import Cancelled, require, user_message
 from SlicerUSSim.Logic.frame import Frame
 from SlicerUSSim.Logic.preset import Preset
 from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.probe_shape import outline_polydata
 from SlicerUSSim.Logic.reuse import ReusedSimulator
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.segmentation import Segmentation, segment_mri
@@ -33,7 +34,7 @@ from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.texture import Texture
 from SlicerUSSim.Logic.tissues import TissueTable
 from SlicerUSSim.Logic.volume import Volume, check_rigid
-from SlicerUSSim.Logic.vtk_data import matrix_array, outline_polydata, set_scalars
+from SlicerUSSim.Logic.vtk_data import matrix_array, set_scalars
 
 _WHOLE_EXTENT = vtkStreamingDemandDrivenPipeline.WHOLE_EXTENT
 

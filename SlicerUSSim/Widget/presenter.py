@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Protocol
 
-from SlicerUSSim.Logic.errors import Cancelled, SimulationError, collected_warnings, require, user_message
+from SlicerUSSim.Logic.errors import Cancelled, SimulationError, require, user_message
 from SlicerUSSim.Logic.preset import Preset
 from SlicerUSSim.Logic.probe import PROBES
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
@@ -203,9 +203,9 @@ class PanelPresenter:
         with self.shown():
             nodes = self._nodes()
             start = perf_counter()
-            with collected_warnings() as messages:
-                self.logic.simulate(nodes.labels, nodes.probe_transform, nodes.output)
-            self.view.showStatus("; ".join(messages) or f"{(perf_counter() - start) * 1e3:.0f} ms")
+            caught: list[Warning] = []
+            self.logic.simulate(nodes.labels, nodes.probe_transform, nodes.output, warned=caught.append)
+            self.view.showStatus("; ".join(map(str, caught)) or f"{(perf_counter() - start) * 1e3:.0f} ms")
             self.logic.showOutline(nodes.outline, nodes.probe_transform)
             if self.view.sliceNode() is not None:
                 self.logic.showInSlice(self.view.sliceNode(), nodes.output, nodes.probe_transform)

@@ -1,0 +1,177 @@
+"""Poses in and images out over OpenIGTLink, with pyigtl at the other end, on loopback."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import time
+
+import numpy as np
+import pytest
+
+from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic.placement import turned
+
+pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pip install '.[serve]'")
+
+from SlicerUSSim.Logic.tracking import TrackerLink, parse_address  # noqa: E402
+
+POSE = turned(np.eye(4), rock_deg=20, tilt_deg=-30, rotate_deg=70)
+POSE[:3, 3] = [12.5, -40.25, 60.0]
+IMAGE = Volume(np.arange(12 * 20, dtype=np.uint8).reshape(1, 12, 20), POSE @ np.diag([0.5, 0.25, 1.0, 1.0]))
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def until(condition, seconds: float = 20.0):
+    """What `condition` comes to give, once it is true."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        result = condition()
+        if result:
+            return result
+        time.sleep(0.01)
+    raise AssertionError("it never came")
+
+
+@pytest.fixture
+def link():
+    made = []
+
+    def make(*arguments, **options):
+        poses = []
+        made.append(TrackerLink(*arguments, poses.append, **options))
+        return made[-1], poses
+
+    yield make
+    for one in made:
+        one.stop()
+
+
+def transform(name: str = "ProbeToReference", matrix=POSE):
+    return pyigtl.TransformMessage(matrix, device_name=name)
+
+
+def test_a_server_moves_the_probe_and_gets_the_image_with_its_place(link):
+    server = pyigtl.OpenIGTLinkServer(port=free_port(), local_server=True)
+    try:
+        ours, poses = link("127.0.0.1", server.port)
+        until(lambda: server.is_connected())
+        server.send_message(transform())
+        until(lambda: poses)
+        assert np.allclose(poses[-1], POSE, atol=1e-5)
+        ours.send(IMAGE)
+        message = until(lambda: server.wait_for_message("SlicerUSSim", timeout=0.1))
+        assert np.array_equal(message.image, IMAGE.array)
+        assert message.world_coordinate_system == "ras"
+        assert np.allclose(message.ijk_to_world_matrix, IMAGE.ijk_to_ras, atol=1e-4)
+        assert "following ProbeToReference" in ours.status and (ours.received, ours.sent) == (1, 1)
+    finally:
+        server.stop()
+
+
+def test_a_client_that_connects_to_us_can_go_and_come_back(link):
+    port = free_port()
+    ours, poses = link("127.0.0.1", port, listen=True)
+    for n in range(1, 4):
+        client = pyigtl.OpenIGTLinkClient("127.0.0.1", port)
+        until(lambda client=client: client.is_connected())
+        client.send_message(transform())
+        until(lambda n=n: len(poses) == n)
+        ours.send(IMAGE)
+        assert until(lambda client=client: client.wait_for_message("SlicerUSSim", timeout=0.1)).image.shape == (
+            1,
+            12,
+            20,
+        )
+        client.stop()
+        until(lambda: "waiting" in ours.status)
+
+
+def test_a_server_that_goes_is_found_again_when_it_comes_back(link):
+    port = free_port()
+    ours, poses = link("127.0.0.1", port)  # before there is anyone
+    until(lambda: "trying again" in ours.status)
+    for n in range(1, 4):
+        with socket.create_server(("127.0.0.1", port)) as listener:
+            peer, _ = listener.accept()
+            with peer:
+                message = transform().pack()
+                peer.sendall(message[:30])  # in pieces, as networks do
+                time.sleep(0.05)
+                peer.sendall(message[30:])
+                until(lambda n=n: len(poses) == n)
+                peer.sendall(message[:70])  # and gone in the middle of a message
+        until(lambda: "trying again" in ours.status)
+    ours.send(IMAGE)  # to nobody: not an error
+
+
+def test_only_the_chosen_transform_moves_the_probe_and_only_where_it_is_rigid(link):
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        ours, poses = link(*listener.getsockname()[:2], device="ProbeToReference")
+        peer, _ = listener.accept()
+        with peer:
+            for message in (
+                transform("StylusToReference"),
+                pyigtl.StringMessage("hello", device_name="Text"),
+                transform(matrix=np.diag([2.0, 1.0, 1.0, 1.0])),
+                transform(matrix=np.full((4, 4), np.nan)),
+            ):
+                peer.sendall(message.pack())
+            until(lambda: "expected" in ours.status)
+            peer.sendall(transform().pack())
+            until(lambda: poses)
+            assert len(poses) == 1 and np.allclose(poses[0], POSE, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [b"GET / HTTP/1.1\r\n\r\n" * 20, struct.pack(">H12s20sQQQ", 1, b"TRANSFORM", b"x", 0, 1 << 60, 0) + b"x" * 100],
+)
+def test_who_does_not_speak_openigtlink_is_dropped_and_the_next_one_heard(link, nonsense):
+    port = free_port()
+    _, poses = link("127.0.0.1", port, listen=True)
+    with socket.create_connection(("127.0.0.1", port)) as stranger:
+        stranger.sendall(nonsense)
+        stranger.settimeout(20)
+        with contextlib.suppress(ConnectionResetError):  # with what was not read, closing is a reset
+            assert stranger.recv(1) == b""
+    client = pyigtl.OpenIGTLinkClient("127.0.0.1", port)
+    until(lambda: client.is_connected())
+    client.send_message(transform())
+    until(lambda: poses)
+    client.stop()
+
+
+def test_of_images_that_wait_only_the_newest_is_sent(link):
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        ours, _ = link(*listener.getsockname()[:2])
+        for value in range(50):  # nobody has accepted, or read, anything yet
+            ours.send(Volume(np.full((1, 400, 400), value, np.uint8), np.eye(4)))
+        peer, _ = listener.accept()
+        with peer:
+            peer.settimeout(20)
+            last = None
+            while last != 49:
+                header = pyigtl.messages.MessageBase.parse_header(peer.recv(58, socket.MSG_WAITALL))
+                message = pyigtl.ImageMessage()
+                message.unpack(header, peer.recv(header["body_size"], socket.MSG_WAITALL))
+                last = int(message.image.max())
+            assert ours.sent < 50
+
+
+def test_addresses():
+    assert parse_address("tracker.local:18944") == ("tracker.local", 18944, False)
+    assert parse_address(":18944") == ("127.0.0.1", 18944, True)
+    for wrong in ("tracker", "18944", "tracker:", "tracker:99999", "tracker:x"):
+        with pytest.raises(SimulationError, match="expected HOST:PORT"):
+            parse_address(wrong)
+
+
+def test_a_port_that_is_taken_is_said():
+    with socket.create_server(("127.0.0.1", 0)) as listener, pytest.raises(SimulationError, match="choose another"):
+        TrackerLink("127.0.0.1", listener.getsockname()[1], print, listen=True)
