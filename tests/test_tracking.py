@@ -155,11 +155,11 @@ def test_of_images_that_wait_only_the_newest_is_sent(link):
         peer, _ = listener.accept()
         with peer:
             peer.settimeout(20)
-            last = None
+            stream, last = peer.makefile("rb"), None
             while last != 49:
-                header = pyigtl.messages.MessageBase.parse_header(peer.recv(58, socket.MSG_WAITALL))
+                header = pyigtl.messages.MessageBase.parse_header(stream.read(58))
                 message = pyigtl.ImageMessage()
-                message.unpack(header, peer.recv(header["body_size"], socket.MSG_WAITALL))
+                message.unpack(header, stream.read(header["body_size"]))
                 last = int(message.image.max())
             assert ours.sent < 50
 
