@@ -46,9 +46,17 @@ from SlicerUSSim.Logic.vtk_data import matrix_array
 T = TypeVar("T")
 
 
-def at_once(function: Callable[[], T]) -> T:
-    """Do work here and now: what a program with one thread wants."""
-    return function()
+class AtOnce:
+    """How a program with one thread works: at once. Where there is an event loop, another class of this form may do it
+    in a thread of its own, and serve events and other calls of the logic's methods until it is done."""
+
+    def do(self, function: Callable[[], T]) -> T:
+        """What `function` gives. It takes time and touches no node; one is called after the other."""
+        return function()
+
+    def tell(self, function: Callable[[], None]) -> None:
+        """From within do(): call `function`, which touches nodes, soon."""
+        function()
 
 
 class UltrasoundSceneLogic:
@@ -61,14 +69,13 @@ class UltrasoundSceneLogic:
     ----------
     scene : vtkMRMLScene.
     device : see device.choose_device.
-    work : does what takes time and touches no node, one thing after the other, and returns its result. A program with
-        an event loop may do it in another thread, and serve events and other calls of these methods until it is done.
+    work : who does what takes time and touches no node.
     """
 
-    def __init__(self, scene, device: str | None = None, work: Callable[[Callable[[], T]], T] = at_once) -> None:
+    def __init__(self, scene, device: str | None = None, work: AtOnce | None = None) -> None:
         self.scene = scene
         self.device = device
-        self._work = work
+        self._work = work or AtOnce()
         self.parameters = SceneParameters(scene)
         self._simulator = ReusedSimulator()
         self._labelled: tuple[object, LabelledTissues] | None = None  # of the version before it
@@ -127,7 +134,7 @@ class UltrasoundSceneLogic:
         mri = read_volume(mri_node, "MRI")
         mask = None if mask_node is None else read_mask(mask_node, mri_node)
         require(mask_node is not labels_node, f"mask and output are both {named(labels_node)}, expected two nodes")
-        result = self._work(
+        result = self._work.do(
             lambda: segment_mri(
                 mri, classes=classes, contrast=contrast, mask=mask, filter_radius=filter_radius,
                 bias_correction=bias_correction, thin_sulci=thin_sulci, device=self.device, progress=progress,
@@ -269,12 +276,12 @@ class UltrasoundSceneLogic:
 
         def told(step: Progress) -> None:
             if plot is not None:
-                plot.add(step)
+                self._work.tell(lambda: plot.add(step))
             if progress is not None:
                 progress(step)
 
         try:
-            return self._work(
+            return self._work.do(
                 lambda: fit(
                     simulator(), tracked, free=free, display=preset.display, register=register, restarts=restarts,
                     max_evaluations=max_evaluations, progress=told,
@@ -395,7 +402,7 @@ class UltrasoundSceneLogic:
             with collected_warnings() as caught:
                 return simulator().simulate(preset.probe, pose, preset.display), caught
 
-        frame, caught = self._work(compute)
+        frame, caught = self._work.do(compute)
         for warning in caught:
             warned(warning)
         return frame
