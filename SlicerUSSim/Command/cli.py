@@ -24,6 +24,7 @@ from SlicerUSSim.Command.options import (
     tissues_beside,
 )
 from SlicerUSSim.Command.progress import Share, Steps
+from SlicerUSSim.Command.serve import serve
 from SlicerUSSim.Command.tracked import optimize, sweep
 from SlicerUSSim.Logic.errors import SimulationError, is_our_warning, user_message
 
@@ -221,6 +222,7 @@ def devices(device: str | None) -> None:
 
 
 main.add_command(bench)
+main.add_command(serve)
 main.add_command(sweep)
 main.add_command(optimize)
 

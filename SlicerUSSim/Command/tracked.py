@@ -11,6 +11,18 @@ from SlicerUSSim.Command.options import Scene, scene_options
 from SlicerUSSim.Command.progress import Curve, Share
 from SlicerUSSim.Logic.errors import SimulationError
 
+transform_option = click.option(
+    "--transform", "path", default="ImageToReference", show_default=True,
+    help="From pixels to where the patient lies; composed of what the sequence has.",
+)  # fmt: skip
+calibration_option = click.option(
+    "--calibration", type=click.Path(),
+    help="What the sequence lacks: a Plus configuration (XML), or a file with the 4x4 ImageToProbe.",
+)  # fmt: skip
+to_mri_option = click.option(
+    "--to-mri", "to_mri_file", type=click.Path(),
+    help="From there to the MRI: a pose file, .xfm, or .tag with landmarks in MRI and ultrasound.",
+)  # fmt: skip
 _SEQUENCE_OPTIONS = (
     click.option(
         "--sequence", "sequence_file", type=click.Path(), required=True,
@@ -20,18 +32,9 @@ _SEQUENCE_OPTIONS = (
     click.option(
         "--frames", help="Which images: 0,5,10 or 0:20:5 (default: all that were tracked; to fit, six of them)."
     ),
-    click.option(
-        "--transform", "path", default="ImageToReference", show_default=True,
-        help="From pixels to where the patient lies; composed of what the sequence has.",
-    ),
-    click.option(
-        "--calibration", type=click.Path(),
-        help="What the sequence lacks: a Plus configuration (XML), or a file with the 4x4 ImageToProbe.",
-    ),
-    click.option(
-        "--to-mri", type=click.Path(),
-        help="From there to the MRI: a pose file, .xfm, or .tag with landmarks in MRI and ultrasound.",
-    ),
+    transform_option,
+    calibration_option,
+    to_mri_option,
     click.option("--cut", type=click.Path(), help="Cut a volume where a probe at this pose would look, and beside it:"),
     click.option("--cut-tilt", type=float, help="tilted by this many degrees in all,"),
     click.option("--cut-slide", type=float, help="or slid by this many millimetres in all,"),
@@ -41,7 +44,7 @@ _SEQUENCE_OPTIONS = (
 
 
 _SEQUENCE_NAMES = (
-    "sequence_file", "frames", "path", "calibration", "to_mri", "cut", "cut_tilt", "cut_slide", "cuts", "field",
+    "sequence_file", "frames", "path", "calibration", "to_mri_file", "cut", "cut_tilt", "cut_slide", "cuts", "field",
 )  # fmt: skip
 
 
@@ -65,10 +68,10 @@ def _open(options: dict, most: int | None = None):
     wanted = {name: options.pop(name) for name in _SEQUENCE_NAMES}
     if wanted["field"]:
         require_place(wanted["field"])
-    to_ras = _to_mri(wanted["to_mri"])
+    to_ras = to_mri(wanted["to_mri_file"])
     probe = None
     if wanted["cut"] is None:
-        sequence = _read_sequence(wanted["sequence_file"], wanted["calibration"])
+        sequence = read_sequence(wanted["sequence_file"], wanted["calibration"])
         scene = Scene(**options)
         probe = scene.probe if scene.probe_is_given else None
     else:
@@ -85,7 +88,8 @@ def _open(options: dict, most: int | None = None):
     return scene, sequence, tracked
 
 
-def _read_sequence(sequence_file, calibration):
+def read_sequence(sequence_file, calibration):
+    """The TrackedSequence of --sequence, with what --calibration adds."""
     from SlicerUSSim.Logic.pose import read_matrix
     from SlicerUSSim.Logic.sequence import TrackedSequence, read_coordinate_definitions
 
@@ -120,7 +124,7 @@ def _read_cuts(wanted: dict):
     return lambda probe: TrackedSequence.from_volume(volume, probe, poses)
 
 
-def _to_mri(file):
+def to_mri(file):
     """(4, 4) rigid of --to-mri, or None."""
     from SlicerUSSim.Logic.pose import read_tags, read_transform, rigid_between
 

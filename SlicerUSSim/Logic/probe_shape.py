@@ -35,7 +35,7 @@ def outline_polydata(probe: Probe) -> vtkPolyData:
 
 
 def field_polydata(probe: Probe) -> vtkPolyData:
-    """The imaged field in the probe frame (mm) as triangles; texture coordinates lay its image over it, upright."""
+    """The imaged field in the probe frame (mm) as triangles; texture coordinates lay its image over it."""
     left, right, top, bottom = probe.image_bounds_mm()
     corners = probe.outline_mm()[:-1]
     half = len(corners) // 2  # along the face, then back along the far end
@@ -47,8 +47,9 @@ def field_polydata(probe: Probe) -> vtkPolyData:
     order = [corner for n in range(half) for corner in (n, len(corners) - 1 - n)]
     strip.InsertNextCell(len(order), order)
     polydata.SetStrips(strip)
-    across, up = (corners[:, 0] - left) / (right - left), (bottom - corners[:, 1]) / (bottom - top)
-    coordinates = numpy_to_vtk(np.stack([across, up], axis=1).astype(np.float32), deep=True)
+    # A texture's first row is an image's, the uppermost.
+    across, down = (corners[:, 0] - left) / (right - left), (corners[:, 1] - top) / (bottom - top)
+    coordinates = numpy_to_vtk(np.stack([across, down], axis=1).astype(np.float32), deep=True)
     coordinates.SetName("TextureCoordinates")
     polydata.GetPointData().SetTCoords(coordinates)
     return polydata

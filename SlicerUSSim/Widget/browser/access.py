@@ -1,0 +1,57 @@
+"""Who may use the workstation: pages of this server only, and from other computers only who has the token."""
+
+from __future__ import annotations
+
+import hmac
+from urllib.parse import urlsplit
+
+from aiohttp import web
+
+_COOKIE = "ussim_token"
+_LOOPBACK = {"127.0.0.1", "localhost", "::1"}
+_REFUSED = """<!doctype html><meta charset="utf-8"><title>SlicerUSSim</title>
+<body style="font-family: sans-serif; background: #111; color: #ddd; margin: 4em">
+<h1>Not allowed</h1><p id="reason">{reason}</p>"""
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a server at this host is reached from this computer only."""
+    return host in _LOOPBACK
+
+
+def guard(app: web.Application, token: str) -> None:
+    """Refuse requests of other sites' pages and, where there is a `token`, of whoever does not have it.
+
+    The token comes with the URL, and then as a cookie, so that the page's files and its web socket have it too. Without
+    a token the server is on loopback: a name that another site made point here is refused as well.
+    """
+    app.middlewares.append(_checker(token))
+
+
+def _checker(token: str):
+    @web.middleware
+    async def check(request: web.Request, handler):
+        reason = _objection(request, token)
+        if reason:
+            return web.Response(status=403, text=_REFUSED.format(reason=reason), content_type="text/html")
+        response = await handler(request)
+        if token and "token" in request.query and not response.prepared:
+            response.set_cookie(_COOKIE, token, httponly=True, samesite="Strict")
+        return response
+
+    return check
+
+
+def _objection(request: web.Request, token: str) -> str:
+    host = urlsplit(f"//{request.host}")
+    origin = request.headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc != host.netloc:
+        return "The request comes from a page of another site."
+    if not token:
+        if not is_loopback(host.hostname or ""):
+            return f"This server answers to 127.0.0.1, not to {request.host!r}."
+        return ""
+    given = request.query.get("token", request.cookies.get(_COOKIE, ""))
+    if not hmac.compare_digest(given.encode(), token.encode()):
+        return "The token is missing or wrong. Use the URL that <code>ussim serve</code> printed."
+    return ""

@@ -1,0 +1,77 @@
+"""What a user takes along: pictures, frames with their geometry, cines, the scene."""
+
+from __future__ import annotations
+
+import io
+from collections import deque
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from PIL import Image
+
+from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.volume import Volume
+
+#: Files of an image with its geometry.
+FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
+#: Images that a cine keeps, and how long one may be shown, in milliseconds.
+_MOST_IMAGES = 200
+_SHORTEST_MS, _LONGEST_MS = 40, 500
+
+
+def png(image: np.ndarray) -> bytes:
+    """A (rows, columns) uint8 image as it is."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def frame_file(image: Volume, suffix: str) -> bytes:
+    """An image with its place in the patient, as a file of one of FRAME_SUFFIXES."""
+    require(suffix in FRAME_SUFFIXES, f"frames are not written as {suffix!r}, expected {', '.join(FRAME_SUFFIXES)}")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"frame{suffix}"
+        image.write(path)
+        return path.read_bytes()
+
+
+def scene_file(app) -> bytes:
+    """The scene of a SlicerApp as .mrb, which 3D Slicer opens. Raises SimulationError if it cannot be written."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "ultrasound.mrb"
+        if not app.io_manager.write_scene(path) or not path.exists():
+            raise SimulationError("the scene could not be written")
+        return path.read_bytes()
+
+
+class Cine:
+    """The last images, as a scanner keeps them."""
+
+    def __init__(self) -> None:
+        self._images: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_IMAGES)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def add(self, image: np.ndarray, seconds: float) -> None:
+        """Keep a (rows, columns) uint8 image of this time; another size begins anew."""
+        if self._images and self._images[-1][1].shape != image.shape:
+            self._images.clear()
+        self._images.append((seconds, image))
+
+    def clear(self) -> None:
+        """Forget the images."""
+        self._images.clear()
+
+    def gif(self) -> bytes:
+        """An animated GIF, as fast as it was seen. Raises SimulationError without images."""
+        require(len(self._images) > 1, f"the cine holds {len(self._images)} images, expected two or more")
+        times = np.array([seconds for seconds, _ in self._images])
+        waits = np.clip(np.diff(times, append=times[-1] + 0.2) * 1e3, _SHORTEST_MS, _LONGEST_MS)
+        first, *others = [Image.fromarray(image) for _, image in self._images]
+        buffer = io.BytesIO()
+        first.save(
+            buffer, "GIF", save_all=True, append_images=others, duration=waits.round(-1).astype(int).tolist(), loop=0
+        )
+        return buffer.getvalue()

@@ -1,0 +1,119 @@
+// What the page does by itself: draws the images that streams.py sends, passes keys on, and measures how long it takes
+// from the mouse to the new image on the screen.
+(() => {
+  const client = Math.random().toString(36).slice(2);
+  const measured = []; // milliseconds from an event to the image that shows what it did
+  const shown = []; // times at which simulated images came on the screen
+  let newest = 0; // time of the newest mouse event
+  let told = 0; // the newest one that the server knows of
+
+  const workstation = { measured, shown, measuring: false, images: 0, connected: false };
+  window.ussim = workstation;
+
+  const session = () => window.trame?.client?.getConnection?.()?.getSession?.();
+  const canvasOf = (name) => document.querySelector(`canvas[data-stream="${name}"]`);
+  const median = (values, share) => {
+    const sorted = [...values].sort((a, b) => a - b);
+    return sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))] : NaN;
+  };
+
+  async function draw([{ name, meta, content }]) {
+    if (meta?.number === undefined) return; // a view of Slicer, which its own component draws
+    const canvas = canvasOf(name);
+    if (!canvas) return;
+    const bitmap = await createImageBitmap(new Blob([content], { type: meta.type }));
+    if (Number(canvas.dataset.number ?? 0) > meta.number && meta.number > 1) return; // overtaken while it was decoded
+    canvas.dataset.number = meta.number;
+    canvas.width = bitmap.width;
+    canvas.height = bitmap.height;
+    canvas.getContext("2d").drawImage(bitmap, 0, 0);
+    bitmap.close();
+    if (name !== "simulated") return;
+    workstation.images += 1;
+    requestAnimationFrame(() => {
+      const now = performance.now();
+      shown.push(now);
+      if (shown.length > 4000) shown.splice(0, 2000);
+      if (meta.stamp && meta.stamp[0] === client) {
+        measured.push(now - meta.stamp[1]);
+        if (measured.length > 4000) measured.splice(0, 2000);
+      }
+    });
+  }
+
+  workstation.summary = (count = 100) => {
+    const last = measured.slice(-count);
+    const times = shown.filter((time) => time > performance.now() - 2000);
+    const rate = times.length > 1 ? (1000 * (times.length - 1)) / (times[times.length - 1] - times[0]) : 0;
+    return { count: last.length, median: median(last, 0.5), p95: median(last, 0.95), rate };
+  };
+
+  function showLatency() {
+    const place = document.getElementById("ussim-latency");
+    if (!place) return;
+    const { count, median: middle, p95, rate } = workstation.summary();
+    place.textContent = count
+      ? `${rate.toFixed(0)} images/s · mouse to image ${middle.toFixed(0)} ms, 95 % within ${p95.toFixed(0)} ms (last ${count})`
+      : "move the probe with the mouse to measure";
+  }
+
+  // The server is told when the event happened, just before the event itself.
+  function stampEvents(connection) {
+    const call = connection.call.bind(connection);
+    connection.call = (method, ...rest) => {
+      if (workstation.measuring && method === "trame.rca.event" && newest > told) {
+        told = newest;
+        window.trame.trigger("stamp", [client, newest]);
+      }
+      return call(method, ...rest);
+    };
+  }
+
+  const isWriting = (element) =>
+    element && (element.isContentEditable || ["INPUT", "TEXTAREA", "SELECT"].includes(element.tagName));
+
+  window.addEventListener("pointermove", (event) => (newest = event.timeStamp), { capture: true, passive: true });
+  window.addEventListener("keydown", (event) => {
+    if (isWriting(event.target) || event.ctrlKey || event.altKey || event.metaKey) return;
+    const keys = window.trame?.state?.get("probe_keys") ?? [];
+    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    if (!keys.includes(key)) return;
+    event.preventDefault();
+    window.trame.trigger("key", [key, event.shiftKey]);
+  });
+
+  workstation.save = async (kind) => {
+    const result = await window.trame.trigger("export", [kind]);
+    if (!result) return; // the server has said why
+    const [name, content, type] = result;
+    window.trame.utils.download(name, content, type);
+  };
+
+  workstation.copy = async (text) => {
+    try {
+      await navigator.clipboard.writeText(text); // not where the page comes from another computer without https
+    } catch {
+      const area = document.getElementById("ussim-script");
+      area?.focus();
+      area?.select();
+      document.execCommand("copy");
+    }
+  };
+
+  function connect() {
+    const connection = session();
+    if (!connection || !window.trame?.state || !canvasOf("simulated")) {
+      setTimeout(connect, 50);
+      return;
+    }
+    stampEvents(connection);
+    connection.subscribe("trame.rca.topic.stream", draw);
+    workstation.connected = true;
+    window.trame.trigger("page_opened");
+    setInterval(() => {
+      workstation.measuring = Boolean(window.trame.state.get("show_latency"));
+      if (workstation.measuring) showLatency();
+    }, 300);
+  }
+  connect();
+})();

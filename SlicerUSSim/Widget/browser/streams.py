@@ -1,0 +1,73 @@
+"""ImageStream: the newest of images that come faster or slower than a browser takes them."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import time
+
+import numpy as np
+from PIL import Image
+
+#: Visually without loss on speckle, a fifth of the size of PNG, and encoded in a millisecond.
+_QUALITY = 92
+
+
+class ImageStream:
+    """Sends grey images to all pages under one name; static/workstation.js draws them.
+
+    Has the form that trame-rca wants of an area that it serves.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.area_name = name
+        self._streamer = None
+        self._waiting: tuple[np.ndarray, dict] | None = None
+        self._last: tuple[bytes, dict] | None = None
+        self._encoding = False
+        self.count = 0
+
+    def send(self, image: np.ndarray, **about) -> None:
+        """Send a (rows, columns) uint8 image; one that still waits is replaced. `about` goes with it."""
+        self._waiting = (image, about)
+        if not self._encoding:
+            self._encoding = True
+            asyncio.get_event_loop().create_task(self._encode_all())
+
+    def send_again(self) -> None:
+        """Send the last image once more, to pages that have just opened."""
+        if self._last is not None:
+            self._push(*self._last)
+
+    async def _encode_all(self) -> None:
+        try:
+            while self._waiting is not None:
+                (image, about), self._waiting = self._waiting, None
+                content = await asyncio.get_running_loop().run_in_executor(None, _jpeg, image)
+                self.count += 1
+                about = {"type": "image/jpeg", "number": self.count, **about}
+                self._last = (content, about)
+                self._push(content, about)
+        finally:
+            self._encoding = False
+
+    def _push(self, content: bytes, about: dict) -> None:
+        if self._streamer is not None:
+            self._streamer.push_content(self.area_name, {**about, "st": int(time.time() * 1e3)}, content)
+
+    # ---- what trame-rca calls ----------------------------------------------------------------------------------
+
+    def set_streamer(self, streamer) -> None:
+        self._streamer = streamer
+
+    def update_size(self, origin, size) -> None:
+        """Pages scale the image themselves."""
+
+    def on_interaction(self, origin, event) -> None:
+        """Pages tell what happens on the image by name, see page.py."""
+
+
+def _jpeg(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "JPEG", quality=_QUALITY)
+    return buffer.getvalue()

@@ -1,0 +1,211 @@
+"""AnatomyViews: Slicer's 3D view and three slice views around the probe: where it is, and what lies under it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from trame_slicer.core import LayoutManager, SlicerApp
+from trame_slicer.rca_view import register_rca_factories
+from trame_slicer.views import AbstractView, Layout, LayoutDirection, SliceView, ThreeDView, ViewLayoutDefinition
+from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
+
+from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.probe_shape import field_polydata, probe_polydata
+from SlicerUSSim.Logic.scene_nodes import composite_of, display_of, node_called, show_in_slice
+from SlicerUSSim.Logic.surface import PatientSurface
+from SlicerUSSim.Logic.volume import Volume
+from SlicerUSSim.Logic.vtk_data import vtk_matrix
+
+#: Planes that a slice view follows the probe in: of the image, across it, and the patient's own.
+IN_PLANE, ACROSS = "In plane", "Across"
+PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
+#: The slice views with the plane that each begins with, by the names that Slicer gives them.
+SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
+THREED_VIEW = "ThreeD"
+#: Images per second of the view under the mouse, and of the others: the ultrasound image goes before them.
+_FAST, _SLOW = 20.0, 8.0
+_LAYOUT = "Anatomy"
+#: Model nodes that show things, by what they show; they are not saved with the scene.
+_PATIENT, _BODY, _FIELD = "Patient surface", "Probe body", "Ultrasound field"
+_SKIN_COLOR, _BODY_COLOR = (0.86, 0.74, 0.66), (0.82, 0.86, 0.9)
+
+
+class AnatomyViews:
+    """Keeps the views on the probe.
+
+    Parameters
+    ----------
+    app : SlicerApp, with its scene.
+    server : trame server that shows the views.
+    view_ui : (server, view_id, view) adds what lies over a view.
+    """
+
+    def __init__(self, app: SlicerApp, server, view_ui: Callable[[object, str, AbstractView], None]) -> None:
+        self._app = app
+        self.planes = dict(SLICE_VIEWS)
+        self.follows = True
+        self._held: SliceView | None = None
+        self._fitted: set[str] = set()
+        self._image = vtkTrivialProducer()
+        self._image.SetOutput(Volume(np.zeros((1, 2, 2), np.uint8), np.eye(4)).to_vtk())  # until there is one
+        register_rca_factories(
+            app.view_manager, server, slice_view_ui_f=view_ui, three_d_view_ui_f=view_ui,
+            target_fps=_FAST, blur_fps=_SLOW, interactive_quality=75,
+        )  # fmt: skip
+        threed = ViewLayoutDefinition.threed_view(name=THREED_VIEW)
+        red, yellow, green = (
+            ViewLayoutDefinition.axial_view(), ViewLayoutDefinition.sagittal_view(), ViewLayoutDefinition.coronal_view()
+        )  # fmt: skip
+        rows = [
+            Layout(LayoutDirection.Horizontal, [threed, red]),
+            Layout(LayoutDirection.Horizontal, [yellow, green]),
+        ]
+        self.layout = LayoutManager(app.scene, app.view_manager, server)
+        self.layout.register_layout(_LAYOUT, Layout(LayoutDirection.Vertical, rows))
+        self.layout.set_layout(_LAYOUT)
+
+    # ---- what there is -----------------------------------------------------------------------------------------
+
+    @property
+    def slices(self) -> list[SliceView]:
+        return self._app.view_manager.get_slice_views()
+
+    @property
+    def threed(self) -> ThreeDView:
+        return self._app.view_manager.get_threed_views()[0]
+
+    def show_volume(self, volume_node) -> None:
+        """Show an MRI in the slice views, all of it."""
+        for view in self.slices:
+            view.set_background_volume_id(None if volume_node is None else volume_node.GetID())
+            view.fit_view_to_content()
+        self._fitted.clear()
+
+    def show_surface(self, surface: PatientSurface) -> None:
+        """Show the patient in 3D."""
+        model = self._model(_PATIENT)
+        model.SetAndObservePolyData(surface.polydata)
+        display = display_of(model)
+        display.SetColor(*_SKIN_COLOR)
+        display.SetOpacity(0.45)
+        display.SetVisibility2D(False)
+        display.SetBackfaceCulling(True)
+
+    def show_probe(self, probe: Probe, transform_node) -> None:
+        """Show the probe's body, and its field for the image to lie on, under its transform."""
+        body, field = self._model(_BODY), self._model(_FIELD)
+        body.SetAndObservePolyData(probe_polydata(probe))
+        field.SetAndObservePolyData(field_polydata(probe))
+        for model in (body, field):
+            model.SetAndObserveTransformNodeID(transform_node.GetID())
+        display = display_of(body)
+        display.SetColor(*_BODY_COLOR)
+        display.SetActiveScalar("Part", 1)  # cell data
+        display.SetAndObserveColorNodeID("vtkMRMLColorTableNodeFileWarmShade1.txt")
+        display.SetScalarVisibility(False)
+        display.SetVisibility2D(True)
+        display.SetSliceIntersectionThickness(2)
+        display = display_of(field)
+        display.SetTextureImageDataConnection(self._image.GetOutputPort())
+        display.SetLighting(False)
+        display.SetColor(1.0, 1.0, 1.0)
+        display.SetBackfaceCulling(False)
+        display.SetVisibility2D(False)
+        self._fitted.clear()
+
+    def show_image(self, volume_node) -> None:
+        """Show the image that a volume node has now, in 3D and blended into the slice views."""
+        image = volume_node.GetImageData()
+        if self._image.GetOutputDataObject(0) is not image:
+            self._image.SetOutput(image)
+            display = volume_node.GetDisplayNode()
+            if display is not None:  # what is black outside of the field does not hide the MRI
+                display.SetThreshold(1, 255)
+                display.SetApplyThreshold(True)
+        for view in self.slices:
+            if view.get_foreground_volume_id() != volume_node.GetID():
+                view.set_foreground_volume_id(volume_node.GetID())
+        self.threed.schedule_render()
+
+    def set_blend(self, share: float) -> None:
+        """How much of the image, against the MRI, the slice views show: 0 to 1."""
+        for view in self.slices:
+            view.set_foreground_opacity(share)
+
+    def show_labels(self, labels_node, on: bool) -> None:
+        """Colour the tissues in the slice views; a label map only."""
+        can = on and labels_node is not None and labels_node.IsA("vtkMRMLLabelMapVolumeNode")
+        for view in self.slices:
+            composite = composite_of(view.get_view_node())
+            composite.SetLabelVolumeID(labels_node.GetID() if can else None)
+            composite.SetLabelOpacity(0.35)
+            view.schedule_render()
+
+    # ---- staying with the probe --------------------------------------------------------------------------------
+
+    def hold(self, view: SliceView | None) -> None:
+        """Let a slice view rest, while the probe is dragged in it; None: none."""
+        self._held = view
+
+    def set_plane(self, name: str, plane: str) -> None:
+        """Choose the plane of a slice view."""
+        self.planes[name] = plane
+        self._fitted.discard(name)
+
+    def follow(self, probe_to_world: np.ndarray, probe: Probe, output_node) -> None:
+        """Turn the slice views to where the probe now is."""
+        left, right, top, bottom = probe.image_bounds_mm()
+        middle = (probe_to_world @ [0.5 * (left + right), 0.5 * (top + bottom), 0.0, 1.0])[:3]
+        for view in self.slices:
+            name, node = view.get_singleton_tag(), view.get_view_node()
+            fit = name not in self._fitted
+            if view is self._held or not (self.follows or fit):
+                continue
+            plane = self.planes[name]
+            was_modifying = node.StartModify()
+            if plane == IN_PLANE:
+                show_in_slice(node, output_node, probe_to_world, probe, fit=False)
+            elif plane == ACROSS:
+                across = np.eye(4)  # right, up and normal of the view: elevation, against depth, lateral
+                across[:3, :3] = probe_to_world[:3, [2, 1, 0]] * [1.0, -1.0, 1.0]
+                across[:3, 3] = middle
+                node.GetSliceToRAS().DeepCopy(vtk_matrix(across))
+                node.UpdateMatrices()
+            else:
+                if fit:
+                    node.SetOrientation(plane)
+                    view.fit_view_to_content()
+                node.JumpSliceByOffsetting(*middle)
+            if fit and plane in (IN_PLANE, ACROSS):
+                width, height, thickness = node.GetFieldOfView()
+                scale = max((right - left) / width, (bottom - top) / height) * 1.25
+                node.SetFieldOfView(width * scale, height * scale, thickness)
+                node.UpdateMatrices()
+            node.EndModify(was_modifying)
+            self._fitted.add(name)
+
+    def look_at_probe(self, probe_to_world: np.ndarray, surface: PatientSurface) -> None:
+        """Turn the 3D view so that the probe is on the side that one sees, its image seen obliquely."""
+        camera = self.threed.get_camera_node()
+        if camera is None:
+            return
+        outward = probe_to_world[:3, 3] - surface.centre
+        away = outward / np.linalg.norm(outward) + 1.3 * probe_to_world[:3, 2] + 0.35 * probe_to_world[:3, 0]
+        if away @ [0, 1, 0] < 0:  # rather from the face's side than from behind
+            away = away - 2.6 * probe_to_world[:3, 2]
+        away = away / np.linalg.norm(away)
+        self.threed.reset_focal_point()
+        self.threed.reset_camera()
+        camera.SetFocalPoint(*surface.centre)
+        camera.SetPosition(*(surface.centre + 480.0 * away))
+        camera.SetViewUp(0.0, 0.0, 1.0)
+        camera.ResetClippingRange()
+        self.threed.schedule_render()
+
+    def _model(self, name: str):
+        model = node_called(self._app.scene, "Model", name)
+        model.SetSaveWithScene(False)
+        display = display_of(model)
+        display.SetSaveWithScene(False)
+        return model

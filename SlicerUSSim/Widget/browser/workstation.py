@@ -1,0 +1,641 @@
+"""Workstation: one scene, one presenter, one page: what `ussim serve` runs."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+
+import numpy as np
+from trame.app import get_server
+from trame_slicer.core import SlicerApp
+from vtkmodules.vtkCommonCore import vtkCommand
+
+from SlicerUSSim.Logic.demo import demo_mri
+from SlicerUSSim.Logic.errors import SimulationError, require, user_message
+from SlicerUSSim.Logic.preset import Preset
+from SlicerUSSim.Logic.scan_conversion import ImageGrid
+from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
+from SlicerUSSim.Logic.scene_nodes import (
+    labels_version,
+    node_to_world,
+    pose_in_labels,
+    probe_pose,
+    read_labels,
+    read_volume,
+    set_node_to_world,
+    write_labels,
+    write_volume,
+)
+from SlicerUSSim.Logic.scene_sequence import add_sequence
+from SlicerUSSim.Logic.script import LabelSource, python_script
+from SlicerUSSim.Logic.sequence import TrackedSequence
+from SlicerUSSim.Logic.surface import PatientSurface
+from SlicerUSSim.Logic.tissues import TissueTable
+from SlicerUSSim.Logic.tracked import TrackedImages
+from SlicerUSSim.Logic.tracking import TrackerLink, parse_address
+from SlicerUSSim.Logic.volume import Volume
+from SlicerUSSim.Widget.browser.export import FRAME_SUFFIXES, Cine, frame_file, png, scene_file
+from SlicerUSSim.Widget.browser.hand import KEYS, ProbeHand
+from SlicerUSSim.Widget.browser.page import POSE_SLIDERS, SIMULATED, build_page, initial_state, view_tools
+from SlicerUSSim.Widget.browser.real import RealImages
+from SlicerUSSim.Widget.browser.streams import ImageStream
+from SlicerUSSim.Widget.browser.tasks import Tasks
+from SlicerUSSim.Widget.browser.view import BrowserView
+from SlicerUSSim.Widget.browser.views import AnatomyViews
+from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Widget.sections import read_sections
+
+#: Seconds between two times that the sliders are told where the probe is.
+_TELL_EVERY_S = 0.1
+
+
+@dataclass(frozen=True)
+class Files:
+    """What to begin with; the demo brain without an MRI and without labels."""
+
+    mri: str | None = None
+    labels: str | None = None
+    contrast: str = "t1"
+    mask: str | None = None
+    preset: Preset | None = None
+    sequence: TrackedSequence | None = None
+    sequence_name: str = "sequence"
+    #: From pixels to where the patient lies, and from there to the MRI; see TrackedImages.of
+    transform: str = "ImageToReference"
+    to_ras: np.ndarray | None = None
+    #: OpenIGTLink, as tracking.parse_address reads it, and the transform to follow
+    tracker: str | None = None
+    tracker_device: str | None = None
+
+
+class Workstation:
+    """Everything behind the page. All pages show and drive the same workstation.
+
+    Parameters
+    ----------
+    files : what to begin with.
+    device : see device.choose_device.
+    """
+
+    def __init__(self, files: Files, device: str | None = None) -> None:
+        self.server = get_server("ussim", client_type="vue3")
+        self.files = files
+        self.state = self.server.state
+        self.app = SlicerApp()
+        self.tasks = Tasks(self._failed)
+        self.logic = UltrasoundSceneLogic(self.app.scene, device, self.tasks)
+        sections = read_sections()
+        self._controls = {control.name: control for section in sections for control in section.controls}
+        self.state.update({**initial_state(sections), "probe_keys": list(KEYS), "trame__title": "SlicerUSSim"})
+        self.view = BrowserView(self.state, self.tasks, sections)
+        self.presenter = self.view.presenter = PanelPresenter(self.logic, self.view)
+        self.views = AnatomyViews(self.app, self.server, view_tools)
+        self.hand = ProbeHand(self.pose, self.move_probe, lambda: self._surface, self.views.hold)
+        for view in (self.views.threed, *self.views.slices):
+            self.hand.attach(view)
+        self.cine = Cine()
+        self._streams = {name: ImageStream(name) for name in ("simulated", "real", "real-over")}
+        self._surface: PatientSurface | None = None
+        self._surface_version: object = None
+        self._source: tuple[object, LabelSource] | None = None  # labels of that version came from there
+        self._real: RealImages | None = None
+        self._browser = None
+        self._playing: asyncio.Task | None = None
+        self._comparing = False
+        self._link: TrackerLink | None = None
+        self._observed: dict[str, tuple[object, int]] = {}
+        self._drawn_probe = None
+        self._stamp = self._stamp_computed = None
+        self._told_pose = 0.0
+        self._refreshing = False
+        self._connect(sections)
+        build_page(self.server, sections, self.views.layout)
+
+    # ---- life --------------------------------------------------------------------------------------------------
+
+    def _connect(self, sections) -> None:
+        triggers: dict[str, Callable] = {
+            "set": self._set_control, "press": self._press, "set_tissue": self._in_task(self.presenter.setTissue),
+            "set_free": self._in_task(self.presenter.fits.setFree), "set_pose": self._set_pose, "key": self._key,
+            "plane": self._choose_plane, "look": self._look, "aim_image": self._aim_image, "play": self._play,
+            "show_number": self.show_number, "cancel": self.view.cancel, "dismiss": self._dismiss,
+            "export": self._export, "script": self._show_script, "stamp": self._stamped, "page_opened": self._opened,
+        }  # fmt: skip
+        for name, method in triggers.items():
+            self.server.controller.trigger(name)(method)
+        for name, method in (
+            ("blend", lambda: self.views.set_blend(float(self.state.blend))),
+            ("follow", self._follow_changed),
+            ("upright", lambda: setattr(self.hand, "upright", bool(self.state.upright))),
+            ("show_tissues", self._show_tissues),
+            ("comparison", self._send_real),
+            ("opened_file", self._file_opened),
+        ):
+            self.state.change(name)(lambda method=method, **_: method())
+        node = self.logic.parameters.node
+        node.AddObserver(vtkCommand.ModifiedEvent, self._parameters_changed)
+        self.view.about_to_compute = self._about_to_compute
+        self.server.controller.on_server_ready.add(self._ready)
+        self.server.controller.on_server_exited.add(self.close)
+
+    def _ready(self, **_) -> None:
+        for stream in self._streams.values():
+            self.server.controller.rc_area_register(stream)
+        self.tasks.start(self._begin)
+
+    def _begin(self) -> None:
+        """Load what was asked for, and show the first image."""
+        files, parameters = self.files, self.logic.parameters
+        with self.presenter.shown():
+            if files.preset is not None:
+                self.logic.preset = files.preset
+            parameters.contrast = files.contrast
+            if files.tracker is not None:
+                host, port, listen = parse_address(files.tracker)
+                self._link = TrackerLink(host, port, self._tracked, device=files.tracker_device, listen=listen)
+                asyncio.get_event_loop().create_task(self._show_tracker())
+            if files.mri is not None or files.labels is None:
+                self.load_mri(files.mri)
+            if files.mask is not None:
+                parameters.mask = self._add_labels(self.tasks.do(lambda: Volume.read(files.mask)), files.mask)
+            if files.labels is not None:
+                self.load_labels(files.labels)
+            else:
+                self.segment()
+            if files.sequence is not None:
+                self.load_sequence(files.sequence, files.sequence_name)
+        self.view.refresh()
+
+    def close(self, **_) -> None:
+        """Let go of the tracker and of what waits."""
+        self.logic.stopLiveUpdate()
+        if self._link is not None:
+            self._link.stop()
+        self.tasks.stop()
+
+    def _failed(self, error: Exception) -> None:
+        message = user_message(error)
+        if message is None:
+            traceback.print_exception(error)
+            message = f"something went wrong ({type(error).__name__}: {error})"
+        self.view.showError(message)
+
+    def _in_task(self, method: Callable) -> Callable:
+        return lambda *arguments: self.tasks.start(lambda: method(*arguments))
+
+    # ---- files -------------------------------------------------------------------------------------------------
+
+    def load_mri(self, path: str | None) -> None:
+        """Take a file as the MRI, or the demo brain. Raises SimulationError for one that cannot be read."""
+        volume, name = self.tasks.do(lambda: demo_mri() if path is None else (Volume.read(path), Path(path).name))
+        node = self.app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "MNI152 brain" if path is None else name)
+        write_volume(node, volume)
+        node.CreateDefaultDisplayNodes()
+        node.SetAttribute("SlicerUSSim.file", "" if path is None else os.path.abspath(path))
+        parameters = self.logic.parameters
+        parameters.mri, parameters.labels, parameters.mask = node, None, None
+        self.state.title = node.GetName()
+        self.views.show_volume(node)
+
+    def load_labels(self, path: str) -> None:
+        """Take a label map, whose tissues are in the .json beside it or the preset's. Raises SimulationError."""
+        from SlicerUSSim.Command.options import tissues_beside
+
+        volume = self.tasks.do(lambda: Volume.read(path))
+        beside = tissues_beside(Path(path))
+        if beside.exists():
+            preset = self.logic.preset
+            tissues = TissueTable.read(beside)
+            for tissue in tissues.values():
+                preset = replace(preset, tissues=preset.tissues.with_tissue(tissue))
+            self.logic.preset = preset
+        else:
+            tissues = self.logic.preset.tissues
+        values = [int(label) for label in np.flatnonzero(np.bincount(volume.array.ravel())) if label]
+        unknown = [label for label in values if label not in tissues]
+        require(not unknown, f"{path}: has the labels {unknown}, which no tissue has; put a tissue table at {beside}")
+        names = [tissues[label].name if label in tissues else "" for label in range(1, max(values) + 1)]
+        node = self._add_labels(volume, path, names)
+        self.logic.parameters.labels = node
+        if self.logic.parameters.mri is None:
+            self.state.title = node.GetName()
+            self.views.show_volume(node)
+        order = read_labels(node, self.logic.preset.tissues).names
+        relabelled = (0, *(order.index(name) + 1 if name else 0 for name in names))
+        self._source = (labels_version(node), LabelSource(os.path.abspath(path), True, relabelled=relabelled))
+        self._labels_ready()
+
+    def _add_labels(self, volume: Volume, path: str, names=("inside",)):
+        node = self.app.scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", Path(path).name)
+        node.SetAttribute("SlicerUSSim.file", os.path.abspath(path))
+        require(
+            bool(np.issubdtype(volume.array.dtype, np.integer)) and volume.array.max() < 256 and volume.array.max() > 0,
+            f"{path}: is not a label map, expected whole numbers from 1 to 255",
+        )
+        write_labels(node, volume.with_array(volume.array.astype(np.uint8)), names, node)
+        return node
+
+    def load_sequence(self, sequence: TrackedSequence, name: str) -> None:
+        """Take real images: the probe goes where they were taken, and is the one that took them."""
+        files, preset = self.files, self.logic.preset
+        given = preset.probe if files.preset is not None else None
+        tracked = self.tasks.do(
+            lambda: TrackedImages.of(
+                sequence, path=files.transform, reference_to_ras=files.to_ras, probe=given, beam=preset.probe
+            )
+        )
+        self._browser, images, _ = add_sequence(self.app.scene, sequence, name, files.transform, files.to_ras)
+        self._real = RealImages(tracked)
+        self.logic.preset = replace(self.logic.preset, probe=tracked.probe)
+        self.logic.parameters.real = images
+        with self.state:
+            self.state.update({"sequence_length": len(self._real), "has_real": True})
+        self.show_number(0)
+
+    def _file_opened(self) -> None:
+        given = self.state.opened_file
+        given = given[0] if isinstance(given, list) and given else given
+        if not given or not given.get("content"):
+            return
+        name, content = Path(given["name"]).name, given["content"]
+        with self.state:
+            self.state.opened_file = None
+        self.tasks.start(lambda: self._open_content(name, bytes(content)))
+
+    def _open_content(self, name: str, content: bytes) -> None:
+        """Whatever a page sent: an MRI, a label map, a tracked sequence, or settings."""
+        with self.presenter.shown(), TemporaryDirectory() as folder:
+            path = Path(folder) / name
+            path.write_bytes(content)
+            try:
+                if name.lower().endswith(".json"):
+                    self.presenter.loadPreset(path)
+                elif ".igs." in name.lower() or ".seq." in name.lower():
+                    self.load_sequence(self.tasks.do(lambda: TrackedSequence.read(path)), name.split(".")[0])
+                elif self.tasks.do(lambda: _are_labels(Volume.read(path))):
+                    self.load_labels(str(path))
+                else:
+                    self.load_mri(str(path))
+                    self.segment()
+            except SimulationError as error:
+                raise SimulationError(str(error).replace(str(folder) + os.sep, "")) from None
+        self.view.refresh()
+
+    # ---- what the panel does -----------------------------------------------------------------------------------
+
+    def segment(self) -> None:
+        """Label the MRI's tissues, and put a probe on the patient if there is none."""
+        parameters = self.logic.parameters
+        if parameters.mri is not None and parameters.labels is None:
+            # A label map: ten times as fast to fill as a segmentation, and its tissues colour the slice views.
+            name = self.app.scene.GenerateUniqueName(f"{parameters.mri.GetName()} tissues")
+            parameters.labels = self.app.scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
+        labels, mri, mask = parameters.labels, parameters.mri, parameters.mask
+        options = {name: getattr(parameters, name) for name in ("contrast", "classes", "thin_sulci", "bias_correction")}
+        before = None if labels is None else labels_version(labels)
+        self.presenter.segment()
+        if labels is None or labels_version(labels) == before or labels.GetImageData() is None:
+            return
+        mask_file = None if mask is None else mask.GetAttribute("SlicerUSSim.file")
+        file = mri.GetAttribute("SlicerUSSim.file")
+        known = file is not None and (mask is None or mask_file is not None)
+        self._source = (labels_version(labels), LabelSource(file, mask=mask_file, options=options)) if known else None
+        self._labels_ready()
+
+    def _labels_ready(self) -> None:
+        self._update_surface()
+        if self.logic.parameters.probe_transform is None:
+            self.presenter.placeProbe()
+        if not self.logic.isLive:
+            self.presenter.setLive(True)
+        self._look()
+
+    def _update_surface(self) -> None:
+        labels = self.logic.parameters.labels
+        if labels is None or (labels.IsA("vtkMRMLVolumeNode") and labels.GetImageData() is None):
+            return
+        version = labels_version(labels)
+        if version == self._surface_version:
+            return
+        self._surface_version = version
+        volume = read_labels(labels, self.logic.preset.tissues).volume
+        placed = Volume(volume.array, node_to_world(labels) @ volume.ijk_to_ras)
+        self._surface = self.tasks.do(lambda: PatientSurface(placed))
+        self.views.show_surface(self._surface)
+        self._show_tissues()
+        self._tell_pose()
+
+    def _press(self, name: str) -> None:
+        presenter, fits = self.presenter, self.presenter.fits
+        actions = {
+            "segmentButton": self.segment, "simulateButton": presenter.simulate, "placeButton": self._place,
+            "resetTissuesButton": presenter.resetTissues, "assignTissueButton": self._assign_tissue,
+            "simulateSequenceButton": self._simulate_sequence, "fitButton": fits.fit, "applyFitButton": fits.apply,
+            "revertFitButton": fits.revert,
+        }  # fmt: skip
+        self.tasks.start(actions[name])
+
+    def _set_control(self, name: str, value) -> None:
+        control = self._controls[name]
+        if control.kind == "node" and not (control.node):
+            self.state[f"control_{name}"] = value
+            return
+        if name == "tissuePresetComboBox":
+            self.state.control_tissuePresetComboBox = value
+            return
+        self.tasks.start(lambda: self.view.changed(control, value))
+
+    def _assign_tissue(self) -> None:
+        with self.presenter.shown():
+            require(bool(self.state.chosen_tissue), "no tissue chosen, click on its line in the table")
+            self.presenter.assignTissue(self.state.chosen_tissue, self.state.control_tissuePresetComboBox)
+
+    def _simulate_sequence(self) -> None:
+        scene = self.app.scene
+        chosen = [
+            scene.GetNodeByID(self.state[f"control_{name}"] or "")
+            for name in ("transformSequenceSelector", "imageSequenceSelector")
+        ]
+        self.presenter.simulateSequence(*chosen)
+
+    def _place(self) -> None:
+        self.presenter.placeProbe()
+        self._look()
+
+    # ---- the probe ---------------------------------------------------------------------------------------------
+
+    def pose(self) -> np.ndarray | None:
+        """(4, 4) probe_to_world, or None without a probe."""
+        transform = self.logic.parameters.probe_transform
+        return None if transform is None else probe_pose(transform)
+
+    def move_probe(self, probe_to_world: np.ndarray) -> None:
+        """Put the probe somewhere; the image follows."""
+        transform = self.logic.parameters.probe_transform
+        if transform is not None:
+            set_node_to_world(transform, probe_to_world)
+
+    def _probe_moved(self, *_) -> None:
+        parameters = self.logic.parameters
+        if parameters.probe_transform is None or parameters.output is None:
+            return
+        pose = self.pose()
+        self.views.follow(pose, self.logic.preset.probe, parameters.output)
+        if perf_counter() - self._told_pose > _TELL_EVERY_S:
+            self._tell_pose()
+        else:
+            asyncio.get_event_loop().call_later(_TELL_EVERY_S, self._tell_pose)
+
+    def _tell_pose(self) -> None:
+        pose, surface = self.pose(), self._surface
+        if pose is None or surface is None or perf_counter() - self._told_pose < 0.5 * _TELL_EVERY_S:
+            return
+        self._told_pose = perf_counter()
+        with self.state:
+            for name, value in asdict(surface.where(pose)).items():
+                self.state[f"pose_{name}"] = round(value, 2)
+
+    def _set_pose(self, name: str, value: float) -> None:
+        pose = self.pose()
+        if pose is not None and self._surface is not None and name in {slider[0] for slider in POSE_SLIDERS}:
+            self.move_probe(self._surface.held(pose, **{name: float(value)}))
+
+    def _key(self, name: str, fast: bool) -> None:
+        self.hand.key(name, fast)
+
+    def _aim_image(self, across: float, down: float) -> None:
+        pose = self.pose()
+        left, right, top, bottom = self.logic.preset.probe.image_bounds_mm()
+        if pose is not None:
+            point = [left + across * (right - left), top + down * (bottom - top), 0.0, 1.0]
+            self.hand.aim((pose @ point)[:3])
+
+    def _look(self) -> None:
+        pose = self.pose()
+        if pose is not None and self._surface is not None:
+            self.views.look_at_probe(pose, self._surface)
+
+    def _choose_plane(self, name: str, plane: str) -> None:
+        self.views.set_plane(name, plane)
+        self.state.planes = dict(self.views.planes)
+        self._probe_moved()
+
+    def _follow_changed(self) -> None:
+        self.views.follows = bool(self.state.follow)
+        self._probe_moved()
+
+    def _show_tissues(self) -> None:
+        self.views.show_labels(self.logic.parameters.labels, bool(self.state.show_tissues))
+
+    # ---- the image ---------------------------------------------------------------------------------------------
+
+    def _parameters_changed(self, *_) -> None:
+        if not self._refreshing:
+            self._refreshing = True
+            self.tasks.start(self._follow_parameters)
+
+    def _follow_parameters(self) -> None:
+        self._refreshing = False
+        parameters = self.logic.parameters
+        self._watch("probe", parameters.probe_transform, "TransformModifiedEvent", self._probe_moved)
+        self._watch("image", parameters.output, "ImageDataModifiedEvent", self._image_changed)
+        probe = self.logic.preset.probe
+        if parameters.probe_transform is not None and (probe, parameters.probe_transform) != self._drawn_probe:
+            self._drawn_probe = (probe, parameters.probe_transform)
+            self.hand.set_probe(probe)
+            self.views.show_probe(probe, parameters.probe_transform)
+            display = parameters.probe_transform.GetDisplayNode()
+            if display is not None:
+                display.SetEditorVisibility(False)  # the probe itself is what one takes here
+            self._probe_moved()
+        self._tell_field()
+        with self.presenter.shown():
+            self._update_surface()
+        self.presenter.parametersChanged()
+
+    def _watch(self, role: str, node, event: str, method: Callable) -> None:
+        if role in self._observed and self._observed[role][0] is node:
+            return
+        if role in self._observed:
+            observed, tag = self._observed.pop(role)
+            observed.RemoveObserver(tag)
+        if node is not None:
+            self._observed[role] = (node, node.AddObserver(getattr(node, event), method))
+
+    def _tell_field(self) -> None:
+        """What the page draws around the image: its place in the probe frame, depths, focus, grey levels."""
+        preset = self.logic.preset
+        grid = ImageGrid.for_probe(preset.probe, preset.display.image_size)
+        width, height = grid.columns * grid.pixel_spacing_mm[0], grid.rows * grid.pixel_spacing_mm[1]
+        step = 10 if height > 40 else 5
+        ticks = [
+            {"y": depth, "text": str(depth) if depth % (2 * step) == 0 else ""}
+            for depth in range(0, int(grid.top_mm + height) + 1, step)
+        ]
+        with self.state:
+            self.state.us = {
+                "x": grid.left_mm, "y": grid.top_mm, "w": width, "h": height, "ticks": ticks, "size": height / 36.0,
+                "focus": preset.probe.focus_mm, "range": f"{preset.display.dynamic_range_db:g}",
+            }  # fmt: skip
+
+    def _stamped(self, page: str, milliseconds: float) -> None:
+        self._stamp = (page, milliseconds)
+
+    def _about_to_compute(self) -> None:
+        self._stamp_computed = self._stamp
+
+    def _image_changed(self, *_) -> None:
+        output = self.logic.parameters.output
+        image = read_volume(output).array[0].copy()
+        self._streams["simulated"].send(image, stamp=self._stamp_computed)
+        self.cine.add(image, perf_counter())
+        self.views.show_image(output)
+        if self._link is not None:
+            self._link.send(self._placed_image())
+        if self._real is not None:
+            self._compare(image)
+
+    def _placed_image(self) -> Volume:
+        output = self.logic.parameters.output
+        require(output is not None and output.GetImageData() is not None, "there is no image yet, expected one")
+        volume = read_volume(output)
+        return Volume(volume.array.copy(), node_to_world(output) @ volume.ijk_to_ras)
+
+    def _opened(self) -> None:
+        """Another page came: it has to be shown what there is."""
+        for stream in self._streams.values():
+            stream.send_again()
+        for view in (self.views.threed, *self.views.slices):
+            view.schedule_render()
+
+    # ---- real images -------------------------------------------------------------------------------------------
+
+    def show_number(self, number: int) -> None:
+        """Put the probe where the real image of this number was taken, and show that image."""
+        if self._real is None:
+            return
+        number = int(np.clip(number, 0, len(self._real) - 1))
+        with self.state:
+            self.state.update({"sequence_number": number, "real_name": f", image {self._real.tracked.numbers[number]}"})
+        if self._browser is not None:
+            self._browser.SetSelectedItemNumber(number)
+        if self.logic.parameters.probe_transform is not None:
+            self.move_probe(self._real.tracked.poses[number])
+        self._send_real()
+
+    def _send_real(self) -> None:
+        if self._real is None or self.state.comparison == SIMULATED:
+            return
+        real, _ = self._real.on_grid(self.state.sequence_number, self._grid())
+        self._streams["real"].send(real)
+        self._streams["real-over"].send(real)
+
+    def _grid(self) -> ImageGrid:
+        preset = self.logic.preset
+        return ImageGrid.for_probe(preset.probe, preset.display.image_size)
+
+    def _compare(self, image: np.ndarray) -> None:
+        """Tell how alike the image and the real one are; of images that come faster than that, the newest."""
+        if self._comparing:
+            return
+        self._comparing = True
+        real, number, grid = self._real, self.state.sequence_number, self._grid()
+
+        async def compare() -> None:
+            try:
+                found = await asyncio.get_event_loop().run_in_executor(None, real.compared, number, image, grid)
+                with self.state:
+                    self.state.similarity = f"cost {found.total:.3f} (ρ {found.bhattacharyya:.3f}, SAD {found.sad:.3f})"
+            except SimulationError as error:
+                with self.state:
+                    self.state.similarity = str(error)
+            finally:
+                self._comparing = False
+
+        asyncio.get_event_loop().create_task(compare())
+
+    def _play(self) -> None:
+        if self._playing is not None:
+            self._playing.cancel()
+            self._playing = None
+            self.state.playing = False
+            return
+        self.state.playing = True
+        self._playing = asyncio.get_event_loop().create_task(self._play_on())
+
+    async def _play_on(self) -> None:
+        while self._real is not None:
+            times = self._real.tracked.numbers
+            await asyncio.sleep(0.1)
+            self.show_number((self.state.sequence_number + 1) % len(times))
+
+    # ---- tracker -----------------------------------------------------------------------------------------------
+
+    def _tracked(self, pose: np.ndarray) -> None:
+        self.tasks.tell(lambda: self.move_probe(pose))
+
+    async def _show_tracker(self) -> None:
+        while self._link is not None:
+            if self.state.tracker_status != self._link.status:
+                with self.state:
+                    self.state.tracker_status = self._link.status
+            await asyncio.sleep(0.3)
+
+    # ---- export ------------------------------------------------------------------------------------------------
+
+    async def _export(self, kind: str):
+        """[file name, content, MIME type], or None after the page was told why not."""
+        try:
+            name, content, mime = await self._exported(kind)
+        except SimulationError as error:
+            self.view.showError(str(error))
+            return None
+        return [name, self.server.protocol.addAttachment(content), mime]
+
+    async def _exported(self, kind: str) -> tuple[str, bytes, str]:
+        if kind == "json":
+            return "preset.json", json.dumps(self.logic.preset.to_dict(), indent=2).encode(), "application/json"
+        if kind == "mrb":
+            return "ultrasound.mrb", scene_file(self.app), "application/zip"
+        if kind == "gif":
+            content = await asyncio.get_event_loop().run_in_executor(None, self.cine.gif)
+            return "ultrasound.gif", content, "image/gif"
+        image = self._placed_image()
+        if kind == "png":
+            return "ultrasound.png", png(image.array[0]), "image/png"
+        require(kind in FRAME_SUFFIXES, f"nothing is exported as {kind!r}")
+        return f"ultrasound{kind}", frame_file(image, kind), "application/octet-stream"
+
+    def script(self) -> str:
+        """A script that gives the image on the screen again. Raises SimulationError where its labels have no file."""
+        labels, pose = self.logic.parameters.labels, self.pose()
+        require(labels is not None and pose is not None, "there is no image yet, expected labels and a probe")
+        require(
+            self._source is not None and self._source[0] == labels_version(labels),
+            f"{labels.GetName()!r} was not made from files by this workstation; save it, and open it as --labels",
+        )
+        preset = self.logic.preset
+        in_labels, moved = pose_in_labels(labels, pose)
+        require(np.allclose(moved, np.eye(4)), f"{labels.GetName()!r} is scaled by a transform, expected a rigid one")
+        names = read_labels(labels, preset.tissues).names
+        return python_script(self._source[1], replace(preset, tissues=preset.tissues.for_names(names)), in_labels)
+
+    def _show_script(self) -> None:
+        with self.presenter.shown():
+            self.state.update({"script": self.script(), "show_script": True})
+
+    def _dismiss(self, number: int) -> None:
+        self.state.errors = [message for n, message in enumerate(self.state.errors) if n != number]
+
+
+def _are_labels(volume: Volume) -> bool:
+    from SlicerUSSim.Command.options import _looks_like_labels
+
+    return _looks_like_labels(volume)
