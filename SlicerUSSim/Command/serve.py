@@ -72,7 +72,7 @@ def serve(
     sequence = read_sequence(sequence_file, calibration) if sequence_file else None
     to_ras = to_mri(to_mri_file)
 
-    _quiet_libraries()
+    _prepare_libraries()
     from SlicerUSSim.Widget.browser.access import guard, is_loopback
     from SlicerUSSim.Widget.browser.workstation import Files, Workstation
 
@@ -109,9 +109,12 @@ def _usable_port(host: str, port: int | None) -> int:
     raise SimulationError(f"cannot listen at {host}:{port if port is not None else _PORT} ({reason}); choose another")
 
 
-def _quiet_libraries() -> None:
+def _prepare_libraries() -> None:
     """What trame and VTK would print is not for the user of a command; nor are this command's options for trame."""
     os.environ.setdefault("WSLINK_READY_MSG", "")
+    os.environ.setdefault("WSLINK_WS_COMPRESS", "0")  # nearly all that goes over the socket is JPEG
+    # Where the processor draws the views too (Mesa's llvmpipe), it leaves half of it to the ultrasound image.
+    os.environ.setdefault("LP_NUM_THREADS", str(max((os.cpu_count() or 2) // 2, 1)))
     sys.argv = sys.argv[:1]
     import vtkmodules.vtkCommonCore as core
 

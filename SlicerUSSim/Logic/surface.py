@@ -11,7 +11,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import mutable
 from vtkmodules.vtkCommonDataModel import vtkPolyData, vtkStaticCellLocator
 from vtkmodules.vtkCommonTransforms import vtkTransform
-from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D, vtkPolyDataNormals
+from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D, vtkPolyDataNormals, vtkQuadricDecimation
 from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
 
 from SlicerUSSim.Logic.errors import require
@@ -26,6 +26,8 @@ _CLOSING_MM = 8.0
 _SMOOTHING_MM = 2.0
 #: A probe's face rests on a patch of this radius; its normal is the mean over the patch.
 _PATCH_MM = 10.0
+#: Share of the triangles that a smooth surface looks the same without.
+_DROPPED = 0.85
 #: A probe that slides is held within these of the surface, wherever it came from, mm.
 _LIFT_MM = (-5.0, 20.0)
 _UP = np.array([0.0, 0.0, 1.0])
@@ -68,6 +70,8 @@ class PatientSurface:
         self._locator = vtkStaticCellLocator()
         self._locator.SetDataSet(self.polydata)
         self._locator.BuildLocator()
+        #: The same with fewer triangles, for renderers without a GPU
+        self.coarse_polydata: vtkPolyData = _with_fewer_triangles(self.polydata)
         low, high = points.min(axis=0), points.max(axis=0)
         #: (3,) the middle of the patient's bounding box, which angles() are seen from
         self.centre = 0.5 * (low + high)
@@ -175,6 +179,18 @@ def _closed_surface(labels: Volume) -> vtkPolyData:
     placed.SetTransform(transform)
     normals = vtkPolyDataNormals()
     normals.SetInputConnection(placed.GetOutputPort())
+    normals.AutoOrientNormalsOn()
+    normals.SplittingOff()
+    normals.Update()
+    return normals.GetOutput()
+
+
+def _with_fewer_triangles(polydata: vtkPolyData) -> vtkPolyData:
+    fewer = vtkQuadricDecimation()
+    fewer.SetInputData(polydata)
+    fewer.SetTargetReduction(_DROPPED)
+    normals = vtkPolyDataNormals()
+    normals.SetInputConnection(fewer.GetOutputPort())
     normals.AutoOrientNormalsOn()
     normals.SplittingOff()
     normals.Update()

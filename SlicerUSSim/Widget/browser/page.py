@@ -25,10 +25,10 @@ MODULE = {
     "styles": ["ussim/workstation.css"],
 }
 #: Controls of the panel that the page has no use for: its slice views follow the probe by themselves, and the fit is
-#: compared in the ultrasound view.
+#: compared in the ultrasound view; the probe is put back to where it began by a button of the page.
 NOT_SHOWN = {
     "sliceViewComboBox", "followCheckBox", "compareComboBox", "compareNumberComboBox", "blinkCheckBox", "cancelButton",
-    "statusLabel",
+    "statusLabel", "placeButton",
 }  # fmt: skip
 #: What buttons do in the page itself.
 _IN_PAGE = {
@@ -216,6 +216,10 @@ def _pose_sliders() -> None:
     v3.VCheckbox(
         label="Keep the probe along the surface normal", v_model=("upright",), density="compact", hide_details=True,
         title="When it slides; otherwise it keeps its angles to the surface", id="upright",
+    )  # fmt: skip
+    v3.VBtn(
+        "Back to a craniotomy", size="small", classes="ma-1", id="place", click="trigger('press', ['placeButton'])",
+        disabled=("can.placeButton === false",), title="A coronal view through a parasagittal craniotomy",
     )  # fmt: skip
     v3.VBtn("Stand upright", size="small", classes="ma-1", click="trigger('key', ['Home', false])", id="stand-upright")
 

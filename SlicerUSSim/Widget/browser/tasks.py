@@ -60,3 +60,26 @@ class Tasks:
                 self._failed(error)
 
         greenlet(run).switch()
+
+
+class AtMost:
+    """Calls a function when called itself, but not more often than every so many seconds; the last call counts."""
+
+    def __init__(self, seconds: float, function: Callable[[], None]) -> None:
+        self._seconds, self._function = seconds, function
+        self._next, self._waiting = 0.0, False
+
+    def __call__(self) -> None:
+        loop = asyncio.get_event_loop()
+        if self._waiting:
+            return
+        if loop.time() >= self._next:
+            self._run()
+        else:
+            self._waiting = True
+            loop.call_at(self._next, self._run)
+
+    def _run(self) -> None:
+        self._waiting = False
+        self._next = asyncio.get_event_loop().time() + self._seconds
+        self._function()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import contextmanager
+from time import perf_counter
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import Control, Section
 
 CUSTOM_PROBE = "custom"
+#: How the presenter says how fast images come, and seconds for which a page shows it.
+_RATE, _STATUS_EVERY_S = "images per second", 1.0
 #: Points of the curve of costs that the page draws.
 _CURVE_POINTS = 150
 
@@ -43,6 +46,7 @@ class BrowserView:
         self._controls = [control for section in sections for control in section.controls]
         self._thread = threading.get_ident()
         self._cancelled = False
+        self._status, self._status_until = "", 0.0
         self._chart_observed: tuple | None = None
         self.presenter: PanelPresenter | None = None
         #: Called before a live image is computed, in the event loop
@@ -64,7 +68,11 @@ class BrowserView:
         self._state.flush()
 
     def showStatus(self, message: str) -> None:
-        self._in_loop(lambda: self._set(status=message))
+        # Images per second are told with every image, which would be too often for a page to draw itself anew.
+        now = perf_counter()
+        if message != self._status and (now > self._status_until or not message.endswith(_RATE)):
+            self._status, self._status_until = message, now + _STATUS_EVERY_S
+            self._in_loop(lambda: self._set(status=message))
 
     def schedule(self, function: Callable[[], None]) -> None:
         def run() -> None:

@@ -24,7 +24,9 @@ PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
 SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
 THREED_VIEW = "ThreeD"
 #: Images per second of the view under the mouse, and of the others: the ultrasound image goes before them.
-_FAST, _SLOW = 20.0, 8.0
+_FAST, _SLOW = 8.0, 2.5
+#: More mouse events than images would only keep the images waiting.
+_EVENTS_EVERY_S = 0.025
 _LAYOUT = "Anatomy"
 #: Model nodes that show things, by what they show; they are not saved with the scene.
 _PATIENT, _BODY, _FIELD = "Patient surface", "Probe body", "Ultrasound field"
@@ -51,7 +53,7 @@ class AnatomyViews:
         self._image.SetOutput(Volume(np.zeros((1, 2, 2), np.uint8), np.eye(4)).to_vtk())  # until there is one
         register_rca_factories(
             app.view_manager, server, slice_view_ui_f=view_ui, three_d_view_ui_f=view_ui,
-            target_fps=_FAST, blur_fps=_SLOW, interactive_quality=75,
+            target_fps=_FAST, blur_fps=_SLOW, interactive_quality=75, rca_event_throttle_s=_EVENTS_EVERY_S,
         )  # fmt: skip
         threed = ViewLayoutDefinition.threed_view(name=THREED_VIEW)
         red, yellow, green = (
@@ -64,6 +66,12 @@ class AnatomyViews:
         self.layout = LayoutManager(app.scene, app.view_manager, server)
         self.layout.register_layout(_LAYOUT, Layout(LayoutDirection.Vertical, rows))
         self.layout.set_layout(_LAYOUT)
+        # Without a GPU these cost more than all the rest, and depth peeling hides what is translucent.
+        for view in (self.threed, *self.slices):
+            view.render_window().SetMultiSamples(0)
+        self.threed.get_view_node().SetUseDepthPeeling(False)
+        self.threed.renderer().SetUseDepthPeeling(False)
+        self.threed.renderer().SetUseDepthPeelingForVolumes(False)
 
     # ---- what there is -----------------------------------------------------------------------------------------
 
@@ -85,7 +93,7 @@ class AnatomyViews:
     def show_surface(self, surface: PatientSurface) -> None:
         """Show the patient in 3D."""
         model = self._model(_PATIENT)
-        model.SetAndObservePolyData(surface.polydata)
+        model.SetAndObservePolyData(surface.coarse_polydata)
         display = display_of(model)
         display.SetColor(*_SKIN_COLOR)
         display.SetOpacity(0.45)

@@ -46,14 +46,15 @@ from SlicerUSSim.Widget.browser.hand import KEYS, ProbeHand
 from SlicerUSSim.Widget.browser.page import POSE_SLIDERS, SIMULATED, build_page, initial_state, view_tools
 from SlicerUSSim.Widget.browser.real import RealImages
 from SlicerUSSim.Widget.browser.streams import ImageStream
-from SlicerUSSim.Widget.browser.tasks import Tasks
+from SlicerUSSim.Widget.browser.tasks import AtMost, Tasks
 from SlicerUSSim.Widget.browser.view import BrowserView
 from SlicerUSSim.Widget.browser.views import AnatomyViews
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import read_sections
 
-#: Seconds between two times that the sliders are told where the probe is.
-_TELL_EVERY_S = 0.1
+#: Seconds between two times that the slice views turn to the probe, and that the sliders are told where it is: both
+#: take time that the image then has to wait for.
+_TURN_EVERY_S, _TELL_EVERY_S = 0.12, 0.4
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class Workstation:
         self.view = BrowserView(self.state, self.tasks, sections)
         self.presenter = self.view.presenter = PanelPresenter(self.logic, self.view)
         self.views = AnatomyViews(self.app, self.server, view_tools)
-        self.hand = ProbeHand(self.pose, self.move_probe, lambda: self._surface, self.views.hold)
+        self.hand = ProbeHand(self.pose, self._moved_by_hand, lambda: self._surface, self._hold)
         for view in (self.views.threed, *self.views.slices):
             self.hand.attach(view)
         self.cine = Cine()
@@ -112,8 +113,9 @@ class Workstation:
         self._link: TrackerLink | None = None
         self._observed: dict[str, tuple[object, int]] = {}
         self._drawn_probe = None
-        self._stamp = self._stamp_computed = None
-        self._told_pose = 0.0
+        self._stamp_told = self._stamp_applied = self._stamp_computed = None
+        self._turn_slices = AtMost(_TURN_EVERY_S, self._turn_slices_now)
+        self._tell_pose = AtMost(_TELL_EVERY_S, self._tell_pose_now)
         self._refreshing = False
         self._connect(sections)
         build_page(self.server, sections, self.views.layout)
@@ -382,22 +384,29 @@ class Workstation:
         if transform is not None:
             set_node_to_world(transform, probe_to_world)
 
-    def _probe_moved(self, *_) -> None:
-        parameters = self.logic.parameters
-        if parameters.probe_transform is None or parameters.output is None:
-            return
-        pose = self.pose()
-        self.views.follow(pose, self.logic.preset.probe, parameters.output)
-        if perf_counter() - self._told_pose > _TELL_EVERY_S:
-            self._tell_pose()
-        else:
-            asyncio.get_event_loop().call_later(_TELL_EVERY_S, self._tell_pose)
+    def _moved_by_hand(self, probe_to_world: np.ndarray) -> None:
+        self._stamp_applied = self._stamp_told
+        self.move_probe(probe_to_world)
 
-    def _tell_pose(self) -> None:
+    def _hold(self, view) -> None:
+        self.views.hold(view)
+        if view is None:
+            self._probe_moved()
+
+    def _probe_moved(self, *_) -> None:
+        self._turn_slices()
+        self._tell_pose()
+
+    def _turn_slices_now(self) -> None:
+        parameters = self.logic.parameters
+        pose = self.pose()
+        if pose is not None and parameters.output is not None:
+            self.views.follow(pose, self.logic.preset.probe, parameters.output)
+
+    def _tell_pose_now(self) -> None:
         pose, surface = self.pose(), self._surface
-        if pose is None or surface is None or perf_counter() - self._told_pose < 0.5 * _TELL_EVERY_S:
+        if pose is None or surface is None:
             return
-        self._told_pose = perf_counter()
         with self.state:
             for name, value in asdict(surface.where(pose)).items():
                 self.state[f"pose_{name}"] = round(value, 2)
@@ -486,10 +495,10 @@ class Workstation:
             }  # fmt: skip
 
     def _stamped(self, page: str, milliseconds: float) -> None:
-        self._stamp = (page, milliseconds)
+        self._stamp_told = (page, milliseconds)
 
     def _about_to_compute(self) -> None:
-        self._stamp_computed = self._stamp
+        self._stamp_computed = self._stamp_applied
 
     def _image_changed(self, *_) -> None:
         output = self.logic.parameters.output

@@ -3,9 +3,9 @@
 (() => {
   const client = Math.random().toString(36).slice(2);
   const measured = []; // milliseconds from an event to the image that shows what it did
+  const STAMP_EVERY_MS = 20; // events in between are counted from the one before, and so as later than they are
+  let stamped = 0;
   const shown = []; // times at which simulated images came on the screen
-  let newest = 0; // time of the newest mouse event
-  let told = 0; // the newest one that the server knows of
 
   const workstation = { measured, shown, measuring: false, images: 0, connected: false };
   window.ussim = workstation;
@@ -24,9 +24,11 @@
     const bitmap = await createImageBitmap(new Blob([content], { type: meta.type }));
     if (Number(canvas.dataset.number ?? 0) > meta.number && meta.number > 1) return; // overtaken while it was decoded
     canvas.dataset.number = meta.number;
-    canvas.width = bitmap.width;
-    canvas.height = bitmap.height;
-    canvas.getContext("2d").drawImage(bitmap, 0, 0);
+    if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
+      canvas.width = bitmap.width; // only then: it makes the browser lay the page out anew
+      canvas.height = bitmap.height;
+    }
+    canvas.getContext("2d", { alpha: false }).drawImage(bitmap, 0, 0);
     bitmap.close();
     if (name !== "simulated") return;
     workstation.images += 1;
@@ -57,22 +59,19 @@
       : "move the probe with the mouse to measure";
   }
 
-  // The server is told when the event happened, just before the event itself.
-  function stampEvents(connection) {
-    const call = connection.call.bind(connection);
-    connection.call = (method, ...rest) => {
-      if (workstation.measuring && method === "trame.rca.event" && newest > told) {
-        told = newest;
-        window.trame.trigger("stamp", [client, newest]);
-      }
-      return call(method, ...rest);
-    };
-  }
-
   const isWriting = (element) =>
     element && (element.isContentEditable || ["INPUT", "TEXTAREA", "SELECT"].includes(element.tagName));
 
-  window.addEventListener("pointermove", (event) => (newest = event.timeStamp), { capture: true, passive: true });
+  // The server is told when the mouse moved just before it is told that it moved.
+  window.addEventListener(
+    "pointermove",
+    (event) => {
+      if (!workstation.measuring || !event.buttons || event.timeStamp - stamped < STAMP_EVERY_MS) return;
+      stamped = event.timeStamp;
+      window.trame.trigger("stamp", [client, stamped]);
+    },
+    { capture: true, passive: true },
+  );
   window.addEventListener("keydown", (event) => {
     if (isWriting(event.target) || event.ctrlKey || event.altKey || event.metaKey) return;
     const keys = window.trame?.state?.get("probe_keys") ?? [];
@@ -106,7 +105,6 @@
       setTimeout(connect, 50);
       return;
     }
-    stampEvents(connection);
     connection.subscribe("trame.rca.topic.stream", draw);
     workstation.connected = true;
     window.trame.trigger("page_opened");
