@@ -340,12 +340,16 @@ def write_image(volume_node, frame: Frame, transform_node=None) -> None:
 
     So the slice moves with the transform at once, and the pixels follow.
     """
-    in_probe = Volume(frame.image[None], frame.grid.slice_to_probe)
+    write_slice(volume_node, Volume(frame.image[None], frame.grid.slice_to_probe), transform_node)
+
+
+def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:
+    """Put a uint8 volume of one slice into a volume node, which keeps its memory where the size is the same."""
     was_modifying = volume_node.StartModify()
     if transform_node is not None and volume_node.GetTransformNodeID() != transform_node.GetID():
         volume_node.SetAndObserveTransformNodeID(transform_node.GetID())
     image = volume_node.GetImageData()
-    rows, columns = frame.image.shape
+    _, rows, columns = in_probe.array.shape
     if image is None or image.GetDimensions() != (columns, rows, 1) or image.GetScalarTypeAsString() != "unsigned char":
         write_volume(volume_node, in_probe)
         _show_all_greys(volume_node)
@@ -353,7 +357,7 @@ def write_image(volume_node, frame: Frame, transform_node=None) -> None:
         if not np.array_equal(ijk_to_ras(volume_node), in_probe.ijk_to_ras):
             volume_node.SetIJKToRASMatrix(vtk_matrix(in_probe.ijk_to_ras))
         scalars = image.GetPointData().GetScalars()
-        np.asarray(memoryview(scalars)).reshape(rows, columns)[:] = frame.image
+        np.asarray(memoryview(scalars)).reshape(rows, columns)[:] = in_probe.array[0]
         scalars.Modified()
         image.Modified()
     volume_node.EndModify(was_modifying)

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from PIL import Image
+from vtkmodules.vtkCommonCore import vtkOutputWindow
 
 from SlicerUSSim.Logic.errors import SimulationError, require
 from SlicerUSSim.Logic.volume import Volume
@@ -40,7 +41,13 @@ def scene_file(app) -> bytes:
     """The scene of a SlicerApp as .mrb, which 3D Slicer opens. Raises SimulationError if it cannot be written."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "ultrasound.mrb"
-        if not app.io_manager.write_scene(path) or not path.exists():
+        window = vtkOutputWindow.GetInstance()
+        window.SetDisplayModeToNever()  # of every file in it
+        try:
+            written = app.io_manager.write_scene(path)
+        finally:
+            window.SetDisplayModeToAlwaysStdErr()
+        if not written or not path.exists():
             raise SimulationError("the scene could not be written")
         return path.read_bytes()
 

@@ -134,11 +134,12 @@ def _control(control: Control) -> None:
     elif control.kind in ("number", "text"):
         unit = f" [{control.unit}]" if control.unit else ""
         value = "Number($event.target.value)" if control.kind == "number" else "$event.target.value"
+        shown = f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})" if control.kind == "number" else key
         limits = f'min="{control.minimum:g}" max="{control.maximum:g}" step="{control.step:g}"'
         html.Div(
             f"""<label for="{control.name}">{control.label}{unit}</label>
             <input type="{control.kind}" id="{control.name}" {limits if control.kind == "number" else ""}
-            :value="{key}" :disabled="{key} === null" @change="trigger('set', ['{control.name}', {value}])">""",
+            :value="{shown}" :disabled="{key} === null" @change="trigger('set', ['{control.name}', {value}])">""",
             classes="ussim-line", title=control.tip,
         )  # fmt: skip
     elif control.kind == "tick":
@@ -170,7 +171,7 @@ def _control(control: Control) -> None:
         _tissue_table(control)
     elif control.name == "freeList":
         html.Div(
-            f"""<div>{control.label}</div><div class="ussim-free" id="{control.name}">
+            f"""<div style="font-size: 12px">{control.label}</div><div class="ussim-free" id="{control.name}">
             <label v-for="entry in free_parameters" style="display: block"><input type="checkbox" :checked="entry.on"
             :aria-label="entry.name" @change="trigger('set_free', [entry.name, $event.target.checked])">
             {{{{ entry.name }}}}</label></div>""",
@@ -242,17 +243,8 @@ def _tools() -> None:
             click="trigger('set', ['liveCheckBox', !control_liveCheckBox])",
             color=("control_liveCheckBox ? 'success' : undefined",),
         ):  # fmt: skip
-            v3.VIcon(("control_liveCheckBox ? 'mdi-snowflake-off' : 'mdi-snowflake'",))
+            v3.VIcon(icon=("control_liveCheckBox ? 'mdi-play-circle' : 'mdi-snowflake'",))
             v3.VTooltip("Live, or frozen", activator="parent")
-        with v3.VBtnToggle(
-            v_model=("comparison",), density="compact", mandatory=True, v_if="has_real", id="comparison", divided=True
-        ):
-            for name in COMPARISONS:
-                v3.VBtn(name, value=name, size="small", id=f"compare-{name.lower()}")
-        html.Div(
-            "{{ similarity }}", v_if="has_real", classes="ussim-similarity text-caption", id="similarity",
-            title="The paper's cost between simulated and real image: 0 for equal ones",
-        )  # fmt: skip
         v3.VSpacer()
         html.Div("Blend", classes="text-caption")
         v3.VSlider(
@@ -280,7 +272,7 @@ def _tools() -> None:
 
 
 def _screens() -> None:
-    with html.Div(classes="ussim-screens"):
+    with html.Div(classes=("{'ussim-screens': true, 'ussim-stacked': has_real && comparison === 'Beside'}",)):
         with html.Div(classes="ussim-screen"):
             html.Div("{{ has_real && comparison !== 'Simulated' ? 'Simulated' : '' }}", classes="ussim-caption")
             with html.Div(classes="ussim-frame", style=(_frame_style(),), id="ultrasound", v_show="us.w > 0"):
@@ -299,14 +291,22 @@ def _screens() -> None:
 
 def _frame_style() -> str:
     return (
-        "`aspect-ratio: ${us.w} / ${us.h}; width: min(100cqw - 110px, (100cqh - 56px) * ${us.w / Math.max(us.h, 1)});`"
+        "`aspect-ratio: ${us.w} / ${us.h}; width: min(100cqw - 120px, (100cqh - 40px) * ${us.w / Math.max(us.h, 1)});`"
     )
 
 
 def _player() -> None:
+    with html.Div(classes="ussim-bar", v_if="has_real"):
+        with v3.VBtnToggle(v_model=("comparison",), density="compact", mandatory=True, id="comparison", divided=True):
+            for name in COMPARISONS:
+                v3.VBtn(name, value=name, size="small", id=f"compare-{name.lower()}")
+        html.Div(
+            "{{ similarity }}", classes="ussim-similarity", id="similarity",
+            title="The paper's cost between simulated and real image: 0 for equal ones",
+        )  # fmt: skip
     with html.Div(classes="ussim-bar", v_if="sequence_length > 0", id="player"):
         with v3.VBtn(icon=True, size="x-small", variant="text", click="trigger('play')", id="play"):
-            v3.VIcon(("playing ? 'mdi-pause' : 'mdi-play'",))
+            v3.VIcon(icon=("playing ? 'mdi-pause' : 'mdi-play'",))
         v3.VSlider(
             model_value=("sequence_number",), min=0, max=("Math.max(sequence_length - 1, 1)",), step=1,
             density="compact", hide_details=True, thumb_size=12, track_size=2, id="sequence-slider",

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 
 import numpy as np
 from trame_slicer.core import LayoutManager, SlicerApp
 from trame_slicer.rca_view import register_rca_factories
 from trame_slicer.views import AbstractView, Layout, LayoutDirection, SliceView, ThreeDView, ViewLayoutDefinition
+from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
 
 from SlicerUSSim.Logic.probe import Probe
 from SlicerUSSim.Logic.probe_shape import field_polydata, probe_polydata
-from SlicerUSSim.Logic.scene_nodes import composite_of, display_of, node_called, show_in_slice
+from SlicerUSSim.Logic.scene_nodes import composite_of, display_of, node_called, read_volume, show_in_slice, write_slice
 from SlicerUSSim.Logic.surface import PatientSurface
 from SlicerUSSim.Logic.volume import Volume
 from SlicerUSSim.Logic.vtk_data import vtk_matrix
@@ -29,8 +31,8 @@ _FAST, _SLOW = 8.0, 2.5
 _EVENTS_EVERY_S = 0.025
 _LAYOUT = "Anatomy"
 #: Model nodes that show things, by what they show; they are not saved with the scene.
-_PATIENT, _BODY, _FIELD = "Patient surface", "Probe body", "Ultrasound field"
-_SKIN_COLOR, _BODY_COLOR = (0.86, 0.74, 0.66), (0.82, 0.86, 0.9)
+_PATIENT, _BODY, _FIELD, _SEEN = "Patient surface", "Probe body", "Ultrasound field", "Ultrasound as shown"
+_SKIN_COLOR, _BODY_COLOR, _RIDGE_COLOR = (0.92, 0.8, 0.72), (0.82, 0.86, 0.9), (1.0, 0.62, 0.18)
 
 
 class AnatomyViews:
@@ -41,14 +43,22 @@ class AnatomyViews:
     app : SlicerApp, with its scene.
     server : trame server that shows the views.
     view_ui : (server, view_id, view) adds what lies over a view.
+    resized : called when a slice view has got another size, and wants to follow anew.
     """
 
-    def __init__(self, app: SlicerApp, server, view_ui: Callable[[object, str, AbstractView], None]) -> None:
+    def __init__(
+        self,
+        app: SlicerApp,
+        server,
+        view_ui: Callable[[object, str, AbstractView], None],
+        resized: Callable[[], None],
+    ) -> None:
         self._app = app
         self.planes = dict(SLICE_VIEWS)
         self.follows = True
         self._held: SliceView | None = None
         self._fitted: set[str] = set()
+        self._blend = 1.0
         self._image = vtkTrivialProducer()
         self._image.SetOutput(Volume(np.zeros((1, 2, 2), np.uint8), np.eye(4)).to_vtk())  # until there is one
         register_rca_factories(
@@ -69,9 +79,20 @@ class AnatomyViews:
         # Without a GPU these cost more than all the rest, and depth peeling hides what is translucent.
         for view in (self.threed, *self.slices):
             view.render_window().SetMultiSamples(0)
+        self._resized = resized
+        for view in self.slices:
+            # Once the view itself knows its new size.
+            view.interactor().AddObserver(
+                vtkCommand.WindowResizeEvent,
+                lambda *_, view=view: asyncio.get_event_loop().call_later(0.05, self._fit_anew, view),
+            )
         self.threed.get_view_node().SetUseDepthPeeling(False)
         self.threed.renderer().SetUseDepthPeeling(False)
         self.threed.renderer().SetUseDepthPeelingForVolumes(False)
+
+    def _fit_anew(self, view: SliceView) -> None:
+        self._fitted.discard(view.get_singleton_tag())
+        self._resized()
 
     # ---- what there is -----------------------------------------------------------------------------------------
 
@@ -107,13 +128,20 @@ class AnatomyViews:
         field.SetAndObservePolyData(field_polydata(probe))
         for model in (body, field):
             model.SetAndObserveTransformNodeID(transform_node.GetID())
+        colors = node_called(self._app.scene, "ColorTable", _BODY)
+        colors.SetSaveWithScene(False)
+        colors.SetTypeToUser()
+        colors.SetNumberOfColors(2)
+        colors.SetColor(0, "body", *_BODY_COLOR)
+        colors.SetColor(1, "ridge", *_RIDGE_COLOR)
         display = display_of(body)
-        display.SetColor(*_BODY_COLOR)
-        display.SetActiveScalar("Part", 1)  # cell data
-        display.SetAndObserveColorNodeID("vtkMRMLColorTableNodeFileWarmShade1.txt")
-        display.SetScalarVisibility(False)
+        display.SetActiveScalar("Part", 1)  # of the cells
+        display.SetAndObserveColorNodeID(colors.GetID())
+        display.SetScalarRangeFlag(display.UseManualScalarRange)
+        display.SetScalarRange(0.0, 1.0)
+        display.SetScalarVisibility(True)
         display.SetVisibility2D(True)
-        display.SetSliceIntersectionThickness(2)
+        display.SetSliceIntersectionThickness(1)
         display = display_of(field)
         display.SetTextureImageDataConnection(self._image.GetOutputPort())
         display.SetLighting(False)
@@ -122,22 +150,32 @@ class AnatomyViews:
         display.SetVisibility2D(False)
         self._fitted.clear()
 
-    def show_image(self, volume_node) -> None:
-        """Show the image that a volume node has now, in 3D and blended into the slice views."""
-        image = volume_node.GetImageData()
-        if self._image.GetOutputDataObject(0) is not image:
-            self._image.SetOutput(image)
-            display = volume_node.GetDisplayNode()
-            if display is not None:  # what is black outside of the field does not hide the MRI
-                display.SetThreshold(1, 255)
-                display.SetApplyThreshold(True)
+    def show_image(self, volume_node, field: np.ndarray) -> None:
+        """Show the image that a volume node has now, in 3D and blended into the slice views.
+
+        `field` (rows, columns) is where it shows anything; around it the MRI stays as it is.
+        """
+        volume = read_volume(volume_node)
+        # A copy, in which nothing inside of the field is 0, so that the threshold takes what is outside.
+        seen = volume.with_array(np.where(field, np.maximum(volume.array, 1), 0).astype(np.uint8))
+        shown = self._seen
+        write_slice(shown, seen, volume_node.GetParentTransformNode())
+        if self._image.GetOutputDataObject(0) is not shown.GetImageData():
+            self._image.SetOutput(shown.GetImageData())
+            display = display_of(shown)
+            display.SetSaveWithScene(False)
+            display.SetAutoThreshold(False)
+            display.SetThreshold(1, 255)
+            display.SetApplyThreshold(True)
         for view in self.slices:
-            if view.get_foreground_volume_id() != volume_node.GetID():
-                view.set_foreground_volume_id(volume_node.GetID())
+            if view.get_foreground_volume_id() != shown.GetID():
+                view.set_foreground_volume_id(shown.GetID())
+                view.set_foreground_opacity(self._blend)
         self.threed.schedule_render()
 
     def set_blend(self, share: float) -> None:
         """How much of the image, against the MRI, the slice views show: 0 to 1."""
+        self._blend = share
         for view in self.slices:
             view.set_foreground_opacity(share)
 
@@ -161,7 +199,7 @@ class AnatomyViews:
         self.planes[name] = plane
         self._fitted.discard(name)
 
-    def follow(self, probe_to_world: np.ndarray, probe: Probe, output_node) -> None:
+    def follow(self, probe_to_world: np.ndarray, probe: Probe) -> None:
         """Turn the slice views to where the probe now is."""
         left, right, top, bottom = probe.image_bounds_mm()
         middle = (probe_to_world @ [0.5 * (left + right), 0.5 * (top + bottom), 0.0, 1.0])[:3]
@@ -173,7 +211,7 @@ class AnatomyViews:
             plane = self.planes[name]
             was_modifying = node.StartModify()
             if plane == IN_PLANE:
-                show_in_slice(node, output_node, probe_to_world, probe, fit=False)
+                show_in_slice(node, self._seen, probe_to_world, probe, fit=False)
             elif plane == ACROSS:
                 across = np.eye(4)  # right, up and normal of the view: elevation, against depth, lateral
                 across[:3, :3] = probe_to_world[:3, [2, 1, 0]] * [1.0, -1.0, 1.0]
@@ -210,6 +248,13 @@ class AnatomyViews:
         camera.SetViewUp(0.0, 0.0, 1.0)
         camera.ResetClippingRange()
         self.threed.schedule_render()
+
+    @property
+    def _seen(self):
+        node = node_called(self._app.scene, "ScalarVolume", _SEEN)
+        node.SetSaveWithScene(False)
+        node.SetHideFromEditors(True)
+        return node
 
     def _model(self, name: str):
         model = node_called(self._app.scene, "Model", name)

@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import numpy as np
+from slicer import vtkSlicerSequencesLogic
 from trame.app import get_server
 from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkCommand
@@ -90,6 +91,7 @@ class Workstation:
         self.files = files
         self.state = self.server.state
         self.app = SlicerApp()
+        self.app.register_module_logic(vtkSlicerSequencesLogic())  # whose nodes the scene does not know without it
         self.tasks = Tasks(self._failed)
         self.logic = UltrasoundSceneLogic(self.app.scene, device, self.tasks)
         sections = read_sections()
@@ -97,7 +99,9 @@ class Workstation:
         self.state.update({**initial_state(sections), "probe_keys": list(KEYS), "trame__title": "SlicerUSSim"})
         self.view = BrowserView(self.state, self.tasks, sections)
         self.presenter = self.view.presenter = PanelPresenter(self.logic, self.view)
-        self.views = AnatomyViews(self.app, self.server, view_tools)
+        self._turn_slices = AtMost(_TURN_EVERY_S, self._turn_slices_now)
+        self._tell_pose = AtMost(_TELL_EVERY_S, self._tell_pose_now)
+        self.views = AnatomyViews(self.app, self.server, view_tools, self._turn_slices)
         self.hand = ProbeHand(self.pose, self._moved_by_hand, lambda: self._surface, self._hold)
         for view in (self.views.threed, *self.views.slices):
             self.hand.attach(view)
@@ -112,10 +116,8 @@ class Workstation:
         self._comparing = False
         self._link: TrackerLink | None = None
         self._observed: dict[str, tuple[object, int]] = {}
-        self._drawn_probe = None
+        self._drawn_probe = self._field_of = self._in_field = None
         self._stamp_told = self._stamp_applied = self._stamp_computed = None
-        self._turn_slices = AtMost(_TURN_EVERY_S, self._turn_slices_now)
-        self._tell_pose = AtMost(_TELL_EVERY_S, self._tell_pose_now)
         self._refreshing = False
         self._connect(sections)
         build_page(self.server, sections, self.views.layout)
@@ -231,7 +233,7 @@ class Workstation:
             self.views.show_volume(node)
         order = read_labels(node, self.logic.preset.tissues).names
         relabelled = (0, *(order.index(name) + 1 if name else 0 for name in names))
-        self._source = (labels_version(node), LabelSource(os.path.abspath(path), True, relabelled=relabelled))
+        self._source = (_voxels_of(node), LabelSource(os.path.abspath(path), True, relabelled=relabelled))
         self._labels_ready()
 
     def _add_labels(self, volume: Volume, path: str, names=("inside",)):
@@ -308,7 +310,7 @@ class Workstation:
         mask_file = None if mask is None else mask.GetAttribute("SlicerUSSim.file")
         file = mri.GetAttribute("SlicerUSSim.file")
         known = file is not None and (mask is None or mask_file is not None)
-        self._source = (labels_version(labels), LabelSource(file, mask=mask_file, options=options)) if known else None
+        self._source = (_voxels_of(labels), LabelSource(file, mask=mask_file, options=options)) if known else None
         self._labels_ready()
 
     def _labels_ready(self) -> None:
@@ -401,7 +403,7 @@ class Workstation:
         parameters = self.logic.parameters
         pose = self.pose()
         if pose is not None and parameters.output is not None:
-            self.views.follow(pose, self.logic.preset.probe, parameters.output)
+            self.views.follow(pose, self.logic.preset.probe)
 
     def _tell_pose_now(self) -> None:
         pose, surface = self.pose(), self._surface
@@ -491,7 +493,7 @@ class Workstation:
         with self.state:
             self.state.us = {
                 "x": grid.left_mm, "y": grid.top_mm, "w": width, "h": height, "ticks": ticks, "size": height / 36.0,
-                "focus": preset.probe.focus_mm, "range": f"{preset.display.dynamic_range_db:g}",
+                "focus": preset.probe.focus_mm, "range": f"{preset.display.dynamic_range_db:.0f}",
             }  # fmt: skip
 
     def _stamped(self, page: str, milliseconds: float) -> None:
@@ -505,7 +507,7 @@ class Workstation:
         image = read_volume(output).array[0].copy()
         self._streams["simulated"].send(image, stamp=self._stamp_computed)
         self.cine.add(image, perf_counter())
-        self.views.show_image(output)
+        self.views.show_image(output, self._field())
         if self._link is not None:
             self._link.send(self._placed_image())
         if self._real is not None:
@@ -549,6 +551,13 @@ class Workstation:
     def _grid(self) -> ImageGrid:
         preset = self.logic.preset
         return ImageGrid.for_probe(preset.probe, preset.display.image_size)
+
+    def _field(self) -> np.ndarray:
+        """(rows, columns) bool: where the image shows anything."""
+        grid, probe = self._grid(), self.logic.preset.probe
+        if self._field_of != (grid, probe):
+            self._field_of, self._in_field = (grid, probe), grid.field(probe)
+        return self._in_field
 
     def _compare(self, image: np.ndarray) -> None:
         """Tell how alike the image and the real one are; of images that come faster than that, the newest."""
@@ -627,7 +636,7 @@ class Workstation:
         labels, pose = self.logic.parameters.labels, self.pose()
         require(labels is not None and pose is not None, "there is no image yet, expected labels and a probe")
         require(
-            self._source is not None and self._source[0] == labels_version(labels),
+            self._source is not None and self._source[0] == _voxels_of(labels),
             f"{labels.GetName()!r} was not made from files by this workstation; save it, and open it as --labels",
         )
         preset = self.logic.preset
@@ -642,6 +651,12 @@ class Workstation:
 
     def _dismiss(self, number: int) -> None:
         self.state.errors = [message for n, message in enumerate(self.state.errors) if n != number]
+
+
+def _voxels_of(labels_node) -> tuple:
+    """Changes with the voxels of a label map."""
+    image = labels_node.GetImageData() if labels_node.IsA("vtkMRMLVolumeNode") else None
+    return labels_node.GetID(), None if image is None else image.GetMTime()
 
 
 def _are_labels(volume: Volume) -> bool:
