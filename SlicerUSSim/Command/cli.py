@@ -21,7 +21,6 @@ from SlicerUSSim.Command.options import (
     scene_options,
     seed_option,
     sulci_option,
-    tissues_beside,
 )
 from SlicerUSSim.Command.progress import Share, Steps
 from SlicerUSSim.Command.serve import serve
@@ -105,7 +104,7 @@ def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -
 def segment(mri, out, contrast, classes, mask, radius, bias_correction, thin_sulci, device) -> None:
     """Label the tissues of a skull-stripped brain MRI."""
     from SlicerUSSim.Logic.segmentation import segment_mri
-    from SlicerUSSim.Logic.tissues import TissueTable
+    from SlicerUSSim.Logic.tissues import TissueTable, tissues_beside
     from SlicerUSSim.Logic.volume import Volume
 
     check_output(out)

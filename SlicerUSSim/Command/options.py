@@ -87,7 +87,7 @@ class Scene:
         from SlicerUSSim.Logic.probe import probe_from_dict
         from SlicerUSSim.Logic.segmentation import segment_mri
         from SlicerUSSim.Logic.simulator import UltrasoundSimulator
-        from SlicerUSSim.Logic.tissues import TissueTable, read_json
+        from SlicerUSSim.Logic.tissues import TissueTable, read_json, tissues_beside
         from SlicerUSSim.Logic.volume import Volume
 
         self.source = os.path.abspath(mri_or_labels)
@@ -102,7 +102,7 @@ class Scene:
         self.probe_is_given = bool(probe_file or preset_file)
         self.pose = None if pose in (None, "auto") else read_pose(pose)
         volume = Volume.read(mri_or_labels)
-        self.is_labels = _looks_like_labels(volume) if is_labels is None else is_labels
+        self.is_labels = volume.looks_like_labels() if is_labels is None else is_labels
         texture = None
         if self.is_labels:
             if settings.needs_texture:
@@ -130,25 +130,6 @@ class Scene:
 def _given(**options) -> dict:
     """The options that were given."""
     return {name: value for name, value in options.items() if value is not None}
-
-
-def _looks_like_labels(volume) -> bool:
-    import numpy as np
-
-    return (
-        bool(np.issubdtype(volume.array.dtype, np.integer))
-        and int(volume.array.min()) >= 0
-        and len(np.unique(volume.array)) <= 32
-    )
-
-
-def tissues_beside(labels: Path) -> Path:
-    """Where the tissue table of a label map lies: beside it, .json."""
-    name = labels.name
-    for suffix in (".nii.gz", labels.suffix):
-        if suffix and name.endswith(suffix):
-            return labels.with_name(name[: -len(suffix)] + ".json")
-    return labels.with_name(name + ".json")
 
 
 def check_output(out: Path, png: bool = False) -> None:

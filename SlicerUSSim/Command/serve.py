@@ -74,7 +74,8 @@ def serve(
 
     _prepare_libraries()
     from SlicerUSSim.Widget.browser.access import guard, is_loopback
-    from SlicerUSSim.Widget.browser.workstation import Files, Workstation
+    from SlicerUSSim.Widget.browser.opener import Files
+    from SlicerUSSim.Widget.browser.workstation import Workstation
 
     token = "" if is_loopback(host) else secrets.token_urlsafe(24)
     workstation = Workstation(

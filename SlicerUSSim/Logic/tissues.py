@@ -368,6 +368,15 @@ def _plain(tissue: Tissue) -> dict:
     return {**asdict(replace(tissue, sources={})), "sources": dict(tissue.sources)}
 
 
+def tissues_beside(labels: Path) -> Path:
+    """Where the tissue table of a label map lies: beside it, .json."""
+    name = labels.name
+    for suffix in (".nii.gz", labels.suffix):
+        if suffix and name.endswith(suffix):
+            return labels.with_name(name[: -len(suffix)] + ".json")
+    return labels.with_name(name + ".json")
+
+
 def read_json(path: str | os.PathLike):
     """The content of a JSON file. Raises SimulationError naming the file."""
     try:

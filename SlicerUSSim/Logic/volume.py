@@ -70,6 +70,11 @@ class Volume:
         require(np.shape(array) == self.array.shape, f"array has shape {np.shape(array)}, expected {self.array.shape}")
         return Volume(array, self.ijk_to_ras)
 
+    def looks_like_labels(self) -> bool:
+        """Whether the image holds few whole numbers, none negative, as a label map does and an MRI does not."""
+        array = self.array
+        return bool(np.issubdtype(array.dtype, np.integer)) and int(array.min()) >= 0 and len(np.unique(array)) <= 32
+
     # ---- files -------------------------------------------------------------------------------------------------
 
     @classmethod

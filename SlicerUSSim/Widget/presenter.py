@@ -71,11 +71,15 @@ class TissueRow:
 
 
 class PanelPresenter:
-    """Acts on one scene for one view."""
+    """Acts on one scene for one view.
 
-    def __init__(self, logic: UltrasoundSceneLogic, view: PanelView) -> None:
+    With `handles`, a probe that is placed gets Slicer's handles to move and turn it by.
+    """
+
+    def __init__(self, logic: UltrasoundSceneLogic, view: PanelView, handles: bool = True) -> None:
         self.logic = logic
         self.view = view
+        self._handles = handles
         self._busy = False
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
@@ -301,14 +305,14 @@ class PanelPresenter:
         return parameters
 
     def _put_probe(self, slice_node=None) -> None:
-        """Place the probe's transform, a new one if none was chosen, and show handles to move and turn it by."""
+        """Place the probe's transform, a new one if none was chosen."""
         parameters = self.logic.parameters
         with self._made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
             self.logic.placeProbe(parameters.labels, probe, slice_node)
         parameters.probe_transform = probe
         display = display_of(probe)
         if display is not None:
-            display.SetEditorVisibility(True)
+            display.SetEditorVisibility(self._handles)
 
     def _live_nodes(self) -> tuple:
         nodes = self.logic.parameters

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import traceback
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import numpy as np
@@ -18,9 +16,7 @@ from trame.app import get_server
 from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkCommand
 
-from SlicerUSSim.Logic.demo import demo_mri
 from SlicerUSSim.Logic.errors import SimulationError, require, user_message
-from SlicerUSSim.Logic.preset import Preset
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.scene_nodes import (
@@ -31,21 +27,17 @@ from SlicerUSSim.Logic.scene_nodes import (
     read_labels,
     read_volume,
     set_node_to_world,
-    write_labels,
-    write_volume,
 )
-from SlicerUSSim.Logic.scene_sequence import add_sequence
 from SlicerUSSim.Logic.script import LabelSource, python_script
 from SlicerUSSim.Logic.sequence import TrackedSequence
 from SlicerUSSim.Logic.surface import PatientSurface
-from SlicerUSSim.Logic.tissues import TissueTable
-from SlicerUSSim.Logic.tracked import TrackedImages
 from SlicerUSSim.Logic.tracking import TrackerLink, parse_address
 from SlicerUSSim.Logic.volume import Volume
 from SlicerUSSim.Widget.browser.export import FRAME_SUFFIXES, Cine, frame_file, png, scene_file
 from SlicerUSSim.Widget.browser.hand import KEYS, ProbeHand
-from SlicerUSSim.Widget.browser.page import POSE_SLIDERS, SIMULATED, build_page, initial_state, view_tools
-from SlicerUSSim.Widget.browser.real import RealImages
+from SlicerUSSim.Widget.browser.opener import FILE, Files, Opener
+from SlicerUSSim.Widget.browser.page import POSE_SLIDERS, build_page, initial_state, view_tools
+from SlicerUSSim.Widget.browser.real import Comparison
 from SlicerUSSim.Widget.browser.streams import ImageStream
 from SlicerUSSim.Widget.browser.tasks import AtMost, Tasks
 from SlicerUSSim.Widget.browser.view import BrowserView
@@ -56,25 +48,6 @@ from SlicerUSSim.Widget.sections import read_sections
 #: Seconds between two times that the slice views turn to the probe, and that the sliders are told where it is: both
 #: take time that the image then has to wait for.
 _TURN_EVERY_S, _TELL_EVERY_S = 0.12, 0.4
-
-
-@dataclass(frozen=True)
-class Files:
-    """What to begin with; the demo brain without an MRI and without labels."""
-
-    mri: str | None = None
-    labels: str | None = None
-    contrast: str = "t1"
-    mask: str | None = None
-    preset: Preset | None = None
-    sequence: TrackedSequence | None = None
-    sequence_name: str = "sequence"
-    #: From pixels to where the patient lies, and from there to the MRI; see TrackedImages.of
-    transform: str = "ImageToReference"
-    to_ras: np.ndarray | None = None
-    #: OpenIGTLink, as tracking.parse_address reads it, and the transform to follow
-    tracker: str | None = None
-    tracker_device: str | None = None
 
 
 class Workstation:
@@ -98,7 +71,7 @@ class Workstation:
         self._controls = {control.name: control for section in sections for control in section.controls}
         self.state.update({**initial_state(sections), "probe_keys": list(KEYS), "trame__title": "SlicerUSSim"})
         self.view = BrowserView(self.state, self.tasks, sections)
-        self.presenter = self.view.presenter = PanelPresenter(self.logic, self.view)
+        self.presenter = self.view.presenter = PanelPresenter(self.logic, self.view, handles=False)
         self._turn_slices = AtMost(_TURN_EVERY_S, self._turn_slices_now)
         self._tell_pose = AtMost(_TELL_EVERY_S, self._tell_pose_now)
         self.views = AnatomyViews(self.app, self.server, view_tools, self._turn_slices)
@@ -106,14 +79,12 @@ class Workstation:
         for view in (self.views.threed, *self.views.slices):
             self.hand.attach(view)
         self.cine = Cine()
-        self._streams = {name: ImageStream(name) for name in ("simulated", "real", "real-over")}
+        self._stream = ImageStream("simulated")
+        self.opener = Opener(self.app.scene, self.logic, self.tasks, files)
+        self.comparison = Comparison(self.state, self.move_probe, self._grid)
         self._surface: PatientSurface | None = None
         self._surface_version: object = None
         self._source: tuple[object, LabelSource] | None = None  # labels of that version came from there
-        self._real: RealImages | None = None
-        self._browser = None
-        self._playing: asyncio.Task | None = None
-        self._comparing = False
         self._link: TrackerLink | None = None
         self._observed: dict[str, tuple[object, int]] = {}
         self._drawn_probe = self._field_of = self._in_field = None
@@ -128,8 +99,8 @@ class Workstation:
         triggers: dict[str, Callable] = {
             "set": self._set_control, "press": self._press, "set_tissue": self._in_task(self.presenter.setTissue),
             "set_free": self._in_task(self.presenter.fits.setFree), "set_pose": self._set_pose, "key": self._key,
-            "plane": self._choose_plane, "look": self._look, "aim_image": self._aim_image, "play": self._play,
-            "show_number": self.show_number, "cancel": self.view.cancel, "dismiss": self._dismiss,
+            "plane": self._choose_plane, "look": self._look, "aim_image": self._aim_image, "play": self.comparison.play,
+            "show_number": self.comparison.show, "cancel": self.view.cancel, "dismiss": self._dismiss,
             "export": self._export, "script": self._show_script, "stamp": self._stamped, "page_opened": self._opened,
         }  # fmt: skip
         for name, method in triggers.items():
@@ -139,7 +110,7 @@ class Workstation:
             ("follow", self._follow_changed),
             ("upright", lambda: setattr(self.hand, "upright", bool(self.state.upright))),
             ("show_tissues", self._show_tissues),
-            ("comparison", self._send_real),
+            ("comparison", self.comparison.send),
             ("opened_file", self._file_opened),
         ):
             self.state.change(name)(lambda method=method, **_: method())
@@ -150,7 +121,7 @@ class Workstation:
         self.server.controller.on_server_exited.add(self.close)
 
     def _ready(self, **_) -> None:
-        for stream in self._streams.values():
+        for stream in (self._stream, *self.comparison.streams):
             self.server.controller.rc_area_register(stream)
         self.tasks.start(self._begin)
 
@@ -166,15 +137,15 @@ class Workstation:
                 self._link = TrackerLink(host, port, self._tracked, device=files.tracker_device, listen=listen)
                 asyncio.get_event_loop().create_task(self._show_tracker())
             if files.mri is not None or files.labels is None:
-                self.load_mri(files.mri)
+                self._take_mri(files.mri)
             if files.mask is not None:
-                parameters.mask = self._add_labels(self.tasks.do(lambda: Volume.read(files.mask)), files.mask)
+                parameters.mask = self.opener.mask(files.mask)
             if files.labels is not None:
-                self.load_labels(files.labels)
+                self._take_labels(files.labels)
             else:
                 self.segment()
             if files.sequence is not None:
-                self.load_sequence(files.sequence, files.sequence_name)
+                self._take_sequence(files.sequence, files.sequence_name)
         self.view.refresh()
 
     def close(self, **_) -> None:
@@ -196,100 +167,53 @@ class Workstation:
 
     # ---- files -------------------------------------------------------------------------------------------------
 
-    def load_mri(self, path: str | None) -> None:
-        """Take a file as the MRI, or the demo brain. Raises SimulationError for one that cannot be read."""
-        volume, name = self.tasks.do(lambda: demo_mri() if path is None else (Volume.read(path), Path(path).name))
-        node = self.app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "MNI152 brain" if path is None else name)
-        write_volume(node, volume)
-        node.CreateDefaultDisplayNodes()
-        node.SetAttribute("SlicerUSSim.file", "" if path is None else os.path.abspath(path))
+    def _take_labels(self, path: str) -> None:
+        node, source = self.opener.labels(path)
+        if self.logic.parameters.mri is None:
+            self._take_volume(node)
+        self.logic.parameters.labels = node
+        self._source = (_voxels_of(node), source)
+        self._labels_ready()
+
+    def _take_mri(self, path: str | None) -> None:
         parameters = self.logic.parameters
+        node = self.opener.mri(path)
         parameters.mri, parameters.labels, parameters.mask = node, None, None
+        self._take_volume(node)
+
+    def _take_volume(self, node) -> None:
         self.state.title = node.GetName()
         self.views.show_volume(node)
 
-    def load_labels(self, path: str) -> None:
-        """Take a label map, whose tissues are in the .json beside it or the preset's. Raises SimulationError."""
-        from SlicerUSSim.Command.options import tissues_beside
-
-        volume = self.tasks.do(lambda: Volume.read(path))
-        beside = tissues_beside(Path(path))
-        if beside.exists():
-            preset = self.logic.preset
-            tissues = TissueTable.read(beside)
-            for tissue in tissues.values():
-                preset = replace(preset, tissues=preset.tissues.with_tissue(tissue))
-            self.logic.preset = preset
-        else:
-            tissues = self.logic.preset.tissues
-        values = [int(label) for label in np.flatnonzero(np.bincount(volume.array.ravel())) if label]
-        unknown = [label for label in values if label not in tissues]
-        require(not unknown, f"{path}: has the labels {unknown}, which no tissue has; put a tissue table at {beside}")
-        names = [tissues[label].name if label in tissues else "" for label in range(1, max(values) + 1)]
-        node = self._add_labels(volume, path, names)
-        self.logic.parameters.labels = node
-        if self.logic.parameters.mri is None:
-            self.state.title = node.GetName()
-            self.views.show_volume(node)
-        order = read_labels(node, self.logic.preset.tissues).names
-        relabelled = (0, *(order.index(name) + 1 if name else 0 for name in names))
-        self._source = (_voxels_of(node), LabelSource(os.path.abspath(path), True, relabelled=relabelled))
-        self._labels_ready()
-
-    def _add_labels(self, volume: Volume, path: str, names=("inside",)):
-        node = self.app.scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", Path(path).name)
-        node.SetAttribute("SlicerUSSim.file", os.path.abspath(path))
-        require(
-            bool(np.issubdtype(volume.array.dtype, np.integer)) and volume.array.max() < 256 and volume.array.max() > 0,
-            f"{path}: is not a label map, expected whole numbers from 1 to 255",
-        )
-        write_labels(node, volume.with_array(volume.array.astype(np.uint8)), names, node)
-        return node
-
-    def load_sequence(self, sequence: TrackedSequence, name: str) -> None:
-        """Take real images: the probe goes where they were taken, and is the one that took them."""
-        files, preset = self.files, self.logic.preset
-        given = preset.probe if files.preset is not None else None
-        tracked = self.tasks.do(
-            lambda: TrackedImages.of(
-                sequence, path=files.transform, reference_to_ras=files.to_ras, probe=given, beam=preset.probe
-            )
-        )
-        self._browser, images, _ = add_sequence(self.app.scene, sequence, name, files.transform, files.to_ras)
-        self._real = RealImages(tracked)
+    def _take_sequence(self, sequence: TrackedSequence, name: str) -> None:
+        """The probe goes where the images were taken, and is the one that took them."""
+        tracked, browser, images = self.opener.sequence(sequence, name)
         self.logic.preset = replace(self.logic.preset, probe=tracked.probe)
         self.logic.parameters.real = images
-        with self.state:
-            self.state.update({"sequence_length": len(self._real), "has_real": True})
-        self.show_number(0)
+        self.comparison.take(tracked, browser)
 
     def _file_opened(self) -> None:
         given = self.state.opened_file
         given = given[0] if isinstance(given, list) and given else given
         if not given or not given.get("content"):
             return
-        name, content = Path(given["name"]).name, given["content"]
+        name, content = Path(given["name"]).name, bytes(given["content"])
         with self.state:
             self.state.opened_file = None
-        self.tasks.start(lambda: self._open_content(name, bytes(content)))
+        self.tasks.start(lambda: self._open_content(name, content))
 
     def _open_content(self, name: str, content: bytes) -> None:
         """Whatever a page sent: an MRI, a label map, a tracked sequence, or settings."""
-        with self.presenter.shown(), TemporaryDirectory() as folder:
-            path = Path(folder) / name
-            path.write_bytes(content)
-            try:
-                if name.lower().endswith(".json"):
-                    self.presenter.loadPreset(path)
-                elif ".igs." in name.lower() or ".seq." in name.lower():
-                    self.load_sequence(self.tasks.do(lambda: TrackedSequence.read(path)), name.split(".")[0])
-                elif self.tasks.do(lambda: _are_labels(Volume.read(path))):
-                    self.load_labels(str(path))
-                else:
-                    self.load_mri(str(path))
-                    self.segment()
-            except SimulationError as error:
-                raise SimulationError(str(error).replace(str(folder) + os.sep, "")) from None
+        with self.presenter.shown(), self.opener.uploaded(name, content) as (path, kind):
+            if kind == "preset":
+                self.presenter.loadPreset(path)
+            elif kind == "sequence":
+                self._take_sequence(self.tasks.do(lambda: TrackedSequence.read(path)), name.split(".")[0])
+            elif kind == "labels":
+                self._take_labels(path)
+            else:
+                self._take_mri(path)
+                self.segment()
         self.view.refresh()
 
     # ---- what the panel does -----------------------------------------------------------------------------------
@@ -307,8 +231,8 @@ class Workstation:
         self.presenter.segment()
         if labels is None or labels_version(labels) == before or labels.GetImageData() is None:
             return
-        mask_file = None if mask is None else mask.GetAttribute("SlicerUSSim.file")
-        file = mri.GetAttribute("SlicerUSSim.file")
+        mask_file = None if mask is None else mask.GetAttribute(FILE)
+        file = mri.GetAttribute(FILE)
         known = file is not None and (mask is None or mask_file is not None)
         self._source = (_voxels_of(labels), LabelSource(file, mask=mask_file, options=options)) if known else None
         self._labels_ready()
@@ -462,9 +386,6 @@ class Workstation:
             self._drawn_probe = (probe, parameters.probe_transform)
             self.hand.set_probe(probe)
             self.views.show_probe(probe, parameters.probe_transform)
-            display = parameters.probe_transform.GetDisplayNode()
-            if display is not None:
-                display.SetEditorVisibility(False)  # the probe itself is what one takes here
             self._probe_moved()
         self._tell_field()
         with self.presenter.shown():
@@ -483,7 +404,7 @@ class Workstation:
     def _tell_field(self) -> None:
         """What the page draws around the image: its place in the probe frame, depths, focus, grey levels."""
         preset = self.logic.preset
-        grid = ImageGrid.for_probe(preset.probe, preset.display.image_size)
+        grid = self._grid()
         width, height = grid.columns * grid.pixel_spacing_mm[0], grid.rows * grid.pixel_spacing_mm[1]
         step = 10 if height > 40 else 5
         ticks = [
@@ -505,48 +426,12 @@ class Workstation:
     def _image_changed(self, *_) -> None:
         output = self.logic.parameters.output
         image = read_volume(output).array[0].copy()
-        self._streams["simulated"].send(image, stamp=self._stamp_computed)
+        self._stream.send(image, stamp=self._stamp_computed)
         self.cine.add(image, perf_counter())
         self.views.show_image(output, self._field())
         if self._link is not None:
             self._link.send(self._placed_image())
-        if self._real is not None:
-            self._compare(image)
-
-    def _placed_image(self) -> Volume:
-        output = self.logic.parameters.output
-        require(output is not None and output.GetImageData() is not None, "there is no image yet, expected one")
-        volume = read_volume(output)
-        return Volume(volume.array.copy(), node_to_world(output) @ volume.ijk_to_ras)
-
-    def _opened(self) -> None:
-        """Another page came: it has to be shown what there is."""
-        for stream in self._streams.values():
-            stream.send_again()
-        for view in (self.views.threed, *self.views.slices):
-            view.schedule_render()
-
-    # ---- real images -------------------------------------------------------------------------------------------
-
-    def show_number(self, number: int) -> None:
-        """Put the probe where the real image of this number was taken, and show that image."""
-        if self._real is None:
-            return
-        number = int(np.clip(number, 0, len(self._real) - 1))
-        with self.state:
-            self.state.update({"sequence_number": number, "real_name": f", image {self._real.tracked.numbers[number]}"})
-        if self._browser is not None:
-            self._browser.SetSelectedItemNumber(number)
-        if self.logic.parameters.probe_transform is not None:
-            self.move_probe(self._real.tracked.poses[number])
-        self._send_real()
-
-    def _send_real(self) -> None:
-        if self._real is None or self.state.comparison == SIMULATED:
-            return
-        real, _ = self._real.on_grid(self.state.sequence_number, self._grid())
-        self._streams["real"].send(real)
-        self._streams["real-over"].send(real)
+        self.comparison.compare(image)
 
     def _grid(self) -> ImageGrid:
         preset = self.logic.preset
@@ -559,40 +444,18 @@ class Workstation:
             self._field_of, self._in_field = (grid, probe), grid.field(probe)
         return self._in_field
 
-    def _compare(self, image: np.ndarray) -> None:
-        """Tell how alike the image and the real one are; of images that come faster than that, the newest."""
-        if self._comparing:
-            return
-        self._comparing = True
-        real, number, grid = self._real, self.state.sequence_number, self._grid()
+    def _placed_image(self) -> Volume:
+        output = self.logic.parameters.output
+        require(output is not None and output.GetImageData() is not None, "there is no image yet, expected one")
+        volume = read_volume(output)
+        return Volume(volume.array.copy(), node_to_world(output) @ volume.ijk_to_ras)
 
-        async def compare() -> None:
-            try:
-                found = await asyncio.get_event_loop().run_in_executor(None, real.compared, number, image, grid)
-                with self.state:
-                    self.state.similarity = f"cost {found.total:.3f} (ρ {found.bhattacharyya:.3f}, SAD {found.sad:.3f})"
-            except SimulationError as error:
-                with self.state:
-                    self.state.similarity = str(error)
-            finally:
-                self._comparing = False
-
-        asyncio.get_event_loop().create_task(compare())
-
-    def _play(self) -> None:
-        if self._playing is not None:
-            self._playing.cancel()
-            self._playing = None
-            self.state.playing = False
-            return
-        self.state.playing = True
-        self._playing = asyncio.get_event_loop().create_task(self._play_on())
-
-    async def _play_on(self) -> None:
-        while self._real is not None:
-            times = self._real.tracked.numbers
-            await asyncio.sleep(0.1)
-            self.show_number((self.state.sequence_number + 1) % len(times))
+    def _opened(self) -> None:
+        """Another page came: it has to be shown what there is."""
+        for stream in (self._stream, *self.comparison.streams):
+            stream.send_again()
+        for view in (self.views.threed, *self.views.slices):
+            view.schedule_render()
 
     # ---- tracker -----------------------------------------------------------------------------------------------
 
@@ -657,9 +520,3 @@ def _voxels_of(labels_node) -> tuple:
     """Changes with the voxels of a label map."""
     image = labels_node.GetImageData() if labels_node.IsA("vtkMRMLVolumeNode") else None
     return labels_node.GetID(), None if image is None else image.GetMTime()
-
-
-def _are_labels(volume: Volume) -> bool:
-    from SlicerUSSim.Command.options import _looks_like_labels
-
-    return _looks_like_labels(volume)
