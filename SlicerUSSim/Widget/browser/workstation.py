@@ -17,6 +17,7 @@ from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkCommand
 
 from SlicerUSSim.Logic.errors import SimulationError, require, user_message
+from SlicerUSSim.Logic.preset import Preset
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.scene_nodes import (
@@ -206,7 +207,7 @@ class Workstation:
         """Whatever a page sent: an MRI, a label map, a tracked sequence, or settings."""
         with self.presenter.shown(), self.opener.uploaded(name, content) as (path, kind):
             if kind == "preset":
-                self.presenter.loadPreset(path)
+                self.logic.preset = Preset.read(path)
             elif kind == "sequence":
                 self._take_sequence(self.tasks.do(lambda: TrackedSequence.read(path)), name.split(".")[0])
             elif kind == "labels":

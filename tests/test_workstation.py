@@ -1,0 +1,764 @@
+"""The workstation in the browser: `ussim serve` as a process, and Chromium in front of it, as a user has them."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import io
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
+pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
+pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pip install '.[serve]'")
+
+from playwright.sync_api import Page, sync_playwright  # noqa: E402
+
+from SlicerUSSim.Logic import PhasedProbe, TissueTable, UltrasoundSimulator, Volume, segment_mri  # noqa: E402
+from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
+from SlicerUSSim.Logic.placement import craniotomy_pose, pose_looking_at, tilt_sweep  # noqa: E402
+from SlicerUSSim.Logic.scan_conversion import ImageGrid  # noqa: E402
+from SlicerUSSim.Logic.sequence import TrackedSequence  # noqa: E402
+from SlicerUSSim.Logic.volume import read_array  # noqa: E402
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is missing: apt-get install chromium")
+
+FLAGS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+POSE = ("right_deg", "front_deg", "rotate_deg", "rock_deg", "tilt_deg", "lift_mm")
+
+
+# ---- server and browser ----------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def serving(*arguments: str):
+    """The URL that `ussim serve` prints, while it runs."""
+    server = subprocess.Popen(
+        [sys.executable, "-m", "SlicerUSSim.cli", "serve", "--port", "0", *arguments],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    try:
+        url = server.stdout.readline().strip()
+        assert url.startswith("http://"), server.stderr.read()
+        yield url
+        assert server.poll() is None, server.stderr.read()
+    finally:
+        server.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            server.wait(10)
+        server.kill()
+        server.communicate()
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> Path:
+    """A head, its labels, and a sequence that a scanner with more gain saw in it."""
+    folder = tmp_path_factory.mktemp("patient")
+    mri = head_mri(2.0)
+    mri.write(folder / "head.nii.gz")
+    segmentation = segment_mri(mri, thin_sulci=True)
+    segmentation.labels.write(folder / "labels.nii.gz")
+    tissues = TissueTable.brain(segmentation.tissue_names)
+    tissues.write(folder / "labels.json")
+    probe = PhasedProbe(field_of_view_deg=75.0, depth_mm=70.0, scan_lines=96)
+    poses = tilt_sweep(craniotomy_pose(segmentation.labels, probe), 20.0, 6)
+    louder = tissues.replace("white matter", mu0=0.6)
+    images = [frame.image for frame in UltrasoundSimulator(segmentation.labels, louder).sweep(probe, poses)]
+    to_probe = ImageGrid.for_probe(probe, None).image_to_probe
+    transforms = tuple({"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in poses)
+    TrackedSequence(np.stack(images), transforms, 0.1 * np.arange(6)).write(folder / "sweep.igs.mha")
+    (folder / "broken.nii.gz").write_bytes(b"this is no image")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tracker():
+    """What a tracker's server would be, at the other end of the workstation's --igtl."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    server = pyigtl.OpenIGTLinkServer(port=port, local_server=True)
+    yield server
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def url(files, tracker):
+    arguments = [str(files / "head.nii.gz"), "--sequence", str(files / "sweep.igs.mha")]
+    with serving(*arguments, "--igtl", f"127.0.0.1:{tracker.port}") as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+def opened(browser, address: str, problems: list[str] | None = None) -> Page:
+    page = browser.new_page(viewport={"width": 1500, "height": 900})
+    if problems is not None:
+        page.on("pageerror", lambda error: problems.append(str(error)))
+    page.goto(address)
+    page.wait_for_function("window.ussim && window.ussim.images > 0", timeout=60_000)
+    return page
+
+
+@pytest.fixture(scope="module")
+def first_page(browser, url):
+    problems: list[str] = []
+    yield opened(browser, url, problems), problems
+
+
+@pytest.fixture
+def page(first_page):
+    """The page with the probe at a craniotomy and no messages."""
+    page, problems = first_page
+    for _ in state(page, "errors"):
+        page.evaluate("window.trame.trigger('dismiss', [0])")
+    page.mouse.move(600, 500)  # away from what shows tips
+    page.evaluate("window.trame.trigger('press', ['placeButton'])")
+    settled(page)
+    yield page
+    assert not problems
+
+
+def state(page: Page, name: str):
+    return page.evaluate("name => window.trame.state.get(name)", name)
+
+
+def pose(page: Page) -> dict[str, float]:
+    return {name: state(page, f"pose_{name}") for name in POSE}
+
+
+def click(page: Page, selector: str) -> None:
+    page.locator(selector).first.click()
+
+
+def settled(page: Page) -> None:
+    """Wait until no more images come, and what is told less often, every 0.4 s, has been told."""
+    last, quiet = -1, 0
+    while quiet < 4:
+        page.wait_for_timeout(120)
+        count = page.evaluate("window.ussim.images")
+        quiet = quiet + 1 if count == last and not state(page, "progress_title") else 0
+        last = count
+
+
+def pixels(page: Page, stream: str = "simulated") -> np.ndarray:
+    """(rows, columns) of a canvas."""
+    size, values = page.evaluate(
+        """stream => { const c = document.querySelector(`canvas[data-stream="${stream}"]`);
+        const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+        let s = ''; for (let n = 0; n < d.length; n += 4) s += String.fromCharCode(d[n]);
+        return [[c.height, c.width], btoa(s)]; }""",
+        stream,
+    )
+    return np.frombuffer(base64.b64decode(values), np.uint8).reshape(size)
+
+
+def views(page: Page):
+    """The four views of Slicer: 3D, red, yellow, green."""
+    found = page.locator(".ussim-anatomy .remote-controlled-area")
+    assert found.count() == 4
+    return [found.nth(n) for n in range(4)]
+
+
+def picture(page: Page, box: dict) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(page.screenshot(clip=box))).convert("RGB")).astype(int)
+
+
+def drag(page: Page, start: tuple[float, float], by: tuple[float, float], key: str | None = None) -> None:
+    with _held(page, key):
+        page.mouse.move(*start)
+        page.mouse.down()
+        for share in np.linspace(0, 1, 9)[1:]:
+            page.mouse.move(start[0] + share * by[0], start[1] + share * by[1])
+            page.wait_for_timeout(25)
+        page.mouse.up()
+    settled(page)
+
+
+@contextlib.contextmanager
+def _held(page: Page, key: str | None):
+    if key:
+        page.keyboard.down(key)
+    yield
+    if key:
+        page.keyboard.up(key)
+
+
+def in_view(view, across: float, down: float) -> tuple[float, float]:
+    box = view.bounding_box()
+    return box["x"] + across * box["width"], box["y"] + down * box["height"]
+
+
+def download(page: Page, kind: str) -> Path:
+    click(page, "#export")
+    with page.expect_download() as waiting:
+        click(page, f"#export-{kind}")
+    return Path(waiting.value.path())
+
+
+def open_section(page: Page, title: str) -> None:
+    if title not in state(page, "open_sections"):
+        page.get_by_role("button", name=title, exact=True).click()
+        page.wait_for_timeout(400)
+
+
+def shown_errors(page: Page) -> str:
+    page.locator(".ussim-error").first.wait_for(timeout=15_000)
+    return " ".join(page.locator(".ussim-error").all_inner_texts())
+
+
+# ---- what one sees ---------------------------------------------------------------------------------------------------
+
+
+def test_the_page_shows_image_ruler_focus_marks_and_the_anatomy_around_the_probe(page):
+    image = pixels(page)
+    assert image.shape[0] == 512 and image.mean() > 15
+    us = state(page, "us")
+    assert us["h"] == pytest.approx(70, rel=0.02)  # the depth of the sequence's probe
+    for mark in ("depth-ruler", "focus-mark", "orientation-mark", "grey-bar"):
+        assert page.locator(f"#{mark}").bounding_box()["width"] > 0
+    labels = page.locator("#depth-ruler text").all_text_contents()
+    assert labels[:3] == ["0", "20", "40"]
+    ticks = [page.locator("#depth-ruler text").nth(n).bounding_box()["y"] for n in range(3)]
+    frame = page.locator("#ultrasound").bounding_box()
+    assert (ticks[2] - ticks[0]) / frame["height"] == pytest.approx(40 / us["h"], rel=0.03)
+    assert frame["width"] / frame["height"] == pytest.approx(us["w"] / us["h"], rel=0.02)
+    for view in views(page):
+        assert picture(page, view.bounding_box()).std() > 10
+
+
+def test_slice_views_show_the_field_outlined_and_the_image_blended_in(page):
+    box = views(page)[1].bounding_box()
+    outlined = picture(page, box)
+    red, green, blue = np.moveaxis(outlined, -1, 0)
+    yellow = (red > 110) & (green > 80) & (blue < 0.6 * green)
+    assert yellow.sum() > 50
+    inside = np.zeros(yellow.shape, bool)
+    rows, columns = np.nonzero(yellow)
+    inside[rows.min() + 20 : rows.max() - 5, columns.min() + 40 : columns.max() - 40] = True
+    textures = []
+    for blend in (0, 1):
+        page.evaluate("blend => window.trame.state.set('blend', blend)", blend)
+        page.wait_for_timeout(1500)
+        textures.append(picture(page, box).mean(axis=-1)[inside])
+    page.evaluate("window.trame.state.set('blend', 0.6)")
+    assert np.abs(np.diff(textures[1])).mean() > 2 * np.abs(np.diff(textures[0])).mean()  # speckle, not MRI
+
+
+def test_every_field_of_the_panel_is_on_the_page(page):
+    from SlicerUSSim.Widget.fields import FIELDS
+    from SlicerUSSim.Widget.sections import read_sections
+
+    sections = read_sections()
+    fields = {control.field for section in sections for control in section.controls if control.field}
+    assert fields == set(FIELDS)
+    for section in sections:
+        for control in section.controls:
+            if control.field:
+                key = f"field_{control.field.replace('.', '_')}"
+                selector = f"#slider-{key}" if control.kind == "slider" else f"#{control.name}"
+                assert page.locator(selector).count() == 1, control.name
+        if section.title:
+            assert page.get_by_role("button", name=section.title, exact=True).count() == 1
+
+
+# ---- moving the probe ------------------------------------------------------------------------------------------------
+
+
+def test_the_probe_slides_over_the_surface_where_the_mouse_drags_it_in_a_slice(page):
+    before, image = pose(page), pixels(page)
+    drag(page, in_view(views(page)[1], 0.5, 0.15), (35, 5))
+    after = pose(page)
+    assert abs(after["right_deg"] - before["right_deg"]) + abs(after["front_deg"] - before["front_deg"]) > 3
+    assert abs(after["rock_deg"]) < 1 and abs(after["tilt_deg"]) < 1  # along the normal
+    assert after["lift_mm"] == pytest.approx(before["lift_mm"], abs=1.0)
+    assert (pixels(page) != image).mean() > 0.2
+
+
+def test_the_probes_body_is_taken_in_3d_and_slides_swings_or_rotates(page):
+    page.wait_for_timeout(600)
+    box = views(page)[0].bounding_box()
+    seen = picture(page, box)
+    body = (seen.min(axis=-1) > 105) & (seen[..., 2] >= seen[..., 0]) & (seen[..., 2] - seen[..., 0] < 45)
+    rows, columns = np.nonzero(body)
+    assert len(rows) > 300
+    grip = box["x"] + float(np.median(columns)), box["y"] + float(np.median(rows))
+    before = pose(page)
+    drag(page, grip, (0, 30), "Shift")
+    swung = pose(page)
+    assert abs(swung["rock_deg"] - before["rock_deg"]) + abs(swung["tilt_deg"] - before["tilt_deg"]) > 3
+    assert swung["right_deg"] == pytest.approx(before["right_deg"], abs=0.1)
+    click(page, "#place")
+    settled(page)
+    drag(page, grip, (40, 0), "Control")
+    assert abs(pose(page)["rotate_deg"] - before["rotate_deg"]) == pytest.approx(20, abs=2)
+    click(page, "#place")
+    settled(page)
+    drag(page, grip, (30, 40))
+    slid = pose(page)
+    assert abs(slid["right_deg"] - before["right_deg"]) + abs(slid["front_deg"] - before["front_deg"]) > 3
+
+
+def test_dragging_beside_the_probe_turns_the_camera_and_not_the_probe(page):
+    before, view = pose(page), views(page)[0]
+    seen = picture(page, view.bounding_box())
+    drag(page, in_view(view, 0.6, 0.85), (40, 0))
+    page.wait_for_timeout(800)
+    assert pose(page) == before
+    assert np.abs(picture(page, view.bounding_box()) - seen).mean() > 1
+    click(page, "#look")
+
+
+def test_a_double_click_aims_the_probe_at_a_structure(page):
+    before = pose(page)
+    page.mouse.dblclick(*in_view(views(page)[2], 0.35, 0.6))  # across the image: the probe has to tilt
+    settled(page)
+    after = pose(page)
+    assert abs(after["tilt_deg"] - before["tilt_deg"]) > 3 and after["right_deg"] == pytest.approx(before["right_deg"])
+    page.locator("#overlay").dblclick(position={"x": 0.7 * page.locator("#overlay").bounding_box()["width"], "y": 150})
+    settled(page)
+    assert abs(pose(page)["rock_deg"] - after["rock_deg"]) > 3
+
+
+def test_keys_and_sliders_move_the_probe(page):
+    before = pose(page)
+    for key, name, change in (("a", "rock_deg", 2), ("w", "tilt_deg", 2), ("Shift+E", "rotate_deg", 10)):
+        page.keyboard.press(key)
+        settled(page)
+        after = pose(page)
+        assert after[name] - before[name] == pytest.approx(change, abs=0.6), key
+        before = after
+    page.keyboard.press("Home")
+    settled(page)
+    assert abs(pose(page)["rock_deg"]) < 0.1 and abs(pose(page)["tilt_deg"]) < 0.1
+    page.keyboard.press("ArrowUp")
+    settled(page)
+    assert pose(page)["front_deg"] != before["front_deg"]
+    slider = page.locator("#slider-pose_lift_mm").locator("xpath=ancestor::*[contains(@class,'v-slider')]").first
+    box = slider.bounding_box()
+    page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+    settled(page)
+    assert pose(page)["lift_mm"] == pytest.approx(10, abs=2)  # the middle of -10 to 30
+    page.keyboard.press("w")  # what is typed into a field is not a key for the probe
+    settled(page)
+    tilted = pose(page)
+    page.locator("#fieldOfViewSpinBox").click()
+    page.keyboard.press("w")
+    page.locator("#fieldOfViewSpinBox").blur()
+    settled(page)
+    assert pose(page) == tilted
+
+
+# ---- tissues, settings -----------------------------------------------------------------------------------------------
+
+
+def test_segment_labels_the_mri_anew_and_says_what_it_cannot(page):
+    before = pixels(page)
+    for on in (False, True):
+        page.get_by_label("Label thin sulci").set_checked(on)
+        page.wait_for_function("on => window.trame.state.get('value_thin_sulci') === on", arg=on)
+        click(page, "#segmentButton")
+        settled(page)
+        assert not state(page, "errors") and pixels(page).mean() > 5
+        assert (
+            np.array_equal(pixels(page), before) == on
+        )  # without its sulci it is another image, and with them the same
+    classes = page.locator("#classesSpinBox")
+    for count in ("4", "3"):
+        classes.fill(count)
+        classes.blur()
+        page.wait_for_function("n => window.trame.state.get('value_classes') === Number(n)", arg=count)
+        if count == "4":
+            click(page, "#segmentButton")
+            assert "classes is 4, expected 3 for contrast t1" in shown_errors(page)
+
+
+def test_a_changed_tissue_changes_the_image_and_nonsense_is_refused(page):
+    open_section(page, "Tissues")
+    cell, before = page.get_by_label("white matter mu0"), pixels(page)
+    was = cell.input_value()
+    cell.fill("1.5")
+    cell.blur()
+    settled(page)
+    assert pixels(page).mean() > before.mean() + 5
+    cell.fill("bright")
+    cell.blur()
+    assert "mu0 is 'bright', expected a number" in shown_errors(page)
+    assert cell.input_value() == "1.5"
+    page.get_by_role("row", name="white matter").locator("td").first.click()
+    page.locator("#tissuePresetComboBox").select_option("white matter")
+    click(page, "#assignTissueButton")
+    settled(page)
+    assert cell.input_value() == was and np.abs(pixels(page).astype(int) - before).mean() < 0.5
+
+
+def test_gain_probe_and_depth_change_the_image(page):
+    before = pixels(page)
+    slider = (
+        page.locator("#slider-field_display_gain_db").locator("xpath=ancestor::*[contains(@class,'v-slider')]").first
+    )
+    slider.scroll_into_view_if_needed()
+    box = slider.bounding_box()
+    page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.5 * box["height"])
+    settled(page)
+    assert state(page, "field_display_gain_db") > 5 and pixels(page).mean() > before.mean() + 10
+    probe, gain = state(page, "control_probePresetComboBox"), state(page, "field_display_gain_db")
+    page.locator("#probePresetComboBox").select_option("linear")
+    settled(page)
+    assert state(page, "field_probe_kind") == "linear" and state(page, "field_probe_radius_mm") is None
+    assert page.locator("#radiusSpinBox").is_disabled() and probe == "custom" and gain > 5
+    page.locator("#widthSpinBox").fill("-5")
+    page.locator("#widthSpinBox").blur()
+    assert "width_mm is -5" in shown_errors(page)
+    assert float(page.locator("#widthSpinBox").input_value()) > 0
+    page.set_input_files("#open-file", {"name": "a.json", "mimeType": "application/json", "buffer": _preset(page)})
+    settled(page)
+    assert state(page, "field_probe_kind") == "phased" and state(page, "field_display_gain_db") == 0
+
+
+def _preset(page: Page) -> bytes:
+    """The preset on the page, back to the sequence's probe and no gain."""
+    values = json.loads(download(page, "json").read_bytes())
+    values["probe"] = PhasedProbe(field_of_view_deg=75.0, depth_mm=70.0, scan_lines=96).to_dict()
+    values["display"]["gain_db"] = 0.0
+    return json.dumps(values).encode()
+
+
+def test_freezing_stops_the_images_and_live_goes_on(page):
+    click(page, "#live")
+    page.wait_for_function("window.trame.state.get('control_liveCheckBox') === false")
+    count = page.evaluate("window.ussim.images")
+    page.keyboard.press("a")
+    page.wait_for_timeout(800)
+    assert page.evaluate("window.ussim.images") == count
+    click(page, "#live")
+    page.wait_for_function("n => window.ussim.images > n", arg=count)
+
+
+# ---- real images -----------------------------------------------------------------------------------------------------
+
+
+def test_a_sequence_plays_beside_the_simulation_and_the_cost_follows(page):
+    click(page, "#compare-beside")
+    settled(page)
+    page.evaluate("window.trame.trigger('show_number', [0])")
+    settled(page)
+    real = pixels(page, "real")
+    assert real.shape == pixels(page).shape and real.mean() > 15
+    cost = state(page, "similarity")
+    assert cost.startswith("cost 0.")
+    click(page, "#play")
+    page.wait_for_function("window.trame.state.get('sequence_number') >= 3", timeout=20_000)
+    click(page, "#play")
+    settled(page)
+    assert (pixels(page, "real") != real).mean() > 0.1
+    at_the_pose = float(state(page, "similarity").split()[1])
+    for _ in range(4):
+        page.keyboard.press("Shift+ArrowRight")
+    settled(page)
+    assert float(state(page, "similarity").split()[1]) > at_the_pose  # elsewhere the images are less alike
+
+
+def test_real_and_simulated_blink_or_are_subtracted(page):
+    page.evaluate("window.trame.trigger('show_number', [2])")
+    click(page, "#compare-difference")
+    settled(page)
+    box = page.locator("#ultrasound").bounding_box()
+    difference = picture(page, box).mean()
+    click(page, "#compare-simulated")
+    page.wait_for_timeout(500)
+    assert 0 < difference < 0.8 * picture(page, box).mean()
+    click(page, "#compare-blink")
+    seen = set()
+    for _ in range(12):
+        page.wait_for_timeout(150)
+        seen.add(round(float(picture(page, box).mean()), 1))
+    assert len(seen) >= 2
+    click(page, "#compare-beside")
+
+
+def fit(page: Page, evaluations: int) -> None:
+    open_section(page, "Fit to real ultrasound")
+    box = page.locator("#fitEvaluationsSpinBox")
+    box.fill(str(evaluations))
+    box.blur()
+    page.wait_for_function("n => window.trame.state.get('value_fit_evaluations') === n", arg=evaluations)
+    click(page, "#fitButton")
+
+
+def test_a_fit_shows_its_costs_and_is_applied_and_reverted(page):
+    page.evaluate("window.trame.trigger('show_number', [2])")
+    settled(page)
+    before = float(state(page, "similarity").split()[1])
+    fit(page, 40)
+    page.locator("#cost-curve svg").wait_for(timeout=30_000)
+    page.wait_for_function("window.trame.state.get('fit_summary').startsWith('cost')", timeout=60_000)
+    settled(page)
+    curve = state(page, "fit_curve")
+    assert len(curve) > 10 and min(curve) < curve[0]
+    assert f"→ {min(curve):.3f}" in page.locator("#cost-curve").inner_text()
+    click(page, "#applyFitButton")
+    settled(page)
+    assert float(state(page, "similarity").split()[1]) < before
+    click(page, "#revertFitButton")
+    settled(page)
+    assert float(state(page, "similarity").split()[1]) == pytest.approx(before, abs=0.02)
+
+
+def test_a_fit_is_cancelled_and_nothing_changes(page):
+    summary, preset = state(page, "fit_summary"), state(page, "field_display_gain_db")
+    fit(page, 100_000)
+    page.locator("#cancel").wait_for(timeout=20_000)
+    page.wait_for_function("window.trame.state.get('fit_curve').length > 1", timeout=30_000)
+    click(page, "#cancel")
+    page.wait_for_function("window.trame.state.get('progress_title') === ''", timeout=20_000)
+    assert state(page, "fit_summary") == summary and state(page, "field_display_gain_db") == preset
+    assert not state(page, "errors")
+
+
+def test_a_fit_goes_on_when_the_browser_is_closed_and_its_result_is_there_after(page, browser, url):
+    other = opened(browser, url)
+    other.evaluate("window.trame.state.set('fit_summary', '')")
+    fit(other, 60)
+    other.wait_for_function("window.trame.state.get('fit_curve').length > 1", timeout=30_000)
+    other.close()
+    again = opened(browser, url)
+    again.wait_for_function("window.trame.state.get('fit_summary').startsWith('cost')", timeout=60_000)
+    again.close()
+
+
+# ---- export ----------------------------------------------------------------------------------------------------------
+
+
+def test_images_are_exported_as_they_are_seen_with_their_place(page):
+    seen = pixels(page)
+    png = np.asarray(Image.open(download(page, "png")))
+    assert png.shape == seen.shape and np.abs(png.astype(int) - seen).mean() < 4  # the page has it as JPEG
+    arrays = []
+    for kind in ("nrrd", "mha", "vti"):
+        file = download(page, kind)
+        named = file.with_suffix(f".{kind}")
+        shutil.copy(file, named)
+        arrays.append(Volume.read(named) if kind == "vti" else read_array(named))
+    (nrrd, to_ras), (mha, to_ras_mha) = arrays[:2]
+    assert np.array_equal(nrrd[0], png) and np.array_equal(mha[0], png) and np.allclose(to_ras, to_ras_mha, atol=1e-4)
+    assert np.array_equal(arrays[2].array[0], png) and np.allclose(arrays[2].ijk_to_ras, to_ras, atol=1e-4)
+    assert np.linalg.norm(to_ras[:3, 0]) == pytest.approx(state(page, "us")["w"] / png.shape[1], rel=1e-4)
+
+
+def test_the_script_gives_the_same_image_pixel_by_pixel(page, tmp_path):
+    expected = np.asarray(Image.open(download(page, "png")))
+    click(page, "#export")
+    click(page, "#export-python")
+    text = page.locator("#ussim-script").input_value()
+    (tmp_path / "again.py").write_text(text)
+    subprocess.run([sys.executable, "again.py"], cwd=tmp_path, check=True, capture_output=True, timeout=120)
+    assert np.array_equal(read_array(tmp_path / "image.nrrd")[0][0], expected)
+    page.get_by_role("button", name="Close", exact=True).click()
+
+
+def test_the_cine_is_a_gif_that_moves(page):
+    for _ in range(4):
+        page.keyboard.press("a")
+        page.wait_for_timeout(150)
+    settled(page)
+    gif = Image.open(download(page, "gif"))
+    assert gif.format == "GIF" and gif.n_frames > 3
+    first = np.asarray(gif.convert("L"))
+    gif.seek(gif.n_frames - 1)
+    assert (np.asarray(gif.convert("L")) != first).mean() > 0.05
+
+
+def test_the_scene_opens_again_with_everything_and_gives_the_same_image(page, tmp_path):
+    from slicer import vtkSlicerSequencesLogic
+    from trame_slicer.core import SlicerApp
+
+    from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
+    from SlicerUSSim.Logic.scene_nodes import read_volume
+
+    expected = np.asarray(Image.open(download(page, "png")))
+    bundle = tmp_path / "ultrasound.mrb"
+    shutil.copy(download(page, "mrb"), bundle)
+    app = SlicerApp()  # Slicer's own scene and logic, without a window
+    app.register_module_logic(vtkSlicerSequencesLogic())
+    assert app.io_manager.load_scene(bundle)
+    scene = app.scene
+    logic = UltrasoundSceneLogic(scene)
+    parameters = logic.parameters
+    assert np.array_equal(read_volume(parameters.output).array[0], expected)
+    logic.simulate(parameters.labels, parameters.probe_transform, parameters.output)
+    assert np.abs(read_volume(parameters.output).array[0].astype(int) - expected).max() <= 1
+    assert parameters.real.GetNumberOfDataNodes() == 6 and parameters.mri is not None
+    assert scene.GetFirstNodeByName("Probe body") is None  # what only this page shows stays here
+
+
+# ---- tracker ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_tracker_moves_the_probe_and_gets_every_image_with_its_matrix(page, tracker):
+    target = pose_looking_at([35.0, 0.0, 60.0], [0.0, 0.0, 0.0])
+    tracker.send_message(pyigtl.TransformMessage(target, device_name="ProbeToReference"), wait=False)
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        message = tracker.wait_for_message("SlicerUSSim", timeout=5)
+        assert message is not None
+        matrix = message.ijk_to_world_matrix
+        # The middle of the image's upper edge is the face of the probe, its rows run down the axis.
+        middle = (matrix @ [(message.image.shape[2] - 1) / 2, -0.5, 0, 1])[:3]
+        if np.linalg.norm(middle - target[:3, 3]) < 0.5:
+            break
+    down = matrix[:3, 1] / np.linalg.norm(matrix[:3, 1])
+    assert np.allclose(middle, target[:3, 3], atol=0.5) and np.allclose(down, target[:3, 1], atol=1e-3)
+    assert message.image.max() > 50
+    page.get_by_text("following ProbeToReference").wait_for(timeout=5000)
+
+
+# ---- more than one page, reload, errors ------------------------------------------------------------------------------
+
+
+def test_two_tabs_show_and_drive_the_same_workstation(page, browser, url):
+    other = opened(browser, url)
+    before = pose(page)
+    other.keyboard.press("Shift+A")
+    settled(page)
+    assert pose(page)["rock_deg"] - before["rock_deg"] == pytest.approx(10, abs=0.7)
+    assert pose(other) == pose(page)
+    assert np.abs(pixels(page).astype(int) - pixels(other)).mean() < 1
+    other.close()
+    page.keyboard.press("a")  # and one can go
+    settled(page)
+    assert pose(page)["rock_deg"] - before["rock_deg"] == pytest.approx(12, abs=0.9)
+
+
+def test_a_reloaded_page_shows_what_there_was(page):
+    image = pixels(page)
+    page.reload()
+    page.wait_for_function("window.ussim && window.ussim.images > 0", timeout=30_000)
+    settled(page)
+    assert np.array_equal(pixels(page), image)
+    for view in views(page):
+        assert picture(page, view.bounding_box()).std() > 10
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("broken.nii.gz", b"this is no image", "broken.nii.gz: "),
+        ("settings.json", b'{"probe": {"kind": "square"}}', "kind"),
+        ("sweep.igs.mha", b"ObjectType = nonsense", "sweep.igs.mha: "),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page, name, content, message):
+    before = state(page, "title"), state(page, "field_probe_kind"), state(page, "node_mri")
+    page.set_input_files("#open-file", {"name": name, "mimeType": "application/octet-stream", "buffer": content})
+    text = shown_errors(page)
+    assert message in text and "/tmp" not in text and "Traceback" not in text
+    settled(page)
+    assert (state(page, "title"), state(page, "field_probe_kind"), state(page, "node_mri")) == before
+    page.locator(".ussim-error button").first.click()
+    page.wait_for_function("window.trame.state.get('errors').length === 0")
+
+
+def test_latency_is_measured_on_request(page):
+    click(page, "#show-latency")
+    page.wait_for_timeout(500)
+    drag(page, in_view(views(page)[1], 0.5, 0.15), (25, 5))
+    page.wait_for_timeout(400)
+    text = page.locator("#ussim-latency").inner_text()
+    assert "mouse to image" in text and "95 % within" in text
+    times = page.evaluate("window.ussim.measured")
+    assert times and min(times) > 1 and max(times) < 10_000
+    click(page, "#show-latency")
+
+
+# ---- who may come in, and how it is started --------------------------------------------------------------------------
+
+
+def test_from_other_computers_only_the_token_opens_the_door(browser, files):
+    import urllib.error
+    import urllib.request
+
+    def status(address: str, **headers: str) -> int:
+        try:
+            return urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=10).status
+        except urllib.error.HTTPError as error:
+            return error.code
+
+    with serving("--labels", str(files / "labels.nii.gz"), "--host", "0.0.0.0") as address:
+        token = address.partition("?token=")[2]
+        assert len(token) >= 32
+        port = address.split(":")[2].split("/")[0]
+        base = f"http://127.0.0.1:{port}/"
+        assert (
+            status(base) == status(f"{base}?token=wrong") == status(f"{base}index.html") == status(f"{base}ws") == 403
+        )
+        assert status(f"{base}?token={token}") == 200
+        assert status(f"{base}ws?token={token}", Origin="http://elsewhere.example") == 403
+        stranger = browser.new_page()
+        stranger.goto(f"{base}?token=wrong")
+        assert "token is missing or wrong" in stranger.locator("#reason").inner_text()
+        stranger.close()
+        # Only the owner's page gets as far as an image; here it is of labels without an MRI.
+        page = opened(browser, f"{base}?token={token}")
+        settled(page)
+        assert pixels(page).mean() > 5 and not state(page, "errors")
+        page.close()
+
+
+def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
+    import urllib.error
+    import urllib.request
+
+    for headers in ({"Origin": "http://elsewhere.example"}, {"Host": "elsewhere.example"}):
+        with pytest.raises(urllib.error.HTTPError) as caught:
+            urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=10)
+        assert caught.value.code == 403
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["missing.nii.gz"], "missing.nii.gz: no such file"),
+        (["{broken}"], "broken.nii.gz: cannot be read"),
+        (["--igtl", "nowhere"], "--igtl is 'nowhere', expected HOST:PORT"),
+        (["--sequence", "{broken}"], "broken.nii.gz"),
+        (["--host", "203.0.113.7"], "cannot listen at 203.0.113.7"),
+        (["--device", "no such device"], "no such device"),
+    ],
+)
+def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):
+    arguments = [text.format(broken=files / "broken.nii.gz") for text in arguments]
+    done = subprocess.run(
+        [sys.executable, "-m", "SlicerUSSim.cli", "serve", *arguments], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("ussim: ") and message in done.stderr and len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_port_that_is_taken_is_said():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = subprocess.run(
+            [sys.executable, "-m", "SlicerUSSim.cli", "serve", "--port", str(port)],
+            capture_output=True, text=True, timeout=60,
+        )  # fmt: skip
+    assert done.returncode == 2 and f"127.0.0.1:{port}" in done.stderr
