@@ -56,8 +56,12 @@ def files(folder: Path, pattern: str) -> set[str]:
 
 def test_every_script_and_resource_of_the_package_is_listed(record):
     package = ROOT / "SlicerUSSim"
-    # The command would be run by Slicer as if it were a module; CMakeLists.txt itself is not installed.
-    scripts = {path for path in files(package, "*.py") if path != "__init__.py" and not path.startswith("Command/")}
+    # Slicer has no use for the command and for the workstation in the browser; CMakeLists.txt itself is not installed.
+    scripts = {
+        path
+        for path in files(package, "*.py")
+        if path != "__init__.py" and not path.startswith(("Command/", "Widget/browser/"))
+    }
     assert set(record["SCRIPTS"]) == scripts and len(scripts) == len(record["SCRIPTS"])
     assert set(record["RESOURCES"]) == {f"Resources/{path}" for path in files(package / "Resources", "*")}
     assert record["NAME"] == ["SlicerUSSim"] and record["TEST"] == ["SlicerUSSim.py"]
