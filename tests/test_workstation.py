@@ -160,6 +160,15 @@ def settled(page: Page) -> None:
         last = count
 
 
+@contextlib.contextmanager
+def new_image(page: Page):
+    """What is done in it has to bring a new image."""
+    count = page.evaluate("window.ussim.images")
+    yield
+    page.wait_for_function("n => window.ussim.images > n", arg=count, timeout=30_000)
+    settled(page)
+
+
 def pixels(page: Page, stream: str = "simulated") -> np.ndarray:
     """(rows, columns) of a canvas."""
     size, values = page.evaluate(
@@ -342,8 +351,8 @@ def test_a_double_click_aims_the_probe_at_a_structure(page):
 def test_keys_and_sliders_move_the_probe(page):
     before = pose(page)
     for key, name, change in (("a", "rock_deg", 2), ("w", "tilt_deg", 2), ("Shift+E", "rotate_deg", 10)):
-        page.keyboard.press(key)
-        settled(page)
+        with new_image(page):
+            page.keyboard.press(key)
         after = pose(page)
         assert after[name] - before[name] == pytest.approx(change, abs=0.6), key
         before = after
@@ -355,8 +364,8 @@ def test_keys_and_sliders_move_the_probe(page):
     assert pose(page)["front_deg"] != before["front_deg"]
     slider = page.locator("#slider-pose_lift_mm").locator("xpath=ancestor::*[contains(@class,'v-slider')]").first
     box = slider.bounding_box()
-    page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
-    settled(page)
+    with new_image(page):
+        page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
     assert pose(page)["lift_mm"] == pytest.approx(10, abs=2)  # the middle of -10 to 30
     page.keyboard.press("w")  # what is typed into a field is not a key for the probe
     settled(page)
@@ -376,12 +385,10 @@ def test_segment_labels_the_mri_anew_and_says_what_it_cannot(page):
     for on in (False, True):
         page.get_by_label("Label thin sulci").set_checked(on)
         page.wait_for_function("on => window.trame.state.get('value_thin_sulci') === on", arg=on)
-        click(page, "#segmentButton")
-        settled(page)
+        with new_image(page):
+            click(page, "#segmentButton")
         assert not state(page, "errors") and pixels(page).mean() > 5
-        assert (
-            np.array_equal(pixels(page), before) == on
-        )  # without its sulci it is another image, and with them the same
+        assert np.array_equal(pixels(page), before) == on  # without sulci it is another image, with them the same
     classes = page.locator("#classesSpinBox")
     for count in ("4", "3"):
         classes.fill(count)
@@ -396,9 +403,9 @@ def test_a_changed_tissue_changes_the_image_and_nonsense_is_refused(page):
     open_section(page, "Tissues")
     cell, before = page.get_by_label("white matter mu0"), pixels(page)
     was = cell.input_value()
-    cell.fill("1.5")
-    cell.blur()
-    settled(page)
+    with new_image(page):
+        cell.fill("1.5")
+        cell.blur()
     assert pixels(page).mean() > before.mean() + 5
     cell.fill("bright")
     cell.blur()
@@ -406,8 +413,8 @@ def test_a_changed_tissue_changes_the_image_and_nonsense_is_refused(page):
     assert cell.input_value() == "1.5"
     page.get_by_role("row", name="white matter").locator("td").first.click()
     page.locator("#tissuePresetComboBox").select_option("white matter")
-    click(page, "#assignTissueButton")
-    settled(page)
+    with new_image(page):
+        click(page, "#assignTissueButton")
     assert cell.input_value() == was and np.abs(pixels(page).astype(int) - before).mean() < 0.5
 
 
@@ -418,20 +425,21 @@ def test_gain_probe_and_depth_change_the_image(page):
     )
     slider.scroll_into_view_if_needed()
     box = slider.bounding_box()
-    page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.5 * box["height"])
-    settled(page)
+    with new_image(page):
+        page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.5 * box["height"])
     assert state(page, "field_display_gain_db") > 5 and pixels(page).mean() > before.mean() + 10
     probe, gain = state(page, "control_probePresetComboBox"), state(page, "field_display_gain_db")
-    page.locator("#probePresetComboBox").select_option("linear")
-    settled(page)
+    with new_image(page):
+        page.locator("#probePresetComboBox").select_option("linear")
     assert state(page, "field_probe_kind") == "linear" and state(page, "field_probe_radius_mm") is None
     assert page.locator("#radiusSpinBox").is_disabled() and probe == "custom" and gain > 5
     page.locator("#widthSpinBox").fill("-5")
     page.locator("#widthSpinBox").blur()
     assert "width_mm is -5" in shown_errors(page)
     assert float(page.locator("#widthSpinBox").input_value()) > 0
-    page.set_input_files("#open-file", {"name": "a.json", "mimeType": "application/json", "buffer": _preset(page)})
-    settled(page)
+    preset = {"name": "a.json", "mimeType": "application/json", "buffer": _preset(page)}
+    with new_image(page):
+        page.set_input_files("#open-file", preset)
     assert state(page, "field_probe_kind") == "phased" and state(page, "field_display_gain_db") == 0
 
 
@@ -516,11 +524,11 @@ def test_a_fit_shows_its_costs_and_is_applied_and_reverted(page):
     curve = state(page, "fit_curve")
     assert len(curve) > 10 and min(curve) < curve[0]
     assert f"→ {min(curve):.3f}" in page.locator("#cost-curve").inner_text()
-    click(page, "#applyFitButton")
-    settled(page)
+    with new_image(page):
+        click(page, "#applyFitButton")
     assert float(state(page, "similarity").split()[1]) < before
-    click(page, "#revertFitButton")
-    settled(page)
+    with new_image(page):
+        click(page, "#revertFitButton")
     assert float(state(page, "similarity").split()[1]) == pytest.approx(before, abs=0.02)
 
 

@@ -83,6 +83,7 @@ class UltrasoundSceneLogic:
         self._texture: tuple[LabelledTissues, Texture] | None = None  # of those labels
         self._preset: tuple[str, Preset] = ("", Preset())
         self._live: LiveUpdate | None = None
+        self._last: tuple[Frame, np.ndarray] | None = None  # and where the probe was
 
     # ---- what is set -------------------------------------------------------------------------------------------
 
@@ -154,11 +155,27 @@ class UltrasoundSceneLogic:
         `warned` is told what there is to warn of.
         """
         self._check_output(labels_node, output_node)
-        frame = self._frame(labels_node, probe_pose(probe_transform_node), warned)
+        probe_to_world = probe_pose(probe_transform_node)
+        frame = self._frame(labels_node, probe_to_world, warned)
         self._check_output(labels_node, output_node)  # much may have happened meanwhile
         require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
+        self._last = (frame, probe_to_world)
         write_image(output_node, frame, probe_transform_node)
         return frame
+
+    @property
+    def lastFrame(self) -> Frame | None:
+        """What simulate() computed last."""
+        return None if self._last is None else self._last[0]
+
+    def lastImage(self) -> Volume:
+        """The image of lastFrame as one slice where the probe was then (RAS), wherever its transform is now.
+
+        Raises SimulationError if there is none.
+        """
+        require(self._last is not None, "there is no image yet, simulate one first")
+        frame, probe_to_world = self._last
+        return Volume(frame.image[None], probe_to_world @ frame.grid.slice_to_probe)
 
     def simulateSequence(
         self,

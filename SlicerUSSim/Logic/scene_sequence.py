@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import slicer
 
@@ -12,24 +14,25 @@ from SlicerUSSim.Logic.vtk_data import vtk_matrix
 
 
 def add_sequence(
-    scene, sequence: TrackedSequence, name: str, path: str = "ImageToReference", to_ras: np.ndarray | None = None
+    scene,
+    sequence: TrackedSequence,
+    name: str,
+    path: str = "ImageToReference",
+    to_ras: np.ndarray | None = None,
+    poses: Sequence[np.ndarray] = (),
+    probe_transform_node=None,
 ):
-    """(browser, images, transforms): a vtkMRMLSequenceBrowserNode and two vtkMRMLSequenceNodes in `scene`.
+    """(browser, images): a vtkMRMLSequenceBrowserNode and the vtkMRMLSequenceNode of the images in `scene`.
 
-    The images are in pixels under the transforms, which take them to the world (RAS); `path` and `to_ras` (4, 4) are
-    those of TrackedImages.of. Images that were not tracked are left out.
-    Raises SimulationError if none were.
+    The images are in pixels under recorded transforms, which take them to the world (RAS); `path` and `to_ras` (4, 4)
+    are those of TrackedImages.of. Images that were not tracked are left out. `poses`, one probe_to_ras (4, 4) for each
+    image that is kept, become a sequence too, which `probe_transform_node` follows when the browser plays.
+    Raises SimulationError if no image was tracked.
     """
     numbers = [number for number in range(len(sequence)) if sequence.has_pose(number, path)] or [0]
     matrices = [sequence.pose(number, path) for number in numbers]
     to_ras = np.eye(4) if to_ras is None else to_ras
-    images, transforms = (
-        scene.AddNewNodeByClass("vtkMRMLSequenceNode", scene.GenerateUniqueName(f"{name}{end}"))
-        for end in ("", " transforms")
-    )
-    for node in (images, transforms):
-        node.SetIndexName("time")
-        node.SetIndexUnit("s")
+    images, transforms = _sequence_node(scene, name), _sequence_node(scene, f"{name} transforms")
     for number, matrix in zip(numbers, matrices, strict=True):
         index = f"{sequence.timestamps[number]:.6f}"
         image = slicer.vtkMRMLScalarVolumeNode()
@@ -50,4 +53,21 @@ def add_sequence(
     shown.SetAndObserveTransformNodeID(placed.GetID())
     browser.AddProxyNode(placed, transforms, False)
     browser.AddProxyNode(shown, images, False)
-    return browser, images, transforms
+    if len(poses):
+        held = _sequence_node(scene, f"{name} probe")
+        for number, pose in zip(numbers, poses, strict=True):
+            transform = slicer.vtkMRMLLinearTransformNode()
+            transform.SetName(f"{name} probe")
+            transform.SetMatrixTransformToParent(vtk_matrix(pose))
+            held.SetDataNodeAtValue(transform, f"{sequence.timestamps[number]:.6f}")
+        browser.AddSynchronizedSequenceNodeID(held.GetID())
+        if probe_transform_node is not None:
+            browser.AddProxyNode(probe_transform_node, held, False)
+    return browser, images
+
+
+def _sequence_node(scene, name: str):
+    node = scene.AddNewNodeByClass("vtkMRMLSequenceNode", scene.GenerateUniqueName(name))
+    node.SetIndexName("time")
+    node.SetIndexUnit("s")
+    return node

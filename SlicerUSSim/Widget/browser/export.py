@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
+import json
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,7 +15,11 @@ from PIL import Image
 from vtkmodules.vtkCommonCore import vtkOutputWindow
 
 from SlicerUSSim.Logic.errors import SimulationError, require
+from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
+from SlicerUSSim.Logic.scene_nodes import pose_in_labels, probe_pose, read_labels
+from SlicerUSSim.Logic.script import python_script
 from SlicerUSSim.Logic.volume import Volume
+from SlicerUSSim.Widget.browser.opener import Opener
 
 #: Files of an image with its geometry.
 FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
@@ -34,21 +41,6 @@ def frame_file(image: Volume, suffix: str) -> bytes:
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"frame{suffix}"
         image.write(path)
-        return path.read_bytes()
-
-
-def scene_file(app) -> bytes:
-    """The scene of a SlicerApp as .mrb, which 3D Slicer opens. Raises SimulationError if it cannot be written."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "ultrasound.mrb"
-        window = vtkOutputWindow.GetInstance()
-        window.SetDisplayModeToNever()  # of every file in it
-        try:
-            written = app.io_manager.write_scene(path)
-        finally:
-            window.SetDisplayModeToAlwaysStdErr()
-        if not written or not path.exists():
-            raise SimulationError("the scene could not be written")
         return path.read_bytes()
 
 
@@ -82,3 +74,54 @@ class Cine:
             buffer, "GIF", save_all=True, append_images=others, duration=waits.round(-1).astype(int).tolist(), loop=0
         )
         return buffer.getvalue()
+
+
+class Exports:
+    """What the menu Export offers, by kind: png, .nrrd, .mha, .vti, gif, mrb, json; and the script.
+
+    Each is (file name, content, MIME type). Raises SimulationError where there is nothing to export.
+    """
+
+    def __init__(self, app, logic: UltrasoundSceneLogic, opener: Opener) -> None:
+        self._app, self._logic, self._opener = app, logic, opener
+        self.cine = Cine()
+
+    async def export(self, kind: str) -> tuple[str, bytes, str]:
+        """One kind; what takes long leaves the event loop free."""
+        if kind == "json":
+            return "preset.json", json.dumps(self._logic.preset.to_dict(), indent=2).encode(), "application/json"
+        if kind == "mrb":
+            return "ultrasound.mrb", scene_file(self._app), "application/zip"
+        if kind == "gif":
+            content = await asyncio.get_running_loop().run_in_executor(None, self.cine.gif)
+            return "ultrasound.gif", content, "image/gif"
+        image = self._logic.lastImage()
+        if kind == "png":
+            return "ultrasound.png", png(image.array[0]), "image/png"
+        return f"ultrasound{kind}", frame_file(image, kind), "application/octet-stream"
+
+    def script(self) -> str:
+        """A script that gives the image on the screen again."""
+        parameters, preset = self._logic.parameters, self._logic.preset
+        labels, transform = parameters.labels, parameters.probe_transform
+        require(labels is not None and transform is not None, "there is no image yet, expected labels and a probe")
+        source = self._opener.source_of(labels)
+        in_labels, moved = pose_in_labels(labels, probe_pose(transform))
+        require(np.allclose(moved, np.eye(4)), f"{labels.GetName()!r} is scaled by a transform, expected a rigid one")
+        names = read_labels(labels, preset.tissues).names
+        return python_script(source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels)
+
+
+def scene_file(app) -> bytes:
+    """The scene of a SlicerApp as .mrb, which 3D Slicer opens. Raises SimulationError if it cannot be written."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "ultrasound.mrb"
+        window = vtkOutputWindow.GetInstance()
+        window.SetDisplayModeToNever()  # of every file in it
+        try:
+            written = app.io_manager.write_scene(path)
+        finally:
+            window.SetDisplayModeToAlwaysStdErr()
+        if not written or not path.exists():
+            raise SimulationError("the scene could not be written")
+        return path.read_bytes()

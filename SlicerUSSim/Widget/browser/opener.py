@@ -52,6 +52,7 @@ class Opener:
 
     def __init__(self, scene, logic: UltrasoundSceneLogic, tasks: Tasks, files: Files) -> None:
         self._scene, self._logic, self._tasks, self._files = scene, logic, tasks, files
+        self._sources: dict[tuple, LabelSource] = {}
 
     def mri(self, path: str | None):
         """A node with the MRI of a file, or the demo brain."""
@@ -72,7 +73,7 @@ class Opener:
         return self._label_map(self._tasks.do(lambda: Volume.read(path)), path, ["inside"])
 
     def labels(self, path: str):
-        """(label map node, where it comes from); its tissues are in the .json beside the file, or the preset's."""
+        """A label map node; its tissues are in the .json beside the file, or the preset's."""
         volume = self._tasks.do(lambda: Volume.read(path))
         beside, preset = tissues_beside(Path(path)), self._logic.preset
         tissues = TissueTable.read(beside) if beside.exists() else preset.tissues
@@ -89,7 +90,22 @@ class Opener:
         node = self._label_map(volume, path, names)
         order = read_labels(node, self._logic.preset.tissues).names
         relabelled = (0, *(order.index(name) + 1 if name in order else 0 for name in names))
-        return node, LabelSource(os.path.abspath(path), True, relabelled=relabelled)
+        self._sources = {_voxels_of(node): LabelSource(os.path.abspath(path), True, relabelled=relabelled)}
+        return node
+
+    def segmented(self, labels_node, mri_node, mask_node, options: dict) -> None:
+        """Remember what labels were made of."""
+        file, mask = mri_node.GetAttribute(FILE), None if mask_node is None else mask_node.GetAttribute(FILE)
+        self._sources = {}
+        if file is not None and (mask_node is None or mask is not None):
+            self._sources[_voxels_of(labels_node)] = LabelSource(file, mask=mask, options=options)
+
+    def source_of(self, labels_node) -> LabelSource:
+        """What labels were made of. Raises SimulationError where it were not files."""
+        source = self._sources.get(_voxels_of(labels_node))
+        name = labels_node.GetName()
+        require(source is not None, f"{name!r} was not made from files here; save it, and open it with --labels")
+        return source
 
     def sequence(self, sequence: TrackedSequence, name: str):
         """(TrackedImages, sequence browser node, sequence node of the images)."""
@@ -100,7 +116,10 @@ class Opener:
                 probe=preset.probe if files.preset is not None else None,
             )
         )  # fmt: skip
-        browser, images, _ = add_sequence(self._scene, sequence, name, files.transform, files.to_ras)
+        browser, images = add_sequence(
+            self._scene, sequence, name, files.transform, files.to_ras, tracked.poses,
+            self._logic.parameters.probe_transform,
+        )  # fmt: skip
         return tracked, browser, images
 
     @contextmanager
@@ -134,3 +153,9 @@ def _require_labels(volume: Volume, path: str) -> None:
         bool(np.issubdtype(array.dtype, np.integer)) and int(array.min()) >= 0 and 0 < int(array.max()) < 256,
         f"{path}: is not a label map, expected whole numbers from 0 to 255",
     )
+
+
+def _voxels_of(labels_node) -> tuple:
+    """Changes with the voxels of a label map."""
+    image = labels_node.GetImageData() if labels_node.IsA("vtkMRMLVolumeNode") else None
+    return labels_node.GetID(), None if image is None else image.GetMTime()

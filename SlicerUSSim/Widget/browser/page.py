@@ -11,7 +11,6 @@ from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import html
 from trame.widgets import vuetify3 as v3
 
-from SlicerUSSim.Widget.browser.export import FRAME_SUFFIXES
 from SlicerUSSim.Widget.browser.view import CUSTOM_PROBE, state_key
 from SlicerUSSim.Widget.browser.views import PLANES, SLICE_VIEWS
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS
@@ -48,7 +47,9 @@ POSE_SLIDERS = (
 )
 _EXPORTS = (
     ("png", "Image (PNG)"),
-    *((suffix, f"Image with geometry ({suffix[1:].upper()})") for suffix in FRAME_SUFFIXES),
+    (".nrrd", "Image with geometry (NRRD)"),
+    (".mha", "Image with geometry (MHA)"),
+    (".vti", "Image with geometry (VTI)"),
     ("gif", "Cine of the last images (GIF)"),
     ("mrb", "Scene for 3D Slicer (MRB)"),
     ("json", "Settings (JSON)"),

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy import ndimage
+from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.errors import SimulationError
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
@@ -57,11 +58,11 @@ class Comparison:
     ----------
     state : of the trame server.
     move : takes the pose (4, 4) that a real image was taken at.
-    grid : gives the pixels of the simulated image.
     """
 
-    def __init__(self, state, move: Callable[[np.ndarray], None], grid: Callable[[], ImageGrid]) -> None:
-        self._state, self._move, self._grid = state, move, grid
+    def __init__(self, state, move: Callable[[np.ndarray], None]) -> None:
+        self._state, self._move = state, move
+        self._grid: ImageGrid | None = None  # of the simulated image
         self._real: RealImages | None = None
         self._browser = None
         self._playing: asyncio.Task | None = None
@@ -90,18 +91,21 @@ class Comparison:
 
     def send(self) -> None:
         """Send the real image to the pages, if they show it."""
-        if self._real is None or self._state.comparison == SIMULATED:
+        if self._real is None or self._grid is None or self._state.comparison == SIMULATED:
             return
-        image, _ = self._real.on_grid(self._state.sequence_number, self._grid())
+        image, _ = self._real.on_grid(self._state.sequence_number, self._grid)
         for stream in self.streams:
             stream.send(image)
 
-    def compare(self, simulated: np.ndarray) -> None:
+    def compare(self, simulated: np.ndarray, grid: ImageGrid) -> None:
         """Tell how alike a simulated image and the real one are; of images that come too fast, some."""
+        if grid != self._grid:
+            self._grid = grid
+            self.send()
         if self._real is None or self._comparing:
             return
         self._comparing = True
-        real, number, grid = self._real, self._state.sequence_number, self._grid()
+        real, number = self._real, self._state.sequence_number
 
         async def compare() -> None:
             try:
@@ -114,7 +118,7 @@ class Comparison:
             with self._state:
                 self._state.similarity = text
 
-        asyncio.get_event_loop().create_task(compare())
+        get_event_loop().create_task(compare())
 
     def play(self) -> None:
         """Play the sequence round and round, or stop."""
@@ -123,7 +127,7 @@ class Comparison:
             self._playing.cancel()
             self._playing = None
         elif self._real is not None:
-            self._playing = asyncio.get_event_loop().create_task(self._play_on())
+            self._playing = get_event_loop().create_task(self._play_on())
 
     async def _play_on(self) -> None:
         while True:

@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 from PIL import Image
+from trame_server.utils.asynchronous import get_event_loop
 
 #: Visually without loss on speckle, a fifth of the size of PNG, and encoded in a millisecond.
 _QUALITY = 92
@@ -32,7 +33,7 @@ class ImageStream:
         self._waiting = (image, about)
         if not self._encoding:
             self._encoding = True
-            asyncio.get_event_loop().create_task(self._encode_all())
+            get_event_loop().create_task(self._encode_all())
 
     def send_again(self) -> None:
         """Send the last image once more, to pages that have just opened."""

@@ -6,12 +6,12 @@ has work to do (UltrasoundSceneLogic, `work`), its greenlet waits, and the event
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 from greenlet import getcurrent, greenlet
+from trame_server.utils.asynchronous import get_event_loop
 
 T = TypeVar("T")
 
@@ -26,7 +26,7 @@ class Tasks:
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         self._failed = failed
-        self._loop = asyncio.get_event_loop()
+        self._loop = get_event_loop()
         # One: what a device does for one task must not change what it does for another in its midst.
         self._executor = ThreadPoolExecutor(1, "ultrasound")
 
@@ -70,7 +70,7 @@ class AtMost:
         self._next, self._waiting = 0.0, False
 
     def __call__(self) -> None:
-        loop = asyncio.get_event_loop()
+        loop = get_event_loop()
         if self._waiting:
             return
         if loop.time() >= self._next:
@@ -81,5 +81,5 @@ class AtMost:
 
     def _run(self) -> None:
         self._waiting = False
-        self._next = asyncio.get_event_loop().time() + self._seconds
+        self._next = get_event_loop().time() + self._seconds
         self._function()

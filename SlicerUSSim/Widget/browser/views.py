@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 
 import numpy as np
+from trame_server.utils.asynchronous import get_event_loop
 from trame_slicer.core import LayoutManager, SlicerApp
 from trame_slicer.rca_view import register_rca_factories
 from trame_slicer.views import AbstractView, Layout, LayoutDirection, SliceView, ThreeDView, ViewLayoutDefinition
@@ -84,7 +84,7 @@ class AnatomyViews:
             # Once the view itself knows its new size.
             view.interactor().AddObserver(
                 vtkCommand.WindowResizeEvent,
-                lambda *_, view=view: asyncio.get_event_loop().call_later(0.05, self._fit_anew, view),
+                lambda *_, view=view: get_event_loop().call_later(0.05, self._fit_anew, view),
             )
         self.threed.get_view_node().SetUseDepthPeeling(False)
         self.threed.renderer().SetUseDepthPeeling(False)

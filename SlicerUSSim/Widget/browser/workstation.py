@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import traceback
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -13,6 +12,7 @@ from time import perf_counter
 import numpy as np
 from slicer import vtkSlicerSequencesLogic
 from trame.app import get_server
+from trame_server.utils.asynchronous import get_event_loop
 from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkCommand
 
@@ -23,20 +23,17 @@ from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.scene_nodes import (
     labels_version,
     node_to_world,
-    pose_in_labels,
     probe_pose,
     read_labels,
-    read_volume,
     set_node_to_world,
 )
-from SlicerUSSim.Logic.script import LabelSource, python_script
 from SlicerUSSim.Logic.sequence import TrackedSequence
 from SlicerUSSim.Logic.surface import PatientSurface
 from SlicerUSSim.Logic.tracking import TrackerLink, parse_address
 from SlicerUSSim.Logic.volume import Volume
-from SlicerUSSim.Widget.browser.export import FRAME_SUFFIXES, Cine, frame_file, png, scene_file
+from SlicerUSSim.Widget.browser.export import Exports
 from SlicerUSSim.Widget.browser.hand import KEYS, ProbeHand
-from SlicerUSSim.Widget.browser.opener import FILE, Files, Opener
+from SlicerUSSim.Widget.browser.opener import Files, Opener
 from SlicerUSSim.Widget.browser.page import POSE_SLIDERS, build_page, initial_state, view_tools
 from SlicerUSSim.Widget.browser.real import Comparison
 from SlicerUSSim.Widget.browser.streams import ImageStream
@@ -79,16 +76,16 @@ class Workstation:
         self.hand = ProbeHand(self.pose, self._moved_by_hand, lambda: self._surface, self._hold)
         for view in (self.views.threed, *self.views.slices):
             self.hand.attach(view)
-        self.cine = Cine()
         self._stream = ImageStream("simulated")
         self.opener = Opener(self.app.scene, self.logic, self.tasks, files)
-        self.comparison = Comparison(self.state, self.move_probe, self._grid)
+        self.exports = Exports(self.app, self.logic, self.opener)
+        self.comparison = Comparison(self.state, self.move_probe)
         self._surface: PatientSurface | None = None
         self._surface_version: object = None
-        self._source: tuple[object, LabelSource] | None = None  # labels of that version came from there
         self._link: TrackerLink | None = None
         self._observed: dict[str, tuple[object, int]] = {}
-        self._drawn_probe = self._field_of = self._in_field = None
+        self._drawn_probe = None
+        self._field: tuple = (None, None)  # of an image's grid and probe
         self._stamp_told = self._stamp_applied = self._stamp_computed = None
         self._refreshing = False
         self._connect(sections)
@@ -136,7 +133,7 @@ class Workstation:
             if files.tracker is not None:
                 host, port, listen = parse_address(files.tracker)
                 self._link = TrackerLink(host, port, self._tracked, device=files.tracker_device, listen=listen)
-                asyncio.get_event_loop().create_task(self._show_tracker())
+                get_event_loop().create_task(self._show_tracker())
             if files.mri is not None or files.labels is None:
                 self._take_mri(files.mri)
             if files.mask is not None:
@@ -169,11 +166,10 @@ class Workstation:
     # ---- files -------------------------------------------------------------------------------------------------
 
     def _take_labels(self, path: str) -> None:
-        node, source = self.opener.labels(path)
+        node = self.opener.labels(path)
         if self.logic.parameters.mri is None:
             self._take_volume(node)
         self.logic.parameters.labels = node
-        self._source = (_voxels_of(node), source)
         self._labels_ready()
 
     def _take_mri(self, path: str | None) -> None:
@@ -232,10 +228,7 @@ class Workstation:
         self.presenter.segment()
         if labels is None or labels_version(labels) == before or labels.GetImageData() is None:
             return
-        mask_file = None if mask is None else mask.GetAttribute(FILE)
-        file = mri.GetAttribute(FILE)
-        known = file is not None and (mask is None or mask_file is not None)
-        self._source = (_voxels_of(labels), LabelSource(file, mask=mask_file, options=options)) if known else None
+        self.opener.segmented(labels, mri, mask, options)
         self._labels_ready()
 
     def _labels_ready(self) -> None:
@@ -301,9 +294,12 @@ class Workstation:
     # ---- the probe ---------------------------------------------------------------------------------------------
 
     def pose(self) -> np.ndarray | None:
-        """(4, 4) probe_to_world, or None without a probe."""
+        """(4, 4) probe_to_world, or None without a probe, or with one that is scaled: simulating says so."""
         transform = self.logic.parameters.probe_transform
-        return None if transform is None else probe_pose(transform)
+        try:
+            return None if transform is None else probe_pose(transform)
+        except SimulationError:
+            return None
 
     def move_probe(self, probe_to_world: np.ndarray) -> None:
         """Put the probe somewhere; the image follows."""
@@ -405,7 +401,7 @@ class Workstation:
     def _tell_field(self) -> None:
         """What the page draws around the image: its place in the probe frame, depths, focus, grey levels."""
         preset = self.logic.preset
-        grid = self._grid()
+        grid = ImageGrid.for_probe(preset.probe, preset.display.image_size)
         width, height = grid.columns * grid.pixel_spacing_mm[0], grid.rows * grid.pixel_spacing_mm[1]
         step = 10 if height > 40 else 5
         ticks = [
@@ -425,31 +421,20 @@ class Workstation:
         self._stamp_computed = self._stamp_applied
 
     def _image_changed(self, *_) -> None:
-        output = self.logic.parameters.output
-        image = read_volume(output).array[0].copy()
-        self._stream.send(image, stamp=self._stamp_computed)
-        self.cine.add(image, perf_counter())
-        self.views.show_image(output, self._field())
+        frame = self.logic.lastFrame
+        self._stream.send(frame.image, stamp=self._stamp_computed)
+        self.exports.cine.add(frame.image, perf_counter())
+        self.views.show_image(self.logic.parameters.output, self._field_of(frame.grid))
         if self._link is not None:
-            self._link.send(self._placed_image())
-        self.comparison.compare(image)
+            self._link.send(self.logic.lastImage())
+        self.comparison.compare(frame.image, frame.grid)
 
-    def _grid(self) -> ImageGrid:
-        preset = self.logic.preset
-        return ImageGrid.for_probe(preset.probe, preset.display.image_size)
-
-    def _field(self) -> np.ndarray:
-        """(rows, columns) bool: where the image shows anything."""
-        grid, probe = self._grid(), self.logic.preset.probe
-        if self._field_of != (grid, probe):
-            self._field_of, self._in_field = (grid, probe), grid.field(probe)
-        return self._in_field
-
-    def _placed_image(self) -> Volume:
-        output = self.logic.parameters.output
-        require(output is not None and output.GetImageData() is not None, "there is no image yet, expected one")
-        volume = read_volume(output)
-        return Volume(volume.array.copy(), node_to_world(output) @ volume.ijk_to_ras)
+    def _field_of(self, grid: ImageGrid) -> np.ndarray:
+        """(rows, columns) bool: where an image shows anything."""
+        probe = self.logic.preset.probe
+        if self._field[0] != (grid, probe):
+            self._field = ((grid, probe), grid.field(probe))
+        return self._field[1]
 
     def _opened(self) -> None:
         """Another page came: it has to be shown what there is."""
@@ -475,49 +460,15 @@ class Workstation:
     async def _export(self, kind: str):
         """[file name, content, MIME type], or None after the page was told why not."""
         try:
-            name, content, mime = await self._exported(kind)
+            name, content, mime = await self.exports.export(kind)
         except SimulationError as error:
             self.view.showError(str(error))
             return None
         return [name, self.server.protocol.addAttachment(content), mime]
 
-    async def _exported(self, kind: str) -> tuple[str, bytes, str]:
-        if kind == "json":
-            return "preset.json", json.dumps(self.logic.preset.to_dict(), indent=2).encode(), "application/json"
-        if kind == "mrb":
-            return "ultrasound.mrb", scene_file(self.app), "application/zip"
-        if kind == "gif":
-            content = await asyncio.get_event_loop().run_in_executor(None, self.cine.gif)
-            return "ultrasound.gif", content, "image/gif"
-        image = self._placed_image()
-        if kind == "png":
-            return "ultrasound.png", png(image.array[0]), "image/png"
-        require(kind in FRAME_SUFFIXES, f"nothing is exported as {kind!r}")
-        return f"ultrasound{kind}", frame_file(image, kind), "application/octet-stream"
-
-    def script(self) -> str:
-        """A script that gives the image on the screen again. Raises SimulationError where its labels have no file."""
-        labels, pose = self.logic.parameters.labels, self.pose()
-        require(labels is not None and pose is not None, "there is no image yet, expected labels and a probe")
-        require(
-            self._source is not None and self._source[0] == _voxels_of(labels),
-            f"{labels.GetName()!r} was not made from files by this workstation; save it, and open it as --labels",
-        )
-        preset = self.logic.preset
-        in_labels, moved = pose_in_labels(labels, pose)
-        require(np.allclose(moved, np.eye(4)), f"{labels.GetName()!r} is scaled by a transform, expected a rigid one")
-        names = read_labels(labels, preset.tissues).names
-        return python_script(self._source[1], replace(preset, tissues=preset.tissues.for_names(names)), in_labels)
-
     def _show_script(self) -> None:
         with self.presenter.shown():
-            self.state.update({"script": self.script(), "show_script": True})
+            self.state.update({"script": self.exports.script(), "show_script": True})
 
     def _dismiss(self, number: int) -> None:
         self.state.errors = [message for n, message in enumerate(self.state.errors) if n != number]
-
-
-def _voxels_of(labels_node) -> tuple:
-    """Changes with the voxels of a label map."""
-    image = labels_node.GetImageData() if labels_node.IsA("vtkMRMLVolumeNode") else None
-    return labels_node.GetID(), None if image is None else image.GetMTime()
