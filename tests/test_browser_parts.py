@@ -1,0 +1,336 @@
+"""What the workstation is made of, without a browser: tasks, cines, scripts, sequences as nodes, the probe's shape."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkFeatureEdges, vtkMassProperties, vtkTriangleFilter
+
+from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationError, TissueTable, UltrasoundSimulator
+from SlicerUSSim.Logic.phantoms import head_mri
+from SlicerUSSim.Logic.placement import craniotomy_pose, tilt_sweep, turned
+from SlicerUSSim.Logic.preset import Preset
+from SlicerUSSim.Logic.probe import PROBES
+from SlicerUSSim.Logic.probe_shape import field_polydata, probe_polydata
+from SlicerUSSim.Logic.scan_conversion import ImageGrid
+from SlicerUSSim.Logic.script import LabelSource, python_script
+from SlicerUSSim.Logic.segmentation import segment_mri
+from SlicerUSSim.Logic.sequence import TrackedSequence
+from SlicerUSSim.Logic.volume import read_array
+
+slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
+pytest.importorskip("greenlet", reason="the workstation comes with: pip install '.[serve]'")
+pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
+
+from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.scene_fit import tracked_images  # noqa: E402
+from SlicerUSSim.Logic.scene_nodes import probe_pose, set_node_to_world, write_labels, write_volume  # noqa: E402
+from SlicerUSSim.Logic.scene_sequence import add_sequence  # noqa: E402
+from SlicerUSSim.Widget.browser.export import Cine  # noqa: E402
+from SlicerUSSim.Widget.browser.tasks import AtMost, Tasks  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def head():
+    return segment_mri(head_mri(3.0), thin_sulci=True)
+
+
+# ---- tasks -----------------------------------------------------------------------------------------------------------
+
+
+def run_in_loop(coroutine_function):
+    """What an async function gives in a loop of its own."""
+    loop = asyncio.new_event_loop()
+    asyncio.set_event_loop(loop)
+    try:
+        return loop.run_until_complete(asyncio.wait_for(coroutine_function(), 60))
+    finally:
+        asyncio.set_event_loop(None)
+        loop.close()
+
+
+def test_while_work_is_done_the_event_loop_goes_on_and_results_come_back_to_their_tasks():
+    async def scenario():
+        tasks, seen, ticks = Tasks(seen_errors.append), [], 0
+
+        def work(name: str):
+            time.sleep(0.1)
+            return name, threading.get_ident()
+
+        def task(name: str) -> None:
+            here = threading.get_ident()
+            result, thread = tasks.do(lambda: work(name))
+            seen.append((result, thread != here, threading.get_ident() == here))
+
+        for name in ("first", "second"):
+            tasks.start(lambda name=name: task(name))
+        while len(seen) < 2:
+            ticks += 1
+            await asyncio.sleep(0.01)
+        tasks.stop()
+        return seen, ticks
+
+    seen_errors: list[Exception] = []
+    seen, ticks = run_in_loop(scenario)
+    assert seen == [("first", True, True), ("second", True, True)] and ticks > 8 and not seen_errors
+
+
+def test_errors_of_work_reach_the_task_and_those_of_tasks_are_told():
+    async def scenario():
+        errors, caught = [], []
+        tasks = Tasks(errors.append)
+
+        def mends() -> None:
+            try:
+                tasks.do(lambda: 1 / 0)
+            except ZeroDivisionError as error:
+                caught.append(error)
+
+        tasks.start(mends)
+        tasks.start(lambda: tasks.do(lambda: [].pop()))
+        while not (caught and errors):
+            await asyncio.sleep(0.01)
+        assert tasks.do(lambda: 7) == 7  # outside of a task it simply waits
+        tasks.stop()
+        return errors
+
+    assert [type(error) for error in run_in_loop(scenario)] == [IndexError]
+
+
+def test_what_is_called_too_often_is_called_once_more_at_the_end():
+    async def scenario():
+        times: list[float] = []
+        often = AtMost(0.1, lambda: times.append(time.monotonic()))
+        for _ in range(30):
+            often()
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.2)
+        return times
+
+    times = run_in_loop(scenario)
+    assert 3 <= len(times) <= 5 and min(np.diff(times)) > 0.09
+
+
+def test_changes_that_come_while_an_image_is_computed_bring_one_more_of_the_last_pose(head):
+    async def scenario():
+        errors, reports = [], []
+        tasks = Tasks(errors.append)
+        scene = slicer.vtkMRMLScene()
+        labels, transform, output = (
+            scene.AddNewNodeByClass(f"vtkMRML{kind}Node")
+            for kind in ("LabelMapVolume", "LinearTransform", "ScalarVolume")
+        )
+        write_labels(labels, head.labels, head.tissue_names, labels)
+        logic = UltrasoundSceneLogic(scene, work=tasks)
+        set_node_to_world(transform, craniotomy_pose(head.labels, logic.preset.probe))
+        started = asyncio.Event()
+
+        def begin() -> None:
+            logic.startLiveUpdate(labels, transform, output, schedule=tasks.start, report=reports.append)
+            started.set()
+
+        tasks.start(begin)
+        await started.wait()
+        start = probe_pose(transform)
+        images = len(reports)
+        for step in range(1, 40):
+            set_node_to_world(transform, turned(start, rock_deg=0.5 * step))
+            await asyncio.sleep(0.002)
+        for _ in range(200):
+            await asyncio.sleep(0.01)
+            moved = np.linalg.inv(probe_pose(transform)) @ logic.lastImage().ijk_to_ras
+            if np.allclose(moved, logic.lastFrame.grid.slice_to_probe, atol=1e-6):
+                break
+        count = len(reports)
+        await asyncio.sleep(0.3)
+        logic.stopLiveUpdate()
+        tasks.stop()
+        assert np.allclose(moved, logic.lastFrame.grid.slice_to_probe, atol=1e-6)
+        return count - images, len(reports) - count, errors, reports
+
+    images, after, errors, reports = run_in_loop(scenario)
+    assert 1 <= images < 39 and after == 0 and not errors and not any(reports)
+
+
+# ---- export ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_cine_keeps_time_and_begins_anew_with_another_size():
+    cine = Cine()
+    with pytest.raises(SimulationError, match="holds 0 images"):
+        cine.gif()
+    cine.add(np.zeros((10, 10), np.uint8), 0.0)
+    for number in range(4):
+        cine.add(np.full((12, 16), 50 * number, np.uint8), 10.0 + 0.25 * number)
+    gif = Image.open(io.BytesIO(cine.gif()))
+    assert gif.size == (16, 12) and gif.n_frames == 4 and len(cine) == 4
+    for number in range(3):
+        gif.seek(number)
+        assert gif.info["duration"] == 250 and np.asarray(gif.convert("L"))[0, 0] == 50 * number
+
+
+def test_the_script_of_a_label_map_simulates_the_same_image(head, tmp_path):
+    # Labels that the scene numbers in another way: 7 for white matter, and 3 for grey matter.
+    numbers = {"csf": 2, "grey matter": 3, "white matter": 7, "leptomeninges": 5}
+    table = np.zeros(len(head.tissue_names) + 1, np.uint8)
+    for label, name in enumerate(head.tissue_names, 1):
+        table[label] = numbers[name]
+    head.labels.with_array(table[head.labels.array]).write(tmp_path / "labels.nii.gz")
+    back = [0] * 8
+    for label, name in enumerate(head.tissue_names, 1):
+        back[numbers[name]] = label
+    probe = PhasedProbe(60.0, 60.0, scan_lines=48)
+    preset = Preset(probe=probe, tissues=TissueTable.brain(head.tissue_names))
+    preset = preset.changed("display", gain_db=4.0)
+    pose = craniotomy_pose(head.labels, probe)
+    source = LabelSource(str(tmp_path / "labels.nii.gz"), True, relabelled=tuple(back))
+    (tmp_path / "again.py").write_text(python_script(source, preset, pose))
+    subprocess.run([sys.executable, "again.py"], cwd=tmp_path, check=True, capture_output=True)
+    frame = UltrasoundSimulator(head.labels, preset.tissues).simulate(probe, pose, preset.display)
+    assert np.array_equal(read_array(tmp_path / "image.nrrd")[0][0], frame.image)
+
+
+def test_the_script_of_an_mri_has_its_mask_and_options_and_the_texture_if_it_is_used():
+    source = LabelSource("it's here.nii", mask="mask.nii", options={"contrast": "t2", "classes": 3})
+    plain = python_script(source, Preset(), np.eye(4))
+    assert """Volume.read("it's here.nii")""" in plain and "mask=Volume.read('mask.nii')" in plain
+    assert "contrast='t2'" in plain and "texture" not in plain
+    hybrid = Preset().changed("settings", partial_volume=True)
+    assert "texture=segmentation.texture()" in python_script(source, hybrid, np.eye(4))
+    for text in (plain, python_script(LabelSource(""), hybrid, np.eye(4))):
+        compile(text, "script", "exec")
+
+
+# ---- sequences as nodes ----------------------------------------------------------------------------------------------
+
+
+def test_a_sequence_as_nodes_holds_the_images_and_the_browser_moves_the_probe(head):
+    probe = PhasedProbe(75.0, 70.0, scan_lines=64)
+    poses = tilt_sweep(craniotomy_pose(head.labels, probe), 10.0, 4)
+    simulator = UltrasoundSimulator(head.labels, TissueTable.brain(head.tissue_names))
+    images = np.stack([frame.image for frame in simulator.sweep(probe, poses)])
+    to_probe = ImageGrid.for_probe(probe, None).image_to_probe
+    transforms = [{"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in poses]
+    transforms[1] = {"ImageToProbe": to_probe}  # not tracked
+    sequence = TrackedSequence(images, tuple(transforms), 0.1 * np.arange(4))
+    kept = [poses[0], poses[2], poses[3]]
+    scene = slicer.vtkMRMLScene()
+    logic = slicer.vtkSlicerSequencesLogic()
+    logic.SetMRMLScene(scene)
+    transform = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
+    browser, node = add_sequence(scene, sequence, "sweep", poses=kept, probe_transform_node=transform)
+    assert browser.GetNumberOfItems() == 3 and node.GetNumberOfDataNodes() == 3
+    for number, pose in enumerate(kept):
+        browser.SetSelectedItemNumber(number)
+        logic.UpdateProxyNodesFromSequences(browser)
+        assert np.allclose(probe_pose(transform), pose, atol=1e-6)
+    found = tracked_images(node, None, probe)
+    assert len(found.images) == 3
+    for pose, expected in zip(found.poses, kept, strict=True):
+        assert np.allclose(pose[:3, 1], expected[:3, 1], atol=0.01)
+        assert np.linalg.norm(pose[:3, 3] - expected[:3, 3]) < 1.0  # the field is found in the images
+
+
+def test_nothing_tracked_is_said():
+    sequence = TrackedSequence(np.ones((2, 8, 8), np.uint8), ({}, {}), [0.0, 1.0])
+    with pytest.raises(SimulationError):
+        add_sequence(slicer.vtkMRMLScene(), sequence, "sweep")
+
+
+def test_an_image_keeps_its_pose_when_the_probe_has_moved_on(head):
+    scene = slicer.vtkMRMLScene()
+    logic = UltrasoundSceneLogic(scene)
+    with pytest.raises(SimulationError, match="no image yet"):
+        logic.lastImage()
+    labels, transform, output = (
+        scene.AddNewNodeByClass(f"vtkMRML{kind}Node") for kind in ("LabelMapVolume", "LinearTransform", "ScalarVolume")
+    )
+    write_labels(labels, head.labels, head.tissue_names, labels)
+    pose = craniotomy_pose(head.labels, logic.preset.probe)
+    set_node_to_world(transform, pose)
+    frame = logic.simulate(labels, transform, output)
+    set_node_to_world(transform, np.eye(4))
+    assert np.allclose(logic.lastImage().ijk_to_ras, pose @ frame.grid.slice_to_probe)
+    assert np.array_equal(logic.lastImage().array[0], frame.image)
+
+
+def test_a_node_is_written_in_place_while_its_size_stays():
+    from SlicerUSSim.Logic.scene_nodes import write_slice
+    from SlicerUSSim.Logic.volume import Volume
+
+    scene = slicer.vtkMRMLScene()
+    node = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode")
+    write_volume(node, Volume(np.zeros((1, 4, 6), np.uint8), np.eye(4)))
+    image = node.GetImageData()
+    write_slice(node, Volume(np.full((1, 4, 6), 9, np.uint8), np.eye(4)))
+    assert node.GetImageData() is image and image.GetScalarRange() == (9.0, 9.0)
+    write_slice(node, Volume(np.full((1, 5, 6), 3, np.uint8), np.eye(4)))
+    assert node.GetImageData().GetDimensions() == (6, 5, 1)
+
+
+# ---- the probe's shape -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", list(PROBES))
+def test_a_probe_has_a_closed_body_behind_its_face_and_its_ridge_on_the_left(name):
+    probe = PROBES[name]
+    body = probe_polydata(probe)
+    points = vtk_to_numpy(body.GetPoints().GetData())
+    assert points[:, 1].max() == pytest.approx(0.0, abs=1e-3) and points[:, 1].min() < -60
+    half = np.abs(probe.origins_mm()[:, 0]).max()
+    assert np.abs(points[:, 0]).max() >= half  # it holds all scan lines
+    part = vtk_to_numpy(body.GetCellData().GetScalars())
+    ridge = [points[list(_cell_points(body, cell)), 0].mean() for cell in np.flatnonzero(part == 1)]
+    assert ridge and max(ridge) < -0.5 * half
+    triangles = vtkTriangleFilter()
+    triangles.SetInputData(body)
+    cleaned = vtkCleanPolyData()  # sharp edges have their points twice, for their normals
+    cleaned.SetInputConnection(triangles.GetOutputPort())
+    cleaned.Update()
+    mass = vtkMassProperties()
+    mass.SetInputData(cleaned.GetOutput())
+    assert mass.GetVolume() > 10_000  # mm3
+    edges = vtkFeatureEdges()
+    edges.SetInputConnection(cleaned.GetOutputPort())
+    edges.BoundaryEdgesOn()
+    edges.FeatureEdgesOff()
+    edges.NonManifoldEdgesOff()
+    edges.ManifoldEdgesOff()
+    edges.Update()
+    assert edges.GetOutput().GetNumberOfCells() == 0  # closed
+
+
+def _cell_points(polydata, cell: int):
+    ids = polydata.GetCell(int(cell)).GetPointIds()
+    return (ids.GetId(n) for n in range(ids.GetNumberOfIds()))
+
+
+@pytest.mark.parametrize("probe", [LinearProbe(38.0, 50.0), ConvexProbe(40.0, 60.0, 100.0), PhasedProbe(80.0, 90.0)])
+def test_the_field_as_triangles_has_its_area_and_the_image_lies_on_it(probe):
+    field = field_polydata(probe)
+    triangles = vtkTriangleFilter()
+    triangles.SetInputData(field)
+    triangles.Update()
+    mass = vtkMassProperties()
+    mass.SetInputData(triangles.GetOutput())
+    if probe.is_linear:
+        area = -2 * probe.first_line * probe.depth_mm
+    else:  # a sector between two radii
+        radius = probe.apex_radius_mm
+        area = -probe.first_line * ((radius + probe.depth_mm) ** 2 - radius**2)
+    assert mass.GetSurfaceArea() == pytest.approx(area, rel=0.01)
+    points = vtk_to_numpy(field.GetPoints().GetData())
+    across, down = vtk_to_numpy(field.GetPointData().GetTCoords()).T
+    left, right, top, bottom = probe.image_bounds_mm()
+    assert np.allclose(left + across * (right - left), points[:, 0], atol=1e-3)
+    assert np.allclose(top + down * (bottom - top), points[:, 1], atol=1e-3)
+    assert np.allclose(probe.outline_mm()[:-1], points, atol=1e-4)
