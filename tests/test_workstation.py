@@ -522,7 +522,7 @@ def test_a_fit_shows_its_costs_and_is_applied_and_reverted(page):
     page.wait_for_function("window.trame.state.get('fit_summary').startsWith('cost')", timeout=60_000)
     settled(page)
     curve = state(page, "fit_curve")
-    assert len(curve) > 10 and min(curve) < curve[0]
+    assert len(curve) > 10 and min(curve) < curve[0] and curve == sorted(curve, reverse=True)
     assert f"→ {min(curve):.3f}" in page.locator("#cost-curve").inner_text()
     with new_image(page):
         click(page, "#applyFitButton")
@@ -696,6 +696,16 @@ def test_latency_is_measured_on_request(page):
     times = page.evaluate("window.ussim.measured")
     assert times and min(times) > 1 and max(times) < 10_000
     click(page, "#show-latency")
+
+
+def test_another_mri_takes_the_place_of_the_first(page, files):
+    content = (files / "head.nii.gz").read_bytes()
+    with new_image(page):
+        page.set_input_files("#open-file", {"name": "again.nii.gz", "mimeType": "application/gzip", "buffer": content})
+    page.wait_for_function("window.trame.state.get('title') === 'again.nii.gz'")
+    assert not state(page, "errors") and state(page, "control_liveCheckBox") and pixels(page).mean() > 5
+    assert page.locator("#mriSelector option:checked").inner_text().strip() == "again.nii.gz"
+    assert page.locator("#labelsSelector option:checked").inner_text().strip() == "again.nii.gz tissues"
 
 
 # ---- who may come in, and how it is started --------------------------------------------------------------------------

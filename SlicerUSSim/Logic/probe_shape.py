@@ -96,8 +96,11 @@ def _lofted(rings: list[np.ndarray], part: int) -> vtkPolyData:
     cells = vtkCellArray()
     for quadrilateral in np.stack([numbers[:-1], after[:-1], after[1:], numbers[1:]], axis=-1).reshape(-1, 4):
         cells.InsertNextCell(4, quadrilateral.tolist())
-    for cap in (numbers[0][::-1], numbers[-1]):
-        cells.InsertNextCell(_RING_POINTS, cap.tolist())
+    opposite = -np.arange(_RING_POINTS // 2 + 1) % _RING_POINTS  # across the thickness: at the same x, where ends curve
+    for ring, turned_round in ((numbers[0], True), (numbers[-1], False)):
+        near, far = ring[: _RING_POINTS // 2 + 1], ring[opposite]
+        for strip in np.stack([near[:-1], near[1:], far[1:], far[:-1]], axis=-1):
+            cells.InsertNextCell(4, (strip[::-1] if turned_round else strip).tolist())
     polydata = vtkPolyData()
     polydata.SetPoints(points)
     polydata.SetPolys(cells)

@@ -189,10 +189,11 @@ class BrowserView:
         if len(columns) < 3 or not columns[0].GetNumberOfTuples():
             return
         evaluations, best = (np.asarray(memoryview(columns[n])) for n in (0, 2))
+        best = np.minimum.accumulate(best)  # restarts, which tell what the images determine, begin high again
         chosen = np.unique(np.linspace(0, len(best) - 1, _CURVE_POINTS).round().astype(int))
         self._set(
             fit_curve=best[chosen].round(5).tolist(),
-            fit_costs=f"cost {best[0]:.3f} → {best.min():.3f} after {evaluations[-1]:.0f} evaluations",
+            fit_costs=f"cost {best[0]:.3f} → {best[-1]:.3f} after {evaluations[-1]:.0f} evaluations",
         )
 
     def _set(self, **values) -> None:

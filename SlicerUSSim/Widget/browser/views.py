@@ -244,7 +244,7 @@ class AnatomyViews:
         self.threed.reset_focal_point()
         self.threed.reset_camera()
         camera.SetFocalPoint(*surface.centre)
-        camera.SetPosition(*(surface.centre + 480.0 * away))
+        camera.SetPosition(*(surface.centre + 540.0 * away))
         camera.SetViewUp(0.0, 0.0, 1.0)
         camera.ResetClippingRange()
         self.threed.schedule_render()

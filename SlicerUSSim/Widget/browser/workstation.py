@@ -67,8 +67,8 @@ class Workstation:
         self.logic = UltrasoundSceneLogic(self.app.scene, device, self.tasks)
         sections = read_sections()
         self._controls = {control.name: control for section in sections for control in section.controls}
-        self.state.update({**initial_state(sections), "probe_keys": list(KEYS), "trame__title": "SlicerUSSim"})
         self.view = BrowserView(self.state, self.tasks, sections)
+        self.state.update({**initial_state(sections), "probe_keys": list(KEYS), "trame__title": "SlicerUSSim"})
         self.presenter = self.view.presenter = PanelPresenter(self.logic, self.view, handles=False)
         self._turn_slices = AtMost(_TURN_EVERY_S, self._turn_slices_now)
         self._tell_pose = AtMost(_TELL_EVERY_S, self._tell_pose_now)
@@ -175,6 +175,7 @@ class Workstation:
     def _take_mri(self, path: str | None) -> None:
         parameters = self.logic.parameters
         node = self.opener.mri(path)
+        self.logic.stopLiveUpdate()  # until there are labels of it
         parameters.mri, parameters.labels, parameters.mask = node, None, None
         self._take_volume(node)
 
@@ -226,7 +227,9 @@ class Workstation:
         options = {name: getattr(parameters, name) for name in ("contrast", "classes", "thin_sulci", "bias_correction")}
         before = None if labels is None else labels_version(labels)
         self.presenter.segment()
-        if labels is None or labels_version(labels) == before or labels.GetImageData() is None:
+        if labels is None or labels_version(labels) == before:
+            if labels is not None and labels.IsA("vtkMRMLVolumeNode") and labels.GetImageData() is None:
+                self.app.scene.RemoveNode(labels)  # made for this, and nothing came of it
             return
         self.opener.segmented(labels, mri, mask, options)
         self._labels_ready()
