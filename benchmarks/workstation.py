@@ -74,14 +74,12 @@ def measured(browser, device: str, seconds: float, frames: int) -> dict:
         page.goto(url)
         page.wait_for_function("window.ussim && window.ussim.images > 0", timeout=120_000)
         result = {"usable_s": perf_counter() - start}
-        page.click("#show-latency")
         page.wait_for_timeout(2000)
         for name, (number, across, down) in GRIPS.items():
             page.evaluate("window.trame.trigger('press', ['placeButton'])")
             page.wait_for_timeout(1500)
             box = page.locator(".ussim-anatomy .remote-controlled-area").nth(number).bounding_box()
             result[name] = dragged(page, box["x"] + across * box["width"], box["y"] + down * box["height"], seconds)
-        page.click("#show-latency")
         if frames:
             result["memory"] = watched(page, process, frames)
         page.close()
@@ -89,18 +87,17 @@ def measured(browser, device: str, seconds: float, frames: int) -> dict:
 
 
 def dragged(page: Page, x: float, y: float, seconds: float) -> dict[str, float]:
-    """Images per second, and milliseconds from mouse to image, while the mouse goes to and fro."""
+    """Images per second, and then milliseconds from mouse to image, while the mouse goes to and fro."""
     page.mouse.move(x, y)
     page.mouse.down()
+    images = _move(page, x, y, seconds)
+    page.evaluate("window.trame.state.set('show_latency', true)")
+    page.wait_for_timeout(500)
     page.evaluate("window.ussim.measured.length = 0")
-    before, start, step = page.evaluate("window.ussim.images"), perf_counter(), 0
-    while perf_counter() - start < seconds:
-        step += 1
-        page.mouse.move(x + 40 * math.sin(step / 20), y + 4 * math.sin(step / 33))
-        page.wait_for_timeout(8)
-    images = (page.evaluate("window.ussim.images") - before) / (perf_counter() - start)
+    _move(page, x, y, seconds)
     times = page.evaluate("window.ussim.measured")
     page.mouse.up()
+    page.evaluate("window.trame.state.set('show_latency', false)")
     if len(times) < 5:
         raise SystemExit(f"benchmarks/workstation.py: only {len(times)} images came of dragging at {x:.0f}, {y:.0f}")
     return {
@@ -109,6 +106,16 @@ def dragged(page: Page, x: float, y: float, seconds: float) -> dict[str, float]:
         "p95_ms": float(np.percentile(times, 95)),
         "measured": len(times),
     }
+
+
+def _move(page: Page, x: float, y: float, seconds: float) -> float:
+    """Images per second."""
+    before, start, step = page.evaluate("window.ussim.images"), perf_counter(), 0
+    while perf_counter() - start < seconds:
+        step += 1
+        page.mouse.move(x + 40 * math.sin(step / 20), y + 4 * math.sin(step / 33))
+        page.wait_for_timeout(8)
+    return (page.evaluate("window.ussim.images") - before) / (perf_counter() - start)
 
 
 def watched(page: Page, process: subprocess.Popen, frames: int) -> dict:

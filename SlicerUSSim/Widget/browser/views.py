@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 
 import numpy as np
@@ -25,8 +26,9 @@ PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
 #: The slice views with the plane that each begins with, by the names that Slicer gives them.
 SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
 THREED_VIEW = "ThreeD"
-#: Images per second of the view under the mouse, and of the others: the ultrasound image goes before them.
-_FAST, _SLOW = 8.0, 2.5
+#: Images per second of the view under the mouse, and of the others: on few cores the ultrasound image goes before them.
+_CORES = os.cpu_count() or 2
+_FAST, _SLOW = min(3.0 * _CORES, 20.0), min(1.0 * _CORES, 8.0)
 #: More mouse events than images would only keep the images waiting.
 _EVENTS_EVERY_S = 0.025
 _LAYOUT = "Anatomy"

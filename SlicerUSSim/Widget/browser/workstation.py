@@ -235,11 +235,11 @@ class Workstation:
         self._labels_ready()
 
     def _labels_ready(self) -> None:
-        self._update_surface()
         if self.logic.parameters.probe_transform is None:
             self.presenter.placeProbe()
         if not self.logic.isLive:
             self.presenter.setLive(True)
+        self._update_surface()  # which the first image does not need
         self._look()
 
     def _update_surface(self) -> None:
@@ -388,8 +388,9 @@ class Workstation:
             self.views.show_probe(probe, parameters.probe_transform)
             self._probe_moved()
         self._tell_field()
-        with self.presenter.shown():
-            self._update_surface()
+        if self.logic.isLive:
+            with self.presenter.shown():
+                self._update_surface()
         self.presenter.parametersChanged()
 
     def _watch(self, role: str, node, event: str, method: Callable) -> None:

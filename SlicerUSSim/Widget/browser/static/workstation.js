@@ -3,7 +3,7 @@
 (() => {
   const client = Math.random().toString(36).slice(2);
   const measured = []; // milliseconds from an event to the image that shows what it did
-  const STAMP_EVERY_MS = 20; // events in between are counted from the one before, and so as later than they are
+  const STAMP_EVERY_MS = 40; // events in between count from the one before, so as later than they are
   let stamped = 0;
   const shown = []; // times at which simulated images came on the screen
 
