@@ -177,20 +177,19 @@ def _closed_surface(labels: Volume) -> vtkPolyData:
     placed = vtkTransformPolyDataFilter()
     placed.SetInputConnection(contour.GetOutputPort())
     placed.SetTransform(transform)
-    normals = vtkPolyDataNormals()
-    normals.SetInputConnection(placed.GetOutputPort())
-    normals.AutoOrientNormalsOn()
-    normals.SplittingOff()
-    normals.Update()
-    return normals.GetOutput()
+    return _with_normals(placed)
 
 
 def _with_fewer_triangles(polydata: vtkPolyData) -> vtkPolyData:
     fewer = vtkQuadricDecimation()
     fewer.SetInputData(polydata)
     fewer.SetTargetReduction(_DROPPED)
+    return _with_normals(fewer)
+
+
+def _with_normals(source) -> vtkPolyData:
     normals = vtkPolyDataNormals()
-    normals.SetInputConnection(fewer.GetOutputPort())
+    normals.SetInputConnection(source.GetOutputPort())
     normals.AutoOrientNormalsOn()
     normals.SplittingOff()
     normals.Update()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import traceback
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -22,30 +22,21 @@ from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.scene_nodes import (
     labels_version,
-    node_to_world,
-    probe_pose,
-    read_labels,
-    set_node_to_world,
 )
 from SlicerUSSim.Logic.sequence import TrackedSequence
-from SlicerUSSim.Logic.surface import PatientSurface
 from SlicerUSSim.Logic.tracking import TrackerLink, parse_address
-from SlicerUSSim.Logic.volume import Volume
 from SlicerUSSim.Widget.browser.export import Exports
-from SlicerUSSim.Widget.browser.hand import KEYS, ProbeHand
+from SlicerUSSim.Widget.browser.hand import KEYS
 from SlicerUSSim.Widget.browser.opener import Files, Opener
-from SlicerUSSim.Widget.browser.page import POSE_SLIDERS, build_page, initial_state, view_tools
+from SlicerUSSim.Widget.browser.page import build_page, initial_state, view_tools
+from SlicerUSSim.Widget.browser.probe_control import ProbeControl
 from SlicerUSSim.Widget.browser.real import Comparison
 from SlicerUSSim.Widget.browser.streams import ImageStream
-from SlicerUSSim.Widget.browser.tasks import AtMost, Tasks
+from SlicerUSSim.Widget.browser.tasks import Tasks
 from SlicerUSSim.Widget.browser.view import BrowserView
 from SlicerUSSim.Widget.browser.views import AnatomyViews
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Widget.sections import read_sections
-
-#: Seconds between two times that the slice views turn to the probe, and that the sliders are told where it is: both
-#: take time that the image then has to wait for.
-_TURN_EVERY_S, _TELL_EVERY_S = 0.12, 0.4
 
 
 class Workstation:
@@ -70,21 +61,15 @@ class Workstation:
         self.view = BrowserView(self.state, self.tasks, sections)
         self.state.update({**initial_state(sections), "probe_keys": list(KEYS), "trame__title": "SlicerUSSim"})
         self.presenter = self.view.presenter = PanelPresenter(self.logic, self.view, handles=False)
-        self._turn_slices = AtMost(_TURN_EVERY_S, self._turn_slices_now)
-        self._tell_pose = AtMost(_TELL_EVERY_S, self._tell_pose_now)
-        self.views = AnatomyViews(self.app, self.server, view_tools, self._turn_slices)
-        self.hand = ProbeHand(self.pose, self._moved_by_hand, lambda: self._surface, self._hold)
-        for view in (self.views.threed, *self.views.slices):
-            self.hand.attach(view)
+        self.views = AnatomyViews(self.app, self.server, view_tools, lambda: self.probe.turn_slices())
+        self.probe = ProbeControl(self.state, self.logic, self.tasks, self.views)
+        self.probe.by_hand = self._moved_by_hand
         self._stream = ImageStream("simulated")
         self.opener = Opener(self.app.scene, self.logic, self.tasks, files)
         self.exports = Exports(self.app, self.logic, self.opener)
-        self.comparison = Comparison(self.state, self.move_probe)
-        self._surface: PatientSurface | None = None
-        self._surface_version: object = None
+        self.comparison = Comparison(self.state, self.probe.move)
         self._link: TrackerLink | None = None
         self._observed: dict[str, tuple[object, int]] = {}
-        self._drawn_probe = None
         self._field: tuple = (None, None)  # of an image's grid and probe
         self._stamp_told = self._stamp_applied = self._stamp_computed = None
         self._refreshing = False
@@ -94,20 +79,21 @@ class Workstation:
     # ---- life --------------------------------------------------------------------------------------------------
 
     def _connect(self, sections) -> None:
+        probe, comparison, fits = self.probe, self.comparison, self.presenter.fits
         triggers: dict[str, Callable] = {
             "set": self._set_control, "press": self._press, "set_tissue": self._in_task(self.presenter.setTissue),
-            "set_free": self._in_task(self.presenter.fits.setFree), "set_pose": self._set_pose, "key": self._key,
-            "plane": self._choose_plane, "look": self._look, "aim_image": self._aim_image, "play": self.comparison.play,
-            "show_number": self.comparison.show, "cancel": self.view.cancel, "dismiss": self._dismiss,
+            "set_free": self._in_task(fits.setFree), "set_pose": probe.set_pose, "key": probe.hand.key,
+            "plane": probe.choose_plane, "look": probe.look, "aim_image": probe.aim_image, "play": comparison.play,
+            "show_number": comparison.show, "cancel": self.view.cancel, "dismiss": self._dismiss,
             "export": self._export, "script": self._show_script, "stamp": self._stamped, "page_opened": self._opened,
         }  # fmt: skip
         for name, method in triggers.items():
             self.server.controller.trigger(name)(method)
         for name, method in (
             ("blend", lambda: self.views.set_blend(float(self.state.blend))),
-            ("follow", self._follow_changed),
-            ("upright", lambda: setattr(self.hand, "upright", bool(self.state.upright))),
-            ("show_tissues", self._show_tissues),
+            ("follow", self.probe.follow_changed),
+            ("upright", lambda: setattr(self.probe.hand, "upright", bool(self.state.upright))),
+            ("show_tissues", self.probe.show_tissues),
             ("comparison", self.comparison.send),
             ("opened_file", self._file_opened),
         ):
@@ -239,23 +225,8 @@ class Workstation:
             self.presenter.placeProbe()
         if not self.logic.isLive:
             self.presenter.setLive(True)
-        self._update_surface()  # which the first image does not need
-        self._look()
-
-    def _update_surface(self) -> None:
-        labels = self.logic.parameters.labels
-        if labels is None or (labels.IsA("vtkMRMLVolumeNode") and labels.GetImageData() is None):
-            return
-        version = labels_version(labels)
-        if version == self._surface_version:
-            return
-        self._surface_version = version
-        volume = read_labels(labels, self.logic.preset.tissues).volume
-        placed = Volume(volume.array, node_to_world(labels) @ volume.ijk_to_ras)
-        self._surface = self.tasks.do(lambda: PatientSurface(placed))
-        self.views.show_surface(self._surface)
-        self._show_tissues()
-        self._tell_pose()
+        self.probe.update_surface()  # which the first image does not need
+        self.probe.look()
 
     def _press(self, name: str) -> None:
         presenter, fits = self.presenter, self.presenter.fits
@@ -292,82 +263,7 @@ class Workstation:
 
     def _place(self) -> None:
         self.presenter.placeProbe()
-        self._look()
-
-    # ---- the probe ---------------------------------------------------------------------------------------------
-
-    def pose(self) -> np.ndarray | None:
-        """(4, 4) probe_to_world, or None without a probe, or with one that is scaled: simulating says so."""
-        transform = self.logic.parameters.probe_transform
-        try:
-            return None if transform is None else probe_pose(transform)
-        except SimulationError:
-            return None
-
-    def move_probe(self, probe_to_world: np.ndarray) -> None:
-        """Put the probe somewhere; the image follows."""
-        transform = self.logic.parameters.probe_transform
-        if transform is not None:
-            set_node_to_world(transform, probe_to_world)
-
-    def _moved_by_hand(self, probe_to_world: np.ndarray) -> None:
-        self._stamp_applied = self._stamp_told
-        self.move_probe(probe_to_world)
-
-    def _hold(self, view) -> None:
-        self.views.hold(view)
-        if view is None:
-            self._probe_moved()
-
-    def _probe_moved(self, *_) -> None:
-        self._turn_slices()
-        self._tell_pose()
-
-    def _turn_slices_now(self) -> None:
-        parameters = self.logic.parameters
-        pose = self.pose()
-        if pose is not None and parameters.output is not None:
-            self.views.follow(pose, self.logic.preset.probe)
-
-    def _tell_pose_now(self) -> None:
-        pose, surface = self.pose(), self._surface
-        if pose is None or surface is None:
-            return
-        with self.state:
-            for name, value in asdict(surface.where(pose)).items():
-                self.state[f"pose_{name}"] = round(value, 2)
-
-    def _set_pose(self, name: str, value: float) -> None:
-        pose = self.pose()
-        if pose is not None and self._surface is not None and name in {slider[0] for slider in POSE_SLIDERS}:
-            self.move_probe(self._surface.held(pose, **{name: float(value)}))
-
-    def _key(self, name: str, fast: bool) -> None:
-        self.hand.key(name, fast)
-
-    def _aim_image(self, across: float, down: float) -> None:
-        pose = self.pose()
-        left, right, top, bottom = self.logic.preset.probe.image_bounds_mm()
-        if pose is not None:
-            point = [left + across * (right - left), top + down * (bottom - top), 0.0, 1.0]
-            self.hand.aim((pose @ point)[:3])
-
-    def _look(self) -> None:
-        pose = self.pose()
-        if pose is not None and self._surface is not None:
-            self.views.look_at_probe(pose, self._surface)
-
-    def _choose_plane(self, name: str, plane: str) -> None:
-        self.views.set_plane(name, plane)
-        self.state.planes = dict(self.views.planes)
-        self._probe_moved()
-
-    def _follow_changed(self) -> None:
-        self.views.follows = bool(self.state.follow)
-        self._probe_moved()
-
-    def _show_tissues(self) -> None:
-        self.views.show_labels(self.logic.parameters.labels, bool(self.state.show_tissues))
+        self.probe.look()
 
     # ---- the image ---------------------------------------------------------------------------------------------
 
@@ -379,18 +275,13 @@ class Workstation:
     def _follow_parameters(self) -> None:
         self._refreshing = False
         parameters = self.logic.parameters
-        self._watch("probe", parameters.probe_transform, "TransformModifiedEvent", self._probe_moved)
+        self._watch("probe", parameters.probe_transform, "TransformModifiedEvent", self.probe.moved)
         self._watch("image", parameters.output, "ImageDataModifiedEvent", self._image_changed)
-        probe = self.logic.preset.probe
-        if parameters.probe_transform is not None and (probe, parameters.probe_transform) != self._drawn_probe:
-            self._drawn_probe = (probe, parameters.probe_transform)
-            self.hand.set_probe(probe)
-            self.views.show_probe(probe, parameters.probe_transform)
-            self._probe_moved()
+        self.probe.draw()
         self._tell_field()
         if self.logic.isLive:
             with self.presenter.shown():
-                self._update_surface()
+                self.probe.update_surface()
         self.presenter.parametersChanged()
 
     def _watch(self, role: str, node, event: str, method: Callable) -> None:
@@ -417,6 +308,9 @@ class Workstation:
                 "x": grid.left_mm, "y": grid.top_mm, "w": width, "h": height, "ticks": ticks, "size": height / 36.0,
                 "focus": preset.probe.focus_mm, "range": f"{preset.display.dynamic_range_db:.0f}",
             }  # fmt: skip
+
+    def _moved_by_hand(self) -> None:
+        self._stamp_applied = self._stamp_told
 
     def _stamped(self, page: str, milliseconds: float) -> None:
         self._stamp_told = (page, milliseconds)
@@ -450,7 +344,7 @@ class Workstation:
     # ---- tracker -----------------------------------------------------------------------------------------------
 
     def _tracked(self, pose: np.ndarray) -> None:
-        self.tasks.tell(lambda: self.move_probe(pose))
+        self.tasks.tell(lambda: self.probe.move(pose))
 
     async def _show_tracker(self) -> None:
         while self._link is not None:
