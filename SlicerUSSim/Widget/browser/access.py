@@ -7,7 +7,6 @@ from urllib.parse import urlsplit
 
 from aiohttp import web
 
-_COOKIE = "ussim_token"
 _LOOPBACK = {"127.0.0.1", "localhost", "::1"}
 _REFUSED = """<!doctype html><meta charset="utf-8"><title>SlicerUSSim</title>
 <body style="font-family: sans-serif; background: #111; color: #ddd; margin: 4em">
@@ -36,10 +35,15 @@ def _checker(token: str):
             return web.Response(status=403, text=_REFUSED.format(reason=reason), content_type="text/html")
         response = await handler(request)
         if token and "token" in request.query and not response.prepared:
-            response.set_cookie(_COOKIE, token, httponly=True, samesite="Strict")
+            response.set_cookie(_cookie(request), token, httponly=True, samesite="Strict")
         return response
 
     return check
+
+
+def _cookie(request: web.Request) -> str:
+    """Browsers share cookies between the ports of a computer; two workstations on it have two tokens."""
+    return f"ussim_token_{request.url.port}"
 
 
 def _objection(request: web.Request, token: str) -> str:
@@ -51,7 +55,7 @@ def _objection(request: web.Request, token: str) -> str:
         if not is_loopback(host.hostname or ""):
             return f"This server answers to 127.0.0.1, not to {request.host!r}."
         return ""
-    given = request.query.get("token", request.cookies.get(_COOKIE, ""))
+    given = request.query.get("token", request.cookies.get(_cookie(request), ""))
     if not hmac.compare_digest(given.encode(), token.encode()):
         return "The token is missing or wrong. Use the URL that <code>ussim serve</code> printed."
     return ""
