@@ -44,10 +44,6 @@ class Tasks:
         waiting.parent.switch()
         return future.result()
 
-    def ahead(self, function: Callable[[], object]) -> None:
-        """Call `function` in the thread for work; nobody waits for it, and what it raises does not matter."""
-        self._executor.submit(function)
-
     def tell(self, function: Callable[[], None]) -> None:
         """From any thread: call `function` soon, from the event loop."""
         self._loop.call_soon_threadsafe(function)

@@ -8,8 +8,17 @@ from collections.abc import Callable
 import numpy as np
 from trame_server.utils.asynchronous import get_event_loop
 from trame_slicer.core import LayoutManager, SlicerApp
-from trame_slicer.rca_view import register_rca_factories
-from trame_slicer.views import AbstractView, Layout, LayoutDirection, SliceView, ThreeDView, ViewLayoutDefinition
+from trame_slicer.rca_view import RemoteViewFactory
+from trame_slicer.views import (
+    AbstractView,
+    Layout,
+    LayoutDirection,
+    NoScheduleRendering,
+    SliceView,
+    ThreeDView,
+    ViewLayoutDefinition,
+    ViewType,
+)
 from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
 
@@ -63,10 +72,13 @@ class AnatomyViews:
         self._blend = 1.0
         self._image = vtkTrivialProducer()
         self._image.SetOutput(Volume(np.zeros((1, 2, 2), np.uint8), np.eye(4)).to_vtk())  # until there is one
-        register_rca_factories(
-            app.view_manager, server, slice_view_ui_f=view_ui, three_d_view_ui_f=view_ui,
-            target_fps=_FAST, blur_fps=_SLOW, interactive_quality=75, rca_event_throttle_s=_EVENTS_EVERY_S,
-        )  # fmt: skip
+        for kind, make in ((ViewType.SLICE_VIEW, SliceView), (ViewType.THREE_D_VIEW, ThreeDView)):
+            app.view_manager.register_factory(
+                RemoteViewFactory(
+                    server, _silent(make), kind, populate_view_ui_f=view_ui, target_fps=_FAST, blur_fps=_SLOW,
+                    interactive_quality=75, rca_event_throttle_s=_EVENTS_EVERY_S,
+                )
+            )  # fmt: skip
         threed = ViewLayoutDefinition.threed_view(name=THREED_VIEW)
         red, yellow, green = (
             ViewLayoutDefinition.axial_view(), ViewLayoutDefinition.sagittal_view(), ViewLayoutDefinition.coronal_view()
@@ -264,3 +276,8 @@ class AnatomyViews:
         display = display_of(model)
         display.SetSaveWithScene(False)
         return model
+
+
+def _silent(make):
+    """Makes views that do not draw themselves anew with every step of their making, some two hundred times."""
+    return lambda **options: make(**options, scheduled_render_strategy=NoScheduleRendering())

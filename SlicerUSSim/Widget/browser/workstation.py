@@ -16,19 +16,14 @@ from trame_server.utils.asynchronous import get_event_loop
 from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkCommand
 
-from SlicerUSSim.Logic.errors import SimulationError, collected_warnings, require, user_message
-from SlicerUSSim.Logic.phantoms import head_mri
+from SlicerUSSim.Logic.errors import SimulationError, require, user_message
 from SlicerUSSim.Logic.preset import Preset
-from SlicerUSSim.Logic.probe import PhasedProbe
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
 from SlicerUSSim.Logic.scene_nodes import (
     labels_version,
 )
-from SlicerUSSim.Logic.segmentation import segment_mri
 from SlicerUSSim.Logic.sequence import TrackedSequence
-from SlicerUSSim.Logic.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.tissues import TissueTable
 from SlicerUSSim.Logic.tracking import TrackerLink, parse_address
 from SlicerUSSim.Widget.browser.export import Exports
 from SlicerUSSim.Widget.browser.hand import KEYS
@@ -60,7 +55,6 @@ class Workstation:
         self.app = SlicerApp()
         self.app.register_module_logic(vtkSlicerSequencesLogic())  # whose nodes the scene does not know without it
         self.tasks = Tasks(self._failed)
-        self.tasks.ahead(lambda: _warm_up(device))
         self.logic = UltrasoundSceneLogic(self.app.scene, device, self.tasks)
         sections = read_sections()
         self._controls = {control.name: control for section in sections for control in section.controls}
@@ -376,12 +370,3 @@ class Workstation:
 
     def _dismiss(self, number: int) -> None:
         self.state.errors = [message for n, message in enumerate(self.state.errors) if n != number]
-
-
-def _warm_up(device: str | None) -> None:
-    """Import what computes, and build its kernels, on as little as possible: while the page is built."""
-    mri = head_mri(12.0)
-    segmentation = segment_mri(mri, thin_sulci=True, device=device)
-    simulator = UltrasoundSimulator(segmentation.labels, TissueTable.brain(segmentation.tissue_names), device=device)
-    with collected_warnings():  # there is nothing in view
-        simulator.simulate(PhasedProbe(60.0, 20.0, scan_lines=16), np.eye(4))
