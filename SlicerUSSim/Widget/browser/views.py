@@ -37,7 +37,7 @@ SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
 THREED_VIEW = "ThreeD"
 #: Images per second of the view under the mouse, and of the others: on few cores the ultrasound image goes before them.
 _CORES = os.cpu_count() or 2
-_FAST, _SLOW = min(3.0 * _CORES, 20.0), min(1.0 * _CORES, 8.0)
+_FAST, _SLOW = min(2.0 * _CORES, 20.0), min(0.75 * _CORES, 8.0)
 #: More mouse events than images would only keep the images waiting.
 _EVENTS_EVERY_S = 0.025
 _LAYOUT = "Anatomy"
