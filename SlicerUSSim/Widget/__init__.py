@@ -1,1 +1,1 @@
-"""The Slicer panel: what it does (presenter.py, no Qt) and how it is wired (panel.py)."""
+"""The panel: what it does (presenter.py, no Qt), wired to Slicer (panel.py) and to a browser (browser/)."""

@@ -11,6 +11,8 @@ from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import html
 from trame.widgets import vuetify3 as v3
 
+from SlicerUSSim.Logic.probe import PROBES
+from SlicerUSSim.Logic.tissues import TISSUES
 from SlicerUSSim.Widget.browser.view import CUSTOM_PROBE, state_key
 from SlicerUSSim.Widget.browser.views import PLANES, SLICE_VIEWS
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS
@@ -349,9 +351,6 @@ def _script_dialog() -> None:
 
 def initial_state(sections: tuple[Section, ...]) -> dict:
     """What the page needs before anything is loaded."""
-    from SlicerUSSim.Logic.probe import PROBES
-    from SlicerUSSim.Logic.tissues import TISSUES
-
     choices = {control.name: list(control.choices) for section in sections for control in section.controls}
     choices |= {"probePresetComboBox": [CUSTOM_PROBE, *PROBES], "tissuePresetComboBox": list(TISSUES)}
     return {

@@ -20,9 +20,7 @@ from SlicerUSSim.Logic.errors import SimulationError, require, user_message
 from SlicerUSSim.Logic.preset import Preset
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
-from SlicerUSSim.Logic.scene_nodes import (
-    labels_version,
-)
+from SlicerUSSim.Logic.scene_nodes import labels_version
 from SlicerUSSim.Logic.sequence import TrackedSequence
 from SlicerUSSim.Logic.tracking import TrackerLink, parse_address
 from SlicerUSSim.Widget.browser.export import Exports
@@ -73,12 +71,12 @@ class Workstation:
         self._field: tuple = (None, None)  # of an image's grid and probe
         self._stamp_told = self._stamp_applied = self._stamp_computed = None
         self._refreshing = False
-        self._connect(sections)
+        self._connect()
         build_page(self.server, sections, self.views.layout)
 
     # ---- life --------------------------------------------------------------------------------------------------
 
-    def _connect(self, sections) -> None:
+    def _connect(self) -> None:
         probe, comparison, fits = self.probe, self.comparison, self.presenter.fits
         triggers: dict[str, Callable] = {
             "set": self._set_control, "press": self._press, "set_tissue": self._in_task(self.presenter.setTissue),
