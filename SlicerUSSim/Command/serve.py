@@ -65,9 +65,7 @@ def serve(
     from SlicerUSSim.Logic.volume import Volume
 
     choose_device(device)
-    for file in (mri, labels, mask):
-        if file is not None:
-            Volume.read(file)
+    volumes = {file: Volume.read(file) for file in (mri, labels, mask) if file is not None}
     preset = Preset.read(preset_file) if preset_file else None
     sequence = read_sequence(sequence_file, calibration) if sequence_file else None
     to_ras = to_mri(to_mri_file)
@@ -82,7 +80,7 @@ def serve(
         Files(
             mri=mri, labels=labels, contrast=contrast, mask=mask, preset=preset, sequence=sequence,
             sequence_name=Path(sequence_file).name.split(".")[0] if sequence_file else "", transform=path,
-            to_ras=to_ras, tracker=igtl, tracker_device=igtl_device,
+            to_ras=to_ras, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
         ),
         device,
     )  # fmt: skip

@@ -87,8 +87,7 @@ def turned(probe_to_ras: np.ndarray, *, rock_deg=0.0, tilt_deg=0.0, rotate_deg=0
     probe's own axis (y); positive as rotations about these axes. The names are AIUM's.
     """
     motion = np.eye(4)
-    angles = [("z", rock_deg), ("x", tilt_deg), ("y", rotate_deg)]
-    motion[:3, :3] = Rotation.from_euler("ZXY", [angle for _, angle in angles], degrees=True).as_matrix()
+    motion[:3, :3] = Rotation.from_euler("ZXY", [rock_deg, tilt_deg, rotate_deg], degrees=True).as_matrix()
     return probe_to_ras @ motion
 
 

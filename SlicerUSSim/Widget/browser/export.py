@@ -59,10 +59,6 @@ class Cine:
             self._images.clear()
         self._images.append((seconds, image))
 
-    def clear(self) -> None:
-        """Forget the images."""
-        self._images.clear()
-
     def gif(self) -> bytes:
         """An animated GIF, as fast as it was seen. Raises SimulationError without images."""
         require(len(self._images) > 1, f"the cine holds {len(self._images)} images, expected two or more")

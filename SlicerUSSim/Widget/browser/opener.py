@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -45,6 +45,8 @@ class Files:
     #: OpenIGTLink, as tracking.parse_address reads it, and the transform to follow
     tracker: str | None = None
     tracker_device: str | None = None
+    #: What has been read of these files already
+    volumes: Mapping[str, Volume] = field(default_factory=dict)
 
 
 class Opener:
@@ -53,12 +55,12 @@ class Opener:
     def __init__(self, scene, logic: UltrasoundSceneLogic, tasks: Tasks, files: Files) -> None:
         self._scene, self._logic, self._tasks, self._files = scene, logic, tasks, files
         self._sources: dict[tuple, LabelSource] = {}
+        self._volumes = dict(files.volumes)  # read, but not asked for yet
 
     def mri(self, path: str | None):
         """A node with the MRI of a file, or the demo brain."""
-        volume, name = self._tasks.do(
-            lambda: (demo_mri()[0], "MNI152 brain") if path is None else (Volume.read(path), Path(path).name)
-        )
+        volume = self._tasks.do(lambda: demo_mri()[0]) if path is None else self._volume(path)
+        name = "MNI152 brain" if path is None else Path(path).name
         node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
         write_volume(node, volume)
         node.SetAttribute(FILE, "" if path is None else os.path.abspath(path))
@@ -70,11 +72,11 @@ class Opener:
 
     def mask(self, path: str):
         """A label map node with the mask of a file."""
-        return self._label_map(self._tasks.do(lambda: Volume.read(path)), path, ["inside"])
+        return self._label_map(self._volume(path), path, ["inside"])
 
     def labels(self, path: str):
         """A label map node; its tissues are in the .json beside the file, or the preset's."""
-        volume = self._tasks.do(lambda: Volume.read(path))
+        volume = self._volume(path)
         beside, preset = tissues_beside(Path(path)), self._logic.preset
         tissues = TissueTable.read(beside) if beside.exists() else preset.tissues
         _require_labels(volume, path)
@@ -134,10 +136,15 @@ class Opener:
                 elif ".igs." in name.lower() or ".seq." in name.lower():
                     kind = "sequence"
                 else:
-                    kind = "labels" if self._tasks.do(lambda: Volume.read(path).looks_like_labels()) else "mri"
+                    volume = self._volumes[str(path)] = self._volume(str(path))
+                    kind = "labels" if volume.looks_like_labels() else "mri"
                 yield str(path), kind
             except SimulationError as error:  # the user knows the file by its name alone
                 raise SimulationError(str(error).replace(folder + os.sep, "")) from None
+
+    def _volume(self, path: str) -> Volume:
+        """The volume of a file, read once."""
+        return self._volumes.pop(path, None) or self._tasks.do(lambda: Volume.read(path))
 
     def _label_map(self, volume: Volume, path: str, names):
         _require_labels(volume, path)

@@ -6,13 +6,14 @@ import asyncio
 from collections.abc import Callable
 
 import numpy as np
-from scipy import ndimage
 from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.errors import SimulationError
+from SlicerUSSim.Logic.placement import slice_under_probe
 from SlicerUSSim.Logic.scan_conversion import ImageGrid
 from SlicerUSSim.Logic.similarity import Similarity, similarity
 from SlicerUSSim.Logic.tracked import TrackedImages
+from SlicerUSSim.Logic.volume import Volume
 from SlicerUSSim.Widget.browser.page import SIMULATED
 from SlicerUSSim.Widget.browser.streams import ImageStream
 
@@ -35,13 +36,11 @@ class RealImages:
         key = (place, grid)
         if self._on_grid is None or self._on_grid[0] != key:
             tracked = self.tracked
-            columns, rows = np.meshgrid(np.arange(grid.columns), np.arange(grid.rows))
-            pixels = np.stack([columns, rows, 0 * rows, 1 + 0 * rows], axis=-1) @ (
-                np.linalg.inv(tracked.grid.image_to_probe) @ grid.image_to_probe
-            ).T  # fmt: skip
-            at = np.stack([pixels[..., 1], pixels[..., 0]])
-            image = ndimage.map_coordinates(tracked.images[place].astype(np.float32), at, order=1)
-            mask = ndimage.map_coordinates(tracked.mask.astype(np.uint8), at, order=0) > 0
+            image, mask = (
+                slice_under_probe(Volume(array[None], tracked.grid.slice_to_probe), grid, np.eye(4), order)
+                for array, order in ((tracked.images[place].astype(np.float32), 1), (tracked.mask.astype(np.uint8), 0))
+            )
+            mask = mask > 0
             self._on_grid = (key, np.where(mask, image.round(), 0).astype(np.uint8), mask)
         return self._on_grid[1], self._on_grid[2]
 
