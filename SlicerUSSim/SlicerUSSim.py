@@ -18,8 +18,7 @@ from slicer import (
     vtkMRMLNode,
     vtkMRMLScalarVolumeNode,
 )
-from slicer.i18n import tr as _
-from slicer.i18n import translate
+from slicer.i18n import tr as _, translate
 from slicer.parameterNodeWrapper import Choice, WithinRange, parameterNodeWrapper
 from slicer.ScriptedLoadableModule import (
     ScriptedLoadableModule,
@@ -227,7 +226,7 @@ class SlicerUSSimLogic(ScriptedLoadableModuleLogic):
 
     def __init__(self) -> None:
         ScriptedLoadableModuleLogic.__init__(self)
-        from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
+        from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 
         self.ultrasound = UltrasoundSceneLogic(slicer.mrmlScene)
 
@@ -252,7 +251,7 @@ class SlicerUSSimTest(ScriptedLoadableModuleTest):
             ensurePackages()
         except RuntimeError as error:  # in testing mode Slicer installs nothing
             self.skipTest(str(error))
-        from SlicerUSSim.Logic.phantoms import head_mri
+        from SlicerUSSim.Logic.mri.samples import head_mri
 
         self.delayDisplay("Make a head")
         mri = head_mri(2.0)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import argparse
 
-from SlicerUSSim.Logic.benchmark.files import result_file
-from SlicerUSSim.Logic.benchmark.tables import comparison
+from SlicerUSSim.Logic.verification.benchmark.files import result_file
+from SlicerUSSim.Logic.verification.benchmark.tables import comparison
 
 
 def main() -> None:

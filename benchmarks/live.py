@@ -16,11 +16,11 @@ from time import perf_counter
 import slicer
 
 from SlicerUSSim.Logic import PhasedProbe
-from SlicerUSSim.Logic.demo import demo_mri
-from SlicerUSSim.Logic.placement import slide_sweep
-from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
-from SlicerUSSim.Logic.scene_nodes import node_to_world, write_volume
-from SlicerUSSim.Logic.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.mri.samples import demo_mri
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume
+from SlicerUSSim.Logic.probe.placement import slide_sweep
 
 PROBE_A = PhasedProbe(75, 73, scan_lines=196)
 

@@ -23,14 +23,14 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, segment_mri
-from SlicerUSSim.Logic.benchmark.files import output_file
-from SlicerUSSim.Logic.benchmark.suite import FRAMES
-from SlicerUSSim.Logic.benchmark.timing import measured, timed
-from SlicerUSSim.Logic.demo import demo_mri
-from SlicerUSSim.Logic.device import devices_to_measure
-from SlicerUSSim.Logic.numpy_model import NumpyModel
-from SlicerUSSim.Logic.placement import craniotomy_pose
-from SlicerUSSim.Logic.tissues import write_json
+from SlicerUSSim.Logic.base.files import write_json
+from SlicerUSSim.Logic.mri.samples import demo_mri
+from SlicerUSSim.Logic.opencl.devices import devices_to_measure
+from SlicerUSSim.Logic.probe.placement import craniotomy_pose
+from SlicerUSSim.Logic.verification.benchmark.files import output_file
+from SlicerUSSim.Logic.verification.benchmark.suite import FRAMES
+from SlicerUSSim.Logic.verification.benchmark.timing import measured, timed
+from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
 
 PROBE = FRAMES["A"]
 ELEMENTS, PITCH_M, WIDTH_M, SPEED, FREQUENCY = 64, 0.15e-3, 0.14e-3, 1540.0, 5e6

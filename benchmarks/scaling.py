@@ -23,10 +23,10 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     Volume,
 )
-from SlicerUSSim.Logic.benchmark.files import output_file
-from SlicerUSSim.Logic.benchmark.timing import measured, timed
-from SlicerUSSim.Logic.placement import pose_looking_at
-from SlicerUSSim.Logic.tissues import write_json
+from SlicerUSSim.Logic.base.files import write_json
+from SlicerUSSim.Logic.probe.placement import pose_looking_at
+from SlicerUSSim.Logic.verification.benchmark.files import output_file
+from SlicerUSSim.Logic.verification.benchmark.timing import measured, timed
 
 PROBE = ConvexProbe(40, 60, 80, scan_lines=128)
 POSE = pose_looking_at((0.0, 0.0, 60.0), (0.0, 0.0, 0.0))

@@ -32,9 +32,9 @@ from SlicerUSSim.Logic import (
     Volume,
     optimize_appearance,
 )
-from SlicerUSSim.Logic.fan import estimate_fan
-from SlicerUSSim.Logic.scan_conversion import ImageGrid
-from SlicerUSSim.Logic.tissues import TISSUES
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tracked.field import estimate_field
 
 WIDTH_MM = 38.0  # of the face of the L14-5
 SAMPLING_MHZ = 40.0
@@ -58,16 +58,16 @@ def fit_speckle(sequence: TrackedSequence):
     """Display and one tissue to the left part of image 20, where the phantom is homogeneous."""
     # The scanner's settings were not recorded; with these speckle is about as large as in the image.
     beam = {"frequency_mhz": 6.6, "fractional_bandwidth": 0.35, "aperture_mm": 9.0}
-    fan = estimate_fan(sequence.images, width_mm=WIDTH_MM, scan_lines=256, **beam)
-    window = rows, columns = fan.window
-    pixel = fan.image_to_probe[0, 0], fan.image_to_probe[1, 1]
-    left, top = (fan.image_to_probe @ [columns.start - 0.5, rows.start - 0.5, 0, 1])[:2]
+    field = estimate_field(sequence.images, width_mm=WIDTH_MM, scan_lines=256, **beam)
+    window = rows, columns = field.window
+    pixel = field.image_to_probe[0, 0], field.image_to_probe[1, 1]
+    left, top = (field.image_to_probe @ [columns.start - 0.5, rows.start - 0.5, 0, 1])[:2]
     real = np.ascontiguousarray(sequence.images[20][window])
     grid = ImageGrid(*real.shape, float(left), float(top), (float(pixel[0]), float(pixel[1])))
     region = np.zeros(real.shape, bool)
     region[round(8 / pixel[1]) : round(42 / pixel[1]), round(4 / pixel[0]) : round(18 / pixel[0])] = True
     free = {"display": None, "phantom": None, "phantom.attenuation_db_cm_mhz": (0.1, 3.0)}
-    return fitted(GEL, fan.probe, real, region, grid, free, DisplaySettings(tgc_db_cm_mhz=0.3))
+    return fitted(GEL, field.probe, real, region, grid, free, DisplaySettings(tgc_db_cm_mhz=0.3))
 
 
 def fit_noise(sequence: TrackedSequence):

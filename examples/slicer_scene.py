@@ -19,12 +19,12 @@ import numpy as np
 import slicer
 
 from SlicerUSSim.Logic import Volume
-from SlicerUSSim.Logic.demo import demo_mri
-from SlicerUSSim.Logic.errors import require
-from SlicerUSSim.Logic.placement import slide_sweep
-from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
-from SlicerUSSim.Logic.scene_nodes import node_to_world, read_volume, write_volume
-from SlicerUSSim.Logic.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.mri.samples import demo_mri
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, read_volume, write_volume
+from SlicerUSSim.Logic.probe.placement import slide_sweep
 
 
 def new_scene() -> tuple[slicer.vtkMRMLScene, slicer.vtkSlicerSequencesLogic]:

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic import PhasedProbe, TissueTable, UltrasoundSimulator, segment_mri
-from SlicerUSSim.Logic.demo import demo_mri
-from SlicerUSSim.Logic.figures import write_png
-from SlicerUSSim.Logic.placement import craniotomy_pose
+from SlicerUSSim.Logic.imaging.figures import write_png
+from SlicerUSSim.Logic.mri.samples import demo_mri
+from SlicerUSSim.Logic.probe.placement import craniotomy_pose
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "sweep")
 out.mkdir(exist_ok=True)

@@ -15,9 +15,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from SlicerUSSim.Logic import TissueTable, segment_mri
-from SlicerUSSim.Logic.demo import demo_mri
-from SlicerUSSim.Logic.tissues import write_json
-from SlicerUSSim.Logic.twins import make_twin
+from SlicerUSSim.Logic.base.files import write_json
+from SlicerUSSim.Logic.mri.samples import demo_mri
+from SlicerUSSim.Logic.verification.twins import make_twin
 
 
 def main() -> None:

@@ -18,11 +18,11 @@ __kernel void mix_parts(__global const float *parts, __global const float *weigh
 
 // Nepers of two-way attenuation along the direct path to every sample of a scan line: one work-item does one line.
 // Reflected branches, which overlap it in time, are taken to have spent as much.
-__kernel void direct_path(__constant const Scene *scene, __global const Segment *segments,
+__kernel void direct_path(__constant const Acquisition *acquisition, __global const Segment *segments,
                           __global const int *segment_counts, __global float *path) {
   const int scan_line = get_global_id(0);
-  const int line = scene->guard_lines + scan_line * scene->lateral_rays;
-  __global float *to = path + scan_line * scene->samples;
+  const int line = acquisition->guard_lines + scan_line * acquisition->lateral_rays;
+  __global float *to = path + scan_line * acquisition->samples;
   const int count = min(segment_counts[line], MAX_SEGMENTS);
   int sample = 0;
   float spent = 0.0f;
@@ -31,13 +31,13 @@ __kernel void direct_path(__constant const Scene *scene, __global const Segment 
     if (segment->reflections > 0) continue;
     const float end = segment->depth_mm + segment->length_mm * segment->depth_per_mm;
     const float before = -log(segment->attenuation);
-    for (; sample < scene->samples && sample * scene->sample_mm <= end; sample++) {
-      const float along = fmax(sample * scene->sample_mm - segment->depth_mm, 0.0f) / segment->depth_per_mm;
+    for (; sample < acquisition->samples && sample * acquisition->sample_mm <= end; sample++) {
+      const float along = fmax(sample * acquisition->sample_mm - segment->depth_mm, 0.0f) / segment->depth_per_mm;
       spent = before + segment->decay_per_mm * along;
       to[sample] = spent;
     }
   }
-  for (; sample < scene->samples; sample++) to[sample] = spent;
+  for (; sample < acquisition->samples; sample++) to[sample] = spent;
 }
 
 // One image's baseband signal: the bases with these weights, times exp2 of the paths with theirs. Global size

@@ -11,22 +11,22 @@
 
 #include "common.clh"
 
-__kernel void lateral_beam(__constant const Scene *scene, __global const float *from_re, __global const float *from_im,
-                           __global float *to_re, __global float *to_im, int stride) {
+__kernel void lateral_beam(__constant const Acquisition *acquisition, __global const float *from_re,
+                           __global const float *from_im, __global float *to_re, __global float *to_im, int stride) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
-  int centre = scene->guard_lines + line * scene->lateral_rays;
+  int centre = acquisition->guard_lines + line * acquisition->lateral_rays;
   // Lane by lane: near a tight focus the width changes from sample to sample.
-  const floatn s = (TO_FLOATN(LANE_INDEX) + sample) * scene->sample_mm;
-  const floatn apart = line_distance_lanes(scene, s), sigma = lateral_sigma_lanes(scene, s);
+  const floatn s = (TO_FLOATN(LANE_INDEX) + sample) * acquisition->sample_mm;
+  const floatn apart = line_distance_lanes(acquisition, s), sigma = lateral_sigma_lanes(acquisition, s);
   floatn step = apart / sigma;  // between traced lines, in sigmas
   floatn step2 = step * step;
   floatn narrow2 = fmax(1.0f - step2 / 6.0f, 0.25f);  // (sigma of these weights / sigma of the beam)^2
   floatn exponent = -0.5f * LOG2_E * step2 / narrow2;
-  const floatn reach = ceil(scene->beam_cutoff * sigma / apart);
+  const floatn reach = ceil(acquisition->beam_cutoff * sigma / apart);
   SPREAD(float, reach_, reach);
   float longest = 0.0f;
   for (int n = 0; n < LANES; n++) longest = fmax(longest, reach_[n]);
-  const int last = min((int)longest, max(centre, scene->traced_lines - 1 - centre));
+  const int last = min((int)longest, max(centre, acquisition->traced_lines - 1 - centre));
   // Edge `edge` lies half a step before traced line `edge`; the strips on both its sides contribute. Edges come in
   // pairs n + 1/2 lines to either side, whose weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
   const floatn fall = exp2_fast(max(2.0f * exponent, -60.0f));
@@ -38,7 +38,7 @@ __kernel void lateral_beam(__constant const Scene *scene, __global const float *
     floatn pair_re = 0.0f, pair_im = 0.0f;
     const int edges[2] = {centre - n, centre + n + 1};
     for (int side = 0; side < 2; side++) {
-      if (edges[side] < 1 || edges[side] >= scene->traced_lines) continue;
+      if (edges[side] < 1 || edges[side] >= acquisition->traced_lines) continue;
       const int before = (2 * edges[side] - 1) * stride + here, behind = before + stride;
       pair_re += LOAD_LANES(from_re + before) + LOAD_LANES(from_re + behind);
       pair_im += LOAD_LANES(from_im + before) + LOAD_LANES(from_im + behind);

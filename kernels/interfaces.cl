@@ -8,20 +8,20 @@
 
 #include "common.clh"
 
-__kernel void interface_echoes(__constant const Scene *scene, __global const Hit *hits, __global const int *hit_counts,
-                               __global float *re, __global float *im, int stride) {
-  int line = get_global_id(0), rays = scene->elevational_rays;
+__kernel void interface_echoes(__constant const Acquisition *acquisition, __global const Hit *hits,
+                               __global const int *hit_counts, __global float *re, __global float *im, int stride) {
+  int line = get_global_id(0), rays = acquisition->elevational_rays;
   __global float *left_re = re + 2 * line * stride + LINE_PAD, *left_im = im + 2 * line * stride + LINE_PAD;
   for (int ray = 0; ray < rays; ray++) {
     int slot = line * rays + ray, count = min(hit_counts[slot], MAX_HITS);
     __global const Hit *ray_hits = hits + slot * MAX_HITS;
     for (int h = 0; h < count; h++) {
       float depth = ray_hits[h].depth_mm, echo = 0.5f * ray_hits[h].echo;
-      float place = depth / scene->sample_mm;
+      float place = depth / acquisition->sample_mm;
       int bin = (int)floor(place);
-      if (bin < 0 || bin + 1 >= scene->samples) continue;
+      if (bin < 0 || bin + 1 >= acquisition->samples) continue;
       float part = place - bin, c, s;
-      turn(depth * scene->cycles_per_mm, &c, &s);
+      turn(depth * acquisition->cycles_per_mm, &c, &s);
       c *= echo, s *= -echo;
       for (int side = 0; side < 2; side++) {
         int at = side * stride + bin;

@@ -33,11 +33,11 @@ typedef struct {
 // The label at fraction f of the cell of voxels at index `here`: the acoustic group with the largest trilinear weight,
 // so that borders are sub-voxel and without stairs, and within it the label of the nearest corner. Voting by group
 // keeps the border of fluid against brain smooth wherever grey, white and other brain labels change along it.
-inline int label_in_cell(__global const ushort *voxels, __global const uchar *groups, __constant const Scene *scene,
-                         int here, float3 f) {
+inline int label_in_cell(__global const ushort *voxels, __global const uchar *groups,
+                         __constant const Acquisition *acquisition, int here, float3 f) {
   const int word = voxels[here];
   if (word & SAME_LABEL) return word & LABEL_MASK;
-  const int nx = scene->dims[0], nxy = nx * scene->dims[1];
+  const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
   if (groups[here] & SAME_GROUP)
     return voxels[here + (f.x > 0.5f) + (f.y > 0.5f ? nx : 0) + (f.z > 0.5f ? nxy : 0)] & LABEL_MASK;
   __global const uchar *far = groups + here + nxy;
@@ -67,12 +67,12 @@ inline int label_in_cell(__global const ushort *voxels, __global const uchar *gr
 }
 
 // The label at `voxel` (padded voxel indices).
-inline int label_at(__global const ushort *voxels, __global const uchar *groups, __constant const Scene *scene,
-                    float3 voxel) {
-  const int nx = scene->dims[0], ny = scene->dims[1], nz = scene->dims[2];
+inline int label_at(__global const ushort *voxels, __global const uchar *groups,
+                    __constant const Acquisition *acquisition, float3 voxel) {
+  const int nx = acquisition->dims[0], ny = acquisition->dims[1], nz = acquisition->dims[2];
   voxel = clamp(voxel, (float3)(0.0f), (float3)(nx - 1.001f, ny - 1.001f, nz - 1.001f));
   const int3 base = convert_int3(voxel);
-  return label_in_cell(voxels, groups, scene, (base.z * ny + base.y) * nx + base.x, voxel - convert_float3(base));
+  return label_in_cell(voxels, groups, acquisition, (base.z * ny + base.y) * nx + base.x, voxel - convert_float3(base));
 }
 
 // Carry a vector perpendicular to `from` along the smallest rotation that takes `from` to `to`.
@@ -88,18 +88,19 @@ typedef struct {
   float path;
 } Course;
 
-inline float3 course_at(__constant const Scene *scene, const Course *course, float l) {
-  return course->start + l * course->step + elevation_sigma(scene, course->path + l) * course->aside;
+inline float3 course_at(__constant const Acquisition *acquisition, const Course *course, float l) {
+  return course->start + l * course->step + elevation_sigma(acquisition, course->path + l) * course->aside;
 }
 
 // Lengths along the course at which it can be inside the volume: (enter, leave). `margin` is in voxels.
-inline float2 volume_span(__constant const Scene *scene, const Course *course, float margin, float longest) {
+inline float2 volume_span(__constant const Acquisition *acquisition, const Course *course, float margin,
+                          float longest) {
   float start[3] = {course->start.x, course->start.y, course->start.z};
   float step[3] = {course->step.x, course->step.y, course->step.z};
   float enter = 0.0f, leave = longest;
   for (int a = 0; a < 3; a++) {
     float inverse = 1.0f / (fabs(step[a]) < 1e-7f ? 1e-7f : step[a]);
-    float t0 = (-margin - start[a]) * inverse, t1 = (scene->dims[a] - 1 + margin - start[a]) * inverse;
+    float t0 = (-margin - start[a]) * inverse, t1 = (acquisition->dims[a] - 1 + margin - start[a]) * inverse;
     enter = fmax(enter, fmin(t0, t1));
     leave = fmin(leave, fmax(t0, t1));
   }
@@ -107,11 +108,12 @@ inline float2 volume_span(__constant const Scene *scene, const Course *course, f
 }
 
 // Halve the stretch from `inside`, in `label`, to `beyond`, in `other`.
-inline void bisect(__global const ushort *voxels, __global const uchar *groups, __constant const Scene *scene,
-                   const Course *course, int label, int times, float *inside, float *beyond, int *other) {
+inline void bisect(__global const ushort *voxels, __global const uchar *groups,
+                   __constant const Acquisition *acquisition, const Course *course, int label, int times, float *inside,
+                   float *beyond, int *other) {
   for (int n = 0; n < times; n++) {
     const float middle = 0.5f * (*inside + *beyond);
-    const int found = label_at(voxels, groups, scene, course_at(scene, course, middle));
+    const int found = label_at(voxels, groups, acquisition, course_at(acquisition, course, middle));
     if (found == label) {
       *inside = middle;
     } else {
@@ -124,16 +126,16 @@ inline void bisect(__global const ushort *voxels, __global const uchar *groups, 
 // March from `*inside` until the label is no longer `label`, then bisect. Returns the first length found to be in
 // another tissue, whose label goes to `other`, and the last one before it in `inside`; or -1 if there is none up to
 // `last`. Nothing before `blind_until` counts. Eight steps of half a voxel are looked up at once.
-inline float next_border(__global const ushort *voxels, __global const uchar *groups, __constant const Scene *scene,
-                         __constant const Tissue *tissues, const Course *course, int label, float *inside, float last,
-                         float blind_until, int *other) {
-  const float stride = 0.5f * scene->voxel_mm;
-  const int nx = scene->dims[0], ny = scene->dims[1];
-  const float3 top = (float3)(nx - 1.001f, ny - 1.001f, scene->dims[2] - 1.001f);
+inline float next_border(__global const ushort *voxels, __global const uchar *groups,
+                         __constant const Acquisition *acquisition, __constant const Tissue *tissues,
+                         const Course *course, int label, float *inside, float last, float blind_until, int *other) {
+  const float stride = 0.5f * acquisition->voxel_mm;
+  const int nx = acquisition->dims[0], ny = acquisition->dims[1];
+  const float3 top = (float3)(nx - 1.001f, ny - 1.001f, acquisition->dims[2] - 1.001f);
   float beyond = -1.0f;
   while (*inside < last && beyond < 0.0f) {
     const float8 ahead = min(*inside + stride * (float8)(1, 2, 3, 4, 5, 6, 7, 8), (float8)(last + 1e-4f));
-    const float8 sigma = elevation_sigma8(scene, course->path + ahead);
+    const float8 sigma = elevation_sigma8(acquisition, course->path + ahead);
     const float8 x =
         clamp(course->start.x + ahead * course->step.x + sigma * course->aside.x, (float8)(0.0f), (float8)(top.x));
     const float8 y =
@@ -152,7 +154,7 @@ inline float next_border(__global const ushort *voxels, __global const uchar *gr
       vstore8(y - convert_float8(j), 0, fy);
       vstore8(z - convert_float8(k), 0, fz);
       for (int n = 0; n < 8; n++) {
-        *other = label_in_cell(voxels, groups, scene, here[n], (float3)(fx[n], fy[n], fz[n]));
+        *other = label_in_cell(voxels, groups, acquisition, here[n], (float3)(fx[n], fy[n], fz[n]));
         if (*other != label && course->path + length[n] > blind_until) {
           beyond = length[n];
           break;
@@ -166,27 +168,28 @@ inline float next_border(__global const ushort *voxels, __global const uchar *gr
   if (beyond < 0.0f) return beyond;
   // Where only attenuation changes, a sixteenth of a voxel is enough, and where a smoothed border tells the rest, half
   // of that.
-  bisect(voxels, groups, scene, course, label, 3, inside, &beyond, other);
+  bisect(voxels, groups, acquisition, course, label, 3, inside, &beyond, other);
   if (tissues[*other].group != tissues[label].group)
-    bisect(voxels, groups, scene, course, label, 2, inside, &beyond, other);
+    bisect(voxels, groups, acquisition, course, label, 2, inside, &beyond, other);
   return beyond;
 }
 
 // Two-way amplitude decay in nepers per mm: 10^(-alpha f 2 l / 20) with l in cm.
-inline float decay_in(__constant const Scene *scene, Tissue tissue) {
-  return tissue.attenuation * scene->frequency_mhz * 0.2f * LN10_OVER_20;
+inline float decay_in(__constant const Acquisition *acquisition, Tissue tissue) {
+  return tissue.attenuation * acquisition->frequency_mhz * 0.2f * LN10_OVER_20;
 }
 
 // The tube (tube_after) behind a mirror of curvature k, met under the angle of incidence i in the plane of the offset:
 // a ray beside this one meets a normal turned by k / cos i per mm of offset, and is turned by twice that.
-inline float4 tube_reflected(__global const uchar *groups, __global const ushort *smooth, __constant const Scene *scene,
-                             float4 tube, Ray ray, float3 point, float3 normal, int before, int behind) {
+inline float4 tube_reflected(__global const uchar *groups, __global const ushort *smooth,
+                             __constant const Acquisition *acquisition, float4 tube, Ray ray, float3 point,
+                             float3 normal, int before, int behind) {
   for (int axis = 0; axis < 2; axis++) {
     const float3 offset = axis == 0 ? ray.lateral : ray.elevational;
     // Along the ray onto the surface, so longer by 1 / cos i.
     const float3 along = offset - dot3(normal, offset) / fmin(dot3(normal, ray.direction), -0.2f) * ray.direction;
     const float longer = fmax(length3(along), 1e-3f);
-    const float curvature = border_curvature(groups, smooth, scene, point, along / longer, before, behind);
+    const float curvature = border_curvature(groups, smooth, acquisition, point, along / longer, before, behind);
     // Concave mirrors focus; taken from voxels that would make random bright spots, so they count as flat.
     const float growth = 2.0f * fmax(curvature, 0.0f) * longer;
     if (axis == 0)
@@ -238,13 +241,13 @@ inline Interface interface_between(Tissue here, Tissue behind, float3 direction,
 
 // The root of a traced line: the beam frame at the probe face, taken from the probe frame to RAS.
 // `origin_and_direction` are (x, y) each.
-inline Ray root_of(__constant const Scene *scene, float4 origin_and_direction) {
+inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_direction) {
   const float2 origin = origin_and_direction.lo, direction = origin_and_direction.hi;
   Ray root;
-  root.axis = affine_point(scene->probe_to_ras, (float3)(origin, 0.0f));
-  root.direction = unit3(affine_vector(scene->probe_to_ras, (float3)(direction, 0.0f)));
-  root.lateral = unit3(affine_vector(scene->probe_to_ras, (float3)(direction.y, -direction.x, 0.0f)));
-  root.elevational = unit3(affine_vector(scene->probe_to_ras, (float3)(0.0f, 0.0f, 1.0f)));
+  root.axis = affine_point(acquisition->probe_to_ras, (float3)(origin, 0.0f));
+  root.direction = unit3(affine_vector(acquisition->probe_to_ras, (float3)(direction, 0.0f)));
+  root.lateral = unit3(affine_vector(acquisition->probe_to_ras, (float3)(direction.y, -direction.x, 0.0f)));
+  root.elevational = unit3(affine_vector(acquisition->probe_to_ras, (float3)(0.0f, 0.0f, 1.0f)));
   root.path = 0.0f;
   root.depth = 0.0f;
   root.log_attenuation = 0.0f;
@@ -259,24 +262,24 @@ inline Ray root_of(__constant const Scene *scene, float4 origin_and_direction) {
 // How much of an echo is left when a surface is tilted in elevation: a ray stands for a stratum of the beam, over which
 // the range changes by slope x width, and an integral over that many turns of the carrier is short of the sum of its
 // parts. Without it, walls seen aslant show as one thin line per ray.
-inline float stratum_coherence(__constant const Scene *scene, Ray ray, float3 normal, float quantile, float path,
-                               float depth_per_mm) {
+inline float stratum_coherence(__constant const Acquisition *acquisition, Ray ray, float3 normal, float quantile,
+                               float path, float depth_per_mm) {
   const float density = 0.39894228f * exp_fast(-0.5f * quantile * quantile);  // of N(0, 1)
-  const float width = elevation_sigma(scene, path) / (scene->elevational_rays * density);
+  const float width = elevation_sigma(acquisition, path) / (acquisition->elevational_rays * density);
   const float slope = dot3(normal, ray.elevational) / fmin(dot3(normal, ray.direction), -0.05f);
-  const float turns = scene->cycles_per_mm * depth_per_mm * width * slope;
+  const float turns = acquisition->cycles_per_mm * depth_per_mm * width * slope;
   return exp_fast(-1.6449341f * turns * turns);  // the main lobe of sin(pi t) / (pi t), to second order
 }
 
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
-__kernel void
-trace(__constant const Scene *scene, __global const ushort *voxels, __global const uchar *groups,
-      __global const ushort *smooth, __constant const Tissue *tissues, __global const float *roots,
-      __global const float *quantiles, __global Segment *segments, __global int *segment_counts, __global Hit *hits,
-      __global int *hit_counts, __global float *cut, __global int *overflown) {
-  const int line = get_global_id(0), ray_of_line = get_global_id(1), rays = scene->elevational_rays;
+__kernel void trace(__constant const Acquisition *acquisition, __global const ushort *voxels,
+                    __global const uchar *groups, __global const ushort *smooth, __constant const Tissue *tissues,
+                    __global const float *roots, __global const float *quantiles, __global Segment *segments,
+                    __global int *segment_counts, __global Hit *hits, __global int *hit_counts, __global float *cut,
+                    __global int *overflown) {
+  const int line = get_global_id(0), ray_of_line = get_global_id(1), rays = acquisition->elevational_rays;
   const int on_axis = ray_of_line == 0;
   const int slot = line * rays + ray_of_line - 1;
   const float quantile = on_axis ? 0.0f : quantiles[slot];
@@ -287,7 +290,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
   float cut_weight = 0.0f;
 
   Ray stack[MAX_STACK];
-  stack[0] = root_of(scene, vload4(line, roots));
+  stack[0] = root_of(acquisition, vload4(line, roots));
   int waiting = 1;
   while (waiting > 0) {
     Ray ray = stack[--waiting];
@@ -297,15 +300,16 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
     }
     while (1) {  // one turn per tree node: march to the next interface, branch, go on with the refracted child
       Course course;
-      course.start = affine_point(scene->ras_to_voxel, ray.axis);
-      course.step = affine_vector(scene->ras_to_voxel, ray.direction);
-      course.aside = affine_vector(scene->ras_to_voxel, ray.elevational) * quantile;
+      course.start = affine_point(acquisition->ras_to_voxel, ray.axis);
+      course.step = affine_vector(acquisition->ras_to_voxel, ray.direction);
+      course.aside = affine_vector(acquisition->ras_to_voxel, ray.elevational) * quantile;
       course.path = ray.path;
-      if (ray.label < 0) ray.label = label_at(voxels, groups, scene, course_at(scene, &course, 0.0f));
+      if (ray.label < 0) ray.label = label_at(voxels, groups, acquisition, course_at(acquisition, &course, 0.0f));
       Tissue here = tissues[ray.label], behind = here;
-      const float depth_per_mm = scene->reference_speed_m_s / here.speed_m_s;
-      const float to_depth = (scene->depth_mm - ray.depth) / depth_per_mm;
-      const float2 span = volume_span(scene, &course, 3.0f + fabs(quantile) * 4.0f / scene->voxel_mm, to_depth);
+      const float depth_per_mm = acquisition->reference_speed_m_s / here.speed_m_s;
+      const float to_depth = (acquisition->depth_mm - ray.depth) / depth_per_mm;
+      const float2 span =
+          volume_span(acquisition, &course, 3.0f + fabs(quantile) * 4.0f / acquisition->voxel_mm, to_depth);
 
       // Tissues of one group have no interface between them: only attenuation changes there and the node goes on.
       // `since` is where the present tissue began, `spent` the attenuation exponent up to there; a segment is open from
@@ -313,12 +317,12 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       float since = 0.0f, spent = 0.0f, open = 0.0f, spent_open = 0.0f, inside = span.x, border;
       int other = ray.label, is_silenced;
       while (1) {
-        const float decay = decay_in(scene, here);
-        const float reserve = log_fast(ray.weight / scene->intensity_threshold) + ray.log_attenuation - spent;
+        const float decay = decay_in(acquisition, here);
+        const float reserve = log_fast(ray.weight / acquisition->intensity_threshold) + ray.log_attenuation - spent;
         const float to_silence = since + fmax(reserve, 0.0f) / fmax(decay, 1e-9f);
         is_silenced = to_silence < to_depth;
         const float longest = fmin(to_depth, to_silence);
-        border = next_border(voxels, groups, scene, tissues, &course, ray.label, &inside, fmin(span.y, longest),
+        border = next_border(voxels, groups, acquisition, tissues, &course, ray.label, &inside, fmin(span.y, longest),
                              ray.blind_until, &other);
         const float until = border < 0.0f ? longest : border;
         const float spent_until = spent + decay * (until - since);
@@ -352,23 +356,24 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       }
 
       float overshoot;
-      const float3 normal = interface_normal(groups, smooth, scene, course_at(scene, &course, border), here.group,
-                                             behind.group, ray.direction, course.step, &overshoot);
+      const float3 normal = interface_normal(groups, smooth, acquisition, course_at(acquisition, &course, border),
+                                             here.group, behind.group, ray.direction, course.step, &overshoot);
       overshoot = fmin(overshoot, border - since);
       float back = overshoot;
       if (overshoot == 0.0f) {  // the labels alone have to tell
         float beyond = border;
-        bisect(voxels, groups, scene, &course, ray.label, 3, &inside, &beyond, &other);
+        bisect(voxels, groups, acquisition, &course, ray.label, 3, &inside, &beyond, &other);
         back = border - beyond;
         behind = tissues[other];
       }
       border -= back;
-      spent -= back * decay_in(scene, here);
+      spent -= back * decay_in(acquisition, here);
       if (on_axis && count > 0 && count <= room) my_segments[count - 1].length_mm -= back;
       const float path = ray.path + border, depth = ray.depth + border * depth_per_mm;
-      if (depth >= scene->depth_mm) break;  // with the overshoot taken back, the border lies beyond the field: a leaf
+      if (depth >= acquisition->depth_mm)
+        break;  // with the overshoot taken back, the border lies beyond the field: a leaf
       const float log_attenuation = ray.log_attenuation - spent, attenuation = exp_fast(log_attenuation);
-      const float3 aside = quantile * elevation_sigma(scene, path) * ray.elevational;
+      const float3 aside = quantile * elevation_sigma(acquisition, path) * ray.elevational;
       const float3 hit_point = ray.axis + border * ray.direction + aside;
       const float4 tube = tube_after(ray.tube, border);
       const Interface surface = interface_between(here, behind, ray.direction, normal);
@@ -385,10 +390,11 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
           hit.attenuation = attenuation;
           hit.cos_incidence = surface.cos_in;
           hit.reflectance = reflectance;
-          hit.echo = ray.weight * attenuation * (scene->interface_is_energy ? reflectance : fabs(surface.pressure)) *
-                     exp2_scalar(max(scene->specular_exponent * log2_scalar(surface.cos_in), -100.0f)) *
-                     scene->interface_gain / (rays * tube.x * tube.z) *
-                     stratum_coherence(scene, ray, normal, quantile, path, depth_per_mm);
+          hit.echo = ray.weight * attenuation *
+                     (acquisition->interface_is_energy ? reflectance : fabs(surface.pressure)) *
+                     exp2_scalar(max(acquisition->specular_exponent * log2_scalar(surface.cos_in), -100.0f)) *
+                     acquisition->interface_gain / (rays * tube.x * tube.z) *
+                     stratum_coherence(acquisition, ray, normal, quantile, path, depth_per_mm);
           hit.reflections = ray.reflections;
           hit.label_before = ray.label;
           hit.label_behind = other;
@@ -399,20 +405,21 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
 
       // The reflected child waits on the stack; weak ones and those beyond the tree's depth are cut.
       const float reflected_weight = ray.weight * reflectance, refracted_weight = ray.weight * (1.0f - reflectance);
-      if (ray.reflections < scene->max_ray_depth && reflected_weight >= scene->reflection_threshold &&
-          reflected_weight * attenuation >= scene->intensity_threshold && waiting < MAX_STACK) {
+      if (ray.reflections < acquisition->max_ray_depth && reflected_weight >= acquisition->reflection_threshold &&
+          reflected_weight * attenuation >= acquisition->intensity_threshold && waiting < MAX_STACK) {
         Ray child = ray;
         child.direction = unit3(mirror(ray.direction, normal));
         child.lateral = mirror(ray.lateral, normal);
         child.elevational = mirror(ray.elevational, normal);
         child.axis = hit_point - mirror(aside, normal);
-        if (scene->reflection_spreading)
-          child.tube = tube_reflected(groups, smooth, scene, tube, ray, hit_point, normal, here.group, behind.group);
+        if (acquisition->reflection_spreading)
+          child.tube =
+              tube_reflected(groups, smooth, acquisition, tube, ray, hit_point, normal, here.group, behind.group);
         child.path = path;
         child.depth = depth;
         child.log_attenuation = log_attenuation;
         child.weight = reflected_weight;
-        child.blind_until = path + scene->voxel_mm;
+        child.blind_until = path + acquisition->voxel_mm;
         child.reflections = ray.reflections + 1;
         stack[waiting++] = child;
       } else {
@@ -421,7 +428,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
 
       // The refracted child is this ray, bent.
       if (surface.is_total) break;
-      if (refracted_weight * attenuation < scene->intensity_threshold || count > room) {
+      if (refracted_weight * attenuation < acquisition->intensity_threshold || count > room) {
         cut_weight += refracted_weight;
         break;
       }
@@ -430,7 +437,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       ray.lateral = carry(ray.lateral, ray.direction, bent);
       ray.elevational = carry(ray.elevational, ray.direction, bent);
       ray.direction = bent;
-      ray.axis = hit_point - quantile * elevation_sigma(scene, path) * ray.elevational;
+      ray.axis = hit_point - quantile * elevation_sigma(acquisition, path) * ray.elevational;
       ray.tube = tube;
       ray.path = path;
       ray.depth = depth;
@@ -438,7 +445,7 @@ trace(__constant const Scene *scene, __global const ushort *voxels, __global con
       ray.weight = refracted_weight;
       ray.label = other;
       // Until the trilinear border is behind, too: at grazing incidence the ray would go on crossing the same border.
-      ray.blind_until = overshoot > 0.0f ? path + overshoot + 0.5f * scene->voxel_mm : path;
+      ray.blind_until = overshoot > 0.0f ? path + overshoot + 0.5f * acquisition->voxel_mm : path;
     }
   }
   cut[line * (rays + 1) + ray_of_line] = cut_weight;

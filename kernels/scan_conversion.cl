@@ -17,20 +17,22 @@ inline floatn angle_of(floatn x, floatn y) {
   return x < 0.0f ? -a : a;
 }
 
-__kernel void scan_convert(__constant const Scene *scene, __global const uchar *grey, float left, float top,
+__kernel void scan_convert(__constant const Acquisition *acquisition, __global const uchar *grey, float left, float top,
                            float pixel_x, float pixel_y, int columns, __global uchar *image) {
   const int column = get_global_id(0) * LANES, row = get_global_id(1);
-  const int scan_lines = scene->scan_lines, samples = scene->samples;
+  const int scan_lines = acquisition->scan_lines, samples = acquisition->samples;
   const floatn x = left + (TO_FLOATN(column + LANE_INDEX) + 0.5f) * pixel_x;
   const floatn y = (floatn)(top + (row + 0.5f) * pixel_y);
   floatn lateral = x, depth = y;
-  if (!scene->linear) {
-    const floatn from_apex = y + scene->apex_radius_mm;
-    depth = sqrt(x * x + from_apex * from_apex) - scene->apex_radius_mm;
+  if (!acquisition->linear) {
+    const floatn from_apex = y + acquisition->apex_radius_mm;
+    depth = sqrt(x * x + from_apex * from_apex) - acquisition->apex_radius_mm;
     lateral = from_apex > 0.0f ? angle_of(x, from_apex) : (floatn)(1e9f);  // the field opens to less than 180 degrees
   }
-  const floatn place = (lateral - scene->first_line) / scene->line_spacing, sample = depth / scene->sample_mm;
-  const intn inside = (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) & (depth < scene->depth_mm);
+  const floatn place = (lateral - acquisition->first_line) / acquisition->line_spacing,
+               sample = depth / acquisition->sample_mm;
+  const intn inside =
+      (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) & (depth < acquisition->depth_mm);
   const intn bin = clamp(TO_INTN(sample), (intn)(0), (intn)(samples - 2));
   const floatn on_line = clamp(place, 0.0f, scan_lines - 1.0f);
   const intn line = TO_INTN(on_line);

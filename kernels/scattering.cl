@@ -71,9 +71,9 @@ inline void add_echo(float4 *sum, int bin, float between, float right, float str
 
 // The label of a scatterer at fraction (fx, fy, fz) of the cell of voxels at `corner`, which has a border or the
 // membrane in it; `random` are bits of the scatterer's own. With TEXTURE, also its gain.
-inline int drawn_label(__constant const Scene *scene, __global const ushort *corner, __global const uint *texture,
-                       float fx, float fy, float fz, uint random, float *gain) {
-  const int nx = scene->dims[0], nxy = nx * scene->dims[1];
+inline int drawn_label(__constant const Acquisition *acquisition, __global const ushort *corner,
+                       __global const uint *texture, float fx, float fy, float fz, uint random, float *gain) {
+  const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
   // Partial volume without blending: the scatterer takes the label of one corner, drawn with that corner's trilinear
   // weight. The border is soft on average and fixed in the patient.
   const int dx = fx * 32.0f > (random & 31u) + 0.5f, dy = fy * 32.0f > ((random >> 5) & 31u) + 0.5f,
@@ -91,21 +91,22 @@ inline int drawn_label(__constant const Scene *scene, __global const ushort *cor
   corner += nxy;
   const float far_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
                             blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
-  if (fabs(blend(near_z, far_z, fz) - 127.5f) >= scene->membrane_reach) return label;
+  if (fabs(blend(near_z, far_z, fz) - 127.5f) >= acquisition->membrane_reach) return label;
   *gain = 1.0f;
   return MEMBRANE_LABEL;
 }
 
 // Three passes over a batch, each without a branch to guess wrong: vectors of all cells; labels of those that count;
 // their echoes, one after the other.
-inline void scatter_batch(__constant const Scene *scene, __global const ushort *voxels, __global const uint *texture,
-                          __global const Tissue *tissues, const Piece *piece, const int *cell_u, const uint *row_key,
-                          const float *row_v, const float *row_w, int count, float4 *sum VARIED_PARAMETERS) {
-  const float cell = scene->cell_mm, grain = cell / 1024.0f;
-  const float cutoff2 = 0.5f * LOG2_E * scene->beam_cutoff * scene->beam_cutoff;
-  const float inverse_sample = 1.0f / scene->sample_mm;
-  const int nx = scene->dims[0], ny = scene->dims[1];
-  const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, scene->dims[2] - 1.001f);
+inline void scatter_batch(__constant const Acquisition *acquisition, __global const ushort *voxels,
+                          __global const uint *texture, __global const Tissue *tissues, const Piece *piece,
+                          const int *cell_u, const uint *row_key, const float *row_v, const float *row_w, int count,
+                          float4 *sum VARIED_PARAMETERS) {
+  const float cell = acquisition->cell_mm, grain = cell / 1024.0f;
+  const float cutoff2 = 0.5f * LOG2_E * acquisition->beam_cutoff * acquisition->beam_cutoff;
+  const float inverse_sample = 1.0f / acquisition->sample_mm;
+  const int nx = acquisition->dims[0], ny = acquisition->dims[1];
+  const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, acquisition->dims[2] - 1.001f);
   const int u = piece->u, v = piece->v, w = piece->w;
   const uint step_u = axis_step(u);
   const float3 d = piece->direction, l = piece->lateral, e = piece->elevational;
@@ -117,7 +118,7 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
   int n = 0;
   for (int begin = 0; begin < count; begin += LANES) {
     const intn cells = LOAD_LANES(cell_u + begin);
-    const uintn key = hash_mixn((LOAD_LANES(row_key + begin) + TO_UINTN(cells) * step_u) ^ scene->seed);
+    const uintn key = hash_mixn((LOAD_LANES(row_key + begin) + TO_UINTN(cells) * step_u) ^ acquisition->seed);
     const uintn key1 = hash_mixn(key + 0x9E3779B9u), key2 = hash_mixn(key + 0x3C6EF372u);
     // (The seed is not added: one added to another would be the same patient, shifted by a cell.)
     // Jitter belongs to the lattice axes: u, v, w take the bits of the axis they stand for.
@@ -147,7 +148,7 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
     const floatn amplitude =
         exp2_fast(clamp(piece->gain0 + t * piece->gain1 - r2, (floatn)(-100.0f), (floatn)(100.0f)));
     floatn cosine, sine;
-    turn(depth * scene->cycles_per_mm, &cosine, &sine);
+    turn(depth * acquisition->cycles_per_mm, &cosine, &sine);
     const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
     const floatn vx = clamp(at.x + pu * ri.x + pv * ri.y + pw * ri.z, (floatn)(0.0f), (floatn)(voxel_top.x));
     const floatn vy = clamp(at.y + pu * rj.x + pv * rj.y + pw * rj.z, (floatn)(0.0f), (floatn)(voxel_top.y));
@@ -185,7 +186,7 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
   for (int k = 0; k < several; k++) {
     const int i = mixed[k], j = chosen[i], here = voxel_[j];
     float gain = 1.0f;
-    label_[i] = drawn_label(scene, voxels + here, texture + here, fx_[j], fy_[j], fz_[j], random_[j], &gain);
+    label_[i] = drawn_label(acquisition, voxels + here, texture + here, fx_[j], fy_[j], fz_[j], random_[j], &gain);
 #ifdef TEXTURE
     gain_[i] = gain;
 #endif
@@ -219,13 +220,14 @@ inline void scatter_batch(__constant const Scene *scene, __global const ushort *
 
 // The scatterers of one piece: finds the lattice cells beside it and computes them in batches. `start` is the segment's
 // start, `low` and `high` are the piece's ends along it, `radius_l` and `radius_e` how far it reaches to either side.
-inline void scatter_piece(__constant const Scene *scene, __global const ushort *voxels, __global const uint *texture,
-                          __global const Tissue *tissues, const Piece *piece, float3 start, float low, float high,
-                          float radius_l, float radius_e, float4 *sum VARIED_PARAMETERS) {
+inline void scatter_piece(__constant const Acquisition *acquisition, __global const ushort *voxels,
+                          __global const uint *texture, __global const Tissue *tissues, const Piece *piece,
+                          float3 start, float low, float high, float radius_l, float radius_e,
+                          float4 *sum VARIED_PARAMETERS) {
   int cell_u[BATCH + LANES];
   uint row_key[BATCH + LANES];
   float row_v[BATCH + LANES], row_w[BATCH + LANES];
-  const float cell = scene->cell_mm, inverse_cell = 1.0f / cell;
+  const float cell = acquisition->cell_mm, inverse_cell = 1.0f / cell;
   const float3 d = piece->direction, l = piece->lateral, e = piece->elevational;
 
   // The box of lattice cells around this piece, then rows along u clipped by the three slabs that bound it.
@@ -283,7 +285,7 @@ inline void scatter_piece(__constant const Scene *scene, __global const ushort *
           STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
           waiting += min(LANES, cells_[j] - cu);
           if (waiting >= BATCH) {
-            scatter_batch(scene, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, BATCH,
+            scatter_batch(acquisition, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, BATCH,
                           sum VARIED_ARGUMENTS);
             waiting -= BATCH;
             for (int i = 0; i < waiting; i++) {
@@ -297,25 +299,26 @@ inline void scatter_piece(__constant const Scene *scene, __global const ushort *
       }
     }
   }
-  scatter_batch(scene, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, waiting, sum VARIED_ARGUMENTS);
+  scatter_batch(acquisition, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, waiting,
+                sum VARIED_ARGUMENTS);
 }
 
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
-__kernel void
-scatter(__constant const Scene *scene, __global const ushort *voxels, __global const uint *texture,
-        __global const Tissue *tissues, __global const Segment *segments, __global const int *segment_counts,
-        __global float *re, __global float *im, int stride VARIED_PARAMETERS) {
+__kernel void scatter(__constant const Acquisition *acquisition, __global const ushort *voxels,
+                      __global const uint *texture, __global const Tissue *tissues, __global const Segment *segments,
+                      __global const int *segment_counts, __global float *re, __global float *im,
+                      int stride VARIED_PARAMETERS) {
   int chunk = get_global_id(0), line = get_global_id(1);
   int first = chunk * CHUNK;
   float4 sum[PARTS * PART];  // left re, im, right re, im
   for (int i = 0; i < PARTS * PART; i++) sum[i] = (float4)(0.0f);
-  const float depth_low = (first - 1) * scene->sample_mm, depth_high = (first + CHUNK) * scene->sample_mm;
+  const float depth_low = (first - 1) * acquisition->sample_mm, depth_high = (first + CHUNK) * acquisition->sample_mm;
   // Widths and gains are taken as linear over BLOCK samples, of which CHUNK is a part, so that the image does not
   // depend on how the work is split.
   const int block = first / BLOCK * BLOCK;
-  const float block_low = (block - 1) * scene->sample_mm, block_high = (block + BLOCK) * scene->sample_mm;
+  const float block_low = (block - 1) * acquisition->sample_mm, block_high = (block + BLOCK) * acquisition->sample_mm;
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int index = 0; index < count; index++) {
@@ -342,7 +345,7 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
     const float3 l = (float3)(segment->lateral[u], segment->lateral[v], segment->lateral[w]);
     const float3 e = (float3)(segment->elevational[u], segment->elevational[v], segment->elevational[w]);
     const float3 start = (float3)(segment->start[u], segment->start[v], segment->start[w]);
-    __constant const float *m = scene->ras_to_voxel;
+    __constant const float *m = acquisition->ras_to_voxel;
     piece.u = u, piece.v = v, piece.w = w;
     piece.direction = d, piece.lateral = l, piece.elevational = e;
     piece.start_u = start.x;
@@ -353,7 +356,7 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
 
     // Widths and gains are taken as linear between the two ends of a piece, so it must not be long for the beam's
     // waist.
-    const float waist = fmin(scene->transmit_rayleigh, scene->elevation_rayleigh);
+    const float waist = fmin(acquisition->transmit_rayleigh, acquisition->elevation_rayleigh);
     const int pieces = max(1, (int)ceil((segment_high - segment_low) / (0.4f * waist)));
     for (int n = 0; n < pieces; n++) {
       const float low = blend(segment_low, segment_high, (float)n / pieces);
@@ -361,18 +364,18 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
       piece.from_mm = n == 0 ? 0.0f : low;
       piece.to_mm = n == pieces - 1 ? segment->length_mm : high;
       const float path_low = segment->path_mm + low, path_high = segment->path_mm + high;
-      const float2 sigma_low = beam_sigma(scene, path_low), sigma_high = beam_sigma(scene, path_high);
-      const float apart_low = line_distance(scene, path_low), apart_high = line_distance(scene, path_high);
+      const float2 sigma_low = beam_sigma(acquisition, path_low), sigma_high = beam_sigma(acquisition, path_high);
+      const float apart_low = line_distance(acquisition, path_low), apart_high = line_distance(acquisition, path_high);
       piece.low = low;
       piece.span = 1.0f / fmax(high - low, 1e-6f);
-      piece.bend = scene->linear ? 0.0f : 0.5f / fmax(scene->apex_radius_mm + path_low, 1.0f);
+      piece.bend = acquisition->linear ? 0.0f : 0.5f / fmax(acquisition->apex_radius_mm + path_low, 1.0f);
       piece.line0 = 1.0f / apart_low;
       piece.line1 = 1.0f / apart_high - piece.line0;
       piece.narrow0 = 0.5f * LOG2_E / (sigma_low.y * sigma_low.y);
       piece.narrow1 = 0.5f * LOG2_E / (sigma_high.y * sigma_high.y) - piece.narrow0;
       // Unit energy of the point spread function, whatever its widths: sqrt(1 / (sigma_l sigma_e)) times the scale; and
       // beam.cl weighs with unit sum, that is with apart / (sqrt(2 pi) sigma_l) at the peak.
-      const float gain = log2(segment->weight * segment->attenuation * scene->speckle_scale * 2.50662827f);
+      const float gain = log2(segment->weight * segment->attenuation * acquisition->speckle_scale * 2.50662827f);
       const float decay = LOG2_E * segment->decay_per_mm;
       // Behind a curved mirror the same power has a wider tube to fill.
       const float4 tube_low = tube_after(vload4(0, segment->tube), low);
@@ -386,8 +389,8 @@ scatter(__constant const Scene *scene, __global const ushort *voxels, __global c
       const float radius_l = 0.5f * fmax(apart_low, apart_high), early = piece.bend * radius_l * radius_l;
       const float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
       if (begin >= end) continue;
-      scatter_piece(scene, voxels, texture, tissues, &piece, start, begin, end, radius_l,
-                    scene->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum VARIED_ARGUMENTS);
+      scatter_piece(acquisition, voxels, texture, tissues, &piece, start, begin, end, radius_l,
+                    acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum VARIED_ARGUMENTS);
     }
   }
   for (int part = 0; part < PARTS; part++) {

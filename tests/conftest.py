@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import LinearProbe, SimulationSettings, Tissue, TissueTable, UltrasoundSimulator, Volume
-from SlicerUSSim.Logic.tissues import TISSUES
+from SlicerUSSim.Logic.tissue.presets import TISSUES
 
 hypothesis.settings.register_profile("ussim", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("ussim")

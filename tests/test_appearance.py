@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from SlicerUSSim.Logic import DisplaySettings, LinearProbe, Membrane, SimulationError, Tissue
-from SlicerUSSim.Logic.appearance import AppearanceModel
-from SlicerUSSim.Logic.scan_conversion import ImageGrid
-from SlicerUSSim.Logic.tissues import TISSUES
+from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.tissue.presets import TISSUES
 from tests.conftest import block, simulator
 
 UPPER = Tissue("upper", 1540.0, 1.60, 0.5, 0.33, 0.0, 0.15)

@@ -16,27 +16,28 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkFeatureEdges, vtkMassProperties, vtkTriangleFilter
 
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationError, TissueTable, UltrasoundSimulator
-from SlicerUSSim.Logic.phantoms import head_mri
-from SlicerUSSim.Logic.placement import craniotomy_pose, tilt_sweep, turned
-from SlicerUSSim.Logic.preset import Preset
-from SlicerUSSim.Logic.probe import PROBES
-from SlicerUSSim.Logic.probe_shape import field_polydata, probe_polydata
-from SlicerUSSim.Logic.scan_conversion import ImageGrid
-from SlicerUSSim.Logic.script import LabelSource, python_script
-from SlicerUSSim.Logic.segmentation import segment_mri
-from SlicerUSSim.Logic.sequence import TrackedSequence
-from SlicerUSSim.Logic.volume import read_array
+from SlicerUSSim.Logic.base.volume import read_array
+from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.mri.segmentation import segment_mri
+from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.probe.placement import craniotomy_pose, tilt_sweep, turned
+from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Workstation.script import LabelSource, python_script
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 pytest.importorskip("greenlet", reason="the workstation comes with: pip install '.[serve]'")
 pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
 
-from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.scene_fit import tracked_images  # noqa: E402
-from SlicerUSSim.Logic.scene_nodes import probe_pose, set_node_to_world, write_labels, write_volume  # noqa: E402
-from SlicerUSSim.Logic.scene_sequence import add_sequence  # noqa: E402
-from SlicerUSSim.Widget.browser.export import Cine  # noqa: E402
-from SlicerUSSim.Widget.browser.tasks import AtMost, Tasks  # noqa: E402
+from SlicerUSSim.Logic.mrml.fit_nodes import tracked_images  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import probe_pose, set_node_to_world, write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence  # noqa: E402
+from SlicerUSSim.Workstation.export import Cine  # noqa: E402
+from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -264,8 +265,8 @@ def test_an_image_keeps_its_pose_when_the_probe_has_moved_on(head):
 
 
 def test_a_node_is_written_in_place_while_its_size_stays():
-    from SlicerUSSim.Logic.scene_nodes import write_slice
-    from SlicerUSSim.Logic.volume import Volume
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mrml.nodes import write_slice
 
     scene = slicer.vtkMRMLScene()
     node = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode")

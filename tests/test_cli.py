@@ -12,11 +12,11 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from SlicerUSSim.cli import main
+from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import Preset, Volume
-from SlicerUSSim.Logic.phantoms import head_mri
-from SlicerUSSim.Logic.pose import read_pose, write_pose
-from SlicerUSSim.Logic.probe import PROBES
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.tracked.pose_files import read_pose, write_pose
 
 
 def ussim(*arguments):
@@ -86,7 +86,7 @@ def test_demo_writes_everything_it_promises(head, tmp_path):
 def test_the_demo_without_nilearn_says_that_it_uses_a_phantom(monkeypatch):
     import importlib.util
 
-    from SlicerUSSim.Logic.demo import demo_mri
+    from SlicerUSSim.Logic.mri.samples import demo_mri
 
     find = importlib.util.find_spec
     monkeypatch.setattr(
@@ -231,7 +231,7 @@ def test_a_device_that_fails_is_one_line_too(labels, tmp_path, monkeypatch):
     def fail(*_):
         raise pyopencl.MemoryError("clEnqueueNDRangeKernel", -4)
 
-    monkeypatch.setattr("SlicerUSSim.Logic.raytracing.RayTracer.run", fail)
+    monkeypatch.setattr("SlicerUSSim.Logic.imaging.raytracing.RayTracer.run", fail)
     result = ussim("simulate", labels, "--pose", "auto", "-o", tmp_path / "o.png")
     assert result.exit_code == 2 and "the OpenCL device failed" in result.stderr
     assert not list(tmp_path.iterdir())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from SlicerUSSim.cli import main
+from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
     PhasedProbe,
     Preset,
@@ -19,11 +19,11 @@ from SlicerUSSim.Logic import (
     Volume,
     segment_mri,
 )
-from SlicerUSSim.Logic.phantoms import head_mri
-from SlicerUSSim.Logic.placement import tilt_sweep
-from SlicerUSSim.Logic.pose import write_pose
-from SlicerUSSim.Logic.tissues import write_json
-from SlicerUSSim.Logic.twins import make_twin
+from SlicerUSSim.Logic.base.files import write_json
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.probe.placement import tilt_sweep
+from SlicerUSSim.Logic.tracked.pose_files import write_pose
+from SlicerUSSim.Logic.verification.twins import make_twin
 from tests.conftest import SHARED, example, needs_shared
 
 
@@ -103,7 +103,7 @@ def test_sweep_draws_the_same_images_on_the_same_pixels(folder):
 
 
 def test_register_moves_the_poses_and_writes_the_transform(folder, monkeypatch):
-    monkeypatch.setattr("SlicerUSSim.Logic.fitting._ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
+    monkeypatch.setattr("SlicerUSSim.Logic.fitting.fit._ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
     done = optimize(
         folder, "--register", "--evaluations", 40, "--restarts", 0, "--free", "display", "--save-transform",
         folder / "moved.json",

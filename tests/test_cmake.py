@@ -102,7 +102,7 @@ def test_the_built_module_simulates_with_its_own_kernels(build):
         import slicer
         slicer.mrmlScene = slicer.vtkMRMLScene()
         module.SlicerUSSimTest().runTest()
-        from SlicerUSSim.Logic.device import kernel_folder
+        from SlicerUSSim.Logic.opencl.device import kernel_folder
         assert kernel_folder() == stand_in.MODULE_FILE.parent / "kernels", kernel_folder()
         print("fine")
     """

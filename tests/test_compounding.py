@@ -5,17 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
-from SlicerUSSim.cli import main
+from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, SimulationError, Volume
-from SlicerUSSim.Logic.compounding import Compounder, sweep_grid
-from SlicerUSSim.Logic.frame import Frame
-from SlicerUSSim.Logic.placement import slide_sweep, tilt_sweep
-from SlicerUSSim.Logic.scan_conversion import ImageGrid
-from SlicerUSSim.Logic.validation.beams import freehand_sweep
+from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
+from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
+from SlicerUSSim.Logic.verification.validation.beams import freehand_sweep
 from tests.conftest import SPECKLE, block, rigid, simulator
 
 PROBE = ConvexProbe(30, 60, 40)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import LinearProbe, SimulationError, UltrasoundSimulator, list_devices
-from SlicerUSSim.Logic.device import Device, DeviceInfo, choose_device, faster_hint, kernel_folder
-from SlicerUSSim.Logic.pocl import require_linker
+from SlicerUSSim.Logic.opencl.device import Device, kernel_folder
+from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device, faster_hint
+from SlicerUSSim.Logic.opencl.pocl import require_linker
 from tests.conftest import SPECKLE, block, rigid, simulator
 
 
@@ -26,7 +27,7 @@ POCL = fake("0:0", "pthread-Xeon", "Portable Computing Language", "CPU", 2)
 @pytest.fixture
 def three_devices(monkeypatch):
     monkeypatch.setattr(
-        "SlicerUSSim.Logic.device.list_devices", lambda: sorted([POCL, INTEL, GPU], key=lambda d: d.rank)
+        "SlicerUSSim.Logic.opencl.device.list_devices", lambda: sorted([POCL, INTEL, GPU], key=lambda d: d.rank)
     )
     monkeypatch.delenv("PYOPENCL_CTX", raising=False)
     monkeypatch.delenv("USSIM_DEVICE", raising=False)
@@ -59,7 +60,7 @@ def test_an_unknown_choice_lists_what_there_is(three_devices, monkeypatch):
 
 
 def test_no_device_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("SlicerUSSim.Logic.device.list_devices", lambda: [])
+    monkeypatch.setattr("SlicerUSSim.Logic.opencl.device.list_devices", lambda: [])
     with pytest.raises(SimulationError, match=r"pip install pocl-binary-distribution.*graphics driver"):
         choose_device()
 
@@ -80,7 +81,7 @@ def test_kernels_are_built_once_and_cached():
 def test_a_kernel_that_does_not_build_is_one_line(tmp_path, monkeypatch):
     (tmp_path / "common.clh").write_text((kernel_folder() / "common.clh").read_text())
     (tmp_path / "broken.cl").write_text("__kernel void broken() { this is not C; }")
-    monkeypatch.setattr("SlicerUSSim.Logic.device.kernel_folder", lambda: tmp_path)
+    monkeypatch.setattr("SlicerUSSim.Logic.opencl.device.kernel_folder", lambda: tmp_path)
     with pytest.raises(SimulationError, match=r"cannot build broken\.cl") as caught:
         Device.get().kernels("broken.cl")
     assert "\n" not in str(caught.value)
@@ -115,7 +116,7 @@ def test_how_a_device_splits_the_work_does_not_change_the_image(lanes, chunk):
 
 def test_importing_the_interface_imports_nothing_heavy():
     code = (
-        "import sys, SlicerUSSim.Logic as L; from SlicerUSSim.cli import main; L.SimulationError; "
+        "import sys, SlicerUSSim.Logic as L; from SlicerUSSim.Command.cli import main; L.SimulationError; "
         "print([m for m in ('numpy', 'vtkmodules', 'SimpleITK', 'pyopencl', 'scipy') if m in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

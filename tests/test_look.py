@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import PhasedProbe, TissueTable, UltrasoundSimulator, Volume, segment_mri
-from SlicerUSSim.Logic.errors import SimulationError
-from SlicerUSSim.Logic.placement import craniotomy_pose, pose_looking_at, sample, slice_under_probe, surface_point
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, sample, slice_under_probe, surface_point
 
 COLIN27 = Path("/usr/share/mricron/templates/ch2bet.nii.gz")
 

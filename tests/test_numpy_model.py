@@ -17,8 +17,8 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     list_devices,
 )
-from SlicerUSSim.Logic.numpy_model import NumpyModel
-from SlicerUSSim.Logic.tissues import Membrane
+from SlicerUSSim.Logic.tissue.tissue import Membrane
+from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
 from tests.conftest import block, rigid
 
 FLUID = Tissue("fluid", 1520, 1.52, 0.0, 0.0, 0.0, 0.0)

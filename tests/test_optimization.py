@@ -15,12 +15,12 @@ from SlicerUSSim.Logic import (
     optimize_appearance,
     segment_mri,
 )
-from SlicerUSSim.Logic.errors import Cancelled
-from SlicerUSSim.Logic.identifiability import variance_db
-from SlicerUSSim.Logic.phantoms import head_mri
-from SlicerUSSim.Logic.scan_conversion import ImageGrid
-from SlicerUSSim.Logic.search import Search
-from SlicerUSSim.Logic.twins import make_twin
+from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.fitting.identifiability import variance_db
+from SlicerUSSim.Logic.fitting.search import Search
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.verification.twins import make_twin
 
 SMALL = PhasedProbe(70.0, 50.0, scan_lines=80)
 

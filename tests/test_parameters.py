@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from SlicerUSSim.Logic import DisplaySettings, SimulationError, TissueTable
-from SlicerUSSim.Logic.parameters import DISPLAY_BOUNDS, TISSUE_BOUNDS, FreeParameters
+from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS, TISSUE_BOUNDS, FreeParameters
 
 TISSUES, DISPLAY = TissueTable.brain(), DisplaySettings()
 

@@ -10,9 +10,9 @@ import pytest
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
-from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
-from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.scene_nodes import write_volume  # noqa: E402
+from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 
 

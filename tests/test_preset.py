@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, Preset, SimulationError, TissueTable
-from SlicerUSSim.Logic.probe import PROBES
-from SlicerUSSim.Logic.tissues import tissue_named
+from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.tissue.names import tissue_named
 
 
 @given(

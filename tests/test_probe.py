@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationError
-from SlicerUSSim.Logic.probe import probe_from_dict
+from SlicerUSSim.Logic.probe.arrays import probe_from_dict
 
 lines = st.integers(2, 300)
 

@@ -26,8 +26,8 @@ from scipy.optimize import curve_fit
 from scipy.signal import hilbert
 
 from SlicerUSSim.Logic import LinearProbe
-from SlicerUSSim.Logic.measurement import correlation, depth_window, echo_near, full_width, level_db
-from SlicerUSSim.Logic.probe import FWHM_PER_SIGMA
+from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA
+from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, echo_near, full_width, level_db
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
 
 pymust = pytest.importorskip("pymust", reason="PyMUST is the reference: pip install PyMUST")

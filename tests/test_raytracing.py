@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, Tissue
-from SlicerUSSim.Logic.simulator import TreeOverflowWarning
+from SlicerUSSim.Logic.imaging.simulator import TreeOverflowWarning
 from tests.conftest import FLUID, block, rigid, simulator
 
 SLOW, FAST = Tissue("slow", 1450.0, 1.45, 0.3), Tissue("fast", 1650.0, 1.9, 0.9)

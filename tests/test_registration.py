@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from SlicerUSSim.Logic import PhasedProbe, SimulationError, TissueTable, segment_mri
-from SlicerUSSim.Logic.errors import Cancelled
-from SlicerUSSim.Logic.registration import register_poses, rigid_from, rotation_deg
-from SlicerUSSim.Logic.twins import make_twin
+from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.fitting.registration import register_poses, rigid_from, rotation_deg
+from SlicerUSSim.Logic.verification.twins import make_twin
 
 PROBE = PhasedProbe(75.0, 60.0, scan_lines=96)
 

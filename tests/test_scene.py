@@ -9,8 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 from vtkmodules.vtkCommonCore import vtkCommand
 
@@ -26,19 +25,13 @@ from SlicerUSSim.Logic import (  # noqa: E402
     Volume,
     segment_mri,
 )
-from SlicerUSSim.Logic.errors import Cancelled  # noqa: E402
-from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
-from SlicerUSSim.Logic.placement import pose_in_slice  # noqa: E402
-from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.scene_nodes import (  # noqa: E402
-    ijk_to_ras,
-    node_to_world,
-    pose_in_labels,
-    set_node_to_world,
-    write_labels,
-    write_volume,
-)
-from SlicerUSSim.Logic.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, pose_in_labels, set_node_to_world, write_volume  # noqa: E402
+from SlicerUSSim.Logic.probe.placement import pose_in_slice  # noqa: E402
 from tests.conftest import FLUID, SPECKLE, block, example, rigid  # noqa: E402
 
 PRESET = Preset(

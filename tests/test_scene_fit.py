@@ -20,20 +20,14 @@ from SlicerUSSim.Logic import (  # noqa: E402
     fitting,
     segment_mri,
 )
-from SlicerUSSim.Logic.errors import Cancelled  # noqa: E402
-from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
-from SlicerUSSim.Logic.scene import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.scene_fit import CostPlot  # noqa: E402
-from SlicerUSSim.Logic.scene_nodes import (  # noqa: E402
-    ijk_to_ras,
-    node_to_world,
-    nodes_of_class,
-    read_volume,
-    write_labels,
-    write_volume,
-)
-from SlicerUSSim.Logic.twins import make_twin  # noqa: E402
-from SlicerUSSim.Logic.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
+from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, nodes_of_class, read_volume, write_volume  # noqa: E402
+from SlicerUSSim.Logic.verification.twins import make_twin  # noqa: E402
 
 PROBE = PhasedProbe(70.0, 50.0, scan_lines=80)
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.ndimage import uniform_filter
 
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
-from SlicerUSSim.Logic.phantoms import head_mri
-from SlicerUSSim.Logic.segmentation import estimate_noise, fit_mixture, guided_filter
+from SlicerUSSim.Logic.mri.guided_filter import guided_filter
+from SlicerUSSim.Logic.mri.mixture import fit_mixture
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.mri.segmentation import estimate_noise
 
 
 def with_rician_noise(volume: Volume, share: float, seed: int = 0) -> Volume:

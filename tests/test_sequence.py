@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import LinearProbe, SimulationError, TrackedSequence, Volume
-from SlicerUSSim.Logic.pose import read_matrix, read_tags, read_transform, rigid_between
-from SlicerUSSim.Logic.sequence import read_coordinate_definitions
-from SlicerUSSim.Logic.tracked import TrackedImages
+from SlicerUSSim.Logic.base.transforms import rigid_between
+from SlicerUSSim.Logic.tracked.images import TrackedImages
+from SlicerUSSim.Logic.tracked.pose_files import read_matrix, read_tags, read_transform
+from SlicerUSSim.Logic.tracked.sequence import read_coordinate_definitions
 from tests.conftest import SHARED, needs_shared
 
 names = st.sampled_from(["ImageToProbe", "ProbeToTracker", "ReferenceToTracker", "ReferenceToRas"])

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import (
@@ -23,10 +22,10 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     Volume,
 )
-from SlicerUSSim.Logic.measurement import level_db
-from SlicerUSSim.Logic.simulator import EmptyViewWarning
-from SlicerUSSim.Logic.tissues import TISSUES
-from SlicerUSSim.Logic.validation import ORIENTATIONS
+from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.verification.measurement import level_db
+from SlicerUSSim.Logic.verification.validation import ORIENTATIONS
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
 
 PROBES = {

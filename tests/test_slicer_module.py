@@ -129,7 +129,7 @@ def test_every_submodule_imports_from_the_module_slicer_loaded(module):
     assert module.__file__.endswith("SlicerUSSim.py") and sys.modules["SlicerUSSim"] is module
     found = [info.name for info in pkgutil.walk_packages(module.__path__, "SlicerUSSim.")]
     names = [name for name in found if ".Command" not in name and name != "SlicerUSSim.SlicerUSSim"]
-    assert len(names) > 35 and "SlicerUSSim.Logic.scene" in names and "SlicerUSSim.Widget.panel" in names
+    assert len(names) > 35 and "SlicerUSSim.Logic.mrml.logic" in names and "SlicerUSSim.Widget.panel" in names
     for name in names:
         assert importlib.import_module(name).__file__.startswith(module.__path__[0]), name
 
@@ -251,7 +251,7 @@ def test_sample_data_is_registered_with_a_checksum_and_a_thumbnail(module, monke
 
 def test_the_parameter_node_is_the_scenes(module):
     hints = typing.get_type_hints(module.SlicerUSSimParameterNode)
-    parameters = importlib.import_module("SlicerUSSim.Logic.scene_parameters")
+    parameters = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node")
     assert set(hints) == {*parameters.NODE_PARAMETERS, *parameters.VALUE_PARAMETERS}
     for name, default in parameters.VALUE_PARAMETERS.items():
         assert hints[name] is type(default), name
@@ -311,8 +311,8 @@ def test_every_node_selector_gets_the_scene():
 
 def test_every_field_of_the_panel_is_one_of_the_preset_and_accepts_both_ends_of_its_range(ui):
     fields = importlib.import_module("SlicerUSSim.Widget.fields")
-    preset_module = importlib.import_module("SlicerUSSim.Logic.preset")
-    probes = importlib.import_module("SlicerUSSim.Logic.probe").PROBES
+    preset_module = importlib.import_module("SlicerUSSim.Logic.imaging.preset")
+    probes = importlib.import_module("SlicerUSSim.Logic.probe.arrays").PROBES
     seen = set()
     for widget in vars(ui).values():
         name = widget.property("presetField")
@@ -385,7 +385,7 @@ def test_the_slice_view_stands_in_the_plane_of_the_probe(session):
     session.ui.simulateButton.click()
     view = session.panel.sliceNode()
     assert view.GetLayoutName() == "Yellow"
-    nodes = importlib.import_module("SlicerUSSim.Logic.scene_nodes")
+    nodes = importlib.import_module("SlicerUSSim.Logic.mrml.nodes")
     pose = nodes.node_to_world(session.parameters.probe_transform)
     matrix = np.array(view.GetSliceToRAS().GetData()).reshape(4, 4)
     np.testing.assert_allclose(matrix[:3, 0], pose[:3, 0], atol=1e-9)
@@ -502,7 +502,7 @@ def test_a_sequence_is_simulated_and_its_browser_plays_it(session):
     session.segmented()
     session.ui.placeButton.click()
     transforms = session.add("Sequence", "sweep")
-    nodes = importlib.import_module("SlicerUSSim.Logic.scene_nodes")
+    nodes = importlib.import_module("SlicerUSSim.Logic.mrml.nodes")
     pose = nodes.node_to_world(session.parameters.probe_transform)
     for number in range(3):
         item = slicer.vtkMRMLLinearTransformNode()
@@ -522,7 +522,9 @@ def test_a_sequence_that_fails_leaves_no_node_behind(session):
     session.segmented()
     transforms = session.add("Sequence", "scaled")
     item = slicer.vtkMRMLLinearTransformNode()
-    item.ApplyTransformMatrix(importlib.import_module("SlicerUSSim.Logic.vtk_data").vtk_matrix(np.diag([2.0, 1, 1, 1])))
+    item.ApplyTransformMatrix(
+        importlib.import_module("SlicerUSSim.Logic.base.vtk_data").vtk_matrix(np.diag([2.0, 1, 1, 1]))
+    )
     transforms.SetDataNodeAtValue(item, "0")
     session.ui.transformSequenceSelector.setCurrentNode(transforms)
     session.ui.simulateSequenceButton.click()
@@ -669,10 +671,12 @@ def test_closing_the_scene_and_leaving_the_module_is_survived(session):
 
 
 def test_reloading_the_module_brings_new_code(module):
-    scene_before = sys.modules.get("SlicerUSSim.Logic.scene") or importlib.import_module("SlicerUSSim.Logic.scene")
+    scene_before = sys.modules.get("SlicerUSSim.Logic.mrml.logic") or importlib.import_module(
+        "SlicerUSSim.Logic.mrml.logic"
+    )
     again = stand_in.load_module()
     try:
-        assert importlib.import_module("SlicerUSSim.Logic.scene") is not scene_before
+        assert importlib.import_module("SlicerUSSim.Logic.mrml.logic") is not scene_before
         assert again.SlicerUSSimLogic is not module.SlicerUSSimLogic
     finally:
         module.__dict__.update(again.__dict__ | {"app": module.app})

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import LinearProbe
-from SlicerUSSim.Logic.measurement import correlation, level_db
-from SlicerUSSim.Logic.validation import ORIENTATIONS
+from SlicerUSSim.Logic.verification.measurement import correlation, level_db
+from SlicerUSSim.Logic.verification.validation import ORIENTATIONS
 from tests.conftest import SPECKLE, block, rigid, simulator
 
 LINEAR = LinearProbe(40, 50, scan_lines=161, focus_mm=25, elevation_focus_mm=25)

@@ -6,14 +6,13 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError, Volume
-from SlicerUSSim.Logic.phantoms import head_mri
-from SlicerUSSim.Logic.placement import aimed_at, angles_to_surface, carried, turned
-from SlicerUSSim.Logic.surface import PatientSurface
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.probe.placement import aimed_at, angles_to_surface, carried, turned
+from SlicerUSSim.Logic.probe.surface import PatientSurface
 from tests.conftest import block
 
 RADIUS = 40.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from SlicerUSSim.cli import main
+from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
     LinearProbe,
     SimulationError,
@@ -19,7 +19,7 @@ from SlicerUSSim.Logic import (
     Volume,
     segment_mri,
 )
-from SlicerUSSim.Logic.measurement import correlation, level_db, region_level_db
+from SlicerUSSim.Logic.verification.measurement import correlation, level_db, region_level_db
 from tests.conftest import SPECKLE, block, rigid
 
 PROBE = LinearProbe(36, 46, scan_lines=145, focus_mm=25, elevation_focus_mm=25)
@@ -187,7 +187,7 @@ def test_textures_that_do_not_fit_are_refused():
 def test_the_commands_take_the_settings_from_an_mri_and_refuse_them_for_labels(tmp_path):
     from PIL import Image
 
-    from SlicerUSSim.Logic.phantoms import head_mri
+    from SlicerUSSim.Logic.mri.samples import head_mri
 
     head_mri(spacing_mm=3.0).write(tmp_path / "mri.nii.gz")
     arguments = ["simulate", str(tmp_path / "mri.nii.gz"), "--pose", "auto", "-o", str(tmp_path / "a.png")]

@@ -6,12 +6,12 @@ import json
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from SlicerUSSim.Logic import Membrane, SimulationError, SimulationSettings, Tissue, TissueTable
-from SlicerUSSim.Logic.settings import DisplaySettings
-from SlicerUSSim.Logic.tissues import TISSUES, tissue_named
+from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.tissue.names import tissue_named
+from SlicerUSSim.Logic.tissue.presets import TISSUES
 
 PARAMETERS = {"speed_of_sound_m_s", "impedance_mrayl", "attenuation_db_cm_mhz", "mu0", "mu1", "sigma0"}
 

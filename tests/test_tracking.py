@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import SimulationError, Volume
-from SlicerUSSim.Logic.placement import turned
+from SlicerUSSim.Logic.probe.placement import turned
 
 pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pip install '.[serve]'")
 
-from SlicerUSSim.Logic.tracking import TrackerLink, parse_address  # noqa: E402
+from SlicerUSSim.Logic.tracked.openigtlink import TrackerLink, parse_address  # noqa: E402
 
 POSE = turned(np.eye(4), rock_deg=20, tilt_deg=-30, rotate_deg=70)
 POSE[:3, 3] = [12.5, -40.25, 60.0]

@@ -8,17 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
-from SlicerUSSim.cli import main
+from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, phantoms, validation
-from SlicerUSSim.Logic.measurement import echo_near, fit_rayleigh, full_width, level_db
-from SlicerUSSim.Logic.phantoms import Echo
-from SlicerUSSim.Logic.settings import SimulationSettings
-from SlicerUSSim.Logic.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.validation import ORIENTATIONS, PROBES, Row, all_checks, validate
+from SlicerUSSim.Logic.base.settings import SimulationSettings
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.verification.measurement import echo_near, fit_rayleigh, full_width, level_db
+from SlicerUSSim.Logic.verification.phantoms import Echo
+from SlicerUSSim.Logic.verification.validation import ORIENTATIONS, PROBES, Row, all_checks, validate
 
 CASES = [(check, orientation) for check in all_checks() for orientation in check.orientations]
 
@@ -107,7 +106,7 @@ def test_wrong_physics_fails_the_check_of_its_phenomenon(monkeypatch, check, wro
 
     (chosen,) = (c for c in all_checks() if c.name == check)
     for module in ("artefacts", "beams", "rays", "speckle"):
-        monkeypatch.setattr(f"SlicerUSSim.Logic.validation.{module}.UltrasoundSimulator", Distorted)
+        monkeypatch.setattr(f"SlicerUSSim.Logic.verification.validation.{module}.UltrasoundSimulator", Distorted)
     assert not all(row.passed for row in chosen.measure(ORIENTATIONS["aligned"], None).rows)
 
 

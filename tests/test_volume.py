@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError, Volume
-from SlicerUSSim.Logic.volume import check_rigid
+from SlicerUSSim.Logic.base.transforms import check_rigid
 
 angles = st.floats(-180, 180)
 spacings = st.floats(0.2, 6.0)
@@ -130,7 +129,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
         (np.array([[["a"]]]), np.eye(4), "expected numbers"),
         (np.zeros((2, 2, 2)), np.eye(3), "shape"),
         (np.zeros((2, 2, 2)), np.diag([1.0, 0, 1, 1]), "singular"),
-        (np.zeros((2, 2, 2)), np.diag([1.0, np.nan, 1, 1]), "not an affine matrix"),
+        (np.zeros((2, 2, 2)), np.diag([1.0, np.nan, 1, 1]), "not finite, expected a 4x4 affine matrix"),
     ],
 )
 def test_impossible_volumes_are_refused(array, matrix, message):

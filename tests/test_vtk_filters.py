@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import vtkmodules.vtkRenderingOpenGL2  # noqa: F401, makes rendering work at all
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonDataModel import vtkDataObject, vtkImageData
@@ -35,9 +34,9 @@ from SlicerUSSim.Logic import (
     Volume,
     segment_mri,
 )
-from SlicerUSSim.Logic.phantoms import head_mri
-from SlicerUSSim.Logic.vtk_data import vtk_matrix
-from SlicerUSSim.Logic.vtk_filters import SegmentationFilter, UltrasoundSimulationFilter
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.vtk.filters import SegmentationFilter, UltrasoundSimulationFilter
 from tests.conftest import FLUID, SPECKLE, block, example, rigid
 
 PROBE = LinearProbe(20, 30, scan_lines=48, focus_mm=15)
@@ -315,8 +314,8 @@ def test_the_example_shows_mri_outline_and_ultrasound_in_one_window(rendered, tm
     yellow = (left[..., 0] > 150) & (left[..., 1] > 120) & (left[..., 2] < 90)
     assert 800 < yellow.sum() < 6000
     rows, columns = np.nonzero(yellow)
-    assert rows.min() < 110 and rows.max() > 480 and columns.min() < 40 and columns.max() > 560  # the whole fan
-    # Speckle inside the fan, the smooth MRI outside it.
+    assert rows.min() < 110 and rows.max() > 480 and columns.min() < 40 and columns.max() > 560  # the whole field
+    # Speckle inside the field, the smooth MRI outside it.
     inside, outside = left[300:360, 120:180, 0], left[250:290, 50:80, 0]
     assert inside.std() > 8 and outside.mean() > 120
     # In the plane of the probe a pixel of the window shows the pixel of the frame that is there.

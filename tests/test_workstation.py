@@ -25,11 +25,11 @@ pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pi
 from playwright.sync_api import Page, sync_playwright  # noqa: E402
 
 from SlicerUSSim.Logic import PhasedProbe, TissueTable, UltrasoundSimulator, Volume, segment_mri  # noqa: E402
-from SlicerUSSim.Logic.phantoms import head_mri  # noqa: E402
-from SlicerUSSim.Logic.placement import craniotomy_pose, pose_looking_at, tilt_sweep  # noqa: E402
-from SlicerUSSim.Logic.scan_conversion import ImageGrid  # noqa: E402
-from SlicerUSSim.Logic.sequence import TrackedSequence  # noqa: E402
-from SlicerUSSim.Logic.volume import read_array  # noqa: E402
+from SlicerUSSim.Logic.base.volume import read_array  # noqa: E402
+from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
+from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, tilt_sweep  # noqa: E402
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence  # noqa: E402
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is missing: apt-get install chromium")
@@ -48,7 +48,7 @@ POSE = ("right_deg", "front_deg", "rotate_deg", "rock_deg", "tilt_deg", "lift_mm
 def serving(*arguments: str):
     """The URL that `ussim serve` prints, while it runs."""
     server = subprocess.Popen(
-        [sys.executable, "-m", "SlicerUSSim.cli", "serve", "--port", "0", *arguments],
+        [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", "0", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
     try:
@@ -284,7 +284,7 @@ def test_slice_views_show_the_field_outlined_and_the_image_blended_in(page):
 
 def test_every_field_of_the_panel_is_on_the_page(page):
     from SlicerUSSim.Widget.fields import FIELDS
-    from SlicerUSSim.Widget.sections import read_sections
+    from SlicerUSSim.Workstation.sections import read_sections
 
     sections = read_sections()
     fields = {control.field for section in sections for control in section.controls if control.field}
@@ -609,8 +609,8 @@ def test_the_scene_opens_again_with_everything_and_gives_the_same_image(page, tm
     from slicer import vtkSlicerSequencesLogic
     from trame_slicer.core import SlicerApp
 
-    from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
-    from SlicerUSSim.Logic.scene_nodes import read_volume
+    from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+    from SlicerUSSim.Logic.mrml.nodes import read_volume
 
     expected = np.asarray(Image.open(download(page, "png")))
     bundle = tmp_path / "ultrasound.mrb"
@@ -775,7 +775,10 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
 def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):
     arguments = [text.format(broken=files / "broken.nii.gz") for text in arguments]
     done = subprocess.run(
-        [sys.executable, "-m", "SlicerUSSim.cli", "serve", *arguments], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("ussim: ") and message in done.stderr and len(done.stderr.strip().splitlines()) == 1
@@ -785,7 +788,7 @@ def test_a_port_that_is_taken_is_said():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         done = subprocess.run(
-            [sys.executable, "-m", "SlicerUSSim.cli", "serve", "--port", str(port)],
+            [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", str(port)],
             capture_output=True, text=True, timeout=60,
         )  # fmt: skip
     assert done.returncode == 2 and f"127.0.0.1:{port}" in done.stderr

@@ -1,5 +1,5 @@
-"""`python -m SlicerUSSim` is the `ussim` command."""
+"""`python -m SlicerUSSim.Command` is the `ussim` command."""
 
-from SlicerUSSim.cli import main
+from SlicerUSSim.Command.cli import main
 
 main()

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from SlicerUSSim import __version__
 from SlicerUSSim.Command.options import device_option
 from SlicerUSSim.Command.progress import Steps
+from SlicerUSSim.Logic.base.version import __version__
 
 
 @click.command()
@@ -23,11 +23,10 @@ def bench(ctx: click.Context, json_file: Path | None, repeat: int, brief: bool, 
     The image is checked too, against the same model in numpy and between the devices: exit status 1 if it is wrong.
     Never because of a time.
     """
-    from SlicerUSSim.Logic.benchmark.suite import run_benchmark
-    from SlicerUSSim.Logic.benchmark.tables import table_of
-    from SlicerUSSim.Logic.device import devices_to_measure
-    from SlicerUSSim.Logic.tissues import write_json
-    from SlicerUSSim.Logic.volume import require_place
+    from SlicerUSSim.Logic.base.files import require_place, write_json
+    from SlicerUSSim.Logic.opencl.devices import devices_to_measure
+    from SlicerUSSim.Logic.verification.benchmark.suite import run_benchmark
+    from SlicerUSSim.Logic.verification.benchmark.tables import table_of
 
     if json_file:
         require_place(json_file)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import click
 
-from SlicerUSSim import __version__
 from SlicerUSSim.Command.bench import bench
 from SlicerUSSim.Command.options import (
     PROBE_NAMES,
@@ -25,7 +24,8 @@ from SlicerUSSim.Command.options import (
 from SlicerUSSim.Command.progress import Share, Steps
 from SlicerUSSim.Command.serve import serve
 from SlicerUSSim.Command.tracked import optimize, sweep
-from SlicerUSSim.Logic.errors import SimulationError, is_our_warning, user_message
+from SlicerUSSim.Logic.base.errors import SimulationError, is_our_warning, user_message
+from SlicerUSSim.Logic.base.version import __version__
 
 
 class _Commands(click.Group):
@@ -67,10 +67,11 @@ def _show_warning(message, category, *_, **__) -> None:
 @device_option
 def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -> None:
     """The whole line on a real brain MRI: segmentation, a craniotomy view, pictures."""
-    from SlicerUSSim.Logic.demo import demo_mri, run_demo
-    from SlicerUSSim.Logic.probe import PROBES
-    from SlicerUSSim.Logic.settings import DisplaySettings, SimulationSettings
-    from SlicerUSSim.Logic.volume import Volume
+    from SlicerUSSim.Command.demo import run_demo
+    from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mri.samples import demo_mri
+    from SlicerUSSim.Logic.probe.arrays import PROBES
 
     settings = SimulationSettings(seed=seed)
     volume, source = (Volume.read(mri), os.path.abspath(mri)) if mri else demo_mri()
@@ -103,9 +104,9 @@ def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -
 @device_option
 def segment(mri, out, contrast, classes, mask, radius, bias_correction, thin_sulci, device) -> None:
     """Label the tissues of a skull-stripped brain MRI."""
-    from SlicerUSSim.Logic.segmentation import segment_mri
-    from SlicerUSSim.Logic.tissues import TissueTable, tissues_beside
-    from SlicerUSSim.Logic.volume import Volume
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mri.segmentation import segment_mri
+    from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 
     check_output(out)
     volume = Volume.read(mri)
@@ -131,7 +132,7 @@ def segment(mri, out, contrast, classes, mask, radius, bias_correction, thin_sul
 )
 def simulate(out: Path, **of_scene) -> None:
     """One B-mode image from an MRI or a label map at a given pose."""
-    from SlicerUSSim.Logic.figures import write_png
+    from SlicerUSSim.Logic.imaging.figures import write_png
 
     check_output(out, png=True)
     scene = Scene(**of_scene)
@@ -157,8 +158,8 @@ def volume(
     out: Path, tilt: float | None, slide: float | None, frames: int, spacing: float, like: str | None, **of_scene
 ) -> None:
     """A 3D ultrasound volume: a sweep of images around a pose, compounded in patient space."""
-    from SlicerUSSim.Logic.placement import slide_sweep, tilt_sweep
-    from SlicerUSSim.Logic.volume import Volume
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
 
     check_output(out)
     if (tilt is None) == (slide is None):
@@ -190,8 +191,7 @@ def volume(
 @click.pass_context
 def validate(ctx: click.Context, out: Path, only: tuple[str, ...], device: str | None) -> None:
     """Measure the simulator against theory on phantoms: tables and pictures; exit status 1 if any number is off."""
-    from SlicerUSSim.Logic.validation import chosen_checks
-    from SlicerUSSim.Logic.validation import validate as run
+    from SlicerUSSim.Logic.verification.validation import chosen_checks, validate as run
 
     with Steps(sum(len(check.orientations) for check in chosen_checks(only))) as step:
         report = run(out, device, only, step)
@@ -209,7 +209,7 @@ def validate(ctx: click.Context, out: Path, only: tuple[str, ...], device: str |
 @device_option
 def devices(device: str | None) -> None:
     """Which OpenCL devices exist, which one is used and why, and how to get a faster one."""
-    from SlicerUSSim.Logic.device import choose_device, faster_hint, list_devices
+    from SlicerUSSim.Logic.opencl.devices import choose_device, faster_hint, list_devices
 
     chosen, reason = choose_device(device)
     for info in list_devices():

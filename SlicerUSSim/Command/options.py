@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.progress import Share
-from SlicerUSSim.Logic.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError
 
 PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # probe.PROBES, which would import numpy
 device_option = click.option(
@@ -81,14 +81,15 @@ class Scene:
         self, mri_or_labels, is_labels, preset_file, probe_file, tissue_file, contrast, mask, thin_sulci,
         partial_volume, mri_modulation, gain, dynamic_range, tgc, seed, device, pose=None,
     ) -> None:  # fmt: skip
-        from SlicerUSSim.Logic.placement import craniotomy_pose
-        from SlicerUSSim.Logic.pose import read_pose
-        from SlicerUSSim.Logic.preset import Preset
-        from SlicerUSSim.Logic.probe import probe_from_dict
-        from SlicerUSSim.Logic.segmentation import segment_mri
-        from SlicerUSSim.Logic.simulator import UltrasoundSimulator
-        from SlicerUSSim.Logic.tissues import TissueTable, read_json, tissues_beside
-        from SlicerUSSim.Logic.volume import Volume
+        from SlicerUSSim.Logic.base.files import read_json
+        from SlicerUSSim.Logic.base.volume import Volume
+        from SlicerUSSim.Logic.imaging.preset import Preset
+        from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+        from SlicerUSSim.Logic.mri.segmentation import segment_mri
+        from SlicerUSSim.Logic.probe.arrays import probe_from_dict
+        from SlicerUSSim.Logic.probe.placement import craniotomy_pose
+        from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
+        from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
         self.source = os.path.abspath(mri_or_labels)
         # What is cheap to check comes before what takes time.
@@ -134,7 +135,8 @@ def _given(**options) -> dict:
 
 def check_output(out: Path, png: bool = False) -> None:
     """Refuse an output that cannot be written now rather than after the work."""
-    from SlicerUSSim.Logic.volume import require_image_name, require_place
+    from SlicerUSSim.Logic.base.files import require_place
+    from SlicerUSSim.Logic.base.volume import require_image_name
 
     if not (png and out.suffix.lower() == ".png"):
         require_image_name(out)

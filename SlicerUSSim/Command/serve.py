@@ -13,7 +13,7 @@ import click
 
 from SlicerUSSim.Command.options import contrast_option, device_option, mask_option
 from SlicerUSSim.Command.tracked import calibration_option, read_sequence, to_mri, to_mri_option, transform_option
-from SlicerUSSim.Logic.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError
 
 _PORT = 8080
 
@@ -55,14 +55,14 @@ def serve(
         if file is not None and not Path(file).exists():
             raise SimulationError(f"{file}: no such file")
     if igtl is not None:
-        from SlicerUSSim.Logic.tracking import parse_address
+        from SlicerUSSim.Logic.tracked.openigtlink import parse_address
 
         parse_address(igtl)
     port = _usable_port(host, port)
 
-    from SlicerUSSim.Logic.device import choose_device
-    from SlicerUSSim.Logic.preset import Preset
-    from SlicerUSSim.Logic.volume import Volume
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.imaging.preset import Preset
+    from SlicerUSSim.Logic.opencl.devices import choose_device
 
     choose_device(device)
     volumes = {file: Volume.read(file) for file in (mri, labels, mask) if file is not None}
@@ -71,9 +71,9 @@ def serve(
     to_ras = to_mri(to_mri_file)
 
     _prepare_libraries()
-    from SlicerUSSim.Widget.browser.access import guard, is_loopback
-    from SlicerUSSim.Widget.browser.opener import Files
-    from SlicerUSSim.Widget.browser.workstation import Workstation
+    from SlicerUSSim.Workstation.access import guard, is_loopback
+    from SlicerUSSim.Workstation.opener import Files
+    from SlicerUSSim.Workstation.workstation import Workstation
 
     token = "" if is_loopback(host) else secrets.token_urlsafe(24)
     workstation = Workstation(

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from SlicerUSSim import __version__
 from SlicerUSSim.Command.options import Scene, scene_options
 from SlicerUSSim.Command.progress import Curve, Share
-from SlicerUSSim.Logic.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.version import __version__
 
 transform_option = click.option(
     "--transform", "path", default="ImageToReference", show_default=True,
@@ -60,10 +60,10 @@ def _open(options: dict, most: int | None = None):
 
     `most` is how many images are taken if none are chosen.
     """
-    from SlicerUSSim.Logic.fan import draw_fan
-    from SlicerUSSim.Logic.sequence import frame_numbers
-    from SlicerUSSim.Logic.tracked import TrackedImages
-    from SlicerUSSim.Logic.volume import require_place
+    from SlicerUSSim.Logic.base.files import require_place
+    from SlicerUSSim.Logic.tracked.field import draw_field
+    from SlicerUSSim.Logic.tracked.images import TrackedImages
+    from SlicerUSSim.Logic.tracked.sequence import frame_numbers
 
     wanted = {name: options.pop(name) for name in _SEQUENCE_NAMES}
     if wanted["field"]:
@@ -84,14 +84,14 @@ def _open(options: dict, most: int | None = None):
         sequence, numbers, path=wanted["path"], reference_to_ras=to_ras, probe=probe, beam=scene.probe, most=most
     )
     if wanted["field"]:
-        draw_fan(wanted["field"], sequence.images[tracked.numbers[0]], tracked.fan)
+        draw_field(wanted["field"], sequence.images[tracked.numbers[0]], tracked.field)
     return scene, sequence, tracked
 
 
 def read_sequence(sequence_file, calibration):
     """The TrackedSequence of --sequence, with what --calibration adds."""
-    from SlicerUSSim.Logic.pose import read_matrix
-    from SlicerUSSim.Logic.sequence import TrackedSequence, read_coordinate_definitions
+    from SlicerUSSim.Logic.tracked.pose_files import read_matrix
+    from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, read_coordinate_definitions
 
     source = Path(sequence_file)
     if source.is_dir():
@@ -107,10 +107,10 @@ def read_sequence(sequence_file, calibration):
 
 def _read_cuts(wanted: dict):
     """A function of the probe that cuts the volume into a sequence."""
-    from SlicerUSSim.Logic.placement import slide_sweep, tilt_sweep
-    from SlicerUSSim.Logic.pose import read_pose
-    from SlicerUSSim.Logic.sequence import TrackedSequence
-    from SlicerUSSim.Logic.volume import Volume
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
+    from SlicerUSSim.Logic.tracked.pose_files import read_pose
+    from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
     pose, tilt, slide = read_pose(wanted["cut"]), wanted["cut_tilt"], wanted["cut_slide"]
     if tilt is not None and slide is not None:
@@ -126,7 +126,8 @@ def _read_cuts(wanted: dict):
 
 def to_mri(file):
     """(4, 4) rigid of --to-mri, or None."""
-    from SlicerUSSim.Logic.pose import read_tags, read_transform, rigid_between
+    from SlicerUSSim.Logic.base.transforms import rigid_between
+    from SlicerUSSim.Logic.tracked.pose_files import read_tags, read_transform
 
     if not file:
         return None
@@ -150,17 +151,17 @@ def sweep(out: Path, **options) -> None:
     """Simulate the images of a tracked sequence: what its probe saw, on the same pixels."""
     import numpy as np
 
-    from SlicerUSSim.Logic.sequence import require_sequence_name
-    from SlicerUSSim.Logic.volume import require_place
+    from SlicerUSSim.Logic.base.files import require_place
+    from SlicerUSSim.Logic.tracked.sequence import require_sequence_name
 
     require_sequence_name(out)
     require_place(out)
     scene, sequence, tracked = _open(options)
-    images = np.zeros((len(tracked.poses), *tracked.fan.mask.shape), np.uint8)
+    images = np.zeros((len(tracked.poses), *tracked.field.mask.shape), np.uint8)
     with Share("sweep") as progress:
         for number, pose in enumerate(tracked.poses):
             frame = scene.simulator.simulate(tracked.probe, pose, scene.display, tracked.grid)
-            images[number][tracked.fan.window] = frame.image
+            images[number][tracked.field.window] = frame.image
             progress((number + 1) / len(tracked.poses))
     sequence.with_images(tracked.numbers, images).write(out)
     click.echo(f"wrote {out} ({len(images)} images of {images.shape[2]}x{images.shape[1]})")
@@ -192,13 +193,12 @@ def optimize(
     out: Path, free, evaluations, restarts, report, save_preset, state, register, save_transform, **options
 ) -> None:
     """Fit display and tissue parameters until simulated and tracked real ultrasound agree."""
-    from SlicerUSSim.Logic.figures import require_matplotlib
-    from SlicerUSSim.Logic.fitting import fit
-    from SlicerUSSim.Logic.pose import write_pose
-    from SlicerUSSim.Logic.preset import Preset
-    from SlicerUSSim.Logic.report import write_report
-    from SlicerUSSim.Logic.tissues import read_json, write_json
-    from SlicerUSSim.Logic.volume import require_place
+    from SlicerUSSim.Logic.base.files import read_json, require_place, write_json
+    from SlicerUSSim.Logic.fitting.fit import fit
+    from SlicerUSSim.Logic.fitting.report import write_report
+    from SlicerUSSim.Logic.imaging.figures import require_matplotlib
+    from SlicerUSSim.Logic.imaging.preset import Preset
+    from SlicerUSSim.Logic.tracked.pose_files import write_pose
 
     for place in filter(None, (out, report, save_preset, state, save_transform)):
         require_place(place)

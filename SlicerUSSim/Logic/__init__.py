@@ -1,40 +1,28 @@
-"""The public interface. Names are imported when first used, so that importing this package costs nothing."""
+"""The public interface: `from SlicerUSSim.Logic import UltrasoundSimulator`.
 
-from __future__ import annotations
+One room per subject, each with a face of its own: base, opencl, probe, tissue, mri, imaging, tracked, fitting, mrml,
+vtk, verification. Names are imported when they are first used, so that importing this package costs nothing.
+"""
 
-import importlib
+from typing import TYPE_CHECKING
 
-_HOMES = {
-    "AppearanceResult": "optimization",
-    "ConvexProbe": "probe",
-    "DisplaySettings": "settings",
-    "Frame": "frame",
-    "LinearProbe": "probe",
-    "Membrane": "tissues",
-    "PhasedProbe": "probe",
-    "Preset": "preset",
-    "Segmentation": "segmentation",
-    "SimulationError": "errors",
-    "SimulationSettings": "settings",
-    "Texture": "texture",
-    "Tissue": "tissues",
-    "TissueTable": "tissues",
-    "TrackedSequence": "sequence",
-    "UltrasoundSimulator": "simulator",
-    "Volume": "volume",
-    "list_devices": "device",
-    "optimize_appearance": "optimization",
-    "segment_mri": "segmentation",
-    "similarity": "similarity",
-}
-__all__ = list(_HOMES)
+from SlicerUSSim.Logic.base.lazy import lazy_exports
 
+if TYPE_CHECKING:
+    from .base.errors import SimulationError as SimulationError
+    from .base.settings import DisplaySettings as DisplaySettings, SimulationSettings as SimulationSettings
+    from .base.volume import Volume as Volume
+    from .fitting.optimization import AppearanceResult as AppearanceResult, optimize_appearance as optimize_appearance
+    from .fitting.similarity import similarity as similarity
+    from .imaging.frame import Frame as Frame
+    from .imaging.preset import Preset as Preset
+    from .imaging.simulator import UltrasoundSimulator as UltrasoundSimulator
+    from .mri.segmentation import Segmentation as Segmentation, segment_mri as segment_mri
+    from .opencl.devices import list_devices as list_devices
+    from .probe.arrays import ConvexProbe as ConvexProbe, LinearProbe as LinearProbe, PhasedProbe as PhasedProbe
+    from .tissue.table import TissueTable as TissueTable
+    from .tissue.texture import Texture as Texture
+    from .tissue.tissue import Membrane as Membrane, Tissue as Tissue
+    from .tracked.sequence import TrackedSequence as TrackedSequence
 
-def __getattr__(name: str):
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+lazy_exports(globals())

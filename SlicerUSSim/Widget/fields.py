@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import log10
 
-from SlicerUSSim.Logic.preset import Preset
+from SlicerUSSim.Logic.imaging.preset import Preset
 
 #: At or below this a noise level means none.
 NO_NOISE_DB = -150.0

@@ -6,17 +6,17 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Protocol
 
-from SlicerUSSim.Logic.errors import SimulationError, require
-from SlicerUSSim.Logic.fitting import Fit
-from SlicerUSSim.Logic.parameters import FreeParameters, all_names
-from SlicerUSSim.Logic.preset import Preset
-from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
-from SlicerUSSim.Logic.scene_fit import COMPARED, CostPlot
-from SlicerUSSim.Logic.scene_nodes import composite_of, node_called, require_node
-from SlicerUSSim.Logic.search import Progress
-from SlicerUSSim.Logic.sequence import frame_numbers
-from SlicerUSSim.Logic.settings import DisplaySettings
-from SlicerUSSim.Logic.tissues import TissueTable
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.fitting.fit import Fit
+from SlicerUSSim.Logic.fitting.parameters import FreeParameters, all_names
+from SlicerUSSim.Logic.fitting.search import Progress
+from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED, CostPlot
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import composite_of, node_called, require_node
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tracked.sequence import frame_numbers
 
 _REGISTRATION = "Ultrasound registration"
 

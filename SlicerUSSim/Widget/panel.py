@@ -11,12 +11,12 @@ from contextlib import contextmanager
 import qt
 import slicer
 
-from SlicerUSSim.Logic.errors import Cancelled
-from SlicerUSSim.Logic.probe import PROBES
-from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
-from SlicerUSSim.Logic.scene_fit import COMPARED
-from SlicerUSSim.Logic.scene_nodes import nodes_of_class
-from SlicerUSSim.Logic.tissues import TISSUES
+from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
+from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter, TissueRow
 
 _CUSTOM = "custom"

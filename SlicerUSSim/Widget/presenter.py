@@ -14,12 +14,15 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Protocol
 
-from SlicerUSSim.Logic.errors import Cancelled, SimulationError, require, user_message
-from SlicerUSSim.Logic.preset import Preset
-from SlicerUSSim.Logic.probe import PROBES
-from SlicerUSSim.Logic.scene import UltrasoundSceneLogic
-from SlicerUSSim.Logic.scene_nodes import display_of, nodes_of_class
-from SlicerUSSim.Logic.tissues import TISSUES, Tissue, TissueTable, same_name
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, user_message
+from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
+from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.tissue.names import same_name
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Widget.fields import field_value, with_field
 from SlicerUSSim.Widget.fit_presenter import FitPresenter
 

@@ -1,0 +1,23 @@
+"""What every other room stands on: errors, settings, volumes, files, transforms.
+
+Imports nothing of the other rooms; numpy always, VTK and SimpleITK only where a volume goes there.
+"""
+
+from typing import TYPE_CHECKING
+
+from SlicerUSSim.Logic.base.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from .errors import Cancelled as Cancelled, SimulationError as SimulationError, user_message as user_message
+    from .files import read_json as read_json, write_json as write_json, written_whole as written_whole
+    from .settings import DisplaySettings as DisplaySettings, SimulationSettings as SimulationSettings
+    from .transforms import (
+        LPS_TO_RAS as LPS_TO_RAS,
+        check_affine as check_affine,
+        check_rigid as check_rigid,
+        nearest_rotation as nearest_rotation,
+        rigid_between as rigid_between,
+    )
+    from .volume import Volume as Volume
+
+lazy_exports(globals())

@@ -1,0 +1,68 @@
+"""Files: written whole or not at all, and JSON in and out."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+
+def require_place(path: Path) -> None:
+    """Raise SimulationError unless `path` could be a file in a folder that exists."""
+    require(path.parent.is_dir(), f"{path}: the folder {path.parent} does not exist")
+    require(not path.is_dir(), f"{path}: is a folder, expected a file name")
+
+
+def make_folder(path: str | os.PathLike) -> Path:
+    """The folder, made if it is not there. Raises SimulationError where that cannot be."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SimulationError(f"{folder}: cannot be made ({error.strerror})") from None
+    return folder
+
+
+@contextmanager
+def written_whole(path: str | os.PathLike) -> Iterator[Path]:
+    """Yield a temporary path to write to; it replaces `path` only if the block succeeds.
+
+    Raises SimulationError naming `path` if it cannot be written.
+    """
+    path = Path(path)
+    require_place(path)
+    try:
+        folder = tempfile.mkdtemp(prefix=".ussim-", dir=path.parent)
+    except OSError as error:
+        raise SimulationError(f"{path}: cannot be written ({error.strerror})") from None
+    try:
+        yield Path(folder) / path.name
+        for file in sorted(Path(folder).iterdir()):  # .mhd and .nhdr come with a second file
+            file.replace(path.parent / file.name)
+    except (OSError, RuntimeError) as error:
+        raise SimulationError(f"{path}: cannot be written ({str(error).strip().splitlines()[-1]})") from None
+    finally:
+        for file in Path(folder).iterdir():
+            file.unlink()
+        os.rmdir(folder)
+
+
+def read_json(path: str | os.PathLike):
+    """The content of a JSON file. Raises SimulationError naming the file."""
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise SimulationError(f"{path}: is not JSON ({error})") from None
+
+
+def write_json(path: str | os.PathLike, values) -> None:
+    """Write plain values as JSON, whole or not at all."""
+    with written_whole(path) as partial:
+        partial.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,65 @@
+"""Transforms: 4x4 matrices checked and compared; the only file that knows ITK's LPS."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def check_affine(name: str, matrix, expected: str = "a 4x4 affine matrix") -> np.ndarray:
+    """`matrix` as a new (4, 4) float64 array. Raises SimulationError unless it is affine, of finite numbers."""
+    try:
+        array = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise SimulationError(f"{name} is not a matrix of numbers, expected {expected}") from None
+    require(array.shape == (4, 4), f"{name} has shape {array.shape}, expected (4, 4)")
+    require(bool(np.isfinite(array).all()), f"{name} holds a value that is not finite, expected {expected}")
+    require(
+        np.allclose(array[3], [0, 0, 0, 1], atol=1e-6), f"{name} has last row {array[3].tolist()}, expected 0 0 0 1"
+    )
+    return array
+
+
+def check_rigid(name: str, matrix) -> np.ndarray:
+    """`matrix` as a (4, 4) float64 array. Raises SimulationError unless it is a rotation and a translation."""
+    pose = check_affine(name, matrix, "a 4x4 rigid transform")
+    rotation = pose[:3, :3]
+    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    require(off < 1e-3, f"{name} is not rigid: its axes are off by {off:.3g} (expected unit length, perpendicular)")
+    require(np.linalg.det(rotation) > 0, f"{name} mirrors (determinant -1), expected a right-handed rotation")
+    return pose
+
+
+def is_singular(matrix: np.ndarray) -> bool:
+    """Whether the axes of a (4, 4) affine matrix lie in a plane, whatever their lengths are."""
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    return bool((lengths == 0).any()) or abs(np.linalg.det(matrix[:3, :3] / np.where(lengths > 0, lengths, 1))) <= 1e-6
+
+
+def nearest_rotation(axes: np.ndarray) -> np.ndarray:
+    """(3, 3) the orthogonal matrix that is nearest to `axes`; rounding in files leaves axes slightly off."""
+    u, _, vt = np.linalg.svd(axes)
+    return u @ vt
+
+
+def rigid_between(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, float]:
+    """((4, 4) rigid map that takes points (n, 3) onto others best, root mean square distance left, mm).
+
+    Arun et al., IEEE PAMI 9(5) 1987. Raises SimulationError for fewer than three points or different numbers of them.
+    """
+    points, onto = np.asarray(points, float), np.asarray(onto, float)
+    require(
+        points.shape == onto.shape and points.ndim == 2 and points.shape[1] == 3 and len(points) >= 3,
+        f"landmarks have shapes {points.shape} and {onto.shape}, expected three or more pairs of 3D points",
+    )
+    middle, goal = points.mean(axis=0), onto.mean(axis=0)
+    u, _, vt = np.linalg.svd((points - middle).T @ (onto - goal))
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    matrix = np.eye(4)
+    matrix[:3, :3] = vt.T @ mirror @ u.T
+    matrix[:3, 3] = goal - matrix[:3, :3] @ middle
+    left = points @ matrix[:3, :3].T + matrix[:3, 3] - onto
+    return matrix, float(np.sqrt((left**2).sum(axis=1).mean()))

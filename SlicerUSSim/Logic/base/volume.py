@@ -1,0 +1,281 @@
+"""Volume: a 3D image with its place in the patient (RAS), and its files."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
+
+WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """A scalar image in patient space.
+
+    Parameters
+    ----------
+    array : (k, j, i) numbers; i varies fastest in memory, as in ITK and VTK.
+    ijk_to_ras : (4, 4) takes homogeneous voxel indices (i, j, k, 1) of voxel *centres* to RAS millimetres.
+
+    Raises SimulationError for an array that is not 3D or not numeric, and for a singular or non-affine matrix.
+    """
+
+    array: np.ndarray
+    ijk_to_ras: np.ndarray
+
+    def __post_init__(self) -> None:
+        array = np.asarray(self.array)
+        require(array.ndim == 3, f"volume has {array.ndim} dimensions {array.shape}, expected 3")
+        require(array.size > 0, f"volume is empty (shape {array.shape})")
+        require(
+            np.issubdtype(array.dtype, np.number) or array.dtype == bool,
+            f"volume holds {array.dtype}, expected numbers",
+        )
+        matrix = check_affine("ijk_to_ras", self.ijk_to_ras)
+        require(not is_singular(matrix), f"ijk_to_ras is singular: {matrix.tolist()}")
+        matrix.setflags(write=False)
+        object.__setattr__(self, "array", array)
+        object.__setattr__(self, "ijk_to_ras", matrix)
+
+    @property
+    def spacing_mm(self) -> np.ndarray:
+        """(3,) voxel size along i, j, k in millimetres."""
+        return np.linalg.norm(self.ijk_to_ras[:3, :3], axis=0)
+
+    @property
+    def ras_to_ijk(self) -> np.ndarray:
+        """(4, 4) inverse of ijk_to_ras."""
+        return np.linalg.inv(self.ijk_to_ras)
+
+    def with_array(self, array: np.ndarray) -> Volume:
+        """Another image on the same grid. Raises SimulationError if the shape differs."""
+        require(np.shape(array) == self.array.shape, f"array has shape {np.shape(array)}, expected {self.array.shape}")
+        return Volume(array, self.ijk_to_ras)
+
+    def looks_like_labels(self) -> bool:
+        """Whether the image holds few whole numbers, none negative, as a label map does and an MRI does not."""
+        array = self.array
+        return bool(np.issubdtype(array.dtype, np.integer)) and int(array.min()) >= 0 and len(np.unique(array)) <= 32
+
+    # ---- files -------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def read(cls, path: str | os.PathLike) -> Volume:
+        """Read NIfTI, NRRD, MetaImage, MINC 1 and 2, VTI, or a folder with one DICOM series.
+
+        Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
+        """
+        path = Path(path)
+        require(path.exists(), f"{path}: no such file or folder")
+        if path.suffix.lower() == ".vti":
+            return cls._read_vti(path)
+        if path.is_dir():
+            return cls.from_sitk(_read_dicom_series(path), name=str(path))
+        if not is_minc1(path):
+            return cls.from_sitk(read_itk_image(path), name=str(path))
+        array, ijk_to_ras = _read_minc1(path)
+        _require_volume(array.shape[::-1], str(path))
+        return cls(array, ijk_to_ras)
+
+    @classmethod
+    def from_sitk(cls, image, name: str = "image") -> Volume:
+        """From a SimpleITK image (LPS). Raises SimulationError if it is not 3D and scalar."""
+        import SimpleITK as sitk
+
+        if image.GetDimension() == 4 and image.GetSize()[3] == 1:
+            image = image[..., 0]  # NIfTI files often carry a time axis of length one
+        _require_volume(image.GetSize(), name)
+        channels = image.GetNumberOfComponentsPerPixel()
+        require(channels == 1, f"{name}: has {channels} components per voxel, expected 1")
+        return cls(sitk.GetArrayFromImage(image), _itk_ijk_to_ras(image))
+
+    def to_sitk(self):
+        """A SimpleITK image (LPS). Raises SimulationError if the axes are not perpendicular (ITK cannot store that)."""
+        import SimpleITK as sitk
+
+        direction, spacing, origin = self._direction_spacing_origin(LPS_TO_RAS @ self.ijk_to_ras)
+        array = self.array.astype(np.uint8) if self.array.dtype == bool else self.array
+        image = sitk.GetImageFromArray(np.ascontiguousarray(array))
+        image.SetSpacing(spacing.tolist())
+        image.SetOrigin(origin.tolist())
+        image.SetDirection(direction.ravel().tolist())
+        return image
+
+    def write(self, path: str | os.PathLike) -> None:
+        """Write the volume whole or not at all; the format follows from the suffix.
+
+        Raises SimulationError for an unknown suffix or an unwritable place.
+        """
+        path = Path(path)
+        require_image_name(path)
+        with written_whole(path) as partial:
+            if path.suffix.lower() == ".vti":
+                self._write_vti(partial)
+            else:
+                import SimpleITK as sitk
+
+                sitk.WriteImage(self.to_sitk(), str(partial), useCompression=not path.name.lower().endswith(".mhd"))
+
+    # ---- VTK ---------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_vtk(cls, image_data, ijk_to_ras: np.ndarray | None = None) -> Volume:
+        """From a vtkImageData whose physical coordinates are RAS, or with a matrix of its own as MRML nodes have.
+
+        Raises SimulationError for an image without scalars, with several components, or that is not 3D.
+        """
+        from vtkmodules.util.numpy_support import vtk_to_numpy
+
+        dims = image_data.GetDimensions()
+        require(min(dims) > 0, "vtkImageData is empty")
+        scalars = image_data.GetPointData().GetScalars()
+        require(scalars is not None, "vtkImageData has no scalars")
+        components = scalars.GetNumberOfComponents()
+        require(components == 1, f"vtkImageData has {components} components per voxel, expected 1")
+        array = vtk_to_numpy(scalars).reshape(dims[::-1])
+        if ijk_to_ras is None:
+            vtk_matrix = image_data.GetIndexToPhysicalMatrix()
+            ijk_to_ras = np.array([[vtk_matrix.GetElement(r, c) for c in range(4)] for r in range(4)])
+        # VTK counts indices from the extent's start; this class counts from zero.
+        first = np.eye(4)
+        first[:3, 3] = image_data.GetExtent()[0::2]
+        return cls(array, np.asarray(ijk_to_ras, float) @ first)
+
+    def to_vtk(self):
+        """A vtkImageData in RAS with a direction matrix; it has its own copy of the voxels."""
+        from vtkmodules.vtkCommonDataModel import vtkImageData
+
+        from SlicerUSSim.Logic.base.vtk_data import set_scalars
+
+        direction, spacing, origin = self._direction_spacing_origin(self.ijk_to_ras)
+        array = self.array.astype(np.uint8) if self.array.dtype == bool else self.array
+        image = vtkImageData()
+        image.SetDimensions(*self.array.shape[::-1])
+        image.SetSpacing(*spacing)
+        image.SetOrigin(*origin)
+        image.SetDirectionMatrix(*direction.ravel())
+        set_scalars(image, array)
+        return image
+
+    def _direction_spacing_origin(self, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        spacing = np.linalg.norm(matrix[:3, :3], axis=0)
+        direction = matrix[:3, :3] / spacing
+        skew = np.abs(direction.T @ direction - np.eye(3)).max()
+        require(skew < 1e-4, f"volume axes are not perpendicular (cosine {skew:.3g}); resample it to a regular grid")
+        return nearest_rotation(direction), spacing, matrix[:3, 3]  # ITK and VTK want the axes exact
+
+    @classmethod
+    def _read_vti(cls, path: Path) -> Volume:
+        from vtkmodules.vtkIOXML import vtkXMLImageDataReader
+
+        reader = vtkXMLImageDataReader()
+        require(bool(reader.CanReadFile(str(path))), f"{path}: cannot be read as a VTK image")
+        reader.SetFileName(str(path))
+        reader.Update()
+        return cls.from_vtk(reader.GetOutput())
+
+    def _write_vti(self, path: Path) -> None:
+        from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+        writer = vtkXMLImageDataWriter()
+        writer.SetFileName(str(path))
+        writer.SetInputData(self.to_vtk())
+        require(writer.Write() == 1, f"{path}: cannot be written")
+
+
+def require_image_name(path: Path) -> None:
+    """Raise SimulationError unless Volume.write knows the format that the name stands for."""
+    require(
+        path.name.lower().endswith(WRITABLE_SUFFIXES),
+        f"{path}: unknown image format, expected a name ending in one of {', '.join(WRITABLE_SUFFIXES)}",
+    )
+
+
+def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """((k, j, i) voxels, (4, 4) ijk_to_ras) of an image file that may hold one slice only.
+
+    Raises SimulationError for a missing or unreadable file and for one that has not three dimensions.
+    """
+    path = Path(path)
+    require(path.is_file(), f"{path}: no such file")
+    if is_minc1(path):
+        return _read_minc1(path)
+    import SimpleITK as sitk
+
+    image = read_itk_image(path)
+    require(image.GetDimension() == 3, f"{path}: has {image.GetDimension()} dimensions, expected 3")
+    return sitk.GetArrayFromImage(image), _itk_ijk_to_ras(image)
+
+
+def read_itk_image(path: Path):
+    """A SimpleITK image of whatever ITK reads. Raises SimulationError, naming the file, for what it does not."""
+    import SimpleITK as sitk
+
+    sitk.ProcessObject.SetGlobalWarningDisplay(False)
+    try:
+        return sitk.ReadImage(str(path))
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
+
+
+def _require_volume(size, name: str) -> None:
+    require(
+        len(size) == 3 and min(size) > 1,
+        f"{name}: is a {'x'.join(map(str, size))} image, expected three dimensions with two or more samples each",
+    )
+
+
+def _itk_ijk_to_ras(image) -> np.ndarray:
+    index_to_lps = np.eye(4)
+    index_to_lps[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * np.array(image.GetSpacing())
+    index_to_lps[:3, 3] = image.GetOrigin()
+    return LPS_TO_RAS @ index_to_lps
+
+
+def is_minc1(path: Path) -> bool:
+    """Whether a file is MINC 1, which is NetCDF (MINC 2 is HDF5, which ITK reads)."""
+    with open(path, "rb") as file:
+        return path.suffix.lower() == ".mnc" and file.read(3) == b"CDF"
+
+
+def _read_minc1(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    import nibabel
+
+    try:
+        image = nibabel.Minc1Image.from_filename(path)
+        values = np.asarray(image.dataobj)
+    except Exception as error:  # scipy's NetCDF reader and nibabel raise whatever comes up in a damaged file
+        raise SimulationError(
+            f"{path}: cannot be read as MINC 1 ({str(error).strip() or type(error).__name__})"
+        ) from None
+    require(values.ndim == 3, f"{path}: has {values.ndim} dimensions, expected 3")
+    whole = values.round()
+    if np.issubdtype(image.get_data_dtype(), np.integer) and np.abs(values - whole).max() < 1e-3:
+        values = whole.astype(np.int32)  # nibabel scales to floating point whatever the file holds
+    # nibabel counts (z, y, x) as the file does, in millimetres of the MNI's world, which is RAS.
+    return values, np.array(image.affine)[:, [2, 1, 0, 3]]
+
+
+def _read_dicom_series(folder: Path):
+    import SimpleITK as sitk
+
+    series = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
+    require(bool(series), f"{folder}: holds no DICOM series")
+    require(
+        len(series) == 1,
+        f"{folder}: holds {len(series)} DICOM series, expected 1; put the one to use in its own folder",
+    )
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0]))
+    try:
+        return reader.Execute()
+    except RuntimeError as error:
+        raise SimulationError(f"{folder}: cannot be read ({str(error).strip().splitlines()[-1]})") from None

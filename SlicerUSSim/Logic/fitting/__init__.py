@@ -1,0 +1,20 @@
+"""Simulated images fitted to real ones: their likeness, what may vary, the search, registration, the report.
+
+`fit` does all of it for tracked images; `optimize_appearance` is the optimisation alone.
+"""
+
+from typing import TYPE_CHECKING
+
+from SlicerUSSim.Logic.base.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from .appearance import AppearanceModel as AppearanceModel
+    from .fit import Fit as Fit, fit as fit
+    from .optimization import AppearanceResult as AppearanceResult, optimize_appearance as optimize_appearance
+    from .parameters import FreeParameters as FreeParameters
+    from .registration import Registration as Registration, register_poses as register_poses
+    from .report import write_report as write_report
+    from .search import Progress as Progress
+    from .similarity import Similarity as Similarity, SimilaritySettings as SimilaritySettings, similarity as similarity
+
+lazy_exports(globals())

@@ -1,0 +1,329 @@
+"""AppearanceModel: images of fixed poses as a function of the parameters that an optimiser varies.
+
+What does not change is not computed again (PHYSICS section 6). The ray tree depends on none of these parameters. The
+echoes of a tissue are linear in mu0 and sigma0, so a few baseband images, its *bases*, hold them for all values:
+
+    iq = [ base + sum over varied tissues (mu0 M + sigma0 S) ] exp(-sum over tissues (alpha - alpha_0) path)
+
+- M and S for another mu1 are sums over bands of T1, by which a tissue's scatterers come to exist one after the other. A
+  band that exists in part is weighted so that the variance p (1 - p) mu0^2 + p sigma0^2, which alone is seen in
+  developed speckle, is kept exactly.
+- Another attenuation changes the amplitude by what the direct path to each sample loses, an approximation where the
+  beam straddles the edge of a shadow, and for echoes of reflected rays. At the anchor alpha_0 nothing is approximated,
+  and `anchor` moves it.
+
+So one image costs a weighted sum, compression and scan conversion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.fitting.parameters import SCATTERING
+from SlicerUSSim.Logic.imaging.bmode import Compressor
+from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
+from SlicerUSSim.Logic.imaging.scattering import EchoLines
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.opencl.device import Device, Workspace
+from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+
+_BANDS = CONSTANTS["BANDS"]
+#: Memory that bases and paths of all images may take; more is asked for by mistake.
+_MOST_BYTES = 4 * 2**30
+#: Attenuation over the whole depth with which path lengths are measured: large against the tracer's tolerance, small
+#: against its threshold.
+_PROBING_DB = 100.0
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A baseband signal on the device, as Compressor takes it."""
+
+    iq: object
+    lines: int
+    samples: int
+
+
+class AppearanceModel:
+    """The images of one patient at some poses, for any display and for any value of the varied tissue parameters.
+
+    Parameters
+    ----------
+    simulator : its labels, tissues and settings; the tissues are the first anchor.
+    probe, poses : the probe and its (4, 4) probe_to_ras, one per image.
+    varied : {tissue name: parameter names among parameters.TISSUE_BOUNDS}.
+    grid : the pixels of the images (default: what just holds the imaged field, as many as display.image_size says).
+
+    Raises SimulationError for a tissue the simulator does not have, a pose that is not rigid, and for more images and
+    parameters than fit into memory.
+    """
+
+    def __init__(
+        self,
+        simulator: UltrasoundSimulator,
+        probe: Probe,
+        poses: Iterable[np.ndarray],
+        varied: dict[str, Iterable[str]],
+        grid: ImageGrid | None = None,
+    ) -> None:
+        self.simulator, self.probe, self._grid = simulator, probe, grid
+        self.device: Device = simulator.device
+        self.poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
+        self.varied = {name: frozenset(parameters) for name, parameters in varied.items()}
+        for name in self.varied:
+            simulator.medium.tissues.tissue(name)
+        #: Tissues whose scatterers vary, and whose attenuation does, in the order of the bases and of the paths
+        self.scattering = [n for n, p in self.varied.items() if p & SCATTERING]
+        self.attenuating = [n for n, p in self.varied.items() if "attenuation_db_cm_mhz" in p]
+        self._check_memory()
+        device = self.device
+        mixing = device.kernels("appearance.cl", device.lanes)
+        self._mix_parts, self._mix_bases = mixing["mix_parts"], mixing["mix_bases"]
+        self._direct_path = device.kernels("appearance.cl")["direct_path"]
+        self._parts, self._mixed, self._lines = EchoLines(device), EchoLines(device), EchoLines(device)
+        self._compressor, self._converter = Compressor(device), ScanConverter(device)
+        self._workspace = Workspace(device)
+        self._part_weights_buffer = device.empty(4 * CONSTANTS["PARTS"])
+        self._weights = device.empty(4 * self._base_count)
+        self._decays = device.empty(4 * max(len(self.attenuating), 1))
+        self.anchor(simulator.medium.tissues)
+
+    def anchor(self, tissues: TissueTable) -> None:
+        """Compute the bases anew for these tissues, for which the model is then exact."""
+        simulator = self.simulator
+        self.tissues = tissues
+        self._weighted: TissueTable | None = None  # the weights on the device are for these tissues
+        self._acquisitions = [simulator.acquisition(self.probe, pose) for pose in self.poses]
+        self._acquisition_buffers = [self.device.empty(ACQUISITION.itemsize) for _ in self.poses]
+        for acquisition, buffer in zip(self._acquisitions, self._acquisition_buffers, strict=True):
+            self.device.write(buffer, acquisition)
+        with simulator.with_tissues(tissues):
+            for number in range(len(self.poses)):
+                self._measure_paths(number)
+                self._compute_bases(number)
+
+    def image(self, number: int, tissues: TissueTable, display: DisplaySettings) -> np.ndarray:
+        """(rows, columns) uint8 image at pose `number`."""
+        self.run(number, tissues, display)
+        return self._converter.download()
+
+    def grid(self, display: DisplaySettings) -> ImageGrid:
+        """The pixels of the images."""
+        return self._grid or ImageGrid.for_probe(self.probe, display.image_size)
+
+    def run(self, number: int, tissues: TissueTable, display: DisplaySettings):
+        """Enqueue the image at pose `number`; returns its device buffer, which the next image overwrites."""
+        acquisition, acquisition_buffer = self._acquisitions[number], self._acquisition_buffers[number]
+        lines, samples = int(acquisition["scan_lines"]), int(acquisition["samples"])
+        if tissues is not self._weighted:  # a write waits for the images before it
+            self.device.write(self._weights, self._base_weights(tissues))
+            self.device.write(self._decays, self._path_weights(tissues))
+            self._weighted = tissues
+        iq = self._workspace.get("iq", lines * samples * 8)
+        self.device.run(
+            self._mix_bases,
+            (samples // self.device.lanes, lines),
+            self._buffer("bases", number),
+            self._weights,
+            np.int32(self._base_count),
+            self._buffer("paths", number),
+            self._decays,
+            np.int32(len(self.attenuating)),
+            iq,
+            np.int32(samples),
+        )
+        self._compressor.run(acquisition, display, Signal(iq, lines, samples))
+        self._converter.run(acquisition_buffer, acquisition, self.grid(display), self._compressor)
+        return self._converter.image
+
+    # ---- bases -------------------------------------------------------------------------------------------------
+
+    @property
+    def _base_count(self) -> int:
+        return 1 + sum(self._bases_of(name) for name in self.scattering)
+
+    def _bases_of(self, name: str) -> int:
+        return 2 * _BANDS if "mu1" in self.varied[name] else 2
+
+    def _check_memory(self) -> None:
+        simulator = self.simulator
+        if not self.poses:
+            return
+        acquisition = simulator.acquisition(self.probe, self.poses[0])
+        values = int(acquisition["scan_lines"]) * int(acquisition["samples"])
+        needed = 4 * values * (2 * self._base_count + len(self.attenuating)) * len(self.poses)
+        require(
+            needed <= _MOST_BYTES,
+            f"{len(self.poses)} images with {self._base_count} parts each need {needed / 2**30:.1f} GB, expected at "
+            f"most {_MOST_BYTES / 2**30:.0f}; choose fewer images or free parameters",
+        )
+
+    def _buffer(self, kind: str, number: int):
+        acquisition = self._acquisitions[number]
+        values = int(acquisition["scan_lines"]) * int(acquisition["samples"])
+        count = 2 * self._base_count if kind == "bases" else max(len(self.attenuating), 1)
+        return self._workspace.get(f"{kind} {number}", 4 * count * values)
+
+    def _compute_bases(self, number: int) -> None:
+        """Trace, scatter tissue by tissue, and bring what is to be mixed later through beam and pulse."""
+        simulator, device = self.simulator, self.device
+        acquisition, acquisition_buffer, medium = (
+            self._acquisitions[number],
+            self._acquisition_buffers[number],
+            simulator.medium,
+        )
+        simulator.tracer.run(acquisition_buffer, acquisition, medium)
+        lines, samples = 2 * int(acquisition["traced_lines"]), int(acquisition["samples"])
+        self._parts.prepare(CONSTANTS["PARTS"] * lines, samples)
+        self._mixed.prepare(lines, samples)
+        done = 0
+        for place in range(max(len(self.scattering), 1)):
+            name = self.scattering[place] if self.scattering else None
+            if simulator.settings.scattering:
+                roles, tops = device.upload(self._roles(place)), device.upload(self._band_tops(name))
+                simulator.scatterers.run(
+                    acquisition_buffer, acquisition, medium, simulator.tracer, self._parts, varied=(roles, tops)
+                )
+            else:
+                self._parts.clear()
+            if place == 0:
+                self._keep(number, done, _only(0), with_interfaces=True)
+                done += 1
+            if name is not None:
+                for weights in self._part_weights(name):
+                    self._keep(number, done, weights)
+                    done += 1
+
+    def _keep(self, number: int, base: int, weights: np.ndarray, with_interfaces: bool = False) -> None:
+        """One base from the parts: a weighted sum, the beam, the pulse."""
+        simulator, device = self.simulator, self.device
+        acquisition, acquisition_buffer = self._acquisitions[number], self._acquisition_buffers[number]
+        values = self._mixed.stride * 2 * int(acquisition["traced_lines"])
+        device.write(self._part_weights_buffer, weights)
+        for parts, mixed in ((self._parts.re, self._mixed.re), (self._parts.im, self._mixed.im)):
+            device.run(
+                self._mix_parts, (values // device.lanes,), parts, self._part_weights_buffer, np.int32(weights.size),
+                np.int32(values), mixed,
+            )  # fmt: skip
+        if with_interfaces and simulator.settings.interfaces:
+            simulator.interfaces.run(acquisition_buffer, acquisition, simulator.tracer, self._mixed)
+        self._lines.prepare(int(acquisition["scan_lines"]), int(acquisition["samples"]))
+        simulator.beam.run(acquisition_buffer, acquisition, self._mixed, self._lines)
+        simulator.pulse.run(acquisition, simulator.axial_sigma_mm(self.probe), self._lines)
+        nbytes = int(acquisition["scan_lines"]) * int(acquisition["samples"]) * 8
+        device.cl.enqueue_copy(
+            device.queue, self._buffer("bases", number), simulator.pulse.iq, byte_count=nbytes, dst_offset=base * nbytes
+        )
+
+    def _roles(self, place: int) -> np.ndarray:
+        """(MAX_TISSUES,) int32: what scatters in which part while tissue `place` is computed."""
+        # What is fixed is computed once, with the first tissue.
+        fixed = CONSTANTS["ROLE_FIXED" if place == 0 else "ROLE_SILENT"]
+        roles = np.full(CONSTANTS["MAX_TISSUES"], fixed, np.int32)
+        members = dict(self.tissues)
+        if self.tissues.membrane is not None:
+            members[CONSTANTS["MEMBRANE_LABEL"]] = self.tissues.membrane.tissue
+        for label, tissue in members.items():
+            if tissue.name in self.scattering:
+                is_its = tissue.name == self.scattering[place]
+                roles[label] = CONSTANTS["ROLE_VARIED" if is_its else "ROLE_SILENT"]
+        return roles
+
+    def _band_tops(self, name: str | None) -> np.ndarray:
+        """(BANDS,) float32; the share at the anchor is one of them, so that no band exists in part there."""
+        tops = np.ones(_BANDS, np.float32)
+        if name is not None:
+            share = self.tissues.tissue(name).scatterer_share
+            half = _BANDS // 2
+            tops[:half] = share * np.arange(1, half + 1) / half
+            tops[half:] = share + (1.0 - share) * np.arange(1, _BANDS - half + 1) / (_BANDS - half)
+        return tops
+
+    def _part_weights(self, name: str) -> list[np.ndarray]:
+        """Which sums of parts are the bases of a tissue: all its parts if mu1 varies, else M and S for its mu1."""
+        parts = CONSTANTS["PARTS"]
+        if "mu1" in self.varied[name]:
+            return [_only(part) for part in range(1, parts)]
+        mean, deviation = np.zeros(parts, np.float32), np.zeros(parts, np.float32)
+        mean[1::2], deviation[2::2] = self._band_weights(name, self.tissues.tissue(name))
+        return [mean, deviation]
+
+    def _band_weights(self, name: str, tissue: Tissue) -> tuple[np.ndarray, np.ndarray]:
+        """((BANDS,), (BANDS,)) weights of the bands' scatterers of amplitude 1 and of amplitude T0."""
+        share = tissue.scatterer_share
+        tops = self._band_tops(name).astype(float)
+        widths = np.diff(tops, prepend=0.0)
+        exists = np.clip((share - (tops - widths)) / np.maximum(widths, 1e-12), 0.0, 1.0)
+        variance = float(widths @ exists**2 - (widths @ exists) ** 2)
+        kept = np.sqrt(share * (1.0 - share) / variance) if variance > 1e-9 else 1.0
+        return kept * (exists - share), np.sqrt(exists)
+
+    def _base_weights(self, tissues: TissueTable) -> np.ndarray:
+        weights = [1.0]
+        for name in self.scattering:
+            tissue = tissues.tissue(name)
+            if "mu1" in self.varied[name]:
+                mean, deviation = self._band_weights(name, tissue)
+                weights += np.stack([tissue.mu0 * mean, tissue.sigma0 * deviation], axis=1).ravel().tolist()
+            else:
+                weights += [tissue.mu0, tissue.sigma0]
+        return np.array(weights, np.float32)
+
+    # ---- paths -------------------------------------------------------------------------------------------------
+
+    @property
+    def _probing_db_cm_mhz(self) -> float:
+        return _PROBING_DB / (2.0 * self.probe.frequency_mhz * 0.1 * self.probe.depth_mm)
+
+    def _measure_paths(self, number: int) -> None:
+        """Nepers lost in each attenuating tissue on the way to every sample, had it the probing attenuation."""
+        simulator, device = self.simulator, self.device
+        acquisition, acquisition_buffer = self._acquisitions[number], self._acquisition_buffers[number]
+        paths = self._buffer("paths", number)
+        nbytes = int(acquisition["scan_lines"]) * int(acquisition["samples"]) * 4
+        one = self._workspace.get("path", nbytes)
+        for place, name in enumerate(self.attenuating):
+            tracer = simulator.tracer
+            with simulator.with_tissues(_only_attenuating(self.tissues, name, self._probing_db_cm_mhz)):
+                tracer.run(acquisition_buffer, acquisition, simulator.medium)
+            device.run(
+                self._direct_path,
+                (int(acquisition["scan_lines"]),),
+                acquisition_buffer,
+                tracer.segments,
+                tracer.segment_counts,
+                one,
+            )
+            device.cl.enqueue_copy(device.queue, paths, one, byte_count=nbytes, dst_offset=place * nbytes)
+
+    def _path_weights(self, tissues: TissueTable) -> np.ndarray:
+        """(attenuating tissues,) exponent of two per neper of the paths."""
+        change = [
+            tissues.tissue(name).attenuation_db_cm_mhz - self.tissues.tissue(name).attenuation_db_cm_mhz
+            for name in self.attenuating
+        ]
+        return -np.array(change or [0.0], np.float32) / np.float32(self._probing_db_cm_mhz * np.log(2.0))
+
+
+def _only(part: int) -> np.ndarray:
+    weights = np.zeros(CONSTANTS["PARTS"], np.float32)
+    weights[part] = 1.0
+    return weights
+
+
+def _only_attenuating(tissues: TissueTable, name: str, attenuation_db_cm_mhz: float) -> TissueTable:
+    """The same tissues, of which only one attenuates."""
+    for tissue in tissues.all_tissues():
+        value = attenuation_db_cm_mhz if tissue.name == name else 0.0
+        tissues = tissues.with_tissue(replace(tissue, attenuation_db_cm_mhz=value))
+    return tissues

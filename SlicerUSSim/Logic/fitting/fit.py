@@ -1,0 +1,120 @@
+"""fit: simulated to tracked images, with or without registration, and the images before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.fitting.optimization import AppearanceResult, optimize_appearance
+from SlicerUSSim.Logic.fitting.parameters import Bounds
+from SlicerUSSim.Logic.fitting.registration import Registration, register_poses
+from SlicerUSSim.Logic.fitting.search import Progress
+from SlicerUSSim.Logic.fitting.similarity import SimilaritySettings
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tracked.images import TrackedImages
+
+#: Of the evaluations, how many a fit takes before registration.
+_FIRST_SHARE = 0.4
+#: Registrations one after the other: bounds (mm and degrees) and evaluations. A fit at wrong poses is biased, and so is
+#: the registration after it; the next ones start closer.
+_ROUNDS = ((8.0, 500), (4.0, 300), (2.0, 250))
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What was fitted, and how it looks."""
+
+    appearance: AppearanceResult
+    #: None where none was asked for
+    registration: Registration | None
+    #: At the registered poses
+    tracked: TrackedImages
+    #: (rows, columns) uint8, simulated with what was and with what was found, at the poses that were and are
+    before: list[np.ndarray] = field(repr=False)
+    after: list[np.ndarray] = field(repr=False)
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON."""
+        found = {} if self.registration is None else {"registration": self.registration.to_dict()}
+        return {**self.appearance.to_dict(), **found, "numbers": self.tracked.numbers}
+
+
+def fit(
+    simulator: UltrasoundSimulator,
+    tracked: TrackedImages,
+    *,
+    free: Iterable[str] | Mapping[str, Bounds | None],
+    display: DisplaySettings | None = None,
+    register: bool = False,
+    max_evaluations: int = 500,
+    restarts: int = 2,
+    seed: int = 0,
+    settings: SimilaritySettings | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    resume: dict | None = None,
+    checkpoint: Callable[[dict], None] | None = None,
+) -> Fit:
+    """Fit display and tissue parameters (optimization.optimize_appearance) and, with `register`, the poses.
+
+    Registration needs images that look alike and the fit needs poses: so short fits and registrations alternate, and
+    the whole fit comes at the poses found. `resume` and `checkpoint` are those of the whole fit.
+    Raises SimulationError as those do.
+    """
+    display = display or DisplaySettings()
+    masks = [tracked.mask] * len(tracked.images)
+    given = tracked
+    common = dict(free=free, masks=masks, grid=tracked.grid, seed=seed, settings=settings, progress=progress)
+    registration = None
+    if register:
+        tracked, registration = _registered(
+            simulator, tracked, display, max(int(_FIRST_SHARE * max_evaluations), 1), common
+        )
+    appearance = optimize_appearance(
+        simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=restarts,
+        max_evaluations=max_evaluations, resume=resume, checkpoint=checkpoint, **common,
+    )  # fmt: skip
+    before = simulated(simulator, given, simulator.medium.tissues, display)
+    after = simulated(simulator, tracked, appearance.tissues, appearance.display)
+    return Fit(appearance, registration, tracked, before, after)
+
+
+def _registered(
+    simulator: UltrasoundSimulator, tracked: TrackedImages, display: DisplaySettings, evaluations: int, common: dict
+) -> tuple[TrackedImages, Registration]:
+    """The images at the poses where a short fit comes closest, and how they were moved there; its costs are theirs."""
+    candidates: list[tuple[float, TrackedImages, Registration]] = []
+    moved = Registration.none(tracked.poses)
+
+    def fitted() -> AppearanceResult:
+        result = optimize_appearance(
+            simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=0,
+            max_evaluations=evaluations, **common,
+        )  # fmt: skip
+        candidates.append((result.cost_after, tracked, moved))
+        return result
+
+    for bound, most in _ROUNDS:
+        first = fitted()
+        with simulator.with_tissues(first.tissues):
+            step = register_poses(
+                simulator, tracked.probe, tracked.poses, tracked.images, display=first.display, grid=tracked.grid,
+                masks=common["masks"], settings=common["settings"], range_mm=bound, range_deg=bound,
+                max_evaluations=most, progress=common["progress"],
+            )  # fmt: skip
+        moved = step.after(moved)
+        tracked = replace(tracked, poses=step.poses)
+    fitted()
+    cost, best, registration = min(candidates, key=lambda candidate: candidate[0])
+    return best, replace(registration, cost_before=candidates[0][0], cost_after=cost)
+
+
+def simulated(
+    simulator: UltrasoundSimulator, tracked: TrackedImages, tissues: TissueTable, display: DisplaySettings
+) -> list[np.ndarray]:
+    """(rows, columns) uint8 simulated images on the pixels of the tracked ones."""
+    with simulator.with_tissues(tissues):
+        return [simulator.simulate(tracked.probe, pose, display, tracked.grid).image for pose in tracked.poses]

@@ -1,0 +1,235 @@
+"""What an image can tell about its parameters, and what it cannot (PHYSICS section 6).
+
+Developed speckle shows a tissue's Var = p (1 - p) mu0^2 + p sigma0^2 and not mu0, sigma0 and mu1; its level shows Var
+times gain; its fall with depth shows attenuation less time-gain compensation; grey levels show all of it over the
+dynamic range. So beside the parameters themselves their identifiable combinations are looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from math import log10
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
+from SlicerUSSim.Logic.fitting.parameters import SCATTERING, FreeParameters
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+
+State = tuple[TissueTable, DisplaySettings]
+
+#: Half the spread within which a parameter counts as determined.
+_TOLERANCES = {
+    "attenuation_db_cm_mhz": 0.1, "mu0": 0.05, "mu1": 0.1, "sigma0": 0.05, "gain_db": 1.5, "dynamic_range_db": 3.0,
+    "tgc_db_cm_mhz": 0.1, "noise_db": 3.0,
+}  # fmt: skip
+_UNITS = {"attenuation_db_cm_mhz": "dB/(cm MHz)", "tgc_db_cm_mhz": "dB/(cm MHz)", "gain_db": "dB", "noise_db": "dB",
+          "dynamic_range_db": "dB"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A parameter or a combination of some, as a function of tissues and display."""
+
+    name: str
+    unit: str
+    #: Half the spread within which it counts as determined
+    tolerance: float
+    of: Callable[[TissueTable, DisplaySettings], float]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """One quantity over all solutions that fit equally well."""
+
+    name: str
+    unit: str
+    #: Of the best solution
+    value: float
+    #: Smallest and largest of the equally good
+    low: float
+    high: float
+    #: Over the restarts that fit as well, the best included; NaN if there are none
+    mean: float
+    standard_deviation: float
+    tolerance: float
+    #: Whether a search from elsewhere found the same cost, without which agreement means nothing
+    was_tested: bool
+
+    @property
+    def is_determined(self) -> bool | None:
+        """Whether the equally good solutions agree within the tolerance; None if nothing else was found to compare."""
+        if self.high - self.low > 2.0 * self.tolerance:
+            return False
+        return True if self.was_tested else None
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """The spread of every free parameter and of every combination."""
+
+    spreads: tuple[Spread, ...]
+    #: Solutions called equally good, and restarts among them, of how many
+    solutions: int
+    restarts_as_good: int
+    restarts: int
+    #: Costs closer than this are called equal: as much changes with the draw of the speckle
+    cost_tolerance: float
+
+    @classmethod
+    def of(
+        cls,
+        quantities: Sequence[Quantity],
+        state_of: Callable[[Sequence[float]], State],
+        best: Sequence[float],
+        as_good: Sequence[Sequence[float]],
+        again: Sequence[Sequence[float]],
+        restarts: int,
+        cost_tolerance: float,
+    ) -> Identifiability:
+        """From the best solution, equally good ones met or drawn, and those that restarts found."""
+        at_best = state_of(best)
+        met, found = [state_of(units) for units in as_good], [state_of(units) for units in again]
+        spreads = []
+        for quantity in quantities:
+            value = quantity.of(*at_best)
+            restarted = np.array([value, *(quantity.of(*state) for state in found)])
+            everything = np.array([*restarted, *(quantity.of(*state) for state in met)])
+            has_restarts = restarted.size > 1
+            spreads.append(
+                Spread(
+                    quantity.name,
+                    quantity.unit,
+                    value,
+                    float(everything.min()),
+                    float(everything.max()),
+                    float(restarted.mean()) if has_restarts else float("nan"),
+                    float(restarted.std(ddof=1)) if has_restarts else float("nan"),
+                    quantity.tolerance,
+                    has_restarts,
+                )
+            )
+        return cls(tuple(spreads), len(met) + len(found), len(found), restarts, cost_tolerance)
+
+    def __getitem__(self, name: str) -> Spread:
+        return next(spread for spread in self.spreads if spread.name == name)
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON; None where there was no restart."""
+        rows = [{**asdict(spread), "is_determined": spread.is_determined} for spread in self.spreads]
+        for row in rows:
+            row.update({key: None for key, value in row.items() if value != value})
+        return {
+            "spreads": rows,
+            "solutions": self.solutions,
+            "restarts_as_good": self.restarts_as_good,
+            "restarts": self.restarts,
+            "cost_tolerance": self.cost_tolerance,
+        }
+
+
+def equal_variance_draws(
+    parameters: FreeParameters, best: np.ndarray, tissues: TissueTable, display: DisplaySettings, random, count: int
+) -> list[np.ndarray]:
+    """Positions with the Var of every tissue as at `best` and its mu0, sigma0 and mu1 drawn anew within the bounds."""
+    groups: dict[str, dict[str, int]] = {}
+    for place, parameter in enumerate(parameters):
+        if parameter.tissue is not None and parameter.attribute in SCATTERING:
+            groups.setdefault(parameter.tissue, {})[parameter.attribute] = place
+    draws = []
+    for name, places in groups.items():
+        if len(places) < 2:
+            continue
+        wanted = variance_db(parameters.apply(best, tissues, display)[0].tissue(name))
+        for _ in range(20 * count):
+            units = np.array(best)
+            units[list(places.values())] = random.random(len(places))
+            amplitudes = [place for attribute, place in places.items() if attribute != "mu1"]
+            for _ in range(3):  # amplitudes are logarithmic: a shift of all of them is a factor
+                tissue = parameters.apply(units, tissues, display)[0].tissue(name)
+                factor = 10.0 ** ((wanted - variance_db(tissue)) / 20.0)
+                for place in amplitudes:
+                    parameter = parameters[place]
+                    units[place] = parameter.unit(parameter.value(units[place]) * factor)
+            tissue = parameters.apply(units, tissues, display)[0].tissue(name)
+            if abs(variance_db(tissue) - wanted) < 0.05:
+                draws.append(units)
+            if len(draws) >= count:
+                break
+    return draws[:count]
+
+
+def variance_db(tissue: Tissue) -> float:
+    """Echogenicity of developed speckle, 10 log10 Var; -200 dB for a tissue without scatterers."""
+    return 10.0 * log10(max(tissue.scatterer_variance, 1e-20))
+
+
+def quantities_of(parameters: FreeParameters, frequency_mhz: float, tissues: TissueTable) -> list[Quantity]:
+    """The free parameters, and the combinations of them that PHYSICS section 6 calls identifiable."""
+    quantities = [
+        Quantity(p.name, _UNITS.get(p.attribute, ""), _TOLERANCES[p.attribute], _reader(p.tissue, p.attribute))
+        for p in parameters
+    ]
+    varied = parameters.varied()
+    brightened = [name for name, names in varied.items() if names & SCATTERING]
+    display = {p.attribute for p in parameters if p.tissue is None}
+    dampened = [name for name, names in varied.items() if "attenuation_db_cm_mhz" in names]
+    if "tgc_db_cm_mhz" in display:
+        dampened += [name for name in _scattering(tissues) if name not in dampened and name in varied]
+    for name in dampened:
+        quantities.append(
+            Quantity(f"net fall with depth in {name}", "dB/cm", 0.2 * frequency_mhz, _fall(name, frequency_mhz))
+        )
+    for name in brightened:
+        quantities.append(Quantity(f"Var of {name}", "dB", 1.5, _echogenicity(name)))
+    for place, name in enumerate(brightened):
+        for other in _scattering(tissues):
+            if other not in brightened[: place + 1]:
+                quantities.append(Quantity(f"Var of {name} re {other}", "dB", 1.5, _relative(name, other)))
+    if "gain_db" in display:
+        for name in brightened:
+            quantities.append(Quantity(f"Var of {name} with gain", "dB", 1.5, _with_gain(name)))
+    if display & {"gain_db", "dynamic_range_db"} or brightened:
+        for name in brightened or _scattering(tissues)[:2]:
+            quantities.append(Quantity(f"grey level of {name} at the face", "of 255", 8.0, _grey_level(name)))
+    return quantities
+
+
+def _scattering(tissues: TissueTable) -> list[str]:
+    """Tissues of the labels that echo by themselves."""
+    return list(dict.fromkeys(tissue.name for tissue in tissues.values() if tissue.scatterer_variance > 1e-8))
+
+
+def _reader(tissue: str | None, attribute: str):
+    if tissue is None:
+        return lambda tissues, display: getattr(display, attribute)
+    return lambda tissues, display: getattr(tissues.tissue(tissue), attribute)
+
+
+def _fall(name: str, frequency_mhz: float):
+    def fall(tissues: TissueTable, display: DisplaySettings) -> float:
+        return 2.0 * frequency_mhz * (tissues.tissue(name).attenuation_db_cm_mhz - display.tgc_db_cm_mhz)
+
+    return fall
+
+
+def _echogenicity(name: str):
+    return lambda tissues, display: variance_db(tissues.tissue(name))
+
+
+def _relative(name: str, other: str):
+    return lambda tissues, display: variance_db(tissues.tissue(name)) - variance_db(tissues.tissue(other))
+
+
+def _with_gain(name: str):
+    return lambda tissues, display: variance_db(tissues.tissue(name)) + display.gain_db
+
+
+def _grey_level(name: str):
+    def grey(tissues: TissueTable, display: DisplaySettings) -> float:
+        level = variance_db(tissues.tissue(name)) + display.gain_db - FULL_SCALE_DB
+        return 255.0 * (1.0 + level / display.dynamic_range_db)
+
+    return grey

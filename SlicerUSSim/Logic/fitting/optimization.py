@@ -1,0 +1,314 @@
+"""optimize_appearance: display and tissue parameters fitted until simulated and real images agree (PHYSICS section 6).
+
+A global search finds the basin, a local one its bottom, then the bases are computed anew there (appearance.py) and the
+local search goes on until the anchor no longer moves the cost. One seed draws scatterers and noise of every evaluation
+(common random numbers), so the cost is a function: the same problem gives the same answer, and an interrupted run is
+resumed by replaying what it had evaluated.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import require_between
+from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
+from SlicerUSSim.Logic.fitting.identifiability import Identifiability, equal_variance_draws, quantities_of
+from SlicerUSSim.Logic.fitting.parameters import Bounds, FreeParameters
+from SlicerUSSim.Logic.fitting.search import (
+    GLOBAL_ALGORITHM,
+    LOCAL_ALGORITHM,
+    Evaluation,
+    Progress,
+    Search,
+    history_from,
+)
+from SlicerUSSim.Logic.fitting.similarity import Similarity, SimilaritySettings
+from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.tissue.table import TissueTable
+
+#: The search for the best, stage by stage; afterwards come "redraw n", "restart n" and "draw".
+STAGES = ("global", "local", "polish")
+#: Shares of the evaluations of the first two; the rest is for the search after the anchor has moved.
+_SHARES = (0.6, 0.25)
+#: Standard deviation of the starts of restarts around the best, between 0 and 1 across the bounds.
+_RESTART_SPREAD = 0.15
+#: Solutions drawn with the same variance of the scatterers, which should fit as well.
+_DRAWS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class AppearanceResult:
+    """What an optimisation found."""
+
+    tissues: TissueTable
+    display: DisplaySettings
+    parameters: FreeParameters
+    #: {parameter name: value} at the start and at the end
+    before: dict[str, float]
+    after: dict[str, float]
+    #: Mean over the images, of full simulations
+    cost_before: float
+    cost_after: float
+    #: Of each image
+    similarity_before: list[Similarity]
+    similarity_after: list[Similarity]
+    history: list[Evaluation] = field(repr=False)
+    #: Evaluations computed in this run; a resumed one has more in its history
+    evaluations: int
+    seconds: float
+    identifiability: Identifiability = field(repr=False)
+    #: What a later run needs to go on: pass it as `resume`
+    state: dict = field(repr=False)
+
+    @property
+    def at_bounds(self) -> list[str]:
+        """Names of parameters that ended at one of their bounds, beyond which the images might fit better."""
+        return [p.name for p in self.parameters if not 0.005 < p.unit(self.after[p.name]) < 0.995]
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON."""
+        return {
+            "at_bounds": self.at_bounds,
+            "parameters": [
+                {"name": p.name, "low": p.low, "high": p.high, "before": self.before[p.name],
+                 "after": self.after[p.name]}
+                for p in self.parameters
+            ],
+            "cost_before": self.cost_before,
+            "cost_after": self.cost_after,
+            "images": [
+                {"before": vars(before), "after": vars(after)}
+                for before, after in zip(self.similarity_before, self.similarity_after, strict=True)
+            ],
+            "evaluations": self.evaluations,
+            "seconds": round(self.seconds, 3),
+            "identifiability": self.identifiability.to_dict(),
+            "display": vars(self.display),
+            **self.tissues.to_dict(),
+        }  # fmt: skip
+
+
+class AppearanceCost:
+    """The mean cost of simulated images against references, as a function of free parameters.
+
+    Parameters
+    ----------
+    model : AppearanceModel with one pose per reference.
+    references : (rows, columns) uint8 each, on the model's grid.
+    masks : (rows, columns) bool each, where the reference shows its field; None is everywhere.
+
+    Raises SimulationError where shapes or counts differ, fields do not overlap, or a reference is black.
+    """
+
+    def __init__(
+        self,
+        model: AppearanceModel,
+        parameters: FreeParameters,
+        references: Sequence[np.ndarray],
+        masks: Sequence[np.ndarray] | None,
+        tissues: TissueTable,
+        display: DisplaySettings,
+        settings: SimilaritySettings,
+    ) -> None:
+        self.model, self.parameters, self.tissues, self.display = model, parameters, tissues, display
+        grid = model.grid(display)
+        self.comparisons = target_comparisons(
+            model.device, model.probe, grid, references, masks, len(model.poses), settings
+        )
+
+    def of_each(self, tissues: TissueTable, display: DisplaySettings) -> list[Similarity]:
+        """The similarity of every image."""
+        for number, comparison in enumerate(self.comparisons):
+            comparison.run(self.model.run(number, tissues, display))
+        return [comparison.result() for comparison in self.comparisons]
+
+    def __call__(self, units: np.ndarray) -> float:
+        """The mean cost at (parameters,) positions between the bounds."""
+        tissues, display = self.parameters.apply(units, self.tissues, self.display)
+        return mean_cost(self.of_each(tissues, display))
+
+
+def optimize_appearance(
+    simulator: UltrasoundSimulator,
+    probe: Probe,
+    poses: Iterable[np.ndarray],
+    references: Sequence[np.ndarray],
+    *,
+    free: Iterable[str] | Mapping[str, Bounds | None],
+    display: DisplaySettings | None = None,
+    grid: ImageGrid | None = None,
+    masks: Sequence[np.ndarray] | None = None,
+    max_evaluations: int = 600,
+    restarts: int = 2,
+    seed: int = 0,
+    settings: SimilaritySettings | None = None,
+    algorithms: tuple[str | None, str] = (GLOBAL_ALGORITHM, LOCAL_ALGORITHM),
+    progress: Callable[[Progress], None] | None = None,
+    resume: dict | None = None,
+    checkpoint: Callable[[dict], None] | None = None,
+) -> AppearanceResult:
+    """Fit display and tissue parameters to real images.
+
+    Parameters
+    ----------
+    simulator : of the patient; its tissues and settings are where the search starts, and it is left as it is.
+    probe, poses : what saw the references, and its (4, 4) probe_to_ras for each.
+    references : (rows, columns) uint8 images.
+    free : names of free parameters, or names with (low, high); see parameters.py.
+    display : where the search starts.
+    grid : the pixels of the references in the probe frame (default: those of simulated images).
+    masks : (rows, columns) bool each, the field that a reference shows; only pixels inside both fields count.
+    max_evaluations : of the cost of all images, in the search for the best.
+    restarts : searches from other starts with other scatterers, for the spread of what fits equally well.
+    seed : of the search; that of scatterers and noise is the simulator's.
+    algorithms : nlopt's names of the global algorithm (None for none) and the local one.
+    progress : told after every evaluation; may raise errors.Cancelled.
+    resume : the state of an earlier, shorter run on the same problem.
+    checkpoint : told the state at the end, and when something ends the run before (Cancelled, an interrupt).
+
+    Raises SimulationError for what FreeParameters, AppearanceModel and AppearanceCost refuse, and for the state of
+    another problem.
+    """
+    started = perf_counter()
+    display = display or DisplaySettings()
+    require_between("optimize_appearance", "max_evaluations", max_evaluations, 1, 1_000_000)
+    require_between("optimize_appearance", "restarts", restarts, 0, 100)
+    tissues = simulator.medium.tissues
+    parameters = FreeParameters.of(free, tissues, display)
+    settings = settings or SimilaritySettings()
+    poses, references = list(poses), [np.asarray(reference) for reference in references]
+    model = AppearanceModel(simulator, probe, poses, parameters.varied(), grid)
+    cost = AppearanceCost(model, parameters, references, masks, tissues, display, settings)
+    problem = _fingerprint(
+        parameters, probe, poses, references, masks, grid, tissues, display, settings, simulator, seed
+    )
+    limit = max_evaluations + restarts * (int(_SHARES[1] * max_evaluations) + 1) + _DRAWS
+
+    def describe(units: np.ndarray) -> dict[str, float]:
+        return dict(zip(parameters.names, parameters.values(units).tolist(), strict=True))
+
+    search = Search(cost, describe, limit, seed, progress, history_from(resume, problem))
+
+    start = parameters.units(tissues, display)
+    before = cost.of_each(tissues, display)
+    try:
+        best = _searched(search, cost, start, algorithms, max_evaluations)
+        fitted_tissues, fitted_display = parameters.apply(best, tissues, display)
+        model.anchor(fitted_tissues)
+        after = cost.of_each(fitted_tissues, fitted_display)
+        identifiability = _identifiability(
+            cost, search, simulator, best, restarts, int(_SHARES[1] * max_evaluations), algorithms[1]
+        )
+    finally:
+        state = {"problem": problem, "history": search.state()}
+        if checkpoint is not None:
+            checkpoint(state)
+    return AppearanceResult(
+        tissues=_with_source(fitted_tissues, parameters),
+        display=fitted_display,
+        parameters=parameters,
+        before=dict(zip(parameters.names, parameters.current(tissues, display).tolist(), strict=True)),
+        after=describe(best),
+        cost_before=mean_cost(before),
+        cost_after=mean_cost(after),
+        similarity_before=before,
+        similarity_after=after,
+        history=search.history,
+        evaluations=search.computed,
+        seconds=perf_counter() - started,
+        identifiability=identifiability,
+        state=state,
+    )
+
+
+def _searched(
+    search: Search, cost: AppearanceCost, start: np.ndarray, algorithms: tuple[str | None, str], evaluations: int
+) -> np.ndarray:
+    """The best positions: globally, locally, and locally with the bases computed anew there."""
+    global_name, local_name = algorithms
+    best = start
+    if global_name is not None:
+        best = search.minimise(global_name, STAGES[0], best, int(_SHARES[0] * evaluations))
+    best = search.minimise(local_name, STAGES[1], best, int(_SHARES[1] * evaluations))
+    # What the model approximates away from its anchor is exact again once the anchor is here.
+    cost.model.anchor(cost.parameters.apply(best, cost.tissues, cost.display)[0])
+    return search.minimise(local_name, STAGES[2], best, evaluations - len(search.history))
+
+
+def _identifiability(
+    cost: AppearanceCost,
+    search: Search,
+    simulator: UltrasoundSimulator,
+    best: np.ndarray,
+    restarts: int,
+    budget: int,
+    algorithm: str,
+) -> Identifiability:
+    """What fits as well: searches with other scatterers from starts around the best, and what was met on the way."""
+    parameters = cost.parameters
+    random = np.random.default_rng(search.seed)
+    best_cost = search.best_cost(STAGES[2])
+    met = [entry for entry in search.history if entry.stage in STAGES[1:]]
+    settings = simulator.settings
+    costs_of_best, found = [best_cost], []
+    try:
+        for number in range(1, restarts + 1):
+            simulator.settings = replace(settings, seed=(settings.seed + 7919 * number) % 2**32)
+            cost.model.anchor(parameters.apply(best, cost.tissues, cost.display)[0])
+            stage = f"restart {number}"
+            start = np.clip(best + random.normal(0.0, _RESTART_SPREAD, len(best)), 0.0, 1.0)
+            costs_of_best.append(search.evaluate(f"redraw {number}", best))
+            units = search.minimise(algorithm, stage, start, budget)
+            found.append((units, search.best_cost(stage) - costs_of_best[-1]))
+    finally:
+        simulator.settings = settings
+    # How much the cost changes from one draw of the speckle to the next: less cannot tell two fits apart.
+    tolerance = max(float(np.std(costs_of_best)), 0.01 * best_cost)
+    cost.model.anchor(parameters.apply(best, cost.tissues, cost.display)[0])
+    for units in equal_variance_draws(parameters, best, cost.tissues, cost.display, random, _DRAWS):
+        search.evaluate("draw", units)
+    met += [entry for entry in search.history if entry.stage == "draw"]
+    as_good = [entry.units for entry in met if entry.cost <= best_cost + tolerance]
+    again = [units for units, excess in found if excess <= tolerance]
+
+    def state_of(units) -> tuple[TissueTable, DisplaySettings]:
+        return parameters.apply(np.asarray(units), cost.tissues, cost.display)
+
+    quantities = quantities_of(parameters, cost.model.probe.frequency_mhz, cost.tissues)
+    return Identifiability.of(quantities, state_of, best, as_good, again, restarts, tolerance)
+
+
+def _with_source(tissues: TissueTable, parameters: FreeParameters) -> TissueTable:
+    """The table with the origin of what was fitted."""
+    for tissue in tissues.all_tissues():
+        fitted = [p.attribute for p in parameters if p.tissue == tissue.name]
+        if fitted:
+            tissues = tissues.with_tissue(
+                replace(tissue, sources={**tissue.sources, **dict.fromkeys(fitted, "fitted to tracked ultrasound")})
+            )
+    return tissues
+
+
+def _fingerprint(parameters, probe, poses, references, masks, grid, tissues, display, settings, simulator, seed) -> str:
+    """What makes two problems the same one."""
+    digest = hashlib.sha256()
+    plain = (list(parameters), probe, grid, tissues.to_dict(), display, settings, simulator.settings, seed)
+    digest.update(repr(plain).encode())
+    for array in (
+        *poses,
+        *references,
+        *(masks or ()),
+        simulator.medium.labels.array,
+        simulator.medium.labels.ijk_to_ras,
+    ):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,181 @@
+"""Free parameters of an optimisation: their names, physical bounds, and the way from numbers to tissues and display.
+
+A name is one of DISPLAY_BOUNDS ("gain_db") or a tissue and one of TISSUE_BOUNDS ("white matter.mu0"). "display" stands
+for all of the first, a tissue's name for all of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from math import exp, log
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.tissue.names import same_name
+from SlicerUSSim.Logic.tissue.table import TissueTable
+
+Bounds = tuple[float, float]
+
+#: What a scanner's console reaches. Noise is in dB re tissue of unit scatterer variance.
+DISPLAY_BOUNDS: dict[str, Bounds] = {
+    "gain_db": (-30.0, 30.0),
+    "dynamic_range_db": (30.0, 90.0),
+    "tgc_db_cm_mhz": (0.0, 1.2),
+    "noise_db": (-120.0, -30.0),
+}
+#: What soft tissue reaches: attenuation from blood to tendon (Duck 1990); echogenicity over some 40 dB.
+TISSUE_BOUNDS: dict[str, Bounds] = {
+    "attenuation_db_cm_mhz": (0.1, 1.2),
+    "mu0": (0.02, 1.5),
+    "mu1": (-1.0, 1.5),
+    "sigma0": (0.02, 1.0),
+}
+#: Those of them that make a tissue's scatterers.
+SCATTERING = frozenset(("mu0", "mu1", "sigma0"))
+#: Echo amplitudes are compared by their ratios.
+_LOGARITHMIC = ("mu0", "sigma0")
+_NO_NOISE_DB = -120.0
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One free parameter. Raises SimulationError for bounds that are not finite or the wrong way round."""
+
+    name: str
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        finite = all(isinstance(value, int | float) and np.isfinite(value) for value in (self.low, self.high))
+        require(
+            finite and self.low < self.high,
+            f"bounds of {self.name} are {self.low!r} to {self.high!r}, expected two numbers, the smaller one first",
+        )
+
+    @property
+    def tissue(self) -> str | None:
+        """The tissue it belongs to, or None for the display."""
+        return self.name.rpartition(".")[0] or None
+
+    @property
+    def attribute(self) -> str:
+        """Its name in Tissue or DisplaySettings."""
+        return self.name.rpartition(".")[2]
+
+    @property
+    def _is_logarithmic(self) -> bool:
+        return self.attribute in _LOGARITHMIC and self.low > 0.0
+
+    def value(self, unit: float) -> float:
+        """The value at `unit` between 0 (low) and 1 (high)."""
+        unit = min(max(float(unit), 0.0), 1.0)
+        if self._is_logarithmic:
+            return min(max(exp(log(self.low) + unit * log(self.high / self.low)), self.low), self.high)
+        return self.low + unit * (self.high - self.low)
+
+    def unit(self, value: float) -> float:
+        """The inverse of `value`; what lies outside the bounds is moved to the nearest."""
+        value = min(max(float(value), self.low), self.high)
+        if self._is_logarithmic:
+            return log(value / self.low) / log(self.high / self.low)
+        return (value - self.low) / (self.high - self.low)
+
+
+class FreeParameters(tuple):
+    """The free parameters of one optimisation, in their order."""
+
+    @classmethod
+    def of(
+        cls, free: Iterable[str] | Mapping[str, Bounds | None], tissues: TissueTable, display: DisplaySettings
+    ) -> FreeParameters:
+        """From names, or from names with their (low, high); None stands for the default bounds.
+
+        Raises SimulationError for a name that is none, for bounds the wrong way round, for values that a Tissue or
+        DisplaySettings would refuse, and if nothing is free.
+        """
+        entries = dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
+        parameters: dict[str, Parameter] = {}
+        for name, bounds in entries.items():
+            for full_name, default in _meant_by(name, tissues):
+                low, high = _pair(full_name, bounds) if bounds is not None else default
+                parameters[full_name] = Parameter(full_name, low, high)
+        require(bool(parameters), "no free parameter, expected at least one, such as gain_db or white matter.mu0")
+        result = cls(parameters.values())
+        for corner in (np.zeros(len(result)), np.ones(len(result))):
+            result.apply(corner, tissues, display)  # which refuses what is out of range
+        return result
+
+    @property
+    def names(self) -> list[str]:
+        return [parameter.name for parameter in self]
+
+    def varied(self) -> dict[str, set[str]]:
+        """{tissue name: its free parameters}."""
+        varied: dict[str, set[str]] = {}
+        for parameter in self:
+            if parameter.tissue is not None:
+                varied.setdefault(parameter.tissue, set()).add(parameter.attribute)
+        return varied
+
+    def values(self, units: np.ndarray) -> np.ndarray:
+        """(parameters,) values at (parameters,) positions between 0 and 1."""
+        return np.array([parameter.value(unit) for parameter, unit in zip(self, units, strict=True)])
+
+    def units(self, tissues: TissueTable, display: DisplaySettings) -> np.ndarray:
+        """(parameters,) positions of what tissues and display are now; outside the bounds, the nearest."""
+        return np.array([p.unit(v) for p, v in zip(self, self.current(tissues, display), strict=True)])
+
+    def current(self, tissues: TissueTable, display: DisplaySettings) -> np.ndarray:
+        """(parameters,) values that tissues and display have now."""
+        known = {tissue.name: tissue for tissue in tissues.all_tissues()}
+        values = [getattr(known[p.tissue] if p.tissue else display, p.attribute) for p in self]
+        return np.array([_NO_NOISE_DB if value is None else value for value in values], float)
+
+    def apply(
+        self, units: np.ndarray, tissues: TissueTable, display: DisplaySettings
+    ) -> tuple[TissueTable, DisplaySettings]:
+        """Tissues and display with the free parameters at these positions."""
+        changes: dict[str | None, dict[str, float]] = {}
+        for parameter, value in zip(self, self.values(units).tolist(), strict=True):
+            changes.setdefault(parameter.tissue, {})[parameter.attribute] = value
+        display = replace(display, **changes.pop(None, {}))
+        for tissue in tissues.all_tissues():
+            if tissue.name in changes:
+                tissues = tissues.with_tissue(replace(tissue, **changes.pop(tissue.name)))
+        return tissues, display
+
+
+def all_names(tissues: TissueTable) -> list[str]:
+    """Everything that can be free: the display's, then those of every tissue that scatters."""
+    scattering = dict.fromkeys(t.name for t in tissues.all_tissues() if t.scatterer_variance > 0.0)
+    return [*DISPLAY_BOUNDS, *(f"{tissue}.{attribute}" for tissue in scattering for attribute in TISSUE_BOUNDS)]
+
+
+def _meant_by(name: str, tissues: TissueTable) -> list[tuple[str, Bounds]]:
+    """(full name, default bounds) of every parameter that `name` stands for."""
+    known = list(dict.fromkeys(tissue.name for tissue in tissues.all_tissues()))
+    if name == "display":
+        return list(DISPLAY_BOUNDS.items())
+    if name in DISPLAY_BOUNDS:
+        return [(name, DISPLAY_BOUNDS[name])]
+    tissue, _, attribute = name.rpartition(".")
+    if attribute not in TISSUE_BOUNDS:
+        tissue, attribute = name, ""
+    owner = next((entry for entry in known if same_name(entry, tissue)), None)
+    if owner is None:
+        raise SimulationError(
+            f"no free parameter {name!r}, expected display, {', '.join(DISPLAY_BOUNDS)}, or a tissue "
+            f"({', '.join(known)}), alone or with .{', .'.join(TISSUE_BOUNDS)}"
+        )
+    return [(f"{owner}.{a}", bounds) for a, bounds in TISSUE_BOUNDS.items() if attribute in ("", a)]
+
+
+def _pair(name: str, bounds) -> Bounds:
+    try:
+        low, high = bounds
+        return float(low), float(high)
+    except (TypeError, ValueError):
+        raise SimulationError(f"bounds of {name} are {bounds!r}, expected two numbers (low, high)") from None

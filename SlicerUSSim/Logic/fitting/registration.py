@@ -1,0 +1,217 @@
+"""register_poses: where the ultrasound lies in the MRI, refined with the cost of the appearance optimisation.
+
+A rigid correction of all poses together, six parameters: millimetres along and degrees about the axes of the middle
+image, about the middle of what the images see, where translations and rotations disturb each other least. Every
+evaluation traces and scatters anew, so the search first runs on a coarse simulation (fewer scan lines, pixels,
+scatterers and rays), then on the full one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import require_between
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.fitting.search import Evaluation, Progress, Search
+from SlicerUSSim.Logic.fitting.similarity import PatchComparison, SimilaritySettings
+from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+
+NAMES = ("x_mm", "y_mm", "z_mm", "about_x_deg", "about_y_deg", "about_z_deg")
+#: nlopt's name. A simplex steps over the ripple that speckle gives the cost; quadratic models fall into it.
+_ALGORITHM = "LN_NELDERMEAD"
+#: Of the evaluations, how many are coarse; first steps of the simplices, in units of the range.
+_COARSE_SHARE = 0.75
+_STEPS, _FINE_STEP = (0.12, 0.25, 0.12, 0.2, 0.12, 0.06), 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A rigid correction and what it brought."""
+
+    #: (4, 4) rigid; corrected poses are correction @ pose
+    correction: np.ndarray
+    poses: list[np.ndarray] = field(repr=False)
+    #: (3,) the middle of what the images saw before, and how far it was moved
+    centre: np.ndarray = field(repr=False)
+    shift_mm: float
+    cost_before: float
+    cost_after: float
+    history: list[Evaluation] = field(repr=False)
+
+    @property
+    def turn_deg(self) -> float:
+        """By how much the images were turned."""
+        return rotation_deg(self.correction)
+
+    @classmethod
+    def none(cls, poses: Sequence[np.ndarray]) -> Registration:
+        """Poses that stay where they are."""
+        return cls(np.eye(4), list(poses), np.mean([pose[:3, 3] for pose in poses], axis=0), 0.0, 0.0, 0.0, [])
+
+    def after(self, earlier: Registration) -> Registration:
+        """Both, one after the other."""
+        correction = self.correction @ earlier.correction
+        start = (np.linalg.inv(earlier.correction) @ [*self.centre, 1.0])[:3]
+        moved = (correction @ [*start, 1.0])[:3] - start
+        return replace(
+            self, correction=correction, centre=start, shift_mm=float(np.linalg.norm(moved)),
+            cost_before=earlier.cost_before, history=[*earlier.history, *self.history],
+        )  # fmt: skip
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON."""
+        return {
+            "correction": self.correction.tolist(),
+            "shift_mm": self.shift_mm,
+            "turn_deg": self.turn_deg,
+            "cost_before": self.cost_before,
+            "cost_after": self.cost_after,
+            "evaluations": len(self.history),
+        }
+
+
+def register_poses(
+    simulator: UltrasoundSimulator,
+    probe: Probe,
+    poses: Sequence[np.ndarray],
+    references: Sequence[np.ndarray],
+    *,
+    display: DisplaySettings,
+    grid: ImageGrid | None = None,
+    masks: Sequence[np.ndarray] | None = None,
+    range_mm: float = 8.0,
+    range_deg: float = 8.0,
+    max_evaluations: int = 900,
+    settings: SimilaritySettings | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Registration:
+    """Move all poses together until simulated and real images agree.
+
+    Parameters are those of optimization.optimize_appearance; tissues and display are taken as they are, so fit them
+    first. `range_mm` and `range_deg` are the bounds of each parameter.
+
+    Raises SimulationError for poses that are not rigid and references that do not fit.
+    """
+    require_between("register_poses", "range_mm", range_mm, 0.01, 100)
+    require_between("register_poses", "range_deg", range_deg, 0.01, 90)
+    poses = [check_rigid(f"pose {number}", pose) for number, pose in enumerate(poses)]
+    settings = settings or SimilaritySettings()
+    grid = grid or ImageGrid.for_probe(probe, display.image_size)
+    ranges = np.array([range_mm] * 3 + [range_deg] * 3)
+
+    def correction(units: np.ndarray) -> np.ndarray:
+        return frame @ rigid_from((2.0 * np.asarray(units) - 1.0) * ranges) @ np.linalg.inv(frame)
+
+    def describe(units: np.ndarray) -> dict[str, float]:
+        return dict(zip(NAMES, ((2.0 * np.asarray(units) - 1.0) * ranges).tolist(), strict=True))
+
+    comparisons = target_comparisons(simulator.device, probe, grid, references, masks, len(poses), settings)
+    frame = _middle_frame(probe, poses)
+    full = _PoseCost(simulator, probe, poses, comparisons, grid, display, correction)
+    coarse_probe, coarse_grid, coarse_references, coarse_masks = _coarser(probe, grid, references, masks)
+    coarse_comparisons = [
+        PatchComparison(simulator.device, reference, mask, coarse_grid.pixel_spacing_mm, settings)
+        for reference, mask in zip(coarse_references, coarse_masks, strict=True)
+    ]
+    coarse = _PoseCost(
+        simulator, coarse_probe, poses, coarse_comparisons, coarse_grid, display, correction,
+        _coarser_settings(simulator.settings),
+    )  # fmt: skip
+    search = Search(coarse, describe, max_evaluations, 0, progress)
+    here = np.full(6, 0.5)
+    before = full(here)
+    random = np.random.default_rng(0)
+    best, coarse_budget = here, int(_COARSE_SHARE * max_evaluations)
+    for step in _STEPS:
+        # A simplex that has shrunk in a dip of the speckle's making is spread out again.
+        start = best if step == _STEPS[0] else best + random.normal(0.0, 0.3 * step, 6)
+        search.minimise(_ALGORITHM, "coarse", start, coarse_budget - len(search.history), step=step)
+        best = np.array(search.best("coarse").units)
+        if len(search.history) >= coarse_budget:
+            break
+    search.cost = full
+    best = search.minimise(_ALGORITHM, "fine", best, max_evaluations - len(search.history), step=_FINE_STEP)
+    after = search.best_cost("fine")
+    if after > before:  # the start was the best after all
+        best, after = here, before
+    matrix = correction(best)
+    centre = frame[:3, 3]
+    shift = float(np.linalg.norm((matrix @ [*centre, 1.0])[:3] - centre))
+    return Registration(matrix, [matrix @ pose for pose in poses], centre, shift, before, after, search.history)
+
+
+def rigid_from(values: Sequence[float]) -> np.ndarray:
+    """(4, 4) from three translations (mm) and a rotation vector (degrees)."""
+    from scipy.spatial.transform import Rotation
+
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(np.deg2rad(values[3:])).as_matrix()
+    matrix[:3, 3] = values[:3]
+    return matrix
+
+
+def rotation_deg(matrix: np.ndarray) -> float:
+    """The angle of a rigid matrix's rotation."""
+    return float(np.rad2deg(np.arccos(np.clip((np.trace(matrix[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))))
+
+
+class _PoseCost:
+    """The mean cost at corrected poses, as a function of the correction's positions between 0 and 1."""
+
+    def __init__(
+        self, simulator, probe, poses, comparisons: list[PatchComparison], grid, display, correction,
+        simulation: SimulationSettings | None = None,
+    ) -> None:  # fmt: skip
+        self.simulator, self.probe, self.poses, self.grid, self.display = simulator, probe, poses, grid, display
+        self.correction, self.simulation = correction, simulation or simulator.settings
+        self.comparisons = comparisons
+
+    def __call__(self, units: np.ndarray) -> float:
+        matrix, before = self.correction(units), self.simulator.settings
+        self.simulator.settings = self.simulation
+        try:
+            for pose, comparison in zip(self.poses, self.comparisons, strict=True):
+                comparison.run(self.simulator.render(self.probe, matrix @ pose, self.display, self.grid))
+            return mean_cost(comparison.result() for comparison in self.comparisons)
+        finally:
+            self.simulator.settings = before
+
+
+def _middle_frame(probe: Probe, poses: list[np.ndarray]) -> np.ndarray:
+    """(4, 4) the axes of the middle image, at the middle of what all images see."""
+    centres = [(pose @ [0.0, 0.5 * probe.depth_mm, 0.0, 1.0])[:3] for pose in poses]
+    frame = np.array(poses[len(poses) // 2])
+    frame[:3, 3] = np.mean(centres, axis=0)
+    return frame
+
+
+def _coarser(probe: Probe, grid: ImageGrid, references, masks):
+    """Half the scan lines, and pixels twice as large in both directions."""
+    rows, columns = grid.rows // 2, grid.columns // 2
+    spacing = 2.0 * grid.pixel_spacing_mm[0], 2.0 * grid.pixel_spacing_mm[1]
+
+    def shrunk(image: np.ndarray) -> np.ndarray:
+        return np.asarray(image, float)[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).mean(axis=(1, 3))
+
+    images = [np.ascontiguousarray(shrunk(image).round().astype(np.uint8)) for image in references]
+    field = grid.field(probe)
+    insides = [shrunk(field if masks is None else field & masks[n]) > 0.99 for n in range(len(images))]
+    coarse_probe = replace(probe, scan_lines=max(probe.scan_lines // 2, 2))
+    return coarse_probe, ImageGrid(rows, columns, grid.left_mm, grid.top_mm, spacing), images, insides
+
+
+def _coarser_settings(settings: SimulationSettings) -> SimulationSettings:
+    """Fewer scatterers (of the same variance) and rays; no mirror images."""
+    return replace(
+        settings,
+        scatterers_per_mm3=min(settings.scatterers_per_mm3, 8.0),
+        elevational_rays=min(settings.elevational_rays, 3),
+        max_ray_depth=min(settings.max_ray_depth, 1),
+    )

@@ -1,0 +1,232 @@
+"""A report of an optimisation as one self-contained HTML file: images, cost, parameters, and what they can tell."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import os
+from pathlib import Path
+from string import Template
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.fitting.identifiability import Spread
+from SlicerUSSim.Logic.fitting.optimization import STAGES, AppearanceResult
+from SlicerUSSim.Logic.imaging.figures import require_matplotlib
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.probe.placement import slice_under_probe
+from SlicerUSSim.Logic.tissue.presets import colour_of
+from SlicerUSSim.Logic.tracked.field import draw_field
+from SlicerUSSim.Logic.tracked.images import TrackedImages
+
+_TEMPLATE = Path(__file__).parent / "report.html"
+_PAPER, _INK = "#161616", "#e4e4e4"
+_BEFORE, _AFTER, _REAL = "#8a8a8a", "#ffc83d", "#6db3f2"
+
+
+def write_report(
+    path: str | os.PathLike,
+    result: AppearanceResult,
+    tracked: TrackedImages,
+    before: list[np.ndarray],
+    after: list[np.ndarray],
+    simulator: UltrasoundSimulator,
+    *,
+    title: str = "Simulated ultrasound fitted to real ultrasound",
+    subtitle: str = "",
+    provenance: str = "",
+) -> None:
+    """Write the report, whole or not at all.
+
+    `before` and `after` are the simulated images (rows, columns) beside those of `tracked`.
+    Raises SimulationError without matplotlib and for an unwritable path.
+    """
+    require_matplotlib()
+    images = [np.where(tracked.mask, image, 0).astype(np.uint8) for image in tracked.images]
+    fill = {
+        "title": html.escape(title),
+        "subtitle": html.escape(subtitle),
+        "cost_before": f"{result.cost_before:.4f}",
+        "cost_after": f"{result.cost_after:.4f}",
+        "change": f"{100.0 * (result.cost_after / max(result.cost_before, 1e-12) - 1.0):+.0f} %",
+        "count": str(len(images)),
+        "evaluations": str(result.evaluations),
+        "seconds": f"{result.seconds:.1f}",
+        "images": "\n".join(
+            _trio(number, real, old, new, *similarities)
+            for number, real, old, new, *similarities in zip(
+                tracked.numbers, images, before, after, result.similarity_before, result.similarity_after, strict=True
+            )
+        ),
+        "histograms": _histograms(tracked, before, after, simulator),
+        "curve": _curve(result),
+        "parameters": "\n".join(_parameter_row(result, parameter) for parameter in result.parameters),
+        "combinations": "\n".join(
+            _combination_row(spread)
+            for spread in result.identifiability.spreads
+            if spread.name not in result.parameters.names
+        ),
+        "identifiability": html.escape(_in_words(result)),
+        "geometry": _geometry(tracked),
+        "provenance": html.escape(provenance),
+    }
+    template = Template(_TEMPLATE.read_text(encoding="utf-8"))
+    with written_whole(path) as partial:
+        partial.write_text(template.substitute(fill), encoding="utf-8")
+
+
+def grey_levels_per_tissue(
+    tracked: TrackedImages, images: list[np.ndarray], simulator: UltrasoundSimulator
+) -> dict[str, np.ndarray]:
+    """{tissue name: (pixels,) grey levels of these images where the labels have that tissue}, the coupling left out."""
+    medium = simulator.medium
+    found: dict[str, list[np.ndarray]] = {}
+    for pose, image in zip(tracked.poses, images, strict=True):
+        labels = slice_under_probe(medium.labels, tracked.grid, pose, order=0)
+        for label, tissue in medium.tissues.items():
+            pixels = image[(labels == label) & tracked.mask]
+            if label != 0 and pixels.size:
+                found.setdefault(tissue.name, []).append(pixels)
+    return {name: np.concatenate(pixels) for name, pixels in found.items()}
+
+
+def _trio(number: int, real: np.ndarray, before: np.ndarray, after: np.ndarray, was, is_now) -> str:
+    before_png, after_png, real_png = (_png(image) for image in (before, after, real))
+    difference = _png(np.clip(127.5 + 0.5 * (after.astype(float) - real), 0, 255).astype(np.uint8))
+    caption = (
+        f"Image {number}: cost {was.total:.4f} → {is_now.total:.4f} (histograms {was.bhattacharyya:.3f} → "
+        f"{is_now.bhattacharyya:.3f}, difference {was.sad:.3f} → {is_now.sad:.3f})"
+    )
+    return f"""<figure class="case">
+<figcaption>{caption}</figcaption>
+<div class="trio"><figure><img alt="before" src="{before_png}"><figcaption>simulated, before</figcaption></figure>
+<figure><img alt="after" src="{after_png}"><figcaption>simulated, after</figcaption></figure>
+<figure><img alt="real" src="{real_png}"><figcaption>real</figcaption></figure></div>
+<div class="compare"><img alt="simulated"><div class="top"><img alt="real"></div><div class="edge"></div>
+<span class="name l">after</span><span class="name r">real</span></div>
+<div class="controls"><input type="range" min="0" max="100" value="50" aria-label="divide simulated and real">
+<select aria-label="simulated image"><option>after</option><option>before</option></select><button>Blink</button></div>
+<details><summary class="dim">difference, after less real</summary>
+<img class="plot" alt="difference" src="{difference}"></details>
+</figure>"""
+
+
+def _parameter_row(result: AppearanceResult, parameter) -> str:
+    spread = result.identifiability[parameter.name]
+    note = ' <span class="no">at its bound</span>' if parameter.name in result.at_bounds else ""
+    return (
+        f"<tr><td>{html.escape(parameter.name)}{note}</td><td>{parameter.low:g} to {parameter.high:g}</td>"
+        f"<td>{result.before[parameter.name]:.3f}</td><td>{result.after[parameter.name]:.3f}</td>{_spread_cells(spread)}</tr>"
+    )
+
+
+def _combination_row(spread: Spread) -> str:
+    name, unit = html.escape(spread.name), html.escape(spread.unit)
+    return f"<tr><td>{name}</td><td>{unit}</td><td>{spread.value:.2f}</td>{_spread_cells(spread)}</tr>"
+
+
+def _spread_cells(spread: Spread) -> str:
+    restarts = "–" if np.isnan(spread.mean) else f"{spread.mean:.3f} ± {spread.standard_deviation:.3f}"
+    answer = {True: '<td class="yes">yes</td>', False: '<td class="no">no</td>', None: "<td>?</td>"}[
+        spread.is_determined
+    ]
+    return f"<td>{spread.low:.3f} to {spread.high:.3f}</td><td>{restarts}</td>{answer}"
+
+
+def _in_words(result: AppearanceResult) -> str:
+    found = result.identifiability
+    text = (
+        f"Speckle is random: another draw of it changes the cost by about {found.cost_tolerance:.4f}, so costs closer "
+        f"than that cannot be told apart. {found.solutions} solutions are equally good by this measure; "
+    )
+    if found.restarts:
+        text += (
+            f"{found.restarts_as_good} of {found.restarts} searches with other speckle from other starts fit as well. "
+        )
+    return text + (
+        "mu0, sigma0 and mu1 act through the variance of developed speckle (Var), Var and gain through the level, "
+        "attenuation and TGC through the fall with depth: combinations can be known where each alone is not."
+    )
+
+
+def _curve(result: AppearanceResult) -> str:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.5, 3.2), facecolor=_PAPER, dpi=110, layout="constrained")
+    axis = _dark(figure.add_subplot())
+    main = [entry for entry in result.history if entry.stage in STAGES]
+    costs = np.array([entry.cost for entry in main])
+    axis.plot(costs, ".", color=_BEFORE, markersize=3, label="evaluation")
+    axis.plot(np.minimum.accumulate(costs), color=_AFTER, label="best so far")
+    for place in range(1, len(main)):
+        if main[place].stage != main[place - 1].stage:
+            axis.axvline(place, color="#555555", linewidth=0.8)
+            axis.annotate(main[place].stage, (place + 2, costs.max()), color=_INK, fontsize=8, va="top")
+    axis.set_xlabel("evaluation")
+    axis.set_ylabel("cost")
+    axis.legend(facecolor=_PAPER, labelcolor=_INK, edgecolor="#444444", fontsize=8)
+    return _figure_png(figure)
+
+
+def _histograms(tracked: TrackedImages, before: list, after: list, simulator: UltrasoundSimulator) -> str:
+    from matplotlib.figure import Figure
+
+    real = grey_levels_per_tissue(tracked, tracked.images, simulator)
+    rows = {name: pixels for name, pixels in real.items() if pixels.size >= 200} or real
+    simulated = [grey_levels_per_tissue(tracked, images, simulator) for images in (before, after)]
+    columns = max(len(rows), 1)
+    figure = Figure(figsize=(3.2 * columns, 2.6), facecolor=_PAPER, dpi=110, layout="constrained")
+    for axis, name in zip(figure.subplots(1, columns, squeeze=False)[0], rows, strict=False):
+        _dark(axis)
+        for pixels, colour, label in (
+            (simulated[0][name], _BEFORE, "before"),
+            (simulated[1][name], _AFTER, "after"),
+            (real[name], _REAL, "real"),
+        ):
+            share = np.bincount(pixels // 8, minlength=32) / pixels.size
+            axis.stairs(share, np.arange(0, 257, 8), color=colour, label=label, linewidth=1.6)
+        axis.set_title(name, color=colour_of(name), fontsize=10)
+        axis.set_xlabel("grey level", fontsize=8)
+        axis.set_yticks([])
+    axis.legend(facecolor=_PAPER, labelcolor=_INK, edgecolor="#444444", fontsize=8)
+    return _figure_png(figure)
+
+
+def _dark(axis):
+    axis.set_facecolor("#101010")
+    axis.tick_params(colors=_INK, labelsize=8)
+    for spine in axis.spines.values():
+        spine.set_color("#555555")
+    axis.xaxis.label.set_color(_INK)
+    axis.yaxis.label.set_color(_INK)
+    return axis
+
+
+def _geometry(tracked: TrackedImages) -> str:
+    whole = np.zeros(tracked.field.mask.shape, np.uint8)
+    whole[tracked.field.window] = tracked.images[0]
+    with TemporaryDirectory() as folder:
+        picture = Path(folder) / "field.png"
+        draw_field(picture, whole, tracked.field)
+        return _data_url(picture.read_bytes())
+
+
+def _png(image: np.ndarray) -> str:
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray(image).save(data, "PNG", optimize=True)
+    return _data_url(data.getvalue())
+
+
+def _figure_png(figure) -> str:
+    data = io.BytesIO()
+    figure.savefig(data, format="png", facecolor=_PAPER)
+    return _data_url(data.getvalue())
+
+
+def _data_url(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()

@@ -1,0 +1,189 @@
+"""Search: nlopt on a cost that is a function, stage by stage; told, cancelled and resumed evaluation by evaluation."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+#: nlopt's names. The choice is justified in docs/optimization.md by benchmarks/optimization.py.
+GLOBAL_ALGORITHM, LOCAL_ALGORITHM = "G_MLSL_LDS", "LN_BOBYQA"
+#: BOBYQA needs two parameters or more.
+_ALGORITHM_FOR_ONE = "LN_SBPLX"
+#: Between 0 and 1 across the bounds: how exactly the best is wanted, and the first step of local searches.
+_TOLERANCE, _FIRST_STEP = 1e-3, 0.1
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One evaluation of the cost."""
+
+    stage: str
+    #: (parameters,) between 0 and 1 within the bounds
+    units: tuple[float, ...]
+    cost: float
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress function is told after every evaluation."""
+
+    stage: str
+    evaluations: int
+    #: How many there will be at most
+    limit: int
+    cost: float
+    best_cost: float
+    #: {parameter name: value} of the best so far
+    best: dict[str, float]
+
+    @property
+    def share(self) -> float:
+        """Share done, 0 to 1."""
+        return min(self.evaluations / self.limit, 1.0)
+
+
+class Search:
+    """Minimises a cost over positions between 0 and 1.
+
+    Parameters
+    ----------
+    cost : of (parameters,) positions; the same for the same, which is what makes a run repeatable.
+    describe : {parameter name: value} of a position, for progress.
+    limit : how many evaluations there will be at most, for progress.
+    seed : of algorithms that draw random numbers.
+    progress : told after every evaluation; may raise errors.Cancelled.
+    replayed : the history of an earlier run: what it evaluated in the same order is not computed again.
+    """
+
+    def __init__(
+        self,
+        cost: Callable[[np.ndarray], float],
+        describe: Callable[[np.ndarray], dict[str, float]],
+        limit: int,
+        seed: int = 0,
+        progress: Callable[[Progress], None] | None = None,
+        replayed: list[Evaluation] | None = None,
+    ) -> None:
+        self.cost, self.describe, self.limit, self.seed = cost, describe, limit, seed
+        self.progress, self.replayed = progress, replayed or []
+        self.history: list[Evaluation] = []
+        #: How many were computed in this run
+        self.computed = 0
+        self._best: Evaluation | None = None
+
+    def minimise(
+        self, algorithm: str, stage: str, start: np.ndarray, budget: int, step: float = _FIRST_STEP
+    ) -> np.ndarray:
+        """The best of at most `budget` evaluations from `start` on, (parameters,) between 0 and 1.
+
+        Raises SimulationError for a name that is no algorithm of nlopt or one that cannot be used here.
+        """
+        import nlopt
+
+        first = len(self.history)
+        failure: list[BaseException] = []
+
+        def evaluate(units: np.ndarray, _gradient) -> float:
+            if len(self.history) - first >= budget:  # some algorithms take a few more than they are allowed
+                weak().force_stop()
+                return float("inf")
+            try:
+                return self.evaluate(stage, units)
+            except BaseException as error:  # through nlopt's C++, which would lose what kind it was
+                failure.append(error)
+                weak().force_stop()
+                return float("inf")
+
+        search = self._optimiser(algorithm, len(start), step)
+        weak = weakref.ref(search)  # which holds `evaluate` where Python's garbage collector does not see it
+        self.evaluate(stage, start)
+        if budget > 1:
+            nlopt.srand(self.seed + 1)
+            search.set_min_objective(evaluate)
+            search.set_maxeval(budget - 1)
+            try:
+                search.optimize(np.clip(start, 0.0, 1.0))
+            except (nlopt.ForcedStop, nlopt.RoundoffLimited):
+                pass
+            except (RuntimeError, ValueError) as error:
+                if not failure:
+                    raise SimulationError(f"nlopt's {algorithm} cannot be used here ({error})") from None
+            if failure:
+                raise failure[0]
+        return np.array(min(self.history[first:], key=lambda entry: entry.cost).units)
+
+    def evaluate(self, stage: str, units: np.ndarray) -> float:
+        """The cost at one position, kept in the history."""
+        place = len(self.history)
+        key = tuple(np.clip(units, 0.0, 1.0).tolist())
+        known = self.replayed[place] if place < len(self.replayed) else None
+        if known is not None and known.stage == stage and known.units == key:
+            cost = known.cost
+        else:
+            cost = self.cost(np.array(key))
+            self.computed += 1
+        entry = Evaluation(stage, key, cost)
+        self.history.append(entry)
+        # A new stage may have another cost, with which earlier ones cannot be compared.
+        if self._best is None or self._best.stage != stage or cost < self._best.cost:
+            self._best = entry
+        if self.progress is not None:
+            best = self._best
+            values = self.describe(np.array(best.units))
+            self.progress(Progress(stage, len(self.history), self.limit, cost, best.cost, values))
+        return cost
+
+    def best(self, stage: str) -> Evaluation:
+        """The evaluation of lowest cost in one stage."""
+        return min((entry for entry in self.history if entry.stage == stage), key=lambda entry: entry.cost)
+
+    def best_cost(self, stage: str) -> float:
+        """The lowest cost of one stage."""
+        return self.best(stage).cost
+
+    def state(self) -> list:
+        """The history as plain values; `history_from` reads it back."""
+        return [[entry.stage, list(entry.units), entry.cost] for entry in self.history]
+
+    def _optimiser(self, algorithm: str, parameters: int, step: float):
+        import nlopt
+
+        def made(name: str, tolerance: float):
+            if parameters == 1 and name == LOCAL_ALGORITHM:
+                name = _ALGORITHM_FOR_ONE
+            try:
+                optimiser = nlopt.opt(getattr(nlopt, name), parameters)
+            except (AttributeError, TypeError, ValueError):
+                known = f"{GLOBAL_ALGORITHM} or {LOCAL_ALGORITHM}"
+                raise SimulationError(f"nlopt has no algorithm {name!r}, expected a name such as {known}") from None
+            optimiser.set_lower_bounds(np.zeros(parameters))
+            optimiser.set_upper_bounds(np.ones(parameters))
+            optimiser.set_xtol_abs(tolerance)
+            optimiser.set_initial_step(step)
+            return optimiser
+
+        search = made(algorithm, _TOLERANCE)
+        if "MLSL" in algorithm or "AUGLAG" in algorithm:
+            search.set_local_optimizer(made(LOCAL_ALGORITHM, 10.0 * _TOLERANCE))
+        return search
+
+
+def history_from(state: dict | None, problem: str) -> list[Evaluation]:
+    """The evaluations of an earlier run from {"problem": ..., "history": ...}.
+
+    Raises SimulationError if it was on another problem, or is no such thing.
+    """
+    if state is None:
+        return []
+    try:
+        known = state["problem"]
+        history = [Evaluation(str(stage), tuple(map(float, units)), float(c)) for stage, units, c in state["history"]]
+    except (KeyError, TypeError, ValueError):
+        raise SimulationError("the state to resume is not one of an optimisation (problem and history)") from None
+    require(known == problem, "the state to resume is of another problem: other images, poses, parameters or settings")
+    return history

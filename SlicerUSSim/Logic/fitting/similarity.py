@@ -1,0 +1,181 @@
+"""How alike two B-mode images are: equations 4 and 5 of Salehi et al., MICCAI 2015 (PHYSICS section 6).
+
+    L(A, B) = rho(A, B) + lambda SAD(A, B),    rho = mean over patches of sqrt(1 - sum_j sqrt(P_j Q_j))
+
+P and Q are the normalised histograms of the two images in one square patch, SAD is the mean absolute difference of
+intensities scaled to [0, 1]. Histograms forget where in a patch a grey level was, so rho does not mind which seed drew
+the speckle; the patches remember where in the image, so anatomy and the fall with depth count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import require, require_between
+from SlicerUSSim.Logic.opencl.device import Device, Workspace
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+
+#: A patch at the edge of the common field counts if this share of it lies inside.
+_LEAST_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """The cost and its two parts; 0 for equal images, larger for less alike ones."""
+
+    #: bhattacharyya + sad_weight x sad
+    total: float
+    #: rho, 0 to 1
+    bhattacharyya: float
+    #: 0 to 1
+    sad: float
+
+
+@dataclass(frozen=True)
+class SimilaritySettings:
+    """What is compared with what."""
+
+    #: Side of the square patches; larger than the image compares it as a whole
+    patch_mm: float = 5.0
+    #: Of the histograms
+    bins: int = 32
+    #: lambda, the weight of the absolute difference
+    sad_weight: float = 1.0
+    #: The weight of the histograms: 1 is the paper, 0 leaves the absolute difference alone
+    histogram_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        owner = "SimilaritySettings"
+        require_between(owner, "patch_mm", self.patch_mm, 0.01, 1e6)
+        require_between(owner, "bins", self.bins, 2, CONSTANTS["MAX_BINS"])
+        require(int(self.bins) == self.bins, f"{owner}: bins is {self.bins!r}, expected a whole number")
+        require_between(owner, "sad_weight", self.sad_weight, 0, 1e3)
+        require_between(owner, "histogram_weight", self.histogram_weight, 0, 1e3)
+
+    def patch_pixels(self, shape: tuple[int, int], pixel_spacing_mm: tuple[float, float]) -> tuple[int, int]:
+        """(rows, columns) of a patch in an image of `shape` (rows, columns); `pixel_spacing_mm` is (column, row)."""
+        rows, columns = (
+            max(round(min(self.patch_mm / spacing, size)), 1)
+            for spacing, size in zip(pixel_spacing_mm[::-1], shape, strict=True)
+        )
+        return rows, columns
+
+    def combine(self, apart: np.ndarray, difference: np.ndarray, count: np.ndarray, full: int) -> Similarity:
+        """The cost from patches: 1 - Bhattacharyya coefficient, sum of absolute grey differences, and pixels of each;
+        `full` is how many pixels a whole patch has."""
+        pixels = int(count.sum())
+        counts = count >= min(_LEAST_SHARE * full, count.max())
+        rho = float(np.sqrt(np.clip(apart[counts], 0.0, 1.0)).mean())
+        sad = float(difference.sum(dtype=np.float64) / (255.0 * pixels))
+        return Similarity(self.histogram_weight * rho + self.sad_weight * sad, rho, sad)
+
+
+def similarity(
+    a: np.ndarray,
+    b: np.ndarray,
+    pixel_spacing_mm: tuple[float, float],
+    *,
+    patch_mm: float = 5.0,
+    bins: int = 32,
+    sad_weight: float = 1.0,
+    mask: np.ndarray | None = None,
+) -> Similarity:
+    """The cost of two images against each other, in plain numpy.
+
+    Parameters
+    ----------
+    a, b : (rows, columns) uint8 on one grid.
+    pixel_spacing_mm : (column, row).
+    patch_mm, bins, sad_weight : see SimilaritySettings.
+    mask : (rows, columns) bool, the pixels inside both fields (default: all).
+
+    Raises SimulationError for images that are not uint8 or differ in shape, and for a mask without pixels.
+    """
+    settings = SimilaritySettings(patch_mm, bins, sad_weight)
+    a, b = _as_image("first image", a), _as_image("second image", b)
+    require(a.shape == b.shape, f"the images have shapes {a.shape} and {b.shape}, expected two of one shape")
+    inside = _as_mask(mask, a.shape)
+    rows, columns = settings.patch_pixels(a.shape, pixel_spacing_mm)
+    down, across = -(-a.shape[0] // rows), -(-a.shape[1] // columns)
+    patch = (np.arange(a.shape[0]) // rows)[:, None] * across + (np.arange(a.shape[1]) // columns)[None, :]
+    patch = patch[inside]
+
+    def histograms(image: np.ndarray) -> np.ndarray:
+        bin_of = image[inside].astype(np.int64) * bins // 256
+        return np.bincount(patch * bins + bin_of, minlength=down * across * bins).reshape(-1, bins)
+
+    count = np.bincount(patch, minlength=down * across)
+    apart = 0.5 * ((np.sqrt(histograms(a)) - np.sqrt(histograms(b))) ** 2).sum(axis=1) / np.maximum(count, 1)
+    difference = np.bincount(patch, np.abs(a[inside].astype(int) - b[inside]), minlength=down * across)
+    return settings.combine(apart, difference, count, rows * columns)
+
+
+class PatchComparison:
+    """Compares images on the device with one reference that stays there."""
+
+    def __init__(
+        self,
+        device: Device,
+        reference: np.ndarray,
+        mask: np.ndarray,
+        pixel_spacing_mm: tuple[float, float],
+        settings: SimilaritySettings,
+    ) -> None:
+        reference = _as_image("reference", reference)
+        self.shape, self.settings, self.device = reference.shape, settings, device
+        self.patch = settings.patch_pixels(reference.shape, pixel_spacing_mm)
+        self.patches = tuple(-(-size // step) for size, step in zip(self.shape, self.patch, strict=True))
+        self.kernel = device.kernels("similarity.cl")["compare_patches"]
+        self._reference = device.upload(reference)
+        self._inside = device.upload(_as_mask(mask, reference.shape).astype(np.uint8))
+        self._workspace = Workspace(device)
+
+    def run(self, image) -> None:
+        """Enqueue the comparison with a device buffer that holds (rows, columns) uint8."""
+        rows, columns = self.shape
+        self._result = self._workspace.get("result", self.patches[0] * self.patches[1] * 12)
+        self.device.run(
+            self.kernel,
+            self.patches[::-1],
+            image,
+            self._reference,
+            self._inside,
+            np.int32(columns),
+            np.int32(rows),
+            np.int32(self.patch[1]),
+            np.int32(self.patch[0]),
+            np.int32(self.settings.bins),
+            self._result,
+        )
+
+    def result(self) -> Similarity:
+        """The cost of the image compared last; waits for it."""
+        parts = self.device.download(self._result, (*self.patches, 3), np.float32)
+        return self.settings.combine(parts[..., 0], parts[..., 1], parts[..., 2], self.patch[0] * self.patch[1])
+
+    def of(self, image: np.ndarray) -> Similarity:
+        """The cost of an image on the host, (rows, columns) uint8."""
+        image = _as_image("image", image)
+        require(image.shape == self.shape, f"the image has shape {image.shape}, expected that of the reference")
+        self.run(self.device.upload(image))
+        return self.result()
+
+
+def _as_image(name: str, image: np.ndarray) -> np.ndarray:
+    image = np.asarray(image)
+    require(
+        image.ndim == 2 and image.dtype == np.uint8 and image.size > 0,
+        f"{name} is {image.dtype} of shape {image.shape}, expected uint8 (rows, columns)",
+    )
+    return np.ascontiguousarray(image)
+
+
+def _as_mask(mask: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:
+    if mask is None:
+        return np.ones(shape, bool)
+    mask = np.asarray(mask, bool)
+    require(mask.shape == shape, f"the mask has shape {mask.shape}, expected that of the images, {shape}")
+    require(bool(mask.any()), "the fields of the two images do not overlap: no pixel lies inside both")
+    return mask

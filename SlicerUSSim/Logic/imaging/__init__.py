@@ -1,0 +1,21 @@
+"""From a label map and a pose to an image, stage by stage: medium, ray tree, echoes, B-mode, scan conversion.
+
+`simulator` runs the stages; each has its host side here and its kernels in kernels/. A Preset is all that a user sets.
+"""
+
+from typing import TYPE_CHECKING
+
+from SlicerUSSim.Logic.base.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from .compounding import Compounder as Compounder, sweep_grid as sweep_grid
+    from .frame import Frame as Frame
+    from .preset import Preset as Preset
+    from .reuse import ReusedSimulator as ReusedSimulator
+    from .simulator import (
+        EmptyViewWarning as EmptyViewWarning,
+        TreeOverflowWarning as TreeOverflowWarning,
+        UltrasoundSimulator as UltrasoundSimulator,
+    )
+
+lazy_exports(globals())

@@ -1,0 +1,58 @@
+"""Frame: one simulated image with its geometry and the signals it was made from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One simulated image with its geometry and the signals it was made from."""
+
+    #: (scan_lines, samples) complex64 baseband (I/Q) signal before noise and TGC
+    iq: np.ndarray = field(repr=False)
+    #: (scan_lines, samples) float32 after noise and TGC
+    envelope: np.ndarray = field(repr=False)
+    #: (scan_lines, samples) uint8 grey levels along the scan lines
+    bmode: np.ndarray = field(repr=False)
+    #: (rows, columns) uint8 scan-converted image; outside the field 0
+    image: np.ndarray = field(repr=False)
+    #: Depth between samples
+    sample_interval_mm: float
+    #: Carrier cycles per millimetre of depth
+    cycles_per_mm: float
+    grid: ImageGrid
+    #: (4, 4)
+    probe_to_ras: np.ndarray
+    #: Milliseconds per stage; empty unless the simulator profiles
+    timings_ms: dict[str, float] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def rf(self) -> np.ndarray:
+        """(scan_lines, samples) complex64 analytic RF signal; its real part is what an A/D converter would see."""
+        depth = np.arange(self.iq.shape[1]) * self.sample_interval_mm
+        return self.iq * np.exp(2j * np.pi * self.cycles_per_mm * depth).astype(np.complex64)
+
+    @property
+    def pixel_spacing_mm(self) -> tuple[float, float]:
+        """(column, row) spacing of the image."""
+        return self.grid.pixel_spacing_mm
+
+    @property
+    def image_to_probe(self) -> np.ndarray:
+        """(4, 4) from (column, row, 0, 1) to the probe frame in millimetres."""
+        return self.grid.image_to_probe
+
+    def to_volume(self) -> Volume:
+        """The image as a Volume of one slice in patient space; the slice is as thick as a pixel is high."""
+        return Volume(self.image[None], self.probe_to_ras @ self.grid.slice_to_probe)
+
+    def to_vtk(self):
+        """The image as a vtkImageData of one slice in patient space (RAS)."""
+        return self.to_volume().to_vtk()

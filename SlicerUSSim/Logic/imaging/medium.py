@@ -1,0 +1,209 @@
+"""The acoustic medium as the device sees it: labels, membrane, smoothed borders and tissue numbers in buffers.
+
+A voxel takes two bytes. The low byte holds the label and flags for cells (the cube between eight voxel centres) whose
+corners agree, so that most look-ups need one load. The high byte holds the *fluid distance*: how far inside the
+membrane's fluids the voxel lies. It comes from their indicator, smoothed by a Gaussian: a planar border at distance d
+smooths to Phi(d / sigma), so d = sigma Phi^-1 of it. Linear between voxels, it places a layer thinner than a voxel
+without stairs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage, special
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.imaging.borders import smoothed_indicators
+from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
+from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
+from SlicerUSSim.Logic.tissue.tissue import Membrane
+
+_FARTHEST_SIGMAS = 2.2  # where the stored distance ends
+# Smoothed indicators take two bytes a voxel and group: so many groups, so many voxels in all; but always two groups.
+_MOST_SMOOTHED_GROUPS = 6
+_SMOOTHED_VOXELS = 100_000_000
+_PAD = 1  # one voxel of coupling medium around the volume, so that a clamped look-up outside finds it
+
+
+class Medium:
+    """Labels and tissues on a device.
+
+    Parameters
+    ----------
+    labels : Volume of whole numbers; 0 is the coupling medium.
+    tissues : a Tissue for every label that occurs.
+    texture : (k, j, i) uint32 of Texture.packed, if scatterers shall know more than labels.
+
+    Raises SimulationError for labels that are not whole numbers or have no tissue.
+    """
+
+    def __init__(self, labels: Volume, tissues: TissueTable, device: Device, texture: np.ndarray | None = None) -> None:
+        self.device = device
+        self.labels = labels
+        array = as_labels(labels.array)
+        counts = np.bincount(array.ravel(), minlength=256)
+        #: Labels that occur, the most frequent first
+        self.present = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
+        self.dims = np.array(array.shape[::-1]) + 2 * _PAD
+        self._check(tissues)
+        padded = np.pad(array, _PAD)
+        #: layout.TISSUE per label, as the device has it
+        self.rows = self._tissue_rows(tissues)
+        self._upload(padded, tissues)
+        self._upload_groups(padded)
+        self.has_texture = texture is not None
+        no_texture = np.zeros(1, np.uint32)
+        self.texture_buffer = device.upload(
+            np.pad(texture, _PAD, constant_values=128 << 16) if self.has_texture else no_texture
+        )
+        self.tissue_buffer = device.upload(self.rows)
+        #: Counts the changes of tissues
+        self.version = 0
+        self.tissues = tissues
+
+    @property
+    def ras_to_voxel(self) -> np.ndarray:
+        """(3, 4) affine map from RAS mm to padded voxel indices (i, j, k)."""
+        matrix = self.labels.ras_to_ijk[:3].copy()
+        matrix[:, 3] += _PAD
+        return matrix
+
+    def set_tissues(self, tissues: TissueTable) -> None:
+        """Change tissue parameters; voxels are touched only if the membrane's place or the acoustic groups change."""
+        self._check(tissues)
+        if _membrane_shape(tissues) != _membrane_shape(self.tissues):
+            self._upload(np.pad(as_labels(self.labels.array), _PAD), tissues)
+        groups_before = self.rows["group"]
+        self.rows = self._tissue_rows(tissues)
+        if not np.array_equal(self.rows["group"], groups_before):
+            self._upload_groups(np.pad(as_labels(self.labels.array), _PAD))
+        self.device.write(self.tissue_buffer, self.rows)
+        self.version += 1
+        self.tissues = tissues
+
+    def _check(self, tissues: TissueTable) -> None:
+        missing = [int(label) for label in sorted(self.present) if label not in tissues]
+        require(
+            not missing,
+            f"label {', '.join(map(str, missing))} has no tissue; the table has {', '.join(map(str, tissues))}",
+        )
+
+    def _tissue_rows(self, tissues: TissueTable) -> np.ndarray:
+        """layout.TISSUE per label. Acoustic groups are numbered from the most frequent tissue on: those get a smoothed
+        indicator."""
+        rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
+        members = {int(label): tissues[label] for label in self.present} | dict(tissues)
+        if tissues.membrane is not None:
+            members[CONSTANTS["MEMBRANE_LABEL"]] = tissues.membrane.tissue
+        groups: dict[tuple[float, float], int] = {}
+        for label, tissue in members.items():
+            acoustics = (tissue.speed_of_sound_m_s, tissue.impedance_mrayl)
+            rows[label] = (
+                *acoustics,
+                tissue.attenuation_db_cm_mhz,
+                tissue.mu0,
+                tissue.sigma0,
+                tissue.scatterer_share,
+                groups.setdefault(acoustics, len(groups)),
+            )
+        return rows
+
+    def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:
+        distance, self.membrane_reach = self._fluid_distance(padded, tissues)
+        words = padded.astype(np.uint16)
+        lowest, highest = _cell_extremes(padded)
+        same, no_membrane = lowest == highest, True
+        if distance is not None:
+            words |= distance.astype(np.uint16) << 8
+            lowest, highest = _cell_extremes(distance)
+            no_membrane = (lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach)
+        words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["NO_MEMBRANE"]) * no_membrane
+        self.voxel_buffer = self.device.upload(words)
+
+    def _upload_groups(self, padded: np.ndarray) -> None:
+        """The acoustic group of every voxel, and smoothed indicators of the first groups: on flat interfaces they know
+        normals best."""
+        group_of = self.rows["group"].astype(np.uint8)
+        group = group_of[padded]
+        lowest, highest = _cell_extremes(group)
+        words = group | np.uint8(CONSTANTS["SAME_GROUP"]) * (lowest == highest)
+        # Rows are read eight voxels at a time, the last one too.
+        self.group_buffer = self.device.upload(np.pad(words.ravel(), (0, 8)))
+        # The coupling medium lies around the volume even where its label does not occur.
+        groups = {int(group_of[label]) for label in (0, *self.present)}
+        room = max(_SMOOTHED_VOXELS // padded.size, 2)
+        self.smooth_groups = min(max(groups) + 1, _MOST_SMOOTHED_GROUPS, room)
+        self.smooth_buffer = smoothed_indicators(self.device, self.group_buffer, self.dims, groups, self.smooth_groups)
+
+    def _fluid_distance(self, padded: np.ndarray, tissues: TissueTable) -> tuple[np.ndarray | None, float]:
+        """(distance as uint8 about 127.5, half the membrane in that unit), or (None, -1) without a membrane."""
+        membrane = tissues.membrane
+        if membrane is None or membrane.thickness_mm == 0:
+            return None, -1.0
+        fluids = _fluid_labels(tissues, membrane)
+        is_fluid = np.isin(np.arange(256), fluids)[padded]
+        if is_fluid.all() or not is_fluid.any():
+            return None, -1.0
+        spacing = self.labels.spacing_mm[::-1]
+        # Wide enough to hide the voxels' stairs, narrow enough to keep a sulcus of two voxels open.
+        sigma_mm = 0.75 * float(np.cbrt(spacing.prod()))
+        thickest = 2.0 * _FARTHEST_SIGMAS * sigma_mm
+        require(
+            membrane.thickness_mm < thickest,
+            f"membrane thickness_mm is {membrane.thickness_mm:g}, expected less than {thickest:.2g} at this voxel "
+            "size; label thicker layers in the label map",
+        )
+        smooth = ndimage.gaussian_filter(is_fluid.astype(np.float32), sigma_mm / spacing, mode="nearest", truncate=3.0)
+        # Phi^-1 by a table: the argument has no more than this many different values worth telling apart.
+        share = np.linspace(0.0, 1.0, 4096)
+        sigmas = np.clip(special.ndtri(share), -_FARTHEST_SIGMAS, _FARTHEST_SIGMAS)
+        unit = 127.5 / _FARTHEST_SIGMAS
+        table = np.rint(127.5 + unit * sigmas).astype(np.uint8)
+        smooth = np.clip(smooth, 0.0, 1.0, out=smooth)
+        smooth *= len(share) - 1
+        distance = table[np.rint(smooth, out=smooth).astype(np.uint16)]
+        return distance, 0.5 * membrane.thickness_mm / sigma_mm * unit
+
+
+def as_labels(array: np.ndarray) -> np.ndarray:
+    """`array` as uint8 labels. Raises SimulationError unless it holds whole numbers from 0 to MAX_LABEL."""
+    if array.dtype == np.uint8:
+        labels = array
+    else:
+        low, high = (array.min(), array.max()) if array.size else (0, 0)
+        require(
+            bool(np.isfinite(low) and np.isfinite(high)) and low >= 0 and high <= MAX_LABEL,
+            f"label map holds values from {low} to {high}, expected whole numbers from 0 to {MAX_LABEL}",
+        )
+        labels = array.astype(np.uint8)
+        if not np.array_equal(labels, array):
+            raise SimulationError("label map holds fractions, expected whole numbers; segment the MRI first")
+    require(int(labels.max()) <= MAX_LABEL, f"label map holds label {labels.max()}, expected 0 to {MAX_LABEL}")
+    return labels
+
+
+def _cell_extremes(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest of the eight voxels at (k, j, i) + {0, 1}^3, for every (k, j, i)."""
+    lowest, highest = array.copy(), array.copy()
+    for axis in range(3):
+        here = [slice(None)] * 3
+        there = [slice(None)] * 3
+        here[axis], there[axis] = slice(0, -1), slice(1, None)
+        here, there = tuple(here), tuple(there)
+        # In-place with ascending memory order: `there` still holds its old value when `here` is written.
+        lowest[here] = np.minimum(lowest[here], lowest[there])
+        highest[here] = np.maximum(highest[here], highest[there])
+    return lowest, highest
+
+
+def _membrane_shape(tissues: TissueTable) -> tuple | None:
+    membrane = tissues.membrane
+    if membrane is None:
+        return None
+    return membrane.thickness_mm, _fluid_labels(tissues, membrane)
+
+
+def _fluid_labels(tissues: TissueTable, membrane: Membrane) -> tuple[int, ...]:
+    return tuple(label for label, tissue in tissues.items() if tissue.name in membrane.fluids)

@@ -1,0 +1,106 @@
+"""Preset: what a user sets, as one value and one JSON file, for the command, the VTK filter and the Slicer module."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass, field, fields, replace
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.probe.arrays import PROBES, Probe, probe_from_dict
+from SlicerUSSim.Logic.tissue.table import TissueTable
+
+#: What segment_mri labels with thin sulci.
+_BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Probe, console, physics and tissues. The default is a cranial phased array and the brain's tissues."""
+
+    probe: Probe = PROBES["phased"]
+    display: DisplaySettings = field(default_factory=DisplaySettings)
+    settings: SimulationSettings = field(default_factory=SimulationSettings)
+    tissues: TissueTable = field(default_factory=lambda: TissueTable.brain(_BRAIN))
+
+    def changed(self, section: str, **values) -> Preset:
+        """A preset with values of one section changed: changed("display", gain_db=3).
+
+        Sections are "probe", "display" and "settings"; probe values may include its "kind": what the new kind needs
+        and the old one lacks comes from the preset of that kind in PROBES. A focus at its default place moves with
+        the depth.
+        Raises SimulationError for an unknown section or name and for a value out of range.
+        """
+        require(
+            section in ("probe", "display", "settings"),
+            f"preset has no section {section!r}, expected probe, display or settings",
+        )
+        if section == "probe":
+            return replace(self, probe=_changed_probe(self.probe, values))
+        old = getattr(self, section)
+        return replace(self, **{section: _from_dict(type(old), {**asdict(old), **values}, section)})
+
+    def to_dict(self) -> dict:
+        """Plain values; from_dict reads them back."""
+        return {
+            "probe": self.probe.to_dict(),
+            "display": asdict(self.display),
+            "settings": asdict(self.settings),
+            **self.tissues.to_dict(),
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict, source: str = "preset") -> Preset:
+        """The preset that to_dict describes; a section that is missing is the default's.
+
+        Raises SimulationError naming `source` and what is wrong in it.
+        """
+        known = ("probe", "display", "settings", "tissues", "membrane")
+        require(isinstance(values, dict), f"{source}: is a {type(values).__name__}, expected an object")
+        for name in values:
+            require(name in known, f"{source}: has {name!r}, expected {', '.join(known)}")
+        sections = {}
+        if "probe" in values:
+            sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")
+        for name, kind in (("display", DisplaySettings), ("settings", SimulationSettings)):
+            if name in values:
+                sections[name] = _from_dict(kind, values[name], f"{source}: {name}")
+        if "tissues" in values:
+            sections["tissues"] = TissueTable.from_dict(values, source)
+        return cls(**sections)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike) -> Preset:
+        """Read a preset from JSON. Raises SimulationError for a missing, unreadable or wrong file."""
+        return cls.from_dict(read_json(path), str(path))
+
+    def write(self, path: str | os.PathLike) -> None:
+        """Write the preset as JSON, whole or not at all."""
+        write_json(path, self.to_dict())
+
+
+def _from_dict(kind: type, values: dict, source: str):
+    require(isinstance(values, dict), f"{source}: is a {type(values).__name__}, expected an object")
+    known = [entry.name for entry in fields(kind)]
+    for name in values:
+        require(name in known, f"{source}: {name!r} is unknown, expected one of {', '.join(known)}")
+    try:
+        return kind(**values)
+    except SimulationError as error:
+        raise SimulationError(f"{source}: {error}") from None
+    except (TypeError, ValueError) as error:
+        raise SimulationError(f"{source}: a value has the wrong type ({error})") from None
+
+
+def _changed_probe(probe: Probe, values: dict) -> Probe:
+    old = probe.to_dict()
+    if "depth_mm" in values:
+        default = type(probe).default_focus_mm(probe.depth_mm)
+        old |= {name: None for name in ("focus_mm", "elevation_focus_mm") if old[name] == default}
+    kind = values.get("kind", old["kind"])
+    if kind != old["kind"]:
+        require(kind in PROBES, f"probe: kind is {kind!r}, expected linear, convex or phased")
+        needed = PROBES[kind].to_dict()
+        old = {name: old.get(name, value) for name, value in needed.items()}
+    return probe_from_dict({**old, **values}, "probe")

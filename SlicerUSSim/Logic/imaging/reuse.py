@@ -1,0 +1,48 @@
+"""A simulator for inputs that change one at a time, as a pipeline's and a scene's do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+
+from SlicerUSSim.Logic.base.settings import SimulationSettings
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.texture import Texture
+
+
+class ReusedSimulator:
+    """Keeps an UltrasoundSimulator and builds it anew only where the voxels on the device have to change."""
+
+    def __init__(self) -> None:
+        self._simulator: UltrasoundSimulator | None = None
+        self._built_for: tuple | None = None
+
+    def get(
+        self,
+        labels_version: Hashable,
+        labels: Callable[[], Volume],
+        tissues: TissueTable,
+        settings: SimulationSettings,
+        device: str | Device | None = None,
+        texture: Texture | None = None,
+    ) -> UltrasoundSimulator:
+        """A simulator for these inputs; `labels` is asked for the label map only if `labels_version` is a new one.
+
+        Raises SimulationError as UltrasoundSimulator does; the next call then starts from nothing.
+        """
+        # Only how scatterers use the texture concerns what is on the device; other settings count per frame.
+        wanted = (labels_version, texture, device, settings.partial_volume, settings.mri_modulation_db)
+        if self._simulator is None or self._built_for != wanted:
+            self.forget()
+            self._simulator = UltrasoundSimulator(labels(), tissues, settings, device, texture)
+            self._built_for = wanted
+        elif self._simulator.medium.tissues != tissues:
+            self._simulator.set_tissues(tissues)
+        self._simulator.settings = settings
+        return self._simulator
+
+    def forget(self) -> None:
+        """Give the device's memory back."""
+        self._simulator = self._built_for = None

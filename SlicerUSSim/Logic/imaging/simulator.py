@@ -1,0 +1,368 @@
+"""UltrasoundSimulator: the line from a label map and a pose to a B-mode image, one stage after the other."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from time import perf_counter
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.imaging.bmode import Compressor, PulseFilter
+from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
+from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
+from SlicerUSSim.Logic.imaging.raytracing import RayTracer, RayTree
+from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
+from SlicerUSSim.Logic.imaging.scattering import EchoLines, InterfaceEchoes, LateralBeam, Scatterers
+from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
+from SlicerUSSim.Logic.probe.arrays import NOMINAL_SPEED_M_S, Probe
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.texture import Texture
+
+
+class EmptyViewWarning(UserWarning):
+    """The imaged field lies wholly outside the volume; the image is black."""
+
+
+class TreeOverflowWarning(UserWarning):
+    """Scan lines with more ray segments than there is room for lack the speckle of the last ones."""
+
+
+class UltrasoundSimulator:
+    """Simulates B-mode images of one patient.
+
+    Parameters
+    ----------
+    labels : Volume of tissue labels; 0 is the coupling medium around the patient.
+    tissues : TissueTable with a tissue for every label.
+    settings : SimulationSettings. The attribute may be replaced between frames, by another seed say; only what concerns
+        the texture counts at construction.
+    device : see device.choose_device.
+    texture : what the MRI knows beyond labels (Segmentation.texture, Texture.from_mri); looked at only if the settings'
+        partial_volume or mri_modulation_db ask for it.
+
+    Raises SimulationError for labels without a tissue, settings that need a texture where there is none or it does not
+    fit, and where no device can be used.
+    """
+
+    def __init__(
+        self,
+        labels: Volume,
+        tissues: TissueTable,
+        settings: SimulationSettings | None = None,
+        device: str | Device | None = None,
+        texture: Texture | None = None,
+    ) -> None:
+        self.settings = settings or SimulationSettings()
+        self.device = Device.get(device)
+        self.medium = Medium(labels, tissues, self.device, _packed_texture(texture, labels, self.settings))
+        self.tracer = RayTracer(self.device)
+        self.traced_lines = EchoLines(self.device)
+        self.scan_lines = EchoLines(self.device)
+        self.scatterers = Scatterers(self.device)
+        self.interfaces = InterfaceEchoes(self.device)
+        self.beam = LateralBeam(self.device)
+        self.pulse = PulseFilter(self.device)
+        self.compressor = Compressor(self.device)
+        self.converter = ScanConverter(self.device)
+        self._acquisition_buffer = self.device.empty(ACQUISITION.itemsize)
+        #: Measure every stage (Frame.timings_ms); each stage is then computed and waited for.
+        self.profiling = False
+
+    def simulate(
+        self,
+        probe: Probe,
+        probe_to_ras: np.ndarray,
+        display: DisplaySettings | None = None,
+        grid: ImageGrid | None = None,
+    ) -> Frame:
+        """The image that `probe` sees at the pose `probe_to_ras` (4, 4).
+
+        `grid` are its pixels, those of a real image to compare with, say; by default they just hold the imaged field,
+        as many as display.image_size says.
+        Warns with EmptyViewWarning (and gives a black image) if the field misses the volume.
+        Raises SimulationError for a pose that is not rigid.
+        """
+        display = display or DisplaySettings()
+        grid = grid or ImageGrid.for_probe(probe, display.image_size)
+        pose = check_rigid("probe_to_ras", probe_to_ras)
+        self._warn_if_empty(probe, pose)
+        timings: dict[str, float] = {}
+        self.render(probe, pose, display, grid, timings)
+        with self._stage("download", timings):
+            samples = self._sample_count(probe)
+            iq = self.pulse.download(samples)
+            envelope, bmode = self.compressor.download(samples)
+            image = self.converter.download()
+            self._warn_if_overflown()
+
+        return Frame(
+            iq=iq,
+            envelope=envelope,
+            bmode=bmode,
+            image=image,
+            sample_interval_mm=self._sample_mm(probe),
+            cycles_per_mm=self._cycles_per_mm(probe),
+            grid=grid,
+            probe_to_ras=pose,
+            timings_ms=timings,
+        )
+
+    def render(
+        self,
+        probe: Probe,
+        pose: np.ndarray,
+        display: DisplaySettings,
+        grid: ImageGrid,
+        timings: dict[str, float] | None = None,
+    ):
+        """Enqueue all stages of one frame; returns the device buffer of its image, which the next frame overwrites.
+
+        Where only the display or the pixels have changed since the last frame, its echoes are used again.
+        """
+        timings = {} if timings is None else timings
+        with self._stage("upload", timings):
+            acquisition = self._upload_acquisition(probe, pose)
+        inputs = (acquisition.tobytes(), self.settings, self.medium.version)
+        if self.profiling or self.pulse.made_for != inputs:
+            self._echoes(probe, acquisition, timings)
+            self.pulse.made_for = inputs
+        with self._stage("B-mode", timings):
+            self.compressor.run(acquisition, display, self.pulse)
+        with self._stage("scan conversion", timings):
+            self.converter.run(self._acquisition_buffer, acquisition, grid, self.compressor)
+        return self.converter.image
+
+    def forget_echoes(self) -> None:
+        """Have the next frame computed from its rays on, though nothing may have changed (for measurements)."""
+        self.pulse.made_for = None
+
+    def _echoes(self, probe: Probe, acquisition: np.ndarray, timings: dict[str, float]) -> None:
+        """Enqueue the stages up to the baseband signal, which depend on neither display nor pixels."""
+        with self._stage("ray tree", timings):
+            self.tracer.run(self._acquisition_buffer, acquisition, self.medium)
+        with self._stage("scatterers", timings):
+            samples = int(acquisition["samples"])
+            self.traced_lines.prepare(2 * int(acquisition["traced_lines"]), samples)  # two edges of each strip
+            if self.settings.scattering:
+                self.scatterers.run(self._acquisition_buffer, acquisition, self.medium, self.tracer, self.traced_lines)
+            else:
+                self.traced_lines.clear()
+        with self._stage("interfaces", timings):
+            if self.settings.interfaces:
+                self.interfaces.run(self._acquisition_buffer, acquisition, self.tracer, self.traced_lines)
+        with self._stage("beam", timings):
+            self.scan_lines.prepare(probe.scan_lines, samples)
+            self.beam.run(self._acquisition_buffer, acquisition, self.traced_lines, self.scan_lines)
+        with self._stage("pulse", timings):
+            self.pulse.run(acquisition, self.axial_sigma_mm(probe), self.scan_lines)
+
+    def trace(self, probe: Probe, probe_to_ras: np.ndarray) -> RayTree:
+        """The ray tree alone, on the host: segments along the beam axes and interface hits."""
+        acquisition = self._upload_acquisition(probe, check_rigid("probe_to_ras", probe_to_ras))
+        self.tracer.run(self._acquisition_buffer, acquisition, self.medium)
+        return self.tracer.download()
+
+    def sweep(
+        self,
+        probe: Probe,
+        poses: Iterable[np.ndarray],
+        display: DisplaySettings | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> Iterator[Frame]:
+        """One Frame per pose, as they are computed; `progress` is told how many are done."""
+        for count, pose in enumerate(poses, 1):
+            yield self.simulate(probe, pose, display)
+            if progress is not None:
+                progress(count)
+
+    def volume(
+        self,
+        probe: Probe,
+        poses: Iterable[np.ndarray],
+        display: DisplaySettings | None = None,
+        *,
+        spacing_mm: float = 0.5,
+        like: Volume | None = None,
+        hole_mm: float | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> Volume:
+        """A 3D image: the sweep over `poses` (regular or freehand), compounded in patient space, holes filled.
+
+        `like` gives the grid (the MRI, say); without it the grid lies along the patient's axes with `spacing_mm`.
+        `hole_mm` is how wide a gap between images is filled (default: as wide as the sweep's widest, 10 mm at most).
+        The grey levels are uint8; where no image came near, 0. Raises SimulationError as sweep_grid and Compounder do.
+        """
+        poses = list(poses)
+        grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
+        compounder = Compounder(grid, probe, self.device)
+        display = display or DisplaySettings()
+        pixels = ImageGrid.for_probe(probe, display.image_size)
+        before = None
+        for count, pose in enumerate(poses, 1):
+            pose = check_rigid("probe_to_ras", pose)
+            self._warn_if_empty(probe, pose)
+            compounder.add_buffer(self.render(probe, pose, display, pixels), pixels, pose)
+            # One image is prepared while the device computes the one before, and no more than one.
+            done = self.device.mark()
+            if before is not None:
+                before.wait()
+            before = done
+            if progress is not None:
+                progress(count)
+        self._warn_if_overflown(len(poses))
+        return compounder.volume(hole_mm)
+
+    def set_tissues(self, tissues: TissueTable) -> None:
+        """Change tissue parameters without building the medium anew."""
+        self.medium.set_tissues(tissues)
+
+    @contextmanager
+    def with_tissues(self, tissues: TissueTable) -> Iterator[None]:
+        """Simulate with other tissues for as long as the block lasts."""
+        before = self.medium.tissues
+        try:
+            self.set_tissues(tissues)
+            yield
+        finally:
+            self.set_tissues(before)
+
+    # ---- the acquisition record --------------------------------------------------------------------------------------
+
+    def _upload_acquisition(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
+        acquisition = self.acquisition(probe, pose)
+        self.device.write(self._acquisition_buffer, acquisition)
+        return acquisition
+
+    def acquisition(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
+        """The record (layout.ACQUISITION) of what the stages need to know of one frame."""
+        settings, medium = self.settings, self.medium
+        block = CONSTANTS["BLOCK"]
+        transmit, elevation = probe.transmit_waist(), probe.elevation_waist()
+        axial_sigma = self.axial_sigma_mm(probe)
+        acquisition = np.zeros((), ACQUISITION)
+        acquisition["ras_to_voxel"] = medium.ras_to_voxel.ravel()
+        acquisition["dims"] = medium.dims
+        acquisition["voxel_mm"] = medium.labels.spacing_mm.min()
+        acquisition["smooth_groups"] = medium.smooth_groups
+        acquisition["membrane_reach"] = medium.membrane_reach
+        acquisition["probe_to_ras"] = pose[:3].ravel()
+        acquisition["linear"] = probe.is_linear
+        acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
+        acquisition["first_line"] = probe.first_line
+        acquisition["line_spacing"] = probe.line_spacing
+        acquisition["scan_lines"] = probe.scan_lines
+        acquisition["depth_mm"] = probe.depth_mm
+        acquisition["frequency_mhz"] = probe.frequency_mhz
+        acquisition["reference_speed_m_s"] = settings.reference_speed_m_s
+        acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
+        acquisition["sample_mm"] = self._sample_mm(probe)
+        acquisition["samples"] = -(-self._sample_count(probe) // block) * block
+        acquisition["transmit_sigma"], acquisition["transmit_focus"], acquisition["transmit_rayleigh"] = transmit
+        acquisition["receive_sigma_min"], acquisition["receive_sigma_slope"] = probe.receive_beam()
+        acquisition["elevation_sigma"] = elevation[0] / np.sqrt(2.0)
+        acquisition["elevation_focus"], acquisition["elevation_rayleigh"] = elevation[1:]
+        acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
+        acquisition["intensity_threshold"] = settings.intensity_threshold
+        acquisition["reflection_threshold"] = settings.reflection_threshold
+        acquisition["reflection_spreading"] = settings.reflection_spreading
+        acquisition["elevational_rays"] = settings.elevational_rays
+        lateral, guard = _traced_lines_for(probe, settings)
+        acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard
+        acquisition["traced_lines"] = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
+        acquisition["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
+        acquisition["interface_is_energy"] = settings.interface_reflection == "energy"
+        acquisition["specular_exponent"] = settings.specular_exponent
+        acquisition["cell_mm"] = settings.scatterers_per_mm3 ** (-1.0 / 3.0)
+        acquisition["seed"] = _mixed(settings.seed)
+        acquisition["beam_cutoff"] = settings.beam_cutoff
+        # The integral of the squared point spread function is pi^1.5 times the product of the three sigmas.
+        acquisition["speckle_scale"] = (settings.scatterers_per_mm3 * np.pi**1.5 * axial_sigma) ** -0.5
+        return acquisition
+
+    def _cycles_per_mm(self, probe: Probe) -> float:
+        return probe.cycles_per_mm * NOMINAL_SPEED_M_S / self.settings.reference_speed_m_s
+
+    def axial_sigma_mm(self, probe: Probe) -> float:
+        """Standard deviation of the pulse in depth as the scanner reckons it, millimetres."""
+        return probe.axial_sigma_mm * self.settings.reference_speed_m_s / NOMINAL_SPEED_M_S
+
+    def _sample_mm(self, probe: Probe) -> float:
+        return 1.0 / (self.settings.samples_per_cycle * self._cycles_per_mm(probe))
+
+    def _sample_count(self, probe: Probe) -> int:
+        return int(np.ceil(probe.depth_mm / self._sample_mm(probe)))
+
+    def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
+        """The box around the imaged field, in voxels, has to meet the volume."""
+        left, right, top, bottom = probe.image_bounds_mm()
+        corners = np.array([[x, y, 0.0, 1.0] for x in (left, right) for y in (top, bottom)])
+        voxels = (self.medium.labels.ras_to_ijk @ pose @ corners.T)[:3]
+        size = np.array(self.medium.labels.array.shape[::-1])
+        if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
+            warnings.warn("the probe looks past the volume: the image is black", EmptyViewWarning, stacklevel=3)
+
+    def _warn_if_overflown(self, frames: int = 1) -> None:
+        lines, traced = self.tracer.overflown_lines(), frames * self.tracer.shape[0]
+        if lines > 0.01 * traced:  # a single chaotic line is lost among its neighbours
+            warnings.warn(
+                f"{lines} of {traced} traced lines have more than {CONSTANTS['MAX_SEGMENTS']} ray segments, "
+                "the last are left out; raise reflection_threshold or lower max_ray_depth",
+                TreeOverflowWarning,
+                stacklevel=3,
+            )
+
+    @contextmanager
+    def _stage(self, name: str, timings: dict[str, float]):
+        if not self.profiling:
+            yield
+            return
+        start = perf_counter()
+        yield
+        self.device.queue.finish()
+        timings[name] = (perf_counter() - start) * 1e3
+
+
+def _packed_texture(texture: Texture | None, labels: Volume, settings: SimulationSettings) -> np.ndarray | None:
+    """The texture as the device reads it, or None if the settings ask for none."""
+    if not settings.needs_texture:
+        return None
+    require(
+        texture is not None,
+        f"partial_volume {settings.partial_volume}, mri_modulation_db {settings.mri_modulation_db:g} need a texture; "
+        "pass segmentation.texture(), or Texture.from_mri(mri, labels) for a label map of your own",
+    )
+    require(
+        texture.deviation.shape == labels.array.shape,
+        f"the texture has shape {texture.deviation.shape}, expected that of the labels, {labels.array.shape}",
+    )
+    return texture.packed(as_labels(labels.array), settings.partial_volume, settings.mri_modulation_db)
+
+
+def _mixed(seed: int) -> int:
+    """The seed with all its bits stirred (the kernels' hash), so that neighbouring seeds have nothing in common."""
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+        seed = ((seed ^ (seed >> shift)) * factor) % 2**32
+    return seed ^ (seed >> 16) ^ 0x2545F491
+
+
+def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
+    """(traced lines per scan line, traced lines beyond either edge of the field).
+
+    Traced lines are at most 1.5 lateral beam sigmas apart at any depth, so that sums over them are integrals; those
+    beyond the edge give the outermost scan lines the other half of their beam (where it is no wider than 16 lines,
+    that is everywhere but next to the apex of a phased array).
+    """
+    depth = np.linspace(0.0, probe.depth_mm, 65)
+    sigmas = probe.line_distance_mm(depth) / probe.beam_sigma_mm(depth)[0]
+    lateral = settings.lateral_rays or int(min(np.ceil(sigmas.max() / 1.5), 128))
+    deep = sigmas[depth >= 0.1 * probe.depth_mm]
+    return lateral, int(min(np.ceil(settings.beam_cutoff * lateral / deep.min()), 16 * lateral))

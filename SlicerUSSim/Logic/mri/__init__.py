@@ -1,0 +1,15 @@
+"""From an MRI to tissues: guided filter, Gaussian mixture, label map; and MRIs to begin with.
+
+Knows nothing of ultrasound beyond the texture that scatterers may take from the MRI.
+"""
+
+from typing import TYPE_CHECKING
+
+from SlicerUSSim.Logic.base.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from .guided_filter import guided_filter as guided_filter
+    from .samples import demo_mri as demo_mri, head_mri as head_mri
+    from .segmentation import Segmentation as Segmentation, segment_mri as segment_mri
+
+lazy_exports(globals())

@@ -1,0 +1,195 @@
+"""Fitting on the nodes of a scene: real images out of nodes, the cost as a plot, images to compare back into nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter
+
+import numpy as np
+from vtkmodules.vtkCommonCore import vtkDoubleArray
+from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.vtk_data import matrix_array
+from SlicerUSSim.Logic.fitting.fit import Fit
+from SlicerUSSim.Logic.fitting.search import Progress
+from SlicerUSSim.Logic.mrml.nodes import (
+    display_of,
+    ijk_to_ras,
+    named,
+    node_called,
+    node_to_world,
+    nodes_of_class,
+    read_volume,
+    require_node,
+    write_volume,
+)
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.tracked.images import TrackedImages
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+
+#: Images that a fit leaves to be compared, by what they show.
+COMPARED = ("real", "before", "after", "difference")
+#: How many images of a sequence are taken if none are chosen, evenly spread.
+MOST_IMAGES = 6
+#: Seconds between two drawings of the plot.
+_PLOT_EVERY = 0.25
+
+
+def tracked_images(
+    images_node,
+    numbers: Sequence[int] | None,
+    probe: Probe,
+    *,
+    probe_to_world: np.ndarray | None = None,
+    estimate_geometry: bool = False,
+) -> TrackedImages:
+    """Real images from a sequence of volumes, from a volume of one slice, or a slice of a 3D volume under the probe.
+
+    A sequence's poses are those that its browser's transforms have at the same time. With `estimate_geometry` the
+    probe's geometry is found in the images, and `probe` says the rest.
+    Raises SimulationError for nodes that hold no such images and as TrackedImages does.
+    """
+    require_node(images_node, "vtkMRMLSequenceNode", "vtkMRMLScalarVolumeNode", use="real images")
+    if images_node.IsA("vtkMRMLSequenceNode"):
+        sequence = _sequence(images_node)
+    else:
+        volume = read_volume(images_node, "real image")
+        if volume.array.shape[0] > 1:
+            require(
+                probe_to_world is not None,
+                f"{named(images_node)} is a 3D volume; choose a probe transform, which says where to cut it",
+            )
+            placed = Volume(volume.array, node_to_world(images_node) @ volume.ijk_to_ras)
+            sequence = TrackedSequence.from_volume(placed, probe, [probe_to_world])
+            return TrackedImages.of(sequence, numbers, probe=probe)
+        sequence = _of_slices([(volume.array[0], node_to_world(images_node) @ volume.ijk_to_ras)], [0.0])
+    known = None if estimate_geometry else probe
+    return TrackedImages.of(sequence, numbers, probe=known, beam=probe, most=MOST_IMAGES)
+
+
+def _sequence(sequence_node) -> TrackedSequence:
+    count = sequence_node.GetNumberOfDataNodes()
+    require(count > 0, f"sequence {named(sequence_node)} is empty, expected images")
+    browser = next(
+        (
+            node
+            for node in nodes_of_class(sequence_node.GetScene(), "vtkMRMLSequenceBrowserNode")
+            if node.IsSynchronizedSequenceNode(sequence_node, True)
+        ),
+        None,
+    )
+    shown = None if browser is None else browser.GetProxyNode(sequence_node)
+    parent = None if shown is None else shown.GetParentTransformNode()
+    slices, times = [], []
+    for number in range(count):
+        item, index = sequence_node.GetNthDataNode(number), sequence_node.GetNthIndexValue(number)
+        use = f"item {number} of {named(sequence_node)}"
+        require(item.IsA("vtkMRMLScalarVolumeNode"), f"{use} is a {item.GetClassName()}, expected an image")
+        image = item.GetImageData()
+        require(image is not None and image.GetDimensions()[2] == 1, f"{use} is not one slice, expected an image")
+        array = Volume.from_vtk(image, ijk_to_ras(item)).array[0]
+        slices.append((array, _to_world_at(browser, parent, index) @ ijk_to_ras(item)))
+        try:
+            times.append(float(index))
+        except ValueError:  # sequences may be indexed by text
+            times.append(float(number))
+    return _of_slices(slices, times)
+
+
+def _to_world_at(browser, transform_node, index: str) -> np.ndarray:
+    """(4, 4) of a chain of transforms, each as its sequence in the browser has it at this index value."""
+    matrix, to_parent = np.eye(4), vtkMatrix4x4()
+    while transform_node is not None:
+        recorded = browser.GetSequenceNode(transform_node)
+        item = transform_node if recorded is None else recorded.GetDataNodeAtValue(index, False)
+        require(
+            item is not None and item.IsA("vtkMRMLLinearTransformNode"),
+            f"{named(transform_node)} has no linear transform at {index}",
+        )
+        item.GetMatrixTransformToParent(to_parent)
+        matrix = matrix_array(to_parent) @ matrix
+        transform_node = transform_node.GetParentTransformNode()
+    return matrix
+
+
+def _of_slices(slices: list[tuple[np.ndarray, np.ndarray]], times: list[float]) -> TrackedSequence:
+    shapes = {image.shape for image, _ in slices}
+    require(len(shapes) == 1, f"the images have the sizes {sorted(shapes)}, expected one")
+    return TrackedSequence(
+        np.stack([image for image, _ in slices]), tuple({"ImageToReference": m} for _, m in slices), times
+    )
+
+
+class CostPlot:
+    """The cost of an optimisation as a table, two series and a chart in the scene, drawn as it runs."""
+
+    def __init__(self, scene, name: str = "Fit to real ultrasound") -> None:
+        self.chart = node_called(scene, "PlotChart", name)
+        self.table = node_called(scene, "Table", f"{name} costs")
+        self._columns = []
+        for title in ("evaluation", "cost", "best"):
+            column = vtkDoubleArray()
+            column.SetName(title)
+            self._columns.append(column)
+        self.table.RemoveAllColumns()
+        for column in self._columns:
+            self.table.AddColumn(column)
+        self.chart.RemoveAllPlotSeriesNodeIDs()
+        for title, colour in (("cost", (0.55, 0.55, 0.55)), ("best", (0.85, 0.55, 0.0))):
+            series = node_called(scene, "PlotSeries", f"{name} {title}")
+            series.SetAndObserveTableNodeID(self.table.GetID())
+            series.SetXColumnName("evaluation")
+            series.SetYColumnName(title)
+            series.SetPlotType(series.PlotTypeScatter)
+            series.SetLineStyle(series.LineStyleSolid if title == "best" else series.LineStyleNone)
+            series.SetMarkerStyle(series.MarkerStyleNone if title == "best" else series.MarkerStyleCircle)
+            series.SetMarkerSize(4)
+            series.SetColor(*colour)
+            self.chart.AddAndObservePlotSeriesNodeID(series.GetID())
+        self.chart.SetTitle(name)
+        self.chart.SetXAxisTitle("evaluation")
+        self.chart.SetYAxisTitle("cost")
+        self._drawn = 0.0
+
+    def add(self, progress: Progress) -> None:
+        """One more evaluation; the views are told a few times a second."""
+        if self.table.GetScene() is None:
+            return  # the user closed the scene
+        for column, value in zip(self._columns, (progress.evaluations, progress.cost, progress.best_cost), strict=True):
+            column.InsertNextValue(value)
+        if perf_counter() - self._drawn > _PLOT_EVERY:
+            self.draw()
+
+    def draw(self) -> None:
+        """Tell the views."""
+        for column in self._columns:
+            column.Modified()
+        self.table.GetTable().Modified()
+        self.table.Modified()
+        self._drawn = perf_counter()
+
+
+def write_compared(nodes: dict, fit: Fit, number: int, to_world: np.ndarray) -> None:
+    """Put one image of a fit into volume nodes, {name among COMPARED: node}, where it lies in the world.
+
+    `to_world` (4, 4) takes the frame of the fit's poses there. Raises SimulationError for an image that was not fitted.
+    """
+    tracked = fit.tracked
+    if number not in tracked.numbers:
+        known = ", ".join(map(str, tracked.numbers))
+        raise SimulationError(f"image {number} was not fitted, expected one of {known}")
+    place = tracked.numbers.index(number)
+    real, after = np.where(tracked.mask, tracked.images[place], 0), fit.after[place]
+    difference = np.where(tracked.mask, 127.5 + 0.5 * (after.astype(float) - real), 0)
+    images = {"real": real, "before": fit.before[place], "after": after, "difference": difference}
+    geometry = to_world @ tracked.poses[place] @ tracked.grid.slice_to_probe
+    for name, node in nodes.items():
+        require_node(node, "vtkMRMLScalarVolumeNode", use=f"volume for {name}")
+        node.SetAndObserveTransformNodeID(None)
+        write_volume(node, Volume(images[name].astype(np.uint8)[None], geometry))
+        display = display_of(node)
+        if display is not None:
+            display.SetAutoWindowLevel(False)
+            display.SetWindowLevelMinMax(0, 255)

@@ -1,0 +1,221 @@
+"""Label maps and segmentations of a scene: their voxels, and the tissues that their names stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import slicer
+from vtkmodules.vtkCommonCore import vtkIntArray, vtkStringArray
+from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
+from SlicerUSSim.Logic.mrml.nodes import (
+    display_of,
+    ijk_to_ras,
+    named,
+    node_to_world,
+    read_volume,
+    require_node,
+    write_volume,
+)
+from SlicerUSSim.Logic.tissue.names import same_name, tissue_named
+from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
+from SlicerUSSim.Logic.tissue.table import TissueTable
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledTissues:
+    """A label map or segmentation as the simulator takes it: one label per tissue."""
+
+    #: uint8 labels in the node's own frame, before its parent transform
+    volume: Volume
+    #: Name of the tissue of label 1, 2, ...
+    names: tuple[str, ...]
+
+
+def read_mask(mask_node, mri_node) -> Volume:
+    """A mask on the grid of an MRI: a label map or scalar volume that has it, or a segmentation.
+
+    Raises SimulationError for another node, and for an empty segmentation.
+    """
+    require_node(mask_node, "vtkMRMLScalarVolumeNode", "vtkMRMLSegmentationNode", use="mask")
+    if not mask_node.IsA("vtkMRMLSegmentationNode"):
+        return read_volume(mask_node, "mask")
+    _require_segments(mask_node, "mask")
+    mri = read_volume(mri_node, "MRI")
+    geometry = slicer.vtkOrientedImageData()
+    geometry.SetExtent(*(bound for n in mri.array.shape[::-1] for bound in (0, n - 1)))
+    mri_to_segmentation = np.linalg.inv(node_to_world(mask_node)) @ node_to_world(mri_node)
+    geometry.SetGeometryFromImageToWorldMatrix(vtk_matrix(mri_to_segmentation @ mri.ijk_to_ras))
+    merged = slicer.vtkOrientedImageData()
+    mask_node.GenerateMergedLabelmapForAllSegments(merged, slicer.vtkSegmentation.EXTENT_REFERENCE_GEOMETRY, geometry)
+    return mri.with_array(Volume.from_vtk(merged, np.eye(4)).array)
+
+
+def labels_version(labels_node) -> Hashable:
+    """Changes when voxels, segments, their names or their place in the node's own frame change."""
+    if labels_node.IsA("vtkMRMLSegmentationNode"):
+        segmentation = labels_node.GetSegmentation()
+        parts = [labels_node.GetID()]
+        for segment_id in segmentation.GetSegmentIDs():
+            segment = segmentation.GetSegment(segment_id)
+            source = segment.GetRepresentation(segmentation.GetSourceRepresentationName())
+            parts.append((segment_id, segment.GetName(), None if source is None else source.GetMTime()))
+        return tuple(parts)
+    image, colours = labels_node.GetImageData(), _colour_node(labels_node)
+    return (
+        labels_node.GetID(),
+        None if image is None else image.GetMTime(),
+        ijk_to_ras(labels_node).tobytes(),
+        None if colours is None else colours.GetMTime(),
+    )
+
+
+def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
+    """What a label map or a segmentation holds, one label for every tissue that its names stand for.
+
+    The names are those of segments, or of a label map's colours; `tissues` are known by name before the presets are.
+    A label whose colour has no tissue's name, or only the one of Slicer's default table, is the tissue with that label
+    in `tissues`.
+    Raises SimulationError for a node without voxels or segments, and lists names that nobody knows.
+    """
+    require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map")
+    if labels_node.IsA("vtkMRMLSegmentationNode"):
+        volume, names = _read_segmentation(labels_node)
+    else:
+        volume = read_volume(labels_node, "label map")
+        names = _colour_names(labels_node, volume, tissues)
+    known = {label: _tissue_name(name, tissues) for label, name in names.items()}
+    unknown = [names[label] for label, tissue in known.items() if tissue is None]
+    require(
+        not unknown,
+        f"{named(labels_node)}: no tissue is called {', '.join(map(repr, unknown))}; rename to one of: "
+        f"{', '.join([*tissues.names()[1:], *(name for name in TISSUES if name not in tissues.names())])}",
+    )
+    order = tuple(dict.fromkeys(known.values()))
+    table = np.zeros(max(names, default=0) + 1, np.uint8)
+    for label, tissue in known.items():
+        table[label] = order.index(tissue) + 1
+    return LabelledTissues(volume.with_array(table[volume.array]), order)
+
+
+def _tissue_name(name: str, tissues: TissueTable) -> str | None:
+    for tissue in tissues.values():
+        if same_name(tissue.name, name):
+            return tissue.name
+    try:
+        return tissue_named(name).name
+    except SimulationError:
+        return None
+
+
+def _require_segments(segmentation_node, use: str) -> None:
+    require(
+        segmentation_node.GetSegmentation().GetNumberOfSegments() > 0,
+        f"{use} {named(segmentation_node)} is empty, expected at least one segment",
+    )
+
+
+def _read_segmentation(segmentation_node) -> tuple[Volume, dict[int, str]]:
+    _require_segments(segmentation_node, "label map")
+    segmentation = segmentation_node.GetSegmentation()
+    ids, values, names = vtkStringArray(), vtkIntArray(), {}
+    for number, segment_id in enumerate(segmentation.GetSegmentIDs(), 1):
+        ids.InsertNextValue(segment_id)
+        values.InsertNextValue(number)
+        names[number] = segmentation.GetSegment(segment_id).GetName()
+    require(
+        segmentation_node.CreateBinaryLabelmapRepresentation(),
+        f"label map {named(segmentation_node)} has no binary label map and none can be made of it",
+    )
+    merged = slicer.vtkOrientedImageData()
+    segmentation_node.GenerateMergedLabelmapForAllSegments(
+        merged, slicer.vtkSegmentation.EXTENT_UNION_OF_EFFECTIVE_SEGMENTS, None, ids, values
+    )
+    require(
+        min(merged.GetDimensions()) > 0 and merged.GetScalarRange()[1] > 0,
+        f"label map {named(segmentation_node)} is empty, expected a segment with voxels",
+    )
+    matrix = vtkMatrix4x4()
+    merged.GetImageToWorldMatrix(matrix)
+    volume = Volume.from_vtk(merged, matrix_array(matrix))
+    return volume, names
+
+
+def _colour_node(labels_node):
+    display = labels_node.GetDisplayNode()
+    return None if display is None else display.GetColorNode()
+
+
+def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int, str]:
+    values = volume.array
+    require(
+        np.issubdtype(values.dtype, np.integer) and int(values.min()) >= 0 and int(values.max()) < 100_000,
+        f"label map {named(labels_node)} holds {values.dtype} from {values.min()} to {values.max()}, expected whole "
+        "numbers from 0 to 99999",
+    )
+    colours, names = _colour_node(labels_node), {}
+    known_colours = 0 if colours is None else colours.GetNumberOfColors()
+    # Slicer gives every label map this table, in which 2 is bone and 3 is skin, whatever they are.
+    is_default = colours is not None and colours.GetName() == "GenericAnatomyColors"
+    for label in map(int, np.flatnonzero(np.bincount(values.ravel()))):
+        if label == 0:
+            continue
+        name = colours.GetColorName(label) if label < known_colours else None
+        if name in (None, "", "(none)"):
+            name = f"label {label}"
+        if label in tissues and (is_default or _tissue_name(name, tissues) is None):
+            name = tissues[label].name
+        names[label] = name
+    require(bool(names), f"label map {named(labels_node)} is empty, expected voxels that are not 0")
+    return names
+
+
+def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -> None:
+    """Put a label map with named, coloured tissues into a label map or segmentation node, where a volume node is."""
+    parent = like_node.GetParentTransformNode()
+    labels_node.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
+    if labels_node.IsA("vtkMRMLSegmentationNode"):
+        # After the transform: the node translates the reference geometry into its own frame.
+        labels_node.SetReferenceImageGeometryParameterFromVolumeNode(like_node)
+        _write_segmentation(labels_node, labels, tuple(names))
+    else:
+        _write_label_map(labels_node, labels, tuple(names))
+
+
+def _write_label_map(labels_node, labels: Volume, names: tuple[str, ...]) -> None:
+    scene = labels_node.GetScene()
+    write_volume(labels_node, labels)
+    colours = labels_node.GetNodeReference("tissueColors")
+    if colours is None:
+        colours = scene.AddNewNodeByClass("vtkMRMLColorTableNode", f"{labels_node.GetName()} tissues")
+        labels_node.SetNodeReferenceID("tissueColors", colours.GetID())
+    colours.SetTypeToUser()
+    colours.SetNumberOfColors(len(names) + 1)
+    colours.SetColor(0, "coupling", 0.0, 0.0, 0.0, 0.0)
+    for label, name in enumerate(names, 1):
+        colours.SetColor(label, name, *colour_of(name), 1.0)
+    display = labels_node.GetDisplayNode()
+    if display is None:  # not the default one, which looks for colours that only Slicer's own scene has
+        display = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeDisplayNode")
+        labels_node.SetAndObserveDisplayNodeID(display.GetID())
+    display.SetAndObserveColorNodeID(colours.GetID())
+    labels_node.Modified()
+
+
+def _write_segmentation(segmentation_node, labels: Volume, names: tuple[str, ...]) -> None:
+    segmentation = segmentation_node.GetSegmentation()
+    was_modifying = segmentation_node.StartModify()
+    segmentation.RemoveAllSegments()
+    segmentation_node.SetSourceRepresentationToBinaryLabelmap()
+    for label, name in enumerate(names, 1):
+        mask = slicer.vtkOrientedImageData()
+        mask.ShallowCopy(Volume(labels.array == label, np.eye(4)).to_vtk())
+        mask.SetImageToWorldMatrix(vtk_matrix(labels.ijk_to_ras))
+        segmentation_node.AddSegmentFromBinaryLabelmapRepresentation(mask, name, colour_of(name), name)
+    segmentation_node.EndModify(was_modifying)
+    display_of(segmentation_node)

@@ -1,0 +1,143 @@
+"""LiveUpdate: one image per burst of changes, and nothing left behind when it ends."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+
+import slicer
+from vtkmodules.vtkCommonCore import VTK_OBJECT, vtkCommand
+
+from SlicerUSSim.Logic.base.errors import user_message
+
+#: Event of an output volume: another live update now writes to it.
+_CLAIMED = vtkCommand.UserEvent + 7301
+
+
+class LiveUpdate:
+    """Keeps an output volume up to date with a probe transform, for UltrasoundSceneLogic.startLiveUpdate.
+
+    `nodes` are labels, probe transform and output volume, then outline model and slice view, which may be None.
+    """
+
+    running = False
+
+    def __init__(
+        self,
+        logic,
+        nodes: tuple,
+        schedule: Callable[[Callable[[], None]], None] | None,
+        report: Callable[[str], None] | None,
+        stopped: Callable[[], None] | None,
+    ) -> None:
+        self._logic = weakref.ref(logic)  # which owns us
+        self._nodes = nodes
+        labels_node, transform_node, output_node = nodes[:3]
+        self._schedule, self._report, self._stopped = schedule, report, stopped
+        self._pending = self._busy = False
+        self._outlined = logic.preset.probe
+        self._observed: list[tuple[object, int]] = []
+        self.running = True
+
+        scene = logic.scene
+        output_node.InvokeEvent(_CLAIMED)  # whoever wrote to it before stops
+        self._observe(output_node, _CLAIMED, self.stop)
+        self._observe(scene, scene.StartCloseEvent, self.stop)
+        self._observe(scene, scene.NodeAboutToBeRemovedEvent, self._node_goes, call_data=VTK_OBJECT)
+        self._observe(scene, scene.EndBatchProcessEvent, self._batch_ended)
+        self._observe(transform_node, transform_node.TransformModifiedEvent, self._request)
+        self._observe(labels_node, labels_node.TransformModifiedEvent, self._request)
+        if labels_node.IsA("vtkMRMLSegmentationNode"):
+            segmentation, events = labels_node.GetSegmentation(), slicer.vtkSegmentation
+            for event in (
+                events.SourceRepresentationModified,
+                events.SegmentAdded,
+                events.SegmentRemoved,
+                events.SegmentModified,
+            ):
+                self._observe(segmentation, event, self._request)
+        else:
+            self._observe(labels_node, labels_node.ImageDataModifiedEvent, self._request)
+            self._observe(labels_node, vtkCommand.ModifiedEvent, self._request)
+        self._observe(logic.parameters.node, vtkCommand.ModifiedEvent, self._request)
+
+    def stop(self) -> None:
+        """Observe nothing any more, hold no node, and say so once."""
+        if not self.running:
+            return
+        self.running = False
+        for observed, tag in self._observed:
+            observed.RemoveObserver(tag)
+        self._observed.clear()
+        self._nodes = ()
+        stopped, self._stopped, self._report = self._stopped, None, None
+        if stopped is not None:
+            stopped()
+
+    def __del__(self) -> None:
+        self._stopped = None
+        self.stop()
+
+    def _observe(self, subject, event, method, call_data=None) -> None:
+        weak = weakref.WeakMethod(method)  # an observer that held us would keep us for as long as the scene lives
+
+        def callback(_subject, _event, *data):
+            alive = weak()
+            if alive is not None:
+                alive(*data)
+
+        if call_data is not None:
+            callback.CallDataType = call_data
+        self._observed.append((subject, subject.AddObserver(event, callback)))
+
+    def _node_goes(self, node) -> None:
+        if any(node is mine for mine in self._nodes):
+            self.stop()
+
+    def _batch_ended(self) -> None:
+        if self._pending:
+            self._pending = False
+            self._request()
+
+    def _request(self) -> None:
+        """Something changed: make sure that one image comes after it, and no more than one."""
+        if self._pending or not self.running:
+            return
+        self._pending = True
+        if self._nodes[2].GetScene().IsBatchProcessing():
+            return  # the scene is half loaded or half closed; the end of the batch comes back here
+        if self._schedule is not None:
+            self._schedule(self._run)
+        elif not self._busy:
+            while self._pending and self.running:  # an image can cause the next change, within this loop
+                self._run()
+
+    def _run(self) -> None:
+        if self._busy or not (self._pending and self.running):
+            return  # where work is done elsewhere, changes come while it is
+        self._pending = False
+        logic = self._logic()
+        if logic is None:
+            return
+        labels, transform, output, outline, view = self._nodes
+        self._busy = True
+        try:
+            caught: list[Warning] = []
+            logic.simulate(labels, transform, output, warned=caught.append)
+            if outline is not None and logic.preset.probe != self._outlined:
+                logic.showOutline(outline, transform)
+                self._outlined = logic.preset.probe
+            if view is not None:
+                logic.showInSlice(view, output, transform, fit=False)
+            message = "; ".join(map(str, caught))
+        except Exception as error:
+            message = user_message(error)
+            if message is None:
+                self.stop()
+                raise
+        finally:
+            self._busy = False
+        if self._report is not None:
+            self._report(message)
+        if self._pending and self._schedule is not None and self.running:
+            self._schedule(self._run)

@@ -1,0 +1,219 @@
+"""Between MRML nodes and this package's values: volumes, labels and their names, poses, images, outlines.
+
+Only this file and scene.py know the `slicer` namespace, 3D Slicer's or that of the slicer-core wheel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
+from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.shape import outline_polydata
+
+
+def named(node) -> str:
+    """How a message calls a node: its kind and name."""
+    if node is None:
+        return "no node"
+    kind = node.GetNodeTagName() if hasattr(node, "GetNodeTagName") else type(node).__name__
+    return f"{kind} {node.GetName()!r}"
+
+
+def require_node(node, *classes: str, use: str) -> None:
+    """Raise SimulationError unless `node` is of one of the classes and still in a scene."""
+    words = " or ".join(name.removeprefix("vtkMRML").removesuffix("Node") for name in classes)
+    require(node is not None, f"no {use} chosen, expected a {words} node")
+    require(
+        hasattr(node, "IsA") and any(node.IsA(name) for name in classes),
+        f"{use} is {named(node)}, expected a {words} node",
+    )
+    require(node.GetScene() is not None, f"{use} {named(node)} is not in a scene any more; choose another")
+
+
+def nodes_of_class(scene, name: str) -> list:
+    """All nodes of a class, subclasses too, in the order of the scene."""
+    return [scene.GetNthNodeByClass(number, name) for number in range(scene.GetNumberOfNodesByClass(name))]
+
+
+def node_called(scene, kind: str, name: str):
+    """The first vtkMRML`kind`Node of that name, or a new one."""
+    known = (node for node in nodes_of_class(scene, f"vtkMRML{kind}Node") if node.GetName() == name)
+    return next(known, None) or scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
+
+
+def display_of(node):
+    """A node's display node, the default one if it has none; None where even that cannot be."""
+    if node.GetDisplayNode() is None:
+        node.CreateDefaultDisplayNodes()
+    return node.GetDisplayNode()
+
+
+# ---- where nodes are -------------------------------------------------------------------------------------------------
+
+
+def node_to_world(node) -> np.ndarray:
+    """(4, 4) from a node's own frame to the world (RAS): its parent transforms; for a transform node, itself too.
+
+    Raises SimulationError where a transform on the way is not linear.
+    """
+    transform = node if node.IsA("vtkMRMLTransformNode") else node.GetParentTransformNode()
+    if transform is None:
+        return np.eye(4)
+    matrix = vtkMatrix4x4()
+    require(
+        bool(transform.IsTransformToWorldLinear()) and bool(transform.GetMatrixTransformToWorld(matrix)),
+        f"{named(node)} is under a transform that is not linear; harden it or use a linear one",
+    )
+    return matrix_array(matrix)
+
+
+def set_node_to_world(transform_node, matrix: np.ndarray) -> None:
+    """Set a linear transform node so that it and its parents together are `matrix` (4, 4)."""
+    parent = transform_node.GetParentTransformNode()
+    to_parent = matrix if parent is None else np.linalg.inv(node_to_world(parent)) @ matrix
+    transform_node.SetMatrixTransformToParent(vtk_matrix(to_parent))
+
+
+def probe_pose(transform_node) -> np.ndarray:
+    """(4, 4) probe_to_ras of a transform node with all its parents. Raises SimulationError unless it is rigid."""
+    require_node(transform_node, "vtkMRMLTransformNode", use="probe transform")
+    return check_rigid(named(transform_node), node_to_world(transform_node))
+
+
+def pose_in_labels(labels_node, probe_to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(probe pose, what the volume has to be moved by), both (4, 4), in one rigid frame.
+
+    A rigid transform of the labels is taken out of the pose, so that moving them costs nothing; one that scales has to
+    be put into the volume.
+    """
+    labels_to_world = node_to_world(labels_node)
+    try:
+        check_rigid("labels", labels_to_world)
+    except SimulationError:
+        return probe_to_world, labels_to_world
+    return np.linalg.inv(labels_to_world) @ probe_to_world, np.eye(4)
+
+
+# ---- volumes ---------------------------------------------------------------------------------------------------------
+
+
+def ijk_to_ras(volume_node) -> np.ndarray:
+    """(4, 4) of a volume node, in its own frame."""
+    matrix = vtkMatrix4x4()
+    volume_node.GetIJKToRASMatrix(matrix)
+    return matrix_array(matrix)
+
+
+def read_volume(volume_node, use: str = "volume") -> Volume:
+    """The image of a scalar volume node, in its own frame; its voxels are shared, not copied.
+
+    Raises SimulationError for another node, and for one without image data.
+    """
+    require_node(volume_node, "vtkMRMLScalarVolumeNode", use=use)
+    image = volume_node.GetImageData()
+    require(image is not None and image.GetNumberOfPoints() > 0, f"{use} {named(volume_node)} has no image data")
+    try:
+        return Volume.from_vtk(image, ijk_to_ras(volume_node))
+    except SimulationError as error:
+        raise SimulationError(f"{use} {named(volume_node)}: {error}") from None
+
+
+def write_volume(volume_node, volume: Volume) -> None:
+    """Put a volume into a volume node, as loading a file does; the node has its own copy of the voxels."""
+    volume_node.SetIJKToRASMatrix(vtk_matrix(volume.ijk_to_ras))
+    volume_node.SetAndObserveImageData(Volume(volume.array, np.eye(4)).to_vtk())
+
+
+# ---- labels ----------------------------------------------------------------------------------------------------------
+
+
+# ---- what is simulated -----------------------------------------------------------------------------------------------
+
+
+def write_image(volume_node, frame: Frame, transform_node=None) -> None:
+    """Put a frame into a volume node: fixed geometry in the probe frame, under the probe's transform node.
+
+    So the slice moves with the transform at once, and the pixels follow.
+    """
+    write_slice(volume_node, Volume(frame.image[None], frame.grid.slice_to_probe), transform_node)
+
+
+def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:
+    """Put a uint8 volume of one slice into a volume node, which keeps its memory where the size is the same."""
+    was_modifying = volume_node.StartModify()
+    if transform_node is not None and volume_node.GetTransformNodeID() != transform_node.GetID():
+        volume_node.SetAndObserveTransformNodeID(transform_node.GetID())
+    image = volume_node.GetImageData()
+    _, rows, columns = in_probe.array.shape
+    if image is None or image.GetDimensions() != (columns, rows, 1) or image.GetScalarTypeAsString() != "unsigned char":
+        write_volume(volume_node, in_probe)
+        _show_all_greys(volume_node)
+    else:
+        if not np.array_equal(ijk_to_ras(volume_node), in_probe.ijk_to_ras):
+            volume_node.SetIJKToRASMatrix(vtk_matrix(in_probe.ijk_to_ras))
+        scalars = image.GetPointData().GetScalars()
+        np.asarray(memoryview(scalars)).reshape(rows, columns)[:] = in_probe.array[0]
+        scalars.Modified()
+        image.Modified()
+    volume_node.EndModify(was_modifying)
+
+
+def _show_all_greys(volume_node) -> None:
+    """Black at 0 and white at 255, as on a scanner: an automatic window would change brightness from frame to frame."""
+    if volume_node.GetScene() is None:  # an item of a sequence
+        return
+    display = display_of(volume_node)
+    if display is not None and display.GetAutoWindowLevel():
+        display.SetAutoWindowLevel(False)
+        display.SetWindowLevelMinMax(0, 255)
+
+
+def write_outline(model_node, probe: Probe, transform_node) -> None:
+    """Put the outline of the imaged field into a model node, under the probe's transform node."""
+    model_node.SetAndObservePolyData(outline_polydata(probe))
+    if model_node.GetTransformNodeID() != transform_node.GetID():
+        model_node.SetAndObserveTransformNodeID(transform_node.GetID())
+    is_new = model_node.GetDisplayNode() is None
+    display = display_of(model_node)
+    if is_new and display is not None:
+        display.SetColor(1.0, 0.85, 0.1)
+        display.SetLineWidth(3)
+        display.SetLighting(False)
+        display.SetVisibility2D(True)
+        display.SetSliceDisplayModeToProjection()
+
+
+def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Probe, fit: bool, behind=None) -> None:
+    """Turn a slice view into the plane of the probe, standing as on a scanner, and lay the image over its background.
+
+    `fit` also makes the imaged field fill the view; `behind` is another volume to put into the background.
+    """
+    left, right, top, bottom = probe.image_bounds_mm()
+    view = probe_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])  # a view's second axis goes up, the probe's goes down
+    view[:3, 3] = (probe_to_world @ [0.5 * (left + right), 0.5 * (top + bottom), 0.0, 1.0])[:3]
+    slice_node.GetSliceToRAS().DeepCopy(vtk_matrix(view))
+    if fit:
+        width, height, thickness = slice_node.GetFieldOfView()
+        scale = max((right - left) / width, (bottom - top) / height) * 1.05
+        slice_node.SetFieldOfView(width * scale, height * scale, thickness)
+    slice_node.UpdateMatrices()
+    composite = composite_of(slice_node)
+    if composite is None:
+        return
+    if behind is not None:
+        composite.SetBackgroundVolumeID(behind.GetID())
+    if composite.GetForegroundVolumeID() != volume_node.GetID():
+        composite.SetForegroundVolumeID(volume_node.GetID())
+        composite.SetForegroundOpacity(1.0)
+
+
+def composite_of(slice_node):
+    """The vtkMRMLSliceCompositeNode that says what a slice view shows, or None."""
+    composites = nodes_of_class(slice_node.GetScene(), "vtkMRMLSliceCompositeNode")
+    return next((node for node in composites if node.GetLayoutName() == slice_node.GetLayoutName()), None)

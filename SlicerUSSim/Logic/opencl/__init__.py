@@ -1,0 +1,15 @@
+"""What computes: the OpenCL devices there are, the one chosen, its programs and buffers.
+
+`layout` declares the structs and constants that the host and the kernels share.
+"""
+
+from typing import TYPE_CHECKING
+
+from SlicerUSSim.Logic.base.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from .device import Device as Device, Workspace as Workspace
+    from .devices import DeviceInfo as DeviceInfo, choose_device as choose_device, list_devices as list_devices
+    from .layout import CONSTANTS as CONSTANTS
+
+lazy_exports(globals())

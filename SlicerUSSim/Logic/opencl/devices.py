@@ -1,0 +1,146 @@
+"""Which OpenCL devices there are, and which one computes.
+
+Order of preference: a GPU, Intel's processor runtime, PoCL, anything else. An explicit choice overrides it: the
+`device` argument, then PYOPENCL_CTX (pyopencl's own "platform:device" notation), then USSIM_DEVICE (either that
+notation or part of a device or platform name).
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass, field
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.opencl.runtimes import load_pyopencl
+
+_EMULATOR_RANK = 9
+INTEL_HINT = 'pip install "SlicerUSSim[intel]"'
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One OpenCL device: `index` in "platform:device" notation, names, and its rank (smaller is preferred)."""
+
+    index: str
+    name: str
+    platform: str
+    kind: str  # "GPU", "CPU" or "other"
+    compute_units: int
+    memory_mb: int
+    rank: int
+    handle: object = field(repr=False, compare=False)
+
+    @property
+    def is_emulator(self) -> bool:
+        """Whether it emulates other hardware, for that hardware's developers."""
+        return self.rank == _EMULATOR_RANK
+
+    def __str__(self) -> str:
+        return f"{self.index}  {self.name} ({self.kind}, {self.platform}, {self.compute_units} compute units)"
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Every usable OpenCL device, best first. Empty when there is none.
+
+    Raises SimulationError if pyopencl itself is missing.
+    """
+    cl = load_pyopencl()
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError:  # the loader's way of saying "no platform at all"
+        return []
+    devices = []
+    for platform_index, cl_platform in enumerate(platforms):
+        try:
+            handles = cl_platform.get_devices()
+        except cl.Error:
+            continue  # a driver without hardware
+        for device_index, handle in enumerate(handles):
+            device = _describe(cl, f"{platform_index}:{device_index}", cl_platform, handle)
+            # A runtime registered twice (its wheel and a vendors folder) would be listed twice.
+            names = {(known.platform, known.name) for known in devices if known.kind == "CPU"}
+            if (device.platform, device.name) not in names:
+                devices.append(device)
+    return sorted(devices, key=lambda device: device.rank)
+
+
+def _describe(cl, index, cl_platform, handle) -> DeviceInfo:
+    is_gpu = bool(handle.type & cl.device_type.GPU)
+    is_cpu = bool(handle.type & cl.device_type.CPU)
+    platform_name = cl_platform.name.strip()
+    if "FPGA" in platform_name or "FPGA" in handle.name:
+        rank = _EMULATOR_RANK  # Intel's FPGA emulator also lists itself; it is for FPGA developers
+    elif is_gpu:
+        rank = 0
+    elif is_cpu and "Intel" in platform_name:
+        rank = 1
+    elif is_cpu and "Portable Computing Language" in platform_name:
+        rank = 2
+    else:
+        rank = 3
+    return DeviceInfo(
+        index=index,
+        name=handle.name.strip(),
+        platform=platform_name,
+        kind="GPU" if is_gpu else "CPU" if is_cpu else "other",
+        compute_units=handle.max_compute_units,
+        memory_mb=handle.global_mem_size // 2**20,
+        rank=rank,
+        handle=handle,
+    )
+
+
+def choose_device(device: str | DeviceInfo | None = None) -> tuple[DeviceInfo, str]:
+    """The device to use and the reason, one short phrase.
+
+    Parameters
+    ----------
+    device : "0:1" (platform:device), part of a name, a DeviceInfo, or None for PYOPENCL_CTX, then USSIM_DEVICE, then
+        the best there is.
+
+    Raises SimulationError if there is no device or none fits the choice.
+    """
+    if isinstance(device, DeviceInfo):
+        return device, "chosen by argument"
+    devices = list_devices()
+    if not devices:
+        raise SimulationError(
+            "no OpenCL device found; on Linux run: pip install pocl-binary-distribution (or, faster: "
+            f"{INTEL_HINT}); on Windows and macOS install the graphics driver"
+        )
+    for choice, source in (
+        (device, "argument"),
+        (os.environ.get("PYOPENCL_CTX"), "PYOPENCL_CTX"),
+        (os.environ.get("USSIM_DEVICE"), "USSIM_DEVICE"),
+    ):
+        if choice:
+            return _find(devices, str(choice), source), f"chosen by {source}"
+    return devices[0], {0: "a GPU", 1: "the fastest processor runtime"}.get(devices[0].rank, "the only kind found")
+
+
+def _find(devices: list[DeviceInfo], choice: str, source: str) -> DeviceInfo:
+    text = choice.strip().lower()
+    text = {"pocl": "portable computing language"}.get(text, text)
+    exact = text if ":" in text else f"{text}:0"
+    for device in devices:
+        if device.index == exact or (not text.isdigit() and text in f"{device.name} {device.platform}".lower()):
+            return device
+    known = "; ".join(f"{device.index} {device.platform}" for device in devices)
+    raise SimulationError(f"{source}: no OpenCL device fits {choice!r}, expected one of: {known}")
+
+
+def devices_to_measure(device: str | None = None) -> list[DeviceInfo]:
+    """The device chosen by `device`, or without a choice all that are no emulators, best first.
+
+    Raises SimulationError as choose_device does.
+    """
+    chosen = [choose_device(device)[0]]
+    return chosen if device else [info for info in list_devices() if not info.is_emulator] or chosen
+
+
+def faster_hint(device: DeviceInfo) -> str | None:
+    """The one pip line that would give a faster device than `device` on this computer, or None."""
+    if device.kind == "CPU" and "Intel" not in device.platform and sys.platform == "linux":
+        return INTEL_HINT
+    return None

@@ -1,0 +1,152 @@
+"""The structs and constants that the host and the kernels share: defined here once, as numpy dtypes.
+
+Every member is four bytes wide, so numpy's packed layout and C's agree on every device.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+#: Constants known to host and kernels by the same name.
+CONSTANTS = {
+    "LABEL_MASK": 0x3F,  # low byte of a medium voxel: six bits of label, ...
+    "SAME_LABEL": 0x40,  # ... one that says that all eight voxels of this cell have one label, ...
+    "NO_MEMBRANE": 0x80,  # ... and one that says that no membrane passes between them
+    "PLAIN_CELL": 0xC0,  # both
+    "GROUP_MASK": 0x7F,
+    "SAME_GROUP": 0x80,  # beside the acoustic group of a voxel: all eight of this cell have the same
+    "MEMBRANE_LABEL": 63,
+    "MAX_TISSUES": 64,
+    "WIDE_SIGMA": 3.0,  # of the Gaussian that smooths the indicators of acoustic groups (medium.py), voxels
+    "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
+    "MAX_SEGMENTS": 256,  # per traced line
+    "MAX_HITS": 96,  # per traced ray
+    "MAX_STACK": 24,  # reflected rays waiting to be followed
+    "BLOCK": 64,  # samples over which beam widths and gains are taken as linear; lines are whole blocks long
+    "BANDS": 4,  # of T1, by which a tissue's scatterers come to exist as mu1 is varied (appearance.py)
+    "PARTS": 9,  # 1 + 2 BANDS
+    "ROLE_FIXED": 0,  # of a tissue while the parts are computed: in part 0, ...
+    "ROLE_VARIED": 1,  # ... in the parts of its own, ...
+    "ROLE_SILENT": 2,  # ... or in none
+    "MAX_BINS": 256,  # of the histograms in similarity.cl
+    "LINE_PAD": 448,  # zeros on either side of a line: the longest pulse filter (bandwidth 0.05, 16 samples per cycle)
+}
+
+_FLOAT, _INT, _UINT = np.float32, np.int32, np.uint32
+
+ACQUISITION = np.dtype(
+    [
+        # medium
+        ("ras_to_voxel", _FLOAT, 12),  # rows of the affine map from RAS mm to padded voxel indices (i, j, k)
+        ("dims", _INT, 3),  # padded voxels along i, j, k
+        ("voxel_mm", _FLOAT),  # smallest spacing
+        ("smooth_groups", _INT),  # acoustic groups with a smoothed indicator
+        ("membrane_reach", _FLOAT),  # half the membrane in units of the fluid distance (0..255); negative: none
+        # probe and pose
+        ("probe_to_ras", _FLOAT, 12),
+        ("linear", _INT),
+        ("apex_radius_mm", _FLOAT),
+        ("first_line", _FLOAT),
+        ("line_spacing", _FLOAT),
+        ("scan_lines", _INT),
+        ("depth_mm", _FLOAT),
+        # wave and beam (Probe.beam_sigma_mm)
+        ("frequency_mhz", _FLOAT),
+        ("reference_speed_m_s", _FLOAT),
+        ("cycles_per_mm", _FLOAT),
+        ("sample_mm", _FLOAT),
+        ("samples", _INT),  # rounded up to whole chunks
+        ("transmit_sigma", _FLOAT),
+        ("transmit_focus", _FLOAT),
+        ("transmit_rayleigh", _FLOAT),
+        ("receive_sigma_min", _FLOAT),
+        ("receive_sigma_slope", _FLOAT),
+        ("elevation_sigma", _FLOAT),
+        ("elevation_focus", _FLOAT),
+        ("elevation_rayleigh", _FLOAT),
+        # ray tree
+        ("max_ray_depth", _INT),
+        ("intensity_threshold", _FLOAT),
+        ("reflection_threshold", _FLOAT),
+        ("reflection_spreading", _INT),
+        ("elevational_rays", _INT),
+        ("lateral_rays", _INT),  # traced lines per scan line
+        ("guard_lines", _INT),  # traced lines beyond either edge of the field
+        ("traced_lines", _INT),
+        ("interface_gain", _FLOAT),
+        ("interface_is_energy", _INT),
+        ("specular_exponent", _FLOAT),
+        # scatterers
+        ("cell_mm", _FLOAT),
+        ("seed", _UINT),
+        ("beam_cutoff", _FLOAT),
+        ("speckle_scale", _FLOAT),  # 1 / sqrt(density pi^1.5 axial sigma): unit variance gives unit mean square
+    ]
+)
+
+TISSUE = np.dtype(
+    [
+        ("speed_m_s", _FLOAT),
+        ("impedance", _FLOAT),
+        ("attenuation", _FLOAT),
+        ("mu0", _FLOAT),
+        ("sigma0", _FLOAT),
+        ("share", _FLOAT),  # p = 1 - Phi(mu1)
+        ("group", _INT),  # tissues of one speed and impedance: no interface between them
+    ]
+)
+
+#: One straight piece of a traced line's ray tree, in one tissue. (xyz triples are RAS mm.)
+SEGMENT = np.dtype(
+    [
+        ("start", _FLOAT, 3),
+        ("direction", _FLOAT, 3),
+        ("lateral", _FLOAT, 3),
+        ("elevational", _FLOAT, 3),
+        ("tube", _FLOAT, 4),  # spreading at `start`: lateral width, growth per mm, elevational width, growth per mm
+        ("path_mm", _FLOAT),  # unfolded path length from the probe face at `start`: sets the beam width
+        ("length_mm", _FLOAT),
+        ("depth_mm", _FLOAT),  # t c_ref / 2 at `start`: what the scanner believes
+        ("depth_per_mm", _FLOAT),  # c_ref / c
+        ("weight", _FLOAT),  # product of R and 1 - R along the path
+        ("attenuation", _FLOAT),  # two-way amplitude factor at `start`
+        ("decay_per_mm", _FLOAT),  # -d ln(attenuation) / ds
+        ("reflections", _INT),
+        ("label", _INT),
+    ]
+)
+
+#: One crossing of a tissue interface by one ray.
+HIT = np.dtype(
+    [
+        ("position", _FLOAT, 3),
+        ("normal", _FLOAT, 3),  # unit, against the ray
+        ("path_mm", _FLOAT),
+        ("depth_mm", _FLOAT),
+        ("weight", _FLOAT),
+        ("attenuation", _FLOAT),
+        ("cos_incidence", _FLOAT),
+        ("reflectance", _FLOAT),  # R = r^2
+        ("echo", _FLOAT),  # amplitude written into the line, before the lateral beam profile
+        ("reflections", _INT),
+        ("label_before", _INT),
+        ("label_behind", _INT),
+    ]
+)
+
+_C_TYPES = {np.dtype(_FLOAT): "float", np.dtype(_INT): "int", np.dtype(_UINT): "uint"}
+
+
+def _c_struct(name: str, dtype: np.dtype) -> str:
+    members = []
+    for field_name, (field, _offset) in dtype.fields.items():
+        base, shape = field.subdtype or (field, ())
+        members.append(f"  {_C_TYPES[base]} {field_name}{f'[{shape[0]}]' if shape else ''};")
+    return "\n".join(["typedef struct {", *members, f"}} {name};"])
+
+
+def shared_source() -> str:
+    """C text of every constant and struct above; Device.kernels puts it in front of a kernel file."""
+    constants = [f"#define {name} {value}{'f' * isinstance(value, float)}" for name, value in CONSTANTS.items()]
+    structs = [("Acquisition", ACQUISITION), ("Tissue", TISSUE), ("Segment", SEGMENT), ("Hit", HIT)]
+    return "\n".join(constants + [_c_struct(name, dtype) for name, dtype in structs])

@@ -1,0 +1,101 @@
+"""What PoCL 3.0 needs beside itself: a processor name that its compiler knows, and a linker.
+
+LLVM 14 calls a processor it does not know "generic" (AMD Zen 4 and 5, for instance), PoCL hands that name to clang,
+and clang refuses it: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open since 2022). PoCL 3.0 has no setting
+for the name, but it keeps it as a C string of its own that is read at every build. This file replaces the string by a
+processor that LLVM 14 knows and that has no instruction this one lacks.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import shutil
+import struct
+import sys
+from pathlib import Path
+
+from SlicerUSSim.Logic.base.errors import require
+
+# The oldest Intel processor of each of PoCL's x86 kernel libraries, and the /proc/cpuinfo flags it needs.
+# PoCL picks its library by these flags, and the name has to go with the library.
+_KNOWN_PROCESSORS = (
+    ("skylake-avx512", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2"}),
+    ("haswell", {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"}),
+    ("ivybridge", {"avx", "f16c"}),
+    ("nehalem", {"sse4_1", "sse4_2"}),
+)
+_DEVICE_STRUCT_BYTES = 4096
+
+
+def name_unknown_processor(handle) -> str | None:
+    """Give PoCL a processor name its compiler accepts; returns it, or None where nothing had to or could be done.
+
+    `handle` is the pyopencl Device. Nothing is written unless a pointer to exactly the string "generic", in a heap
+    block large enough for the new name, is found in the device's own structure.
+    """
+    if not handle.version.endswith("-generic"):
+        return None
+    flags = _processor_flags()
+    name = next((name for name, needed in _KNOWN_PROCESSORS if needed <= flags), None)
+    if name is None:
+        return None
+    try:
+        # /proc/self/mem answers with an error where following a wrong pointer would end the process.
+        memory = os.open("/proc/self/mem", os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        address = _find_string(memory, handle.int_ptr, b"generic\0")
+    finally:
+        os.close(memory)
+    if address is None or _usable_bytes(address) <= len(name):
+        return None
+    ctypes.memmove(address, name.encode() + b"\0", len(name) + 1)
+    return name
+
+
+def require_linker(version: str) -> None:
+    """Raise SimulationError where PoCL would end the process: up to version 5 it links every kernel with `ld`, against
+    libgcc and libc, and aborts where it cannot, as on a minimal Debian. `version` is that of the OpenCL platform."""
+    found = re.search(r"PoCL (\d+)", version, re.IGNORECASE)
+    if found is None or int(found.group(1)) > 5 or sys.platform != "linux":
+        return
+    search = os.pathsep.join([os.environ.get("PATH", ""), "/usr/bin", "/bin"])
+    has_libraries = any(shutil.which(name, path=search) for name in ("gcc", "cc")) or any(
+        any(Path("/usr").glob(f"{place}/gcc/*/*/libgcc.a")) for place in ("lib", "lib64")
+    )
+    require(
+        shutil.which("ld", path=search) is not None and has_libraries,
+        "PoCL, the OpenCL runtime in use, links its kernels with `ld` and libgcc, which are not installed; on Debian "
+        "and Ubuntu run: sudo apt-get install gcc libc6-dev",
+    )
+
+
+def _processor_flags() -> set[str]:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return set()
+    return next((set(line.split(":", 1)[1].split()) for line in lines if line.startswith("flags")), set())
+
+
+def _find_string(memory: int, structure: int, text: bytes) -> int | None:
+    def read(address: int, count: int) -> bytes:
+        try:
+            return os.pread(memory, count, address)
+        except OSError:
+            return b""
+
+    raw = read(structure, _DEVICE_STRUCT_BYTES)
+    for (address,) in struct.iter_unpack("<Q", raw[: len(raw) // 8 * 8]):
+        if 4096 < address < 2**47 and read(address, len(text)) == text:
+            return address
+    return None
+
+
+def _usable_bytes(address: int) -> int:
+    usable = ctypes.CDLL(None).malloc_usable_size
+    usable.restype, usable.argtypes = ctypes.c_size_t, [ctypes.c_void_p]
+    return usable(address)

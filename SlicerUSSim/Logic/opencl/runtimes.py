@@ -1,0 +1,73 @@
+"""pyopencl, with every OpenCL runtime that pip installed made known to its loader."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import sys
+import zlib
+from functools import lru_cache
+from pathlib import Path
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+
+
+@lru_cache(maxsize=1)
+def load_pyopencl():
+    """Import pyopencl with every installed runtime visible to its ICD loader, or say what to install."""
+    if "pyopencl" not in sys.modules and sys.platform == "linux" and "OCL_ICD_VENDORS" not in os.environ:
+        _register_pip_runtimes()
+    try:
+        import pyopencl
+    except ImportError as error:
+        raise SimulationError(f"pyopencl cannot be imported ({error}); install it with: pip install pyopencl") from None
+    return pyopencl
+
+
+def _register_pip_runtimes() -> None:
+    """Point the ICD loader at a folder that names every runtime by absolute path.
+
+    Intel's wheel ships an .icd file with a placeholder path, and OCL_ICD_VENDORS *replaces* the loader's own folders,
+    so a folder of our own has to list Intel's library, PoCL's wheel and whatever the system has installed.
+    """
+    libraries = {}
+    for name, distribution, pattern in (
+        ("intel", "intel-opencl-rt", "libintelocl.so"),
+        ("pocl", "pocl-binary-distribution", "libpocl-"),
+    ):
+        library = _library_of(distribution, pattern)
+        if library is not None:
+            libraries[f"ussim-{name}.icd"] = str(library)
+    if "ussim-intel.icd" not in libraries:
+        return  # without Intel's wheel the loader finds everything by itself
+    import platformdirs
+
+    folder = Path(platformdirs.user_cache_dir("ussim")) / "vendors" / f"{zlib.crc32(sys.prefix.encode()):08x}"
+    try:
+        for vendor in Path("/etc/OpenCL/vendors").glob("*.icd"):
+            libraries[vendor.name] = vendor.read_text().strip()
+        folder.mkdir(parents=True, exist_ok=True)
+        for stale in folder.glob("*.icd"):
+            if stale.name not in libraries:
+                stale.unlink(missing_ok=True)
+        for name, library in libraries.items():
+            if not (folder / name).exists() or (folder / name).read_text() != library:
+                partial = folder / f"{name}.{os.getpid()}"
+                partial.write_text(library)
+                partial.replace(folder / name)
+    except OSError:
+        return  # a read-only home: the loader's own folders still work
+    os.environ["OCL_ICD_VENDORS"] = str(folder)
+
+
+def _library_of(distribution: str, pattern: str) -> Path | None:
+    try:
+        files = importlib.metadata.files(distribution) or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    for file in files:
+        if file.name.startswith(pattern) and ".so" in file.name and not file.name.endswith((".py", ".pyc")):
+            path = Path(str(file.locate())).resolve()
+            if path.exists():
+                return path
+    return None

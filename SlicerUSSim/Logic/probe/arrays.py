@@ -1,0 +1,317 @@
+"""Probes: where the scan lines start, where they go, and how wide the beam is.
+
+Probe frame (millimetres): origin at the centre of the probe face, +x lateral (left to right in the image), +y depth,
++z elevational. A scan line is a polar line around the apex of a curved array, or a parallel line of a linear one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, asdict, dataclass, fields
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between
+
+NOMINAL_SPEED_M_S = 1540.0
+#: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
+MAIN_LOBE = 1.21
+FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Probe:
+    """What all probes share. Use LinearProbe, ConvexProbe or PhasedProbe.
+
+    The two-way beam (amplitude, PHYSICS section 4) is Gaussian across its axis. Laterally it is the product of a
+    transmit beam focused once at `focus_mm` and a receive beam that is focused at every depth, with an aperture that
+    grows at constant f-number until it is fully open; elevationally the lens focuses both ways at one depth.
+    Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
+    """
+
+    # depth_mm is declared by each kind, so that it can be given by position.
+    scan_lines: int = 192
+    frequency_mhz: float = 5.0
+    #: Fractional -6 dB bandwidth of the two-way pulse.
+    fractional_bandwidth: float = 0.5
+    #: Transmit focus; None puts it at 60 % of the depth.
+    focus_mm: float | None = None
+    #: Lateral size of the fully open aperture.
+    aperture_mm: float = 12.0
+    #: Smallest f-number of the receive aperture (it opens with depth until it reaches aperture_mm).
+    receive_f_number: float = 2.5
+    #: Height of the elements.
+    elevation_aperture_mm: float = 7.0
+    #: Focus of the lens; None puts it at 60 % of the depth.
+    elevation_focus_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        owner = type(self).__name__
+        require_between(owner, "depth_mm", self.depth_mm, 1, 400)
+        require_between(owner, "scan_lines", self.scan_lines, 2, 4096)
+        require(
+            int(self.scan_lines) == self.scan_lines,
+            f"{owner}: scan_lines is {self.scan_lines}, expected a whole number",
+        )
+        require_between(owner, "frequency_mhz", self.frequency_mhz, 0.5, 40)
+        require_between(owner, "fractional_bandwidth", self.fractional_bandwidth, 0.05, 1.5)
+        require_between(owner, "aperture_mm", self.aperture_mm, 0.5, 200)
+        require_between(owner, "receive_f_number", self.receive_f_number, 0.5, 20)
+        require_between(owner, "elevation_aperture_mm", self.elevation_aperture_mm, 0.5, 100)
+        for name in ("focus_mm", "elevation_focus_mm"):
+            value = getattr(self, name)
+            if value is None:
+                object.__setattr__(self, name, self.default_focus_mm(self.depth_mm))
+            else:
+                require_between(owner, name, value, 0.1, 1000)
+
+    @staticmethod
+    def default_focus_mm(depth_mm: float) -> float:
+        """Where a focus lies that is not given."""
+        return 0.6 * depth_mm
+
+    # ---- geometry, defined by each kind ------------------------------------------------------------------------
+
+    @property
+    def apex_radius_mm(self) -> float:
+        """Distance from the apex to the face; 0 for a phased array, inf for a linear one."""
+        raise NotImplementedError
+
+    @property
+    def line_spacing(self) -> float:
+        """Step between scan lines: radians around the apex, or millimetres along a linear face."""
+        raise NotImplementedError
+
+    @property
+    def first_line(self) -> float:
+        """Position of scan line 0, in the unit of line_spacing."""
+        return -0.5 * self.line_spacing * (self.scan_lines - 1)
+
+    @property
+    def is_linear(self) -> bool:
+        """True where scan lines are parallel."""
+        return bool(np.isinf(self.apex_radius_mm))
+
+    def line_positions(self) -> np.ndarray:
+        """(scan_lines,) position of every line: radians around the apex, or millimetres along a linear face."""
+        return self.first_line + self.line_spacing * np.arange(self.scan_lines)
+
+    def line_at(self, position) -> tuple[np.ndarray, np.ndarray]:
+        """((..., 3) origin in mm, (..., 3) unit direction) in the probe frame of the lines at these positions."""
+        position = np.asarray(position, float)
+        zero = np.zeros_like(position)
+        if self.is_linear:
+            return np.stack([position, zero, zero], axis=-1), np.stack([zero, zero + 1.0, zero], axis=-1)
+        sine, cosine, radius = np.sin(position), np.cos(position), self.apex_radius_mm
+        return (
+            np.stack([radius * sine, radius * (cosine - 1.0), zero], axis=-1),
+            np.stack([sine, cosine, zero], axis=-1),
+        )
+
+    def origins_mm(self) -> np.ndarray:
+        """(scan_lines, 3) starting points on the probe face in the probe frame."""
+        return self.line_at(self.line_positions())[0]
+
+    def directions(self) -> np.ndarray:
+        """(scan_lines, 3) unit vectors along the scan lines in the probe frame."""
+        return self.line_at(self.line_positions())[1]
+
+    def line_through(self, lateral_mm, depth_mm) -> tuple[np.ndarray, np.ndarray]:
+        """(position of the line, millimetres along it) of points of the image plane; the inverse of line_at."""
+        x, y = np.asarray(lateral_mm, float), np.asarray(depth_mm, float)
+        if self.is_linear:
+            return x, y
+        from_apex = y + self.apex_radius_mm
+        return np.arctan2(x, from_apex), np.hypot(x, from_apex) - self.apex_radius_mm
+
+    def line_distance_mm(self, along_mm) -> np.ndarray:
+        """Distance between neighbouring scan lines, `along_mm` from the face."""
+        along = np.asarray(along_mm, float)
+        return self.line_spacing * (np.ones_like(along) if self.is_linear else along + self.apex_radius_mm)
+
+    def image_bounds_mm(self) -> tuple[float, float, float, float]:
+        """(left, right, top, bottom) of the imaged field in the probe frame; top is negative for a curved face."""
+        starts = self.origins_mm()
+        points = np.concatenate([starts, starts + self.depth_mm * self.directions()])
+        if not self.is_linear:
+            points = np.concatenate([points, [[0.0, self.depth_mm, 0.0]]])  # the middle of the arc, if no line is there
+        x, y = points[:, 0], points[:, 1]
+        return float(x.min()), float(x.max()), float(min(y.min(), 0.0)), float(y.max())
+
+    def outline_mm(self, points_per_arc: int = 65) -> np.ndarray:
+        """(points, 3) closed outline of the imaged field in the probe frame, for drawing."""
+        ends = np.linspace(self.first_line, -self.first_line, points_per_arc)
+        if self.is_linear:
+            near = np.stack([ends, 0 * ends, 0 * ends], axis=1)
+            far = near + [0.0, self.depth_mm, 0.0]
+        else:
+            ray = np.stack([np.sin(ends), np.cos(ends), 0 * ends], axis=1)
+            apex = np.array([0.0, -self.apex_radius_mm, 0.0])
+            near, far = apex + self.apex_radius_mm * ray, apex + (self.apex_radius_mm + self.depth_mm) * ray
+        return np.concatenate([near, far[::-1], near[:1]])
+
+    def holds(self, lateral_mm: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
+        """Whether points of the image plane (probe frame, any shape) lie in the imaged field."""
+        position, along = self.line_through(lateral_mm, depth_mm)
+        return (np.abs(position) <= -self.first_line) & (along >= 0.0) & (along <= self.depth_mm)
+
+    # ---- wave and beam -----------------------------------------------------------------------------------------
+
+    @property
+    def wavelength_mm(self) -> float:
+        """Wavelength at the nominal speed of sound, 1540 m/s, which arrays are designed for."""
+        return NOMINAL_SPEED_M_S / self.frequency_mhz * 1e-3
+
+    @property
+    def cycles_per_mm(self) -> float:
+        """Cycles of the carrier per millimetre of *depth*: the pulse travels there and back."""
+        return 2.0 / self.wavelength_mm
+
+    @property
+    def axial_sigma_mm(self) -> float:
+        """Standard deviation of the pulse envelope in depth.
+
+        A Gaussian spectrum whose amplitude is halved (-6 dB) at f0 (1 +- b/2) has sigma_f = b f0 / FWHM_PER_SIGMA, and
+        sigma_t = 1 / (2 pi sigma_f); depth is c t / 2.
+        """
+        sigma_mhz = self.fractional_bandwidth * self.frequency_mhz / FWHM_PER_SIGMA
+        return NOMINAL_SPEED_M_S * 1e-3 / (4.0 * np.pi * sigma_mhz)
+
+    def beam_sigma_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
+        """(lateral, elevational) standard deviation of the two-way beam amplitude at `depth_mm` along a scan line."""
+        depth = np.asarray(depth_mm, dtype=float)
+        transmit = self._gaussian_beam(depth, *self.transmit_waist())
+        least, slope = self.receive_beam()
+        receive = np.maximum(least, slope * depth)
+        lateral = transmit * receive / np.hypot(transmit, receive)
+        elevational = self._gaussian_beam(depth, *self.elevation_waist()) / np.sqrt(2.0)
+        return lateral, elevational
+
+    def receive_beam(self) -> tuple[float, float]:
+        """(least sigma in mm, sigma per mm of depth) of the one-way lateral receive beam, focused at every depth."""
+        per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
+        return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
+
+    def transmit_waist(self) -> tuple[float, float, float]:
+        """(sigma at the focus, focus, Rayleigh length) of the one-way lateral transmit beam, millimetres."""
+        return self._waist(self.focus_mm, self.aperture_mm)
+
+    def elevation_waist(self) -> tuple[float, float, float]:
+        """(sigma at the focus, focus, Rayleigh length) of the one-way elevational beam, millimetres."""
+        return self._waist(self.elevation_focus_mm, self.elevation_aperture_mm)
+
+    def _waist(self, focus_mm: float, aperture_mm: float) -> tuple[float, float, float]:
+        sigma = MAIN_LOBE * self.wavelength_mm * focus_mm / aperture_mm / FWHM_PER_SIGMA
+        # A Gaussian beam of amplitude exp(-y^2 / w^2), w^2 = 2 sigma^2, has the Rayleigh length pi w^2 / wavelength.
+        return sigma, focus_mm, 2.0 * np.pi * sigma**2 / self.wavelength_mm
+
+    @staticmethod
+    def _gaussian_beam(depth, sigma, focus, rayleigh):
+        return sigma * np.sqrt(1.0 + ((depth - focus) / rayleigh) ** 2)
+
+    # ---- JSON --------------------------------------------------------------------------------------------------
+
+    def to_dict(self) -> dict:
+        """Plain values, with the kind of probe under "kind"; probe_from_dict reads it back."""
+        return {"kind": _KIND_NAMES[type(self)], **asdict(self)}
+
+
+@dataclass(frozen=True)
+class LinearProbe(Probe):
+    """A flat array with parallel scan lines over `width_mm`."""
+
+    width_mm: float
+    depth_mm: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_between("LinearProbe", "width_mm", self.width_mm, 1, 400)
+
+    @property
+    def apex_radius_mm(self) -> float:
+        return float("inf")
+
+    @property
+    def line_spacing(self) -> float:
+        return self.width_mm / (self.scan_lines - 1)
+
+
+@dataclass(frozen=True)
+class ConvexProbe(Probe):
+    """A curved array of radius `radius_mm`; scan lines leave it at right angles over `field_of_view_deg`."""
+
+    radius_mm: float
+    field_of_view_deg: float
+    depth_mm: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_between("ConvexProbe", "radius_mm", self.radius_mm, 1, 400)
+        require_between("ConvexProbe", "field_of_view_deg", self.field_of_view_deg, 1, 170)
+
+    @property
+    def apex_radius_mm(self) -> float:
+        return self.radius_mm
+
+    @property
+    def line_spacing(self) -> float:
+        return np.deg2rad(self.field_of_view_deg) / (self.scan_lines - 1)
+
+
+@dataclass(frozen=True)
+class PhasedProbe(Probe):
+    """A small array that steers: every scan line starts at the centre of the face, over `field_of_view_deg`."""
+
+    field_of_view_deg: float
+    depth_mm: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_between("PhasedProbe", "field_of_view_deg", self.field_of_view_deg, 1, 170)
+
+    @property
+    def apex_radius_mm(self) -> float:
+        return 0.0
+
+    @property
+    def line_spacing(self) -> float:
+        return np.deg2rad(self.field_of_view_deg) / (self.scan_lines - 1)
+
+
+_KIND_NAMES = {LinearProbe: "linear", ConvexProbe: "convex", PhasedProbe: "phased"}
+
+
+def probe_from_dict(values: dict, source: str = "probe") -> Probe:
+    """The probe described by plain values (see Probe.to_dict). Raises SimulationError for an unknown kind or name."""
+    require(isinstance(values, dict), f'{source}: is a {type(values).__name__}, expected an object with a "kind"')
+    kinds = {name: kind for kind, name in _KIND_NAMES.items()}
+    kind = values.get("kind")
+    require(kind in kinds, f"{source}: kind is {kind!r}, expected one of {', '.join(kinds)}")
+    arguments = {name: value for name, value in values.items() if name != "kind"}
+    known = {field.name for field in fields(kinds[kind])}
+    for name in arguments:
+        require(
+            name in known,
+            f"{source}: {name} is not a parameter of a {kind} probe, expected one of {', '.join(sorted(known))}",
+        )
+    try:
+        return kinds[kind](**arguments)
+    except SimulationError as error:
+        raise SimulationError(f"{source}: {error}") from None
+    except TypeError:
+        needed = {field.name for field in fields(kinds[kind]) if field.default is MISSING} - set(arguments)
+        raise SimulationError(f"{source}: a {kind} probe also needs {', '.join(sorted(needed))}") from None
+
+
+#: Probes to start from, by name: PROBES["phased"].
+PROBES: dict[str, Probe] = {
+    "phased": PhasedProbe(field_of_view_deg=80.0, depth_mm=90.0, scan_lines=196, frequency_mhz=5.0),
+    "convex": ConvexProbe(radius_mm=40.0, field_of_view_deg=60.0, depth_mm=100.0, scan_lines=192, frequency_mhz=5.0),
+    "linear": LinearProbe(width_mm=38.0, depth_mm=40.0, scan_lines=192, frequency_mhz=9.0, elevation_aperture_mm=5.0),
+    "microconvex": ConvexProbe(
+        radius_mm=14.0, field_of_view_deg=90.0, depth_mm=80.0, frequency_mhz=6.5, aperture_mm=8.0,
+    ),
+    "abdominal": ConvexProbe(
+        radius_mm=60.0, field_of_view_deg=70.0, depth_mm=160.0, frequency_mhz=3.5, aperture_mm=20.0,
+        elevation_aperture_mm=12.0,
+    ),
+}  # fmt: skip

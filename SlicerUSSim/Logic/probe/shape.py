@@ -1,0 +1,110 @@
+"""What a probe looks like in 3D: the outline of its field, the field itself, the body in the sonographer's hand."""
+
+from __future__ import annotations
+
+import numpy as np
+from vtkmodules.util.numpy_support import numpy_to_vtk
+from vtkmodules.vtkCommonCore import vtkPoints
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+from vtkmodules.vtkFiltersCore import vtkAppendPolyData, vtkPolyDataNormals
+
+from SlicerUSSim.Logic.probe.arrays import Probe
+
+#: Housing around a face, and the least half width of one that a hand can hold, mm.
+_HOUSING_MM, _LEAST_HALF_WIDTH_MM, _HALF_THICKNESS_MM = 3.0, 9.0, 8.0
+#: Sections of the handle: mm behind the face, half width and half thickness there.
+_HANDLE = ((34.0, 14.0, 11.0), (86.0, 14.0, 11.0), (92.0, 11.0, 8.5))
+#: The housing goes on like the face for so far, mm.
+_STRAIGHT_MM = 16.0
+#: The ridge that tells one side from the other: from and to mm behind the face, half width, half thickness.
+_RIDGE = (5.0, 30.0, 2.6, 1.8)
+_RING_POINTS = 48
+
+
+def outline_polydata(probe: Probe) -> vtkPolyData:
+    """The outline of the imaged field in the probe frame (mm), one closed line."""
+    corners = probe.outline_mm()
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(corners), deep=True))
+    lines = vtkCellArray()
+    lines.InsertNextCell(len(corners), list(range(len(corners))))
+    outline = vtkPolyData()
+    outline.SetPoints(points)
+    outline.SetLines(lines)
+    return outline
+
+
+def field_polydata(probe: Probe) -> vtkPolyData:
+    """The imaged field in the probe frame (mm) as triangles; texture coordinates lay its image over it."""
+    left, right, top, bottom = probe.image_bounds_mm()
+    corners = probe.outline_mm()[:-1]
+    half = len(corners) // 2  # along the face, then back along the far end
+    polydata = vtkPolyData()
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(corners), deep=True))
+    polydata.SetPoints(points)
+    strip = vtkCellArray()
+    order = [corner for n in range(half) for corner in (n, len(corners) - 1 - n)]
+    strip.InsertNextCell(len(order), order)
+    polydata.SetStrips(strip)
+    # A texture's first row is an image's, the uppermost.
+    across, down = (corners[:, 0] - left) / (right - left), (corners[:, 1] - top) / (bottom - top)
+    coordinates = numpy_to_vtk(np.stack([across, down], axis=1).astype(np.float32), deep=True)
+    coordinates.SetName("TextureCoordinates")
+    polydata.GetPointData().SetTCoords(coordinates)
+    return polydata
+
+
+def probe_polydata(probe: Probe) -> vtkPolyData:
+    """A probe's body behind its face, in the probe frame (mm), with a ridge on the side that is left in the image.
+
+    For people to see how the probe is held; nothing is simulated with it. Cell scalars "Part" are 1 on the ridge.
+    """
+    half_face = max(float(np.abs(probe.origins_mm()[:, 0]).max()) + _HOUSING_MM, _LEAST_HALF_WIDTH_MM)
+    face = _ring(half_face, _HALF_THICKNESS_MM)
+    if not probe.is_linear:
+        radius = max(probe.apex_radius_mm, 1.5 * half_face)
+        face[:, 1] = np.sqrt(radius**2 - face[:, 0] ** 2) - radius
+    housing = _ring(half_face, _HALF_THICKNESS_MM) - [0.0, _STRAIGHT_MM, 0.0]
+    handle = [_ring(width, thickness) - [0.0, behind, 0.0] for behind, width, thickness in _HANDLE]
+    first, last, width, thickness = _RIDGE
+    ridge = [_ring(width, thickness) - [half_face, behind, 0.0] for behind in (first, last)]
+    joined = vtkAppendPolyData()
+    joined.AddInputData(_lofted([face, housing, *handle], 0))
+    joined.AddInputData(_lofted(ridge, 1))
+    normals = vtkPolyDataNormals()
+    normals.SetInputConnection(joined.GetOutputPort())
+    normals.SetFeatureAngle(50.0)
+    normals.AutoOrientNormalsOn()
+    normals.Update()
+    return normals.GetOutput()
+
+
+def _ring(half_width: float, half_thickness: float) -> np.ndarray:
+    """(points, 3) of a rounded rectangle across the probe's axis, as housings are."""
+    turn = np.linspace(0.0, 2 * np.pi, _RING_POINTS, endpoint=False)
+    x, z = (np.sign(v) * np.sqrt(np.abs(v)) for v in (np.cos(turn), np.sin(turn)))
+    return np.stack([half_width * x, 0.0 * x, half_thickness * z], axis=1)
+
+
+def _lofted(rings: list[np.ndarray], part: int) -> vtkPolyData:
+    """Rings of (points, 3), joined by quadrilaterals and closed at both ends."""
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(np.concatenate(rings)), deep=True))
+    numbers = np.arange(len(rings) * _RING_POINTS).reshape(len(rings), _RING_POINTS)
+    after = np.roll(numbers, -1, axis=1)
+    cells = vtkCellArray()
+    for quadrilateral in np.stack([numbers[:-1], after[:-1], after[1:], numbers[1:]], axis=-1).reshape(-1, 4):
+        cells.InsertNextCell(4, quadrilateral.tolist())
+    opposite = -np.arange(_RING_POINTS // 2 + 1) % _RING_POINTS  # across the thickness: at the same x, where ends curve
+    for ring, turned_round in ((numbers[0], True), (numbers[-1], False)):
+        near, far = ring[: _RING_POINTS // 2 + 1], ring[opposite]
+        for strip in np.stack([near[:-1], near[1:], far[1:], far[:-1]], axis=-1):
+            cells.InsertNextCell(4, (strip[::-1] if turned_round else strip).tolist())
+    polydata = vtkPolyData()
+    polydata.SetPoints(points)
+    polydata.SetPolys(cells)
+    scalars = numpy_to_vtk(np.full(cells.GetNumberOfCells(), part, np.uint8), deep=True)
+    scalars.SetName("Part")
+    polydata.GetCellData().SetScalars(scalars)
+    return polydata

@@ -1,0 +1,204 @@
+"""PatientSurface: where a probe can lie on a patient: the outside of what is labelled, closed over sulci."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonCore import mutable
+from vtkmodules.vtkCommonDataModel import vtkPolyData, vtkStaticCellLocator
+from vtkmodules.vtkCommonTransforms import vtkTransform
+from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D, vtkPolyDataNormals, vtkQuadricDecimation
+from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.probe.placement import angles_to_surface, carried, turned
+
+#: Voxels of this size are fine enough to lie on, and coarse enough to be made while one waits, mm.
+_VOXEL_MM = 2.0
+#: Gaps narrower than twice this are bridged, as a probe's face bridges a sulcus.
+_CLOSING_MM = 8.0
+_SMOOTHING_MM = 2.0
+#: A probe's face rests on a patch of this radius; its normal is the mean over the patch.
+_PATCH_MM = 10.0
+#: Share of the triangles that a smooth surface looks the same without.
+_DROPPED = 0.85
+#: A probe that slides is held within these of the surface, wherever it came from, mm.
+_LIFT_MM = (-5.0, 20.0)
+_UP = np.array([0.0, 0.0, 1.0])
+#: Probe on the vertex of the head that looks down, its lateral axis to the patient's right.
+_LOOKING_DOWN = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+@dataclass(frozen=True)
+class SurfacePose:
+    """A probe's pose as a sonographer says it: where on the patient, and how it is held there."""
+
+    #: Where on the surface, away from the vertex of the head; see PatientSurface.angles
+    right_deg: float
+    front_deg: float
+    #: Turned about its own axis: at 0, in front of the vertex, the image's lateral axis points to the patient's right
+    rotate_deg: float
+    #: Against the normal of the surface; see placement.turned
+    rock_deg: float
+    tilt_deg: float
+    #: Between surface and face; negative is pressed in
+    lift_mm: float
+
+
+class PatientSurface:
+    """The surface around the labelled voxels, smooth enough to slide a probe over.
+
+    Parameters
+    ----------
+    labels : non-zero is the patient, in whatever frame `labels.ijk_to_ras` leads to; all points here are in it.
+
+    Raises SimulationError for labels that are all zero.
+    """
+
+    def __init__(self, labels: Volume) -> None:
+        require(bool((labels.array > 0).any()), "the label map is empty, expected voxels for a probe to lie on")
+        self.polydata: vtkPolyData = _closed_surface(labels)
+        points = vtk_to_numpy(self.polydata.GetPoints().GetData()).astype(float)
+        self._normals = vtk_to_numpy(self.polydata.GetPointData().GetNormals()).astype(float)
+        self._tree = cKDTree(points)
+        self._locator = vtkStaticCellLocator()
+        self._locator.SetDataSet(self.polydata)
+        self._locator.BuildLocator()
+        #: The same with fewer triangles, for renderers without a GPU
+        self.coarse_polydata: vtkPolyData = _with_fewer_triangles(self.polydata)
+        low, high = points.min(axis=0), points.max(axis=0)
+        #: (3,) the middle of the patient's bounding box, which angles() are seen from
+        self.centre = 0.5 * (low + high)
+        self._radius = float(np.linalg.norm(high - low))
+
+    def nearest(self, point) -> np.ndarray:
+        """(3,) the point of the surface that is closest to `point`."""
+        closest, cell, part, distance = [0.0, 0.0, 0.0], mutable(0), mutable(0), mutable(0.0)
+        self._locator.FindClosestPoint(list(map(float, point)), closest, cell, part, distance)
+        return np.array(closest)
+
+    def hit(self, start, end) -> np.ndarray | None:
+        """(3,) where the line from `start` to `end` first meets the surface, or None."""
+        t, point, parametric = mutable(0.0), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        part, cell = mutable(0), mutable(0)
+        met = self._locator.IntersectWithLine(
+            list(map(float, start)), list(map(float, end)), 1e-6, t, point, parametric, part, cell
+        )
+        return np.array(point) if met else None
+
+    def normal(self, point) -> np.ndarray:
+        """(3,) outward normal of the patch around a point of the surface, as a probe's face feels it."""
+        point = np.asarray(point, float)
+        near = self._tree.query_ball_point(point, _PATCH_MM) or [self._tree.query(point)[1]]
+        away = np.linalg.norm(self._tree.data[near] - point, axis=1) / _PATCH_MM
+        mean = (1.0 - np.minimum(away, 0.999) ** 2) ** 2 @ self._normals[near]
+        length = np.linalg.norm(mean)
+        return mean / length if length > 1e-6 else self._normals[near[0]]
+
+    def angles(self, point) -> tuple[float, float]:
+        """(to the right, to the front) in degrees: where a point is, seen from the centre, away from straight up.
+
+        An azimuthal equidistant map: both zero at the vertex of the head, (90, 0) at the right ear, (0, 90) at the
+        forehead; only straight down is singular.
+        """
+        x, y, z = np.asarray(point, float) - self.centre
+        away, across = np.rad2deg(np.arctan2(np.hypot(x, y), z)), np.hypot(x, y)
+        return (float(away * x / across), float(away * y / across)) if across > 1e-9 else (0.0, 0.0)
+
+    def at(self, right_deg: float, front_deg: float) -> np.ndarray:
+        """(3,) the outermost point of the surface in the direction of these angles; the inverse of angles()."""
+        away, across = np.deg2rad(np.hypot(right_deg, front_deg)), np.arctan2(front_deg, right_deg)
+        outward = np.array([np.sin(away) * np.cos(across), np.sin(away) * np.sin(across), np.cos(away)])
+        far = self.centre + self._radius * outward
+        found = self.hit(far, self.centre)
+        return self.nearest(far) if found is None else found
+
+    def where(self, probe_to_ras: np.ndarray) -> SurfacePose:
+        """A probe's pose (4, 4), said by the surface that is nearest to its face."""
+        face = probe_to_ras[:3, 3]
+        point = self.nearest(face)
+        normal = self.normal(point)
+        rock, tilt = angles_to_surface(probe_to_ras, normal)
+        upright = probe_to_ras @ np.linalg.inv(turned(np.eye(4), rock_deg=rock, tilt_deg=tilt))
+        across = carried(_LOOKING_DOWN, face, _UP, normal)[:3, :3].T @ upright[:3, 0]
+        rotate = np.rad2deg(np.arctan2(-across[2], across[0]))
+        return SurfacePose(*self.angles(point), float(rotate), rock, tilt, float((face - point) @ normal))
+
+    def held(self, probe_to_ras: np.ndarray, **changes: float) -> np.ndarray:
+        """(4, 4) probe_to_ras with some values of its SurfacePose changed; a face that is not moved stays exactly."""
+        pose = replace(self.where(probe_to_ras), **changes)
+        if {"right_deg", "front_deg", "lift_mm"} & set(changes):
+            point = self.at(pose.right_deg, pose.front_deg)
+            normal = self.normal(point)
+            face = point + pose.lift_mm * normal
+        else:
+            face = probe_to_ras[:3, 3]
+            normal = self.normal(self.nearest(face))
+        upright = turned(carried(_LOOKING_DOWN, face, _UP, normal), rotate_deg=pose.rotate_deg)
+        return turned(upright, rock_deg=pose.rock_deg, tilt_deg=pose.tilt_deg)
+
+    def slid(self, probe_to_ras: np.ndarray, point, *, upright: bool = True) -> np.ndarray:
+        """(4, 4) probe_to_ras slid to where the surface is nearest to `point`, as far above it as it was.
+
+        An `upright` probe comes to stand along the normal there; another one keeps its angles to the surface.
+        """
+        face = probe_to_ras[:3, 3]
+        here, there = self.nearest(face), self.nearest(point)
+        old, new = self.normal(here), self.normal(there)
+        lift = np.clip((face - here) @ old, *_LIFT_MM)
+        return carried(probe_to_ras, there + lift * new, -probe_to_ras[:3, 1] if upright else old, new)
+
+
+def _closed_surface(labels: Volume) -> vtkPolyData:
+    spacing = np.array(labels.spacing_mm)[::-1]  # k, j, i
+    step = np.maximum(1, np.round(_VOXEL_MM / spacing)).astype(int)
+    margin = np.ceil((_CLOSING_MM + 3 * _SMOOTHING_MM) / (step * spacing)).astype(int)
+    inside = np.pad(_coarse(labels.array > 0, step), [(m, m) for m in margin])
+    size = step * spacing
+    near = ndimage.distance_transform_edt(~inside, sampling=size) <= _CLOSING_MM
+    closed = ndimage.distance_transform_edt(near, sampling=size) > _CLOSING_MM
+    soft = ndimage.gaussian_filter((closed | inside).astype(np.float32), _SMOOTHING_MM / size)
+
+    contour = vtkFlyingEdges3D()
+    contour.SetInputData(Volume(soft, np.eye(4)).to_vtk())
+    contour.SetValue(0, 0.5)
+    contour.ComputeNormalsOff()
+    to_ras = labels.ijk_to_ras.copy()  # of the middles of the coarse voxels
+    to_ras[:3, 3] += to_ras[:3, :3] @ (0.5 * (step[::-1] - 1) - step[::-1] * margin[::-1])
+    to_ras[:3, :3] *= step[::-1]
+    transform = vtkTransform()
+    transform.SetMatrix(vtk_matrix(to_ras))
+    placed = vtkTransformPolyDataFilter()
+    placed.SetInputConnection(contour.GetOutputPort())
+    placed.SetTransform(transform)
+    return _with_normals(placed)
+
+
+def _with_fewer_triangles(polydata: vtkPolyData) -> vtkPolyData:
+    fewer = vtkQuadricDecimation()
+    fewer.SetInputData(polydata)
+    fewer.SetTargetReduction(_DROPPED)
+    return _with_normals(fewer)
+
+
+def _with_normals(source) -> vtkPolyData:
+    normals = vtkPolyDataNormals()
+    normals.SetInputConnection(source.GetOutputPort())
+    normals.AutoOrientNormalsOn()
+    normals.SplittingOff()
+    normals.Update()
+    return normals.GetOutput()
+
+
+def _coarse(inside: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Blocks of step voxels that hold any of the patient."""
+    wanted = -(-np.array(inside.shape) // step) * step
+    padded = np.pad(inside, [(0, extra) for extra in wanted - inside.shape])
+    k, j, i = wanted // step
+    return padded.reshape(k, step[0], j, step[1], i, step[2]).any(axis=(1, 3, 5))

@@ -1,0 +1,17 @@
+"""Tissues: their acoustic parameters with sources, the labels and names they go by, and their texture.
+
+A tissue is six numbers; a TissueTable says which tissue every label of a label map stands for.
+"""
+
+from typing import TYPE_CHECKING
+
+from SlicerUSSim.Logic.base.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from .names import same_name as same_name, tissue_named as tissue_named
+    from .presets import TISSUES as TISSUES, colour_of as colour_of
+    from .table import TissueTable as TissueTable
+    from .texture import Texture as Texture
+    from .tissue import Membrane as Membrane, Tissue as Tissue
+
+lazy_exports(globals())

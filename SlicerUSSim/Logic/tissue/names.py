@@ -1,0 +1,51 @@
+"""Names of tissues, as label maps and segmentations of other programs use them."""
+
+from __future__ import annotations
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+
+#: Other names for the same tissue, as label maps and segmentations use them.
+_ALIASES = {
+    "background": "coupling", "cerebrospinal fluid": "csf", "ventricles": "csf", "cyst": "csf",
+    "gray matter": "grey matter",
+    "gm": "grey matter", "wm": "white matter", "tumor": "tumour", "dura": "falx", "skin": "scalp", "vessels": "blood",
+    "vessel": "blood", "cortical bone": "bone", "choroid plexus": "enhancing",
+}  # fmt: skip
+
+
+#: What a longer name, such as FreeSurfer's or a colleague's, is taken for by a word in it; the first that is found.
+_WORDS = {
+    "white matter": "white matter", "corpus callosum": "white matter", "ventricle": "csf", "csf": "csf",
+    "choroid plexus": "enhancing", "grey matter": "grey matter", "gray matter": "grey matter", "cortex": "grey matter",
+    "ctx": "grey matter", "thalamus": "grey matter", "caudate": "grey matter", "putamen": "grey matter",
+    "pallidum": "grey matter", "hippocampus": "grey matter", "amygdala": "grey matter", "accumbens": "grey matter",
+    "brain stem": "white matter", "tumor": "tumour", "tumour": "tumour", "glioma": "tumour", "metastasis": "tumour",
+    "meningioma": "tumour", "falx": "falx", "tentorium": "falx", "dura": "falx", "artery": "blood", "vein": "blood",
+    "vessel": "blood", "sinus": "blood", "skull": "skull", "scalp": "scalp", "skin": "scalp", "bone": "bone",
+    "muscle": "muscle", "liver": "liver", "kidney": "kidney", "fat": "fat", "cyst": "csf", "air": "air",
+}  # fmt: skip
+
+
+def plain_name(name: str) -> str:
+    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+
+
+def same_name(a: str, b: str) -> bool:
+    """Whether two names differ only in case, hyphens and underscores."""
+    return plain_name(a) == plain_name(b)
+
+
+def tissue_named(name: str) -> Tissue:
+    """The preset for a tissue name: case, usual synonyms, and words in a longer name ("Left-Cerebral-White-Matter").
+
+    Raises SimulationError for a name that means none of them.
+    """
+    key = plain_name(name)
+    key = _ALIASES.get(key, key)
+    if key not in TISSUES:
+        texts = f" {key} ", f" {key} ".replace("s ", " ")  # as it stands, and without plurals
+        key = next((tissue for word, tissue in _WORDS.items() if any(f" {word} " in text for text in texts)), key)
+    require(key in TISSUES, f"no preset for tissue {name!r}, expected one of: {', '.join(TISSUES)}")
+    return TISSUES[key]

@@ -1,0 +1,83 @@
+"""Preset tissues with the source of every number, and their colours."""
+
+from __future__ import annotations
+
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+
+_ITIS = "IT'IS Foundation tissue properties database v4"
+_SZABO = "Szabo, Diagnostic Ultrasound Imaging (2004), table B.1"
+_DUCK = "Duck, Physical Properties of Tissue (1990)"
+_PAPER = "Salehi et al., MICCAI 2015, table 1 (mean after optimisation, rounded)"
+_PAPER_BEFORE = "Salehi et al., MICCAI 2015, table 1 (before optimisation)"
+
+
+def _level(text: str) -> str:
+    return f"this project: {text}"
+
+
+def _tissue(name, c, c_source, z, z_source, alpha, alpha_source, mu0=0.0, mu1=0.0, sigma0=0.0, scatter="") -> Tissue:
+    sources = {"speed_of_sound_m_s": c_source, "impedance_mrayl": z_source, "attenuation_db_cm_mhz": alpha_source}
+    sources |= dict.fromkeys(("mu0", "mu1", "sigma0"), scatter or "no scatterers")
+    return Tissue(name, c, z, alpha, mu0, mu1, sigma0, sources)
+
+
+_DENSITY = f"density ({_ITIS}) x speed of sound"
+
+
+# Grey and white matter share Szabo's speed for brain and one impedance: published differences between them are smaller
+# than between publications, and a difference would bend rays at every voxel of a border that is not a sharp interface.
+# fmt: off
+TISSUES: dict[str, Tissue] = {
+    tissue.name: tissue
+    for tissue in (
+        _tissue("coupling", 1504.5, "as CSF: saline over an open craniotomy", 1.515, "as CSF", 0.002, "as CSF"),
+        _tissue("csf", 1504.5, _ITIS, 1.515, f"1007 kg/m3 {_DENSITY}", 0.002, "as water, " + _DUCK),
+        _tissue("grey matter", 1541.0, f"brain, {_SZABO}", 1.607, f"brain, 1043 kg/m3 {_DENSITY}", 0.50,
+                f"cortex is below white matter, {_DUCK}", 0.20, 0.0, 0.08, _level("about 5 dB below white matter")),
+        _tissue("white matter", 1541.0, f"brain, {_SZABO}", 1.607, f"brain, 1043 kg/m3 {_DENSITY}", 0.54, _PAPER_BEFORE,
+                0.33, 0.0, 0.15, _PAPER),
+        _tissue("enhancing", 1550.0, "within the range for tumours, " + _DUCK, 1.63, "glioma, as for tumour", 0.60,
+                "between brain and tumour", 0.70, 0.0, 0.35, _level("vessels, choroid plexus: 7 dB above white")),
+        _tissue("tumour", 1550.0, "within the range for tumours, " + _DUCK, 1.63, "slightly denser than brain", 0.70,
+                "more than brain, " + _DUCK, 0.60, 0.0, 0.28, _level("about 6 dB above white matter")),
+        _tissue("falx", 1600.0, "collagenous membrane, " + _DUCK, 1.80, f"dura 1174 kg/m3 {_DENSITY}, softened", 1.0,
+                "connective tissue, " + _DUCK, 0.90, 0.0, 0.45, _level("about 10 dB above white matter")),
+        _tissue("leptomeninges", 1541.0, "as brain: too thin to matter", 1.607, "as brain", 0.54, "as brain",
+                0.90, 0.0, 0.50, _level("about 9 dB above white matter: arachnoid, pia, vessels in sulci; ependyma")),
+        _tissue("skull", 2814.0, f"skull, {_ITIS}", 5.37, f"1908 kg/m3 {_DENSITY}", 7.8, f"skull, {_DUCK}",
+                0.50, 0.0, 0.30, _level("masked by its own surface echo")),
+        _tissue("scalp", 1624.0, f"skin, {_ITIS}", 1.80, f"skin 1109 kg/m3 {_DENSITY}", 0.80, f"skin, {_DUCK}",
+                0.60, 0.0, 0.30, _level("echogenic skin and fat")),
+        _tissue("blood", 1584.0, _SZABO, 1.679, f"1060 kg/m3, {_SZABO}", 0.14, _SZABO, 0.03, 0.0, 0.02,
+                _level("some 20 dB below tissue at 5 MHz")),
+        _tissue("water", 1524.0, "37 degrees C, " + _DUCK, 1.514, "993 kg/m3, " + _DUCK, 0.002, _DUCK),
+        _tissue("gel", 1540.0, "coupling gel, matched to tissue", 1.57, "1020 kg/m3 x 1540 m/s", 0.05, "nearly water"),
+        _tissue("air", 343.0, "20 degrees C", 0.0004, "1.2 kg/m3 x 343 m/s", 12.0, f"at 1 MHz, {_DUCK}"),
+        _tissue("fat", 1430.0, _SZABO, 1.327, f"928 kg/m3, {_SZABO}", 0.60, _SZABO, 0.25, 0.0, 0.12,
+                _level("hypoechoic lobules")),
+        _tissue("muscle", 1580.0, _SZABO, 1.645, f"1041 kg/m3, {_SZABO}", 0.57, _SZABO, 0.28, 0.0, 0.14,
+                _level("below liver across the fibres")),
+        _tissue("liver", 1578.0, _SZABO, 1.657, f"1050 kg/m3, {_SZABO}", 0.45, _SZABO, 0.40, 0.0, 0.20,
+                _level("reference for the abdomen")),
+        _tissue("kidney", 1560.0, _SZABO, 1.638, f"1050 kg/m3, {_SZABO}", 1.0, f"kidney, {_DUCK}", 0.28, 0.0, 0.13,
+                _level("cortex slightly below liver")),
+        _tissue("bone", 3198.0, _SZABO, 6.364, f"1990 kg/m3, {_SZABO}", 3.54, _SZABO, 0.50, 0.0, 0.30,
+                _level("masked by its own surface echo")),
+    )
+}
+# fmt: on
+
+#: Colours of tissues in pictures, label maps and segmentations: quiet and distinguishable; red, green, blue, 0 to 1.
+_COLOURS = {
+    "csf": (0.17, 0.37, 0.54), "grey matter": (0.55, 0.55, 0.55), "white matter": (0.91, 0.89, 0.85),
+    "leptomeninges": (0.78, 0.35, 0.33), "enhancing": (0.85, 0.64, 0.25), "tumour": (0.37, 0.62, 0.43),
+    "falx": (0.56, 0.42, 0.70), "blood": (0.75, 0.10, 0.10), "skull": (0.95, 0.93, 0.75), "bone": (0.95, 0.93, 0.75),
+    "scalp": (0.87, 0.72, 0.63), "fat": (0.93, 0.83, 0.45), "muscle": (0.70, 0.33, 0.29), "liver": (0.52, 0.23, 0.19),
+    "kidney": (0.65, 0.30, 0.25), "water": (0.30, 0.60, 0.85), "gel": (0.45, 0.75, 0.85), "air": (0.85, 0.95, 1.0),
+}  # fmt: skip
+_OTHER_COLOUR = (0.3, 0.75, 0.8)
+
+
+def colour_of(tissue_name: str) -> tuple[float, float, float]:
+    """Red, green, blue from 0 to 1 of a tissue in pictures, label maps and segmentations."""
+    return _COLOURS.get(tissue_name, _OTHER_COLOUR)

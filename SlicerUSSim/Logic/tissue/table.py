@@ -1,0 +1,189 @@
+"""TissueTable: which tissue every label of a label map stands for."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
+
+MAX_LABEL = 62  # six bits in the device's label volume, and 63 is the membrane
+
+
+class TissueTable(Mapping):
+    """Which tissue every label stands for: a read-only mapping {label: Tissue}, and the membrane, if any.
+
+    Label 0 is the coupling medium around the patient and is added when it is not given.
+    Raises SimulationError for labels outside 0..62.
+    """
+
+    def __init__(self, tissues: Mapping[int, Tissue], membrane: Membrane | None = None) -> None:
+        table = {}
+        for label, tissue in tissues.items():
+            require(
+                isinstance(label, int | np.integer) and 0 <= label <= MAX_LABEL,
+                f"tissue label is {label!r}, expected a whole number from 0 to {MAX_LABEL}",
+            )
+            require(isinstance(tissue, Tissue), f"label {label}: {tissue!r} is not a Tissue")
+            table[int(label)] = tissue
+        table.setdefault(0, TISSUES["coupling"])
+        self._tissues = dict(sorted(table.items()))
+        self.membrane = membrane
+
+    def __getitem__(self, label: int) -> Tissue:
+        return self._tissues[label]
+
+    def __iter__(self):
+        return iter(self._tissues)
+
+    def __len__(self) -> int:
+        return len(self._tissues)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, TissueTable) and (self._tissues, self.membrane) == (other._tissues, other.membrane)
+
+    def __repr__(self) -> str:
+        names = ", ".join(f"{label}: {tissue.name}" for label, tissue in self.items())
+        return f"TissueTable({names}{'' if self.membrane is None else '; ' + self.membrane.tissue.name})"
+
+    # ---- presets -----------------------------------------------------------------------------------------------
+
+    @classmethod
+    def brain(cls, tissue_names: Iterable[str] = ("csf", "grey matter", "white matter")) -> TissueTable:
+        """Presets for labels 1, 2, ... named `tissue_names`, with leptomeninges and ependyma as the membrane."""
+        return cls.named(tissue_names, Membrane(TISSUES["leptomeninges"]))
+
+    @classmethod
+    def named(cls, tissue_names: Iterable[str], membrane: Membrane | None = None) -> TissueTable:
+        """Presets for labels 1, 2, ... by name, for the body as for the brain. SimulationError for a new one."""
+        return cls({label: tissue_named(name) for label, name in enumerate(tissue_names, 1)}, membrane)
+
+    def label_of(self, name: str) -> int:
+        """The label of a tissue by name. Raises SimulationError if the table has none of that name."""
+        for label, tissue in self.items():
+            if tissue.name == name:
+                return label
+        raise SimulationError(f"no tissue named {name!r} in the table, expected one of: {', '.join(self.names())}")
+
+    def names(self) -> list[str]:
+        """Tissue names in the order of their labels."""
+        return [tissue.name for tissue in self.values()]
+
+    def all_tissues(self) -> list[Tissue]:
+        """Tissues in the order of their labels, the membrane's last."""
+        return [*self.values(), *([] if self.membrane is None else [self.membrane.tissue])]
+
+    def tissue(self, name: str) -> Tissue:
+        """The tissue of that name, the membrane's too. Raises SimulationError that lists the names if there is none."""
+        for tissue in self.all_tissues():
+            if tissue.name == name:
+                return tissue
+        names = dict.fromkeys(tissue.name for tissue in self.all_tissues())
+        raise SimulationError(f"no tissue named {name!r}, expected one of: {', '.join(names)}")
+
+    def with_tissue(self, tissue: Tissue) -> TissueTable:
+        """A new table in which everything of that name, the membrane too, is `tissue`; added if nothing is."""
+        labels = [label for label, old in self.items() if old.name == tissue.name]
+        membrane = self.membrane
+        if membrane is not None and membrane.tissue.name == tissue.name:
+            membrane = replace(membrane, tissue=tissue)
+        elif not labels:
+            labels = [next(label for label in range(MAX_LABEL + 1) if label not in self)]
+        return TissueTable({**self, **dict.fromkeys(labels, tissue)}, membrane)
+
+    def replace(self, name: str, **changes) -> TissueTable:
+        """A new table in which the tissue `name` (the membrane's too) has the given parameters changed."""
+        known = {field.name for field in fields(Tissue)}
+        for parameter in changes:
+            require(
+                parameter in known,
+                f"{parameter!r} is not a tissue parameter, expected one of: {', '.join(sorted(known))}",
+            )
+        if self.membrane is not None and name == self.membrane.tissue.name and name not in self.names():
+            return TissueTable(self, replace(self.membrane, tissue=replace(self.membrane.tissue, **changes)))
+        label = self.label_of(name)
+        return TissueTable({**self, label: replace(self[label], **changes)}, self.membrane)
+
+    def for_names(self, names: Iterable[str]) -> TissueTable:
+        """A table for labels 1, 2, ... named `names`: every tissue from this table if it has one of that name, else
+        from the presets; coupling medium and membrane stay.
+
+        Raises SimulationError that lists the names nobody knows.
+        """
+        mine = {plain_name(tissue.name): tissue for tissue in self.values()}
+        table, unknown = {0: self[0]}, []
+        for label, name in enumerate(names, 1):
+            try:
+                table[label] = mine.get(plain_name(name)) or tissue_named(name)
+            except SimulationError:
+                unknown.append(name)
+        require(
+            not unknown,
+            f"no tissue for {', '.join(map(repr, unknown))}, expected names among: {', '.join(TISSUES)}",
+        )
+        return TissueTable(table, self.membrane)
+
+    def with_membrane(self, membrane: Membrane | None) -> TissueTable:
+        """A new table with another membrane, or none."""
+        return TissueTable(self, membrane)
+
+    # ---- JSON --------------------------------------------------------------------------------------------------
+
+    def to_dict(self) -> dict:
+        """Plain values; from_dict reads them back."""
+        values = {"tissues": {str(label): _plain(tissue) for label, tissue in self.items()}}
+        if self.membrane is not None:
+            values["membrane"] = {
+                "tissue": _plain(self.membrane.tissue),
+                "thickness_mm": self.membrane.thickness_mm,
+                "fluids": list(self.membrane.fluids),
+            }
+        return values
+
+    @classmethod
+    def from_dict(cls, values: dict, source: str = "tissues") -> TissueTable:
+        """The table described by to_dict. Raises SimulationError naming `source` and what is wrong in it."""
+        require(
+            isinstance(values, dict) and isinstance(values.get("tissues"), dict),
+            f'{source}: expected {{"tissues": {{"1": {{...}}}}}}',
+        )
+        try:
+            table = {int(label): Tissue(**tissue) for label, tissue in values["tissues"].items()}
+            membrane = values.get("membrane")
+            if membrane is not None:
+                membrane = Membrane(**{**membrane, "tissue": Tissue(**membrane["tissue"])})
+            return cls(table, membrane)
+        except SimulationError as error:
+            raise SimulationError(f"{source}: {error}") from None
+        except (TypeError, ValueError, KeyError, AttributeError) as error:
+            raise SimulationError(f"{source}: not a tissue table ({error})") from None
+
+    @classmethod
+    def read(cls, path: str | os.PathLike) -> TissueTable:
+        """Read a table from JSON. Raises SimulationError for a missing, unreadable or wrong file."""
+        return cls.from_dict(read_json(path), str(path))
+
+    def write(self, path: str | os.PathLike) -> None:
+        """Write the table as JSON, whole or not at all."""
+        write_json(path, self.to_dict())
+
+
+def _plain(tissue: Tissue) -> dict:
+    return {**asdict(replace(tissue, sources={})), "sources": dict(tissue.sources)}
+
+
+def tissues_beside(labels: Path) -> Path:
+    """Where the tissue table of a label map lies: beside it, .json."""
+    name = labels.name
+    for suffix in (".nii.gz", labels.suffix):
+        if suffix and name.endswith(suffix):
+            return labels.with_name(name[: -len(suffix)] + ".json")
+    return labels.with_name(name + ".json")

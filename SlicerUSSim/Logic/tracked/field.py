@@ -1,0 +1,209 @@
+"""estimate_field: what a scanner's images show of its geometry: the imaged field, and the probe that would see it.
+
+Scanners draw the field on black, with rulers, logos and text beside it. The field is the largest connected part of
+what is ever bright; its two straight sides say whether lines are parallel or meet in an apex.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between
+from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.probe.arrays import Probe, probe_from_dict
+
+#: Grey levels above this are not the black around the field.
+_DARK = 4
+#: Sides closer to parallel than this belong to a linear array, degrees each.
+_PARALLEL_DEG = 1.5
+#: Apex radius below this share of the outer one is a phased array.
+_POINT_SHARE = 0.06
+#: The estimate has to cover and be covered by what is bright (intersection over union).
+_LEAST_OVERLAP = 0.85
+
+
+@dataclass(frozen=True, eq=False)
+class ImagedField:
+    """The imaged field of an image, as a probe and its place in the image."""
+
+    probe: Probe
+    #: (4, 4) from (column, row, 0, 1) to the probe frame, millimetres
+    image_to_probe: np.ndarray
+    #: (rows, columns) bool, what lies in the field
+    mask: np.ndarray
+    #: How well the field explains what is bright: intersection over union, 1 is perfect; NaN if it was not estimated
+    overlap: float = float("nan")
+
+    @classmethod
+    def of(cls, probe: Probe, image_to_probe: np.ndarray, shape: tuple[int, int], overlap=float("nan")) -> ImagedField:
+        """The field of a known probe in an image of `shape` (rows, columns)."""
+        columns, rows = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
+        x = image_to_probe[0, 0] * columns + image_to_probe[0, 1] * rows + image_to_probe[0, 3]
+        y = image_to_probe[1, 0] * columns + image_to_probe[1, 1] * rows + image_to_probe[1, 3]
+        return cls(probe, image_to_probe, probe.holds(x, y), overlap)
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns that just hold the field. Raises SimulationError if it lies outside the image."""
+        rows, columns = (np.flatnonzero(self.mask.any(axis=axis)) for axis in (1, 0))
+        require(rows.size > 0, "the probe's field lies outside the images")
+        return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+    def outline_pixels(self) -> np.ndarray:
+        """(points, 2) closed outline as (column, row), for drawing."""
+        outline = self.probe.outline_mm()
+        points = np.concatenate([outline, np.ones((len(outline), 1))], axis=1) @ np.linalg.inv(self.image_to_probe).T
+        return points[:, :2]
+
+
+def estimate_field(
+    images: np.ndarray,
+    pixel_spacing_mm: tuple[float, float] | None = None,
+    *,
+    width_mm: float | None = None,
+    depth_mm: float | None = None,
+    **probe_parameters,
+) -> ImagedField:
+    """The field that images show, and the probe that would see it.
+
+    Parameters
+    ----------
+    images : (n, rows, columns) or (rows, columns) uint8, rows away from the probe; more images show more of the field.
+    pixel_spacing_mm : (column, row). Without it, pixels are square and their size follows from the next:
+    width_mm : of a linear probe's face, or
+    depth_mm : of the field along its lines.
+    probe_parameters : of the probe beside its geometry, such as frequency_mhz.
+
+    Raises SimulationError where no field is found (black images, or a bright part of another
+    shape), and where nothing says how large a pixel is.
+    """
+    images = np.asarray(images)
+    stack = images if images.ndim == 3 else images[None]
+    require(stack.ndim == 3 and stack.size > 0, f"images have shape {images.shape}, expected (n, rows, columns)")
+    bright = _field_pixels(stack.max(axis=0))
+    scale = np.asarray((1.0, 1.0) if pixel_spacing_mm is None else pixel_spacing_mm, float)
+    require(
+        scale.shape == (2,) and bool((scale > 0).all()), f"pixel spacing is {pixel_spacing_mm}, expected (x, y) in mm"
+    )
+    left, right = _sides(bright, scale)
+    rows, columns = np.nonzero(bright)
+    points = np.stack([columns, rows], axis=1) * scale
+    if max(abs(left[1]), abs(right[1])) < np.tan(np.deg2rad(_PARALLEL_DEG)):
+        kind, geometry, origin = _linear(points, scale)
+    else:
+        kind, geometry, origin = _sector(points, left, right, scale)
+    if pixel_spacing_mm is None:
+        size = _size_of_pixel(geometry, width_mm=width_mm, depth_mm=depth_mm)
+        geometry = {name: value * size if name.endswith("_mm") else value for name, value in geometry.items()}
+        scale, origin = size * scale, size * origin
+    image_to_probe = np.diag([*scale, 1.0, 1.0])
+    image_to_probe[:2, 3] = -origin
+    probe = probe_from_dict({"kind": kind, **geometry, **probe_parameters}, "estimated probe")
+    field = ImagedField.of(probe, image_to_probe, bright.shape)
+    overlap = float((field.mask & bright).sum() / (field.mask | bright).sum())
+    require(
+        overlap >= _LEAST_OVERLAP,
+        f"the bright part of the images is no probe's field (the best one fits {overlap:.0%}); give the probe and its "
+        "place",
+    )
+    return replace(field, overlap=overlap)
+
+
+def draw_field(path: str | os.PathLike, image: np.ndarray, field: ImagedField) -> None:
+    """Write a PNG of an image (rows, columns) with the outline of the field drawn in, to check it."""
+    from PIL import Image, ImageDraw
+
+    picture = Image.fromarray(np.asarray(image, np.uint8)).convert("RGB")
+    draw = ImageDraw.Draw(picture)
+    draw.line([tuple(point) for point in field.outline_pixels()], fill=(255, 200, 61), width=2)
+    x, y = np.linalg.inv(field.image_to_probe)[:2, 3]
+    draw.ellipse((x - 4, y - 4, x + 4, y + 4), outline=(255, 90, 60), width=2)  # the centre of the probe's face
+    kind = field.probe.to_dict()["kind"]
+    fits = "" if np.isnan(field.overlap) else f", fits {field.overlap:.0%}"
+    draw.text((8, picture.height - 16), f"{kind}, {field.probe.depth_mm:.1f} mm deep{fits}", fill=(255, 200, 61))
+    with written_whole(path) as partial:
+        picture.save(partial)
+
+
+def _field_pixels(brightest: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: the largest connected bright part, without holes and thin attachments."""
+    bright = ndimage.binary_closing(brightest > _DARK, iterations=3)
+    bright = ndimage.binary_opening(bright, structure=np.ones((9, 9)))
+    labels, count = ndimage.label(bright)
+    require(count > 0, "the images are black: no field is found")
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return ndimage.binary_fill_holes(labels == sizes.argmax())
+
+
+def _sides(bright: np.ndarray, scale: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The two straight sides as x = a + b y, millimetres: the longest edges of the convex hull on either side."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    rows, columns = np.nonzero(bright ^ ndimage.binary_erosion(bright))
+    points = np.stack([columns, rows], axis=1) * scale
+    try:
+        hull = points[ConvexHull(points).vertices]
+    except QhullError:
+        raise SimulationError("the bright part of the images is no probe's field, it has no area") from None
+    middle = hull.mean(axis=0)
+    found = []
+    for is_right in (False, True):
+        # Outer points of each row on this side, between the ends of the side's longest hull edge
+        ends = [(p, q) for p, q in zip(hull, np.roll(hull, -1, axis=0), strict=True)]
+        side = [
+            (p, q)
+            for p, q in ends
+            if (0.5 * (p + q)[0] > middle[0]) == is_right and 3.0 * abs(q[1] - p[1]) > abs(q[0] - p[0])
+        ]
+        require(bool(side), "the bright part of the images is no probe's field, it has no sides")
+        p, q = max(side, key=lambda edge: np.hypot(*(edge[1] - edge[0])))
+        slope = (q[0] - p[0]) / (q[1] - p[1])
+        # The hull touches only outliers; the line is fitted to all border points near it.
+        distance = np.abs(points[:, 0] - p[0] - slope * (points[:, 1] - p[1]))
+        low, high = sorted((p[1], q[1]))
+        near = (distance < 3.0 * scale[0]) & (points[:, 1] >= low) & (points[:, 1] <= high)
+        slope, start = (
+            np.polyfit(points[near, 1], points[near, 0], 1) if near.sum() > 10 else (slope, p[0] - slope * p[1])
+        )
+        found.append((float(start), float(slope)))
+    return found[0], found[1]
+
+
+def _size_of_pixel(geometry: dict[str, float], **known: float | None) -> float:
+    """Millimetres per pixel from what is known of a geometry in pixels."""
+    given = {name: value for name, value in known.items() if value is not None}
+    require(len(given) == 1, "nothing says how large a pixel is, expected its spacing, or one of width_mm and depth_mm")
+    (name, value), *_ = given.items()
+    require(name in geometry, f"{name} is known of linear probes only, this one needs depth_mm or the pixel spacing")
+    require_between("estimate_field", name, value, 1, 400)
+    return value / geometry[name]
+
+
+def _linear(points: np.ndarray, scale: np.ndarray) -> tuple[str, dict[str, float], np.ndarray]:
+    low, high = np.percentile(points, 0.1, axis=0) - 0.5 * scale, np.percentile(points, 99.9, axis=0) + 0.5 * scale
+    width, depth = (high - low).tolist()
+    return "linear", {"width_mm": width, "depth_mm": depth}, np.array([0.5 * (low[0] + high[0]), low[1]])
+
+
+def _sector(points: np.ndarray, left, right, scale) -> tuple[str, dict[str, float], np.ndarray]:
+    require(right[1] > left[1], "the sides of the bright part of the images do not open away from the first row")
+    depth = (left[0] - right[0]) / (right[1] - left[1])
+    apex = np.array([left[0] + left[1] * depth, depth])
+    half = 0.5 * (np.arctan(right[1]) - np.arctan(left[1]))
+    away = points - apex
+    radius = np.hypot(*away.T)
+    angle = np.abs(np.arctan2(away[:, 0], away[:, 1]))
+    outer = float(np.percentile(radius[angle < half], 99.9) + 0.5 * scale[1])
+    # The face is a circle about the apex: each direction's first bright pixel lies on it.
+    bins = np.clip((angle / half * 20).astype(int), 0, 19)
+    first = np.array([radius[bins == n].min() for n in range(15) if (bins == n).any()])
+    inner = max(float(np.median(first) - 0.5 * scale[1]), 0.0)
+    opening = {"field_of_view_deg": float(2.0 * np.rad2deg(half))}
+    if inner < _POINT_SHARE * outer:
+        return "phased", {**opening, "depth_mm": outer}, apex
+    return "convex", {**opening, "radius_mm": inner, "depth_mm": outer - inner}, apex + [0.0, inner]

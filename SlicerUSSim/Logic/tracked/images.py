@@ -1,0 +1,154 @@
+"""TrackedImages: what simulated images are compared with, from a tracked sequence: probe, poses, images, field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.transforms import check_rigid, nearest_rotation
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.tracked.field import ImagedField, estimate_field
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+
+#: Largest cosine between the axes of an image that still counts as perpendicular.
+_SKEW = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedImages:
+    """Real images with everything that it takes to simulate the same."""
+
+    probe: Probe
+    #: (4, 4) probe_to_ras each
+    poses: list[np.ndarray]
+    #: (rows, columns) uint8 each, cropped to the field
+    images: list[np.ndarray]
+    #: Their pixels in the probe frame
+    grid: ImageGrid
+    #: (rows, columns) bool, the field in the cropped images
+    mask: np.ndarray
+    #: Their numbers in the sequence, and the field in whole images
+    numbers: list[int]
+    field: ImagedField
+
+    @classmethod
+    def of(
+        cls,
+        sequence: TrackedSequence,
+        numbers: Sequence[int] | None = None,
+        *,
+        path: str = "ImageToReference",
+        reference_to_ras: np.ndarray | None = None,
+        probe: Probe | None = None,
+        beam: Probe | None = None,
+        most: int | None = None,
+    ) -> TrackedImages:
+        """The images of a sequence as a simulator would see them.
+
+        Parameters
+        ----------
+        numbers : which images (default: all whose pose is known, or `most` of them, evenly spread).
+        path : transform from pixels to the reference frame, in which the patient lies.
+        reference_to_ras : (4, 4) rigid, where that frame is in the MRI (default: the same).
+        probe : known; its place in the image is then taken from ImageToProbe, if the sequence has one in that probe's
+            frame (as those that this package writes), else found in the images. Without it, it is estimated too.
+
+        Raises SimulationError for images that do not exist or were not tracked, for a skewed or mirrored calibration, a
+        field that is not found, and images that are all black.
+        """
+        require(
+            sequence.image_type == "BRIGHTNESS",
+            f"the sequence holds {sequence.image_type} data, expected B-mode images (BRIGHTNESS)",
+        )
+        kept = [n for n in range(len(sequence)) if sequence.has_pose(n, path)] if numbers is None else list(numbers)
+        if numbers is None and most is not None and len(kept) > most:
+            kept = [kept[place] for place in np.linspace(0, len(kept) - 1, most).round().astype(int)]
+        # With none tracked, the first says what is missing.
+        matrices = [sequence.pose(number, path) for number in kept or [0]]
+        chosen = sequence.select(kept)
+        images = _as_uint8(chosen.images)
+        for number, image in zip(kept, images, strict=True):
+            require(int(image.max()) > 0, f"image {number} of the sequence is black")
+        spacing = _pixel_spacing(matrices[0], path)
+        field = _located_field(sequence, images, spacing, probe, beam)
+        to_ras = np.eye(4) if reference_to_ras is None else check_rigid("reference_to_ras", reference_to_ras)
+        poses = [to_ras @ _probe_pose(matrix, field, path) for matrix in matrices]
+        window = rows, columns = field.window
+        left, top = (field.image_to_probe @ [columns.start - 0.5, rows.start - 0.5, 0.0, 1.0])[:2]
+        size = field.image_to_probe[0, 0], field.image_to_probe[1, 1]
+        mask = field.mask[window]
+        grid = ImageGrid(*mask.shape, float(left), float(top), (float(size[0]), float(size[1])))
+        cropped = [np.ascontiguousarray(image[window]) for image in images]
+        return cls(field.probe, poses, cropped, grid, mask, kept, field)
+
+
+def _as_uint8(images: np.ndarray) -> np.ndarray:
+    if images.dtype == np.uint8:
+        return images
+    require(
+        np.issubdtype(images.dtype, np.number) and images.min() >= 0 and images.max() <= 255,
+        f"images are {images.dtype} from {images.min()} to {images.max()}, expected grey levels from 0 to 255",
+    )
+    return images.round().astype(np.uint8)
+
+
+def _pixel_spacing(image_to_world: np.ndarray, path: str) -> tuple[float, float]:
+    """(column, row) size of a pixel in millimetres. Raises SimulationError unless pixels are rectangles."""
+    x, y = image_to_world[:3, 0], image_to_world[:3, 1]
+    size = float(np.linalg.norm(x)), float(np.linalg.norm(y))
+    require(min(size) > 0, f"{path} is singular, expected an image's axes in millimetres per pixel")
+    cosine = abs(float(x @ y)) / (size[0] * size[1])
+    require(cosine < _SKEW, f"{path} is skewed: the image's axes have a cosine of {cosine:.2g}, expected 0")
+    return size
+
+
+def _located_field(
+    sequence: TrackedSequence,
+    images: np.ndarray,
+    spacing: tuple[float, float],
+    probe: Probe | None,
+    beam: Probe | None,
+) -> ImagedField:
+    if probe is None:
+        shared = {field.name for field in fields(Probe)}
+        known = {} if beam is None else {name: v for name, v in beam.to_dict().items() if name in shared}
+        return estimate_field(images, spacing, **known)
+    if all("ImageToProbe" in entry for entry in sequence.transforms):
+        image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
+        # In this package's probe frame it is upright and lies in the plane; a tracker's marker is anywhere.
+        upright = np.diag([*spacing, 1.0, 1.0])
+        upright[:, 3] = image_to_probe[:, 3]
+        upright[2, 2] = image_to_probe[2, 2]
+        if np.allclose(image_to_probe, upright, atol=1e-4) and abs(image_to_probe[2, 3]) < 1e-6:
+            image_to_probe[2, 2] = 1.0
+            return ImagedField.of(probe, image_to_probe, images.shape[1:])
+    found = estimate_field(images, spacing)
+    kinds = found.probe.to_dict()["kind"], probe.to_dict()["kind"]
+    require(
+        kinds[0] == kinds[1] or {"convex", "phased"} == set(kinds),
+        f"the images show the field of a {kinds[0]} probe, but the probe given is {kinds[1]}",
+    )
+    depth = found.probe.depth_mm
+    if abs(depth - probe.depth_mm) > 0.1 * depth:
+        raise SimulationError(
+            f"the images show a field {depth:.1f} mm deep, but the probe given sees {probe.depth_mm:g} mm; check the "
+            "calibration"
+        )
+    return replace(ImagedField.of(probe, found.image_to_probe, images.shape[1:]), overlap=found.overlap)
+
+
+def _probe_pose(image_to_world: np.ndarray, field: ImagedField, path: str) -> np.ndarray:
+    """(4, 4) rigid probe_to_world: an image has pixels as its unit, the probe frame millimetres."""
+    in_pixels = np.linalg.inv(field.image_to_probe)
+    pose = np.eye(4)
+    for axis in range(2):
+        column = image_to_world[:3, axis]
+        pose[:3, axis] = column / np.linalg.norm(column)
+    pose[:3, 2] = np.cross(pose[:3, 0], pose[:3, 1])
+    pose[:3, :3] = nearest_rotation(pose[:3, :3])
+    pose[:3, 3] = (image_to_world @ [in_pixels[0, 3], in_pixels[1, 3], 0.0, 1.0])[:3]
+    return check_rigid(path, pose)

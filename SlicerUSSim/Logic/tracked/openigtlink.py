@@ -1,0 +1,217 @@
+"""TrackerLink: probe poses in and simulated images out over OpenIGTLink, through drop-outs, with pyigtl's messages.
+
+pyigtl's own client and server notice a peer that has gone only when they fail to send to it; hence a loop of our own.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import select
+import socket
+import threading
+from collections.abc import Callable
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.transforms import check_rigid, nearest_rotation
+from SlicerUSSim.Logic.base.volume import Volume
+
+#: OpenIGTLink's usual port.
+DEFAULT_PORT = 18944
+#: Seconds until the next try after a connection was lost or refused; until a peer that stops in mid-message is dropped.
+_RETRY_S, _STALLED_S = 0.25, 5.0
+#: No transform, image or string that concerns us is larger; whoever says so does not speak OpenIGTLink.
+_LARGEST_BYTES = 1 << 28
+
+
+def parse_address(text: str) -> tuple[str, int, bool]:
+    """(host, port, whether to wait for the other end to connect) of HOST:PORT, or of :PORT, where we wait.
+
+    Raises SimulationError for other text.
+    """
+    host, _, port = text.rpartition(":")
+    require(
+        ":" in text and port.isdigit() and 0 < int(port) < 65536,
+        f"--igtl is {text!r}, expected HOST:PORT to connect to, or :PORT to wait for a connection (such as "
+        f"127.0.0.1:{DEFAULT_PORT})",
+    )
+    return host or "127.0.0.1", int(port), not host
+
+
+class TrackerLink:
+    """One OpenIGTLink connection that is kept up until stop().
+
+    Parameters
+    ----------
+    host, port : of the other end, or with `listen` our own.
+    moved : told every pose, (4, 4) probe_to_ras in mm, and told in the link's own thread.
+    device : name of the TRANSFORM to follow (default: the first that comes).
+    listen : wait for the other end to connect, instead of connecting to it.
+
+    Raises SimulationError without pyigtl, and with `listen` for a port that is taken.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        moved: Callable[[np.ndarray], None],
+        *,
+        device: str | None = None,
+        listen: bool = False,
+        image_name: str = "SlicerUSSim",
+    ) -> None:
+        require(
+            importlib.util.find_spec("pyigtl") is not None,
+            'OpenIGTLink needs pyigtl; install it with: pip install "SlicerUSSim[serve]"',
+        )
+        self._host, self._port, self._moved = host, port, moved
+        self._device, self._image_name = device, image_name
+        #: What to tell the user
+        self.status = ""
+        #: Poses that came, images that went
+        self.received = self.sent = 0
+        self._outgoing: bytes | None = None
+        self._lock = threading.Lock()
+        # Wakes the loop for an image to send, or to stop.
+        self._wake_out, self._wake_in = socket.socketpair()
+        self._wake_in.setblocking(False)
+        self._stopping = False
+        self._listener = self._listening() if listen else None
+        self._thread = threading.Thread(target=self._run, name="OpenIGTLink", daemon=True)
+        self._thread.start()
+
+    def send(self, image: Volume) -> None:
+        """Send an image with its place (RAS); one that still waits to be sent is replaced."""
+        from pyigtl import ImageMessage
+
+        message = ImageMessage(
+            image.array, image.ijk_to_ras, world_coordinate_system="ras", device_name=self._image_name
+        )
+        with self._lock:
+            self._outgoing = message.pack()
+        self._wake()
+
+    def stop(self) -> None:
+        """Close the connection and wait until nothing more comes."""
+        self._stopping = True
+        self._wake()
+        self._thread.join()
+        for end in (self._listener, self._wake_in, self._wake_out):
+            if end is not None:
+                end.close()
+
+    # ---- the loop, in its own thread ---------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._stopping:
+            try:
+                peer = self._connected()
+                if peer is None:
+                    continue
+                with peer:
+                    self._serve(peer)
+            except (OSError, ValueError, SimulationError) as error:
+                self.status = f"{self._peer_name} was lost ({error}), trying again"
+                self._wait(_RETRY_S)
+            except Exception as error:  # a message that cannot be understood: whoever sent it is not worth listening to
+                self.status = f"{self._peer_name} sent what is not OpenIGTLink ({error}), trying again"
+                self._wait(_RETRY_S)
+
+    def _serve(self, peer: socket.socket) -> None:
+        self.status = f"connected to {self._peer_name}"
+        peer.settimeout(_STALLED_S)
+        while not self._stopping:
+            readable, _, _ = select.select([peer, self._wake_in], [], [])
+            if self._wake_in in readable:
+                self._awake()
+            if peer in readable:
+                self._receive(peer)
+            with self._lock:
+                outgoing, self._outgoing = self._outgoing, None
+            if outgoing is not None:
+                peer.sendall(outgoing)
+                self.sent += 1
+
+    def _receive(self, peer: socket.socket) -> None:
+        from pyigtl.messages import MessageBase
+
+        header = MessageBase.parse_header(_exactly(peer, MessageBase.IGTL_HEADER_SIZE))
+        size = header["body_size"]
+        require(size <= _LARGEST_BYTES, f"a message claims {size} bytes")
+        body = _exactly(peer, size)
+        if header["message_type"] != "TRANSFORM":
+            return
+        message = MessageBase.create_message("TRANSFORM")
+        message.unpack(header, body)
+        if self._device is None:
+            self._device = message.device_name
+        if message.device_name != self._device:
+            return
+        try:
+            pose = check_rigid(f"transform {message.device_name!r}", _orthonormal(message.matrix))
+        except SimulationError as error:  # a tracker that loses sight of its tool may send anything
+            self.status = str(error)
+            return
+        self.status = f"connected to {self._peer_name}, following {self._device}"
+        self.received += 1
+        self._moved(pose)
+
+    def _connected(self) -> socket.socket | None:
+        if self._listener is None:
+            self.status = self.status or f"connecting to {self._peer_name}"
+            return socket.create_connection((self._host, self._port), timeout=_STALLED_S)
+        self.status = f"waiting for a connection to port {self._port}"
+        readable, _, _ = select.select([self._listener, self._wake_in], [], [])
+        if self._wake_in in readable:
+            self._awake()
+        return self._listener.accept()[0] if self._listener in readable else None
+
+    def _listening(self) -> socket.socket:
+        try:
+            return socket.create_server((self._host, self._port))
+        except OSError as error:
+            raise SimulationError(f"port {self._port} cannot be waited at ({error}); choose another") from None
+
+    @property
+    def _peer_name(self) -> str:
+        return "the other end" if self._listener is not None else f"{self._host}:{self._port}"
+
+    def _wake(self) -> None:
+        self._wake_out.send(b"!")
+
+    def _awake(self) -> None:
+        try:
+            while self._wake_in.recv(1024):
+                pass
+        except BlockingIOError:
+            pass
+
+    def _wait(self, seconds: float) -> None:
+        select.select([self._wake_in], [], [], seconds)
+        if self._stopping:
+            return
+        self._awake()
+
+
+def _exactly(peer: socket.socket, count: int) -> bytes:
+    """So many bytes, or ConnectionError where the other end closes before."""
+    parts, missing = [], count
+    while missing:
+        part = peer.recv(min(missing, 1 << 20))
+        if not part:
+            raise ConnectionError("closed by the other end")
+        parts.append(part)
+        missing -= len(part)
+    return b"".join(parts)
+
+
+def _orthonormal(matrix: np.ndarray) -> np.ndarray:
+    """Single precision leaves a rotation slightly off; one that is not near a rotation stays as it is."""
+    matrix = np.array(matrix, float)
+    if np.isfinite(matrix).all():
+        rotation = nearest_rotation(matrix[:3, :3])
+        if np.abs(matrix[:3, :3] - rotation).max() < 1e-3:
+            matrix[:3, :3] = rotation
+    return matrix

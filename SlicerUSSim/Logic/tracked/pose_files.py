@@ -1,0 +1,154 @@
+"""Probe poses in files: JSON, plain text, and ITK transforms as 3D Slicer saves them."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, check_rigid, is_singular
+
+_ITK_SUFFIXES = (".tfm", ".h5", ".hdf5", ".mat")
+
+
+def read_pose(path: str | os.PathLike) -> np.ndarray:
+    """(4, 4) probe_to_ras from a file.
+
+    JSON holds {"probe_to_ras": [[...], ...]} or the bare matrix; a text file sixteen numbers by rows. ITK files (.tfm,
+    .h5, .mat, .txt) hold, as Slicer writes a linear transform, the map from world to probe in LPS.
+    Raises SimulationError for anything else and for a matrix that is not rigid.
+    """
+    path = Path(path)
+    require(path.is_file(), f"{path}: no such file")
+    if path.suffix.lower() == ".json":
+        values = read_json(path)
+        if isinstance(values, dict):
+            require("probe_to_ras" in values, f'{path}: has no "probe_to_ras", expected a 4x4 matrix under that name')
+            values = values["probe_to_ras"]
+        return check_rigid(f"{path}: probe_to_ras", values)
+    if path.suffix.lower() in _ITK_SUFFIXES or _starts_like_itk(path):
+        return _read_itk(path)
+    return check_rigid(f"{path}: probe_to_ras", _numbers(path))
+
+
+def read_matrix(path: str | os.PathLike) -> np.ndarray:
+    """(4, 4) affine matrix from a text file of sixteen numbers by rows, or JSON rows; it may scale, as calibrations do.
+
+    Raises SimulationError for anything else.
+    """
+    path = Path(path)
+    require(path.is_file(), f"{path}: no such file")
+    try:
+        matrix = np.array(read_json(path), float) if path.suffix.lower() == ".json" else _numbers(path)
+    except (TypeError, ValueError):
+        raise SimulationError(f"{path}: is not a matrix, expected four rows of four numbers") from None
+    return check_affine(str(path), matrix)
+
+
+def _numbers(path: Path) -> np.ndarray:
+    """(4, 4) of sixteen numbers in a text file."""
+    try:
+        numbers = np.array(path.read_text().replace(",", " ").split(), float)
+    except (ValueError, UnicodeDecodeError):
+        raise SimulationError(f"{path}: is not a pose, expected 16 numbers by rows, JSON or an ITK transform") from None
+    require(numbers.size == 16, f"{path}: holds {numbers.size} numbers, expected 16 (a 4x4 matrix by rows)")
+    return numbers.reshape(4, 4)
+
+
+def write_pose(path: str | os.PathLike, probe_to_ras: np.ndarray) -> None:
+    """Write a pose as JSON, whole or not at all."""
+    write_json(path, {"probe_to_ras": np.asarray(probe_to_ras).tolist()})
+
+
+def _starts_like_itk(path: Path) -> bool:
+    with open(path, "rb") as file:
+        return file.read(8) == b"#Insight"
+
+
+def _read_itk(path: Path) -> np.ndarray:
+    import SimpleITK as sitk
+
+    try:
+        transform = sitk.ReadTransform(str(path))
+    except RuntimeError as error:
+        raise SimulationError(
+            f"{path}: cannot be read as a transform ({str(error).splitlines()[-1].strip()})"
+        ) from None
+    require(transform.IsLinear(), f"{path}: the transform is not linear, expected a rigid one")
+    # A linear map is known from where it takes the origin and the axes.
+    origin = np.array(transform.TransformPoint((0.0, 0.0, 0.0)))
+    world_to_probe = np.eye(4)
+    for axis, unit in enumerate(np.eye(3)):
+        world_to_probe[:3, axis] = np.array(transform.TransformPoint(unit.tolist())) - origin
+    world_to_probe[:3, 3] = origin
+    require(not is_singular(world_to_probe), f"{path}: the transform is singular, expected a rigid one")
+    return check_rigid(f"{path}: transform", LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS)
+
+
+def read_transform(path: str | os.PathLike) -> np.ndarray:
+    """(4, 4) affine map from a file: whatever read_pose reads, or a linear MNI .xfm, which may scale.
+
+    Raises SimulationError for anything else.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".xfm":
+        return _read_xfm(path)
+    return read_pose(path)
+
+
+def read_tags(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray | None]:
+    """((n, 3), (n, 3) or None) RAS points of an MNI .tag file, as BITE and RESECT mark landmarks in one or two volumes.
+
+    Raises SimulationError for a file that is none.
+    """
+    path = Path(path)
+    text = _mni_text(path, "MNI Tag Point File")
+    volumes = re.search(r"Volumes\s*=\s*(\d+)", text)
+    points = re.search(r"Points\s*=(.*)", text, re.DOTALL)
+    require(
+        volumes is not None and int(volumes.group(1)) in (1, 2) and points is not None,
+        f"{path}: has no points of one or two volumes, expected an MNI tag file",
+    )
+    per_point = 3 * int(volumes.group(1))
+    rows = []
+    for line in points.group(1).split("\n"):
+        numbers = re.findall(r"[-+]?\d*\.?\d+(?:[eE][-+]?\d+)?", line.split('"')[0])
+        if len(numbers) >= per_point:
+            rows.append([float(number) for number in numbers[:per_point]])
+        else:
+            require(not numbers, f"{path}: a point has {len(numbers)} numbers, expected {per_point}")
+    require(bool(rows), f"{path}: holds no points")
+    array = np.array(rows)
+    return array[:, :3], (array[:, 3:] if per_point == 6 else None)
+
+
+def _read_xfm(path: Path) -> np.ndarray:
+    text = _mni_text(path, "MNI Transform File")
+    kind = re.search(r"Transform_Type\s*=\s*(\w+)", text)
+    name = kind.group(1) if kind else "none"
+    require(name == "Linear", f"{path}: holds a transform of type {name}, expected Linear")
+    match = re.search(r"Linear_Transform\s*=([^;]*);", text)
+    numbers = match.group(1).split() if match else []
+    require(len(numbers) == 12, f"{path}: holds {len(numbers)} numbers, expected 12 (a 3x4 matrix by rows)")
+    matrix = np.eye(4)
+    try:
+        matrix[:3] = np.array(numbers, float).reshape(3, 4)
+    except ValueError:
+        raise SimulationError(f"{path}: Linear_Transform is not made of numbers") from None
+    if re.search(r"Invert_Flag\s*=\s*True", text):
+        matrix = np.linalg.inv(matrix)
+    return matrix
+
+
+def _mni_text(path: Path, first_words: str) -> str:
+    require(path.is_file(), f"{path}: no such file")
+    try:
+        text = path.read_text()
+    except UnicodeDecodeError:
+        text = ""
+    require(text.lstrip().startswith(first_words), f"{path}: does not start with {first_words!r}")
+    return re.sub(r"^%.*$", "", text, flags=re.MULTILINE)  # comments

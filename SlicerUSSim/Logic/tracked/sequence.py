@@ -1,0 +1,452 @@
+"""TrackedSequence: ultrasound images with the transforms that a tracker measured for each.
+
+Files are the sequence metafiles of Plus and IGSIO, which 3D Slicer reads too: MetaImage or NRRD with fields such as
+Seq_Frame0003_ProbeToTrackerTransform. Transforms take homogeneous column vectors; the frame called Image counts pixels
+(column, row, 0, 1) of the image as it is here, oriented MF: columns towards the marked side of the probe, rows away
+from it. World frames are RAS millimetres, as those programs take them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
+from SlicerUSSim.Logic.base.volume import Volume
+
+#: Names that `write` accepts.
+SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".mhd", ".seq.nrrd", ".nrrd")
+_FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
+_ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
+_OK = "OK"
+#: What ITK and NRRD files hold beside the fields of a sequence.
+_NOT_OURS = (
+    "ITK_", "Kinds", "Modality", "NRRD_", "ObjectType", "AnatomicalOrientation", "type", "dimension", "space", "sizes",
+    "kinds", "endian", "encoding", "measurement frame", "centers", "spacings", "thicknesses", "axis", "labels", "units",
+)  # fmt: skip
+_OPPOSITE = {"M": "U", "U": "M", "F": "N", "N": "F"}
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedSequence:
+    """Tracked images of one sweep.
+
+    Raises SimulationError if images, transforms and timestamps are not as many, and for matrices that are not 4x4.
+    """
+
+    #: [n, row, column]; for RF data [n, scan line, sample]
+    images: np.ndarray
+    #: {"ProbeToTracker": (4, 4), ...} for each image; what was not tracked is missing
+    transforms: tuple[Mapping[str, np.ndarray], ...]
+    #: Seconds
+    timestamps: np.ndarray
+    #: BRIGHTNESS, or RF_REAL, RF_I_LINE_Q_LINE, RF_IQ_LINE for RF data
+    image_type: str = "BRIGHTNESS"
+    #: Other fields of the file, and of every image
+    fields: Mapping[str, str] = field(default_factory=dict)
+    frame_fields: tuple[Mapping[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        images = np.asarray(self.images)
+        require(images.ndim == 3 and images.size > 0, f"images have shape {images.shape}, expected (n, rows, columns)")
+        count = len(images)
+        transforms = tuple(
+            {name: _matrix(f"image {n}: {name}", m) for name, m in entry.items()}
+            for n, entry in enumerate(self.transforms)
+        )
+        require(len(transforms) == count, f"{len(transforms)} sets of transforms for {count} images, expected as many")
+        timestamps = np.asarray(self.timestamps, float)
+        require(timestamps.shape == (count,), f"timestamps have shape {timestamps.shape}, expected ({count},)")
+        frame_fields = tuple(self.frame_fields) or ({},) * count
+        require(len(frame_fields) == count, f"{len(frame_fields)} sets of fields for {count} images, expected as many")
+        for name, value in (
+            ("images", images), ("transforms", transforms), ("timestamps", timestamps), ("frame_fields", frame_fields),
+        ):  # fmt: skip
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    # ---- poses -------------------------------------------------------------------------------------------------
+
+    def frames_of_reference(self) -> list[str]:
+        """The coordinate frames that the transforms connect."""
+        return sorted({end for entry in self.transforms for name in entry for end in _ends(name)})
+
+    def pose(self, number: int, name: str) -> np.ndarray:
+        """(4, 4) transform of image `number`, such as ImageToReference: measured, or composed of measured ones and
+        their inverses along the shortest path.
+
+        Raises SimulationError for an image that does not exist and where no path leads from one frame to the other.
+        """
+        count = len(self)
+        require(
+            int(number) == number and 0 <= number < count, f"image {number} does not exist, expected 0 to {count - 1}"
+        )
+        entry = self.transforms[number]
+        steps: dict[str, list[tuple[str, np.ndarray]]] = {}
+        for known, matrix in entry.items():
+            start, end = _ends(known)
+            steps.setdefault(start, []).append((end, matrix))
+            if not is_singular(matrix):
+                steps.setdefault(end, []).append((start, np.linalg.inv(matrix)))
+        source, target = self._asked_ends(name, set(steps))
+        found = {source: np.eye(4)}
+        waiting = deque([source])
+        while waiting and target not in found:
+            here = waiting.popleft()
+            for there, matrix in steps.get(here, []):
+                if there not in found:
+                    found[there] = matrix @ found[here]
+                    waiting.append(there)
+        if target not in found:
+            raise SimulationError(
+                f"image {number}: no path from {source} to {target}, the file has {', '.join(sorted(entry)) or 'no'} "
+                f"transforms; give the missing one{_calibration_hint(source, steps)}"
+            )
+        return found[target]
+
+    def has_pose(self, number: int, name: str) -> bool:
+        """Whether `pose` knows this transform of this image: whether it was tracked."""
+        try:
+            self.pose(number, name)
+        except SimulationError:
+            return False
+        return True
+
+    def with_transforms(self, constant: Mapping[str, np.ndarray]) -> TrackedSequence:
+        """The same with transforms that are the same for all images: a calibration, a registration."""
+        constant = {name: _matrix(name, matrix) for name, matrix in constant.items()}
+        return replace(self, transforms=tuple({**entry, **constant} for entry in self.transforms))
+
+    def select(self, numbers: Sequence[int]) -> TrackedSequence:
+        """Only these images. Raises SimulationError for one that does not exist."""
+        count = len(self)
+        for number in numbers:
+            require(
+                int(number) == number and 0 <= number < count,
+                f"image {number} does not exist, expected 0 to {count - 1}",
+            )
+        require(len(numbers) > 0, "no image chosen, expected at least one")
+        pick = list(numbers)
+        return replace(
+            self,
+            images=self.images[pick],
+            transforms=tuple(self.transforms[n] for n in pick),
+            timestamps=self.timestamps[pick],
+            frame_fields=tuple(self.frame_fields[n] for n in pick),
+        )
+
+    def with_images(self, numbers: Sequence[int], images: np.ndarray) -> TrackedSequence:
+        """The images `numbers` with other pixels [n, row, column]; transforms and times stay theirs."""
+        return replace(self.select(numbers), images=images)
+
+    def _asked_ends(self, name: str, known: set[str]) -> tuple[str, str]:
+        splits = [(name[: m.start()], name[m.end() :]) for m in re.finditer("To", name)]
+        splits = [(start, end) for start, end in splits if start and end]
+        require(bool(splits), f"transform is {name!r}, expected two frames joined by To, such as ImageToReference")
+        return max(splits, key=lambda ends: sum(end in known for end in ends))
+
+    # ---- files -------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def read(cls, path: str | os.PathLike) -> TrackedSequence:
+        """Read a sequence metafile (.igs.mha, .seq.mha, .mhd, .nrrd), compressed or not, in any image orientation.
+
+        A transform whose status is not OK was not tracked and is left out. Colours become grey.
+        Raises SimulationError for a file that is missing, unreadable or none of these.
+        """
+        path = Path(path)
+        require(path.is_file(), f"{path}: no such file")
+        is_nrrd = path.name.lower().endswith((".nrrd", ".nhdr"))
+        array, header = _read_nrrd(path) if is_nrrd else _read_metaimage(path)
+        return _from_header(array, header, str(path))
+
+    def write(self, path: str | os.PathLike, compress: bool = True) -> None:
+        """Write a sequence metafile whole or not at all; the format follows from the name (SEQUENCE_SUFFIXES).
+
+        Raises SimulationError for another name and where the file cannot be written.
+        """
+        path = Path(path)
+        require_sequence_name(path)
+        header = self._header()
+        with written_whole(path) as partial:
+            if path.name.lower().endswith(".nrrd"):
+                _write_nrrd(partial, self.images, header, compress)
+            else:
+                _write_metaimage(partial, self.images, header, compress)
+
+    def _header(self) -> dict[str, str]:
+        is_rf = self.image_type != "BRIGHTNESS"
+        header = {**self.fields, _ORIENTATION: "FM" if is_rf else "MF", _TYPE: self.image_type}
+        names = sorted({name for entry in self.transforms for name in entry})
+        for n, (entry, extra) in enumerate(zip(self.transforms, self.frame_fields, strict=True)):
+            start = f"Seq_Frame{n:04d}_"
+            for name in names:
+                matrix = entry.get(name, np.eye(4))
+                header[f"{start}{name}Transform"] = " ".join(f"{value:.9g}" for value in matrix.ravel())
+                header[f"{start}{name}TransformStatus"] = _OK if name in entry else "INVALID"
+            header[f"{start}Timestamp"] = f"{self.timestamps[n]:.6f}"
+            header |= {f"{start}{name}": value for name, value in {"ImageStatus": _OK, **extra}.items()}
+        return header
+
+    # ---- other sources -----------------------------------------------------------------------------------------
+
+    @classmethod
+    def from_slices(cls, paths: Iterable[str | os.PathLike]) -> TrackedSequence:
+        """From one image file per slice, each with its place in the patient, as the MNI's BITE has them (MINC 1 or 2).
+
+        ImageToReference of each is the file's own geometry. Raises SimulationError for files that are not one slice
+        each, or not of one size.
+        """
+        slices = [_read_slice(Path(path)) for path in paths]
+        require(bool(slices), "no slice, expected at least one file")
+        shapes = {image.shape for image, _ in slices}
+        require(len(shapes) == 1, f"the slices have the sizes {sorted(shapes)}, expected one")
+        images = np.stack([image for image, _ in slices])
+        if images.dtype != np.uint8:
+            top = float(images.max())
+            images = np.clip(images * (255.0 / top if top > 255.0 else 1.0), 0, 255).round().astype(np.uint8)
+        return cls(images, tuple({"ImageToReference": m} for _, m in slices), np.arange(len(slices), dtype=float))
+
+    @classmethod
+    def from_volume(cls, volume: Volume, probe, poses: Iterable[np.ndarray], image_size=None) -> TrackedSequence:
+        """Slices of a 3D ultrasound volume (such as RESECT's) where a probe at these (4, 4) probe_to_ras would see.
+
+        ProbeToReference are the poses, ImageToProbe is that of the probe's image. Outside the field images are black.
+        """
+        from SlicerUSSim.Logic.base.transforms import check_rigid
+        from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+        from SlicerUSSim.Logic.probe.placement import slice_under_probe
+
+        grid = ImageGrid.for_probe(probe, image_size)
+        inside = grid.field(probe)
+        poses = [check_rigid(f"pose {n}", pose) for n, pose in enumerate(poses)]
+        images = [np.where(inside, slice_under_probe(volume, grid, pose), 0) for pose in poses]
+        array = np.clip(np.stack(images), 0, 255).round().astype(np.uint8)
+        transforms = tuple({"ImageToProbe": grid.image_to_probe, "ProbeToReference": pose} for pose in poses)
+        return cls(array, transforms, np.arange(len(poses), dtype=float))
+
+
+def require_sequence_name(path: Path) -> None:
+    """Raise SimulationError unless TrackedSequence.write knows the format that the name stands for."""
+    require(
+        path.name.lower().endswith(SEQUENCE_SUFFIXES),
+        f"{path}: unknown sequence format, expected a name ending in one of {', '.join(SEQUENCE_SUFFIXES)}",
+    )
+
+
+def frame_numbers(text: str, count: int) -> list[int]:
+    """Numbers of images from text: 0,5,10, or from:to:step as in Python, or both.
+
+    Raises SimulationError for text that is neither and for a choice of none of `count` images.
+    """
+    numbers: list[int] = []
+    for part in text.split(","):
+        try:
+            ends = [int(end) if end.strip() else None for end in part.split(":")]
+            if not 1 <= len(ends) <= 3 or ends == [None] or (len(ends) == 3 and ends[2] == 0):
+                raise ValueError
+        except ValueError:
+            raise SimulationError(f"frames are {text!r}, expected such as 0,5,10 or 0:20:5") from None
+        numbers += [ends[0]] if len(ends) == 1 else list(range(count))[slice(*ends)]
+    require(bool(numbers), f"frames {text} choose none of the {count} images, expected at least one")
+    return numbers
+
+
+def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """{"ImageToProbe": (4, 4), ...} of the <CoordinateDefinitions> in a Plus configuration file (XML).
+
+    Raises SimulationError for a file that is none, and for a matrix that is not 4x4.
+    """
+    from xml.etree import ElementTree
+
+    path = Path(path)
+    try:
+        root = ElementTree.parse(path).getroot()
+    except OSError as error:
+        raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
+    except ElementTree.ParseError as error:
+        raise SimulationError(f"{path}: is not XML ({error})") from None
+    transforms = {}
+    for entry in root.iter("Transform"):
+        start, end, text = entry.get("From"), entry.get("To"), entry.get("Matrix")
+        if start and end and text:
+            transforms[f"{start}To{end}"] = _numbers(f"{path}: {start} to {end}", text)
+    require(bool(transforms), f"{path}: has no <Transform From= To= Matrix=>, expected a Plus configuration")
+    return transforms
+
+
+# ---- fields ----------------------------------------------------------------------------------------------------------
+
+
+def _ends(name: str) -> tuple[str, str]:
+    """Frames of a transform in a file: split at the last To that leaves a capital letter behind it."""
+    splits = [m for m in re.finditer(r"To(?=[A-Z0-9])", name) if m.start() > 0]
+    require(bool(splits), f"transform is called {name!r}, expected two frames joined by To, such as ProbeToTracker")
+    return name[: splits[-1].start()], name[splits[-1].end() :]
+
+
+def _calibration_hint(source: str, steps: Mapping) -> str:
+    return ", such as the calibration ImageToProbe" if source == "Image" and source not in steps else ""
+
+
+def _matrix(name: str, matrix) -> np.ndarray:
+    array = check_affine(name, matrix)
+    array.setflags(write=False)
+    return array
+
+
+def _numbers(name: str, text: str) -> np.ndarray:
+    try:
+        values = np.array(text.split(), float)
+    except ValueError:
+        raise SimulationError(f"{name} is {text.strip()[:40]!r}, expected 16 numbers") from None
+    require(values.size == 16, f"{name} holds {values.size} numbers, expected 16")
+    return _matrix(name, values.reshape(4, 4))
+
+
+def _from_header(array: np.ndarray, header: Mapping[str, str], source: str) -> TrackedSequence:
+    """From [n, y, x] pixels as the file has them, and its fields."""
+    count = len(array)
+    transforms: list[dict] = [{} for _ in range(count)]
+    others: list[dict] = [{} for _ in range(count)]
+    timestamps = np.full(count, np.nan)
+    fields = {}
+    for key, text in header.items():
+        match = _FRAME_FIELD.fullmatch(key)
+        if match is None:
+            if key not in (_ORIENTATION, _TYPE) and not key.startswith(_NOT_OURS):
+                fields[key] = text
+            continue
+        number, name = int(match.group(1)), match.group(2)
+        require(number < count, f"{source}: has {key}, but {count} images")
+        if name.endswith("TransformStatus"):
+            continue
+        if name.endswith("Transform"):
+            if header.get(f"{key}Status", _OK).strip().upper() == _OK:
+                name = name.removesuffix("Transform")
+                transforms[number][name] = _numbers(f"{source}: {key}", text)
+        elif name == "Timestamp":
+            try:
+                timestamps[number] = float(text)
+            except ValueError:
+                raise SimulationError(f"{source}: {key} is {text!r}, expected seconds") from None
+        else:
+            others[number][name] = text
+    # A file without times still has an order.
+    timestamps = np.where(np.isfinite(timestamps), timestamps, np.arange(count))
+    image_type = header.get(_TYPE, "BRIGHTNESS").strip()
+    image_type = "BRIGHTNESS" if image_type == "RGB_COLOR" else image_type
+    wanted = "MF" if image_type == "BRIGHTNESS" else "FM"
+    array = _oriented(array, header.get(_ORIENTATION, wanted).strip().upper(), wanted, source)
+    return TrackedSequence(array, tuple(transforms), timestamps, image_type, fields, tuple(others))
+
+
+def _oriented(array: np.ndarray, orientation: str, wanted: str, source: str) -> np.ndarray:
+    """[n, y, x] images whose axes x, y point as `orientation` says, turned to `wanted`."""
+    letters = orientation[:2]
+    known = len(orientation) in (2, 3) and any(letters in (a + b, b + a) for a in "MU" for b in "FN")
+    if orientation in ("XX", "XXX"):
+        return array
+    require(known, f"{source}: {_ORIENTATION} is {orientation!r}, expected such as MF, UF, MN or MFA")
+    if letters[0] not in (wanted[0], _OPPOSITE[wanted[0]]):
+        array, letters = array.swapaxes(1, 2), letters[::-1]
+    if letters[0] != wanted[0]:
+        array = array[:, :, ::-1]
+    if letters[1] != wanted[1]:
+        array = array[:, ::-1, :]
+    return np.ascontiguousarray(array)
+
+
+def _as_images(array: np.ndarray, components: int, source: str) -> np.ndarray:
+    """[n, y, x] from an array with or without a slice axis of one, and a last axis of colours if components > 1."""
+    if components > 1:
+        require(components in (3, 4), f"{source}: has {components} components per pixel, expected 1 or colours")
+        array = (array[..., :3] @ np.array([0.299, 0.587, 0.114])).round().astype(array.dtype)  # ITU-R BT.601
+    if array.ndim == 4:
+        require(array.shape[1] == 1, f"{source}: holds volumes of {array.shape[1]} slices, expected images")
+        array = array[:, 0]
+    if array.ndim == 2:
+        array = array[None]
+    require(array.ndim == 3, f"{source}: has {array.ndim} dimensions, expected columns, rows and images")
+    return array
+
+
+# ---- formats ---------------------------------------------------------------------------------------------------------
+
+
+def _read_metaimage(path: Path) -> tuple[np.ndarray, dict[str, str]]:
+    import SimpleITK as sitk
+
+    from SlicerUSSim.Logic.base.volume import read_itk_image
+
+    image = read_itk_image(path)
+    header = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys()}
+    return _as_images(sitk.GetArrayFromImage(image), image.GetNumberOfComponentsPerPixel(), str(path)), header
+
+
+def _write_metaimage(path: Path, images: np.ndarray, header: Mapping[str, str], compress: bool) -> None:
+    import SimpleITK as sitk
+
+    image = sitk.GetImageFromArray(np.ascontiguousarray(images))
+    for key, value in header.items():
+        image.SetMetaData(key, value)
+    sitk.WriteImage(image, str(path), useCompression=compress)
+
+
+def _read_nrrd(path: Path) -> tuple[np.ndarray, dict[str, str]]:
+    import nrrd
+
+    try:
+        array, header = nrrd.read(str(path), index_order="C")
+    except (OSError, ValueError, nrrd.NRRDError) as error:
+        raise SimulationError(f"{path}: cannot be read as NRRD ({str(error).splitlines()[-1]})") from None
+    kinds = list(header.get("kinds", []))[::-1]  # slowest axis first, as the array
+    components = 1
+    for axis, kind in enumerate(kinds):
+        if kind == "list":
+            array = np.moveaxis(array, axis, 0)
+        elif "color" in kind.lower() or "vector" in kind.lower():
+            array, components = np.moveaxis(array, axis, -1), array.shape[axis]
+    # Plus writes the two general fields in words of NRRD's own style.
+    names = {"ultrasound image orientation": _ORIENTATION, "ultrasound image type": _TYPE}
+    return _as_images(array, components, str(path)), {
+        names.get(key, key): value for key, value in header.items() if isinstance(value, str)
+    }
+
+
+def _write_nrrd(path: Path, images: np.ndarray, header: Mapping[str, str], compress: bool) -> None:
+    import nrrd
+
+    fields = {
+        "kinds": ["domain", "domain", "list"],
+        "encoding": "gzip" if compress else "raw",
+        "ultrasound image orientation": header[_ORIENTATION],
+        "ultrasound image type": header[_TYPE],
+        **header,
+    }
+    nrrd.write(str(path), np.ascontiguousarray(images), fields, index_order="C")
+
+
+def _read_slice(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """((rows, columns), image_to_ras) of a file that holds one slice: the axis of one sample may be any."""
+    from SlicerUSSim.Logic.base.volume import read_array
+
+    array, ijk_to_ras = read_array(path)
+    flat = [axis for axis in range(3) if array.shape[axis] == 1]
+    require(len(flat) == 1, f"{path}: is {'x'.join(map(str, array.shape[::-1]))}, expected one slice")
+    rows, columns = (axis for axis in range(3) if axis != flat[0])
+    matrix = np.eye(4)
+    matrix[:, 0], matrix[:, 1], matrix[:, 3] = ijk_to_ras[:, 2 - columns], ijk_to_ras[:, 2 - rows], ijk_to_ras[:, 3]
+    normal = np.cross(matrix[:3, 0], matrix[:3, 1])
+    matrix[:3, 2] = normal / np.linalg.norm(normal)
+    return array.squeeze(flat[0]), matrix

@@ -1,0 +1,31 @@
+"""Files that benchmark scripts read and write, as argparse types: refused before anything is measured."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.files import require_place
+
+
+def output_file(text: str) -> Path:
+    """A file that can be written when the work is done."""
+    path = Path(text)
+    try:
+        require_place(path)
+    except SimulationError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return path
+
+
+def result_file(text: str) -> dict:
+    """What `ussim bench --json` kept."""
+    try:
+        result = json.loads(Path(text).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise argparse.ArgumentTypeError(f"{text}: cannot be read ({error})") from None
+    if not isinstance(result, dict) or "devices" not in result:
+        raise argparse.ArgumentTypeError(f"{text}: holds no devices, expected a file of ussim bench --json")
+    return result

@@ -1,0 +1,122 @@
+"""What can be measured in a frame: levels, places and widths of echoes, correlations, the Rayleigh fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.probe.arrays import Probe
+
+
+def level_db(signal: np.ndarray) -> float:
+    """Mean power in dB; -300 for silence."""
+    return float(10.0 * np.log10(max((np.abs(signal) ** 2).mean(), 1e-30)))
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Magnitude of the complex correlation coefficient of two zero-mean signals."""
+    return float(abs((a * b.conj()).sum()) / np.sqrt((abs(a) ** 2).sum() * (abs(b) ** 2).sum()))
+
+
+def sample_positions(frame: Frame, probe: Probe) -> tuple[np.ndarray, np.ndarray]:
+    """((scan_lines, samples) lateral, likewise depth) of every sample in the probe frame, millimetres."""
+    along = np.arange(frame.iq.shape[1]) * frame.sample_interval_mm
+    origins, directions = probe.origins_mm(), probe.directions()
+    return tuple(origins[:, a, None] + along * directions[:, a, None] for a in (0, 1))
+
+
+def depth_window(frame: Frame, depth_mm: float, half_mm: float) -> np.ndarray:
+    """(scan_lines, samples) of the baseband signal within `half_mm` of a distance along the lines."""
+    first, last = (round((depth_mm + side * half_mm) / frame.sample_interval_mm) for side in (-1, 1))
+    return frame.iq[:, first:last]
+
+
+def region_level_db(frame: Frame, probe: Probe, region_mm: tuple[float, float, float, float]) -> float:
+    """Mean power in dB of the samples in (left, right, top, bottom). Raises SimulationError if there are none."""
+    x, y = sample_positions(frame, probe)
+    left, right, top, bottom = region_mm
+    inside = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
+    require(bool(inside.any()), f"no sample lies in the region {region_mm} mm of the probe frame")
+    return level_db(frame.iq[inside])
+
+
+def echo_near(
+    frame: Frame, probe: Probe, place_mm: tuple[float, float], within_mm: float
+) -> tuple[float, float, float]:
+    """(lateral mm, depth mm, amplitude) of the strongest echo within a distance of a place (lateral, depth).
+
+    Across the lines the place is the centroid of the power within half a millimetre of the echo's range; along the
+    line that of the power between the -6 dB points. Not a number where all is silent.
+    Raises SimulationError for a place outside the imaged field.
+    """
+    x, y = sample_positions(frame, probe)
+    near = np.hypot(x - place_mm[0], y - place_mm[1]) < within_mm
+    require(bool(near.any()), f"no sample lies within {within_mm:g} mm of {place_mm}")
+    amplitude = np.where(near, np.abs(frame.iq), 0.0)
+    line, sample = np.unravel_index(np.argmax(amplitude), amplitude.shape)
+    if amplitude[line, sample] == 0.0:
+        return np.nan, np.nan, 0.0
+    half = max(round(0.5 / frame.sample_interval_mm), 1)
+    power = (amplitude[:, max(sample - half, 0) : sample + half + 1] ** 2).sum(axis=1)
+    power[power < 0.25 * power.max()] = 0.0
+    position = float(np.average(np.arange(len(power)), weights=power))
+    trace = np.abs(frame.iq[line])
+    peak = trace[sample]
+    first = last = sample
+    while first > 0 and trace[first - 1] > 0.5 * peak:
+        first -= 1
+    while last + 1 < len(trace) and trace[last + 1] > 0.5 * peak:
+        last += 1
+    along = np.average(np.arange(first, last + 1), weights=trace[first : last + 1] ** 2) * frame.sample_interval_mm
+    origin, direction = probe.line_at(probe.first_line + position * probe.line_spacing)
+    x, y, _ = origin + along * direction
+    return float(x), float(y), float(peak)
+
+
+def full_width(positions: np.ndarray, amplitudes: np.ndarray, at: float = 0.5) -> float:
+    """Width between the outermost crossings of `at` times the maximum, next to it (default: -6 dB, FWHM)."""
+    top = int(np.argmax(amplitudes))
+    limit = at * amplitudes[top]
+
+    def crossing(step: int) -> float:
+        n = top
+        while 0 <= n + step < len(amplitudes) and amplitudes[n + step] >= limit:
+            n += step
+        require(0 <= n + step < len(amplitudes), f"the profile does not fall to {at:g} of its maximum")
+        inner, outer = amplitudes[n], amplitudes[n + step]
+        return float(positions[n] + (positions[n + step] - positions[n]) * (inner - limit) / (inner - outer))
+
+    return abs(crossing(1) - crossing(-1))
+
+
+@dataclass(frozen=True, eq=False)
+class RayleighFit:
+    """The paper's Fig. 4: a Rayleigh density fitted to the histogram of an envelope scaled to 8 bits."""
+
+    #: In grey levels
+    sigma: float
+    #: Sum of squared differences between the normalised histogram and the density, over 256 bins
+    sse: float
+    #: (256,) share of the samples per grey level
+    histogram: np.ndarray
+    #: (256,) fitted density
+    density: np.ndarray
+
+
+def fit_rayleigh(envelope: np.ndarray) -> RayleighFit:
+    """Least-squares Rayleigh fit to the 256-bin histogram of `envelope`, its maximum scaled to 255."""
+    from scipy.optimize import curve_fit
+
+    scaled = 255.0 * np.ravel(envelope) / np.max(envelope)
+    histogram = np.histogram(scaled, bins=256, range=(0.0, 256.0))[0] / scaled.size
+    grey = np.arange(256) + 0.5
+
+    def density(r, sigma):
+        return r / sigma**2 * np.exp(-0.5 * (r / sigma) ** 2)
+
+    (sigma,), _ = curve_fit(density, grey, histogram, p0=[np.sqrt(0.5 * (scaled**2).mean())])
+    fitted = density(grey, sigma)
+    return RayleighFit(float(sigma), float(((histogram - fitted) ** 2).sum()), histogram, fitted)

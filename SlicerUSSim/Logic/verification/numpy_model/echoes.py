@@ -1,0 +1,175 @@
+"""Scatterers and interfaces as impulses, and the lateral beam (kernels/scattering.cl, interfaces.cl, beam.cl)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
+from SlicerUSSim.Logic.verification.numpy_model.elementary import (
+    LOG2_E,
+    affine_point,
+    exp2,
+    f32,
+    gaussian,
+    hash_mix,
+    turn,
+)
+from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
+
+_BLOCK = CONSTANTS["BLOCK"]  # samples over which widths and gains are taken as linear
+_AXIS_STEPS = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint32)
+
+
+def scatterer_lines(
+    acquisition: np.ndarray, labels: Labels, tissues: np.ndarray, segments, segment_lines
+) -> np.ndarray:
+    """(2 traced lines, samples) complex64 impulses of all scatterers, on the left and right edges of every strip."""
+    lines = np.zeros((2 * int(acquisition["traced_lines"]), int(acquisition["samples"])), np.complex128)
+    for segment, line in zip(segments, segment_lines, strict=True):
+        slope, start = segment["depth_per_mm"], segment["depth_mm"]
+        end = start + segment["length_mm"] * slope
+        for block in range(
+            max(int(start / acquisition["sample_mm"]) - 1, 0) // _BLOCK, int(acquisition["samples"]) // _BLOCK
+        ):
+            first = block * _BLOCK
+            if (first - 1) * acquisition["sample_mm"] > end:
+                break
+            _add_block(
+                acquisition, labels, tissues, segment, first, lines[2 * line : 2 * line + 2, first : first + _BLOCK]
+            )
+    return lines.astype(np.complex64)
+
+
+def _add_block(acquisition, labels, tissues, segment, first: int, sums: np.ndarray) -> None:
+    """Add the scatterers of one segment to the samples of one block, (2, block) from sample `first` on."""
+    slope, depth0 = segment["depth_per_mm"], segment["depth_mm"]
+    low = np.maximum(f32(0), (f32(first - 1) * acquisition["sample_mm"] - depth0) / slope)
+    high = np.minimum(segment["length_mm"], (f32(first + _BLOCK) * acquisition["sample_mm"] - depth0) / slope)
+    if low >= high:
+        return
+    waist = np.minimum(acquisition["transmit_rayleigh"], acquisition["elevation_rayleigh"])
+    pieces = max(1, int(np.ceil((high - low) / (f32(0.4) * waist))))
+    ends = [low + f32(n) / f32(pieces) * (high - low) for n in range(pieces + 1)]
+    for n in range(pieces):
+        begin = f32(0) if n == 0 else ends[n]
+        stop = segment["length_mm"] if n == pieces - 1 else ends[n + 1]
+        _add_piece(acquisition, labels, tissues, segment, first, ends[n], ends[n + 1], (begin, stop), sums)
+
+
+def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs, sums) -> None:
+    beam = Beam(acquisition)
+    path = segment["path_mm"] + np.array([low, high])
+    lateral, elevation, apart = beam.lateral_sigma(path), beam.elevation_sigma(path), beam.line_distance(path)
+    narrow = f32(0.5) * LOG2_E / (elevation * elevation)
+    along_tube = [segment["tube"][w] + segment["tube"][w + 1] * np.array([low, high]) for w in (0, 2)]
+    strength = np.log2(segment["weight"] * segment["attenuation"] * acquisition["speckle_scale"] * f32(2.50662827))
+    gain = strength - LOG2_E * segment["decay_per_mm"] * np.array([low, high])
+    gain = gain + f32(0.5) * np.log2(lateral / (elevation * along_tube[0] * along_tube[1])) - np.log2(apart)
+
+    # Lattice axes as the kernel orders them: sums of products round as they do there.
+    u = int(np.abs(segment["elevational"]).argmax())
+    v, w = (u + 1) % 3, (u + 2) % 3
+    if abs(segment["direction"][v]) < abs(segment["direction"][w]):
+        v, w = w, v
+    order = [u, v, w]
+    start = segment["start"][order]
+    d, side, e = (segment[name][order] for name in ("direction", "lateral", "elevational"))
+    cells = _cells_of_box(acquisition, start, d, side, e, low, high, 0.5 * apart.max(), elevation.max())
+
+    key = hash_mix((cells.astype(np.uint32) * _AXIS_STEPS[order]).sum(axis=1, dtype=np.uint32) ^ acquisition["seed"])
+    key1, key2 = hash_mix(key + np.uint32(0x9E3779B9)), hash_mix(key + np.uint32(0x3C6EF372))
+    cell, grain = acquisition["cell_mm"], acquisition["cell_mm"] / f32(1024)
+    p = [
+        (cells[:, n].astype(np.float32) * cell - start[n])
+        + (((key >> np.uint32(10 * axis)) & np.uint32(0x3FF)).astype(np.float32) + f32(0.5)) * grain
+        for n, axis in enumerate(order)
+    ]
+    along, aside_l, aside_e = (p[0] * x[0] + p[1] * x[1] + p[2] * x[2] for x in (d, side, e))
+    t = (along - low) * (f32(1) / np.maximum(high - low, f32(1e-6)))
+    one_over = f32(1) / apart
+    right = f32(0.5) + aside_l * (one_over[0] + t * (one_over[1] - one_over[0]))
+    r2 = aside_e * aside_e * (narrow[0] + t * (narrow[1] - narrow[0]))
+    bend = f32(0) if acquisition["linear"] else f32(0.5) / np.maximum(acquisition["apex_radius_mm"] + path[0], f32(1))
+    depth = segment["depth_mm"] + (along + aside_l * aside_l * bend) * segment["depth_per_mm"]
+    place = depth * (f32(1) / acquisition["sample_mm"])
+    bins = np.floor(place).astype(int) - first
+    cutoff2 = f32(0.5) * LOG2_E * acquisition["beam_cutoff"] * acquisition["beam_cutoff"]
+    counts = (right >= 0) & (right < 1) & (r2 <= cutoff2) & (bins >= -1) & (bins < _BLOCK)
+    counts &= (along >= belongs[0]) & (along < belongs[1])
+    p, t, r2, right, depth = [x[counts] for x in p], t[counts], r2[counts], right[counts], depth[counts]
+    bins, part, key1, key2 = bins[counts], (place - np.floor(place))[counts], key1[counts], key2[counts]
+
+    at = affine_point(acquisition["ras_to_voxel"], segment["start"])
+    rows = acquisition["ras_to_voxel"].reshape(3, 4)[:, order]
+    voxel = np.stack([at[n] + p[0] * r[0] + p[1] * r[1] + p[2] * r[2] for n, r in enumerate(rows)], axis=-1)
+    tissue = tissues[drawn_labels(acquisition, labels, voxel, key2)]
+    share = tissue["share"]
+    exists = ((key2 >> np.uint32(16)).astype(np.float32) + f32(0.5) < share * f32(65536)).astype(np.float32)
+    strength = tissue["mu0"] * (exists - share) + tissue["sigma0"] * gaussian(key1) * exists
+    amplitude = exp2(np.clip(gain[0] + t * (gain[1] - gain[0]) - r2, f32(-100), f32(100)))
+    cosine, sine = turn(depth * acquisition["cycles_per_mm"])
+    echo = strength * amplitude * (cosine - 1j * sine)
+    for edge, of_edge in enumerate((f32(1) - right, right)):
+        for ahead, of_sample in enumerate((f32(1) - part, part)):
+            here = bins + ahead
+            inside = (here >= 0) & (here < _BLOCK)
+            value = (echo * of_edge * of_sample)[inside]
+            for quadrature, component in ((1, value.real), (1j, value.imag)):
+                sums[edge] += quadrature * np.bincount(here[inside], component, _BLOCK)
+
+
+def _cells_of_box(acquisition, start, d, side, e, low, high, radius_l, sigma_e) -> np.ndarray:
+    """(n, 3) indices of the lattice cells in the box around a piece, in the order of the axes given."""
+    ends = start + np.outer([low, high], d)
+    reach = radius_l * np.abs(side) + acquisition["beam_cutoff"] * sigma_e * np.abs(e) + acquisition["cell_mm"]
+    first = np.floor((ends.min(axis=0) - reach) / acquisition["cell_mm"]).astype(np.int64)
+    last = np.floor((ends.max(axis=0) + reach) / acquisition["cell_mm"]).astype(np.int64)
+    return np.stack(np.meshgrid(*map(np.arange, first, last + 1), indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def drawn_labels(acquisition, labels: Labels, voxel: np.ndarray, random: np.ndarray) -> np.ndarray:
+    """The labels of scatterers at (n, 3) voxel positions: a corner drawn by its weight, or the membrane."""
+    here, f = labels.cells(voxel)
+    threshold = ((random[:, None] >> np.array([0, 5, 10], np.uint32)) & np.uint32(31)).astype(np.float32) + f32(0.5)
+    corner = here + (f * f32(32) > threshold) @ labels.steps
+    label = (labels.voxels[corner] & CONSTANTS["LABEL_MASK"]).astype(int)
+    if acquisition["membrane_reach"] < 0:
+        return label
+    distance = (labels.voxels[here[:, None] + labels.corner_steps] >> 8).astype(np.float32)
+    for axis in range(3):  # x first
+        distance = distance[:, ::2] + f[:, axis : axis + 1] * (distance[:, 1::2] - distance[:, ::2])
+    label[np.abs(distance[:, 0] - f32(127.5)) < acquisition["membrane_reach"]] = CONSTANTS["MEMBRANE_LABEL"]
+    return label
+
+
+def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndarray, lines: np.ndarray) -> None:
+    """Add every hit as an impulse at its own time, half on either side of its line."""
+    place = hits["depth_mm"] / acquisition["sample_mm"]
+    bins = np.floor(place).astype(int)
+    fits = (bins >= 0) & (bins + 1 < int(acquisition["samples"]))
+    hits, hit_lines, bins, part = hits[fits], hit_lines[fits], bins[fits], (place - np.floor(place))[fits]
+    cosine, sine = turn(hits["depth_mm"] * acquisition["cycles_per_mm"])
+    echo = f32(0.5) * hits["echo"] * (cosine - 1j * sine)
+    for side in (0, 1):
+        np.add.at(lines, (2 * hit_lines + side, bins), echo * (f32(1) - part))
+        np.add.at(lines, (2 * hit_lines + side, bins + 1), echo * part)
+
+
+def lateral_beam(acquisition: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """(scan lines, samples) complex64 from the impulses of the traced lines, spread as the lateral profile says."""
+    beam = Beam(acquisition)
+    s = np.arange(int(acquisition["samples"]), dtype=np.float32) * acquisition["sample_mm"]
+    step = beam.line_distance(s) / beam.lateral_sigma(s)
+    narrow2 = np.maximum(f32(1) - step * step / f32(6), f32(0.25))
+    edges = lines[1:-1:2] + lines[2::2]  # edge n lies half a step behind traced line n
+    scale = step / np.sqrt(narrow2) * f32(0.39894228)
+    result = np.empty((int(acquisition["scan_lines"]), len(s)), np.complex64)
+    reach = np.ceil(acquisition["beam_cutoff"] * beam.lateral_sigma(s) / beam.line_distance(s)) + f32(0.5)
+    for n in range(len(result)):
+        centre = int(acquisition["guard_lines"]) + n * int(acquisition["lateral_rays"])
+        away = np.arange(len(edges), dtype=np.float32)[:, None] + f32(0.5) - f32(centre)
+        near = np.flatnonzero(np.abs(away[:, 0]) <= reach.max())
+        weights = np.exp(f32(-0.5) * step * step / narrow2 * away[near] ** 2) * (np.abs(away[near]) <= reach)
+        result[n] = (weights * edges[near]).sum(axis=0) * scale
+    return result

@@ -1,0 +1,178 @@
+"""Label map, acoustic groups and borders of a medium, looked up for many points at once (kernels/borders.clh)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from SlicerUSSim.Logic.imaging.medium import Medium
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.verification.numpy_model.elementary import LOG2_E, dot, exp, exp2, f32, length, log, ramp, sum8
+
+_CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])  # (x, y, z) of the corners of a cell
+_FINE_SIGMA = f32(1.5)
+_FINE_REACH = f32(3.5)
+_EIGHT = np.arange(8, dtype=np.float32)
+
+
+class Labels:
+    """What Medium uploaded, fetched back."""
+
+    def __init__(self, medium: Medium) -> None:
+        shape = tuple(int(n) for n in medium.dims[::-1])
+        download = medium.device.download
+        self.dims = medium.dims.astype(np.int64)
+        self.voxels = download(medium.voxel_buffer, int(np.prod(shape)), np.uint16)
+        self.groups = download(medium.group_buffer, int(np.prod(shape)) + 8, np.uint8) & CONSTANTS["GROUP_MASK"]
+        self.smooth_groups = medium.smooth_groups
+        self.smooth = download(medium.smooth_buffer, (medium.smooth_groups, int(np.prod(shape))), np.uint16)
+        self.steps = np.array([1, self.dims[0], self.dims[0] * self.dims[1]])
+        self.corner_steps = _CORNERS @ self.steps
+
+    def cells(self, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(index of the cell, fraction (..., 3) inside it) of (..., 3) voxel positions, those outside moved in."""
+        voxel = np.clip(voxel, f32(0), f32(self.dims) - f32(1.001))
+        base = voxel.astype(np.int32)
+        return base @ self.steps, voxel - base.astype(np.float32)
+
+    def trilinear_weights(self, f: np.ndarray) -> np.ndarray:
+        """(..., 8) weights of the corners at fraction f (..., 3)."""
+        sides = np.stack([f32(1) - f, f], axis=-1)
+        x, y, z = (sides[..., axis, _CORNERS[:, axis]] for axis in range(3))
+        return x * y * z
+
+    def at(self, voxel: np.ndarray) -> np.ndarray:
+        """Labels at (..., 3) voxel positions: the group with the largest trilinear weight, in it the nearest corner."""
+        here, f = self.cells(voxel)
+        labels = self.voxels[here] & CONSTANTS["LABEL_MASK"]
+        several = (self.voxels[here] & CONSTANTS["SAME_LABEL"]) == 0
+        if several.any():
+            corners = here[several][:, None] + self.corner_steps
+            weights, group = self.trilinear_weights(f[several]), self.groups[corners]
+            votes = np.stack([sum8(np.where(group == g[:, None], weights, f32(0))) for g in group.T], axis=-1)
+            best = np.take_along_axis(group, votes.argmax(axis=-1)[:, None], axis=-1)
+            # The last one of equally near corners, and the first one where all are of one group
+            nearest = 7 - np.where(group == best, weights, f32(-1))[:, ::-1].argmax(axis=-1)
+            one_group = (group == best).all(axis=-1)
+            nearest[one_group] = (f[several][one_group] > f32(0.5)) @ [1, 2, 4]
+            chosen = np.take_along_axis(corners, nearest[:, None], axis=-1)[:, 0]
+            labels[several] = self.voxels[chosen] & CONSTANTS["LABEL_MASK"]
+        return labels
+
+    def borders(self, voxel, before, behind) -> tuple[np.ndarray, np.ndarray]:
+        """(towards (n, 3), overshoot (n,)) of the border between groups near (n, 3) voxel positions."""
+        towards, overshoot, confidence = self._wide(voxel, before, behind)
+        doubtful = confidence < 1
+        fine_towards, fine_overshoot, fine_confidence = self._fine(voxel[doubtful], before[doubtful], behind[doubtful])
+        wide, start = confidence[doubtful], fine_confidence * fine_overshoot
+        overshoot[doubtful] = start + wide * (overshoot[doubtful] - start)
+        towards[doubtful] = fine_towards + wide[:, None] * (towards[doubtful] - fine_towards)
+        return towards, overshoot
+
+    def _fine(self, voxel, before, behind):
+        """By the labels within 3.5 voxels, smoothed here."""
+        top = self.dims - 1
+        inside = np.clip(voxel, f32(0), f32(top))
+        low = np.maximum(np.ceil(inside - _FINE_REACH).astype(np.int64), 0)
+        count = np.minimum(np.floor(inside + _FINE_REACH).astype(np.int64), top) - low + 1
+        away = (low.astype(np.float32) - voxel)[..., None] + _EIGHT  # (n, 3, 8)
+        narrow = f32(-0.5) * LOG2_E / (_FINE_SIGMA * _FINE_SIGMA)
+        weight = np.maximum(exp2(np.maximum(narrow * away * away, f32(-100))) - f32(0.065730), f32(0))
+        weight[count[..., None] <= _EIGHT] = 0
+        wx, wy, wz = weight[:, 0], weight[:, 1], weight[:, 2]
+        dx, dy, dz = away[:, 0], away[:, 1], away[:, 2]
+        moments = np.zeros((5, len(voxel), 8), np.float32)  # of D over j and k: 1, y, z, y^2 + z^2; and of |D|
+        for k in range(8):
+            for j in range(8):
+                yz, y, z = (wy[:, j] * wz[:, k])[:, None], dy[:, j : j + 1], dz[:, k : k + 1]
+                # Beyond the window the weight is 0, whatever is read.
+                row = np.minimum((low + [0, j, k]) @ self.steps, len(self.groups) - 8)
+                group = self.groups[row[:, None] + np.arange(8)]
+                sign = f32(group == before[:, None]) - f32(group == behind[:, None])
+                factors = (yz, yz * y, yz * z, yz * (y * y + z * z))
+                for moment, factor in zip(moments, factors, strict=False):
+                    moment += factor * sign
+                moments[4] += yz * np.abs(sign)
+        difference, by_y, by_z, by_square, either = moments
+        total_d, square = sum8(wx * difference), sum8(wx * (dx * dx * difference + by_square))
+        gradient = np.stack([sum8(wx * dx * difference), sum8(wx * by_y), sum8(wx * by_z)], axis=-1)
+        sx, sy, sz = sum8(wx), sum8(wy), sum8(wz)
+        total = sx * sy * sz + f32(1e-6)
+        total_square = sum8(wx * dx * dx) * sy * sz + sx * sum8(wy * dy * dy) * sz + sx * sy * sum8(wz * dz * dz)
+        steepness = np.maximum(length(gradient), f32(1e-9))
+        towards = np.where((steepness < f32(1e-3) * total)[:, None], f32(0), gradient / steepness[:, None])
+        share = f32(0.5) - f32(0.5) * total_d / (sum8(wx * either) + f32(1e-6))
+        overshoot = _border_distance(_FINE_SIGMA, share, (square - total_square / total * total_d) / steepness)
+        return towards, overshoot, f32(np.abs(overshoot) < 0.5)
+
+    def _wide(self, voxel, before, behind):
+        """By the indicators smoothed beforehand; confidence 0 where they do not know."""
+        towards, overshoot, confidence = np.zeros_like(voxel), *np.zeros((2, len(voxel)), np.float32)
+        if self.dims.min() < 4:
+            return towards, overshoot, confidence
+        known = np.flatnonzero((before < self.smooth_groups) & (behind < self.smooth_groups))
+        difference, both, up, down = self._stencil(voxel[known], before[known], behind[known])
+        fits = (both >= f32(0.97)) & (np.abs(difference) <= f32(0.5))
+        known, difference, both, up, down = known[fits], difference[fits], both[fits], up[fits], down[fits]
+        slope, bends = f32(0.5) * (up - down), up + down - (f32(2) * difference)[:, None]
+        laplacian = bends[:, 0] + bends[:, 1] + bends[:, 2]
+        wide = f32(CONSTANTS["WIDE_SIGMA"])
+        variance = wide * wide + f32(1) / f32(6)
+        steepness, sigma = np.maximum(length(slope), f32(1e-6)), np.sqrt(variance)
+        share = f32(0.5) - f32(0.5) * difference / both
+        distance = _border_distance(sigma, share, variance * laplacian / steepness)
+        of_plane = f32(0.79788456) / sigma * exp(f32(-0.5) * distance * distance / variance)
+        towards[known], overshoot[known] = slope / steepness[:, None], distance
+        confidence[known] = ramp(0.95, 0.99, steepness / of_plane)
+        return towards, overshoot, confidence
+
+    def _stencil(self, voxel, before, behind):
+        """(D, [before] + [behind]) of the smoothed indicators at voxel positions, and D a voxel up and down each axis.
+
+        (n,), (n,), (n, 3), (n, 3). Trilinear; the outermost cells are extrapolated from the next.
+        """
+        voxel = np.clip(voxel, f32(0), f32(self.dims) - f32(1.001))
+        base = np.clip(voxel.astype(np.int32), 1, self.dims - 3)
+        (fx, fy, fz), (gx, gy, gz) = (w.T for w in (voxel - f32(base), f32(1) - (voxel - f32(base))))
+        here = base @ self.steps
+
+        def node(i, j, k):
+            at = here + np.array([i, j, k]) @ self.steps
+            return f32(self.smooth[before, at]), f32(self.smooth[behind, at])
+
+        def row(j, k, shift=0):
+            """D at the position's i + shift on a row of the stencil."""
+            (a0, b0), (a1, b1) = node(shift, j, k), node(shift + 1, j, k)
+            return gx * (a0 - b0) + fx * (a1 - b1)
+
+        rows = {(j, k): row(j, k) for k in (0, 1) for j in (0, 1)}
+        wy, wz = (gy, fy), (gz, fz)
+        difference = both = right = left = f32(0)
+        for k in (0, 1):
+            for j in (0, 1):
+                weight = wy[j] * wz[k]
+                difference = difference + weight * rows[j, k]
+                right, left = right + weight * row(j, k, 1), left + weight * row(j, k, -1)
+                (a0, b0), (a1, b1) = node(0, j, k), node(1, j, k)
+                both = both + weight * (gx * (a0 + b0) + fx * (a1 + b1))
+        ahead = behind_ = above = below = f32(0)
+        for n in (0, 1):
+            ahead = ahead + wz[n] * (gy * rows[1, n] + fy * row(2, n))
+            behind_ = behind_ + wz[n] * (gy * row(-1, n) + fy * rows[0, n])
+            above = above + wy[n] * (gz * rows[n, 1] + fz * row(n, 2))
+            below = below + wy[n] * (gz * row(n, -1) + fz * rows[n, 0])
+        unit = f32(1.0 / 65535.0)
+        up, down = np.stack([right, ahead, above], -1) * unit, np.stack([left, behind_, below], -1) * unit
+        return difference * unit, both * unit, up, down
+
+
+def _border_distance(sigma, share, bend):
+    share = np.clip(share, f32(0.01), f32(0.99))
+    return f32(0.5) * (sigma / f32(1.702) * log(share / (f32(1) - share)) + bend)
+
+
+def border_normals(ras_to_voxel: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """(n, 3) unit normals in RAS of directions in voxel indices; zero where there is none."""
+    m = ras_to_voxel.reshape(3, 4)
+    normal = np.stack([dot(m[:, axis], towards) for axis in range(3)], axis=-1)
+    size = length(normal)
+    return np.where((size < f32(1e-6))[:, None], f32(0), normal / np.maximum(size, f32(1e-30))[:, None])

@@ -1,0 +1,359 @@
+"""The ray trees of all lines at once, wave by wave (kernels/raytracing.cl)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from SlicerUSSim.Logic.opencl.layout import HIT, SEGMENT
+from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
+from SlicerUSSim.Logic.verification.numpy_model.elementary import (
+    LN10_OVER_20,
+    affine_point,
+    affine_vector,
+    dot,
+    exp,
+    exp2,
+    f32,
+    length,
+    log,
+    log2,
+    ramp,
+    unit,
+)  # fmt: skip
+from SlicerUSSim.Logic.verification.numpy_model.labels import Labels, border_normals
+
+
+@dataclass
+class Rays:
+    """Rays on their way, one row each. Besides raytracing.cl's Ray: where in the output they write, and their node."""
+
+    line: np.ndarray
+    ray: np.ndarray  # 0 on the axis
+    quantile: np.ndarray
+    axis: np.ndarray
+    direction: np.ndarray
+    lateral: np.ndarray
+    elevational: np.ndarray
+    tube: np.ndarray
+    path: np.ndarray
+    depth: np.ndarray
+    log_attenuation: np.ndarray
+    weight: np.ndarray
+    blind_until: np.ndarray
+    reflections: np.ndarray
+    label: np.ndarray
+    # The node: course in voxels, where it ends, what happened since it began
+    start: np.ndarray = field(default=None)
+    step: np.ndarray = field(default=None)
+    aside: np.ndarray = field(default=None)
+    depth_per_mm: np.ndarray = field(default=None)
+    to_depth: np.ndarray = field(default=None)
+    leave: np.ndarray = field(default=None)
+    inside: np.ndarray = field(default=None)
+    since: np.ndarray = field(default=None)
+    spent: np.ndarray = field(default=None)
+    open: np.ndarray = field(default=None)
+    spent_open: np.ndarray = field(default=None)
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def of(self, which: np.ndarray) -> Rays:
+        """A copy of some rows."""
+        return Rays(*(None if v is None else v[which] for v in (getattr(self, f.name) for f in fields(self))))
+
+    @staticmethod
+    def joined(parts: list[Rays]) -> Rays:
+        return Rays(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Rays)))
+
+
+class Tracer:
+    """Traces an acquisition; `segments` and `hits` are layout records with their lines and rays beside them."""
+
+    def __init__(self, acquisition: np.ndarray, labels: Labels, tissues: np.ndarray) -> None:
+        self.acquisition, self.labels, self.tissues = acquisition, labels, tissues
+        self.elevation_sigma = Beam(acquisition).elevation_sigma
+        self.to_voxel = acquisition["ras_to_voxel"]
+        self.voxel_mm = acquisition["voxel_mm"]
+        self.decay = tissues["attenuation"] * acquisition["frequency_mhz"] * f32(0.2) * LN10_OVER_20
+
+    def run(self, roots: np.ndarray, quantiles: np.ndarray):
+        """(segments, their lines, hits, their lines) for roots (lines, 4) and quantiles (lines, rays)."""
+        self._segments, self._segment_lines, self._hits, self._hit_lines = [], [], [], []
+        rays = self._begin(self._roots(roots, quantiles))
+        while len(rays):
+            rays = self._advance(rays)
+        order = np.argsort(np.concatenate(self._segment_lines), kind="stable")
+        lines = np.concatenate(self._segment_lines)[order]
+        hits = np.concatenate(self._hits) if self._hits else np.zeros(0, HIT)
+        hit_lines = np.concatenate(self._hit_lines) if self._hits else np.zeros(0, int)
+        return np.concatenate(self._segments)[order], lines, hits, hit_lines
+
+    def _roots(self, roots: np.ndarray, quantiles: np.ndarray) -> Rays:
+        lines, each = len(roots), quantiles.shape[1] + 1
+        m, count = self.acquisition["probe_to_ras"], lines * each
+        line, ray = np.divmod(np.arange(count), each)
+        x, y, dx, dy = roots[line].T
+        zero, one = np.zeros(count, np.float32), np.ones(count, np.float32)
+        return Rays(
+            line=line, ray=ray, quantile=np.pad(quantiles, ((0, 0), (1, 0))).ravel(),
+            axis=affine_point(m, np.stack([x, y, zero], -1)),
+            direction=unit(affine_vector(m, np.stack([dx, dy, zero], -1))),
+            lateral=unit(affine_vector(m, np.stack([dy, -dx, zero], -1))),
+            elevational=unit(affine_vector(m, np.stack([zero, zero, one], -1))),
+            tube=np.stack([one, zero, one, zero], -1), path=zero, depth=zero, log_attenuation=zero, weight=one,
+            blind_until=-one, reflections=np.zeros(count, int), label=np.full(count, -1),
+        )  # fmt: skip
+
+    def _begin(self, rays: Rays) -> Rays:
+        """Every ray at the start of a node."""
+        acquisition = self.acquisition
+        rays.start = affine_point(self.to_voxel, rays.axis)
+        rays.step = affine_vector(self.to_voxel, rays.direction)
+        rays.aside = affine_vector(self.to_voxel, rays.elevational) * rays.quantile[:, None]
+        zero = np.zeros(len(rays), np.float32)
+        unknown = rays.label < 0
+        if unknown.any():
+            some = rays.of(unknown)
+            rays.label[unknown] = self.labels.at(self._place(some, zero[unknown]))
+        rays.depth_per_mm = acquisition["reference_speed_m_s"] / self.tissues["speed_m_s"][rays.label]
+        rays.to_depth = (acquisition["depth_mm"] - rays.depth) / rays.depth_per_mm
+        margin = f32(3) + np.abs(rays.quantile) * f32(4) / self.voxel_mm
+        enter, leave = zero, rays.to_depth
+        for a in range(3):
+            step = rays.step[:, a]
+            inverse = f32(1) / np.where(np.abs(step) < f32(1e-7), f32(1e-7), step)
+            t0 = (-margin - rays.start[:, a]) * inverse
+            t1 = (acquisition["dims"][a] - f32(1) + margin - rays.start[:, a]) * inverse
+            enter, leave = np.maximum(enter, np.minimum(t0, t1)), np.minimum(leave, np.maximum(t0, t1))
+        rays.inside, rays.leave = np.minimum(enter, rays.to_depth), leave
+        rays.since = rays.spent = rays.open = rays.spent_open = zero
+        return rays
+
+    def _place(self, rays: Rays, at: np.ndarray) -> np.ndarray:
+        """(n, [m,] 3) voxel positions at lengths (n, [m]) of the nodes."""
+        shape = (len(rays),) + (1,) * (at.ndim - 1)
+        sigma = self.elevation_sigma(rays.path.reshape(shape) + at)[..., None]
+        start, step, aside = (v.reshape(*shape, 3) for v in (rays.start, rays.step, rays.aside))
+        return start + at[..., None] * step + sigma * aside
+
+    def _next_border(self, rays: Rays, last: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(last length before, first behind, label behind) of each ray's next change of label; -1 if none to `last`."""
+        inside, beyond, other = rays.inside.copy(), np.full(len(rays), -1, np.float32), rays.label.copy()
+        stride = f32(0.5) * self.voxel_mm
+        left = np.flatnonzero(inside < last)
+        while len(left):
+            some = rays.of(left)
+            ahead = np.minimum(
+                inside[left, None] + stride * np.arange(1, 9, dtype=np.float32), last[left, None] + f32(1e-4)
+            )
+            labels = self.labels.at(self._place(some, ahead))
+            counts = (labels != some.label[:, None]) & (some.path[:, None] + ahead > some.blind_until[:, None])
+            found, first = counts.any(axis=1), counts.argmax(axis=1)
+            row = np.arange(len(left))
+            before = np.where(first > 0, ahead[row, first - 1], inside[left])
+            inside[left] = np.where(found, before, ahead[:, -1])
+            beyond[left] = np.where(found, ahead[row, first], beyond[left])
+            other[left] = np.where(found, labels[row, first], labels[:, -1])
+            left = left[~found & (inside[left] < last[left])]
+        found = np.flatnonzero(beyond >= 0)
+        self._bisect(rays, found, 3, inside, beyond, other)
+        group = self.tissues["group"]
+        found = found[group[other[found]] != group[rays.label[found]]]
+        self._bisect(rays, found, 2, inside, beyond, other)
+        return inside, beyond, other
+
+    def _bisect(self, rays: Rays, which: np.ndarray, times: int, inside, beyond, other) -> None:
+        """Halve the stretch between `inside` and `beyond` of some rays, in place."""
+        some = rays.of(which)
+        for _ in range(times if len(which) else 0):
+            middle = f32(0.5) * (inside[which] + beyond[which])
+            found = self.labels.at(self._place(some, middle))
+            same = found == some.label
+            inside[which] = np.where(same, middle, inside[which])
+            beyond[which] = np.where(same, beyond[which], middle)
+            other[which] = np.where(same, other[which], found)
+
+    def _advance(self, rays: Rays) -> Rays:
+        """Every ray to its next change of tissue; the rays that go on from there."""
+        acquisition, group = self.acquisition, self.tissues["group"]
+        decay = self.decay[rays.label]
+        reserve = log(rays.weight / acquisition["intensity_threshold"]) + rays.log_attenuation - rays.spent
+        to_silence = rays.since + np.maximum(reserve, f32(0)) / np.maximum(decay, f32(1e-9))
+        longest = np.minimum(rays.to_depth, to_silence)
+        rays.inside, border, other = self._next_border(rays, np.minimum(rays.leave, longest))
+        until = np.where(border < 0, longest, border)
+        spent_until = rays.spent + decay * (until - rays.since)
+        ends = (border < 0) | (group[other] != group[rays.label])
+        written = self._write_segments(rays, decay, until, spent_until, ends)
+
+        on = rays.of(~ends)
+        on.since = until[~ends]
+        on.spent, on.label, on.inside = spent_until[~ends], other[~ends], border[~ends]
+        met = ends & (border >= 0)
+        rays.spent = spent_until
+        branches = self._branch(rays.of(met), border[met], other[met], written[met])
+        return Rays.joined([on, *branches])
+
+    def _write_segments(self, rays: Rays, decay, until, spent_until, ends) -> np.ndarray:
+        """Write what the axis rays have come through; returns where each ray's last segment lies (-1: none)."""
+        earlier = rays.since - rays.open
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mean_decay = np.where(earlier > 0, (rays.spent - rays.spent_open) / earlier, decay)
+        on_axis = rays.ray == 0
+        closes = on_axis & (np.abs(decay - mean_decay) * np.minimum(earlier, until - rays.since) > f32(0.02))
+        self._segment_of(rays, closes, rays.open, rays.since, rays.spent_open, rays.spent)
+        rays.open = np.where(closes, rays.since, rays.open)
+        rays.spent_open = np.where(closes, rays.spent, rays.spent_open)
+        last = on_axis & ends & (until > rays.open)
+        self._segment_of(rays, last, rays.open, until, rays.spent_open, spent_until)
+        written = np.full(len(rays), -1)
+        written[last] = np.arange(last.sum())  # in the block written last
+        return written
+
+    def _segment_of(self, rays: Rays, which, begin, end, spent_begin, spent_end) -> None:
+        some, begin, end = rays.of(which), begin[which], end[which]
+        spent_begin, spent_end = spent_begin[which], spent_end[which]
+        segment = np.zeros(len(some), SEGMENT)
+        segment["start"] = some.axis + begin[:, None] * some.direction
+        segment["direction"], segment["lateral"] = some.direction, some.lateral
+        segment["elevational"], segment["tube"] = some.elevational, _tube_after(some.tube, begin)
+        segment["path_mm"], segment["length_mm"] = some.path + begin, end - begin
+        segment["depth_mm"] = some.depth + begin * some.depth_per_mm
+        segment["depth_per_mm"], segment["weight"] = some.depth_per_mm, some.weight
+        segment["attenuation"] = exp(some.log_attenuation - spent_begin)
+        segment["decay_per_mm"] = (spent_end - spent_begin) / (end - begin)
+        segment["reflections"], segment["label"] = some.reflections, some.label
+        self._segments.append(segment)
+        self._segment_lines.append(some.line)
+
+    def _branch(self, rays: Rays, border, other, written) -> list[Rays]:
+        """Write the hits at the borders; returns the reflected and the refracted children."""
+        acquisition, tissues = self.acquisition, self.tissues
+        before, behind = tissues["group"][rays.label], tissues["group"][other]
+        normal, overshoot = self._normals(rays, border, before, behind)
+        overshoot = np.minimum(overshoot, border - rays.since)
+        beyond = border.copy()
+        self._bisect(rays, np.flatnonzero(overshoot == 0), 3, rays.inside, beyond, other)
+        back = np.where(overshoot == 0, border - beyond, overshoot)
+        border = border - back
+        rays.spent = rays.spent - back * self.decay[rays.label]
+        shortened = written >= 0
+        self._segments[-1]["length_mm"][written[shortened]] -= back[shortened]
+        keep = rays.depth + border * rays.depth_per_mm < acquisition["depth_mm"]
+        rays, border, other, normal, overshoot = rays.of(keep), border[keep], other[keep], normal[keep], overshoot[keep]
+        before, behind = before[keep], behind[keep]
+
+        path, depth = rays.path + border, rays.depth + border * rays.depth_per_mm
+        log_attenuation = rays.log_attenuation - rays.spent
+        attenuation = exp(log_attenuation)
+        aside = (rays.quantile * self.elevation_sigma(path))[:, None] * rays.elevational
+        point = rays.axis + border[:, None] * rays.direction + aside
+        tube = _tube_after(rays.tube, border)
+        cos_in = np.clip(-dot(rays.direction, normal), f32(0.01), f32(1))
+        ratio = tissues["speed_m_s"][other] / tissues["speed_m_s"][rays.label]
+        sin2_out = ratio * ratio * (f32(1) - cos_in * cos_in)
+        is_total = sin2_out >= 1
+        cos_out = np.sqrt(np.maximum(f32(0), f32(1) - sin2_out))
+        z_in, z_out = tissues["impedance"][rays.label] * cos_out, tissues["impedance"][other] * cos_in
+        pressure = np.where(is_total, f32(1), (z_out - z_in) / (z_out + z_in))
+        reflectance = pressure * pressure
+        self._write_hits(rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube)
+
+        reflected_weight, refracted_weight = rays.weight * reflectance, rays.weight * (f32(1) - reflectance)
+        reflects = np.flatnonzero(
+            (rays.reflections < acquisition["max_ray_depth"])
+            & (reflected_weight >= acquisition["reflection_threshold"])
+            & (reflected_weight * attenuation >= acquisition["intensity_threshold"])
+        )
+        refracts = np.flatnonzero(~is_total & (refracted_weight * attenuation >= acquisition["intensity_threshold"]))
+        child = rays.of(reflects)
+        if acquisition["reflection_spreading"]:
+            spread = (tube[reflects], child, point[reflects], normal[reflects], before[reflects], behind[reflects])
+            child.tube = self._tube_reflected(*spread)
+        n = normal[reflects]
+        child.direction = unit(_mirror(child.direction, n))
+        child.lateral, child.elevational = _mirror(child.lateral, n), _mirror(child.elevational, n)
+        child.axis = point[reflects] - _mirror(aside[reflects], n)
+        child.weight, child.blind_until = reflected_weight[reflects], path[reflects] + self.voxel_mm
+        child.reflections = child.reflections + 1
+        child.path, child.depth, child.log_attenuation = path[reflects], depth[reflects], log_attenuation[reflects]
+
+        bent = rays.of(refracts)
+        n, ratio, path = normal[refracts], ratio[refracts], path[refracts]
+        towards = unit(ratio[:, None] * bent.direction + (ratio * cos_in[refracts] - cos_out[refracts])[:, None] * n)
+        bent.lateral = _carried(bent.lateral, bent.direction, towards)
+        bent.elevational = _carried(bent.elevational, bent.direction, towards)
+        bent.direction = towards
+        bent.axis = point[refracts] - (bent.quantile * self.elevation_sigma(path))[:, None] * bent.elevational
+        bent.tube, bent.path, bent.depth = tube[refracts], path, depth[refracts]
+        bent.log_attenuation, bent.weight = log_attenuation[refracts], refracted_weight[refracts]
+        bent.label = other[refracts]
+        over = overshoot[refracts]
+        bent.blind_until = np.where(over > 0, path + over + f32(0.5) * self.voxel_mm, path)
+        return [self._begin(child), self._begin(bent)]
+
+    def _normals(self, rays: Rays, border, before, behind) -> tuple[np.ndarray, np.ndarray]:
+        """(unit normals in RAS against the rays, lengths by which the rays are beyond the border)."""
+        towards, overshoot = self.labels.borders(self._place(rays, border), before, behind)
+        across = -dot(rays.step, towards)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            overshoot = np.where(across * self.voxel_mm > f32(0.2), overshoot / across, f32(0))
+        normal = border_normals(self.to_voxel, towards)
+        normal = np.where((dot(normal, rays.direction) > 0)[:, None], -normal, normal)
+        nowhere = dot(normal, normal) == 0
+        return np.where(nowhere[:, None], -rays.direction, normal), overshoot
+
+    def _tube_reflected(self, tube, rays: Rays, point, normal, before, behind) -> np.ndarray:
+        tube = tube.copy()
+        reach = f32(2) * self.voxel_mm
+        towards_ray = np.minimum(dot(normal, rays.direction), f32(-0.2))
+        for width, offset in ((0, rays.lateral), (2, rays.elevational)):
+            along = offset - (dot(normal, offset) / towards_ray)[:, None] * rays.direction
+            longer = np.maximum(length(along), f32(1e-3))
+            tangent = along / longer[:, None]
+            sides = []
+            for side in (-reach, reach):
+                place = affine_point(self.to_voxel, point + side * tangent)
+                sides.append(border_normals(self.to_voxel, self.labels.borders(place, before, behind)[0]))
+            curvature = dot(sides[1] - sides[0], tangent) / (f32(2) * reach)
+            curvature = curvature * ramp(0.004, 0.008, np.abs(curvature) * self.voxel_mm)
+            tube[:, width + 1] += f32(2) * np.maximum(curvature, f32(0)) * longer * tube[:, width]
+        return tube
+
+    def _write_hits(self, rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube) -> None:
+        acquisition, beside = self.acquisition, rays.ray > 0
+        count = acquisition["elevational_rays"].astype(np.float32)
+        density = f32(0.39894228) * exp(f32(-0.5) * rays.quantile * rays.quantile)
+        width = self.elevation_sigma(path) / (count * density)
+        slope = dot(normal, rays.elevational) / np.minimum(dot(normal, rays.direction), f32(-0.05))
+        turns = acquisition["cycles_per_mm"] * rays.depth_per_mm * width * slope
+        coherence = exp(f32(-1.6449341) * turns * turns)
+        specular = exp2(np.maximum(acquisition["specular_exponent"] * log2(cos_in), f32(-100)))
+        strength = pressure * pressure if acquisition["interface_is_energy"] else np.abs(pressure)
+        hit = np.zeros(len(rays), HIT)
+        hit["position"], hit["normal"], hit["path_mm"], hit["depth_mm"] = point, normal, path, depth
+        hit["weight"], hit["attenuation"], hit["cos_incidence"] = rays.weight, attenuation, cos_in
+        hit["reflectance"], hit["reflections"] = pressure * pressure, rays.reflections
+        hit["label_before"], hit["label_behind"] = rays.label, other
+        gain = acquisition["interface_gain"] / (count * tube[:, 0] * tube[:, 2])
+        hit["echo"] = rays.weight * attenuation * strength * specular * gain * coherence
+        self._hits.append(hit[beside])
+        self._hit_lines.append(rays.line[beside])
+
+
+def _tube_after(tube: np.ndarray, along: np.ndarray) -> np.ndarray:
+    after = tube.copy()
+    after[:, 0] += tube[:, 1] * along
+    after[:, 2] += tube[:, 3] * along
+    return after
+
+
+def _mirror(v: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    return v - (f32(2) * dot(v, normal))[:, None] * normal
+
+
+def _carried(v: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    return v - (dot(v, end) / (f32(1) + dot(start, end)))[:, None] * (start + end)

@@ -1,0 +1,524 @@
+"""Test objects made by code: phantoms that say what theory expects of their image.
+
+A phantom is described in the frame of the probe that looks at it (mm: x lateral, y depth, z elevational, origin at the
+probe face; no object changes along z unless it says so) and voxelised in patient space under any rotation: the same
+object then lies differently on the voxels, and nothing about its image may change.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+
+REFERENCE_SPEED_M_S = 1540.0
+#: Speckle in a medium that the scanner takes for what it is
+BACKGROUND = Tissue("background", REFERENCE_SPEED_M_S, 1.6, 0.5, mu0=0.33, sigma0=0.15)
+#: No echo, no attenuation
+FLUID = Tissue("fluid", REFERENCE_SPEED_M_S, 1.6, 0.0)
+#: Reflects nearly everything and absorbs the rest, so that no comet tail covers what lies behind
+STEEL = Tissue("steel", REFERENCE_SPEED_M_S, 46.0, 30.0)
+
+
+class _Box(NamedTuple):
+    """What a phantom holds at least, in the probe frame (mm)."""
+
+    half_width: float = 18.0
+    top: float = -4.0
+    bottom: float = 54.0
+    half_thickness: float = 6.0
+
+
+@dataclass(frozen=True)
+class Echo:
+    """Theory: the image shows an echo here."""
+
+    name: str
+    #: (lateral, depth) in the probe frame, where the image shows it
+    shown_mm: tuple[float, float]
+    #: (lateral, depth) of the object it comes from
+    object_mm: tuple[float, float]
+    #: In dB re the first echo of the phantom; None where theory says nothing
+    level_db: float | None = None
+
+
+@dataclass(frozen=True)
+class LevelChange:
+    """Theory: in this region the mean level differs from that of the phantom's `reference` tissues."""
+
+    name: str
+    #: (left, right, top, bottom) in the probe frame
+    region_mm: tuple[float, float, float, float]
+    change_db: float
+
+
+@dataclass(frozen=True)
+class Level:
+    """Theory: the mean level in this region."""
+
+    name: str
+    #: (left, right, top, bottom) in the probe frame
+    region_mm: tuple[float, float, float, float]
+    #: In dB re tissue of unit scatterer variance without attenuation
+    level_db: float
+
+
+@dataclass(frozen=True, eq=False)
+class Phantom:
+    """A test object: labels, tissues, the pose to look at it from, and what its image must show."""
+
+    name: str
+    labels: Volume
+    tissues: TissueTable
+    #: (4, 4)
+    probe_to_ras: np.ndarray
+    #: What a given probe sees, by theory
+    expected: Callable[[Probe], tuple[Echo | LevelChange | Level, ...]] = lambda probe: ()
+    #: The same object without the effect it demonstrates, for comparison
+    reference: TissueTable | None = None
+    #: Centre of a sphere
+    centre_ras: tuple[float, float, float] | None = None
+
+
+def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence=1.0):
+    """Pressure reflection coefficient r of a border between two fluids; 1 beyond the critical angle.
+
+    r = (Z2 cos i - Z1 cos t) / (Z2 cos i + Z1 cos t), sin t / c2 = sin i / c1 (PHYSICS section 3).
+    """
+    cos_in = np.asarray(cos_incidence, float)
+    sin_out = behind.speed_of_sound_m_s / before.speed_of_sound_m_s * np.sqrt(1.0 - cos_in**2)
+    z_in = before.impedance_mrayl * np.sqrt(np.clip(1.0 - sin_out**2, 0.0, None))
+    z_out = behind.impedance_mrayl * cos_in
+    return np.where(sin_out >= 1.0, 1.0, (z_out - z_in) / (z_out + z_in))
+
+
+# ---- the five phantoms of the paper's Fig. 2 ------------------------------------------------------------------------
+
+
+def attenuating_block(
+    attenuation_db_cm_mhz: float = 1.2, rotation: np.ndarray | None = None, *, thickness_mm: float = 12.0
+) -> Phantom:
+    """Shadow, or enhancement with less attenuation than the background's: a block in the middle of speckle.
+
+    Behind it the mean level changes by -2 (alpha_block - alpha_background) f d dB (PHYSICS section 7).
+    """
+    block = replace(BACKGROUND, name="block", attenuation_db_cm_mhz=attenuation_db_cm_mhz)
+    top = 14.0
+
+    def label(x, y, z):
+        return np.where((np.abs(x) < 8.0) & (y > top) & (y < top + thickness_mm), 2, 1)
+
+    def expected(probe: Probe):
+        more = attenuation_db_cm_mhz - BACKGROUND.attenuation_db_cm_mhz
+        change = -2.0 * more * probe.frequency_mhz * thickness_mm / 10.0
+        return (
+            LevelChange("behind the block", (-2.0, 2.0, top + thickness_mm + 6.0, top + thickness_mm + 22.0), change),
+        )
+
+    tissues = TissueTable({0: BACKGROUND, 1: BACKGROUND, 2: block})
+    return _phantom(
+        "attenuating block", label, tissues, rotation, 0.5, expected, tissues.replace("block", **_acoustics(BACKGROUND))
+    )
+
+
+def speed_block(
+    speed_m_s: float = 1450.0, rotation: np.ndarray | None = None, *, thickness_mm: float = 16.0
+) -> Phantom:
+    """Range distortion: a wire behind a block of another speed of sound moves by d (c_ref / c - 1)."""
+    block = replace(BACKGROUND, name="block", speed_of_sound_m_s=speed_m_s)
+    top, wire, radius = 12.0, (0.0, 40.0), 0.8
+
+    def label(x, y, z):
+        labels = np.where((np.abs(x) < 10.0) & (y > top) & (y < top + thickness_mm), 2, 1)
+        return np.where(_in_cylinder(x, y, wire, radius), 3, labels)
+
+    def expected(probe: Probe):
+        moved = thickness_mm * (REFERENCE_SPEED_M_S / speed_m_s - 1.0)
+        front = wire[1] - radius
+        return (Echo("wire", (0.0, front + moved), (0.0, front)),)
+
+    tissues = TissueTable({0: BACKGROUND, 1: BACKGROUND, 2: block, 3: STEEL})
+    return _phantom(
+        "speed block", label, tissues, rotation, 0.25, expected, tissues.replace("block", **_acoustics(BACKGROUND))
+    )
+
+
+def mirror(rotation: np.ndarray | None = None, *, tilt_deg: float = 30.0) -> Phantom:
+    """Mirroring: a rod before an oblique strong reflector appears again behind it, at its mirror image."""
+    tilt = np.radians(tilt_deg)
+    point, normal = np.array([0.0, 30.0]), np.array([-np.sin(tilt), -np.cos(tilt)])  # towards the probe
+    radius, away = 0.6, 9.0
+    down = np.array([0.0, 1.0])
+    rod = point + away * (down - 2.0 * (down @ normal) * normal)
+
+    def label(x, y, z):
+        labels = np.where((x - point[0]) * normal[0] + (y - point[1]) * normal[1] < 0.0, 2, 1)
+        return np.where(_in_cylinder(x, y, rod, radius), 3, labels)
+
+    def expected(probe: Probe):
+        image = rod - 2.0 * ((rod - point) @ normal) * normal
+        return (
+            Echo("rod", tuple(rod - radius * _line_direction_at(probe, rod)), tuple(rod)),
+            Echo("mirror image", tuple(image - radius * _line_direction_at(probe, image)), tuple(rod)),
+        )
+
+    plate = replace(STEEL, name="mirror")
+    dim = replace(BACKGROUND, attenuation_db_cm_mhz=0.1, mu0=0.033, sigma0=0.015)
+    return _phantom("mirror", label, TissueTable({0: dim, 1: dim, 2: plate, 3: STEEL}), rotation, 0.25, expected)
+
+
+def refracting_wedge(
+    rotation: np.ndarray | None = None, *, tilt_deg: float = 25.0, speeds_m_s: tuple[float, float] = (1450.0, 1620.0)
+) -> Phantom:
+    """Refraction: wires behind an oblique interface are shown where the unbent ray would have met them."""
+    tilt, radius = np.radians(tilt_deg), 0.6
+    point, normal = np.array([0.0, 20.0]), np.array([np.sin(tilt), -np.cos(tilt)])
+    wires = [np.array(wire) for wire in ((-8.0, 36.0), (0.0, 40.0), (8.0, 44.0))]
+
+    def label(x, y, z):
+        labels = np.where((x - point[0]) * normal[0] + (y - point[1]) * normal[1] < 0.0, 2, 1)
+        for wire in wires:
+            labels = np.where(_in_cylinder(x, y, wire, radius), 3, labels)
+        return labels
+
+    def expected(probe: Probe):
+        return tuple(
+            Echo(f"wire {n}", _shown_behind_plane(probe, wire, radius, point, normal, speeds_m_s), tuple(wire))
+            for n, wire in enumerate(wires, 1)
+        )
+
+    # One impedance on either side: what bends the ray is the speed alone.
+    above, below = (
+        replace(BACKGROUND, name=name, speed_of_sound_m_s=c, mu0=0.1, sigma0=0.045)
+        for name, c in zip(("slow", "fast"), speeds_m_s, strict=True)
+    )
+    return _phantom("refracting wedge", label, TissueTable({1: above, 2: below, 3: STEEL}), rotation, 0.2, expected)
+
+
+def parallel_plates(
+    rotation: np.ndarray | None = None, *, gap_mm: float = 7.2, speed_m_s: float = 1600.0, spacing_mm: float = 0.2
+) -> Phantom:
+    """Reverberation between two plane borders: an echo every d c_ref / c, each weaker by 20 log10(r1 r2) dB."""
+    top = 15.0
+    above, gap = FLUID, Tissue("gap", speed_m_s, 9.0, 0.0)
+    below = replace(FLUID, name="below", impedance_mrayl=1.8)
+
+    def label(x, y, z):
+        return np.where(y < top, 1, np.where(y < top + gap_mm, 2, 3))
+
+    def expected(probe: Probe):
+        apart = gap_mm * REFERENCE_SPEED_M_S / speed_m_s
+        fall = 20.0 * np.log10(reflection_coefficient(gap, above) * reflection_coefficient(gap, below))
+        far = top + gap_mm
+        return tuple(
+            Echo(f"bounce {n}" if n else "far side", (0.0, top + (n + 1) * apart), (0.0, far), n * fall)
+            for n in range(3)
+        )
+
+    return _phantom(
+        "parallel plates",
+        label,
+        TissueTable({0: above, 1: above, 2: gap, 3: below}),
+        rotation,
+        spacing_mm,
+        expected,
+        box=_Box(half_width=20.0),
+    )
+
+
+def curved_mirror(rotation: np.ndarray | None = None, *, radius_mm: float = 12.0, is_sphere: bool = True) -> Phantom:
+    """A steel ball or a rod across the image, in speckle that it mirrors, thinner the further away.
+
+    A convex mirror of radius r has the focal length r/2, so at a distance l a narrow beam is 1 + 2 l / r times as wide:
+    in both directions behind a ball, laterally behind a rod. The power of what it shows falls by as much.
+    """
+    top = 22.0
+    plain = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
+
+    def label(x, y, z):
+        return np.where(x**2 + (y - top - radius_mm) ** 2 + is_sphere * z**2 < radius_mm**2, 2, 1)
+
+    def expected(probe: Probe):
+        reflectance = reflection_coefficient(plain, STEEL) ** 2
+        direct = 10 * np.log10(plain.scatterer_variance)
+        levels = []
+        for away in (3.0, 6.0, 10.0):
+            wider = (1.0 + 2.0 * away / radius_mm) ** (2 if is_sphere else 1)
+            region = (-1.5, 1.5, top + away - 1.0, top + away + 1.0)
+            level = direct + 20 * np.log10(reflectance) - 10 * np.log10(wider)
+            levels.append(Level(f"{away:.0f} mm", region, level))
+        return tuple(levels)
+
+    tissues = TissueTable({0: plain, 1: plain, 2: STEEL})
+    return _phantom("curved mirror", label, tissues, rotation, 0.4, expected)
+
+
+# ---- resolution and speckle -----------------------------------------------------------------------------------------
+
+
+def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0.2) -> Phantom:
+    """A quality-assurance phantom: wires every 10 mm of depth, black cysts, and blocks 6 dB above and below."""
+    radius = 0.4
+    # None is on another's scan line, or on a cyst's, for any kind of probe.
+    wires = [(-2.0, 10.0), (2.0, 20.0), (-1.0, 30.0), (1.0, 40.0), (0.0, 50.0)]
+    cysts = {2: [(-12.0, 20.0), (-12.0, 45.0)], 3: [(12.0, 20.0)], 4: [(12.0, 45.0)]}
+    changes_db = {3: 6.0, 4: -6.0}
+    plain = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
+    tissues = {0: plain, 1: plain, 2: FLUID, 5: STEEL}
+    for number, change in changes_db.items():
+        factor = 10.0 ** (change / 20.0)
+        name = f"{change:+.0f} dB"
+        tissues[number] = replace(tissues[1], name=name, mu0=factor * BACKGROUND.mu0, sigma0=factor * BACKGROUND.sigma0)
+
+    def label(x, y, z):
+        labels = np.ones(np.broadcast_shapes(x.shape, y.shape, z.shape), np.uint8)
+        for number, centres in cysts.items():
+            for centre in centres:
+                labels[_in_cylinder(x, y, centre, 4.0)] = number
+        for wire in wires:
+            labels[_in_cylinder(x, y, wire, radius)] = 5
+        return labels
+
+    def expected(probe: Probe):
+        echoes = tuple(
+            Echo(f"wire at {wire[1]:.0f} mm", tuple(wire - radius * _line_direction_at(probe, wire)), tuple(wire))
+            for wire in map(np.array, wires)
+        )
+        levels = tuple(
+            LevelChange(tissues[number].name, (x - 2.5, x + 2.5, y - 2.5, y + 2.5), change)
+            for number, change in changes_db.items()
+            for x, y in cysts[number]
+        )
+        return echoes + levels
+
+    table = TissueTable(tissues)
+    reference = table
+    for number in changes_db:
+        reference = reference.replace(tissues[number].name, mu0=BACKGROUND.mu0, sigma0=BACKGROUND.sigma0)
+    return _phantom("wires and cysts", label, table, rotation, spacing_mm, expected, reference)
+
+
+def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom:
+    """One tissue everywhere: the level is Var of its scatterers, the envelope Rayleigh; the PSF sets correlations."""
+
+    def expected(probe: Probe):
+        if tissue.attenuation_db_cm_mhz > 0.0:
+            return ()  # the level falls with depth
+        region = (-0.2 * probe.depth_mm, 0.2 * probe.depth_mm, 0.2 * probe.depth_mm, 0.9 * probe.depth_mm)
+        return (Level("speckle", region, 10 * np.log10(tissue.scatterer_variance)),)
+
+    tissues = TissueTable({0: tissue, 1: tissue})
+    return _phantom("uniform speckle", lambda x, y, z: np.ones_like(x + y + z), tissues, rotation, 1.0, expected)
+
+
+def thin_rod(rotation: np.ndarray | None = None, *, depth_mm: float = 30.0, width_mm: float = 1.2) -> Phantom:
+    """A thin echogenic bar along the lateral axis, square in section, in a fluid: shows how thick the slice is."""
+
+    def label(x, y, z):
+        return np.where((np.abs(y - depth_mm) < 0.5 * width_mm) & (np.abs(z) < 0.5 * width_mm), 1, 0)
+
+    bar = replace(FLUID, name="bar", mu0=2.0, sigma0=1.0)
+    tissues = TissueTable({0: FLUID, 1: bar})
+    place = (0.0, depth_mm)
+    return _phantom(
+        "thin rod", label, tissues, rotation, 0.3, lambda probe: (Echo("bar", place, place),), box=_Box(half_width=12.0)
+    )
+
+
+def layered(
+    tissues: Sequence[Tissue],
+    borders_mm: Sequence[float],
+    rotation: np.ndarray | None = None,
+    *,
+    tilt_deg: float = 0.0,
+    spacing_mm: float = 0.5,
+    half_width_mm: float = 50.0,
+) -> Phantom:
+    """Plane layers of labels 1, 2, ... with borders at the given depths on the axis, tilted about z."""
+    require(len(tissues) == len(borders_mm) + 1, f"{len(tissues)} tissues and {len(borders_mm)} borders do not fit")
+    tilt = np.radians(tilt_deg)
+
+    def label(x, y, z):
+        along = np.sin(tilt) * x + np.cos(tilt) * y
+        return 1 + sum((along > np.cos(tilt) * border).astype(np.uint8) for border in borders_mm)
+
+    def expected(probe: Probe):
+        if tilt_deg != 0.0:
+            return ()  # off the axis, or off the perpendicular
+        thickness = np.diff([0.0, *borders_mm])
+        speeds = [tissue.speed_of_sound_m_s for tissue in tissues[:-1]]
+        shown = np.cumsum(thickness * REFERENCE_SPEED_M_S / speeds)
+        return tuple(
+            Echo(f"border {n}", (0.0, float(depth)), (0.0, border))
+            for n, (depth, border) in enumerate(zip(shown, borders_mm, strict=True), 1)
+        )
+
+    table = TissueTable(dict(enumerate(tissues, 1)))
+    # In a fast layer the field reaches farther than its nominal depth.
+    box = _Box(half_width=half_width_mm, bottom=60.0)
+    return _phantom("layers", label, table, rotation, spacing_mm, expected, box=box)
+
+
+def small_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.0, half_mm: float = 2.0) -> Phantom:
+    """A square plate, small against the beam's changes and fine against its width, that faces the probe."""
+
+    def label(x, y, z):
+        return np.where((y > depth_mm) & (y < depth_mm + 1.5) & (np.abs(x) < half_mm) & (np.abs(z) < half_mm), 1, 0)
+
+    tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sheet", impedance_mrayl=1.8)})
+    box = _Box(half_mm + 2.0, depth_mm - 2.0, depth_mm + 4.0, half_mm + 6.0)
+    return _phantom("small sheet", label, tissues, rotation, 0.1, _facing(depth_mm), box=box)
+
+
+# ---- voxels ---------------------------------------------------------------------------------------------------------
+
+
+def voxel_sphere(
+    rotation: np.ndarray | None = None,
+    *,
+    radius_mm: float = 20.0,
+    spacing_mm: float = 1.0,
+    centre_mm=(0.31, 0.17, -0.42),
+) -> Phantom:
+    """A sphere on coarse voxels, its centre nowhere special on them; PHYSICS section 3 bounds its stairs.
+
+    `centre_mm` is in RAS; the probe face is 29 mm before it.
+    """
+    centre = np.asarray(centre_mm, float)
+    half = int(np.ceil((radius_mm + 10.0) / spacing_mm))
+    axis = spacing_mm * np.arange(-half, half + 1)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    inside = (x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2 < radius_mm**2
+    matrix = np.diag([spacing_mm] * 3 + [1.0])
+    matrix[:3, 3] = axis[0]
+    pose = _pose(rotation)
+    pose[:3, 3] = -(radius_mm + 9.0) * pose[:3, 1]
+    # An impedance of its own makes it a border; a speed of its own would bend the rays inside.
+    tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sphere", impedance_mrayl=2.0)})
+    x0, y0, z0 = pose[:3, :3].T @ (centre - pose[:3, 3])  # in the probe frame
+
+    def expected(probe: Probe):
+        # The image plane cuts the sphere beside its centre; the line towards the cut's centre meets it at right angles.
+        front = np.array([x0, y0]) - np.sqrt(radius_mm**2 - z0**2) * _line_direction_at(probe, (x0, y0))
+        return (Echo("front", tuple(front), tuple(front)),)
+
+    volume = Volume(inside.astype(np.uint8), matrix)
+    return Phantom("voxel sphere", volume, tissues, pose, expected, centre_ras=tuple(centre))
+
+
+def voxel_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, spacing_mm: float = 1.0) -> Phantom:
+    """A sheet one voxel thick across the beam (falx, dura); an oblique one has voxels that touch by edges at least."""
+    thickness = spacing_mm if rotation is None or np.allclose(np.abs(rotation).max(axis=0), 1.0) else 1.5 * spacing_mm
+
+    def label(x, y, z):
+        return np.where(np.abs(y - depth_mm) < 0.5 * thickness, 1, 0)
+
+    tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sheet", impedance_mrayl=1.9)})
+    return _phantom(
+        "voxel sheet",
+        label,
+        tissues,
+        rotation,
+        spacing_mm,
+        _facing(depth_mm - 0.5 * thickness),
+        box=_Box(half_width=50.0),
+    )
+
+
+def _facing(depth_mm: float) -> Callable[[Probe], tuple[Echo, ...]]:
+    """What a face across the axis shows."""
+    return lambda probe: (Echo("face", (0.0, depth_mm), (0.0, depth_mm)),)
+
+
+def _phantom(name, label, tissues, rotation, spacing_mm, expected=None, reference=None, box=None) -> Phantom:
+    pose = _pose(rotation)
+    labels = _voxelise(label, pose[:3, :3], spacing_mm, box or _Box())
+    return Phantom(name, labels, tissues, pose, expected or (lambda probe: ()), reference)
+
+
+def _pose(rotation: np.ndarray | None) -> np.ndarray:
+    pose = np.eye(4)
+    if rotation is not None:
+        require(np.shape(rotation) == (3, 3), f"rotation has shape {np.shape(rotation)}, expected (3, 3)")
+        pose[:3, :3] = rotation
+    return check_rigid("rotation", pose)
+
+
+def _voxelise(label, rotation: np.ndarray, spacing_mm: float, box: _Box) -> Volume:
+    """Labels on a grid along RAS. Voxel centres lie at odd multiples of half the spacing, so that a plane at a multiple
+    of the spacing is half-way between two layers: where the object lies straight, its borders are exact."""
+    sides = (-box.half_width, box.half_width), (box.top, box.bottom), (-box.half_thickness, box.half_thickness)
+    corners = np.array(list(itertools.product(*sides))) @ rotation.T
+    low = np.floor(corners.min(axis=0) / spacing_mm).astype(int)
+    high = np.ceil(corners.max(axis=0) / spacing_mm).astype(int)
+    x, y, z = (spacing_mm * (np.arange(a, b) + 0.5) for a, b in zip(low, high, strict=True))
+    array = np.empty((len(z), len(y), len(x)), np.uint8)
+    yx = np.stack(np.meshgrid(y, x, indexing="ij"))
+    for k, depth in enumerate(z):  # slice by slice: whole volumes of coordinates would fill the memory
+        points = [rotation[0, a] * yx[1] + rotation[1, a] * yx[0] + rotation[2, a] * depth for a in range(3)]
+        array[k] = label(*points)
+    matrix = np.diag([spacing_mm] * 3 + [1.0])
+    matrix[:3, 3] = spacing_mm * (low + 0.5)
+    return Volume(array, matrix)
+
+
+def _acoustics(tissue: Tissue) -> dict[str, float]:
+    return {name: getattr(tissue, name) for name in ("speed_of_sound_m_s", "impedance_mrayl", "attenuation_db_cm_mhz")}
+
+
+def _in_cylinder(x, y, centre, radius: float):
+    """Inside the cylinder along z."""
+    return (x - centre[0]) ** 2 + (y - centre[1]) ** 2 < radius**2
+
+
+# ---- geometrical acoustics in the image plane, independent of the kernels -------------------------------------------
+
+
+def _line_at(probe: Probe, position) -> tuple[np.ndarray, np.ndarray]:
+    """(origin, direction), both (lateral, depth), of the scan line at `position`."""
+    origin, direction = probe.line_at(position)
+    return origin[:2], direction[:2]
+
+
+def _line_direction_at(probe: Probe, point) -> np.ndarray:
+    """Direction of the scan line through a point (lateral, depth)."""
+    return _line_at(probe, probe.line_through(*point)[0])[1]
+
+
+def _shown_behind_plane(probe, target, radius, point, normal, speeds_m_s) -> tuple[float, float]:
+    """Where a cylinder behind a plane border is shown: on the scan line whose refracted ray aims at its axis.
+
+    Snell's law in vector form; `normal` points towards the probe, `speeds_m_s` are before and behind the plane.
+    """
+
+    def bent(position: float):
+        origin, direction = _line_at(probe, position)
+        before = ((point - origin) @ normal) / (direction @ normal)
+        ratio, cos_in = speeds_m_s[1] / speeds_m_s[0], -(direction @ normal)
+        cos_out = np.sqrt(1.0 - ratio**2 * (1.0 - cos_in**2))
+        return before, origin + before * direction, ratio * direction + (ratio * cos_in - cos_out) * normal
+
+    def miss(position: float) -> float:
+        _, crossing, direction = bent(position)
+        to_target = target - crossing
+        return direction[0] * to_target[1] - direction[1] * to_target[0]
+
+    end = 0.9 * abs(probe.first_line)
+    position = brentq(miss, -end, end)
+    before, crossing, _ = bent(position)
+    behind = np.linalg.norm(target - crossing) - radius
+    depth = REFERENCE_SPEED_M_S * (before / speeds_m_s[0] + behind / speeds_m_s[1])
+    origin, direction = _line_at(probe, position)
+    shown = origin + depth * direction
+    return float(shown[0]), float(shown[1])

@@ -1,0 +1,228 @@
+"""Checks of the speckle (PHYSICS section 4): statistics, correlations by the point spread function, a fixed patient."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy import stats
+
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.probe.arrays import LinearProbe, Probe
+from SlicerUSSim.Logic.probe.placement import elevational_motion
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, fit_rayleigh, level_db
+from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, uniform_speckle
+from SlicerUSSim.Logic.verification.validation import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.verification.validation.pictures import (
+    Curve,
+    Plot,
+    View,
+    draw_images,
+    draw_plots,
+    draw_rayleigh,
+    draw_views,
+)
+
+#: Without attenuation, so that statistics do not change with depth
+SPECKLE = replace(BACKGROUND, name="speckle", attenuation_db_cm_mhz=0.0)
+#: Mean over standard deviation of a Rayleigh variable
+RAYLEIGH_SNR = float(np.sqrt(np.pi / (4.0 - np.pi)))
+DEPTHS_MM = (10.0, 30.0, 46.0)
+SEEDS = range(8)
+
+
+def _simulators(rotation: np.ndarray, device, tissue: Tissue = SPECKLE, seeds=SEEDS, **settings):
+    phantom = uniform_speckle(tissue, rotation)
+    return phantom, [
+        UltrasoundSimulator(phantom.labels, phantom.tissues, SimulationSettings(seed=seed, **settings), device)
+        for seed in seeds
+    ]
+
+
+def statistics(rotation: np.ndarray, device) -> Outcome:
+    """First-order statistics in uniform tissue."""
+    phantom, simulators = _simulators(rotation, device)
+    rows = []
+    for name, probe in PROBES.items():
+        signals = [s.simulate(probe, phantom.probe_to_ras).iq[:, 64:-64] for s in simulators]
+        envelope = np.abs(np.stack(signals))
+        variance = 10 * np.log10(SPECKLE.scatterer_variance)
+        snr = float(envelope.mean() / envelope.std())
+        rows += [
+            Row(f"mean / standard deviation, {name}", "", RAYLEIGH_SNR, snr, 0.02 * RAYLEIGH_SNR),
+            Row(f"level, {name}", "dB", variance, level_db(envelope), 0.5),
+            Row(f"spectral peak over surroundings, {name}", "", 8.0, _spectral_peak(envelope), 0.0, "at most"),
+        ]
+    frame = simulators[0].simulate(PROBES["convex"], phantom.probe_to_ras, DisplaySettings(tgc_db_cm_mhz=0.0))
+    return Outcome(tuple(rows), partial(draw_views, views=[View("speckle", phantom, PROBES["convex"], frame)]))
+
+
+def _spectral_peak(envelope: np.ndarray) -> float:
+    """How far the highest line of the mean intensity spectrum stands out; a lattice or a tiling would show as one.
+
+    The mean of eight exponential variables exceeds its median eightfold less than once in 10^18.
+    """
+    from scipy.ndimage import median_filter
+
+    intensity = envelope**2 - (envelope**2).mean(axis=(1, 2), keepdims=True)
+    power = (np.abs(np.fft.fft2(intensity)) ** 2).sum(axis=0)
+    smooth = median_filter(power, size=(9, 31), mode="wrap")
+    strong = smooth > 1e-3 * smooth.max()
+    return float((power[strong] / smooth[strong]).max())
+
+
+def correlations(rotation: np.ndarray, device) -> Outcome:
+    """Second-order statistics at three depths."""
+    phantom, simulators = _simulators(rotation, device)
+    rows, curves = [], []
+    for name, probe in PROBES.items():
+        frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+        for depth in DEPTHS_MM:
+            sigma_l, sigma_e = (float(s) for s in probe.beam_sigma_mm(depth))
+            apart = float(probe.line_distance_mm(depth))
+            lag = max(1, round(sigma_l / apart))
+            beside = phantom.probe_to_ras @ elevational_motion(0.8 * sigma_e)
+            others = [s.simulate(probe, beside) for s in simulators]
+            near = [depth_window(f, depth, 1.0) for f in frames]
+            wide = [depth_window(f, depth, 3.0) for f in frames]
+            dz, sigma_a = frames[0].sample_interval_mm, probe.axial_sigma_mm
+            axial = max(1, round(sigma_a / dz))
+            found = {
+                "lateral": (lag * apart, sigma_l, [correlation(s[:-lag], s[lag:]) for s in near]),
+                "elevational": (
+                    0.8 * sigma_e,
+                    sigma_e,
+                    [correlation(s, depth_window(o, depth, 1.0)) for s, o in zip(near, others, strict=True)],
+                ),
+                "axial": (axial * dz, sigma_a, [correlation(s[:, :-axial], s[:, axial:]) for s in wide]),
+            }
+            for direction, (distance, sigma, values) in found.items():
+                theory = float(np.exp(-(distance**2) / (4 * sigma**2)))
+                rows.append(
+                    Row(f"{direction} at {depth:.0f} mm, {name}", "", theory, float(np.mean(values)), 0.1 * theory)
+                )
+            if name == "linear":
+                lags = np.arange(0, max(2, round(3.2 * sigma_l / apart)))
+                measured = [np.mean([correlation(s[: len(s) - n], s[n:]) for s in near]) for n in lags]
+                fine = np.linspace(0.0, lags[-1] * apart, 100)
+                theory = np.exp(-(fine**2) / (4 * sigma_l**2))
+                curves.append(Curve(f"{depth:.0f} mm deep", lags * apart, np.array(measured), fine, theory))
+    plot = Plot("lateral correlation of speckle, linear array", "distance [mm]", "correlation", curves)
+    return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
+
+
+def coherence(rotation: np.ndarray, device) -> Outcome:
+    """The probe moves along its own lateral axis by one scan line; the patient stays."""
+    phantom, (simulator,) = _simulators(rotation, device, seeds=(0,))
+    rows = []
+    probes = {"linear": replace(PROBES["linear"], width_mm=36.0, scan_lines=181)} | {
+        name: PROBES[name] for name in ("convex", "phased")
+    }
+    for name, probe in probes.items():
+        here = simulator.simulate(probe, phantom.probe_to_ras)
+        moved = simulator.simulate(probe, phantom.probe_to_ras @ one_line_on(probe))
+        again = simulator.simulate(probe, phantom.probe_to_ras)
+        kept = correlation(here.iq[1:], moved.iq[:-1])
+        if name == "convex":
+            images = {
+                "before": here.iq[1:],
+                "moved by a line, re-aligned": moved.iq[:-1],
+                "difference": moved.iq[:-1] - here.iq[1:],
+            }
+        rows += [
+            Row(f"after re-alignment by one line, {name}", "", 0.95, kept, 0.0, "at least"),
+            Row(f"largest change when simulated again, {name}", "", 0.0, float(abs(again.iq - here.iq).max()), 0.0),
+        ]
+    return Outcome(tuple(rows), partial(draw_images, images=images))
+
+
+def one_line_on(probe: Probe) -> np.ndarray:
+    """(4, 4) motion in the probe frame that takes every scan line to the next one's place."""
+    motion = np.eye(4)
+    if probe.is_linear:
+        motion[0, 3] = probe.line_spacing
+        return motion
+    angle, radius = probe.line_spacing, probe.apex_radius_mm
+    motion[:2, :2] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    motion[:2, 3] = radius * np.array([np.sin(angle), np.cos(angle) - 1.0])  # about the apex, at (0, -radius)
+    return motion
+
+
+def echogenicity(rotation: np.ndarray, device) -> Outcome:
+    """Var = p (1 - p) mu0^2 + p sigma0^2 alone sets the level."""
+    rows = []
+    for name, changes in {
+        "mu0 0.33, sigma0 0.15, mu1 0": {},
+        "sigma0 alone": {"mu0": 0.0, "sigma0": 0.4},
+        "mu0 alone": {"mu0": 0.6, "sigma0": 0.0},
+        "rare, mu1 1": {"mu1": 1.0},
+    }.items():
+        tissue = replace(SPECKLE, **changes)
+        phantom, simulators = _simulators(rotation, device, tissue, seeds=range(2))
+        frames = [s.simulate(PROBES["linear"], phantom.probe_to_ras) for s in simulators]
+        level = level_db(np.stack([f.iq[:, 64:-64] for f in frames]))
+        rows.append(Row(name, "dB", 10 * np.log10(tissue.scatterer_variance), level, 0.5))
+    return Outcome(tuple(rows))
+
+
+#: The paper's Fig. 4: a lattice of 20 um of which one site in a hundred is taken, 1250 scatterers per mm^3.
+RAYLEIGH_SITES_PER_MM3, RAYLEIGH_SHARE = 125_000.0, 0.01
+#: A high frequency and a low f-number give many resolution cells in a small volume; each holds some 60 scatterers.
+RAYLEIGH_PROBE = LinearProbe(
+    24.0, 16.0, scan_lines=241, frequency_mhz=10.0, receive_f_number=1.5, aperture_mm=12.0, focus_mm=400.0,
+    elevation_aperture_mm=2.4, elevation_focus_mm=10.0,
+)  # fmt: skip
+
+
+def rayleigh(rotation: np.ndarray, device) -> Outcome:
+    """The envelope's distribution, by the paper's protocol."""
+    probe, first_mm = RAYLEIGH_PROBE, 3.0
+    tissue = replace(SPECKLE, mu1=float(stats.norm.isf(RAYLEIGH_SHARE)))
+    phantom, simulators = _simulators(
+        rotation, device, tissue, range(3), scatterers_per_mm3=RAYLEIGH_SITES_PER_MM3, reflections=False
+    )
+    frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+    first = int(first_mm / frames[0].sample_interval_mm)
+    envelope = np.abs(np.stack([frame.iq[:, first:-64] for frame in frames]))
+    fit = fit_rayleigh(envelope)
+    # Four sigmas apart, signals correlate by exp(-4) = 2 %; the level is known beforehand, so nothing is fitted.
+    deep = first_mm + np.arange(envelope.shape[2]) * frames[0].sample_interval_mm
+    lines = int(np.ceil(4 * probe.beam_sigma_mm(deep)[0].max() / probe.line_spacing))
+    samples = int(np.ceil(4 * probe.axial_sigma_mm / frames[0].sample_interval_mm))
+    apart = envelope[:, ::lines, ::samples].ravel()
+    p_value = stats.kstest(apart, stats.rayleigh(scale=np.sqrt(0.5 * tissue.scatterer_variance)).cdf).pvalue
+    snr = float(envelope.mean() / envelope.std())
+    sigma = 255.0 * float(np.sqrt(0.5 * tissue.scatterer_variance) / envelope.max())
+    return Outcome(
+        (
+            Row("SSE of the fit", "", 3.14e-5, fit.sse, 0.0, "at most"),
+            Row("sigma of the fit", "grey levels", sigma, fit.sigma, 0.02 * sigma),
+            Row("mean / standard deviation", "", RAYLEIGH_SNR, snr, 0.02 * RAYLEIGH_SNR),
+            Row(f"p of Kolmogorov-Smirnov, {apart.size} samples", "", 0.05, float(p_value), 0.0, "at least"),
+        ),
+        partial(draw_rayleigh, fit=fit, envelope=envelope[0]),
+    )  # fmt: skip
+
+
+CHECKS = (
+    Check(
+        "speckle statistics",
+        "Mean over standard deviation 1.913, mean power = Var of the scatterers, no lattice in the spectrum.",
+        statistics,
+    ),
+    Check(
+        "speckle correlation",
+        "exp(-d^2 / 4 sigma^2) between signals d apart, with the sigma of the beam at that depth.",
+        correlations,
+    ),
+    Check("speckle coherence", "The same scatterers from every pose.", coherence),
+    Check("echogenicity", "Var = p (1 - p) mu0^2 + p sigma0^2 alone sets the level.", echogenicity),
+    Check(
+        "rayleigh",
+        "Fully developed speckle has a Rayleigh envelope (the paper's Fig. 4: 1250 scatterers per mm^3 on 20 um).",
+        rayleigh,
+    ),
+)

@@ -1,0 +1,323 @@
+"""The simulator as VTK filters: an MRI goes in, labels come out; labels go in, a B-mode image comes out.
+
+    segmentation = SegmentationFilter()
+    segmentation.SetInputConnection(reader.GetOutputPort())
+    simulation = UltrasoundSimulationFilter()
+    simulation.SetInputConnection(segmentation.GetOutputPort())
+    simulation.SetProbeTransform(transform)
+    actor.GetMapper().SetInputConnection(simulation.GetOutputPort())
+
+All images are in patient space (RAS, mm), with origin, spacing and direction matrix. What the caller caused is an
+ErrorEvent with one line, and the text of GetErrorMessage; the output is then empty.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from vtkmodules.util.vtkAlgorithm import VTKPythonAlgorithmBase
+from vtkmodules.vtkCommonCore import VTK_UNSIGNED_CHAR, vtkCommand, vtkOutputWindow, vtkStringArray
+from vtkmodules.vtkCommonDataModel import vtkDataObject, vtkImageData, vtkPolyData
+from vtkmodules.vtkCommonExecutionModel import vtkAlgorithm, vtkStreamingDemandDrivenPipeline
+from vtkmodules.vtkCommonMath import vtkMatrix4x4
+from vtkmodules.vtkCommonTransforms import vtkLinearTransform, vtkMatrixToLinearTransform, vtkTransform
+from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
+
+from SlicerUSSim.Logic.base.errors import Cancelled, require, user_message
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.vtk_data import matrix_array, set_scalars
+from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
+from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.probe.shape import outline_polydata
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.texture import Texture
+
+_WHOLE_EXTENT = vtkStreamingDemandDrivenPipeline.WHOLE_EXTENT
+
+#: Field data of a label image: the name of label 1, 2, ...
+TISSUE_NAMES = "TissueNames"
+
+
+class _ImageFilter(VTKPythonAlgorithmBase):
+    """Whole images in, whole images out, and errors as VTK users expect them."""
+
+    def __init__(self, **ports) -> None:
+        super().__init__(inputType="vtkImageData", outputType="vtkImageData", **ports)
+        self._message = ""
+        self._device: str | None = None
+
+    def SetDevice(self, device: str | None) -> None:
+        """OpenCL device (see device.choose_device)."""
+        self._change("_device", device)
+
+    def SetInputData(self, image: vtkImageData | None) -> None:
+        """The input itself, where no filter makes it."""
+        self.SetInputDataObject(0, image)
+
+    def GetOutput(self, port: int = 0):
+        """The output of the last update."""
+        return self.GetOutputDataObject(port)
+
+    def GetErrorMessage(self) -> str:
+        """What was wrong in the last update, one line; empty if nothing was."""
+        return self._message
+
+    def ProcessRequest(self, request, inInfo, outInfo):  # noqa: N803
+        try:
+            result = super().ProcessRequest(request, inInfo, outInfo)
+        except Exception as error:
+            message = user_message(error)
+            if message is None:
+                raise
+            self._fail("" if isinstance(error, Cancelled) else message)
+            return 0
+        if request.Has(vtkStreamingDemandDrivenPipeline.REQUEST_DATA()):
+            self._message = ""
+        return result
+
+    def RequestUpdateExtent(self, request, inInfo, outInfo):  # noqa: N803
+        for port in inInfo:
+            info = port.GetInformationObject(0)
+            if info is not None and info.Has(_WHOLE_EXTENT()):
+                update = vtkStreamingDemandDrivenPipeline.UPDATE_EXTENT()
+                info.Set(update, info.Get(_WHOLE_EXTENT()), 6)
+        return 1
+
+    def _fail(self, message: str) -> None:
+        self._message = message
+        for port in range(self.GetNumberOfOutputPorts()):
+            output = self.GetOutputDataObject(port)
+            if output is not None:
+                output.Initialize()
+        if not message:
+            return
+        if self.HasObserver(vtkCommand.ErrorEvent):
+            self.InvokeEvent(vtkCommand.ErrorEvent, message)
+        else:
+            vtkOutputWindow.GetInstance().DisplayErrorText(f"{type(self).__name__}: {message}\n")
+
+    def _change(self, name: str, value) -> None:
+        """Set an attribute; only another value makes the filter execute again."""
+        if getattr(self, name) != value:
+            setattr(self, name, value)
+            self.Modified()
+
+
+class SegmentationFilter(_ImageFilter):
+    """An MRI (port 0), and a mask if the brain is not stripped (port 1, optional), to uint8 tissue labels.
+
+    The names of the labels travel with the output as field data "TissueNames"; UltrasoundSimulationFilter knows its
+    tissues by them. See segmentation.segment_mri for what the parameters mean and what is refused.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(nInputPorts=2)
+        self._classes, self._contrast = 3, "t1"
+        self._filter_radius, self._bias_correction, self._thin_sulci = 1, False, True
+        self._segmentation: Segmentation | None = None
+
+    def SetClasses(self, classes: int) -> None:
+        """Number of tissues that intensity tells apart; 3."""
+        self._change("_classes", classes)
+
+    def SetContrast(self, contrast: str) -> None:
+        """ "t1", "t1gd", "t2" or "flair"."""
+        self._change("_contrast", contrast)
+
+    def SetFilterRadius(self, voxels: int) -> None:
+        """Radius of the guided filter; 1, and 0 for none."""
+        self._change("_filter_radius", voxels)
+
+    def SetBiasCorrection(self, on: bool) -> None:
+        """N4 first, for scans with an intensity gradient; off."""
+        self._change("_bias_correction", bool(on))
+
+    def SetThinSulci(self, on: bool) -> None:
+        """Label sulci too narrow to reach CSF intensity as leptomeninges; on."""
+        self._change("_thin_sulci", bool(on))
+
+    def SetMaskConnection(self, port) -> None:
+        """Where the mask comes from: an image on the MRI's grid, not zero inside."""
+        self.SetInputConnection(1, port)
+
+    def SetMaskData(self, mask: vtkImageData | None) -> None:
+        """The mask itself."""
+        self.SetInputDataObject(1, mask)
+
+    def GetSegmentation(self) -> Segmentation | None:
+        """The mixture, posteriors and texture of the last update."""
+        return self._segmentation
+
+    def FillInputPortInformation(self, port, info):
+        super().FillInputPortInformation(port, info)
+        if port == 1:
+            info.Set(vtkAlgorithm.INPUT_IS_OPTIONAL(), 1)
+        return 1
+
+    def RequestInformation(self, request, inInfo, outInfo):  # noqa: N803
+        mri, labels = inInfo[0].GetInformationObject(0), outInfo.GetInformationObject(0)
+        for key in (_WHOLE_EXTENT(), vtkDataObject.SPACING(), vtkDataObject.ORIGIN(), vtkDataObject.DIRECTION()):
+            if mri.Has(key):
+                labels.CopyEntry(mri, key)
+        vtkDataObject.SetPointDataActiveScalarInfo(labels, VTK_UNSIGNED_CHAR, 1)
+        return 1
+
+    def RequestData(self, request, inInfo, outInfo):  # noqa: N803
+        self._segmentation = None
+        mri = vtkImageData.GetData(inInfo[0])
+        masked = inInfo[1].GetNumberOfInformationObjects() > 0
+        self._segmentation = segment_mri(
+            Volume.from_vtk(mri), classes=self._classes, contrast=self._contrast,
+            mask=Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None,
+            filter_radius=self._filter_radius, bias_correction=self._bias_correction, thin_sulci=self._thin_sulci,
+            device=self._device, progress=self._report,
+        )  # fmt: skip
+        output = vtkImageData.GetData(outInfo)
+        output.CopyStructure(mri)
+        set_scalars(output, self._segmentation.labels.array)
+        set_tissue_names(output, self._segmentation.tissue_names)
+        return 1
+
+    def _report(self, share: float) -> None:
+        self.UpdateProgress(share)
+        if self.CheckAbort():
+            raise Cancelled
+
+
+class UltrasoundSimulationFilter(_ImageFilter):
+    """Tissue labels (port 0) to the B-mode image under the probe (output 0) and the outline of its field (output 1).
+
+    The image is one slice at the probe's place. The filter executes again when the labels, the probe's transform (with
+    whatever it is concatenated from), or a parameter changes, and only then. Labels are told apart by the names that
+    SegmentationFilter gave them (field data "TissueNames"); without names, by the labels of the tissue table.
+    """
+
+    def __init__(self) -> None:
+        # Port 1 is the filter's own: the outline, moved by the probe's transform. So the pipeline itself knows when the
+        # probe has moved, even where a transform inside a chain of transforms did, and no observer can outlive us.
+        super().__init__(nInputPorts=2, nOutputPorts=2)
+        preset = Preset()
+        self._probe, self._display, self._settings = preset.probe, preset.display, preset.settings
+        self._tissues, self._texture = preset.tissues, None
+        self._field_alpha = False
+        self._probe_transform: vtkLinearTransform | vtkMatrix4x4 = vtkTransform()  # as it was given
+        self._simulator = ReusedSimulator()
+        self._frame: Frame | None = None
+        self._placed_outline = vtkTransformPolyDataFilter()
+        self._placed_outline.SetInputData(outline_polydata(self._probe))
+        self._placed_outline.SetTransform(self._probe_transform)
+        self.SetInputConnection(1, self._placed_outline.GetOutputPort())
+
+    def SetProbe(self, probe: Probe) -> None:
+        """A LinearProbe, ConvexProbe or PhasedProbe."""
+        if probe != self._probe:
+            self._placed_outline.SetInputData(outline_polydata(probe))
+        self._change("_probe", probe)
+
+    def SetProbeTransform(self, transform: vtkLinearTransform | vtkMatrix4x4) -> None:
+        """Where the probe is: probe_to_ras. The object is watched, not copied.
+
+        Raises SimulationError for anything else than a vtkLinearTransform or a vtkMatrix4x4.
+        """
+        require(
+            isinstance(transform, vtkLinearTransform | vtkMatrix4x4),
+            f"probe transform is a {type(transform).__name__}, expected a vtkLinearTransform or a vtkMatrix4x4",
+        )
+        if transform is self._probe_transform:
+            return
+        self._change("_probe_transform", transform)
+        if isinstance(transform, vtkMatrix4x4):
+            matrix, transform = transform, vtkMatrixToLinearTransform()
+            transform.SetInput(matrix)
+        self._placed_outline.SetTransform(transform)
+
+    def SetTissues(self, tissues: TissueTable) -> None:
+        """Acoustic parameters of the labels; brain presets until set."""
+        self._change("_tissues", tissues)
+
+    def SetSettings(self, settings: SimulationSettings) -> None:
+        """The physics."""
+        self._change("_settings", settings)
+
+    def SetDisplay(self, display: DisplaySettings) -> None:
+        """Gain, dynamic range, time-gain compensation, noise, image size."""
+        self._change("_display", display)
+
+    def SetPreset(self, preset: Preset) -> None:
+        """Probe, display, settings and tissues at once."""
+        self.SetProbe(preset.probe)
+        self.SetDisplay(preset.display)
+        self.SetSettings(preset.settings)
+        self.SetTissues(preset.tissues)
+
+    def SetTexture(self, texture: Texture | None) -> None:
+        """What the MRI knows beyond labels, where the settings ask for it (Segmentation.texture)."""
+        self._change("_texture", texture)
+
+    def SetFieldAlpha(self, on: bool) -> None:
+        """Give the image a second component, 255 in the imaged field and 0 outside, for laying it over others; off."""
+        self._change("_field_alpha", bool(on))
+
+    def GetFrame(self) -> Frame | None:
+        """The frame of the last update: RF, envelope, image, pose."""
+        return self._frame
+
+    def FillInputPortInformation(self, port, info):
+        info.Set(vtkAlgorithm.INPUT_REQUIRED_DATA_TYPE(), ("vtkImageData", "vtkPolyData")[port])
+        return 1
+
+    def FillOutputPortInformation(self, port, info):
+        info.Set(vtkDataObject.DATA_TYPE_NAME(), ("vtkImageData", "vtkPolyData")[port])
+        return 1
+
+    def RequestInformation(self, request, inInfo, outInfo):  # noqa: N803
+        grid = ImageGrid.for_probe(self._probe, self._display.image_size)
+        pose = self._pose()
+        slice_to_ras = pose @ grid.slice_to_probe
+        info = outInfo.GetInformationObject(0)
+        info.Set(_WHOLE_EXTENT(), (0, grid.columns - 1, 0, grid.rows - 1, 0, 0), 6)
+        info.Set(vtkDataObject.SPACING(), tuple(np.linalg.norm(slice_to_ras[:3, :3], axis=0)), 3)
+        info.Set(vtkDataObject.ORIGIN(), tuple(slice_to_ras[:3, 3]), 3)
+        info.Set(vtkDataObject.DIRECTION(), tuple(pose[:3, :3].ravel()), 9)
+        vtkDataObject.SetPointDataActiveScalarInfo(info, VTK_UNSIGNED_CHAR, 2 if self._field_alpha else 1)
+        return 1
+
+    def RequestData(self, request, inInfo, outInfo):  # noqa: N803
+        self._frame = None
+        labels = vtkImageData.GetData(inInfo[0])
+        names = tissue_names(labels)
+        tissues = self._tissues.for_names(names) if names else self._tissues
+        simulator = self._simulator.get(
+            labels.GetMTime(), lambda: Volume.from_vtk(labels), tissues, self._settings, self._device, self._texture
+        )
+        self._frame = simulator.simulate(self._probe, self._pose(), self._display)
+        image = vtkImageData.GetData(outInfo, 0)
+        image.ShallowCopy(self._frame.to_vtk())
+        if self._field_alpha:
+            field = self._frame.grid.field(self._probe)
+            set_scalars(image, np.stack([self._frame.image, np.where(field, np.uint8(255), np.uint8(0))], axis=-1))
+        vtkPolyData.GetData(outInfo, 1).ShallowCopy(vtkPolyData.GetData(inInfo[1]))
+        return 1
+
+    def _pose(self) -> np.ndarray:
+        return check_rigid("probe transform", matrix_array(self._placed_outline.GetTransform().GetMatrix()))
+
+
+def set_tissue_names(image: vtkImageData, names) -> None:
+    """Let the names of label 1, 2, ... travel with a label image."""
+    array = vtkStringArray()
+    array.SetName(TISSUE_NAMES)
+    for name in names:
+        array.InsertNextValue(name)
+    image.GetFieldData().AddArray(array)
+
+
+def tissue_names(image: vtkImageData) -> tuple[str, ...]:
+    """The names that set_tissue_names gave; empty if there are none."""
+    array = image.GetFieldData().GetAbstractArray(TISSUE_NAMES)
+    return () if array is None else tuple(array.GetValue(n) for n in range(array.GetNumberOfValues()))

@@ -1,0 +1,283 @@
+"""AnatomyViews: Slicer's 3D view and three slice views around the probe: where it is, and what lies under it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+import numpy as np
+from trame_server.utils.asynchronous import get_event_loop
+from trame_slicer.core import LayoutManager, SlicerApp
+from trame_slicer.rca_view import RemoteViewFactory
+from trame_slicer.views import (
+    AbstractView,
+    Layout,
+    LayoutDirection,
+    NoScheduleRendering,
+    SliceView,
+    ThreeDView,
+    ViewLayoutDefinition,
+    ViewType,
+)
+from vtkmodules.vtkCommonCore import vtkCommand
+from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
+
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.mrml.nodes import composite_of, display_of, node_called, read_volume, show_in_slice, write_slice
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
+from SlicerUSSim.Logic.probe.surface import PatientSurface
+
+#: Planes that a slice view follows the probe in: of the image, across it, and the patient's own.
+IN_PLANE, ACROSS = "In plane", "Across"
+PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
+#: The slice views with the plane that each begins with, by the names that Slicer gives them.
+SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
+THREED_VIEW = "ThreeD"
+#: Images per second of the view under the mouse, and of the others: on few cores the ultrasound image goes before them.
+_CORES = os.cpu_count() or 2
+_FAST, _SLOW = min(2.0 * _CORES, 20.0), min(0.75 * _CORES, 8.0)
+#: More mouse events than images would only keep the images waiting.
+_EVENTS_EVERY_S = 0.025
+_LAYOUT = "Anatomy"
+#: Model nodes that show things, by what they show; they are not saved with the scene.
+_PATIENT, _BODY, _FIELD, _SEEN = "Patient surface", "Probe body", "Ultrasound field", "Ultrasound as shown"
+_SKIN_COLOR, _BODY_COLOR, _RIDGE_COLOR = (0.92, 0.8, 0.72), (0.82, 0.86, 0.9), (1.0, 0.62, 0.18)
+
+
+class AnatomyViews:
+    """Keeps the views on the probe.
+
+    Parameters
+    ----------
+    app : SlicerApp, with its scene.
+    server : trame server that shows the views.
+    view_ui : (server, view_id, view) adds what lies over a view.
+    resized : called when a slice view has got another size, and wants to follow anew.
+    """
+
+    def __init__(
+        self,
+        app: SlicerApp,
+        server,
+        view_ui: Callable[[object, str, AbstractView], None],
+        resized: Callable[[], None],
+    ) -> None:
+        self._app = app
+        self.planes = dict(SLICE_VIEWS)
+        self.follows = True
+        self._held: SliceView | None = None
+        self._fitted: set[str] = set()
+        self._blend = 1.0
+        self._image = vtkTrivialProducer()
+        self._image.SetOutput(Volume(np.zeros((1, 2, 2), np.uint8), np.eye(4)).to_vtk())  # until there is one
+        for kind, make in ((ViewType.SLICE_VIEW, SliceView), (ViewType.THREE_D_VIEW, ThreeDView)):
+            app.view_manager.register_factory(
+                RemoteViewFactory(
+                    server, _silent(make), kind, populate_view_ui_f=view_ui, target_fps=_FAST, blur_fps=_SLOW,
+                    interactive_quality=75, rca_event_throttle_s=_EVENTS_EVERY_S,
+                )
+            )  # fmt: skip
+        threed = ViewLayoutDefinition.threed_view(name=THREED_VIEW)
+        red, yellow, green = (
+            ViewLayoutDefinition.axial_view(), ViewLayoutDefinition.sagittal_view(), ViewLayoutDefinition.coronal_view()
+        )  # fmt: skip
+        rows = [
+            Layout(LayoutDirection.Horizontal, [threed, red]),
+            Layout(LayoutDirection.Horizontal, [yellow, green]),
+        ]
+        self.layout = LayoutManager(app.scene, app.view_manager, server)
+        self.layout.register_layout(_LAYOUT, Layout(LayoutDirection.Vertical, rows))
+        self.layout.set_layout(_LAYOUT)
+        # Without a GPU these cost more than all the rest, and depth peeling hides what is translucent.
+        for view in (self.threed, *self.slices):
+            view.render_window().SetMultiSamples(0)
+        self._resized = resized
+        for view in self.slices:
+            # Once the view itself knows its new size.
+            view.interactor().AddObserver(
+                vtkCommand.WindowResizeEvent,
+                lambda *_, view=view: get_event_loop().call_later(0.05, self._fit_anew, view),
+            )
+        self.threed.get_view_node().SetUseDepthPeeling(False)
+        self.threed.renderer().SetUseDepthPeeling(False)
+        self.threed.renderer().SetUseDepthPeelingForVolumes(False)
+
+    def _fit_anew(self, view: SliceView) -> None:
+        self._fitted.discard(view.get_singleton_tag())
+        self._resized()
+
+    # ---- what there is -----------------------------------------------------------------------------------------
+
+    @property
+    def slices(self) -> list[SliceView]:
+        return self._app.view_manager.get_slice_views()
+
+    @property
+    def threed(self) -> ThreeDView:
+        return self._app.view_manager.get_threed_views()[0]
+
+    def show_volume(self, volume_node) -> None:
+        """Show an MRI in the slice views, all of it."""
+        for view in self.slices:
+            view.set_background_volume_id(None if volume_node is None else volume_node.GetID())
+            view.fit_view_to_content()
+        self._fitted.clear()
+
+    def show_surface(self, surface: PatientSurface) -> None:
+        """Show the patient in 3D."""
+        model = self._model(_PATIENT)
+        model.SetAndObservePolyData(surface.coarse_polydata)
+        display = display_of(model)
+        display.SetColor(*_SKIN_COLOR)
+        display.SetOpacity(0.45)
+        display.SetVisibility2D(False)
+        display.SetBackfaceCulling(True)
+
+    def show_probe(self, probe: Probe, transform_node) -> None:
+        """Show the probe's body, and its field for the image to lie on, under its transform."""
+        body, field = self._model(_BODY), self._model(_FIELD)
+        body.SetAndObservePolyData(probe_polydata(probe))
+        field.SetAndObservePolyData(field_polydata(probe))
+        for model in (body, field):
+            model.SetAndObserveTransformNodeID(transform_node.GetID())
+        colors = node_called(self._app.scene, "ColorTable", _BODY)
+        colors.SetSaveWithScene(False)
+        colors.SetTypeToUser()
+        colors.SetNumberOfColors(2)
+        colors.SetColor(0, "body", *_BODY_COLOR)
+        colors.SetColor(1, "ridge", *_RIDGE_COLOR)
+        display = display_of(body)
+        display.SetActiveScalar("Part", 1)  # of the cells
+        display.SetAndObserveColorNodeID(colors.GetID())
+        display.SetScalarRangeFlag(display.UseManualScalarRange)
+        display.SetScalarRange(0.0, 1.0)
+        display.SetScalarVisibility(True)
+        display.SetVisibility2D(True)
+        display.SetSliceIntersectionThickness(1)
+        display = display_of(field)
+        display.SetTextureImageDataConnection(self._image.GetOutputPort())
+        display.SetLighting(False)
+        display.SetColor(1.0, 1.0, 1.0)
+        display.SetBackfaceCulling(False)
+        display.SetVisibility2D(False)
+        self._fitted.clear()
+
+    def show_image(self, volume_node, field: np.ndarray) -> None:
+        """Show the image that a volume node has now, in 3D and blended into the slice views.
+
+        `field` (rows, columns) is where it shows anything; around it the MRI stays as it is.
+        """
+        volume = read_volume(volume_node)
+        # A copy, in which nothing inside of the field is 0, so that the threshold takes what is outside.
+        seen = volume.with_array(np.where(field, np.maximum(volume.array, 1), 0).astype(np.uint8))
+        shown = self._seen
+        write_slice(shown, seen, volume_node.GetParentTransformNode())
+        if self._image.GetOutputDataObject(0) is not shown.GetImageData():
+            self._image.SetOutput(shown.GetImageData())
+            display = display_of(shown)
+            display.SetSaveWithScene(False)
+            display.SetAutoThreshold(False)
+            display.SetThreshold(1, 255)
+            display.SetApplyThreshold(True)
+        for view in self.slices:
+            if view.get_foreground_volume_id() != shown.GetID():
+                view.set_foreground_volume_id(shown.GetID())
+                view.set_foreground_opacity(self._blend)
+        self.threed.schedule_render()
+
+    def set_blend(self, share: float) -> None:
+        """How much of the image, against the MRI, the slice views show: 0 to 1."""
+        self._blend = share
+        for view in self.slices:
+            view.set_foreground_opacity(share)
+
+    def show_labels(self, labels_node, on: bool) -> None:
+        """Colour the tissues in the slice views; a label map only."""
+        can = on and labels_node is not None and labels_node.IsA("vtkMRMLLabelMapVolumeNode")
+        for view in self.slices:
+            composite = composite_of(view.get_view_node())
+            composite.SetLabelVolumeID(labels_node.GetID() if can else None)
+            composite.SetLabelOpacity(0.35)
+            view.schedule_render()
+
+    # ---- staying with the probe --------------------------------------------------------------------------------
+
+    def hold(self, view: SliceView | None) -> None:
+        """Let a slice view rest, while the probe is dragged in it; None: none."""
+        self._held = view
+
+    def set_plane(self, name: str, plane: str) -> None:
+        """Choose the plane of a slice view."""
+        self.planes[name] = plane
+        self._fitted.discard(name)
+
+    def follow(self, probe_to_world: np.ndarray, probe: Probe) -> None:
+        """Turn the slice views to where the probe now is."""
+        left, right, top, bottom = probe.image_bounds_mm()
+        middle = (probe_to_world @ [0.5 * (left + right), 0.5 * (top + bottom), 0.0, 1.0])[:3]
+        for view in self.slices:
+            name, node = view.get_singleton_tag(), view.get_view_node()
+            fit = name not in self._fitted
+            if view is self._held or not (self.follows or fit):
+                continue
+            plane = self.planes[name]
+            was_modifying = node.StartModify()
+            if plane == IN_PLANE:
+                show_in_slice(node, self._seen, probe_to_world, probe, fit=False)
+            elif plane == ACROSS:
+                across = np.eye(4)  # right, up and normal of the view: elevation, against depth, lateral
+                across[:3, :3] = probe_to_world[:3, [2, 1, 0]] * [1.0, -1.0, 1.0]
+                across[:3, 3] = middle
+                node.GetSliceToRAS().DeepCopy(vtk_matrix(across))
+                node.UpdateMatrices()
+            else:
+                if fit:
+                    node.SetOrientation(plane)
+                    view.fit_view_to_content()
+                node.JumpSliceByOffsetting(*middle)
+            if fit and plane in (IN_PLANE, ACROSS):
+                width, height, thickness = node.GetFieldOfView()
+                scale = max((right - left) / width, (bottom - top) / height) * 1.25
+                node.SetFieldOfView(width * scale, height * scale, thickness)
+                node.UpdateMatrices()
+            node.EndModify(was_modifying)
+            self._fitted.add(name)
+
+    def look_at_probe(self, probe_to_world: np.ndarray, surface: PatientSurface) -> None:
+        """Turn the 3D view so that the probe is on the side that one sees, its image seen obliquely."""
+        camera = self.threed.get_camera_node()
+        if camera is None:
+            return
+        outward = probe_to_world[:3, 3] - surface.centre
+        away = outward / np.linalg.norm(outward) + 1.3 * probe_to_world[:3, 2] + 0.35 * probe_to_world[:3, 0]
+        if away @ [0, 1, 0] < 0:  # rather from the face's side than from behind
+            away = away - 2.6 * probe_to_world[:3, 2]
+        away = away / np.linalg.norm(away)
+        self.threed.reset_focal_point()
+        self.threed.reset_camera()
+        camera.SetFocalPoint(*surface.centre)
+        camera.SetPosition(*(surface.centre + 540.0 * away))
+        camera.SetViewUp(0.0, 0.0, 1.0)
+        camera.ResetClippingRange()
+        self.threed.schedule_render()
+
+    @property
+    def _seen(self):
+        node = node_called(self._app.scene, "ScalarVolume", _SEEN)
+        node.SetSaveWithScene(False)
+        node.SetHideFromEditors(True)
+        return node
+
+    def _model(self, name: str):
+        model = node_called(self._app.scene, "Model", name)
+        model.SetSaveWithScene(False)
+        display = display_of(model)
+        display.SetSaveWithScene(False)
+        return model
+
+
+def _silent(make):
+    """Makes views that do not draw themselves anew with every step of their making, some two hundred times."""
+    return lambda **options: make(**options, scheduled_render_strategy=NoScheduleRendering())

@@ -1,0 +1,124 @@
+"""What a user takes along: pictures, frames with their geometry, cines, the scene."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from PIL import Image
+from vtkmodules.vtkCommonCore import vtkOutputWindow
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mrml.label_nodes import read_labels
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose
+from SlicerUSSim.Workstation.opener import Opener
+from SlicerUSSim.Workstation.script import python_script
+
+#: Files of an image with its geometry.
+FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
+#: Images that a cine keeps, and how long one may be shown, in milliseconds.
+_MOST_IMAGES = 200
+_SHORTEST_MS, _LONGEST_MS = 40, 500
+
+
+def png(image: np.ndarray) -> bytes:
+    """A (rows, columns) uint8 image as it is."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def frame_file(image: Volume, suffix: str) -> bytes:
+    """An image with its place in the patient, as a file of one of FRAME_SUFFIXES."""
+    require(suffix in FRAME_SUFFIXES, f"frames are not written as {suffix!r}, expected {', '.join(FRAME_SUFFIXES)}")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"frame{suffix}"
+        image.write(path)
+        return path.read_bytes()
+
+
+class Cine:
+    """The last images, as a scanner keeps them."""
+
+    def __init__(self) -> None:
+        self._images: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_IMAGES)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def add(self, image: np.ndarray, seconds: float) -> None:
+        """Keep a (rows, columns) uint8 image of this time; another size begins anew."""
+        if self._images and self._images[-1][1].shape != image.shape:
+            self._images.clear()
+        self._images.append((seconds, image))
+
+    def gif(self) -> bytes:
+        """An animated GIF, as fast as it was seen. Raises SimulationError without images."""
+        require(len(self._images) > 1, f"the cine holds {len(self._images)} images, expected two or more")
+        times = np.array([seconds for seconds, _ in self._images])
+        waits = np.clip(np.diff(times, append=times[-1] + 0.2) * 1e3, _SHORTEST_MS, _LONGEST_MS)
+        first, *others = [Image.fromarray(image) for _, image in self._images]
+        buffer = io.BytesIO()
+        first.save(
+            buffer, "GIF", save_all=True, append_images=others, duration=waits.round(-1).astype(int).tolist(), loop=0
+        )
+        return buffer.getvalue()
+
+
+class Exports:
+    """What the menu Export offers, by kind: png, .nrrd, .mha, .vti, gif, mrb, json; and the script.
+
+    Each is (file name, content, MIME type). Raises SimulationError where there is nothing to export.
+    """
+
+    def __init__(self, app, logic: UltrasoundSceneLogic, opener: Opener) -> None:
+        self._app, self._logic, self._opener = app, logic, opener
+        self.cine = Cine()
+
+    async def export(self, kind: str) -> tuple[str, bytes, str]:
+        """One kind; what takes long leaves the event loop free."""
+        if kind == "json":
+            return "preset.json", json.dumps(self._logic.preset.to_dict(), indent=2).encode(), "application/json"
+        if kind == "mrb":
+            return "ultrasound.mrb", scene_file(self._app), "application/zip"
+        if kind == "gif":
+            content = await asyncio.get_running_loop().run_in_executor(None, self.cine.gif)
+            return "ultrasound.gif", content, "image/gif"
+        image = self._logic.lastImage()
+        if kind == "png":
+            return "ultrasound.png", png(image.array[0]), "image/png"
+        return f"ultrasound{kind}", frame_file(image, kind), "application/octet-stream"
+
+    def script(self) -> str:
+        """A script that gives the image on the screen again."""
+        parameters, preset = self._logic.parameters, self._logic.preset
+        labels, transform = parameters.labels, parameters.probe_transform
+        require(labels is not None and transform is not None, "there is no image yet, expected labels and a probe")
+        source = self._opener.source_of(labels)
+        in_labels, moved = pose_in_labels(labels, probe_pose(transform))
+        require(np.allclose(moved, np.eye(4)), f"{labels.GetName()!r} is scaled by a transform, expected a rigid one")
+        names = read_labels(labels, preset.tissues).names
+        return python_script(source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels)
+
+
+def scene_file(app) -> bytes:
+    """The scene of a SlicerApp as .mrb, which 3D Slicer opens. Raises SimulationError if it cannot be written."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "ultrasound.mrb"
+        window = vtkOutputWindow.GetInstance()
+        window.SetDisplayModeToNever()  # of every file in it
+        try:
+            written = app.io_manager.write_scene(path)
+        finally:
+            window.SetDisplayModeToAlwaysStdErr()
+        if not written or not path.exists():
+            raise SimulationError("the scene could not be written")
+        return path.read_bytes()

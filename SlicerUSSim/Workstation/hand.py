@@ -1,0 +1,247 @@
+"""ProbeHand: the probe moved by mouse and keys: slid over the patient, rocked, tilted, rotated, aimed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import monotonic
+
+import numpy as np
+from trame_slicer.views import AbstractView, SliceView, ThreeDView
+from vtkmodules.vtkCommonCore import mutable, vtkCommand
+from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.vtk_data import matrix_array
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.placement import aimed_at, carried, turned
+from SlicerUSSim.Logic.probe.shape import probe_polydata
+from SlicerUSSim.Logic.probe.surface import PatientSurface
+
+#: What keys do: turn by (rock, tilt, rotate) degrees, slide by (lateral, elevational) mm, lift by mm. With Shift: five
+#: times as much.
+KEYS: dict[str, tuple[str, tuple[float, ...]]] = {
+    "ArrowLeft": ("slide", (-2.0, 0.0)),
+    "ArrowRight": ("slide", (2.0, 0.0)),
+    "ArrowUp": ("slide", (0.0, 2.0)),
+    "ArrowDown": ("slide", (0.0, -2.0)),
+    "a": ("turn", (2.0, 0.0, 0.0)),
+    "d": ("turn", (-2.0, 0.0, 0.0)),
+    "w": ("turn", (0.0, 2.0, 0.0)),
+    "s": ("turn", (0.0, -2.0, 0.0)),
+    "q": ("turn", (0.0, 0.0, -2.0)),
+    "e": ("turn", (0.0, 0.0, 2.0)),
+    "+": ("lift", (0.5,)),
+    "-": ("lift", (-0.5,)),
+    "Home": ("upright", ()),
+}
+_DOUBLE_CLICK_S, _DOUBLE_CLICK_PX = 0.4, 5
+#: A drag in a slice view begins at the probe, and slides it, down to here below its face, mm; beyond, it aims.
+_AT_THE_PROBE_MM = 8.0
+#: Degrees that the probe is rotated by per pixel of the mouse.
+_DEG_PER_PIXEL = 0.5
+#: Before VTK's own observers, which then do not see what was meant for the probe.
+_FIRST = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Drag:
+    kind: str
+    pose: np.ndarray
+    point: np.ndarray  # that was grabbed, in the world
+    pixel: np.ndarray
+    normal: np.ndarray  # of the plane that the mouse moves in
+
+
+class ProbeHand:
+    """Turns what a user does with mouse and keys into poses.
+
+    Parameters
+    ----------
+    pose : gives (4, 4) probe_to_world, or None without a probe.
+    move : takes the new one.
+    surface : gives what the probe slides over, or None.
+    hold : told the slice view that a drag goes on in, and None at its end.
+    """
+
+    def __init__(
+        self,
+        pose: Callable[[], np.ndarray | None],
+        move: Callable[[np.ndarray], None],
+        surface: Callable[[], PatientSurface | None],
+        hold: Callable[[SliceView | None], None],
+    ) -> None:
+        self._pose, self._move, self._surface, self._hold = pose, move, surface, hold
+        #: Whether sliding makes the probe stand along the normal of the surface, or keeps its angles to it
+        self.upright = True
+        self._drag: _Drag | None = None
+        self._last_press = (0.0, np.zeros(2))
+        self._body = vtkStaticCellLocator()
+        self._probe: Probe | None = None
+
+    def set_probe(self, probe: Probe) -> None:
+        """Another probe has another body to grab."""
+        self._probe = probe
+        self._body.SetDataSet(probe_polydata(probe))
+        self._body.BuildLocator()
+
+    # ---- keys and buttons --------------------------------------------------------------------------------------
+
+    def key(self, name: str, fast: bool = False) -> bool:
+        """Do what a key does; whether it does anything."""
+        pose, surface = self._pose(), self._surface()
+        if name not in KEYS or pose is None:
+            return False
+        kind, values = KEYS[name]
+        values = tuple((5.0 if fast else 1.0) * value for value in values)
+        if kind == "turn":
+            rock, tilt, rotate = values
+            self._move(turned(pose, rock_deg=rock, tilt_deg=tilt, rotate_deg=rotate))
+        elif kind == "lift":
+            pose = pose.copy()
+            pose[:3, 3] -= values[0] * pose[:3, 1]
+            self._move(pose)
+        elif surface is None:
+            return False
+        elif kind == "slide":
+            self._move(surface.slid(pose, pose[:3, 3] + pose[:3, [0, 2]] @ values, upright=self.upright))
+        else:
+            self._move(surface.held(pose, rock_deg=0.0, tilt_deg=0.0))
+        return True
+
+    def aim(self, point_world: np.ndarray) -> None:
+        """Turn the probe where it is so that its axis goes through a point."""
+        pose = self._pose()
+        if pose is None:
+            return
+        try:
+            self._move(aimed_at(pose, point_world))
+        except SimulationError:  # the point is on the face: nothing to aim at
+            return
+
+    # ---- mouse -------------------------------------------------------------------------------------------------
+
+    def attach(self, view: AbstractView) -> None:
+        """Listen to the mouse in a view, before the view's own interaction does."""
+        interactor = view.interactor()
+
+        def observe(event: int, method) -> None:
+            tags: list[int] = []
+
+            def callback(_subject, _event) -> None:
+                if method(view):
+                    interactor.GetCommand(tags[0]).SetAbortFlag(1)
+
+            tags.append(interactor.AddObserver(event, callback, _FIRST))
+
+        observe(vtkCommand.LeftButtonPressEvent, self._pressed)
+        observe(vtkCommand.MouseMoveEvent, self._moved)
+        observe(vtkCommand.LeftButtonReleaseEvent, self._released)
+
+    def _pressed(self, view: AbstractView) -> bool:
+        pose = self._pose()
+        if pose is None:
+            return False
+        pixel, now = np.array(view.interactor().GetEventPosition(), float), monotonic()
+        last, where = self._last_press
+        self._last_press = (now, pixel)
+        if now - last < _DOUBLE_CLICK_S and np.abs(pixel - where).max() <= _DOUBLE_CLICK_PX:
+            self._last_press = (0.0, pixel)
+            return self._double_clicked(view, pixel)
+        drag = self._grab_in_slice(view, pose, pixel) if isinstance(view, SliceView) else self._grab(view, pose, pixel)
+        self._drag = drag
+        if drag is not None and isinstance(view, SliceView):
+            self._hold(view)
+        return drag is not None
+
+    def _grab_in_slice(self, view: SliceView, pose: np.ndarray, pixel: np.ndarray) -> _Drag | None:
+        point, normal = _in_slice(view, pixel), _slice_normal(view)
+        x, y, _ = (np.linalg.inv(pose) @ [*point, 1.0])[:3]
+        kind = _kind(view) or ("slide" if y < _AT_THE_PROBE_MM else "swing")
+        beside = abs(x) > 60.0 and y < 0  # far from the body
+        return None if beside or self._surface() is None else _Drag(kind, pose, point, pixel, normal)
+
+    def _grab(self, view: ThreeDView, pose: np.ndarray, pixel: np.ndarray) -> _Drag | None:
+        near, far = _ray(view, pixel)
+        to_probe = np.linalg.inv(pose)
+        start, end = (to_probe @ [*near, 1.0])[:3], (to_probe @ [*far, 1.0])[:3]
+        t, point, local = mutable(0.0), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        hit = self._body.IntersectWithLine(start.tolist(), end.tolist(), 1e-6, t, point, local, mutable(0), mutable(0))
+        kind = _kind(view)
+        if hit:
+            grabbed = np.array(point)
+        elif kind and (start[2] > 0) != (end[2] > 0):  # with a key also the field can be taken
+            grabbed = start + start[2] / (start[2] - end[2]) * (end - start)
+            if not self._probe.holds(grabbed[0], grabbed[1]):
+                return None
+        else:
+            return None
+        direction = (far - near) / np.linalg.norm(far - near)
+        return _Drag(kind or "slide", pose, (pose @ [*grabbed, 1.0])[:3], pixel, direction)
+
+    def _moved(self, view: AbstractView) -> bool:
+        drag = self._drag
+        if drag is None:
+            return False
+        pixel = np.array(view.interactor().GetEventPosition(), float)
+        if drag.kind == "rotate":
+            self._move(turned(drag.pose, rotate_deg=_DEG_PER_PIXEL * (pixel - drag.pixel)[0]))
+            return True
+        point = _in_slice(view, pixel) if isinstance(view, SliceView) else _on_plane(view, pixel, drag)
+        face, surface = drag.pose[:3, 3], self._surface()
+        if drag.kind == "slide" and surface is not None:
+            self._move(surface.slid(drag.pose, face + point - drag.point, upright=self.upright))
+        elif drag.kind == "swing" and min(np.linalg.norm(drag.point - face), np.linalg.norm(point - face)) > 1.0:
+            self._move(carried(drag.pose, face, drag.point - face, point - face))
+        return True
+
+    def _released(self, view: AbstractView) -> bool:
+        was, self._drag = self._drag, None
+        self._hold(None)
+        return was is not None
+
+    def _double_clicked(self, view: AbstractView, pixel: np.ndarray) -> bool:
+        pose, surface = self._pose(), self._surface()
+        if isinstance(view, SliceView):
+            self.aim(_in_slice(view, pixel))
+            return True
+        found = None if surface is None else surface.hit(*_ray(view, pixel))
+        if found is None:
+            return False
+        self._move(surface.slid(pose, found, upright=self.upright))
+        return True
+
+
+def _kind(view: AbstractView) -> str:
+    """What the keys held say: "rotate", "swing" or nothing."""
+    interactor = view.interactor()
+    if interactor.GetControlKey():
+        return "rotate"
+    return "swing" if interactor.GetShiftKey() else ""
+
+
+def _in_slice(view: SliceView, pixel: np.ndarray) -> np.ndarray:
+    """(3,) in the world, of a pixel."""
+    return (matrix_array(view.get_view_node().GetXYToRAS()) @ [*pixel, 0.0, 1.0])[:3]
+
+
+def _slice_normal(view: SliceView) -> np.ndarray:
+    return matrix_array(view.get_view_node().GetSliceToRAS())[:3, 2]
+
+
+def _ray(view: ThreeDView, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((3,), (3,)) ends of what lies behind a pixel, in the world."""
+    ends = []
+    for depth in (0.0, 1.0):
+        view.renderer().SetDisplayPoint(*pixel, depth)
+        view.renderer().DisplayToWorld()
+        point = np.array(view.renderer().GetWorldPoint())
+        ends.append(point[:3] / point[3])
+    return ends[0], ends[1]
+
+
+def _on_plane(view: ThreeDView, pixel: np.ndarray, drag: _Drag) -> np.ndarray:
+    """(3,) where the ray behind a pixel meets the plane through what was grabbed, which faces the viewer."""
+    near, far = _ray(view, pixel)
+    along = far - near
+    return near + ((drag.point - near) @ drag.normal) / (along @ drag.normal) * along

@@ -1,0 +1,169 @@
+"""Opener: files that become nodes of the scene: MRI, label maps, masks, tracked sequences."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mri.samples import demo_mri
+from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
+from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
+from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
+from SlicerUSSim.Logic.tracked.images import TrackedImages
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Workstation.script import LabelSource
+from SlicerUSSim.Workstation.tasks import Tasks
+
+#: Attribute of a node: the file it came from; "" for the demo brain.
+FILE = "SlicerUSSim.file"
+
+
+@dataclass(frozen=True)
+class Files:
+    """What to begin with; the demo brain without an MRI and without labels."""
+
+    mri: str | None = None
+    labels: str | None = None
+    contrast: str = "t1"
+    mask: str | None = None
+    preset: Preset | None = None
+    sequence: TrackedSequence | None = None
+    sequence_name: str = "sequence"
+    #: From pixels to where the patient lies, and from there to the MRI; see TrackedImages.of
+    transform: str = "ImageToReference"
+    to_ras: np.ndarray | None = None
+    #: OpenIGTLink, as tracking.parse_address reads it, and the transform to follow
+    tracker: str | None = None
+    tracker_device: str | None = None
+    #: What has been read of these files already
+    volumes: Mapping[str, Volume] = field(default_factory=dict)
+
+
+class Opener:
+    """Reads files in the thread for work, and puts what they hold into the scene. Raises SimulationError for others."""
+
+    def __init__(self, scene, logic: UltrasoundSceneLogic, tasks: Tasks, files: Files) -> None:
+        self._scene, self._logic, self._tasks, self._files = scene, logic, tasks, files
+        self._sources: dict[tuple, LabelSource] = {}
+        self._volumes = dict(files.volumes)  # read, but not asked for yet
+
+    def mri(self, path: str | None):
+        """A node with the MRI of a file, or the demo brain."""
+        volume = self._tasks.do(lambda: demo_mri()[0]) if path is None else self._volume(path)
+        name = "MNI152 brain" if path is None else Path(path).name
+        node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
+        write_volume(node, volume)
+        node.SetAttribute(FILE, "" if path is None else os.path.abspath(path))
+        display = display_of(node)
+        display.SetAutoWindowLevel(False)  # its own takes bright tissue for white
+        inside = volume.array[volume.array > 0]
+        display.SetWindowLevelMinMax(0.0, 1.1 * float(np.percentile(inside, 99.8)) if inside.size else 1.0)
+        return node
+
+    def mask(self, path: str):
+        """A label map node with the mask of a file."""
+        return self._label_map(self._volume(path), path, ["inside"])
+
+    def labels(self, path: str):
+        """A label map node; its tissues are in the .json beside the file, or the preset's."""
+        volume = self._volume(path)
+        beside, preset = tissues_beside(Path(path)), self._logic.preset
+        tissues = TissueTable.read(beside) if beside.exists() else preset.tissues
+        _require_labels(volume, path)
+        values = [int(label) for label in np.unique(volume.array) if label]
+        unknown = [label for label in values if label not in tissues]
+        require(not unknown, f"{path}: has the labels {unknown}, which no tissue has; put a tissue table at {beside}")
+        if beside.exists():
+            mine = preset.tissues
+            for tissue in tissues.values():
+                mine = mine.with_tissue(tissue)
+            self._logic.preset = replace(preset, tissues=mine)
+        names = [tissues[label].name if label in tissues else "" for label in range(1, max(values) + 1)]
+        node = self._label_map(volume, path, names)
+        order = read_labels(node, self._logic.preset.tissues).names
+        relabelled = (0, *(order.index(name) + 1 if name in order else 0 for name in names))
+        self._sources = {_voxels_of(node): LabelSource(os.path.abspath(path), True, relabelled=relabelled)}
+        return node
+
+    def segmented(self, labels_node, mri_node, mask_node, options: dict) -> None:
+        """Remember what labels were made of."""
+        file, mask = mri_node.GetAttribute(FILE), None if mask_node is None else mask_node.GetAttribute(FILE)
+        self._sources = {}
+        if file is not None and (mask_node is None or mask is not None):
+            self._sources[_voxels_of(labels_node)] = LabelSource(file, mask=mask, options=options)
+
+    def source_of(self, labels_node) -> LabelSource:
+        """What labels were made of. Raises SimulationError where it were not files."""
+        source = self._sources.get(_voxels_of(labels_node))
+        name = labels_node.GetName()
+        require(source is not None, f"{name!r} was not made from files here; save it, and open it with --labels")
+        return source
+
+    def sequence(self, sequence: TrackedSequence, name: str):
+        """(TrackedImages, sequence browser node, sequence node of the images)."""
+        files, preset = self._files, self._logic.preset
+        tracked = self._tasks.do(
+            lambda: TrackedImages.of(
+                sequence, path=files.transform, reference_to_ras=files.to_ras, beam=preset.probe,
+                probe=preset.probe if files.preset is not None else None,
+            )
+        )  # fmt: skip
+        browser, images = add_sequence(
+            self._scene, sequence, name, files.transform, files.to_ras, tracked.poses,
+            self._logic.parameters.probe_transform,
+        )  # fmt: skip
+        return tracked, browser, images
+
+    @contextmanager
+    def uploaded(self, name: str, content: bytes) -> Iterator[tuple[str, str]]:
+        """(path, kind) of a file whose content came from a page: "preset", "sequence", "labels" or "mri"."""
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / name
+            path.write_bytes(content)
+            try:
+                if name.lower().endswith(".json"):
+                    kind = "preset"
+                elif ".igs." in name.lower() or ".seq." in name.lower():
+                    kind = "sequence"
+                else:
+                    volume = self._volumes[str(path)] = self._volume(str(path))
+                    kind = "labels" if volume.looks_like_labels() else "mri"
+                yield str(path), kind
+            except SimulationError as error:  # the user knows the file by its name alone
+                raise SimulationError(str(error).replace(folder + os.sep, "")) from None
+
+    def _volume(self, path: str) -> Volume:
+        """The volume of a file, read once."""
+        return self._volumes.pop(path, None) or self._tasks.do(lambda: Volume.read(path))
+
+    def _label_map(self, volume: Volume, path: str, names):
+        _require_labels(volume, path)
+        node = self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", Path(path).name)
+        node.SetAttribute(FILE, os.path.abspath(path))
+        write_labels(node, volume.with_array(volume.array.astype(np.uint8)), names, node)
+        return node
+
+
+def _require_labels(volume: Volume, path: str) -> None:
+    array = volume.array
+    require(
+        bool(np.issubdtype(array.dtype, np.integer)) and int(array.min()) >= 0 and 0 < int(array.max()) < 256,
+        f"{path}: is not a label map, expected whole numbers from 0 to 255",
+    )
+
+
+def _voxels_of(labels_node) -> tuple:
+    """Changes with the voxels of a label map."""
+    image = labels_node.GetImageData() if labels_node.IsA("vtkMRMLVolumeNode") else None
+    return labels_node.GetID(), None if image is None else image.GetMTime()

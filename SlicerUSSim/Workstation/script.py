@@ -1,0 +1,77 @@
+"""python_script: what is on the screen as a script, which gives the same image again, pixel by pixel."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from SlicerUSSim.Logic.imaging.preset import Preset
+
+_TEMPLATE = '''"""The image of a SlicerUSSim workstation, again."""
+
+import json
+
+import numpy as np
+
+from SlicerUSSim.Logic import {imports}
+from SlicerUSSim.Logic.imaging.preset import Preset
+{more_imports}
+{labels}
+preset = Preset.from_dict(json.loads("""
+{preset}
+"""))
+probe_to_ras = np.array({pose})
+
+simulator = UltrasoundSimulator(labels, preset.tissues, preset.settings{texture})
+frame = simulator.simulate(preset.probe, probe_to_ras, preset.display)
+frame.to_volume().write("image.nrrd")  # frame.image is a (rows, columns) uint8 array
+print(frame.image.shape, "pixels, mean", frame.image.mean())
+'''
+
+
+@dataclass(frozen=True)
+class LabelSource:
+    """Where labels come from: a file of labels, or the segmentation of an MRI."""
+
+    #: File of the MRI or of the labels; "" is the demo brain
+    path: str
+    is_labels: bool = False
+    #: File of the mask, if one was used
+    mask: str | None = None
+    #: Other arguments of segment_mri
+    options: dict = field(default_factory=dict)
+    #: What the simulator calls the labels 0, 1, 2, ... of the file
+    relabelled: tuple[int, ...] = ()
+
+
+def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray) -> str:
+    """A script that simulates what `preset`, whose tissues are by label, shows at a pose (4, 4) in these labels."""
+    imports, more, lines = ["UltrasoundSimulator"], "", []
+    is_demo = not source.path
+    if is_demo:
+        more = "from SlicerUSSim.Logic.mri.samples import demo_mri\n"
+        lines.append("mri, _ = demo_mri()")
+    else:
+        imports.append("Volume")
+        lines.append(f"{'labels' if source.is_labels else 'mri'} = Volume.read({source.path!r})")
+    if source.is_labels:
+        if source.relabelled and source.relabelled != tuple(range(len(source.relabelled))):
+            lines.append(f"labels = labels.with_array(np.array({list(source.relabelled)}, np.uint8)[labels.array])")
+    else:
+        imports.append("segment_mri")
+        options = [f"{name}={value!r}" for name, value in source.options.items()]
+        if source.mask is not None:
+            imports.append("Volume")
+            options.append(f"mask=Volume.read({source.mask!r})")
+        lines += [f"segmentation = segment_mri({', '.join(['mri', *options])})", "labels = segmentation.labels"]
+    needs_texture = preset.settings.needs_texture and not source.is_labels
+    return _TEMPLATE.format(
+        imports=", ".join(sorted(set(imports))),
+        more_imports=more,
+        labels="\n".join(lines),
+        preset=json.dumps(preset.to_dict(), indent=1),
+        pose=np.array2string(probe_to_ras, separator=", ", floatmode="unique", max_line_width=118),
+        texture=", texture=segmentation.texture()" if needs_texture else "",
+    )

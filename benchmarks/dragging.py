@@ -1,0 +1,167 @@
+"""The workstation in the browser: how soon it is usable, images per second and latency while dragging, memory.
+
+    python benchmarks/workstation.py [--device intel --device pocl] [--seconds 10] [--frames 2000] [--json FILE]
+
+Starts `ussim serve` with the demo brain, opens it in headless Chromium, drags the probe with the mouse in a slice view
+and in the 3D view. Server, browser and whoever moves the mouse share the processor. Needs playwright and Chromium.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from playwright.sync_api import Page, sync_playwright
+
+from SlicerUSSim.Logic.base.files import write_json
+from SlicerUSSim.Logic.opencl.devices import list_devices
+from SlicerUSSim.Logic.verification.benchmark.files import output_file
+
+FLAGS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+#: Where the probe's body is in a view, as shares of its width and height: the craniotomy of the demo brain.
+GRIPS = {"slice view": (1, 0.5, 0.2), "3D view": (0, 0.12, 0.08)}
+#: Frames before the first measurement of memory: what is allocated once is there by then.
+WARM_UP_FRAMES = 300
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", action="append", help="as of `ussim devices`; may be repeated (default: each once)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of dragging, in each view")
+    parser.add_argument("--frames", type=int, default=2000, help="over which memory is watched; 0: not at all")
+    parser.add_argument("--json", type=output_file, help="keep the numbers in this file")
+    arguments = parser.parse_args()
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        raise SystemExit("benchmarks/workstation.py: Chromium is missing, install it with: apt-get install chromium")
+    results = {}
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        for device in arguments.device or [info.index for info in list_devices()]:
+            results[device] = numbers = measured(browser, device, arguments.seconds, arguments.frames)
+            print(f"{device}: usable after {numbers['usable_s']:.1f} s")
+            for view in GRIPS:
+                drag = numbers[view]
+                print(
+                    f"  dragging in the {view:10s} {drag['images_per_s']:5.1f} images/s, mouse to image "
+                    f"{drag['median_ms']:4.0f} ms, 95 % within {drag['p95_ms']:4.0f} ms"
+                )
+            if arguments.frames:
+                memory = numbers["memory"]
+                for owner in ("server", "page"):
+                    was, now = memory[f"{owner}_mb"]
+                    print(f"  memory of the {owner} {was:.0f} -> {now:.0f} MB over {memory['frames']} images")
+    if arguments.json:
+        write_json(arguments.json, results)
+
+
+def measured(browser, device: str, seconds: float, frames: int) -> dict:
+    """All numbers of one device."""
+    start = perf_counter()
+    with serving(device) as (url, process):
+        page = browser.new_page(viewport={"width": 1500, "height": 900})
+        page.goto(url)
+        page.wait_for_function("window.ussim && window.ussim.images > 0", timeout=120_000)
+        result = {"usable_s": perf_counter() - start}
+        page.wait_for_timeout(2000)
+        for name, (number, across, down) in GRIPS.items():
+            page.evaluate("window.trame.trigger('press', ['placeButton'])")
+            page.wait_for_timeout(1500)
+            box = page.locator(".ussim-anatomy .remote-controlled-area").nth(number).bounding_box()
+            result[name] = dragged(page, box["x"] + across * box["width"], box["y"] + down * box["height"], seconds)
+        if frames:
+            result["memory"] = watched(page, process, frames)
+        page.close()
+    return result
+
+
+def dragged(page: Page, x: float, y: float, seconds: float) -> dict[str, float]:
+    """Images per second, and then milliseconds from mouse to image, while the mouse goes to and fro."""
+    page.mouse.move(x, y)
+    page.mouse.down()
+    images = _move(page, x, y, seconds)
+    page.evaluate("window.trame.state.set('show_latency', true)")
+    page.wait_for_timeout(500)
+    page.evaluate("window.ussim.measured.length = 0")
+    _move(page, x, y, seconds)
+    times = page.evaluate("window.ussim.measured")
+    page.mouse.up()
+    page.evaluate("window.trame.state.set('show_latency', false)")
+    if len(times) < 5:
+        raise SystemExit(f"benchmarks/workstation.py: only {len(times)} images came of dragging at {x:.0f}, {y:.0f}")
+    return {
+        "images_per_s": images,
+        "median_ms": float(np.median(times)),
+        "p95_ms": float(np.percentile(times, 95)),
+        "measured": len(times),
+    }
+
+
+def _move(page: Page, x: float, y: float, seconds: float) -> float:
+    """Images per second."""
+    before, start, step = page.evaluate("window.ussim.images"), perf_counter(), 0
+    while perf_counter() - start < seconds:
+        step += 1
+        page.mouse.move(x + 40 * math.sin(step / 20), y + 4 * math.sin(step / 33))
+        page.wait_for_timeout(8)
+    return (page.evaluate("window.ussim.images") - before) / (perf_counter() - start)
+
+
+def watched(page: Page, process: subprocess.Popen, frames: int) -> dict:
+    """Memory before and after so many images, of server and page."""
+    session = page.context.new_cdp_session(page)
+
+    def page_mb() -> float:
+        session.send("HeapProfiler.collectGarbage")
+        return page.evaluate("performance.memory.usedJSHeapSize") / 2**20
+
+    def server_mb() -> float:
+        pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+    def run(count: int) -> None:
+        end, step = page.evaluate("window.ussim.images") + count, 0
+        while page.evaluate("window.ussim.images") < end:
+            step += 1
+            for name, angle in (("rock_deg", 20 * math.sin(step / 15)), ("tilt_deg", 15 * math.sin(step / 23))):
+                page.evaluate("([n, v]) => window.trame.trigger('set_pose', [n, v])", [name, angle])
+
+    run(WARM_UP_FRAMES)
+    before = server_mb(), page_mb()
+    run(frames)
+    after = server_mb(), page_mb()
+    return {"frames": frames, "server_mb": [before[0], after[0]], "page_mb": [before[1], after[1]]}
+
+
+@contextmanager
+def serving(device: str):
+    """(URL, process) of `ussim serve`."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", "0", "--device", device],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        url = process.stdout.readline().strip()
+        if not url.startswith("http"):
+            raise SystemExit(process.stderr.read().strip())
+        yield url, process
+    finally:
+        process.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(10)
+        process.kill()
+
+
+if __name__ == "__main__":
+    main()

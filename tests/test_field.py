@@ -1,0 +1,181 @@
+"""The imaged field, found in images: simulated ones whose geometry is known, and real ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+from PIL import Image
+
+from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationError, TrackedSequence
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.tracked.field import ImagedField, draw_field, estimate_field
+from SlicerUSSim.Logic.tracked.images import TrackedImages
+from tests.conftest import SHARED, needs_shared
+
+
+def screen(probe, left: int = 60, top: int = 15, seed: int = 0) -> tuple[np.ndarray, ImageGrid]:
+    """A scanner's screen: speckle in the field of `probe`, a logo, a grey bar and a ruler beside it."""
+    grid = ImageGrid.for_probe(probe, None)
+    random = np.random.default_rng(seed)
+    field = np.where(grid.field(probe), random.integers(5, 160, (grid.rows, grid.columns)), 0)
+    image = np.zeros((grid.rows + 40, grid.columns + 120), np.uint8)
+    image[top : top + grid.rows, left : left + grid.columns] = field
+    image[5:25, 5:40] = 220
+    image[60:300, 20:30] = np.linspace(255, 0, 240)[:, None]
+    image[::25, -8:] = 200
+    return image, grid
+
+
+convex = st.builds(ConvexProbe, st.floats(10, 70), st.floats(40, 100), st.floats(40, 200))
+linear = st.builds(LinearProbe, st.floats(20, 60), st.floats(20, 90))
+phased = st.builds(PhasedProbe, st.floats(50, 100), st.floats(50, 180))
+
+
+@given(st.one_of(convex, linear, phased))
+def test_geometry_is_found_from_the_image(probe):
+    image, grid = screen(probe)
+    field = estimate_field(image, grid.pixel_spacing_mm)
+    pixel = grid.pixel_spacing_mm[1]
+    found, true = field.probe.to_dict(), probe.to_dict()
+    assert found["kind"] == true["kind"]
+    assert found["depth_mm"] == pytest.approx(true["depth_mm"], abs=5 * pixel)
+    if "field_of_view_deg" in true:
+        assert found["field_of_view_deg"] == pytest.approx(true["field_of_view_deg"], abs=1.5)
+    if "radius_mm" in true:
+        assert found["radius_mm"] == pytest.approx(true["radius_mm"], abs=6 * pixel)
+    if "width_mm" in true:
+        assert found["width_mm"] == pytest.approx(true["width_mm"], abs=4 * pixel)
+    face = (np.linalg.inv(field.image_to_probe) @ [0, 0, 0, 1])[:2]
+    expected = np.linalg.inv(grid.image_to_probe)[:2, 3] + [60, 15]
+    assert np.abs(face - expected).max() < 6.0
+    assert field.overlap > 0.95
+
+
+def test_size_of_a_pixel_follows_from_what_is_known():
+    image, grid = screen(LinearProbe(38, 50))
+    by_width = estimate_field(image, width_mm=38.0, frequency_mhz=9.0)
+    assert by_width.probe.depth_mm == pytest.approx(50.0, abs=0.3) and by_width.probe.frequency_mhz == 9.0
+    assert by_width.image_to_probe[0, 0] == pytest.approx(grid.pixel_spacing_mm[0], rel=0.01)
+    assert estimate_field(image, depth_mm=50.0).probe.to_dict()["width_mm"] == pytest.approx(38.0, abs=0.3)
+    for options in ({}, {"width_mm": 38.0, "depth_mm": 50.0}):
+        with pytest.raises(SimulationError, match="how large a pixel is"):
+            estimate_field(image, **options)
+    sector, _ = screen(ConvexProbe(20, 70, 80))
+    with pytest.raises(SimulationError, match="width_mm is known of linear probes only"):
+        estimate_field(sector, width_mm=38.0)
+
+
+@pytest.mark.parametrize(
+    "image, message",
+    [
+        (np.zeros((50, 60), np.uint8), "black"),
+        (np.full((3, 0, 4), 9, np.uint8), "expected (n, rows, columns)"),
+        (np.tri(200, 200, dtype=np.uint8) * 99, "no probe's field"),
+    ],
+)
+def test_images_without_a_fan_are_refused(image, message):
+    with pytest.raises(SimulationError) as caught:
+        estimate_field(image, (0.1, 0.1))
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_picture_to_check_shows_the_outline(tmp_path):
+    image, grid = screen(ConvexProbe(40, 60, 80))
+    field = estimate_field(image, grid.pixel_spacing_mm)
+    draw_field(tmp_path / "field.png", image, field)
+    picture = np.asarray(Image.open(tmp_path / "field.png")).astype(int)
+    yellow = (picture[..., 0] > 200) & (picture[..., 2] < 120)
+    rows, columns = np.nonzero(yellow[:-20])
+    outline = field.outline_pixels()
+    assert abs(columns.min() - outline[:, 0].min()) < 4 and abs(rows.max() - outline[:, 1].max()) < 4
+
+
+def test_field_of_a_known_probe_is_its_own():
+    probe = LinearProbe(20, 30)
+    grid = ImageGrid.for_probe(probe, (60, 40))
+    assert np.array_equal(ImagedField.of(probe, grid.image_to_probe, (60, 40)).mask, grid.field(probe))
+
+
+# ---- tracked images --------------------------------------------------------------------------------------------------
+
+
+def tracked_screen(probe) -> TrackedSequence:
+    image, grid = screen(probe)
+    calibration = np.diag([*grid.pixel_spacing_mm, 1.0, 1.0])
+    calibration[:3, 3] = 3.0, 7.0, -2.0  # of a tracker's marker, not of the probe's face
+    other = screen(probe, seed=1)[0]
+    return TrackedSequence(
+        np.stack([image, other]), ({"ImageToProbe": calibration, "ProbeToReference": np.eye(4)},) * 2, [0.0, 1.0]
+    )
+
+
+def test_poses_and_pixels_follow_from_calibration_and_field():
+    probe = ConvexProbe(40, 60, 80)
+    sequence = tracked_screen(probe)
+    found = TrackedImages.of(sequence)
+    # Pixels of the cropped image lie where those of the whole one do.
+    row, column = 100, 120
+    rows, columns = found.field.window
+    there = found.poses[0] @ found.grid.image_to_probe @ [column, row, 0, 1]
+    expected = sequence.pose(0, "ImageToReference") @ [column + columns.start, row + rows.start, 0, 1]
+    assert np.allclose(there, expected, atol=1e-6)
+    assert np.array_equal(found.images[1], sequence.images[1][rows, columns])
+    assert np.allclose(found.poses[0][:3, :3], np.eye(3), atol=1e-6)
+
+
+def test_a_given_probe_keeps_its_beam_and_gets_the_place_of_the_field():
+    sequence = tracked_screen(ConvexProbe(40, 60, 80))
+    probe = ConvexProbe(40, 60, 80, frequency_mhz=7.0)
+    found = TrackedImages.of(sequence, [1], probe=probe)
+    assert found.probe is probe and found.numbers == [1]
+    assert np.allclose(found.poses[0], TrackedImages.of(sequence).poses[1], atol=0.4)
+    with pytest.raises(SimulationError, match="field of a convex probe, but the probe given is linear"):
+        TrackedImages.of(sequence, probe=LinearProbe(40, 80))
+    with pytest.raises(SimulationError, match="mm deep, but the probe given sees 120 mm"):
+        TrackedImages.of(sequence, probe=ConvexProbe(40, 60, 120))
+
+
+def test_images_are_spread_over_those_that_were_tracked():
+    sequence = tracked_screen(LinearProbe(40, 50))
+    many = TrackedSequence(
+        np.concatenate([sequence.images] * 6), [t if n != 0 else {} for n, t in enumerate(sequence.transforms * 6)],
+        np.arange(12.0),
+    )  # fmt: skip
+    assert TrackedImages.of(many).numbers == list(range(1, 12))
+    assert TrackedImages.of(many, most=3).numbers == [1, 6, 11]
+    assert TrackedImages.of(many, [2, 3, 4, 5], most=3).numbers == [2, 3, 4, 5]
+
+
+def test_registration_moves_the_poses():
+    sequence = tracked_screen(ConvexProbe(40, 60, 80))
+    moved = np.eye(4)
+    moved[:3, 3] = 1, 2, 3
+    before, after = TrackedImages.of(sequence), TrackedImages.of(sequence, reference_to_ras=moved)
+    assert np.allclose(after.poses[0], moved @ before.poses[0])
+
+
+def test_bad_sequences_are_refused_in_one_line():
+    sequence = tracked_screen(LinearProbe(40, 50))
+    black = sequence.with_images([0, 1], np.stack([sequence.images[0], np.zeros_like(sequence.images[0])]))
+    skewed = sequence.with_transforms(
+        {"ImageToProbe": np.array([[0.1, 0.05, 0, 0], [0, 0.1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])}
+    )
+    for attempt, message in (
+        (lambda: TrackedImages.of(black), "image 1 of the sequence is black"),
+        (lambda: TrackedImages.of(skewed), "skewed"),
+        (lambda: TrackedImages.of(sequence, [5]), "image 5 does not exist, expected 0 to 1"),
+        (lambda: TrackedImages.of(sequence, path="ImageToPatient"), "no path from Image to Patient"),
+        (lambda: TrackedImages.of(sequence, reference_to_ras=np.diag([2.0, 1, 1, 1])), "reference_to_ras"),
+    ):  # fmt: skip
+        with pytest.raises(SimulationError) as caught:
+            attempt()
+        assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@needs_shared
+@pytest.mark.parametrize("name, depth", [("SpinePhantomFreehand", 50.0), ("BoneUltrasound_L14", 50.0)])
+def test_real_images_show_the_field_of_the_38_mm_probe_that_took_them(name, depth):
+    sequence = TrackedSequence.read(SHARED / f"{name}.igs.mha")
+    field = estimate_field(sequence.images, width_mm=38.0)  # L14-5
+    assert field.probe.is_linear and field.probe.depth_mm == pytest.approx(depth, abs=1.0) and field.overlap > 0.99
