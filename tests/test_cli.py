@@ -279,5 +279,5 @@ def test_the_command_offers_every_probe_there_is():
 
 
 def test_python_m_is_the_command():
-    done = subprocess.run([sys.executable, "-m", "SlicerUSSim", "--version"], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-m", "SlicerUSSim.Command", "--version"], capture_output=True, text=True)
     assert done.returncode == 0 and "ussim, version" in done.stdout

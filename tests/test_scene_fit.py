@@ -17,7 +17,6 @@ from SlicerUSSim.Logic import (  # noqa: E402
     SimulationError,
     TissueTable,
     Volume,
-    fitting,
     segment_mri,
 )
 from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
@@ -206,7 +205,7 @@ def test_geometry_can_be_estimated(scene):
 
 
 def test_registration_is_written_as_a_transform_of_the_tracking(brain, monkeypatch):
-    monkeypatch.setattr(fitting, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well it finds is tested elsewhere
+    monkeypatch.setattr("SlicerUSSim.Logic.fitting.fit._ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
     own = Scene(brain)
     away = np.eye(4)
     away[:3, 3] = 1.5, -1.0, 2.0

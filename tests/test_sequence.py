@@ -96,7 +96,7 @@ def test_shapes_that_do_not_fit_are_refused():
         ((images[0], ({}, {}), [0, 1]), "expected (n, rows, columns)"),
         ((images, ({},), [0, 1]), "1 sets of transforms for 2 images"),
         ((images, ({}, {}), [0]), "timestamps have shape (1,)"),
-        ((images, ({"AToB": np.eye(3)}, {}), [0, 1]), "image 0: AToB is not a 4x4 matrix"),
+        ((images, ({"AToB": np.eye(3)}, {}), [0, 1]), "image 0: AToB has shape (3, 3)"),
         ((images, ({}, {"AToB": np.full((4, 4), np.nan)}), [0, 1]), "image 1: AToB"),
     ):
         with pytest.raises(SimulationError) as caught:
