@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import weakref
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -330,6 +331,18 @@ def test_slicers_default_colours_do_not_make_bone_of_grey_matter(bench):
         bench.logic.tissues(labels)
     colours.SetColorName(1, "liver")
     assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["liver", "bone"]
+
+
+def test_labels_without_names_follow_the_tissues_that_have_their_numbers(bench):
+    """They are read again when the same names stand for other labels: once the old ones stayed, without an error."""
+    labels = add(bench.scene, "LabelMapVolume", "labels.nii")
+    write_volume(labels, cyst())
+    assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["speckle", "fluid"]
+    bench.logic.preset = replace(PRESET, tissues=TissueTable({0: FLUID, 2: SPECKLE, 3: FLUID}))
+    with pytest.raises(SimulationError, match="no tissue is called 'label 1'"):
+        bench.logic.tissues(labels)
+    bench.logic.preset = replace(PRESET, tissues=TissueTable({0: FLUID, 1: FLUID, 2: SPECKLE}))
+    assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["fluid", "speckle"]
 
 
 # ---- placing ---------------------------------------------------------------------------------------------------------

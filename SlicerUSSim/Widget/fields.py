@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import log10
+from typing import Any
 
 from SlicerUSSim.Logic.imaging.preset import Preset
 
@@ -16,8 +17,8 @@ NO_NOISE_DB = -150.0
 class Field:
     """How a value of the preset is shown, and read back."""
 
-    shown: Callable[[object], object] = lambda value: value
-    meant: Callable[[object], object] = lambda value: value
+    shown: Callable[[Any], Any] = lambda value: value
+    meant: Callable[[Any], Any] = lambda value: value
 
 
 def _db(amplitude: float) -> float:

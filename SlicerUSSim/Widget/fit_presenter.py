@@ -15,8 +15,10 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED, CostPlot
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import composite_of, node_called, require_node
+from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.sequence import frame_numbers
+from SlicerUSSim.Widget.interface import PanelView
 
 _REGISTRATION = "Ultrasound registration"
 
@@ -24,20 +26,27 @@ _REGISTRATION = "Ultrasound registration"
 class FitHost(Protocol):
     """What it needs of the panel's presenter."""
 
-    logic: UltrasoundSceneLogic
-    view: object
+    @property
+    def logic(self) -> UltrasoundSceneLogic: ...
+
+    @property
+    def view(self) -> PanelView: ...
 
     def tissueTable(self) -> TissueTable:
         """The tissues in use."""
+        ...
 
     def canSimulate(self) -> tuple[bool, str]:
         """(whether there is something to simulate, why not)"""
+        ...
 
     def shown(self) -> AbstractContextManager[None]:
         """Show what the user caused in one line."""
+        ...
 
     def working(self, title: str) -> AbstractContextManager[Callable[[float], None]]:
         """Show progress, and let nothing else begin."""
+        ...
 
 
 class FitPresenter:
@@ -130,8 +139,7 @@ class FitPresenter:
         """Take the result into the preset; what registration found becomes a transform to put above the tracking."""
         panel = self._panel
         with panel.shown():
-            require(self._fit is not None, "nothing to apply, fit first")
-            found, labels = self._fit
+            found, labels = self._required("nothing to apply, fit first")
             before = panel.logic.applyFit(found)
             if found.registration is not None:
                 transform = node_called(self._panel.logic.scene, "LinearTransform", _REGISTRATION)
@@ -142,7 +150,8 @@ class FitPresenter:
     def revert(self) -> None:
         """Back to what was before Apply."""
         with self._panel.shown():
-            require(self._before is not None, "nothing to revert to, apply a fit first")
+            if self._before is None:
+                raise SimulationError("nothing to revert to, apply a fit first")
             self._panel.logic.preset, self._before = self._before, None
         self._panel.view.refresh()
 
@@ -155,7 +164,7 @@ class FitPresenter:
     def compare(self, kind: str, number: int) -> None:
         """Show one image of the fit in the slice view: one of scene_fit.COMPARED."""
         with self._panel.shown():
-            require(self._fit is not None, "nothing to show, fit first")
+            self._required("nothing to show, fit first")
             require(kind in COMPARED, f"nothing is called {kind!r}, expected one of {', '.join(COMPARED)}")
             self._show(kind, number)
 
@@ -167,7 +176,7 @@ class FitPresenter:
             composite.SetForegroundOpacity(0.0 if composite.GetForegroundOpacity() > 0.5 else 1.0)
 
     def _show(self, kind: str, number: int) -> None:
-        found, labels = self._fit
+        found, labels = self._required("nothing to show, fit first")
         logic = self._panel.logic
         require_node(labels, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map of the fit")
         nodes = {name: node_called(self._panel.logic.scene, "ScalarVolume", f"Fit: {name}") for name in COMPARED}
@@ -176,8 +185,14 @@ class FitPresenter:
         if view is not None:
             logic.showFitInSlice(view, found, labels, nodes[kind], nodes["real"], number)
 
+    def _required(self, message: str) -> tuple[Fit, object]:
+        """The last fit and the labels it is of. Raises SimulationError(message) if there is none."""
+        if self._fit is None:
+            raise SimulationError(message)
+        return self._fit
+
     @property
-    def _parameters(self):
+    def _parameters(self) -> SceneParameters:
         return self._panel.logic.parameters
 
 

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Protocol
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, user_message
 from SlicerUSSim.Logic.imaging.preset import Preset
@@ -25,6 +24,7 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Widget.fields import field_value, with_field
 from SlicerUSSim.Widget.fit_presenter import FitPresenter
+from SlicerUSSim.Widget.interface import PanelView
 
 #: Columns of the tissue table: parameter, heading, unit.
 TISSUE_COLUMNS = (
@@ -35,31 +35,6 @@ TISSUE_COLUMNS = (
     ("mu1", "μ₁", "threshold of scatterers: the share 1 - Φ(μ₁) of sites holds one"),
     ("sigma0", "σ₀", "standard deviation of the scatterers' amplitude"),
 )
-
-
-class PanelView(Protocol):
-    """What the presenter wants of a user interface."""
-
-    def showError(self, message: str) -> None:
-        """Show one line in a message box."""
-
-    def showStatus(self, message: str) -> None:
-        """Show one line in the panel, beside Live."""
-
-    def refresh(self) -> None:
-        """Show everything anew: fields, tissues, what can be done."""
-
-    def progress(self, title: str) -> AbstractContextManager[Callable[[float], None]]:
-        """Show a progress bar; the function is told the share done and raises Cancelled if the user wants."""
-
-    def schedule(self, function: Callable[[], None]) -> None:
-        """Call `function` once, soon, from the event loop."""
-
-    def sliceNode(self):
-        """The vtkMRMLSliceNode of the chosen slice view, or None."""
-
-    def showChart(self, chart_node) -> None:
-        """Show a vtkMRMLPlotChartNode where plots are shown."""
 
 
 @dataclass(frozen=True)
@@ -292,7 +267,8 @@ class PanelPresenter:
         """Change a tissue of the table in use; one that the preset did not have is added to it."""
         preset, used = self._preset(), self.tissueTable()
         old = next((tissue for tissue in used.all_tissues() if same_name(tissue.name, name)), None)
-        require(old is not None, f"no tissue is called {name!r}, expected one of {', '.join(used.names())}")
+        if old is None:
+            raise SimulationError(f"no tissue is called {name!r}, expected one of {', '.join(used.names())}")
         self.logic.preset = replace(preset, tissues=preset.tissues.with_tissue(change(old)))
 
     def _nodes(self):
@@ -356,7 +332,7 @@ class PanelPresenter:
         self.view.refresh()
 
     @contextmanager
-    def shown(self):
+    def shown(self) -> Iterator[None]:
         """What the user caused is shown in one line; the panel then shows what really is."""
         try:
             yield
@@ -369,7 +345,7 @@ class PanelPresenter:
             self.view.refresh()
 
     @contextmanager
-    def working(self, title: str):
+    def working(self, title: str) -> Iterator[Callable[[float], None]]:
         require(not self._busy, "wait until the work under way is done")
         self._busy = True
         self.view.refresh()

@@ -1,8 +1,8 @@
-"""A simulator for inputs that change one at a time, as a pipeline's and a scene's do."""
+"""A simulator for inputs that change one at a time, as those of a pipeline and of a scene do."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
@@ -22,13 +22,13 @@ class ReusedSimulator:
     def get(
         self,
         labels_version: Hashable,
-        labels: Callable[[], Volume],
+        labels: Volume,
         tissues: TissueTable,
         settings: SimulationSettings,
         device: str | Device | None = None,
         texture: Texture | None = None,
     ) -> UltrasoundSimulator:
-        """A simulator for these inputs; `labels` is asked for the label map only if `labels_version` is a new one.
+        """A simulator for these inputs; voxels count as the same for as long as `labels_version` is the same.
 
         Raises SimulationError as UltrasoundSimulator does; the next call then starts from nothing.
         """
@@ -36,7 +36,7 @@ class ReusedSimulator:
         wanted = (labels_version, texture, device, settings.partial_volume, settings.mri_modulation_db)
         if self._simulator is None or self._built_for != wanted:
             self.forget()
-            self._simulator = UltrasoundSimulator(labels(), tissues, settings, device, texture)
+            self._simulator = UltrasoundSimulator(labels, tissues, settings, device, texture)
             self._built_for = wanted
         elif self._simulator.medium.tissues != tissues:
             self._simulator.set_tissues(tissues)

@@ -57,10 +57,10 @@ def tracked_images(
     else:
         volume = read_volume(images_node, "real image")
         if volume.array.shape[0] > 1:
-            require(
-                probe_to_world is not None,
-                f"{named(images_node)} is a 3D volume; choose a probe transform, which says where to cut it",
-            )
+            if probe_to_world is None:
+                raise SimulationError(
+                    f"{named(images_node)} is a 3D volume; choose a probe transform, which says where to cut it"
+                )
             placed = Volume(volume.array, node_to_world(images_node) @ volume.ijk_to_ras)
             sequence = TrackedSequence.from_volume(placed, probe, [probe_to_world])
             return TrackedImages.of(sequence, numbers, probe=probe)
@@ -104,10 +104,8 @@ def _to_world_at(browser, transform_node, index: str) -> np.ndarray:
     while transform_node is not None:
         recorded = browser.GetSequenceNode(transform_node)
         item = transform_node if recorded is None else recorded.GetDataNodeAtValue(index, False)
-        require(
-            item is not None and item.IsA("vtkMRMLLinearTransformNode"),
-            f"{named(transform_node)} has no linear transform at {index}",
-        )
+        if item is None or not item.IsA("vtkMRMLLinearTransformNode"):
+            raise SimulationError(f"{named(transform_node)} has no linear transform at {index}")
         item.GetMatrixTransformToParent(to_parent)
         matrix = matrix_array(to_parent) @ matrix
         transform_node = transform_node.GetParentTransformNode()
@@ -118,7 +116,7 @@ def _of_slices(slices: list[tuple[np.ndarray, np.ndarray]], times: list[float]) 
     shapes = {image.shape for image, _ in slices}
     require(len(shapes) == 1, f"the images have the sizes {sorted(shapes)}, expected one")
     return TrackedSequence(
-        np.stack([image for image, _ in slices]), tuple({"ImageToReference": m} for _, m in slices), times
+        np.stack([image for image, _ in slices]), tuple({"ImageToReference": m} for _, m in slices), np.array(times)
     )
 
 

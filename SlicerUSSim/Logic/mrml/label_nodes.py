@@ -6,18 +6,19 @@ from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import slicer
 from vtkmodules.vtkCommonCore import vtkIntArray, vtkStringArray
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
+from SlicerUSSim.Logic.mrml.libraries import slicer
 from SlicerUSSim.Logic.mrml.nodes import (
     display_of,
     ijk_to_ras,
     named,
     node_to_world,
+    pose_in_labels,
     read_volume,
     require_node,
     write_volume,
@@ -25,6 +26,9 @@ from SlicerUSSim.Logic.mrml.nodes import (
 from SlicerUSSim.Logic.tissue.names import same_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
 from SlicerUSSim.Logic.tissue.table import TissueTable
+
+#: Nodes that can hold labels.
+LABEL_CLASSES = ("vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +39,50 @@ class LabelledTissues:
     volume: Volume
     #: Name of the tissue of label 1, 2, ...
     names: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Patient:
+    """All that the simulator needs of a label node, read at one moment: from here on nobody asks the node again."""
+
+    #: How a message calls the node
+    name: str
+    #: uint8 labels, one per tissue, in a frame that the world reaches rigidly
+    labels: Volume
+    #: Name of the tissue of label 1, 2, ...
+    names: tuple[str, ...]
+    #: (4, 4) rigid, from the world (RAS) to the frame of `labels`
+    world_to_patient: np.ndarray
+    #: Of the node's voxels and names, see labels_version; and of what simulators are built for, which knows the names'
+    #: tissues and a scaling transform too
+    node_version: Hashable
+    version: Hashable
+
+    def pose(self, probe_to_world: np.ndarray) -> np.ndarray:
+        """(4, 4) of a probe in the frame of `labels`."""
+        return self.world_to_patient @ probe_to_world
+
+
+class PatientReader:
+    """Reads label nodes, and keeps the labels it read last for as long as node and tissues stay what they are."""
+
+    def __init__(self) -> None:
+        self._read: tuple[Hashable, LabelledTissues] | None = None
+
+    def read(self, labels_node, tissues: TissueTable) -> Patient:
+        """What a label map or segmentation holds and where it is; see read_labels for `tissues` and errors."""
+        require_node(labels_node, *LABEL_CLASSES, use="label map")
+        node_version = labels_version(labels_node)
+        # Names alone would not do: a label map without names of its own takes those that `tissues` has by label.
+        version = (node_version, tuple((label, tissue.name) for label, tissue in tissues.items()))
+        if self._read is None or self._read[0] != version:
+            self._read = (version, read_labels(labels_node, tissues))
+        labelled = self._read[1]
+        world_to_patient, scaling = pose_in_labels(labels_node, np.eye(4))
+        labels = Volume(labelled.volume.array, scaling @ labelled.volume.ijk_to_ras)
+        return Patient(
+            named(labels_node), labels, labelled.names, world_to_patient, node_version, (version, scaling.tobytes())
+        )
 
 
 def read_mask(mask_node, mri_node) -> Volume:
@@ -83,14 +131,15 @@ def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
     in `tissues`.
     Raises SimulationError for a node without voxels or segments, and lists names that nobody knows.
     """
-    require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map")
+    require_node(labels_node, *LABEL_CLASSES, use="label map")
     if labels_node.IsA("vtkMRMLSegmentationNode"):
         volume, names = _read_segmentation(labels_node)
     else:
         volume = read_volume(labels_node, "label map")
         names = _colour_names(labels_node, volume, tissues)
-    known = {label: _tissue_name(name, tissues) for label, name in names.items()}
-    unknown = [names[label] for label, tissue in known.items() if tissue is None]
+    found = {label: _tissue_name(name, tissues) for label, name in names.items()}
+    known = {label: tissue for label, tissue in found.items() if tissue is not None}
+    unknown = [names[label] for label in names if label not in known]
     require(
         not unknown,
         f"{named(labels_node)}: no tissue is called {', '.join(map(repr, unknown))}; rename to one of: "
@@ -159,13 +208,12 @@ def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int
         "numbers from 0 to 99999",
     )
     colours, names = _colour_node(labels_node), {}
-    known_colours = 0 if colours is None else colours.GetNumberOfColors()
     # Slicer gives every label map this table, in which 2 is bone and 3 is skin, whatever they are.
     is_default = colours is not None and colours.GetName() == "GenericAnatomyColors"
     for label in map(int, np.flatnonzero(np.bincount(values.ravel()))):
         if label == 0:
             continue
-        name = colours.GetColorName(label) if label < known_colours else None
+        name = colours.GetColorName(label) if colours is not None and label < colours.GetNumberOfColors() else None
         if name in (None, "", "(none)"):
             name = f"label {label}"
         if label in tissues and (is_default or _tissue_name(name, tissues) is None):

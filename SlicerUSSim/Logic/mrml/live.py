@@ -4,39 +4,47 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import slicer
 from vtkmodules.vtkCommonCore import VTK_OBJECT, vtkCommand
 
 from SlicerUSSim.Logic.base.errors import user_message
+from SlicerUSSim.Logic.mrml.libraries import slicer
 
 #: Event of an output volume: another live update now writes to it.
 _CLAIMED = vtkCommand.UserEvent + 7301
 
 
-class LiveUpdate:
-    """Keeps an output volume up to date with a probe transform, for UltrasoundSceneLogic.startLiveUpdate.
+class LiveNodes(NamedTuple):
+    """The nodes of one live update; outline model and slice view may be None."""
 
-    `nodes` are labels, probe transform and output volume, then outline model and slice view, which may be None.
-    """
+    labels: Any
+    probe_transform: Any
+    output: Any
+    outline: Any
+    slice_view: Any
+
+
+class LiveUpdate:
+    """Keeps an output volume up to date with a probe transform, for UltrasoundSceneLogic.startLiveUpdate."""
 
     running = False
 
     def __init__(
         self,
         logic,
-        nodes: tuple,
+        nodes: LiveNodes,
         schedule: Callable[[Callable[[], None]], None] | None,
         report: Callable[[str], None] | None,
         stopped: Callable[[], None] | None,
     ) -> None:
         self._logic = weakref.ref(logic)  # which owns us
-        self._nodes = nodes
-        labels_node, transform_node, output_node = nodes[:3]
+        self._nodes: LiveNodes | None = nodes
+        labels_node, transform_node, output_node = nodes.labels, nodes.probe_transform, nodes.output
         self._schedule, self._report, self._stopped = schedule, report, stopped
         self._pending = self._busy = False
         self._outlined = logic.preset.probe
-        self._observed: list[tuple[object, int]] = []
+        self._observed: list[tuple[Any, int]] = []
         self.running = True
 
         scene = logic.scene
@@ -69,7 +77,7 @@ class LiveUpdate:
         for observed, tag in self._observed:
             observed.RemoveObserver(tag)
         self._observed.clear()
-        self._nodes = ()
+        self._nodes = None
         stopped, self._stopped, self._report = self._stopped, None, None
         if stopped is not None:
             stopped()
@@ -87,11 +95,11 @@ class LiveUpdate:
                 alive(*data)
 
         if call_data is not None:
-            callback.CallDataType = call_data
+            setattr(callback, "CallDataType", call_data)  # noqa: B010, where VTK looks for it
         self._observed.append((subject, subject.AddObserver(event, callback)))
 
     def _node_goes(self, node) -> None:
-        if any(node is mine for mine in self._nodes):
+        if any(node is mine for mine in self._nodes or ()):
             self.stop()
 
     def _batch_ended(self) -> None:
@@ -101,10 +109,10 @@ class LiveUpdate:
 
     def _request(self) -> None:
         """Something changed: make sure that one image comes after it, and no more than one."""
-        if self._pending or not self.running:
+        if self._pending or self._nodes is None:
             return
         self._pending = True
-        if self._nodes[2].GetScene().IsBatchProcessing():
+        if self._nodes.output.GetScene().IsBatchProcessing():
             return  # the scene is half loaded or half closed; the end of the batch comes back here
         if self._schedule is not None:
             self._schedule(self._run)
@@ -113,22 +121,19 @@ class LiveUpdate:
                 self._run()
 
     def _run(self) -> None:
-        if self._busy or not (self._pending and self.running):
+        logic, nodes = self._logic(), self._nodes
+        if self._busy or not self._pending or logic is None or nodes is None:
             return  # where work is done elsewhere, changes come while it is
         self._pending = False
-        logic = self._logic()
-        if logic is None:
-            return
-        labels, transform, output, outline, view = self._nodes
         self._busy = True
         try:
             caught: list[Warning] = []
-            logic.simulate(labels, transform, output, warned=caught.append)
-            if outline is not None and logic.preset.probe != self._outlined:
-                logic.showOutline(outline, transform)
+            logic.simulate(nodes.labels, nodes.probe_transform, nodes.output, warned=caught.append)
+            if nodes.outline is not None and logic.preset.probe != self._outlined:
+                logic.showOutline(nodes.outline, nodes.probe_transform)
                 self._outlined = logic.preset.probe
-            if view is not None:
-                logic.showInSlice(view, output, transform, fit=False)
+            if nodes.slice_view is not None:
+                logic.showInSlice(nodes.slice_view, nodes.output, nodes.probe_transform, fit=False)
             message = "; ".join(map(str, caught))
         except Exception as error:
             message = user_message(error)

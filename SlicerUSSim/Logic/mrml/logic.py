@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -21,8 +22,15 @@ from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
 from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot, tracked_images, write_compared
-from SlicerUSSim.Logic.mrml.label_nodes import LabelledTissues, labels_version, read_labels, read_mask, write_labels
-from SlicerUSSim.Logic.mrml.live import LiveUpdate
+from SlicerUSSim.Logic.mrml.label_nodes import (
+    LABEL_CLASSES,
+    Patient,
+    PatientReader,
+    labels_version,
+    read_mask,
+    write_labels,
+)
+from SlicerUSSim.Logic.mrml.live import LiveNodes, LiveUpdate
 from SlicerUSSim.Logic.mrml.nodes import (
     named,
     node_to_world,
@@ -74,10 +82,10 @@ class UltrasoundSceneLogic:
         self.device = device
         self._work = work or AtOnce()
         self.parameters = SceneParameters(scene)
-        self._simulator = ReusedSimulator()
-        self._labelled: tuple[object, LabelledTissues] | None = None  # of the version before it
-        self._segmented: tuple[object, Segmentation] | None = None  # labels of that version came from it
-        self._texture: tuple[LabelledTissues, Texture] | None = None  # of those labels
+        self._simulators = ReusedSimulator()
+        self._patients = PatientReader()
+        self._segmented: tuple[Hashable, Segmentation] | None = None  # labels of that version came from it
+        self._texture: tuple[Hashable, Texture] | None = None  # of labels of that version
         self._preset: tuple[str, Preset] = ("", Preset())
         self._live: LiveUpdate | None = None
         self._last: tuple[Frame, np.ndarray] | None = None  # and where the probe was
@@ -105,7 +113,7 @@ class UltrasoundSceneLogic:
 
     def tissues(self, labels_node) -> TissueTable:
         """The tissues of a label map or segmentation: what the preset says about those names, else the presets."""
-        return self.preset.tissues.for_names(self._read_labels(labels_node).names)
+        return self.preset.tissues.for_names(self._patient(labels_node).names)
 
     # ---- once --------------------------------------------------------------------------------------------------
 
@@ -127,7 +135,7 @@ class UltrasoundSceneLogic:
         See segmentation.segment_mri; `mask_node` is a label map on the MRI's grid, or a segmentation. `progress` may
         raise errors.Cancelled; the nodes are then as they were.
         """
-        require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="output of Segment")
+        require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         require(labels_node is not mri_node, f"input and output are both {named(mri_node)}, expected two nodes")
         mri = read_volume(mri_node, "MRI")
         mask = None if mask_node is None else read_mask(mask_node, mri_node)
@@ -138,7 +146,7 @@ class UltrasoundSceneLogic:
                 bias_correction=bias_correction, thin_sulci=thin_sulci, device=self.device, progress=progress,
             )
         )  # fmt: skip
-        require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="output of Segment")
+        require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         write_labels(labels_node, result.labels, result.tissue_names, mri_node)
         self._segmented = (labels_version(labels_node), result)
         return result
@@ -153,7 +161,7 @@ class UltrasoundSceneLogic:
         """
         self._check_output(labels_node, output_node)
         probe_to_world = probe_pose(probe_transform_node)
-        frame = self._frame(labels_node, probe_to_world, warned)
+        frame = self._frame(self._patient(labels_node), probe_to_world, warned)
         self._check_output(labels_node, output_node)  # much may have happened meanwhile
         require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         self._last = (frame, probe_to_world)
@@ -170,7 +178,8 @@ class UltrasoundSceneLogic:
 
         Raises SimulationError if there is none.
         """
-        require(self._last is not None, "there is no image yet, simulate one first")
+        if self._last is None:
+            raise SimulationError("there is no image yet, simulate one first")
         frame, probe_to_world = self._last
         return Volume(frame.image[None], probe_to_world @ frame.grid.slice_to_probe)
 
@@ -203,7 +212,7 @@ class UltrasoundSceneLogic:
             item = transforms_node.GetNthDataNode(number)
             require_node(item, "vtkMRMLTransformNode", use=f"item {number} of {named(transforms_node)}")
             pose = check_rigid(f"item {number} of {named(transforms_node)}", to_world @ node_to_world(item))
-            frame = self._frame(labels_node, pose)
+            frame = self._frame(self._patient(labels_node), pose, warn_again)
             image = self.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
             image.UnRegister(None)
             write_image(image, frame)
@@ -233,9 +242,8 @@ class UltrasoundSceneLogic:
         middle of the view by default). Without one it is a coronal view through a parasagittal craniotomy.
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
-        labelled = self._read_labels(labels_node)
-        to_world = node_to_world(labels_node)
-        surface = Volume(labelled.volume.array, to_world @ labelled.volume.ijk_to_ras)
+        patient = self._patient(labels_node)
+        surface = Volume(patient.labels.array, np.linalg.inv(patient.world_to_patient) @ patient.labels.ijk_to_ras)
         if slice_node is None:
             pose = craniotomy_pose(surface, self.preset.probe)
         else:
@@ -278,29 +286,34 @@ class UltrasoundSceneLogic:
         volume, cut where the probe is. `frames` are numbers of images (default: six, spread). `plot` draws the cost,
         live. Nothing else in the scene changes: applyFit takes the result over. `progress` may raise errors.Cancelled.
         """
-        labelled = self._read_labels(labels_node)
-        preset = self.preset
+        patient, preset = self._patient(labels_node), self.preset
         pose = None if probe_transform_node is None else probe_pose(probe_transform_node)
         tracked = tracked_images(
             images_node, frames, preset.probe, probe_to_world=pose, estimate_geometry=estimate_geometry
         )
-        poses = [pose_in_labels(labels_node, pose) for pose in tracked.poses]
-        tracked = replace(tracked, poses=[pose for pose, _ in poses])
-        simulator = self._simulator_for(labels_node, labelled, poses[0][1])
+        tracked = replace(tracked, poses=[patient.pose(pose) for pose in tracked.poses])
+        texture = self._texture_of(patient)
 
         def told(step: Progress) -> None:
             if plot is not None:
-                self._work.tell(lambda: plot.add(step))
+                self._work.tell(partial(plot.add, step))
             if progress is not None:
                 progress(step)
 
+        def compute() -> Fit:
+            return fit(
+                self._simulator(patient, preset, texture),
+                tracked,
+                free=free,
+                display=preset.display,
+                register=register,
+                restarts=restarts,
+                max_evaluations=max_evaluations,
+                progress=told,
+            )
+
         try:
-            return self._work.do(
-                lambda: fit(
-                    simulator(), tracked, free=free, display=preset.display, register=register, restarts=restarts,
-                    max_evaluations=max_evaluations, progress=told,
-                )
-            )  # fmt: skip
+            return self._work.do(compute)
         finally:
             if plot is not None:
                 plot.draw()
@@ -317,7 +330,8 @@ class UltrasoundSceneLogic:
     def writeRegistration(self, found: Fit, labels_node, transform_node) -> None:
         """Put what registration moved the ultrasound by into a linear transform: the last parent of its tracking."""
         require_node(transform_node, "vtkMRMLLinearTransformNode", use="registration")
-        require(found.registration is not None, "the fit was made without registration")
+        if found.registration is None:
+            raise SimulationError("the fit was made without registration")
         to_world = self._fit_to_world(labels_node)
         set_node_to_world(transform_node, to_world @ found.registration.correction @ np.linalg.inv(to_world))
 
@@ -374,7 +388,7 @@ class UltrasoundSceneLogic:
             self.showOutline(outline_node, probe_transform_node)
         if slice_node is not None:
             self.showInSlice(slice_node, output_node, probe_transform_node)
-        nodes = (labels_node, probe_transform_node, output_node, outline_node, slice_node)
+        nodes = LiveNodes(labels_node, probe_transform_node, output_node, outline_node, slice_node)
         self._live = LiveUpdate(self, nodes, schedule, report, stopped)
         if report is not None:
             report("; ".join(map(str, caught)))
@@ -398,52 +412,40 @@ class UltrasoundSceneLogic:
             output_node is not self.parameters.mri, f"output is the MRI {named(output_node)}, expected another volume"
         )
 
-    def _read_labels(self, labels_node) -> LabelledTissues:
-        require_node(labels_node, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map")
-        known = tuple(tissue.name for tissue in self.preset.tissues.values())
-        version = (labels_version(labels_node), known)
-        if self._labelled is None or self._labelled[0] != version:
-            self._labelled = (version, read_labels(labels_node, self.preset.tissues))
-        return self._labelled[1]
+    def _patient(self, labels_node) -> Patient:
+        return self._patients.read(labels_node, self.preset.tissues)
 
-    def _frame(self, labels_node, probe_to_world: np.ndarray, warned: Callable[[Warning], None] = warn_again) -> Frame:
-        labelled = self._read_labels(labels_node)
-        pose, moved = pose_in_labels(labels_node, probe_to_world)
-        simulator, preset = self._simulator_for(labels_node, labelled, moved), self.preset
+    def _frame(self, patient: Patient, probe_to_world: np.ndarray, warned: Callable[[Warning], None]) -> Frame:
+        preset, texture = self.preset, self._texture_of(patient)
 
         def compute() -> tuple[Frame, list[Warning]]:
             # Collected within the work: Python can do that for one thing at a time only.
             with collected_warnings() as caught:
-                return simulator().simulate(preset.probe, pose, preset.display), caught
+                simulator = self._simulator(patient, preset, texture)
+                return simulator.simulate(preset.probe, patient.pose(probe_to_world), preset.display), caught
 
         frame, caught = self._work.do(compute)
         for warning in caught:
             warned(warning)
         return frame
 
-    def _simulator_for(
-        self, labels_node, labelled: LabelledTissues, moved: np.ndarray
-    ) -> Callable[[], UltrasoundSimulator]:
-        """What gives the simulator, to be called in the work itself: it may have to be built, or is still in use."""
-        preset, version = self.preset, (self._labelled[0], moved.tobytes())
-        texture = self._texture_of(labels_node, labelled) if preset.settings.needs_texture else None
-        return lambda: self._simulator.get(
-            version,
-            lambda: Volume(labelled.volume.array, moved @ labelled.volume.ijk_to_ras),
-            preset.tissues.for_names(labelled.names),
-            preset.settings,
-            self.device,
-            texture,
-        )
+    def _simulator(self, patient: Patient, preset: Preset, texture: Texture | None) -> UltrasoundSimulator:
+        """Touches no node, but the device: to be called in the work itself."""
+        tissues = preset.tissues.for_names(patient.names)
+        return self._simulators.get(patient.version, patient.labels, tissues, preset.settings, self.device, texture)
 
-    def _texture_of(self, labels_node, labelled: LabelledTissues) -> Texture:
-        require(
-            self._segmented is not None and self._segmented[0] == labels_version(labels_node),
-            f"the settings want more of the MRI than {named(labels_node)} holds; segment the MRI again, or set "
-            "partial_volume to false and mri_modulation_db to 0",
-        )
-        if self._texture is None or self._texture[0] is not labelled:
-            segmentation = self._segmented[1]
+    def _texture_of(self, patient: Patient) -> Texture | None:
+        """What the MRI knows of a patient beyond labels, if the settings ask for it."""
+        if not self.preset.settings.needs_texture:
+            return None
+        segmented = self._segmented
+        if segmented is None or segmented[0] != patient.node_version:
+            raise SimulationError(
+                f"the settings want more of the MRI than {patient.name} holds; segment the MRI again, or set "
+                "partial_volume to false and mri_modulation_db to 0"
+            )
+        if self._texture is None or self._texture[0] != patient.version:
             # A segmentation node gives its labels cropped to what it holds.
-            self._texture = (labelled, segmentation.texture().on_grid_of(labelled.volume, segmentation.labels))
+            texture = segmented[1].texture().on_grid_of(patient.labels, segmented[1].labels)
+            self._texture = (patient.version, texture)
         return self._texture[1]

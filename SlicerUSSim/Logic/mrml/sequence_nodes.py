@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import slicer
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.mrml.libraries import slicer
 from SlicerUSSim.Logic.mrml.nodes import write_volume
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 

@@ -293,7 +293,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         names = tissue_names(labels)
         tissues = self._tissues.for_names(names) if names else self._tissues
         simulator = self._simulator.get(
-            labels.GetMTime(), lambda: Volume.from_vtk(labels), tissues, self._settings, self._device, self._texture
+            labels.GetMTime(), Volume.from_vtk(labels), tissues, self._settings, self._device, self._texture
         )
         self._frame = simulator.simulate(self._probe, self._pose(), self._display)
         image = vtkImageData.GetData(outInfo, 0)
