@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import subprocess
@@ -278,6 +279,14 @@ def test_the_command_offers_every_probe_there_is():
     assert list(options["kind"].type.choices) == list(PROBES)
 
 
+@pytest.mark.parametrize("name", list(main.commands))
+def test_a_command_says_every_parameter_and_its_type(name):
+    parameters = inspect.signature(main.commands[name].callback).parameters.values()
+    for parameter in parameters:
+        assert parameter.kind is not parameter.VAR_KEYWORD, f"{name} takes **{parameter.name}"
+        assert parameter.annotation is not parameter.empty, f"{name}: {parameter.name} has no type"
+
+
 def test_python_m_is_the_command():
-    done = subprocess.run([sys.executable, "-m", "SlicerUSSim", "--version"], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-m", "SlicerUSSim.Command", "--version"], capture_output=True, text=True)
     assert done.returncode == 0 and "ussim, version" in done.stdout
