@@ -41,7 +41,12 @@ _MOST_IMAGES = 6
     help="Keep what was evaluated here, and go on from there when run again: .json",
 )
 @click.option("--register", is_flag=True, help="Also refine where the ultrasound lies in the MRI (rigid).")
-@click.option("--save-transform", type=click.Path(path_type=Path), help="With --register: ultrasound to MRI, .json")
+@click.option(
+    "--save-transform",
+    type=click.Path(path_type=Path),
+    help="With --register: the refined map from the ultrasound's reference frame to the MRI, whole, as --to-mri takes "
+    "it: .json",
+)
 def optimize(
     patient: PatientOptions,
     tracking: SequenceOptions,
@@ -84,7 +89,7 @@ def optimize(
         result = found.appearance
         Preset(found.tracked.probe, result.display, simulator.settings, result.tissues).write(save_preset)
     if save_transform and found.registration:
-        write_pose(save_transform, found.registration.correction)
+        write_pose(save_transform, found.registration.correction @ tracked.reference_to_ras)
     if report:
         _write_report(report, found, tracked, patient, tracking)
     _tell(found)
