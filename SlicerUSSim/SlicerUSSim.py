@@ -116,7 +116,7 @@ def _install_missing(path: str) -> None:
 
 @parameterNodeWrapper
 class SlicerUSSimParameterNode:
-    """What a scene remembers of the module; the names are those of Logic/scene_parameters.py.
+    """What a scene remembers of the module; the names are those of Logic/mrml/parameter_node.py.
 
     mask and labels may be label maps or segmentations, real a sequence or a volume, which the panel sees to.
     """
@@ -219,7 +219,7 @@ class SlicerUSSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
 
 
 class SlicerUSSimLogic(ScriptedLoadableModuleLogic):
-    """`ultrasound` does everything (see Logic/scene.py); this class gives it to Slicer.
+    """`ultrasound` does everything (see Logic/mrml/logic.py); this class gives it to Slicer.
 
     In scripts: logic = slicer.util.getModuleLogic("SlicerUSSim").ultrasound
     """

@@ -17,10 +17,10 @@ from pathlib import Path
 from time import perf_counter
 
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume, segment_mri
-from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.mri.samples import demo_mri
+from SlicerUSSim.Logic.base import write_json
+from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.opencl.devices import devices_to_measure
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose
+from SlicerUSSim.Logic.probe import craniotomy_pose
 from SlicerUSSim.Logic.verification.benchmark.files import output_file
 from SlicerUSSim.Logic.verification.benchmark.suite import FRAMES
 

@@ -1,6 +1,6 @@
 """The workstation in the browser: how soon it is usable, images per second and latency while dragging, memory.
 
-    python benchmarks/workstation.py [--device intel --device pocl] [--seconds 10] [--frames 2000] [--json FILE]
+    python benchmarks/dragging.py [--device intel --device pocl] [--seconds 10] [--frames 2000] [--json FILE]
 
 Starts `ussim serve` with the demo brain, opens it in headless Chromium, drags the probe with the mouse in a slice view
 and in the 3D view. Server, browser and whoever moves the mouse share the processor. Needs playwright and Chromium.
@@ -21,8 +21,8 @@ from time import perf_counter
 import numpy as np
 from playwright.sync_api import Page, sync_playwright
 
-from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.opencl.devices import list_devices
+from SlicerUSSim.Logic.base import write_json
+from SlicerUSSim.Logic.opencl import list_devices
 from SlicerUSSim.Logic.verification.benchmark.files import output_file
 
 FLAGS = [
@@ -44,7 +44,7 @@ def main() -> None:
     arguments = parser.parse_args()
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if chromium is None:
-        raise SystemExit("benchmarks/workstation.py: Chromium is missing, install it with: apt-get install chromium")
+        raise SystemExit("benchmarks/dragging.py: Chromium is missing, install it with: apt-get install chromium")
     results = {}
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
@@ -99,7 +99,7 @@ def dragged(page: Page, x: float, y: float, seconds: float) -> dict[str, float]:
     page.mouse.up()
     page.evaluate("window.trame.state.set('show_latency', false)")
     if len(times) < 5:
-        raise SystemExit(f"benchmarks/workstation.py: only {len(times)} images came of dragging at {x:.0f}, {y:.0f}")
+        raise SystemExit(f"benchmarks/dragging.py: only {len(times)} images came of dragging at {x:.0f}, {y:.0f}")
     return {
         "images_per_s": images,
         "median_ms": float(np.median(times)),

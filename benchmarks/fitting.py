@@ -1,10 +1,10 @@
-"""What the appearance optimisation finds on twins: patients whose parameters are known (Logic/twins.py).
+"""What the appearance optimisation finds on twins: patients whose parameters are known (twins.py).
 
-    python benchmarks/optimization.py twins         # 14 patients: cost, parameters, errors; the paper's Table 1
-    python benchmarks/optimization.py algorithms    # nlopt's global and local algorithms
-    python benchmarks/optimization.py ablation      # the local measure against global histogram and difference
-    python benchmarks/optimization.py registration  # a 4 mm and 4 degree offset, recovered
-    python benchmarks/optimization.py evaluation    # milliseconds of one evaluation against one frame
+    python benchmarks/fitting.py twins         # 14 patients: cost, parameters, errors; the paper's Table 1
+    python benchmarks/fitting.py algorithms    # nlopt's global and local algorithms
+    python benchmarks/fitting.py ablation      # the local measure against global histogram and difference
+    python benchmarks/fitting.py registration  # a 4 mm and 4 degree offset, recovered
+    python benchmarks/fitting.py evaluation    # milliseconds of one evaluation against one frame
 
 Every table is markdown; --patients N takes the first N, --device chooses the device, --json FILE keeps the numbers.
 """
@@ -19,19 +19,17 @@ from time import perf_counter
 import numpy as np
 
 from SlicerUSSim.Logic import DisplaySettings, TissueTable, Volume, optimize_appearance, segment_mri
-from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
+from SlicerUSSim.Logic.base import write_json
+from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, SimilaritySettings
 from SlicerUSSim.Logic.fitting.fit import fit, simulated
 from SlicerUSSim.Logic.fitting.identifiability import variance_db
 from SlicerUSSim.Logic.fitting.optimization import AppearanceCost
-from SlicerUSSim.Logic.fitting.parameters import FreeParameters
 from SlicerUSSim.Logic.fitting.registration import rigid_from, rotation_deg
 from SlicerUSSim.Logic.fitting.report import grey_levels_per_tissue
-from SlicerUSSim.Logic.fitting.similarity import SimilaritySettings
-from SlicerUSSim.Logic.imaging.simulator import TreeOverflowWarning
-from SlicerUSSim.Logic.mri.samples import demo_mri
-from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.tracked.images import TrackedImages
+from SlicerUSSim.Logic.imaging import TreeOverflowWarning
+from SlicerUSSim.Logic.mri import demo_mri
+from SlicerUSSim.Logic.probe import ImageGrid
+from SlicerUSSim.Logic.tracked import TrackedImages
 from SlicerUSSim.Logic.verification.benchmark.files import output_file
 from SlicerUSSim.Logic.verification.benchmark.timing import measured
 from SlicerUSSim.Logic.verification.twins import TISSUE, Twin, make_twin

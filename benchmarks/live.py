@@ -17,10 +17,10 @@ import slicer
 
 from SlicerUSSim.Logic import PhasedProbe
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
-from SlicerUSSim.Logic.mri.samples import demo_mri
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mri import demo_mri
+from SlicerUSSim.Logic.mrml import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume
-from SlicerUSSim.Logic.probe.placement import slide_sweep
+from SlicerUSSim.Logic.probe import slide_sweep
 
 PROBE_A = PhasedProbe(75, 73, scan_lines=196)
 

@@ -23,8 +23,8 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     Volume,
 )
-from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.probe.placement import pose_looking_at
+from SlicerUSSim.Logic.base import write_json
+from SlicerUSSim.Logic.probe import pose_looking_at
 from SlicerUSSim.Logic.verification.benchmark.files import output_file
 from SlicerUSSim.Logic.verification.benchmark.timing import measured, timed
 

@@ -32,9 +32,9 @@ from SlicerUSSim.Logic import (
     Volume,
     optimize_appearance,
 )
-from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tracked.field import estimate_field
+from SlicerUSSim.Logic.probe import ImageGrid
+from SlicerUSSim.Logic.tissue import TISSUES
+from SlicerUSSim.Logic.tracked import estimate_field
 
 WIDTH_MM = 38.0  # of the face of the L14-5
 SAMPLING_MHZ = 40.0

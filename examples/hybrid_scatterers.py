@@ -15,9 +15,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from SlicerUSSim.Logic import SimulationSettings, TissueTable, UltrasoundSimulator, segment_mri
-from SlicerUSSim.Logic.mri.samples import demo_mri
-from SlicerUSSim.Logic.probe.arrays import PROBES
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, slice_under_probe
+from SlicerUSSim.Logic.mri import demo_mri
+from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose, slice_under_probe
 
 VARIANTS = {
     "labels alone (paper)": {},

@@ -21,10 +21,10 @@ import slicer
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
-from SlicerUSSim.Logic.mri.samples import demo_mri
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mri import demo_mri
+from SlicerUSSim.Logic.mrml import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, read_volume, write_volume
-from SlicerUSSim.Logic.probe.placement import slide_sweep
+from SlicerUSSim.Logic.probe import slide_sweep
 
 
 def new_scene() -> tuple[slicer.vtkMRMLScene, slicer.vtkSlicerSequencesLogic]:

@@ -7,8 +7,8 @@ import numpy as np
 
 from SlicerUSSim.Logic import PhasedProbe, TissueTable, UltrasoundSimulator, segment_mri
 from SlicerUSSim.Logic.imaging.figures import write_png
-from SlicerUSSim.Logic.mri.samples import demo_mri
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose
+from SlicerUSSim.Logic.mri import demo_mri
+from SlicerUSSim.Logic.probe import craniotomy_pose
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "sweep")
 out.mkdir(exist_ok=True)

@@ -28,10 +28,9 @@ from vtkmodules.vtkRenderingCore import (
 
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
-from SlicerUSSim.Logic.mri.samples import demo_mri
-from SlicerUSSim.Logic.probe.arrays import PROBES
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose
-from SlicerUSSim.Logic.vtk.filters import SegmentationFilter, UltrasoundSimulationFilter
+from SlicerUSSim.Logic.mri import demo_mri
+from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose
+from SlicerUSSim.Logic.vtk import SegmentationFilter, UltrasoundSimulationFilter
 
 
 @dataclass

@@ -5,7 +5,7 @@
         -o FOLDER/result.json --report FOLDER/report.html
 
 The "real" images in tracked.igs.mha are simulated with the parameters in truth.json, other speckle and noise;
-labels.nii.gz is the same brain, segmented slightly wrongly (Logic/twins.py).
+labels.nii.gz is the same brain, segmented slightly wrongly (SlicerUSSim/Logic/verification/twins.py).
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from SlicerUSSim.Logic import TissueTable, segment_mri
-from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.mri.samples import demo_mri
-from SlicerUSSim.Logic.verification.twins import make_twin
+from SlicerUSSim.Logic.base import write_json
+from SlicerUSSim.Logic.mri import demo_mri
+from SlicerUSSim.Logic.verification import make_twin
 
 
 def main() -> None:

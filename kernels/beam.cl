@@ -1,4 +1,5 @@
-// lateral_beam: the lateral part of the point spread function, from traced lines to scan lines (PHYSICS section 4).
+// lateral_beam: the lateral part of the point spread function, from traced lines to scan lines
+// (docs/physics.md#4-beam-and-pulse).
 //
 // One work-item computes LANES samples of one scan line; global size (samples / LANES, scan lines). In the unfolded
 // geometry of the array two lines are y = (R + s) dtheta apart at path length s (or a fixed distance for a linear

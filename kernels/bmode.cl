@@ -1,4 +1,5 @@
-// From complex baseband impulses to grey levels (PHYSICS sections 4 and 5). Global size (samples / LANES, scan lines).
+// From complex baseband impulses to grey levels (docs/physics.md#4-beam-and-pulse, docs/physics.md#6-from-rf-to-image).
+// Global size (samples / LANES, scan lines).
 //
 // Buffers: re, im float [scan line][stride], LINE_PAD zeros on either side of the samples; pulse float [2 reach + 1];
 // iq float2 (real, imaginary), envelope float and grey uchar [scan line][samples].

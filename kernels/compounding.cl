@@ -1,4 +1,4 @@
-// Images of a sweep become one volume (Logic/compounding.py). Positions are in voxels (i, j, k) and pixels (column,
+// Images of a sweep become one volume (compounding.py). Positions are in voxels (i, j, k) and pixels (column,
 // row).
 
 #include "common.clh"

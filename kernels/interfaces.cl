@@ -1,4 +1,5 @@
-// interface_echoes: adds the echoes of tissue interfaces to the traced lines (PHYSICS section 3, the paper's eq. 2).
+// interface_echoes: adds the echoes of tissue interfaces to the traced lines (docs/physics.md#3-rays; eq. 2 of
+// the paper).
 //
 // One work-item computes one traced line: every hit of its elevational rays is an impulse at its own time. The rays run
 // at quantiles of the elevational profile, so their sum has the beam's elevational width; beam.cl adds the lateral one.

@@ -1,4 +1,4 @@
-// What the machine can do at most (Logic/benchmark/machine.py): the floors that stages are measured against.
+// What the machine can do at most (machine.py): the floors that stages are measured against.
 
 #include "common.clh"
 

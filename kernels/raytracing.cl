@@ -1,4 +1,4 @@
-// trace: the binary ray tree of every traced line (PHYSICS section 3).
+// trace: the binary ray tree of every traced line (docs/physics.md#3-rays).
 //
 // One work-item follows one ray and all its children. Global size (traced lines, 1 + elevational rays).
 //   ray 0 of a line runs along the beam axis and writes the segments along which the scatter kernel works;
@@ -220,7 +220,7 @@ inline Segment segment_of(Ray ray, float from, float to, float spent_from, float
   return segment;
 }
 
-// What a fluid interface does to a wave (PHYSICS section 3): Snell, and the pressure reflection coefficient r.
+// What a fluid interface does to a wave (docs/physics.md#3-rays): Snell, and the pressure reflection coefficient r.
 // R = r^2 is the two-way factor of the reflected branch, 1 - R that of the refracted one.
 typedef struct {
   float cos_in, cos_out, speed_ratio, pressure;

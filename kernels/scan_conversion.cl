@@ -1,8 +1,9 @@
-// scan_convert: scan lines to pixels of the probe plane. One work-item computes LANES pixels of a row; global size
-// (columns / LANES rounded up, rows).
+// scan_convert: scan lines to pixels of the probe plane (docs/physics.md#6-from-rf-to-image). One work-item computes
+// LANES pixels of a row; global size (columns / LANES rounded up, rows).
 //
-// Along the line interpolation is linear (samples are four per wavelength); across lines it is cubic (Catmull-Rom),
-// since lines are little denser than the beam is wide and linear interpolation shows as spokes in the far field.
+// Along the line interpolation is linear (samples lie an eighth of a wavelength apart by default, four per cycle of the
+// carrier); across lines it is cubic (Catmull-Rom), since lines are little denser than the beam is wide and linear
+// interpolation shows as spokes in the far field.
 // Buffers: grey uchar [scan line][samples]; image uchar [row][column], 0 outside the field.
 
 #include "common.clh"

@@ -1,4 +1,4 @@
-// scatter: every scatterer beside every ray segment, as complex baseband impulses (PHYSICS section 4).
+// scatter: every scatterer beside every ray segment, as complex baseband impulses (docs/physics.md#5-scatterers).
 //
 // One work-item owns CHUNK samples of one traced line: it visits the segments of the line's ray tree whose times meet
 // those samples and, for each, the cells of the patient-fixed scatterer lattice beside it: half-way to the next traced

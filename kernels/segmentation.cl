@@ -1,4 +1,4 @@
-// 3D guided filter (He et al., ECCV 2010), self-guided, inside a mask (PHYSICS section 1).
+// 3D guided filter (He et al., ECCV 2010), self-guided, inside a mask (docs/physics.md#1-from-mri-to-tissues).
 //
 // Box windows are running sums along one axis at a time, so the cost does not depend on the radius. Volumes are float
 // [k][j][i] with i padded to whole lanes; the mask (1 inside) keeps air out of every mean.

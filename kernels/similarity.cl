@@ -1,5 +1,6 @@
-// compare_patches: the local histograms of two images and their absolute difference (PHYSICS section 6, equations 4-5
-// of the paper). One work-item compares one square patch; global size (patch columns, patch rows).
+// compare_patches: the local histograms of two images and their absolute difference
+// (docs/optimization.md#the-cost, equations 4 and 5 of the paper). One work-item compares one square patch; global size
+// (patch columns, patch rows).
 //
 // Buffers: image, reference uchar [row][column]; inside uchar likewise, 0 where a pixel does not count; result float
 // [patch row][patch column][3]: 1 - sum_j sqrt(P_j Q_j), sum of absolute differences in grey levels, pixels that count.

@@ -1,4 +1,4 @@
-// The indicators of acoustic groups, smoothed (Logic/smoothing.py): a separable Gaussian whose ends repeat the border
+// The indicators of acoustic groups, smoothed (borders.py): a separable Gaussian whose ends repeat the border
 // voxels. One work-item computes LANES voxels of a row; global size (columns / LANES rounded up, rows, planes).
 //
 // Buffers: groups uchar [k][j][i] with flags; taps float [2 reach + 1] of unit sum; partial float [plane][j][i]; smooth

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import subprocess
@@ -276,6 +277,14 @@ def test_a_preset_gives_the_same_image_and_options_go_before_it(head, labels, tm
 def test_the_command_offers_every_probe_there_is():
     options = {option.name: option for option in main.commands["demo"].params}
     assert list(options["kind"].type.choices) == list(PROBES)
+
+
+@pytest.mark.parametrize("name", list(main.commands))
+def test_a_command_says_every_parameter_and_its_type(name):
+    parameters = inspect.signature(main.commands[name].callback).parameters.values()
+    for parameter in parameters:
+        assert parameter.kind is not parameter.VAR_KEYWORD, f"{name} takes **{parameter.name}"
+        assert parameter.annotation is not parameter.empty, f"{name}: {parameter.name} has no type"
 
 
 def test_python_m_is_the_command():

@@ -20,9 +20,11 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.base.files import write_json
+from SlicerUSSim.Logic.fitting.fit import fit
+from SlicerUSSim.Logic.fitting.registration import rigid_from
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.placement import tilt_sweep
-from SlicerUSSim.Logic.tracked.pose_files import write_pose
+from SlicerUSSim.Logic.tracked import TrackedImages, read_pose, write_pose
 from SlicerUSSim.Logic.verification.twins import make_twin
 from tests.conftest import SHARED, example, needs_shared
 
@@ -102,18 +104,31 @@ def test_sweep_draws_the_same_images_on_the_same_pixels(folder):
     assert np.corrcoef(blocks)[0, 1] > 0.9
 
 
-def test_register_moves_the_poses_and_writes_the_transform(folder, monkeypatch):
+@pytest.mark.parametrize("has_given_map", [False, True])
+def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tmp_path, monkeypatch, has_given_map):
+    fits = []
     monkeypatch.setattr("SlicerUSSim.Logic.fitting.fit._ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
+    monkeypatch.setattr("SlicerUSSim.Logic.fitting.fit.fit", lambda *a, **b: fits.append(fit(*a, **b)) or fits[-1])
+    given_map = rigid_from([1.5, -1.0, 2.0, 2.0, -1.0, 1.5]) if has_given_map else np.eye(4)
+    write_pose(tmp_path / "given.json", given_map)
     done = optimize(
         folder, "--register", "--evaluations", 40, "--restarts", 0, "--free", "display", "--save-transform",
-        folder / "moved.json",
+        tmp_path / "saved.json", *(["--to-mri", tmp_path / "given.json"] if has_given_map else []),
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     assert re.search(r"moved by [\d.]+ mm and [\d.]+ degrees", done.output)
-    matrix = np.array(json.loads((folder / "moved.json").read_text())["probe_to_ras"])
-    assert np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6)
-    found = json.loads((folder / "result.json").read_text())["registration"]
-    assert found["cost_after"] <= found["cost_before"] and np.allclose(found["correction"], matrix)
+    registration = json.loads((folder / "result.json").read_text())["registration"]
+    assert registration["cost_after"] <= registration["cost_before"]
+
+    def poses(reference_to_ras):
+        """As `ussim optimize --to-mri` places the images."""
+        sequence = TrackedSequence.read(folder / "tracked.igs.mha")
+        return TrackedImages.of(sequence, reference_to_ras=reference_to_ras, probe=PhasedProbe(70.0, 50.0)).poses
+
+    fitted, correction = fits[0].tracked.poses, np.array(registration["correction"])
+    assert not np.allclose(correction, np.eye(4), atol=1e-3)
+    assert np.allclose([correction @ pose for pose in poses(given_map)], fitted, atol=1e-6)
+    assert np.allclose(poses(read_pose(tmp_path / "saved.json")), fitted, atol=1e-6)
 
 
 def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path):

@@ -9,7 +9,7 @@ user; here its channels are beamformed by its own delay-and-sum matrix. Differen
 - Its beams have side lobes (sinc), ours none; the main lobes' widths are compared.
 - It attenuates each frequency by itself, so that the pulse's centre frequency sinks with depth and it loses less than
   2 alpha f0 z: by 0.2 dB for the attenuation tested here, by 1.6 dB for 0.5 dB/(cm MHz) at 50 mm. This simulator has no
-  downshift (docs/physics.md).
+  downshift (docs/physics.md#8-not-modelled).
 - Its level falls with distance by diffraction, which this simulator takes for compensated; so what attenuation alone
   does to the level is compared.
 - Elevation: PyMUST 0.1.9 with `height` and `focus` gives a beam half as wide as the diffraction integral of that

@@ -1,4 +1,4 @@
-"""Segmentation: the rows of PHYSICS section 1 on a real template, the filter against its definition, bad input."""
+"""Segmentation (docs/physics.md#1-from-mri-to-tissues): a real template, the filter by its definition, bad input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hybrid scatterers (PHYSICS section 8): tissues mixed by probability, amplitudes that follow the MRI."""
+"""Hybrid scatterers (docs/physics.md#hybrid-scatterers): tissues by probability, amplitudes that follow the MRI."""
 
 from __future__ import annotations
 

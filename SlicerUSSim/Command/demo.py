@@ -1,103 +1,42 @@
-"""The whole line on one brain, with pictures: what `ussim demo` runs."""
+"""`ussim demo`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict
+import os
 from pathlib import Path
-from time import perf_counter
 
-import numpy as np
+import click
 
-from SlicerUSSim.Logic.base.files import make_folder, write_json
-from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.imaging.figures import draw_views, require_matplotlib, write_png
-from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.mri.segmentation import segment_mri
-from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, slice_under_probe
-from SlicerUSSim.Logic.tissue.table import TissueTable
-from SlicerUSSim.Logic.tracked.pose_files import write_pose
+from SlicerUSSim.Command.options import device_option
+from SlicerUSSim.Command.progress import Steps
+
+PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # probe.PROBES, which would import numpy
 
 
-def run_demo(
-    out: Path,
-    mri: Volume,
-    source: str,
-    probe: Probe,
-    settings: SimulationSettings,
-    display: DisplaySettings,
-    device: str | None = None,
-    progress: Callable[[str], None] = lambda stage: None,
-) -> dict:
-    """Segment, place the probe, simulate, and write pictures, volumes and a summary to the folder `out`.
+@click.command()
+@click.option(
+    "--out", type=click.Path(path_type=Path), default="ussim-demo", show_default=True, help="Folder for the results."
+)
+@click.option(
+    "--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain that nilearn carries)."
+)
+@click.option("--probe", "kind", type=click.Choice(PROBE_NAMES), default="phased", show_default=True)
+@click.option("--seed", type=int, default=0, show_default=True, help="Which speckle and noise.")
+@device_option
+def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -> None:
+    """The whole line on a real brain MRI: segmentation, a craniotomy view, pictures."""
+    from SlicerUSSim.Command.whole_line import run_whole_line
+    from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mri.samples import demo_mri
+    from SlicerUSSim.Logic.probe.arrays import PROBES
 
-    `progress` is told the name of every step as it begins. Returns what demo.json holds.
-    Raises SimulationError for anything the caller can mend.
-    """
-    require_matplotlib()  # now rather than after the work
-    make_folder(out)
-    timings: dict[str, float] = {}
-
-    progress("segment the MRI")
-    start = perf_counter()
-    segmentation = segment_mri(mri, thin_sulci=True, device=device)
-    timings["segmentation"] = (perf_counter() - start) * 1e3
-
-    progress("build the acoustic medium")
-    start = perf_counter()
-    tissues = TissueTable.brain(segmentation.tissue_names)
-    simulator = UltrasoundSimulator(segmentation.labels, tissues, settings, device)
-    pose = craniotomy_pose(segmentation.labels, probe)
-    timings["medium"] = (perf_counter() - start) * 1e3
-
-    progress("simulate")
-    simulator.profiling = True
-    start = perf_counter()
-    simulator.simulate(probe, pose, display)
-    timings["first frame"] = (perf_counter() - start) * 1e3
-    frames = [simulator.simulate(probe, pose, display) for _ in range(3)]
-    frame = frames[-1]
-    stages = {stage: min(f.timings_ms[stage] for f in frames) for stage in frame.timings_ms}
-    timings |= {"frame": sum(stages.values())}
-
-    progress("draw")
-    bounds = probe.image_bounds_mm()
-    names = segmentation.tissue_names
-    seen = ("MRI under the probe", slice_under_probe(mri, frame.grid, pose), "mri")
-    labelled = ("Tissues", slice_under_probe(segmentation.labels, frame.grid, pose, order=0), "labels")
-    simulated = ("Simulated B-mode", frame.image, "bmode")
-    draw_views(out / "figure.png", [seen, labelled, simulated], probe, bounds, names)
-    draw_views(out / "mri.png", [seen], probe, bounds, names)
-    draw_views(out / "labels.png", [labelled], probe, bounds, names)
-
-    progress("write")
-    write_png(out / "bmode.png", frame.image)
-    frame.to_volume().write(out / "bmode.mha")
-    segmentation.labels.write(out / "labels.nii.gz")
-    tissues.write(out / "labels.json")
-    write_pose(out / "pose.json", pose)
-    Preset(probe, display, settings, tissues).write(out / "preset.json")
-    summary = {
-        "mri": source,
-        "device": str(simulator.device.info),
-        "probe": probe.to_dict(),
-        "probe_to_ras": pose.tolist(),
-        "settings": asdict(settings),
-        "display": asdict(display),
-        "segmentation": {
-            "tissue_names": list(names),
-            "means": segmentation.means.tolist(),
-            "standard_deviations": segmentation.standard_deviations.tolist(),
-            "weights": segmentation.weights.tolist(),
-            "noise": segmentation.noise,
-            "voxels": np.bincount(segmentation.labels.array.ravel()).tolist(),
-        },
-        "tissues": tissues.to_dict(),
-        "milliseconds": {name: round(value, 3) for name, value in timings.items()},
-        "milliseconds_per_stage": {name: round(value, 3) for name, value in stages.items()},
-    }
-    write_json(out / "demo.json", summary)
-    return summary
+    settings = SimulationSettings(seed=seed)
+    volume, source = (Volume.read(mri), os.path.abspath(mri)) if mri else demo_mri()
+    click.echo(f"MRI: {source}, {'x'.join(map(str, volume.array.shape[::-1]))} voxels")
+    with Steps(5) as step:
+        summary = run_whole_line(out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step)
+    times = summary["milliseconds"]
+    click.echo(f"device: {summary['device']}")
+    click.echo(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")
+    click.echo(f"wrote {out / 'figure.png'} and nine more files beside it")

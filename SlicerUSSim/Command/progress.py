@@ -3,19 +3,43 @@
 from __future__ import annotations
 
 import sys
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from SlicerUSSim.Logic.fitting import Progress
 
 
-class Steps:
-    """A progress bar that is told the name of each step."""
+class _Bar:
+    """A bar that is drawn while its `with` block runs, and only where stderr is a terminal."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, total: int, name: str = "") -> None:
         from tqdm import tqdm
 
-        self.bar = tqdm(total=count, bar_format="|{bar:24}| {desc}", file=sys.stderr, leave=False, disable=None)
-        self.begun = 0
+        self.bar = tqdm(total=total, bar_format="|{bar:24}| {desc}", file=sys.stderr, leave=False, disable=None)
+        self.bar.set_description_str(name)
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.bar.close()
+
+    def _reach(self, share: float) -> None:
+        """Draw a share done, between 0 and 1."""
+        self.bar.update(int((self.bar.total or 0) * share) - self.bar.n)
+
+
+class Steps(_Bar):
+    """A progress bar that is told the name of each step as it begins."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__(count)
+        self.begun = 0
 
     def __call__(self, name: str) -> None:
         self.bar.set_description_str(name, refresh=False)
@@ -23,28 +47,23 @@ class Steps:
         self.bar.refresh()
         self.begun += 1
 
-    def __exit__(self, *_) -> None:
-        self.bar.close()
 
-
-class Curve(Steps):
-    """The same for an optimisation: its stage and the best cost so far."""
+class Share(_Bar):
+    """A progress bar that is told a share done, between 0 and 1."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(100)
-        self.bar.set_description_str(name)
-
-    def __call__(self, progress) -> None:
-        self.bar.set_description_str(f"{progress.stage}: cost {progress.best_cost:.4f}", refresh=False)
-        self.bar.update(int(100 * progress.share) - self.bar.n)
-
-
-class Share(Steps):
-    """The same for a share done between 0 and 1."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__(100)
-        self.bar.set_description_str(name)
+        super().__init__(100, name)
 
     def __call__(self, share: float) -> None:
-        self.bar.update(int(100 * share) - self.bar.n)
+        self._reach(share)
+
+
+class Curve(_Bar):
+    """A progress bar of an optimisation: its stage and the best cost so far."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(100, name)
+
+    def __call__(self, progress: Progress) -> None:
+        self.bar.set_description_str(f"{progress.stage}: cost {progress.best_cost:.4f}", refresh=False)
+        self._reach(progress.share)

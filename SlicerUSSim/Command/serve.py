@@ -8,12 +8,22 @@ import secrets
 import socket
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from SlicerUSSim.Command.options import contrast_option, device_option, mask_option
-from SlicerUSSim.Command.tracked import calibration_option, read_sequence, to_mri, to_mri_option, transform_option
+from SlicerUSSim.Command.sequence_options import (
+    calibration_option,
+    read_sequence,
+    read_to_mri,
+    to_mri_option,
+    transform_option,
+)
 from SlicerUSSim.Logic.base.errors import SimulationError
+
+if TYPE_CHECKING:
+    from trame_server import Server
 
 _PORT = 8080
 
@@ -21,11 +31,11 @@ _PORT = 8080
 @click.command()
 @click.argument("mri", type=click.Path(), required=False)
 @click.option("--labels", type=click.Path(), help="Label map to simulate from, instead of segmenting the MRI.")
-@click.option("--sequence", "sequence_file", type=click.Path(), help="Tracked ultrasound to play and to compare with.")
+@click.option("--sequence", type=click.Path(), help="Tracked ultrasound to play and to compare with.")
 @transform_option
 @calibration_option
 @to_mri_option
-@click.option("--preset", "preset_file", type=click.Path(), help="Probe, display, settings and tissues as JSON.")
+@click.option("--preset", type=click.Path(), help="Probe, display, settings and tissues as JSON.")
 @contrast_option
 @mask_option
 @click.option("--port", type=click.IntRange(0, 65535), help=f"Port (default: {_PORT}, or a free one if it is taken).")
@@ -43,16 +53,27 @@ _PORT = 8080
 @click.option("--igtl-device", help="Name of the transform to follow (default: the first that comes).")
 @device_option
 def serve(
-    mri, labels, sequence_file, path, calibration, to_mri_file, preset_file, contrast, mask, port, host, igtl,
-    igtl_device, device,
-) -> None:  # fmt: skip
+    mri: str | None,
+    labels: str | None,
+    sequence: str | None,
+    transform: str,
+    calibration: str | None,
+    to_mri: str | None,
+    preset: str | None,
+    contrast: str,
+    mask: str | None,
+    port: int | None,
+    host: str,
+    igtl: str | None,
+    igtl_device: str | None,
+    device: str | None,
+) -> None:
     """The workstation in the browser: MRI, probe, image, live. Without a file, the demo brain."""
-    for name in ("trame_slicer", "greenlet"):
-        if importlib.util.find_spec(name) is None:
-            raise SimulationError(f'the workstation needs {name}; install it with: pip install "SlicerUSSim[serve]"')
+    _require_workstation()
+    files = [file for file in (mri, labels, mask) if file is not None]
     # What a page could only show is said here, where it was caused.
-    for file in (mri, labels, mask):
-        if file is not None and not Path(file).exists():
+    for file in files:
+        if not Path(file).exists():
             raise SimulationError(f"{file}: no such file")
     if igtl is not None:
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address
@@ -65,29 +86,42 @@ def serve(
     from SlicerUSSim.Logic.opencl.devices import choose_device
 
     choose_device(device)
-    volumes = {file: Volume.read(file) for file in (mri, labels, mask) if file is not None}
-    preset = Preset.read(preset_file) if preset_file else None
-    sequence = read_sequence(sequence_file, calibration) if sequence_file else None
-    to_ras = to_mri(to_mri_file)
+    volumes = {file: Volume.read(file) for file in files}
+    chosen_preset = Preset.read(preset) if preset else None
+    tracked = read_sequence(sequence, calibration) if sequence else None
+    to_ras = read_to_mri(to_mri) if to_mri else None
 
     _prepare_libraries()
-    from SlicerUSSim.Workstation.access import guard, is_loopback
     from SlicerUSSim.Workstation.opener import Files
     from SlicerUSSim.Workstation.workstation import Workstation
 
-    token = "" if is_loopback(host) else secrets.token_urlsafe(24)
     workstation = Workstation(
         Files(
-            mri=mri, labels=labels, contrast=contrast, mask=mask, preset=preset, sequence=sequence,
-            sequence_name=Path(sequence_file).name.split(".")[0] if sequence_file else "", transform=path,
-            to_ras=to_ras, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
+            mri=mri, labels=labels, contrast=contrast, mask=mask, preset=chosen_preset, sequence=tracked,
+            sequence_name=Path(sequence).name.split(".")[0] if sequence else "", transform=transform, to_ras=to_ras,
+            tracker=igtl, tracker_device=igtl_device, volumes=volumes,
         ),
         device,
     )  # fmt: skip
-    server = workstation.server
+    _run(workstation.server, host, port)
+
+
+def _require_workstation() -> None:
+    """Raise SimulationError unless the libraries of the workstation are installed."""
+    for name in ("trame_slicer", "greenlet"):
+        if importlib.util.find_spec(name) is None:
+            raise SimulationError(f'the workstation needs {name}; install it with: pip install "SlicerUSSim[serve]"')
+
+
+def _run(server: Server | None, host: str, port: int) -> None:
+    """Print the URL and serve until the command is interrupted."""
+    from SlicerUSSim.Workstation.access import guard, is_loopback
+
+    assert server is not None  # trame's get_server is declared to give one or None
+    token = "" if is_loopback(host) else secrets.token_urlsafe(24)
     server.controller.on_server_bind.add(lambda wslink: guard(wslink.app, token))
 
-    def tell(**_) -> None:
+    def tell(**_: Any) -> None:
         shown = host if host not in ("0.0.0.0", "::") else socket.gethostname()
         shown = f"[{shown}]" if ":" in shown else shown
         click.echo(f"http://{shown}:{server.port}/" + (f"?token={token}" if token else ""))
@@ -99,6 +133,7 @@ def serve(
 def _usable_port(host: str, port: int | None) -> int:
     """`port`, or one that is free. Raises SimulationError for a host that is not ours and a port that is taken."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    reason = None
     for candidate in [port] if port is not None else [_PORT, 0]:
         try:
             with socket.create_server((host, candidate), family=family):

@@ -82,7 +82,7 @@ class BrowserView:
         self._tasks.start(run)
 
     def sliceNode(self):
-        """None: views.py keeps the slice views on the probe."""
+        """None: anatomy.py keeps the slice views on the probe."""
         return None
 
     def showChart(self, chart_node) -> None:

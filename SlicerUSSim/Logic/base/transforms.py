@@ -1,4 +1,4 @@
-"""Transforms: 4x4 matrices checked and compared; the only file that knows ITK's LPS."""
+"""4x4 matrices checked and compared, and LPS_TO_RAS, which only those need who read and write ITK's files."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """AppearanceModel: images of fixed poses as a function of the parameters that an optimiser varies.
 
-What does not change is not computed again (PHYSICS section 6). The ray tree depends on none of these parameters. The
-echoes of a tissue are linear in mu0 and sigma0, so a few baseband images, its *bases*, hold them for all values:
+What does not change is not computed again (docs/optimization.md#how-it-is-fast). The ray tree depends on none of these
+parameters. The echoes of a tissue are linear in mu0 and sigma0, so a few baseband images, its *bases*, hold them for
+all values:
 
     iq = [ base + sum over varied tissues (mu0 M + sigma0 S) ] exp(-sum over tissues (alpha - alpha_0) path)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
-#: nlopt's names. The choice is justified in docs/optimization.md by benchmarks/optimization.py.
+#: nlopt's names. The choice is justified in docs/optimization.md by benchmarks/fitting.py.
 GLOBAL_ALGORITHM, LOCAL_ALGORITHM = "G_MLSL_LDS", "LN_BOBYQA"
 #: BOBYQA needs two parameters or more.
 _ALGORITHM_FOR_ONE = "LN_SBPLX"

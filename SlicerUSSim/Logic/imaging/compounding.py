@@ -51,7 +51,7 @@ class Compounder:
     ----------
     grid : the volume to fill; its array is not looked at.
     probe : which took the images.
-    device : see device.choose_device.
+    device : see opencl.devices.choose_device.
     """
 
     def __init__(self, grid: Volume, probe: Probe, device: str | Device | None = None) -> None:

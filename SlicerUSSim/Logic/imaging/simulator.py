@@ -45,7 +45,7 @@ class UltrasoundSimulator:
     tissues : TissueTable with a tissue for every label.
     settings : SimulationSettings. The attribute may be replaced between frames, by another seed say; only what concerns
         the texture counts at construction.
-    device : see device.choose_device.
+    device : see opencl.devices.choose_device.
     texture : what the MRI knows beyond labels (Segmentation.texture, Texture.from_mri); looked at only if the settings'
         partial_volume or mri_modulation_db ask for it.
 

@@ -1,4 +1,4 @@
-"""From an MRI to a label map: 3D guided filter, then a Gaussian mixture fitted by EM (PHYSICS section 1)."""
+"""From an MRI to a label map: 3D guided filter, then a Gaussian mixture (docs/physics.md#1-from-mri-to-tissues)."""
 
 from __future__ import annotations
 

@@ -67,13 +67,13 @@ class AtOnce:
 class UltrasoundSceneLogic:
     """Simulates on the nodes of one scene.
 
-    What is set (`preset`, and the nodes the module works with) is kept in the scene, see scene_parameters. Every method
+    What is set (`preset`, and the nodes the module works with) is kept in the scene, see parameter_node. Every method
     raises SimulationError for a node that is missing, empty, of the wrong kind or under a transform that is not linear.
 
     Parameters
     ----------
     scene : vtkMRMLScene.
-    device : see device.choose_device.
+    device : see opencl.devices.choose_device.
     work : who does what takes time and touches no node.
     """
 
@@ -156,7 +156,7 @@ class UltrasoundSceneLogic:
     ) -> Frame:
         """The image under the probe, into a scalar volume node that is put under the probe's transform.
 
-        `labels_node` is a label map or a segmentation; its names choose the tissues, see scene_nodes.read_labels.
+        `labels_node` is a label map or a segmentation; its names choose the tissues, see label_nodes.read_labels.
         `warned` is told what there is to warn of.
         """
         self._check_output(labels_node, output_node)

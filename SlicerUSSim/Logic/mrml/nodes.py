@@ -1,6 +1,6 @@
 """Between MRML nodes and this package's values: volumes, labels and their names, poses, images, outlines.
 
-Only this file and scene.py know the `slicer` namespace, 3D Slicer's or that of the slicer-core wheel.
+Works on nodes alone and needs nothing of the `slicer` namespace.
 """
 
 from __future__ import annotations

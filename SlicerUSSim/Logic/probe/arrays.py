@@ -22,9 +22,10 @@ FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 class Probe:
     """What all probes share. Use LinearProbe, ConvexProbe or PhasedProbe.
 
-    The two-way beam (amplitude, PHYSICS section 4) is Gaussian across its axis. Laterally it is the product of a
-    transmit beam focused once at `focus_mm` and a receive beam that is focused at every depth, with an aperture that
-    grows at constant f-number until it is fully open; elevationally the lens focuses both ways at one depth.
+    The two-way beam (amplitude, docs/physics.md#4-beam-and-pulse) is Gaussian across its axis. Laterally it is the
+    product of a transmit beam focused once at `focus_mm` and a receive beam that is focused at every depth, with an
+    aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both ways at one
+    depth.
     Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
     """
 

@@ -1,9 +1,9 @@
-"""What an MRI knows about scatterers beyond hard labels (PHYSICS section 8, the "hybrid" scatterers).
+"""What an MRI knows about scatterers beyond hard labels (docs/physics.md#hybrid-scatterers).
 
 Two things, either of which can be used alone:
 - partial volume: the probability that a voxel is of another tissue than its label says. A scatterer takes its tissue
-  by that probability, drawn once and for ever, so that the mean power is sum_k P_k Var_k and the signal stays linear in
-  mu0 and sigma0 of every tissue;
+  by that probability, drawn once and for ever, so that the mean power is that of both in their shares and the signal
+  stays linear in mu0 and sigma0 of every tissue;
 - intensity: how far the MRI deviates from the mean of the tissue. Amplitudes follow it in decibels, normalised so that
   the tissue as a whole keeps its mean power.
 """

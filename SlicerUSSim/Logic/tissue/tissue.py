@@ -1,6 +1,6 @@
 """Tissue and Membrane: what a tissue is to ultrasound.
 
-Six parameters make a tissue (docs/physics.md, tissues and scatterers): speed of sound, impedance, attenuation, and the
+Six parameters make a tissue (docs/physics.md#5-scatterers): speed of sound, impedance, attenuation, and the
 scatterers' mu0, mu1 and sigma0. A scatterer exists where T1 >= mu1 and has amplitude mu0 + sigma0 T0, with T0, T1 ~
 N(0, 1).
 """

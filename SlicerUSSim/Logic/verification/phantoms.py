@@ -94,7 +94,7 @@ class Phantom:
 def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence=1.0):
     """Pressure reflection coefficient r of a border between two fluids; 1 beyond the critical angle.
 
-    r = (Z2 cos i - Z1 cos t) / (Z2 cos i + Z1 cos t), sin t / c2 = sin i / c1 (PHYSICS section 3).
+    r = (Z2 cos i - Z1 cos t) / (Z2 cos i + Z1 cos t), sin t / c2 = sin i / c1 (docs/physics.md#3-rays).
     """
     cos_in = np.asarray(cos_incidence, float)
     sin_out = behind.speed_of_sound_m_s / before.speed_of_sound_m_s * np.sqrt(1.0 - cos_in**2)
@@ -111,7 +111,7 @@ def attenuating_block(
 ) -> Phantom:
     """Shadow, or enhancement with less attenuation than the background's: a block in the middle of speckle.
 
-    Behind it the mean level changes by -2 (alpha_block - alpha_background) f d dB (PHYSICS section 7).
+    Behind it the mean level changes by -2 (alpha_block - alpha_background) f d dB (docs/physics.md#3-rays).
     """
     block = replace(BACKGROUND, name="block", attenuation_db_cm_mhz=attenuation_db_cm_mhz)
     top = 14.0
@@ -391,7 +391,7 @@ def voxel_sphere(
     spacing_mm: float = 1.0,
     centre_mm=(0.31, 0.17, -0.42),
 ) -> Phantom:
-    """A sphere on coarse voxels, its centre nowhere special on them; PHYSICS section 3 bounds its stairs.
+    """A sphere on coarse voxels, its centre nowhere special on them (docs/physics.md#2-interfaces).
 
     `centre_mm` is in RAS; the probe face is 29 mm before it.
     """

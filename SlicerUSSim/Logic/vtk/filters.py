@@ -52,7 +52,7 @@ class _ImageFilter(VTKPythonAlgorithmBase):
         self._device: str | None = None
 
     def SetDevice(self, device: str | None) -> None:
-        """OpenCL device (see device.choose_device)."""
+        """OpenCL device (see opencl.devices.choose_device)."""
         self._change("_device", device)
 
     def SetInputData(self, image: vtkImageData | None) -> None:

@@ -1,4 +1,4 @@
-"""Checks of the artefacts of the paper's Fig. 2 (PHYSICS section 7), and of a wire and cyst phantom."""
+"""Checks of the artefacts of the paper's Fig. 2 (docs/physics.md#3-rays), and of a wire and cyst phantom."""
 
 from __future__ import annotations
 

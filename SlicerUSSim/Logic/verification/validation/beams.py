@@ -1,4 +1,5 @@
-"""Checks of the beam (PHYSICS sections 3 and 4): echoes as wide as the point spread function, slice thickness."""
+"""Checks of the beam: echoes as wide as the point spread function (docs/physics.md#3-rays), resolution and slice
+thickness (docs/physics.md#4-beam-and-pulse)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of the ray tree (PHYSICS section 3): Snell, Fresnel, attenuation, time, sub-voxel interfaces, energy."""
+"""Checks of the ray tree (docs/physics.md#3-rays) and of interfaces (docs/physics.md#2-interfaces)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of the speckle (PHYSICS section 4): statistics, correlations by the point spread function, a fixed patient."""
+"""Checks of the speckle (docs/physics.md#5-scatterers): statistics, correlations, level, a fixed patient."""
 
 from __future__ import annotations
 

@@ -1,0 +1,144 @@
+"""`ussim optimize`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from SlicerUSSim.Command.options import gathered
+from SlicerUSSim.Command.patient_options import PatientOptions
+from SlicerUSSim.Command.progress import Curve
+from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.version import __version__
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.fitting import Fit
+
+#: Images that are fitted if none are chosen.
+_MOST_IMAGES = 6
+
+
+@click.command()
+@gathered(patient=PatientOptions, tracking=SequenceOptions)
+@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Result: .json")
+@click.option(
+    "--free",
+    multiple=True,
+    metavar="NAME[=LOW:HIGH]",
+    help='Free parameters: "display", a tissue, one of either ("gain_db", "white matter.mu0"), with bounds if wanted; '
+    'may be repeated (default: display and "white matter").',
+)
+@click.option("--evaluations", type=click.IntRange(1), default=500, show_default=True, help="Of the cost, at most.")
+@click.option("--restarts", type=click.IntRange(0), default=2, show_default=True, help="For what fits equally well.")
+@click.option("--report", type=click.Path(path_type=Path), help="Self-contained report: .html")
+@click.option("--save-preset", type=click.Path(path_type=Path), help="Preset with what was found: .json")
+@click.option(
+    "--state",
+    type=click.Path(path_type=Path),
+    help="Keep what was evaluated here, and go on from there when run again: .json",
+)
+@click.option("--register", is_flag=True, help="Also refine where the ultrasound lies in the MRI (rigid).")
+@click.option(
+    "--save-transform",
+    type=click.Path(path_type=Path),
+    help="With --register: the refined map from the ultrasound's reference frame to the MRI, whole, as --to-mri takes "
+    "it: .json",
+)
+def optimize(
+    patient: PatientOptions,
+    tracking: SequenceOptions,
+    out: Path,
+    free: tuple[str, ...],
+    evaluations: int,
+    restarts: int,
+    report: Path | None,
+    save_preset: Path | None,
+    state: Path | None,
+    register: bool,
+    save_transform: Path | None,
+) -> None:
+    """Fit display and tissue parameters until simulated and tracked real ultrasound agree."""
+    from SlicerUSSim.Logic.base.files import read_json, require_place, write_json
+    from SlicerUSSim.Logic.fitting.fit import fit
+    from SlicerUSSim.Logic.imaging.figures import require_matplotlib
+    from SlicerUSSim.Logic.imaging.preset import Preset
+    from SlicerUSSim.Logic.tracked.pose_files import write_pose
+
+    places = [place for place in (out, report, save_preset, save_transform, state) if place]
+    for place in places:
+        require_place(place)
+    if report:
+        require_matplotlib()
+    if save_transform and not register:
+        raise SimulationError("--save-transform needs --register")
+    names = dict(_free_parameter(text) for text in free) or dict.fromkeys(("display", "white matter"))
+    tracked = open_tracked(patient, tracking, most=_MOST_IMAGES)
+    simulator = tracked.examination.simulator
+    with Curve("optimize") as curve:
+        found = fit(
+            simulator, tracked.images, free=names, display=tracked.examination.display, register=register,
+            max_evaluations=evaluations, restarts=restarts, progress=curve,
+            resume=read_json(state) if state and state.exists() else None,
+            checkpoint=(lambda reached: write_json(state, reached)) if state else None,
+        )  # fmt: skip
+    write_json(out, found.to_dict())
+    if save_preset:
+        result = found.appearance
+        Preset(found.tracked.probe, result.display, simulator.settings, result.tissues).write(save_preset)
+    if save_transform and found.registration:
+        write_pose(save_transform, found.registration.correction @ tracked.reference_to_ras)
+    if report:
+        _write_report(report, found, tracked, patient, tracking)
+    _tell(found)
+    click.echo("wrote " + ", ".join(map(str, places)))
+
+
+def _free_parameter(text: str) -> tuple[str, tuple[float, float] | None]:
+    """A name, or name=low:high."""
+    name, equals, bounds = text.partition("=")
+    if not equals:
+        return name.strip(), None
+    try:
+        low, high = (float(end) for end in bounds.split(":"))
+    except ValueError:
+        raise SimulationError(f"--free is {text!r}, expected such as white matter.mu0=0.1:0.8") from None
+    return name.strip(), (low, high)
+
+
+def _write_report(
+    path: Path, found: Fit, tracked: TrackedExamination, patient: PatientOptions, tracking: SequenceOptions
+) -> None:
+    """--report, with all that it takes to do the same again."""
+    from SlicerUSSim.Logic.fitting.report import write_report
+
+    simulator = tracked.examination.simulator
+    provenance = (
+        f"SlicerUSSim {__version__}, {simulator.device.info}. MRI or labels: {patient.source}. Sequence: "
+        f"{tracking.sequence}, images {', '.join(map(str, tracked.images.numbers))}. Probe: {tracked.images.probe}. "
+        f"Settings: {simulator.settings}."
+    )
+    write_report(
+        path, found.appearance, found.tracked, found.before, found.after, simulator,
+        subtitle=f"{Path(tracking.sequence).name} on {Path(patient.source).name}", provenance=provenance,
+    )  # fmt: skip
+
+
+def _tell(found: Fit) -> None:
+    """What was found, one line for the cost and one for each parameter."""
+    if found.registration:
+        moved = found.registration
+        click.echo(f"moved by {moved.shift_mm:.2f} mm and {moved.turn_deg:.2f} degrees")
+    result = found.appearance
+    click.echo(f"cost {result.cost_before:.4f} -> {result.cost_after:.4f} ({result.evaluations} evaluations)")
+    for parameter in result.parameters:
+        spread = result.identifiability[parameter.name]
+        note = ""
+        if parameter.name in result.at_bounds:
+            note = "  at its bound"
+        elif spread.is_determined is False:
+            note = f"  not determined: {spread.low:.3g} to {spread.high:.3g} fit as well"
+        before, after = result.before[parameter.name], result.after[parameter.name]
+        click.echo(f"{parameter.name:42s} {before:8.3f} -> {after:8.3f}{note}")

@@ -1,0 +1,187 @@
+"""PatientOptions, what every command that simulates is told of a patient and a probe; and the Examination they make."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from SlicerUSSim.Command.options import contrast_option, declared, device_option, mask_option, sulci_option
+from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Logic.base.errors import SimulationError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from SlicerUSSim.Logic.base import DisplaySettings, Volume
+    from SlicerUSSim.Logic.imaging import Preset, UltrasoundSimulator
+    from SlicerUSSim.Logic.mri import Segmentation
+    from SlicerUSSim.Logic.probe import Probe
+    from SlicerUSSim.Logic.tissue import TissueTable
+
+pose_option = click.option(
+    "--pose", required=True, help='File with probe_to_ras (JSON, 16 numbers, or a Slicer transform), or "auto".'
+)
+
+
+@dataclass(frozen=True)
+class PatientOptions:
+    """Whom to simulate, with which probe, and how the images are shown. Files are named by their paths."""
+
+    mri_or_labels: str = declared(click.argument("mri_or_labels", type=click.Path()))
+    #: None where the input has to tell
+    is_labels: bool | None = declared(
+        click.option(
+            "--labels/--mri", "is_labels", default=None,
+            help="What the input is (default: few whole numbers are labels).",
+        )
+    )  # fmt: skip
+    preset: str | None = declared(
+        click.option(
+            "--preset", type=click.Path(),
+            help="Probe, display, settings and tissues as JSON, from `ussim demo` or the Slicer module; the options "
+            "below go before it.",
+        )
+    )  # fmt: skip
+    probe: str | None = declared(
+        click.option("--probe", type=click.Path(), help="Probe as JSON (default: the preset's, a phased array).")
+    )
+    tissues: str | None = declared(
+        click.option(
+            "--tissues", type=click.Path(),
+            help="Tissue table as JSON (default: the preset's, the file beside the labels, or brain).",
+        )
+    )  # fmt: skip
+    contrast: str = declared(contrast_option)
+    mask: str | None = declared(mask_option)
+    thin_sulci: bool = declared(sulci_option)
+    partial_volume: bool | None = declared(
+        click.option(
+            "--partial-volume/--hard-labels", default=None,
+            help="Scatterers take their tissue by the segmentation's probabilities (from an MRI only).",
+        )
+    )  # fmt: skip
+    mri_modulation: float | None = declared(
+        click.option(
+            "--mri-modulation", type=float,
+            help="Scatterers follow the MRI inside tissues, dB per standard deviation (from an MRI only).",
+        )
+    )  # fmt: skip
+    gain: float | None = declared(click.option("--gain", type=float, help="Gain [dB] (default: the preset's, 0)."))
+    dynamic_range: float | None = declared(
+        click.option("--dynamic-range", type=float, help="Dynamic range [dB] (default: the preset's, 55).")
+    )
+    tgc: float | None = declared(
+        click.option("--tgc", type=float, help="Time-gain compensation [dB/(cm MHz)] (default: the preset's, 0.5).")
+    )
+    seed: int | None = declared(
+        click.option("--seed", type=int, help="Which speckle and noise (default: the preset's, 0).")
+    )
+    device: str | None = declared(device_option)
+
+    @property
+    def gives_probe(self) -> bool:
+        """Whether the probe was chosen, and is not just the one there is by default."""
+        return bool(self.probe or self.preset)
+
+    @property
+    def source(self) -> str:
+        """The MRI or label map, for a report."""
+        return os.path.abspath(self.mri_or_labels)
+
+    def changed_preset(self) -> Preset:
+        """--preset, or the default one, with what the options for probe, display and settings change of it.
+
+        Raises SimulationError for files that cannot be read and values out of range.
+        """
+        from SlicerUSSim.Logic.base.files import read_json
+        from SlicerUSSim.Logic.imaging.preset import Preset
+        from SlicerUSSim.Logic.probe.arrays import probe_from_dict
+
+        preset = Preset.read(self.preset) if self.preset else Preset()
+        preset = preset.changed(
+            "display", **_given(gain_db=self.gain, dynamic_range_db=self.dynamic_range, tgc_db_cm_mhz=self.tgc)
+        ).changed(
+            "settings",
+            **_given(seed=self.seed, partial_volume=self.partial_volume, mri_modulation_db=self.mri_modulation),
+        )
+        return replace(preset, probe=probe_from_dict(read_json(self.probe), self.probe)) if self.probe else preset
+
+
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """A simulator for one patient, the probe, and how its images are shown."""
+
+    simulator: UltrasoundSimulator
+    probe: Probe
+    display: DisplaySettings
+    #: Whether the patient came as a label map, and not as an MRI
+    is_labels: bool
+
+
+def open_examination(patient: PatientOptions) -> Examination:
+    """The Examination of a command's options. An MRI is segmented, with a progress bar.
+
+    What is cheap to check comes before what takes time. Raises SimulationError for everything that does not fit.
+    """
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+
+    preset = patient.changed_preset()
+    volume = Volume.read(patient.mri_or_labels)
+    is_labels = volume.looks_like_labels() if patient.is_labels is None else patient.is_labels
+    if is_labels and preset.settings.needs_texture:
+        raise SimulationError(
+            f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need the MRI it came from"
+        )
+    labels, tissues, texture = volume, preset.tissues, None
+    table = _tissues_from_file(patient, is_labels)
+    if not is_labels:
+        segmentation = _segmented(volume, patient)
+        labels, tissues = segmentation.labels, preset.tissues.for_names(segmentation.tissue_names)
+        texture = segmentation.texture() if preset.settings.needs_texture else None
+    simulator = UltrasoundSimulator(
+        labels, tissues if table is None else table, preset.settings, patient.device, texture
+    )
+    return Examination(simulator, preset.probe, preset.display, is_labels)
+
+
+def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination, np.ndarray]:
+    """(Examination, (4, 4) probe_to_ras) of a command's options; a pose of "auto" is a view through a craniotomy."""
+    from SlicerUSSim.Logic.probe.placement import craniotomy_pose
+    from SlicerUSSim.Logic.tracked.pose_files import read_pose
+
+    given = None if pose == "auto" else read_pose(pose)
+    examination = open_examination(patient)
+    if given is not None:
+        return examination, given
+    return examination, craniotomy_pose(examination.simulator.medium.labels, examination.probe)
+
+
+def _tissues_from_file(patient: PatientOptions, is_labels: bool) -> TissueTable | None:
+    """The table of --tissues, or of the file beside a label map; None if there is none or a preset goes before it."""
+    from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
+
+    if patient.tissues:
+        return TissueTable.read(patient.tissues)
+    beside = tissues_beside(Path(patient.mri_or_labels))
+    return TissueTable.read(beside) if is_labels and not patient.preset and beside.exists() else None
+
+
+def _segmented(mri: Volume, patient: PatientOptions) -> Segmentation:
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mri.segmentation import segment_mri
+
+    with Share("segment") as progress:
+        return segment_mri(
+            mri, contrast=patient.contrast, mask=Volume.read(patient.mask) if patient.mask else None,
+            thin_sulci=patient.thin_sulci, device=patient.device, progress=progress,
+        )  # fmt: skip
+
+
+def _given(**options) -> dict:
+    """The options that were given."""
+    return {name: value for name, value in options.items() if value is not None}

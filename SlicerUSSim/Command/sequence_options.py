@@ -1,0 +1,184 @@
+"""SequenceOptions, what every command that reads tracked ultrasound is told of it; and what is read by them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from SlicerUSSim.Command.options import declared
+from SlicerUSSim.Command.patient_options import Examination, PatientOptions, open_examination
+from SlicerUSSim.Logic.base.errors import SimulationError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from SlicerUSSim.Logic.base import Volume
+    from SlicerUSSim.Logic.probe import Probe
+    from SlicerUSSim.Logic.tracked import TrackedImages, TrackedSequence
+
+transform_option = click.option(
+    "--transform", default="ImageToReference", show_default=True,
+    help="From pixels to where the patient lies; composed of what the sequence has.",
+)  # fmt: skip
+calibration_option = click.option(
+    "--calibration", type=click.Path(),
+    help="What the sequence lacks: a Plus configuration (XML), or a file with the 4x4 ImageToProbe.",
+)  # fmt: skip
+to_mri_option = click.option(
+    "--to-mri", type=click.Path(),
+    help="From there to the MRI: a pose file, .xfm, or .tag with landmarks in MRI and ultrasound.",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SequenceOptions:
+    """Which tracked images, and where they lie in the MRI. Files are named by their paths."""
+
+    sequence: str = declared(
+        click.option(
+            "--sequence", type=click.Path(), required=True,
+            help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer), a folder of MINC slices, or with "
+            "--cut a 3D ultrasound volume. Without --probe or --preset, the probe's geometry is found in the images.",
+        )
+    )  # fmt: skip
+    frames: str | None = declared(
+        click.option(
+            "--frames", help="Which images: 0,5,10 or 0:20:5 (default: all that were tracked; to fit, six of them)."
+        )
+    )
+    transform: str = declared(transform_option)
+    calibration: str | None = declared(calibration_option)
+    to_mri: str | None = declared(to_mri_option)
+    cut: str | None = declared(
+        click.option(
+            "--cut", type=click.Path(), help="Cut a volume where a probe at this pose would look, and beside it:"
+        )
+    )
+    cut_tilt: float | None = declared(
+        click.option("--cut-tilt", type=float, help="tilted by this many degrees in all,")
+    )
+    cut_slide: float | None = declared(
+        click.option("--cut-slide", type=float, help="or slid by this many millimetres in all,")
+    )
+    cuts: int = declared(
+        click.option("--cuts", type=click.IntRange(1), default=3, show_default=True, help="in as many images.")
+    )
+    field: Path | None = declared(  # noqa: RUF009, a dataclasses.field like the others
+        click.option("--field", type=click.Path(path_type=Path), help="Picture of the imaged field, to check it: .png")
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedExamination:
+    """An examination, and the real images to which it is compared."""
+
+    examination: Examination
+    sequence: TrackedSequence
+    #: Those of its images that were chosen, at their poses in the MRI
+    images: TrackedImages
+    #: (4, 4) rigid, from the reference frame of the ultrasound to the MRI; the identity without --to-mri
+    reference_to_ras: np.ndarray
+
+
+def open_tracked(patient: PatientOptions, tracking: SequenceOptions, most: int | None = None) -> TrackedExamination:
+    """The TrackedExamination of a command's options; `most` is how many images are taken if none are chosen.
+
+    What is cheap to check comes before what takes time. Raises SimulationError for everything that does not fit.
+    """
+    import numpy as np
+
+    from SlicerUSSim.Logic.base.files import require_place
+    from SlicerUSSim.Logic.tracked.field import draw_field
+    from SlicerUSSim.Logic.tracked.images import TrackedImages
+    from SlicerUSSim.Logic.tracked.sequence import frame_numbers
+
+    if tracking.field:
+        require_place(tracking.field)
+    to_ras = read_to_mri(tracking.to_mri) if tracking.to_mri else np.eye(4)
+    if tracking.cut:
+        cuts = _read_cuts(tracking.cut, tracking)
+        examination = open_examination(patient)
+        known_probe, sequence = examination.probe, cuts.seen_by(examination.probe)
+    else:
+        sequence = read_sequence(tracking.sequence, tracking.calibration)
+        examination = open_examination(patient)
+        known_probe = examination.probe if patient.gives_probe else None
+    images = TrackedImages.of(
+        sequence,
+        None if tracking.frames is None else frame_numbers(tracking.frames, len(sequence)),
+        path=tracking.transform,
+        reference_to_ras=to_ras,
+        probe=known_probe,
+        beam=examination.probe,
+        most=most,
+    )
+    if tracking.field:
+        draw_field(tracking.field, sequence.images[images.numbers[0]], images.field)
+    return TrackedExamination(examination, sequence, images, to_ras)
+
+
+def read_sequence(path: str, calibration: str | None) -> TrackedSequence:
+    """The TrackedSequence of --sequence, with what --calibration adds."""
+    from SlicerUSSim.Logic.tracked.pose_files import read_matrix
+    from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, read_coordinate_definitions
+
+    source = Path(path)
+    if source.is_dir():
+        sequence = TrackedSequence.from_slices(sorted(source.glob("*.mnc")))
+    else:
+        sequence = TrackedSequence.read(source)
+    if calibration:
+        is_xml = Path(calibration).suffix.lower() == ".xml"
+        constant = read_coordinate_definitions(calibration) if is_xml else {"ImageToProbe": read_matrix(calibration)}
+        sequence = sequence.with_transforms(constant)
+    return sequence
+
+
+def read_to_mri(path: str) -> np.ndarray:
+    """(4, 4) map of --to-mri, from the reference frame of the ultrasound to the MRI."""
+    from SlicerUSSim.Logic.base.transforms import rigid_between
+    from SlicerUSSim.Logic.tracked.pose_files import read_tags, read_transform
+
+    if Path(path).suffix.lower() != ".tag":
+        return read_transform(path)
+    in_mri, in_ultrasound = read_tags(path)
+    if in_ultrasound is None:
+        raise SimulationError(f"{path}: has points of one volume, expected pairs in MRI and ultrasound")
+    to_ras, left = rigid_between(in_ultrasound, in_mri)
+    click.echo(f"{len(in_mri)} landmarks agree to {left:.2f} mm (root mean square)")
+    return to_ras
+
+
+@dataclass(frozen=True, eq=False)
+class _Cuts:
+    """A volume of ultrasound, and where a probe is to have looked in it."""
+
+    volume: Volume
+    #: (4, 4) each, from the probe to the frame of the volume
+    poses: list[np.ndarray]
+
+    def seen_by(self, probe: Probe) -> TrackedSequence:
+        """The images that `probe` would have taken there."""
+        from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+
+        return TrackedSequence.from_volume(self.volume, probe, self.poses)
+
+
+def _read_cuts(pose_file: str, tracking: SequenceOptions) -> _Cuts:
+    """The volume of --sequence, to be cut at the pose of --cut and beside it."""
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
+    from SlicerUSSim.Logic.tracked.pose_files import read_pose
+
+    if tracking.cut_tilt is not None and tracking.cut_slide is not None:
+        raise SimulationError("expected either --cut-tilt DEGREES or --cut-slide MILLIMETRES, for cuts of one kind")
+    pose = read_pose(pose_file)
+    poses = [pose]
+    if tracking.cut_tilt is not None:
+        poses = tilt_sweep(pose, tracking.cut_tilt, tracking.cuts)
+    elif tracking.cut_slide is not None:
+        poses = slide_sweep(pose, tracking.cut_slide, tracking.cuts)
+    return _Cuts(Volume.read(tracking.sequence), poses)

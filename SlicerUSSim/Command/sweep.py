@@ -1,0 +1,40 @@
+"""`ussim sweep`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from SlicerUSSim.Command.options import gathered
+from SlicerUSSim.Command.patient_options import PatientOptions
+from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
+
+
+@click.command()
+@gathered(patient=PatientOptions, tracking=SequenceOptions)
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path), required=True, help="Sequence: .igs.mha .seq.mha .mhd or .nrrd"
+)
+def sweep(patient: PatientOptions, tracking: SequenceOptions, out: Path) -> None:
+    """Simulate the images of a tracked sequence: what its probe saw, on the same pixels."""
+    import numpy as np
+
+    from SlicerUSSim.Logic.base.files import require_place
+    from SlicerUSSim.Logic.tracked.sequence import require_sequence_name
+
+    require_sequence_name(out)
+    require_place(out)
+    tracked = open_tracked(patient, tracking)
+    simulator, display = tracked.examination.simulator, tracked.examination.display
+    real = tracked.images
+    rows, columns = real.field.mask.shape
+    simulated = np.zeros((len(real.poses), rows, columns), np.uint8)
+    with Share("sweep") as progress:
+        for number, pose in enumerate(real.poses):
+            frame = simulator.simulate(real.probe, pose, display, real.grid)
+            simulated[number][real.field.window] = frame.image
+            progress((number + 1) / len(real.poses))
+    tracked.sequence.with_images(real.numbers, simulated).write(out)
+    click.echo(f"wrote {out} ({len(simulated)} images of {columns}x{rows})")

@@ -1,0 +1,39 @@
+"""`ussim validate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from SlicerUSSim.Command.options import device_option
+from SlicerUSSim.Command.progress import Steps
+
+
+@click.command()
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default="ussim-validation",
+    show_default=True,
+    help="Folder for the report.",
+)
+@click.option(
+    "--only", multiple=True, metavar="TEXT", help="Only checks with this text in their name; may be repeated."
+)
+@device_option
+@click.pass_context
+def validate(ctx: click.Context, out: Path, only: tuple[str, ...], device: str | None) -> None:
+    """Measure the simulator against theory on phantoms: tables and pictures; exit status 1 if any number is off."""
+    from SlicerUSSim.Logic.verification.validation import chosen_checks, validate as run
+
+    with Steps(sum(len(check.orientations) for check in chosen_checks(only))) as step:
+        report = run(out, device, only, step)
+    for finding in report.failed:
+        row = finding.row
+        click.echo(
+            f"off: {finding.check}, {row.quantity}, {finding.orientation}: {row.measured:.4g} {row.unit}, "
+            f"predicted {row.predicted:.4g} ({row.limits})"
+        )
+    click.echo(f"{report.summary()} Wrote {out / 'report.md'}, report.json and {len(report.pictures)} pictures.")
+    ctx.exit(1 if report.failed else 0)

@@ -1,0 +1,47 @@
+"""`ussim volume`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from SlicerUSSim.Command.options import check_output, gathered
+from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option
+from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Logic.base.errors import SimulationError
+
+
+@click.command()
+@gathered(patient=PatientOptions)
+@pose_option
+@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Volume: .nrrd .nii.gz .mha or .vti")
+@click.option("--tilt", type=float, help="Tilt the image plane about the probe's face by this many degrees in all.")
+@click.option("--slide", type=float, help="Slide the probe across its image plane by this many millimetres in all.")
+@click.option("--frames", type=click.IntRange(1), default=61, show_default=True, help="Images of the sweep.")
+@click.option("--spacing", type=float, default=0.5, show_default=True, help="Voxel size [mm].")
+@click.option("--like", type=click.Path(), help="Take the voxel grid of this volume instead (the MRI, say).")
+def volume(
+    patient: PatientOptions, pose: str, out: Path, tilt: float | None, slide: float | None, frames: int,
+    spacing: float, like: str | None,
+) -> None:  # fmt: skip
+    """A 3D ultrasound volume: a sweep of images around a pose, compounded in patient space."""
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
+
+    check_output(out)
+    if tilt is not None and slide is None:
+        sweep, extent = tilt_sweep, tilt
+    elif slide is not None and tilt is None:
+        sweep, extent = slide_sweep, slide
+    else:
+        raise SimulationError("expected either --tilt DEGREES or --slide MILLIMETRES, for a sweep of one kind")
+    grid = Volume.read(like) if like else None
+    examination, middle = open_examination_at(patient, pose)
+    with Share("sweep") as progress:
+        result = examination.simulator.volume(
+            examination.probe, sweep(middle, extent, frames), examination.display, spacing_mm=spacing, like=grid,
+            progress=lambda done: progress(done / frames),
+        )  # fmt: skip
+    result.write(out)
+    click.echo(f"wrote {out} ({'x'.join(map(str, result.array.shape[::-1]))} voxels from {frames} images)")
