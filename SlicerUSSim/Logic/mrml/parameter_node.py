@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from SlicerUSSim.Logic.base.errors import require
 
-MODULE_NAME = "SlicerUSSim"
+MODULE_NAME = "USSim"
 
 #: Roles of nodes, and the classes that can play them.
 NODE_PARAMETERS: dict[str, tuple[str, ...]] = {
