@@ -28,8 +28,8 @@ _NAME = "SlicerUSSim"
 def ensure_packages(requirements_file: Path) -> None:
     """Install what is missing of a requirements file, after asking.
 
-    Raises SimulationError if the user declines, if pip fails, if Slicer has a package in a version that will not do, and
-    if something is missing in Slicer's testing mode, in which nothing is installed.
+    Raises SimulationError if the user declines, if pip fails, if Slicer has a package in a version that will not do,
+    and if something is missing in Slicer's testing mode, in which nothing is installed.
     """
     missing = _missing(requirements_file)
     if not missing:
