@@ -6,7 +6,6 @@ Slicer.
 
 import importlib.machinery
 import importlib.util
-import os
 import sys
 import unittest
 from pathlib import Path
@@ -33,8 +32,8 @@ from slicer.util import VTKObservationMixin
 if sys.version_info < (3, 10):  # noqa: UP036, Slicer runs this file whatever its Python is
     raise RuntimeError(f"USSim needs Slicer 5.10 or newer: Python 3.10, and this is {sys.version.split()[0]}")
 
-_HERE = os.path.dirname(os.path.abspath(__file__))
-_RESOURCES = Path(_HERE, "Resources")
+_HERE = Path(__file__).absolute().parent
+_RESOURCES = _HERE / "Resources"
 _HOME = "https://github.com/SlicerUSSim/SlicerUSSim"
 
 
@@ -45,9 +44,9 @@ def bindPackage() -> None:
     around it in a checkout and after pip, whatever that folder is called. Python may already have imported another
     copy, installed with pip, or before "Reload" an older state of this one: none of that stays.
     """
-    beside = os.path.join(_HERE, "SlicerUSSim")
+    beside = _HERE / "SlicerUSSim"
     spec = importlib.machinery.ModuleSpec("SlicerUSSim", loader=None, is_package=True)
-    spec.submodule_search_locations = [beside if os.path.isdir(os.path.join(beside, "Logic")) else _HERE]
+    spec.submodule_search_locations = [str(beside if (beside / "Logic").is_dir() else _HERE)]
     for name in [name for name in sys.modules if name.split(".")[0] == "SlicerUSSim"]:
         del sys.modules[name]
     sys.modules["SlicerUSSim"] = importlib.util.module_from_spec(spec)

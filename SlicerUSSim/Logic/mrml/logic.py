@@ -59,7 +59,7 @@ class AtOnce:
 class UltrasoundSceneLogic:
     """Simulates on the nodes of one scene.
 
-    What is set (`preset`, and the nodes the module works with) is kept in the scene, see scene_parameters. Every method
+    What is set (`preset`, and the nodes the module works with) is kept in the scene, see parameter_node. Every method
     raises SimulationError for a node that is missing, empty, of the wrong kind or under a transform that is not linear.
 
     Parameters
