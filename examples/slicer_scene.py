@@ -1,7 +1,7 @@
 """A MRML scene without Slicer's window: python examples/slicer_scene.py [OUT.mrb]
 
 Loads the demo brain, segments it, puts the probe on the cortex, lets the image follow the probe while it slides,
-records the sweep as sequences with a browser, and saves a .mrb. Opened in 3D Slicer, the SlicerUSSim module shows
+records the sweep as sequences with a browser, and saves a .mrb. Opened in 3D Slicer, the module USSim shows
 everything as it was left: tick Live, and move the probe. The file is read back here to show that it is whole.
 
 Needs pip install "SlicerUSSim[slicer,demo]"; in Slicer's own Python console `slicer.mrmlScene` takes the scene's place.

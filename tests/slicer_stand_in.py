@@ -7,18 +7,15 @@ properties of the widgets, and the form in which parameterNodeWrapper keeps valu
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 import types
 import typing
+import unittest
 from pathlib import Path
 
 import slicer
 import vtk
 from PySide6 import QtCore, QtGui, QtUiTools, QtWidgets
-
-MODULE_FILE = Path(__file__).parents[1] / "SlicerUSSim" / "SlicerUSSim.py"
-
 
 # ---- CTK and MRML widgets --------------------------------------------------------------------------------------------
 
@@ -344,9 +341,6 @@ class ScriptedLoadableModuleWidget:
     def setup(self) -> None:
         pass
 
-    def resourcePath(self, name: str) -> str:
-        return str(MODULE_FILE.parent / "Resources" / name)
-
 
 class ScriptedLoadableModuleLogic:
     def __init__(self, parent=None) -> None:
@@ -363,17 +357,9 @@ class ScriptedLoadableModuleLogic:
         return node
 
 
-def scripted_loadable_module_test():
-    import unittest
-
-    class ScriptedLoadableModuleTest(unittest.TestCase):
-        def delayDisplay(self, message: str) -> None:
-            pass
-
-        def runTest(self) -> None:
-            pass
-
-    return ScriptedLoadableModuleTest
+class ScriptedLoadableModuleTest(unittest.TestCase):
+    def delayDisplay(self, message: str) -> None:
+        slicer.app.shown.append(message)
 
 
 # ---- the application -------------------------------------------------------------------------------------------------
@@ -388,7 +374,15 @@ class Application:
         self.questions: list[str] = []
         self.answer = True
         self.started: list = []
+        self.shown: list[str] = []
+        #: What pip was told: packages, and what the file of constraints said
         self.installed: list[str] = []
+        self.constraints = ""
+        #: --testing, in which message boxes answer themselves
+        self.testing = False
+
+    def testingEnabled(self) -> bool:
+        return self.testing
 
     def connect(self, signal: str, function) -> None:
         assert signal == "startupCompleted()"
@@ -396,6 +390,15 @@ class Application:
 
     def processEvents(self) -> None:
         self.qt.processEvents()
+
+    def pip_install(self, arguments: list[str]) -> None:
+        at = arguments.index("--constraint")
+        self.constraints = Path(arguments[at + 1]).read_text()
+        self.installed += arguments[:at] + arguments[at + 2 :]
+
+    def confirm(self, question: str) -> bool:
+        self.questions.append(question)
+        return self.answer or self.testing
 
 
 def _qt_name(name: str):
@@ -423,7 +426,7 @@ def start() -> Application:
             ScriptedLoadableModule=ScriptedLoadableModule,
             ScriptedLoadableModuleWidget=ScriptedLoadableModuleWidget,
             ScriptedLoadableModuleLogic=ScriptedLoadableModuleLogic,
-            ScriptedLoadableModuleTest=scripted_loadable_module_test(),
+            ScriptedLoadableModuleTest=ScriptedLoadableModuleTest,
         ),
     }
     sys.modules.update(modules)
@@ -431,20 +434,6 @@ def start() -> Application:
     slicer.util.loadUI = load_ui
     slicer.util.childWidgetVariables = child_widget_variables
     slicer.util.errorDisplay = app.errors.append
-    slicer.util.pip_install = app.installed.extend
-
-    def confirm(question: str) -> bool:
-        app.questions.append(question)
-        return app.answer
-
-    slicer.util.confirmOkCancelDisplay = confirm
+    slicer.util.pip_install = app.pip_install
+    slicer.util.confirmOkCancelDisplay = app.confirm
     return app
-
-
-def load_module():
-    """What qSlicerScriptedUtils::loadSourceAsModule does."""
-    spec = importlib.util.spec_from_file_location("SlicerUSSim", str(MODULE_FILE))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["SlicerUSSim"] = module
-    spec.loader.exec_module(module)
-    return module

@@ -1,18 +1,28 @@
-"""The extension's build: configured with a stand-in for Slicer, complete, and what it makes runs."""
+"""The extension: built and installed with a stand-in for Slicer, loaded from there, fit for the Extensions Index.
+
+tests/slicer_cmake/SlicerConfig.cmake lays files out as Slicer's build does. The Index's rules are those of
+scripts/check_description_files.py and schemas/slicer-extension-catalog-entry-schema-v1.0.2.json in
+Slicer/ExtensionsIndex, as far as they can be held without the network.
+"""
 
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
+from tests.test_slicer_loading import assert_loaded_from, load, needs_slicer
+
 ROOT = Path(__file__).parents[1]
 MODULES = "lib/Slicer-5.10/qt-scripted-modules"
+CMAKE_TEXT = (ROOT / "CMakeLists.txt").read_text()
+ENTRY_FILE = ROOT / "USSim.json"
 
 
 def tool(name: str) -> str | None:
@@ -21,22 +31,35 @@ def tool(name: str) -> str | None:
 
 
 CMAKE, NINJA = tool("cmake"), tool("ninja")
-pytestmark = pytest.mark.skipif(None in (CMAKE, NINJA), reason="CMake is missing: pip install cmake ninja")
+needs_cmake = pytest.mark.skipif(None in (CMAKE, NINJA), reason="CMake is missing: pip install cmake ninja")
+
+
+def run_cmake(*arguments) -> str:
+    return subprocess.run([CMAKE, *map(str, arguments)], check=True, capture_output=True, text=True).stdout
+
+
+def build_extension(source: Path, folder: Path) -> Path:
+    run_cmake(
+        *("-S", source, "-B", folder, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={NINJA}", "-DBUILD_TESTING=ON"),
+        *(f"-DSlicer_DIR={ROOT / 'tests/slicer_cmake'}", f"-DCMAKE_INSTALL_PREFIX={folder / 'installed'}"),
+    )
+    run_cmake("--build", folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
 def build(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("build")
-    subprocess.run(
-        [
-            *(CMAKE, "-S", ROOT, "-B", folder, "-G", "Ninja", f"-DCMAKE_MAKE_PROGRAM={NINJA}"),
-            *(f"-DSlicer_DIR={ROOT / 'tests/slicer_cmake'}", "-DBUILD_TESTING=ON"),
-            f"-DCMAKE_INSTALL_PREFIX={folder / 'installed'}",
-        ],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
+    return build_extension(ROOT, tmp_path_factory.mktemp("build"))
+
+
+@pytest.fixture(scope="module")
+def installed(build) -> Path:
+    """The installed module folder, where another extension has files of its own already."""
+    folder = build / "installed" / MODULES
+    for name in ("Resources/requirements.txt", "Resources/Icons/Other.png", "Logic/__init__.py"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("another extension's\n")
+    run_cmake("--install", build)
     return folder
 
 
@@ -49,62 +72,139 @@ def record(build) -> dict[str, list[str]]:
     return asked
 
 
-def files(folder: Path, pattern: str) -> set[str]:
+def files(folder: Path, pattern: str = "*") -> set[str]:
     found = (path for path in folder.rglob(pattern) if path.is_file() and "__pycache__" not in path.parts)
     return {path.relative_to(folder).as_posix() for path in found}
 
 
-def test_every_script_and_resource_of_the_package_is_listed(record):
+# ---- build and install -----------------------------------------------------------------------------------------------
+
+
+@needs_cmake
+def test_the_module_its_resources_and_one_folder_are_installed_and_nothing_else(build, installed):
     package = ROOT / "SlicerUSSim"
-    # Slicer has no use for the command and for the workstation in the browser; CMakeLists.txt itself is not installed.
-    scripts = {
-        path
-        for path in files(package, "*.py")
-        if path != "__init__.py" and not path.startswith(("Command/", "Widget/browser/"))
-    }
-    assert set(record["SCRIPTS"]) == scripts and len(scripts) == len(record["SCRIPTS"])
-    assert set(record["RESOURCES"]) == {f"Resources/{path}" for path in files(package / "Resources", "*")}
-    assert record["NAME"] == ["SlicerUSSim"] and record["TEST"] == ["SlicerUSSim.py"]
+    wanted = {"USSim.py"} | {f"Resources/{path}" for path in files(package / "Resources")}
+    for folder in ("Logic", "Widget"):  # Slicer has no use for the command and the workstation in the browser
+        wanted |= {f"SlicerUSSim/{folder}/{path}" for path in files(package / folder)}
+    wanted |= {f"SlicerUSSim/kernels/{path}" for path in files(ROOT / "kernels")}
+    assert {"SlicerUSSim/Logic/fitting/report.html", "SlicerUSSim/Logic/py.typed", "Resources/UI/USSim.ui"} <= wanted
+    assert files(build / MODULES) == wanted
+    others = {"Resources/requirements.txt", "Resources/Icons/Other.png", "Logic/__init__.py"}
+    assert files(installed) == wanted | others
+    assert all((installed / name).read_text() == "another extension's\n" for name in others)
 
 
-def test_every_kernel_is_beside_the_module_in_the_build_and_the_installed_tree(build):
-    kernels = files(ROOT / "kernels", "*")
-    assert len(kernels) > 8 and files(build / MODULES / "kernels", "*") == kernels
-    subprocess.run([CMAKE, "--install", build], check=True, capture_output=True)
-    assert files(build / "installed" / MODULES / "kernels", "*") == kernels
+@needs_cmake
+def test_every_installed_resource_bears_the_modules_name(installed):
+    """Other extensions' resources lie in the same folders: Resources/UI/Settings.ui would be anybody's."""
+    mine = files(ROOT / "SlicerUSSim" / "Resources")
+    assert mine and all("USSim" in Path(path).parts or Path(path).stem == "USSim" for path in mine)
 
 
-def test_the_extension_says_what_the_extensions_index_wants(record):
+@needs_cmake
+def test_a_new_file_is_built_without_a_list_to_add_it_to(tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(ROOT / "SlicerUSSim", source / "SlicerUSSim", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("kernels", "CMakeLists.txt", "LICENSE", "README.md"):
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+        copy(ROOT / name, source / name)
+    build = build_extension(source, tmp_path / "build")
+    new = {"SlicerUSSim/Logic/probe/new.py": "Logic/probe/new.py", "SlicerUSSim/kernels/new.cl": "../kernels/new.cl"}
+    for path in new.values():
+        (source / "SlicerUSSim" / path).write_text("")
+    run_cmake("--build", build)
+    assert set(new) <= files(build / MODULES)
+
+
+@needs_cmake
+def test_slicer_is_asked_for_the_module_and_its_test(record):
+    assert record["NAME"] == ["USSim", "SlicerUSSim"] and record["TEST"] == ["USSim.py"]
+
+
+@needs_cmake
+@needs_slicer
+def test_the_built_module_loads_from_its_own_folder(build):
+    package = build / MODULES / "SlicerUSSim"
+    assert_loaded_from(load(build / MODULES), build / MODULES / "USSim.py", package, package / "kernels")
+
+
+@needs_cmake
+@needs_slicer
+def test_the_installed_module_simulates_beside_other_extensions_with_its_own_kernels(installed):
+    """Another extension's Logic lies on sys.path there, and is left alone."""
+    package = installed / "SlicerUSSim"
+    result = load(installed, self_test=True)
+    assert_loaded_from(result, installed / "USSim.py", package, package / "kernels")
+    assert result["shown"][-1] == "Test passed"
+
+
+@needs_cmake
+@needs_slicer
+def test_a_build_without_source_files_loads_too(build, tmp_path):
+    """CTK_COMPILE_PYTHON_SCRIPT_KEEP_ONLY_PYC: .pyc files in the place of .py files."""
+    folder = shutil.copytree(build / MODULES, tmp_path / "compiled")
+    subprocess.run([sys.executable, "-m", "compileall", "-q", "-b", folder], check=True)
+    for file in folder.rglob("*.py"):
+        file.unlink()
+    package = folder / "SlicerUSSim"
+    assert_loaded_from(load(folder), folder / "USSim.pyc", package, package / "kernels")
+
+
+# ---- the Extensions Index --------------------------------------------------------------------------------------------
+
+
+def entry() -> dict:
+    return json.loads(ENTRY_FILE.read_text())
+
+
+def test_the_entry_has_the_fields_of_the_schema_and_no_others():
+    required = {"$schema", "category", "scm_url"}
+    kinds = {
+        "$schema": str, "category": str, "scm_url": str, "scm_revision": str, "scm_type": str,
+        "build_dependencies": list, "dicom_support_rule": str, "build_subdirectory": str, "enabled": bool, "tier": int,
+    }  # fmt: skip
+    values = entry()
+    assert required <= set(values) <= set(kinds)
+    assert all(type(value) is kinds[name] for name, value in values.items())
+    assert values["scm_type"] == "git" and 1 <= values["tier"] <= 5 and values["build_dependencies"] == []
+    schemas = "https://raw.githubusercontent.com/Slicer/Slicer/main/Schemas/slicer-extension-catalog-entry-schema-"
+    assert re.fullmatch(re.escape(schemas) + r"v1\.0\.[12]\.json#", values["$schema"])
+    assert b"\r" not in ENTRY_FILE.read_bytes()
+
+
+def test_the_extension_is_called_as_the_index_wants():
+    name = ENTRY_FILE.stem
+    assert not name.lower().startswith("slicer")
+    assert re.findall(r"project\s*\(\s*([^\s\)\n\r]+)", CMAKE_TEXT, re.IGNORECASE)[0] == name
+    url = urlsplit(entry()["scm_url"])
+    assert url.scheme in ("git", "https") and Path(url.path).stem == f"Slicer{name}"  # the repository's name
+
+
+def test_the_category_is_one_of_the_indexs():
+    assert entry()["category"] == "Ultrasound"  # ACCEPTED_EXTENSION_CATEGORIES
+
+
+@pytest.mark.parametrize(("variable", "at_least"), [("ICONURL", 1), ("SCREENSHOTURLS", 1)])
+def test_the_pictures_are_found_in_the_text_and_lie_where_their_addresses_say(variable, at_least):
+    """The Index reads them from CMakeLists.txt with these expressions, and loads them."""
+    (text,) = re.findall(rf'set\s*\(EXTENSION_{variable}\s*"([^"]+)"[ ]*\)', CMAKE_TEXT, re.IGNORECASE)
+    urls = text.split()
+    assert len(urls) >= at_least
+    for url in urls:
+        base = "https://raw.githubusercontent.com/SlicerUSSim/SlicerUSSim/main/"
+        assert url.startswith(base) and url.endswith(".png")
+        assert (ROOT / url.removeprefix(base)).read_bytes().startswith(b"\x89PNG"), url
+
+
+def test_a_licence_lies_where_the_index_looks_for_it():
+    assert any((ROOT / name).is_file() for name in ("LICENSE", "License.txt", "LICENSE.txt", "COPYING"))
+
+
+@needs_cmake
+def test_the_build_and_the_entry_say_the_same(record):
     for name in ("HOMEPAGE", "CATEGORY", "CONTRIBUTORS", "DESCRIPTION", "DEPENDS"):
         assert record[f"EXTENSION_{name}"][0].strip(), name
-    for url in [*record["EXTENSION_ICONURL"], *record["EXTENSION_SCREENSHOTURLS"][0].split()]:
-        base = "https://raw.githubusercontent.com/SlicerUSSim/SlicerUSSim/main/"
-        assert url.startswith(base) and (ROOT / url.removeprefix(base)).exists(), url
-    assert Path(record["EXTENSION_LICENSE_FILE"][0]).exists()
-    entry = json.loads((ROOT / "SlicerUSSim.json").read_text())
-    assert entry["category"] == record["EXTENSION_CATEGORY"][0]
-    assert entry["scm_url"] == record["EXTENSION_HOMEPAGE"][0] + ".git"
-
-
-def test_the_built_module_simulates_with_its_own_kernels(build):
-    pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
-    pytest.importorskip("PySide6", reason="the panel is tested on Qt for Python: pip install PySide6-Essentials")
-    code = f"""
-        import os, sys
-        from pathlib import Path
-        os.environ["QT_QPA_PLATFORM"] = "offscreen"
-        from tests import slicer_stand_in as stand_in
-        stand_in.MODULE_FILE = Path({str(build / MODULES / "SlicerUSSim.py")!r})
-        stand_in.start()
-        for name in [name for name in sys.modules if name.split(".")[0] == "SlicerUSSim"]:
-            del sys.modules[name]
-        module = stand_in.load_module()
-        import slicer
-        slicer.mrmlScene = slicer.vtkMRMLScene()
-        module.SlicerUSSimTest().runTest()
-        from SlicerUSSim.Logic.opencl.device import kernel_folder
-        assert kernel_folder() == stand_in.MODULE_FILE.parent / "kernels", kernel_folder()
-        print("fine")
-    """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0 and done.stdout.strip().endswith("fine"), done.stderr[-2000:]
+    assert Path(record["EXTENSION_LICENSE_FILE"][0]).exists() and Path(record["EXTENSION_README_FILE"][0]).exists()
+    assert entry()["category"] == record["EXTENSION_CATEGORY"][0]
+    assert entry()["scm_url"] == record["EXTENSION_HOMEPAGE"][0] + ".git"
+    assert record["EXTENSION_DEPENDS"] == ["NA"] and entry()["build_dependencies"] == []

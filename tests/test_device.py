@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import LinearProbe, SimulationError, UltrasoundSimulator, list_devices
+from SlicerUSSim.Logic.opencl import runtimes
 from SlicerUSSim.Logic.opencl.device import Device, kernel_folder
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device, faster_hint
 from SlicerUSSim.Logic.opencl.pocl import require_linker
+from SlicerUSSim.Logic.opencl.runtimes import register_pip_runtimes
 from tests.conftest import SPECKLE, block, rigid, simulator
 
 
@@ -59,16 +62,82 @@ def test_an_unknown_choice_lists_what_there_is(three_devices, monkeypatch):
         choose_device()
 
 
-def test_no_device_says_what_to_install(monkeypatch):
+@pytest.mark.parametrize(
+    ("system", "machine", "advice", "hint"),
+    [
+        (
+            "linux", "x86_64",
+            "run: pip install pocl-binary-distribution (or, faster: pip install intel-opencl-rt intel-cmplr-lib-rt)",
+            "pip install intel-opencl-rt intel-cmplr-lib-rt",
+        ),
+        (
+            "linux", "aarch64",
+            "install the system's OpenCL runtime; on Debian and Ubuntu run: sudo apt-get install pocl-opencl-icd", None,
+        ),
+        (
+            "win32", "AMD64", "install the graphics driver, or for the processor run: pip install intel-opencl-rt",
+            "pip install intel-opencl-rt",
+        ),
+        ("win32", "ARM64", "install the graphics driver", None),
+        ("darwin", "arm64", "install the graphics driver", None),
+    ],
+)  # fmt: skip
+def test_what_to_install_is_what_there_is_for_the_computer(monkeypatch, system, machine, advice, hint):
+    """Packages that pip finds, and no extra of this package, which is not published."""
     monkeypatch.setattr("SlicerUSSim.Logic.opencl.devices.list_devices", lambda: [])
-    with pytest.raises(SimulationError, match=r"pip install pocl-binary-distribution.*graphics driver"):
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    with pytest.raises(SimulationError) as caught:
         choose_device()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="Intel's runtime from pip is for Linux")
-def test_only_a_slow_device_gets_a_hint():
-    assert "intel" in faster_hint(POCL)
+    assert str(caught.value) == f"no OpenCL device found; {advice}"
+    assert faster_hint(POCL) == hint  # only a slow device gets one
     assert faster_hint(INTEL) is None and faster_hint(GPU) is None
+
+
+@pytest.fixture
+def intels_wheel(tmp_path, monkeypatch):
+    """Intel's wheel as pip installs it on Windows: the library in the prefix, its path from site-packages on record."""
+    library = tmp_path / "Library" / "bin" / "intelocl64.dll"
+    record = tmp_path / "Lib" / "site-packages" / "intel_opencl_rt-2026.2.0.dist-info"
+    for folder in (library.parent, record):
+        folder.mkdir(parents=True)
+    library.write_bytes(b"")
+    (record / "METADATA").write_text("Metadata-Version: 2.1\nName: intel-opencl-rt\nVersion: 2026.2.0\n")
+    (record / "RECORD").write_text("../../Library/bin/common_clang64.dll,,\n../../Library/bin/intelocl64.dll,,\n")
+    monkeypatch.setattr(sys, "path", [str(record.parent)])
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setenv("OCL_ICD_FILENAMES", "")
+    return library
+
+
+@pytest.mark.parametrize(("before", "after"), [("", "{0}"), ("C:\\own.dll", "C:\\own.dll;{0}"), ("{0}", "{0}")])
+def test_on_windows_intels_wheel_is_named_to_the_loader(intels_wheel, monkeypatch, before, after):
+    """OCL_ICD_FILENAMES, paths with ; between them. Untested on Windows itself."""
+    monkeypatch.setenv("OCL_ICD_FILENAMES", before.format(intels_wheel))
+    register_pip_runtimes()
+    assert os.environ["OCL_ICD_FILENAMES"] == after.format(intels_wheel)
+
+
+def test_on_windows_nothing_is_named_that_is_not_there(intels_wheel):
+    intels_wheel.unlink()
+    register_pip_runtimes()
+    assert os.environ["OCL_ICD_FILENAMES"] == ""
+
+
+def test_runtimes_are_named_before_pyopencl_is_imported(monkeypatch):
+    """Its loader reads the environment once."""
+    imported = []
+
+    def remember() -> None:
+        imported.append("pyopencl" in sys.modules)
+
+    for name in [name for name in sys.modules if name.split(".")[0] == "pyopencl"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pyopencl._cl", None)  # which may be loaded once per process
+    monkeypatch.setattr(runtimes, "register_pip_runtimes", remember)
+    with pytest.raises(SimulationError, match="pyopencl cannot be imported"):
+        runtimes.load_pyopencl.__wrapped__()
+    assert imported == [False]
 
 
 def test_kernels_are_built_once_and_cached():

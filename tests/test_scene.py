@@ -683,8 +683,8 @@ def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
     parameters.labels = bench.labels
     parameters.thin_sulci = False
     parameters.classes = 4
-    node = bench.scene.GetSingletonNode("SlicerUSSim", "vtkMRMLScriptedModuleNode")
-    assert node is parameters.node and node.GetAttribute("ModuleName") == "SlicerUSSim"
+    node = bench.scene.GetSingletonNode("USSim", "vtkMRMLScriptedModuleNode")
+    assert node is parameters.node and node.GetAttribute("ModuleName") == "USSim"
     assert node.GetNodeReference("labels") is bench.labels and node.HasParameter("labels")
     assert node.GetParameter("thin_sulci") == "False" and node.GetParameter("classes") == "4"
     assert json.loads(node.GetParameter("preset"))["display"]["image_size"] == [96, 64]

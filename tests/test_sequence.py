@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -287,6 +289,22 @@ def test_minc1_is_read_with_its_place(tmp_path):
     (tmp_path / "broken.mnc").write_bytes((tmp_path / "volume.mnc").read_bytes()[:60])
     with pytest.raises(SimulationError, match=r"broken\.mnc: cannot be read as MINC 1"):
         Volume.read(tmp_path / "broken.mnc")
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "distribution"), [("s.seq.nrrd", "nrrd", "pynrrd"), ("slice.mnc", "nibabel", "nibabel")]
+)
+def test_a_package_that_only_some_files_need_is_named_where_it_is_missing(
+    tmp_path, monkeypatch, name, module, distribution
+):
+    """3D Slicer's Python has neither, and the module for Slicer does not install them."""
+    write_minc1(tmp_path / "slice.mnc", np.ones((1, 4, 4)), (0, 0, 0), (1, 1, 1), np.eye(3))
+    (tmp_path / "s.seq.nrrd").write_text("NRRD0004\n")
+    monkeypatch.setitem(sys.modules, module, None)
+    read = TrackedSequence.read if module == "nrrd" else Volume.read
+    wanted = f"needs {distribution}; install it with: pip install {distribution}"
+    with pytest.raises(SimulationError, match=f"{re.escape(name)}: .* {wanted}$"):
+        read(tmp_path / name)
 
 
 def test_minc_slices_become_a_sequence(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
+import importlib.metadata
 import json
 import os
 import pkgutil
@@ -12,6 +12,7 @@ import subprocess
 import sys
 import textwrap
 import time
+import types
 import typing
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -25,24 +26,29 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 pytest.importorskip("PySide6", reason="the panel is tested on Qt for Python: pip install PySide6-Essentials")
 
 from tests import slicer_stand_in as stand_in  # noqa: E402
+from tests.slicer_factory import load_source_as_module  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
-UI_FILE = ROOT / "SlicerUSSim" / "Resources" / "UI" / "SlicerUSSim.ui"
+MODULE_FILE = ROOT / "SlicerUSSim" / "USSim.py"
+RESOURCES = ROOT / "SlicerUSSim" / "Resources"
+UI_FILE = RESOURCES / "UI" / "USSim.ui"
+#: What Slicer gets of the package
+PACKAGES = ("Logic", "Widget")
 
 
 @pytest.fixture(scope="module")
 def module():
-    """SlicerUSSim.py, loaded as Slicer does; afterwards everything is imported as it was."""
+    """USSim.py, loaded as Slicer does; afterwards everything is imported as it was."""
     before = dict(sys.modules)
     own = slicer.__dict__.copy(), slicer.util.__dict__.copy()
     app = stand_in.start()
     for name in [name for name in sys.modules if name.split(".")[0] == "SlicerUSSim"]:
         del sys.modules[name]
-    loaded = stand_in.load_module()
+    loaded = load_source_as_module("USSim", MODULE_FILE)
     loaded.app = app
     yield loaded
     for name in set(sys.modules) - set(before):
-        if name.split(".")[0] in ("SlicerUSSim", "qt") or name.startswith("slicer."):
+        if name.split(".")[0] in ("USSim", "SlicerUSSim", "qt") or name.startswith("slicer."):
             del sys.modules[name]
     sys.modules.update(before)
     for target, values in zip((slicer, slicer.util), own, strict=True):
@@ -68,7 +74,7 @@ class Session:
         stand_in.QtWidgets.QVBoxLayout(parent)
         parent.isEntered = True
         self.parent = parent
-        self.widget = module.SlicerUSSimWidget(parent)
+        self.widget = module.USSimWidget(parent)
         self.widget.setup()
         self.widget.enter()
         self.ui, self.panel = self.widget.ui, self.widget.panel
@@ -81,7 +87,7 @@ class Session:
     def head(self):
         """A small head, as loading an MRI would add it."""
         node = self.add("ScalarVolume", "Head")
-        self.logic_module("scene_nodes").write_volume(node, self.logic_module("phantoms").head_mri(3.0))
+        self.logic_module("mrml.nodes").write_volume(node, self.logic_module("mri.samples").head_mri(3.0))
         return node
 
     def segmented(self):
@@ -116,6 +122,12 @@ class Session:
 
 
 @pytest.fixture
+def simulation_error(module):
+    """The class as the module imported it, whatever else is imported under that name."""
+    return lambda: importlib.import_module("SlicerUSSim.Logic.base.errors").SimulationError
+
+
+@pytest.fixture
 def session(module):
     result = Session(module)
     yield result
@@ -125,46 +137,40 @@ def session(module):
 # ---- loading ---------------------------------------------------------------------------------------------------------
 
 
-def test_every_submodule_imports_from_the_module_slicer_loaded(module):
-    assert module.__file__.endswith("SlicerUSSim.py") and sys.modules["SlicerUSSim"] is module
-    found = [info.name for info in pkgutil.walk_packages(module.__path__, "SlicerUSSim.")]
-    names = [name for name in found if ".Command" not in name and name != "SlicerUSSim.SlicerUSSim"]
-    assert len(names) > 35 and "SlicerUSSim.Logic.mrml.logic" in names and "SlicerUSSim.Widget.panel" in names
-    for name in names:
-        assert importlib.import_module(name).__file__.startswith(module.__path__[0]), name
-
-
-def test_the_module_folder_holds_no_file_that_slicer_would_take_for_a_module():
-    """Slicer runs every .py file beside a module; __main__.py would replace its own main module and quit."""
-    assert {path.name for path in (ROOT / "SlicerUSSim").glob("*.py")} == {"SlicerUSSim.py", "__init__.py"}
-
-
-def test_slicer_may_try_the_packages_own_file_as_a_module():
-    """It finds no module in it, and says so; nothing else may happen."""
-    spec = importlib.util.spec_from_file_location("__init__", ROOT / "SlicerUSSim" / "__init__.py")
-    tried = importlib.util.module_from_spec(spec)
-    before = list(sys.path)
-    spec.loader.exec_module(tried)
-    assert sys.path == before and not hasattr(tried, "__path__")
+def test_every_submodule_imports_from_the_package_of_the_module(module):
+    package = sys.modules["SlicerUSSim"]
+    assert list(package.__path__) == [str(MODULE_FILE.parent)] and not getattr(package, "__file__", None)
+    imported = []
+    for folder in PACKAGES:
+        for info in pkgutil.walk_packages([str(MODULE_FILE.parent / folder)], f"SlicerUSSim.{folder}."):
+            imported.append(Path(importlib.import_module(info.name).__file__))
+    assert len(imported) > 70 and all(file.is_relative_to(MODULE_FILE.parent) for file in imported)
 
 
 def test_start_up_imports_nothing_that_takes_time_or_may_be_missing():
     code = """
         import os, sys
+        from importlib import metadata
         os.environ["QT_QPA_PLATFORM"] = "offscreen"
-        missing = ("pyopencl", "nlopt", "skimage", "platformdirs", "PIL", "tqdm", "click", "matplotlib", "nilearn")
+        missing = ("pyopencl", "nlopt", "skimage", "platformdirs", "PIL", "tqdm", "click", "matplotlib", "nilearn",
+                   "nrrd", "nibabel")
         class Finder:
             def find_spec(self, name, path=None, target=None):
                 if name.split(".")[0] in missing:
                     raise ImportError(name)
         sys.meta_path.insert(0, Finder())
-        from tests import slicer_stand_in as stand_in
+        from tests import slicer_stand_in as stand_in, test_slicer_module as tests
         app = stand_in.start()
-        module = stand_in.load_module()
+        real = metadata.version
+        def version(name):         # as if they had never been installed
+            if name in ("pyopencl", "scikit-image") and not app.installed:
+                raise metadata.PackageNotFoundError(name)
+            return real(name)
+        metadata.version = version
+        module = tests.load_source_as_module("USSim", tests.MODULE_FILE)
         assert not any(name.startswith(("SlicerUSSim.", "scipy")) for name in sys.modules), "imported at start-up"
-        from tests.test_slicer_module import Session
         module.app = app
-        session = Session(module)          # the panel opens all the same
+        session = tests.Session(module)    # the panel opens all the same
         assert not session.app.errors
         session.parameters.mri = session.head()
         app.answer = False                 # the user does not want the packages
@@ -173,31 +179,17 @@ def test_start_up_imports_nothing_that_takes_time_or_may_be_missing():
             "SlicerUSSim needs Python packages that are not installed (the installation was declined)"
         ], session.app.errors
         assert "pyopencl" in app.questions[0] and not app.installed
-        app.answer = True
+        app.testing, app.answer = True, False    # Slicer's message boxes then answer themselves
+        module.USSimTest().runTest()
+        assert "Test skipped" in app.shown[-1] and "pyopencl" in app.shown[-1] and not app.installed, app.shown
+        app.testing, app.answer = False, True
         module.ensurePackages()
-        assert any(name.startswith("pyopencl") for name in app.installed), app.installed
+        assert app.installed == ["pyopencl>=2023.1", "scikit-image>=0.22"], app.installed
+        assert "numpy==" + real("numpy") in app.constraints.splitlines()
         print("fine")
     """
-    # Without the distributions' metadata: as if they had never been installed.
-    hide = """
-        import importlib.metadata as metadata
-        real = metadata.version
-        def version(name):
-            if name in ("pyopencl", "scikit-image"):
-                raise metadata.PackageNotFoundError(name)
-            return real(name)
-        metadata.version = version
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(hide) + textwrap.dedent(code)], capture_output=True, text=True, cwd=ROOT
-    )
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0 and done.stdout.strip().endswith("fine"), done.stderr[-2000:]
-
-
-def test_packages_are_installed_once_and_only_if_missing(module):
-    module.app.installed.clear()
-    module.ensurePackages()
-    assert not module.app.installed  # everything is here
 
 
 def test_requirements_are_those_of_the_package_without_what_slicer_brings():
@@ -205,11 +197,13 @@ def test_requirements_are_those_of_the_package_without_what_slicer_brings():
     package = {
         _distribution(r) for r in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     }
-    lines = (ROOT / "SlicerUSSim" / "Resources" / "requirements.txt").read_text().splitlines()
+    lines = (RESOURCES / "USSim" / "requirements.txt").read_text().splitlines()
     module = {_distribution(line) for line in lines if line and not line.startswith("#")}
     in_slicer = {"numpy", "vtk", "simpleitk"}
     for_the_command = {"click", "tqdm", "pillow"}
-    assert module == {entry for entry in package if entry[0] not in in_slicer | for_the_command}
+    for_files_that_slicer_reads_itself = {"nibabel", "pynrrd"}
+    left_out = in_slicer | for_the_command | for_files_that_slicer_reads_itself
+    assert module == {entry for entry in package if entry[0] not in left_out}
 
 
 def _distribution(requirement: str) -> tuple[str, str]:
@@ -219,13 +213,13 @@ def _distribution(requirement: str) -> tuple[str, str]:
 
 def test_the_module_describes_itself(module):
     class Parent:
-        path = str(stand_in.MODULE_FILE)
+        path = str(MODULE_FILE)
 
-    described = module.SlicerUSSim(Parent())
+    described = module.USSim(Parent())
     parent = described.parent
     assert parent.title and parent.categories == ["Ultrasound"] and "Salehi" in parent.acknowledgementText
     assert "MRI" in parent.helpText and "<a href=" in parent.helpText
-    assert (ROOT / "SlicerUSSim" / "Resources" / "Icons" / "SlicerUSSim.png").exists()
+    assert (RESOURCES / "Icons" / "USSim.png").exists()
 
 
 def test_sample_data_is_registered_with_a_checksum_and_a_thumbnail(module, monkeypatch):
@@ -250,7 +244,7 @@ def test_sample_data_is_registered_with_a_checksum_and_a_thumbnail(module, monke
 
 
 def test_the_parameter_node_is_the_scenes(module):
-    hints = typing.get_type_hints(module.SlicerUSSimParameterNode)
+    hints = typing.get_type_hints(module.USSimParameterNode)
     parameters = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node")
     assert set(hints) == {*parameters.NODE_PARAMETERS, *parameters.VALUE_PARAMETERS}
     for name, default in parameters.VALUE_PARAMETERS.items():
@@ -261,8 +255,13 @@ def test_the_parameter_node_is_the_scenes(module):
 
 
 def test_the_modules_own_test_passes(module):
+    module.app.testing = True
     slicer.mrmlScene = slicer.vtkMRMLScene()
-    module.SlicerUSSimTest().runTest()
+    try:
+        module.USSimTest().runTest()
+    finally:
+        module.app.testing = False
+    assert module.app.shown[-1] == "Test passed"
 
 
 # ---- the .ui file ----------------------------------------------------------------------------------------------------
@@ -277,7 +276,7 @@ def ui(module):
 
 
 def test_every_widget_the_code_names_is_in_the_ui_file(ui):
-    for file in (ROOT / "SlicerUSSim" / "Widget" / "panel.py", ROOT / "SlicerUSSim" / "SlicerUSSim.py"):
+    for file in (ROOT / "SlicerUSSim" / "Widget" / "panel.py", MODULE_FILE):
         names = set(re.findall(r"\bui\.(\w+)", file.read_text()))
         missing = {name for name in names if not hasattr(ui, name)} - {"__dict__"}
         assert not missing, file.name
@@ -557,9 +556,9 @@ def with_real_image(session, gain_db: float = 9.0):
     session.logic.preset = preset.changed("display", gain_db=gain_db).changed("settings", seed=77)
     session.ui.simulateButton.click()
     real = session.add("ScalarVolume", "Real")
-    module = session.logic_module("scene_nodes")
+    module = session.logic_module("mrml.nodes")
     shown = module.read_volume(session.parameters.output)
-    volume = session.logic_module("volume").Volume
+    volume = session.logic_module("base.volume").Volume
     place = module.node_to_world(session.parameters.output) @ shown.ijk_to_ras
     module.write_volume(real, volume(shown.array.copy(), place))
     session.logic.preset = preset
@@ -674,10 +673,10 @@ def test_reloading_the_module_brings_new_code(module):
     scene_before = sys.modules.get("SlicerUSSim.Logic.mrml.logic") or importlib.import_module(
         "SlicerUSSim.Logic.mrml.logic"
     )
-    again = stand_in.load_module()
+    again = load_source_as_module("USSim", MODULE_FILE)
     try:
         assert importlib.import_module("SlicerUSSim.Logic.mrml.logic") is not scene_before
-        assert again.SlicerUSSimLogic is not module.SlicerUSSimLogic
+        assert again.USSimLogic is not module.USSimLogic
     finally:
         module.__dict__.update(again.__dict__ | {"app": module.app})
 
@@ -727,11 +726,126 @@ def test_a_probe_that_looks_away_is_told_beside_the_tick_box(session):
     assert "looks past" not in session.ui.statusLabel.text()
 
 
-def test_a_slicer_that_has_pip_ensure_is_left_to_it(module, monkeypatch):
+@pytest.fixture
+def bare_slicer(module, monkeypatch):
+    """A Slicer before 5.11, without pyopencl until pip is asked for it, and with versions of its own."""
+    app = module.app
+    app.installed, app.questions, app.answer = [], [], True
+    versions = {"numpy": "2.0.2", "SimpleITK": "2.5.0", "scipy": "1.14.1"}
+
+    def version(name: str) -> str:
+        if name == "pyopencl" and not app.installed:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return versions.get(name, "9999")
+
+    def distributions():
+        odd = [{"Name": None, "Version": None}, {"Name": "handmade", "Version": "today"}]
+        shadowed = [{"Name": "Numpy", "Version": "1.0"}]  # further behind on sys.path: not what Python imports
+        own = [{"Name": name, "Version": text} for name, text in versions.items()]
+        return [types.SimpleNamespace(metadata=entry) for entry in own + shadowed + odd]
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    monkeypatch.setattr(importlib.metadata, "distributions", distributions)
+    monkeypatch.setitem(sys.modules, "slicer.packaging", None)
+    return types.SimpleNamespace(app=app, versions=versions, ensure=module.ensurePackages)
+
+
+def test_packages_are_installed_without_changing_what_slicer_has(bare_slicer):
+    bare_slicer.ensure()
+    assert bare_slicer.app.installed == ["pyopencl>=2023.1"]
+    assert bare_slicer.app.constraints.splitlines() == ["numpy==2.0.2", "scipy==1.14.1", "simpleitk==2.5.0"]
+    bare_slicer.ensure()
+    assert len(bare_slicer.app.installed) == len(bare_slicer.app.questions) == 1  # all is there
+
+
+def test_a_package_of_slicers_that_is_too_old_is_named_and_left_alone(bare_slicer, simulation_error):
+    bare_slicer.versions["scipy"] = "1.9"
+    message = r'needs scipy>=1.10, and this Slicer has 1.9, .* slicer.util.pip_install\("scipy>=1.10"\)'
+    with pytest.raises(simulation_error(), match=message):
+        bare_slicer.ensure()
+    assert not bare_slicer.app.installed and not bare_slicer.app.questions
+
+
+def test_what_pip_says_is_one_line(bare_slicer, simulation_error, monkeypatch):
+    def fail(arguments):
+        raise RuntimeError("Collecting pyopencl\nERROR: no space left on device\n")
+
+    monkeypatch.setattr(slicer.util, "pip_install", fail)
+    with pytest.raises(simulation_error(), match=r"not installed \(ERROR: no space left on device\)$"):
+        bare_slicer.ensure()
+
+
+def test_a_slicer_that_has_pip_ensure_is_left_to_it(bare_slicer, simulation_error, monkeypatch):
     asked = []
+
+    def pip_ensure(requirements, constraints=None, requester=None):
+        asked.append((requester, list(map(str, requirements)), Path(constraints).read_text()))
+        if not bare_slicer.app.testing:  # where it returns and does nothing
+            bare_slicer.app.installed.append("pyopencl")
+
     packaging = type(sys)("slicer.packaging")
-    packaging.load_requirements = lambda path: [line for line in Path(path).read_text().splitlines() if line[0] != "#"]
-    packaging.pip_ensure = lambda requirements, requester: asked.append((requester, requirements))
+    packaging.pip_ensure = pip_ensure
     monkeypatch.setitem(sys.modules, "slicer.packaging", packaging)
-    module.ensurePackages()
-    assert asked[0][0] == "SlicerUSSim" and any(line.startswith("pyopencl") for line in asked[0][1])
+    monkeypatch.setattr(bare_slicer.app, "testing", True)
+    with pytest.raises(simulation_error(), match=r"not installed \(pyopencl>=2023.1\)"):
+        bare_slicer.ensure()
+    monkeypatch.setattr(bare_slicer.app, "testing", False)
+    bare_slicer.ensure()
+    requester, requirements, constraints = asked[-1]
+    assert requester == "SlicerUSSim" and requirements == ["pyopencl>=2023.1"] and "numpy==2.0.2" in constraints
+
+
+def test_on_windows_without_a_device_intels_runtime_is_offered(bare_slicer, simulation_error, monkeypatch):
+    """Untested on Windows: what is held here is what the module asks and does."""
+    app = bare_slicer.app
+    app.installed = ["pyopencl"]
+    devices = importlib.import_module("SlicerUSSim.Logic.opencl.devices")
+    found, absent = [], ["intel-opencl-rt"]
+    known = importlib.metadata.version
+
+    def version(name: str) -> str:
+        if name in absent:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return known(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    monkeypatch.setattr(devices, "list_devices", lambda: found)
+    bare_slicer.ensure()
+    assert not app.questions  # not where Linux is
+    monkeypatch.setattr(sys, "platform", "win32")
+    app.answer = False
+    bare_slicer.ensure()  # the work goes on, and says that there is no device
+    assert "intel-opencl-rt" in app.questions[0] and app.installed == ["pyopencl"]
+    app.answer = True
+    with pytest.raises(simulation_error(), match="restart Slicer"):
+        bare_slicer.ensure()
+    assert app.installed == ["pyopencl", "intel-opencl-rt"] and "numpy==2.0.2" in app.constraints
+    app.questions.clear()
+    found.append("a device")
+    bare_slicer.ensure()
+    found.clear(), absent.clear()  # installed, and no device all the same
+    bare_slicer.ensure()
+    assert not app.questions
+
+
+def test_a_scene_loaded_while_the_panel_is_open_is_shown(session, tmp_path):
+    session.segmented()
+    session.ui.placeButton.click()
+    session.ui.gainSlider.setValue(9.0)
+    session.parameters.contrast = "t2"
+    session.scene.SetRootDirectory(str(tmp_path))
+    session.scene.SetSaveToXMLString(1)
+    session.scene.Commit()
+    saved = session.scene.GetSceneXMLString()
+    session.scene.Clear(0)
+    session.process()
+    ui = session.ui
+    assert ui.labelsSelector.currentNode() is None and ui.gainSlider.property("value") == 0.0
+    session.scene.SetLoadFromXMLString(1)
+    session.scene.SetSceneXMLString(saved)
+    session.scene.Import()
+    session.process()
+    shown = [ui.mriSelector, ui.labelsSelector, ui.transformSelector]
+    assert [s.currentNode() and s.currentNode().GetName() for s in shown] == ["Head", "Head tissues", "Probe"]
+    assert ui.gainSlider.property("value") == 9.0 and ui.contrastComboBox.currentText() == "t2"
+    assert session.parameters.labels is ui.labelsSelector.currentNode() and not session.app.errors

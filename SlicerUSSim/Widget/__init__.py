@@ -1,1 +1,1 @@
-"""The panel: what it does (presenter.py, no Qt), wired to Slicer (panel.py) and to a browser (browser/)."""
+"""The panel: what it does (presenter.py, no Qt), wired to Slicer (panel.py), and what it needs (packages.py)."""

@@ -1,4 +1,4 @@
-"""Panel: the widgets of Resources/UI/SlicerUSSim.ui, wired to a PanelPresenter. All it decides is how things look.
+"""Panel: the widgets of Resources/UI/USSim.ui, wired to a PanelPresenter. All it decides is how things look.
 
 Widgets are read and written by property() and setProperty(), which PythonQt and other bindings of Qt share.
 """
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import contextmanager
 from typing import Any
 
-from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED
 from SlicerUSSim.Logic.mrml.libraries import slicer
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
@@ -37,7 +37,7 @@ class Panel:
     ----------
     ui : the named widgets, as slicer.util.childWidgetVariables gives them.
     logic : UltrasoundSceneLogic of the scene.
-    ensure_packages : called before the first work that needs them; raises RuntimeError if the user does not want them.
+    ensure_packages : called before work that needs them; raises SimulationError if they are not there then.
     """
 
     def __init__(self, ui, logic: UltrasoundSceneLogic, ensure_packages: Callable[[], None]) -> None:
@@ -181,8 +181,8 @@ class Panel:
     def _with_packages(self, action: Callable[[], None]) -> None:
         try:
             self._ensure_packages()
-        except Exception as error:  # declined, or pip failed: whatever it was, it is one line to the user
-            self.showError(f"SlicerUSSim needs Python packages that are not installed ({error})")
+        except SimulationError as error:
+            self.showError(str(error))
             self.refresh()
             return
         action()

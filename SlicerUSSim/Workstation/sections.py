@@ -1,4 +1,4 @@
-"""What the panel consists of, read from Resources/UI/SlicerUSSim.ui.
+"""What the panel consists of, read from Resources/UI/USSim.ui.
 
 Slicer shows that file with Qt, the browser what is read here in HTML: the same sections with the same labels, tips,
 ranges and units, from one file that Qt Designer edits.
@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
 
-_UI_FILE = Path(__file__).parents[1] / "Resources" / "UI" / "SlicerUSSim.ui"
+_UI_FILE = Path(__file__).parents[1] / "Resources" / "UI" / "USSim.ui"
 
 #: Kinds of controls, by widget class.
 _KINDS = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,6 +27,12 @@ def require(condition: bool, message: str) -> None:
     """Raise SimulationError(message) unless `condition` holds."""
     if not condition:
         raise SimulationError(message)
+
+
+def require_package(module: str, distribution: str, purpose: str) -> None:
+    """Raise SimulationError, saying what to install, if `module`, which is in a pip `distribution`, is missing."""
+    if importlib.util.find_spec(module) is None:
+        raise SimulationError(f"{purpose} needs {distribution}; install it with: pip install {distribution}")
 
 
 def require_between(owner: str, name: str, value: float, low: float, high: float) -> None:

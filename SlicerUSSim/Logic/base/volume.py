@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
 
@@ -247,6 +247,7 @@ def is_minc1(path: Path) -> bool:
 
 
 def _read_minc1(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    require_package("nibabel", "nibabel", f"{path}: reading MINC 1")
     import nibabel
 
     try:

@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
-MODULE_NAME = "SlicerUSSim"
+MODULE_NAME = "USSim"
 T = TypeVar("T", str, bool, int)
 
 

@@ -8,14 +8,16 @@ notation or part of a device or platform name).
 from __future__ import annotations
 
 import os
+import platform
 import sys
 from dataclasses import dataclass, field
 
 from SlicerUSSim.Logic.base.errors import SimulationError
-from SlicerUSSim.Logic.opencl.runtimes import load_pyopencl
+from SlicerUSSim.Logic.opencl.runtimes import INTEL_RUNTIME, load_pyopencl
 
 _EMULATOR_RANK = 9
-INTEL_HINT = 'pip install "SlicerUSSim[intel]"'
+#: What pip installs of Intel's runtime for processors, by sys.platform; there are wheels for x86-64 only.
+_INTEL_PACKAGES = {"linux": f"{INTEL_RUNTIME} intel-cmplr-lib-rt", "win32": INTEL_RUNTIME}
 
 
 @dataclass(frozen=True)
@@ -105,10 +107,7 @@ def choose_device(device: str | DeviceInfo | None = None) -> tuple[DeviceInfo, s
         return device, "chosen by argument"
     devices = list_devices()
     if not devices:
-        raise SimulationError(
-            "no OpenCL device found; on Linux run: pip install pocl-binary-distribution (or, faster: "
-            f"{INTEL_HINT}); on Windows and macOS install the graphics driver"
-        )
+        raise SimulationError(f"no OpenCL device found; {_how_to_get_one()}")
     for choice, source in (
         (device, "argument"),
         (os.environ.get("PYOPENCL_CTX"), "PYOPENCL_CTX"),
@@ -141,6 +140,23 @@ def devices_to_measure(device: str | None = None) -> list[DeviceInfo]:
 
 def faster_hint(device: DeviceInfo) -> str | None:
     """The one pip line that would give a faster device than `device` on this computer, or None."""
-    if device.kind == "CPU" and "Intel" not in device.platform and sys.platform == "linux":
-        return INTEL_HINT
-    return None
+    return _intel_hint() if device.kind == "CPU" and "Intel" not in device.platform else None
+
+
+def _intel_hint() -> str | None:
+    packages = _INTEL_PACKAGES.get(sys.platform)
+    return None if packages is None or not _is_x86_64() else f"pip install {packages}"
+
+
+def _is_x86_64() -> bool:
+    return platform.machine().lower() in ("x86_64", "amd64")
+
+
+def _how_to_get_one() -> str:
+    """What to do on this computer to get an OpenCL device; it names nothing that pip could not find."""
+    if sys.platform == "linux" and _is_x86_64():
+        return f"run: pip install pocl-binary-distribution (or, faster: {_intel_hint()})"
+    if sys.platform == "linux":
+        return "install the system's OpenCL runtime; on Debian and Ubuntu run: sudo apt-get install pocl-opencl-icd"
+    intel = _intel_hint()
+    return "install the graphics driver" + ("" if intel is None else f", or for the processor run: {intel}")

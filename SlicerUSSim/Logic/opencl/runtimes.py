@@ -1,9 +1,14 @@
-"""pyopencl, with every OpenCL runtime that pip installed made known to its loader."""
+"""pyopencl, with every OpenCL runtime that pip installed made known to its loader.
+
+A driver registers its runtime with the system; a wheel cannot, so its library is named to the loader here, before
+pyopencl is imported: in a folder of .icd files on Linux, in OCL_ICD_FILENAMES on Windows (untested there).
+"""
 
 from __future__ import annotations
 
 import importlib.metadata
 import os
+import re
 import sys
 import zlib
 from functools import lru_cache
@@ -11,12 +16,15 @@ from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 
+#: The distribution of Intel's runtime for processors
+INTEL_RUNTIME = "intel-opencl-rt"
+
 
 @lru_cache(maxsize=1)
 def load_pyopencl():
     """Import pyopencl with every installed runtime visible to its ICD loader, or say what to install."""
-    if "pyopencl" not in sys.modules and sys.platform == "linux" and "OCL_ICD_VENDORS" not in os.environ:
-        _register_pip_runtimes()
+    if "pyopencl" not in sys.modules:
+        register_pip_runtimes()
     try:
         import pyopencl
     except ImportError as error:
@@ -24,7 +32,30 @@ def load_pyopencl():
     return pyopencl
 
 
-def _register_pip_runtimes() -> None:
+def register_pip_runtimes() -> None:
+    """Name the runtimes that pip installed to the ICD loader, in the environment of this process."""
+    if sys.platform == "linux" and "OCL_ICD_VENDORS" not in os.environ:
+        _point_at_vendors_folder()
+    elif sys.platform == "win32":
+        _add_to_icd_filenames()
+
+
+def _add_to_icd_filenames() -> None:
+    """Add Intel's library to the variable that Khronos' loader, the one in pyopencl's wheels, reads on Windows.
+
+    The loader takes paths with ; between them, before the registry's drivers, and searches a library's own folder for
+    what that library needs. It ignores the variable in programs that run as administrator. Source: icd.c and windows/*
+    of KhronosGroup/OpenCL-ICD-Loader. Untested on Windows.
+    """
+    library = _library_of(INTEL_RUNTIME, r"intelocl64\.dll")
+    if library is None:
+        return
+    named = [path for path in os.environ.get("OCL_ICD_FILENAMES", "").split(";") if path]
+    if str(library) not in named:
+        os.environ["OCL_ICD_FILENAMES"] = ";".join([*named, str(library)])
+
+
+def _point_at_vendors_folder() -> None:
     """Point the ICD loader at a folder that names every runtime by absolute path.
 
     Intel's wheel ships an .icd file with a placeholder path, and OCL_ICD_VENDORS *replaces* the loader's own folders,
@@ -32,8 +63,8 @@ def _register_pip_runtimes() -> None:
     """
     libraries = {}
     for name, distribution, pattern in (
-        ("intel", "intel-opencl-rt", "libintelocl.so"),
-        ("pocl", "pocl-binary-distribution", "libpocl-"),
+        ("intel", INTEL_RUNTIME, r"libintelocl\.so.*"),
+        ("pocl", "pocl-binary-distribution", r"libpocl-.*\.so.*"),
     ):
         library = _library_of(distribution, pattern)
         if library is not None:
@@ -61,12 +92,13 @@ def _register_pip_runtimes() -> None:
 
 
 def _library_of(distribution: str, pattern: str) -> Path | None:
+    """The first file of an installed distribution whose name is like `pattern`."""
     try:
         files = importlib.metadata.files(distribution) or []
     except importlib.metadata.PackageNotFoundError:
         return None
     for file in files:
-        if file.name.startswith(pattern) and ".so" in file.name and not file.name.endswith((".py", ".pyc")):
+        if re.fullmatch(pattern, file.name) and not file.name.endswith((".py", ".pyc")):
             path = Path(str(file.locate())).resolve()
             if path.exists():
                 return path

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
@@ -404,6 +404,7 @@ def _write_metaimage(path: Path, images: np.ndarray, header: Mapping[str, str], 
 
 
 def _read_nrrd(path: Path) -> tuple[np.ndarray, dict[str, str]]:
+    require_package("nrrd", "pynrrd", f"{path}: reading NRRD sequences")
     import nrrd
 
     try:
@@ -425,6 +426,7 @@ def _read_nrrd(path: Path) -> tuple[np.ndarray, dict[str, str]]:
 
 
 def _write_nrrd(path: Path, images: np.ndarray, header: Mapping[str, str], compress: bool) -> None:
+    require_package("nrrd", "pynrrd", f"{path.name}: writing NRRD sequences")
     import nrrd
 
     fields = {

@@ -1,13 +1,14 @@
-"""What 3D Slicer loads: module, widget, logic and test of the scripted module SlicerUSSim.
+"""What 3D Slicer loads: module, widget, logic and test of the scripted module USSim.
 
-Slicer runs this file under the name `SlicerUSSim`, which is also the package around it. So the file makes itself that
-package: `from SlicerUSSim.Logic import ...` works here as it does after pip. What the module does is in Logic and
-Widget; this file is the part that only exists inside Slicer.
+What the module does is in the package SlicerUSSim, in Logic and Widget; this file is the part that only exists inside
+Slicer.
 """
 
-import os
+import importlib.machinery
+import importlib.util
 import sys
-from importlib.metadata import PackageNotFoundError, version
+import unittest
+from pathlib import Path
 from typing import Annotated
 
 import slicer
@@ -29,19 +30,34 @@ from slicer.ScriptedLoadableModule import (
 from slicer.util import VTKObservationMixin
 
 if sys.version_info < (3, 10):  # noqa: UP036, Slicer runs this file whatever its Python is
-    raise RuntimeError(f"SlicerUSSim needs Slicer 5.10 or newer: Python 3.10, and this is {sys.version.split()[0]}")
+    raise RuntimeError(f"USSim needs Slicer 5.10 or newer: Python 3.10, and this is {sys.version.split()[0]}")
 
-__path__ = [os.path.dirname(os.path.abspath(__file__))]
-# "Reload" runs this file again; the rest of the package has to be new then too.
-for _name in [name for name in sys.modules if name.startswith("SlicerUSSim.")]:
-    del sys.modules[_name]
-
-# Slicer runs this file at start-up; what takes time to import is imported when the module is first used.
-
+_HERE = Path(__file__).absolute().parent
+_RESOURCES = _HERE / "Resources"
 _HOME = "https://github.com/SlicerUSSim/SlicerUSSim"
 
 
-class SlicerUSSim(ScriptedLoadableModule):
+def bindPackage() -> None:
+    """Let `import SlicerUSSim` mean the package that this file belongs to, wherever Python would look for it.
+
+    Slicer puts no more than the folder of this file on sys.path. The package is beside the file where CMake laid it,
+    around it in a checkout and after pip, whatever that folder is called. Python may already have imported another
+    copy, installed with pip, or before "Reload" an older state of this one: none of that stays.
+    """
+    beside = _HERE / "SlicerUSSim"
+    spec = importlib.machinery.ModuleSpec("SlicerUSSim", loader=None, is_package=True)
+    spec.submodule_search_locations = [str(beside if (beside / "Logic").is_dir() else _HERE)]
+    for name in [name for name in sys.modules if name.split(".")[0] == "SlicerUSSim"]:
+        del sys.modules[name]
+    sys.modules["SlicerUSSim"] = importlib.util.module_from_spec(spec)
+
+
+bindPackage()
+
+# Slicer runs this file at start-up; what takes time to import is imported when the module is first used.
+
+
+class USSim(ScriptedLoadableModule):
     """The module as Slicer lists it."""
 
     def __init__(self, parent) -> None:
@@ -70,7 +86,7 @@ def registerSampleData() -> None:
     SampleData.SampleDataLogic.registerCustomSampleDataSource(
         category="Ultrasound Simulator",
         sampleName="MNI152 brain",
-        thumbnailFileName=os.path.join(__path__[0], "Resources", "Icons", "MNI152Brain.png"),
+        thumbnailFileName=str(_RESOURCES / "USSim" / "MNI152Brain.png"),
         uris="https://raw.githubusercontent.com/nilearn/nilearn/59fffa24b81712132c78549c242f68d0f3db8a67/"
         "nilearn/datasets/data/mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz",
         fileNames="mni_icbm152_t1_brain.nii.gz",
@@ -82,40 +98,16 @@ def registerSampleData() -> None:
 def ensurePackages() -> None:
     """Install what Slicer's Python lacks, after asking; on first use, not at start-up.
 
-    Raises RuntimeError if the user declines, and what pip raises if it fails.
+    Raises SimulationError if something is missing then, and after installing what takes effect when Slicer starts anew.
     """
-    requirements = os.path.join(__path__[0], "Resources", "requirements.txt")
-    try:
-        from slicer.packaging import load_requirements, pip_ensure
-    except ImportError:  # before Slicer 5.11
-        _install_missing(requirements)
-    else:
-        pip_ensure(load_requirements(requirements), requester="SlicerUSSim")
+    from SlicerUSSim.Widget.packages import ensure_packages, offer_opencl_runtime
 
-
-def _install_missing(path: str) -> None:
-    from packaging.requirements import Requirement
-
-    with open(path, encoding="utf-8") as file:
-        wanted = [Requirement(line.strip()) for line in file if line.strip() and not line.startswith("#")]
-    missing = []
-    for requirement in wanted:
-        try:
-            here = requirement.specifier.contains(version(requirement.name), prereleases=True)
-        except PackageNotFoundError:
-            here = False
-        if not here and (requirement.marker is None or requirement.marker.evaluate()):
-            missing.append(f"{requirement.name}{requirement.specifier}")
-    if not missing:
-        return
-    question = _("SlicerUSSim needs these Python packages: {names}. Install them now?").format(names=", ".join(missing))
-    if not slicer.util.confirmOkCancelDisplay(question):
-        raise RuntimeError("the installation was declined")
-    slicer.util.pip_install(missing)
+    ensure_packages(_RESOURCES / "USSim" / "requirements.txt")
+    offer_opencl_runtime()
 
 
 @parameterNodeWrapper
-class SlicerUSSimParameterNode:
+class USSimParameterNode:
     """What a scene remembers of the module; the names are those of Logic/mrml/parameter_node.py.
 
     mask and labels may be label maps or segmentations, real a sequence or a volume, which the panel sees to.
@@ -141,7 +133,7 @@ class SlicerUSSimParameterNode:
     fit_evaluations: int = 500
 
 
-class SlicerUSSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
+class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
     """The panel's life in Slicer: it shows the parameters of the scene that is open."""
 
     def __init__(self, parent=None) -> None:
@@ -160,16 +152,19 @@ class SlicerUSSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         except ImportError:  # a Slicer without scipy
             ensurePackages()
             from SlicerUSSim.Widget.panel import Panel
-        widget = slicer.util.loadUI(self.resourcePath("UI/SlicerUSSim.ui"))
+        widget = slicer.util.loadUI(str(_RESOURCES / "UI" / "USSim.ui"))
         self.layout.addWidget(widget)
         self.ui = slicer.util.childWidgetVariables(widget)
         widget.setMRMLScene(slicer.mrmlScene)
-        self.logic = SlicerUSSimLogic()
+        self.logic = USSimLogic()
         self.initializeParameterNode()
         self.panel = Panel(self.ui, self.logic.ultrasound, ensurePackages)
         self.panel.presenter.chooseDefaultNodes()
-        self.addObserver(slicer.mrmlScene, slicer.mrmlScene.StartCloseEvent, self.onSceneStartClose)
-        self.addObserver(slicer.mrmlScene, slicer.mrmlScene.EndCloseEvent, self.onSceneEndClose)
+        scene = slicer.mrmlScene
+        for event in (scene.StartCloseEvent, scene.StartImportEvent):
+            self.addObserver(scene, event, self.onSceneStartChange)
+        for event in (scene.EndCloseEvent, scene.EndImportEvent):
+            self.addObserver(scene, event, self.onSceneEndChange)
 
     def cleanup(self) -> None:
         """Called when the application closes or the module is reloaded."""
@@ -186,12 +181,12 @@ class SlicerUSSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         """Called each time the user opens another module; live update goes on."""
         self.setParameterNode(None)
 
-    def onSceneStartClose(self, caller, event) -> None:
-        """Called just before the scene is closed."""
+    def onSceneStartChange(self, caller, event) -> None:
+        """Called just before the scene is closed, or another is loaded into it: the panel keeps its hands off."""
         self.setParameterNode(None)
 
-    def onSceneEndClose(self, caller, event) -> None:
-        """Called just after the scene is closed."""
+    def onSceneEndChange(self, caller, event) -> None:
+        """Called just after that: the panel shows the parameters that the scene now has."""
         if self.parent.isEntered:
             self.initializeParameterNode()
 
@@ -218,10 +213,10 @@ class SlicerUSSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
             self.panel.presenter.parametersChanged()
 
 
-class SlicerUSSimLogic(ScriptedLoadableModuleLogic):
+class USSimLogic(ScriptedLoadableModuleLogic):
     """`ultrasound` does everything (see Logic/mrml/logic.py); this class gives it to Slicer.
 
-    In scripts: logic = slicer.util.getModuleLogic("SlicerUSSim").ultrasound
+    In scripts: logic = slicer.util.getModuleLogic("USSim").ultrasound
     """
 
     def __init__(self) -> None:
@@ -232,31 +227,39 @@ class SlicerUSSimLogic(ScriptedLoadableModuleLogic):
 
     def getParameterNode(self):
         """The parameters of the scene, typed."""
-        return SlicerUSSimParameterNode(super().getParameterNode())
+        return USSimParameterNode(super().getParameterNode())
 
 
-class SlicerUSSimTest(ScriptedLoadableModuleTest):
+class USSimTest(ScriptedLoadableModuleTest):
     """The whole way in Slicer: phantom head, Segment, place, Live."""
 
     def setUp(self) -> None:
         slicer.mrmlScene.Clear()
 
     def runTest(self) -> None:
+        """What the SelfTests module and the panel's Test button run; CTest runs the test_ methods by itself."""
         self.setUp()
-        self.test_image_follows_probe()
+        try:
+            self.test_image_follows_probe()
+        except unittest.SkipTest as reason:
+            self.delayDisplay(f"Test skipped: {reason}")
 
     def test_image_follows_probe(self) -> None:
-        """An image appears under the probe and follows it."""
+        """An image appears under the probe and follows it. Skipped where packages or an OpenCL device are missing."""
+        from SlicerUSSim.Logic.base.errors import SimulationError
+        from SlicerUSSim.Logic.opencl.devices import choose_device
+
         try:
             ensurePackages()
-        except RuntimeError as error:  # in testing mode Slicer installs nothing
+            choose_device()
+        except SimulationError as error:  # in testing mode Slicer installs nothing
             self.skipTest(str(error))
         from SlicerUSSim.Logic.mri.samples import head_mri
 
         self.delayDisplay("Make a head")
         mri = head_mri(2.0)
         node = slicer.util.addVolumeFromArray(mri.array, mri.ijk_to_ras, "Head")
-        logic = SlicerUSSimLogic().ultrasound
+        logic = USSimLogic().ultrasound
         labels = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Tissues")
         probe = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
         output = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Ultrasound")

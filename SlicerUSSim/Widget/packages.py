@@ -1,0 +1,146 @@
+"""What the module needs and Slicer's Python lacks: found out, asked for, installed.
+
+Nothing that Slicer has is changed by it: pip is given every installed distribution, at its version, as a constraint,
+and finds versions of what is missing that fit, or fails.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+
+import slicer
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import InvalidVersion, Version
+from slicer.i18n import tr as _
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+_NAME = "SlicerUSSim"
+
+
+def ensure_packages(requirements_file: Path) -> None:
+    """Install what is missing of a requirements file, after asking.
+
+    Raises SimulationError if the user declines, if pip fails, if Slicer has a package in a version that will not do,
+    and if something is missing in Slicer's testing mode, in which nothing is installed.
+    """
+    missing = _missing(requirements_file)
+    if not missing:
+        return
+    for requirement in missing:
+        version = _installed_version(requirement.name)
+        require(
+            version is None,
+            f"{_NAME} needs {requirement}, and this Slicer has {version}, which the module leaves as it is; to change "
+            f'it, run slicer.util.pip_install("{requirement}") and restart Slicer',
+        )
+    _ask_and_install(missing)
+    still = _missing(requirements_file)
+    require(not still, _not_installed(", ".join(map(str, still))))
+
+
+def offer_opencl_runtime() -> None:
+    """On Windows without any OpenCL device, offer Intel's runtime, which computes on the processor.
+
+    Untested on Windows. Elsewhere nothing happens: on Linux PoCL is a requirement, and macOS has a runtime of its own.
+    Raises SimulationError if the runtime was installed, since Slicer has to be restarted, and if pip failed.
+    """
+    if sys.platform != "win32" or slicer.app.testingEnabled():
+        return
+    from SlicerUSSim.Logic.opencl.devices import list_devices
+    from SlicerUSSim.Logic.opencl.runtimes import INTEL_RUNTIME
+
+    if _installed_version(INTEL_RUNTIME) is not None or list_devices():
+        return
+    question = _(
+        "{name} found no OpenCL device. The driver of a graphics card brings one. On the processor Intel's runtime "
+        "computes (Python package {package}, 120 MB). Install it now?"
+    )
+    if slicer.util.confirmOkCancelDisplay(question.format(name=_NAME, package=INTEL_RUNTIME)):
+        _install([Requirement(INTEL_RUNTIME)])
+        raise SimulationError("Intel's OpenCL runtime is installed; restart Slicer, which looks for runtimes only once")
+
+
+def _ask_and_install(missing: list[Requirement]) -> None:
+    try:
+        from slicer.packaging import pip_ensure
+    except ImportError:  # before Slicer 5.11
+        names = ", ".join(map(str, missing))
+        require(not slicer.app.testingEnabled(), _not_installed(f"{names}; in testing mode Slicer installs nothing"))
+        question = _("{name} needs these Python packages: {packages}. Install them now?")
+        wanted = slicer.util.confirmOkCancelDisplay(question.format(name=_NAME, packages=names))
+        require(wanted, _not_installed("the installation was declined"))
+        _install(missing)
+        return
+    with _in_one_line(), _constraints_file() as constraints:
+        pip_ensure(missing, constraints=constraints, requester=_NAME)  # in testing mode it does nothing, without a word
+
+
+def _install(missing: list[Requirement]) -> None:
+    with _in_one_line(), _constraints_file() as constraints:
+        slicer.util.pip_install([*map(str, missing), "--constraint", str(constraints)])
+
+
+def _missing(requirements_file: Path) -> list[Requirement]:
+    """What concerns this computer and is not fulfilled, without its condition (the marker)."""
+    lines = [line.strip() for line in requirements_file.read_text(encoding="utf-8").splitlines()]
+    wanted = [Requirement(line) for line in lines if line and not line.startswith("#")]
+    importlib.invalidate_caches()  # pip may just have been at work
+    missing = []
+    for requirement in wanted:
+        version = _installed_version(requirement.name)
+        fulfilled = version is not None and requirement.specifier.contains(version, prereleases=True)
+        if not fulfilled and (requirement.marker is None or requirement.marker.evaluate()):
+            requirement.marker = None
+            missing.append(requirement)
+    return missing
+
+
+def _installed_version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+@contextmanager
+def _constraints_file() -> Iterator[Path]:
+    """A file of pip constraints that keep every distribution of this Python at its version."""
+    versions: dict[str, str] = {}
+    for distribution in metadata.distributions():
+        name, version = distribution.metadata["Name"], distribution.metadata["Version"]
+        if name and _is_version(version):
+            versions.setdefault(canonicalize_name(name), version)  # the first is the one that Python imports
+    with tempfile.TemporaryDirectory(prefix="ussim-") as folder:
+        path = Path(folder) / "constraints.txt"
+        path.write_text("".join(f"{name}=={versions[name]}\n" for name in sorted(versions)), encoding="utf-8")
+        yield path
+
+
+def _is_version(text: str | None) -> bool:
+    """Whether pip takes it for a version; one odd line would make it refuse the whole file."""
+    try:
+        return text is not None and bool(Version(text))
+    except InvalidVersion:
+        return False
+
+
+@contextmanager
+def _in_one_line() -> Iterator[None]:
+    """Whatever goes wrong in Slicer's installer is one line to the user."""
+    try:
+        yield
+    except Exception as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise SimulationError(_not_installed(lines[-1])) from error
+
+
+def _not_installed(reason: str) -> str:
+    return f"{_NAME} needs Python packages that are not installed ({reason})"
