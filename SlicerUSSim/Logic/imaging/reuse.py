@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
@@ -25,7 +25,7 @@ class ReusedSimulator:
         labels: Callable[[], Volume],
         tissues: TissueTable,
         settings: SimulationSettings,
-        device: str | Device | None = None,
+        device: DeviceChoice = None,
         texture: Texture | None = None,
     ) -> UltrasoundSimulator:
         """A simulator for these inputs; `labels` is asked for the label map only if `labels_version` is a new one.

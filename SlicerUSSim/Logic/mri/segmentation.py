@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.errors import require, require_between
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.guided_filter import guided_filter
 from SlicerUSSim.Logic.mri.mixture import classify, fit_mixture, mixture_posteriors
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
 
 #: Tissue names per contrast and number of classes, in the order of intensity.
@@ -90,7 +90,7 @@ def segment_mri(
     filter_epsilon: float | None = None,
     bias_correction: bool = False,
     thin_sulci: bool = False,
-    device: str | Device | None = None,
+    device: DeviceChoice = None,
     progress: Callable[[float], None] | None = None,
 ) -> Segmentation:
     """Label the tissues of a brain MRI by intensity.

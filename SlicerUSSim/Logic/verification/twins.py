@@ -15,7 +15,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.probe.arrays import PhasedProbe, Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, sample, surface_point, tilt_sweep
@@ -71,7 +71,7 @@ def make_twin(
     crossing: bool = False,
     display: DisplaySettings | None = None,
     display_is_known: bool = False,
-    device: str | Device | None = None,
+    device: DeviceChoice = None,
 ) -> Twin:
     """Patient number `seed` on true `labels` (1 is CSF), seen in `frames` images of a tilted probe.
 
