@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
+from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 

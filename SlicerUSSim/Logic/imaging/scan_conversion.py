@@ -26,9 +26,7 @@ class ScanConverter:
         self.grid: ImageGrid
         self.image: Buffer
 
-    def run(
-        self, acquisition_buffer: Buffer, acquisition: np.ndarray, grid: ImageGrid, lines: Compressor
-    ) -> None:
+    def run(self, acquisition_buffer: Buffer, acquisition: np.ndarray, grid: ImageGrid, lines: Compressor) -> None:
         """Enqueue the conversion of one frame."""
         self.grid = grid
         self.image = self.workspace.get("image", grid.rows * grid.columns)

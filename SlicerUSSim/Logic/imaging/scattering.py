@@ -112,9 +112,7 @@ class LateralBeam:
         self.device = device
         self.kernel = device.kernels("beam.cl", device.lanes)["lateral_beam"]
 
-    def run(
-        self, acquisition_buffer: Buffer, acquisition: np.ndarray, traced: EchoLines, scanned: EchoLines
-    ) -> None:
+    def run(self, acquisition_buffer: Buffer, acquisition: np.ndarray, traced: EchoLines, scanned: EchoLines) -> None:
         """Enqueue the lateral convolution of one frame; it overwrites `scanned`."""
         self.device.run(
             self.kernel,

@@ -7,7 +7,7 @@ Probe frame (millimetres): origin at the centre of the probe face, +x lateral (l
 from __future__ import annotations
 
 from dataclasses import MISSING, asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ NOMINAL_SPEED_M_S = 1540.0
 #: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
 MAIN_LOBE = 1.21
 FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
-#: None stands for a number while a probe is made, and for no longer: hence Any, so that the fields are numbers to readers
+#: None, until the probe knows its depth: Any, since nobody who has a probe meets it
 _BY_DEPTH: Any = None
 
 
@@ -30,14 +30,6 @@ class Probe:
     grows at constant f-number until it is fully open; elevationally the lens focuses both ways at one depth.
     Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
     """
-
-    if TYPE_CHECKING:
-
-        @property
-        def depth_mm(self) -> float:
-            """Depth of the imaged field. A field of each kind, where it can be given by position; none of this class, or
-            it would come before what is a kind's own."""
-            ...
 
     scan_lines: int = 192
     frequency_mhz: float = 5.0
@@ -55,6 +47,8 @@ class Probe:
     elevation_focus_mm: float = _BY_DEPTH
 
     def __post_init__(self) -> None:
+        # A field of each kind, so that it can be given by position after what is the kind's own.
+        self.depth_mm: float
         owner = type(self).__name__
         require_between(owner, "depth_mm", self.depth_mm, 1, 400)
         require_between(owner, "scan_lines", self.scan_lines, 2, 4096)
