@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 
@@ -103,7 +104,8 @@ def test_sweep_draws_the_same_images_on_the_same_pixels(folder):
 
 
 def test_register_moves_the_poses_and_writes_the_transform(folder, monkeypatch):
-    monkeypatch.setattr("SlicerUSSim.Logic.fitting.fit._ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
+    fitting = importlib.import_module("SlicerUSSim.Logic.fitting.fit")
+    monkeypatch.setattr(fitting, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
     done = optimize(
         folder, "--register", "--evaluations", 40, "--restarts", 0, "--free", "display", "--save-transform",
         folder / "moved.json",

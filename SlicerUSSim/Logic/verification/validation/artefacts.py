@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.verification.phantoms import (
     speed_block,
     wires_and_cysts,
 )
-from SlicerUSSim.Logic.verification.validation import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import View, draw_views
 
 _SEARCH_MM = 1.5  # around the predicted place; five times the widest tolerance

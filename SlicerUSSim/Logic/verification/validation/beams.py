@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.verification.phantoms import (
     thin_rod,
     wires_and_cysts,
 )
-from SlicerUSSim.Logic.verification.validation import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_cross_sections, draw_plots
 
 #: A border with FLUID that bends no ray

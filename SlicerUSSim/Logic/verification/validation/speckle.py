@@ -16,7 +16,7 @@ from SlicerUSSim.Logic.probe.placement import elevational_motion
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, fit_rayleigh, level_db
 from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, Phantom, uniform_speckle
-from SlicerUSSim.Logic.verification.validation import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import (
     Curve,
     Plot,
