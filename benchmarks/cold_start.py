@@ -28,7 +28,7 @@ NAMES = ("csf", "grey matter", "white matter")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--json", type=output_file, help="keep the numbers in this file")
     parser.add_argument("--first-frame", metavar="DEVICE", help=argparse.SUPPRESS)
     parser.add_argument("--labels", type=Path, help=argparse.SUPPRESS)

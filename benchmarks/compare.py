@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.verification.benchmark.tables import comparison
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("before", type=result_file)
     parser.add_argument("after", type=result_file)
     arguments = parser.parse_args()

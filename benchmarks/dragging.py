@@ -17,6 +17,7 @@ import sys
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from playwright.sync_api import Page, sync_playwright
@@ -36,7 +37,7 @@ WARM_UP_FRAMES = 300
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--device", action="append", help="as of `ussim devices`; may be repeated (default: each once)")
     parser.add_argument("--seconds", type=float, default=10.0, help="of dragging, in each view")
     parser.add_argument("--frames", type=int, default=2000, help="over which memory is watched; 0: not at all")
@@ -73,7 +74,7 @@ def measured(browser, device: str, seconds: float, frames: int) -> dict:
         page = browser.new_page(viewport={"width": 1500, "height": 900})
         page.goto(url)
         page.wait_for_function("window.ussim && window.ussim.images > 0", timeout=120_000)
-        result = {"usable_s": perf_counter() - start}
+        result: dict[str, Any] = {"usable_s": perf_counter() - start}
         page.wait_for_timeout(2000)
         for name, (number, across, down) in GRIPS.items():
             page.evaluate("window.trame.trigger('press', ['placeButton'])")
@@ -151,6 +152,7 @@ def serving(device: str):
         [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", "0", "--device", device],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
+    assert process.stdout is not None and process.stderr is not None, "both are pipes"
     try:
         url = process.stdout.readline().strip()
         if not url.startswith("http"):

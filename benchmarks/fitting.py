@@ -53,7 +53,7 @@ MEASURES = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("what", choices=["twins", "algorithms", "ablation", "registration", "evaluation"])
     parser.add_argument("--patients", type=int, default=14)
     parser.add_argument("--device")
@@ -190,6 +190,7 @@ def registration(labels: Volume, tissues: TissueTable, patients: int, device) ->
         found = fit(
             twin.simulator, tracked, free=["display", TISSUE], display=twin.display, register=True, restarts=0
         ).registration
+        assert found is not None, "it was asked for"
         left = found.correction @ np.linalg.inv(offset)
         error_mm = float(np.linalg.norm((left @ [*middle, 1.0])[:3] - middle))
         result = {

@@ -15,7 +15,7 @@ from time import perf_counter
 
 import slicer
 
-from SlicerUSSim.Logic import PhasedProbe
+from SlicerUSSim.Logic import PhasedProbe, UltrasoundSimulator
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.mrml import UltrasoundSceneLogic
@@ -26,7 +26,7 @@ PROBE_A = PhasedProbe(75, 73, scan_lines=196)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--repeat", type=int, default=60, help="frames of each kind")
     parser.add_argument("--device", help="see `ussim devices`")
     arguments = parser.parse_args()
@@ -51,17 +51,17 @@ def measure(kind: str, repeat: int, device: str | None) -> tuple[list[float], li
     probe = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
     output = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "Ultrasound")
     outline = scene.AddNewNodeByClass("vtkMRMLModelNode", "Outline")
-    logic.segment(node, labels)
+    segmentation = logic.segment(node, labels)
+    simulator = UltrasoundSimulator(
+        segmentation.labels, logic.preset.tissues.for_names(segmentation.tissue_names), logic.preset.settings, device
+    )
     logic.placeProbe(labels, probe)
     logic.startLiveUpdate(labels, probe, output, outline)
-    labelled = logic._read_labels(labels)
-    simulator = logic._simulator_for(labels, labelled, node_to_world(labels))
     poses = slide_sweep(node_to_world(probe), 10.0, repeat)
     alone, live = [], []
     for pose in poses:
         start = perf_counter()
         simulator.simulate(logic.preset.probe, pose, logic.preset.display)
-        simulator.forget_echoes()  # it is the live update's, too
         middle = perf_counter()
         probe.SetMatrixTransformToParent(vtk_matrix(pose))
         end = perf_counter()

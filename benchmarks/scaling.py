@@ -36,7 +36,7 @@ SIDES = (64, 128, 256, 512)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--device", help="see `ussim devices`")
     parser.add_argument("--out", type=output_file, default=Path("docs/images/scaling.png"))
     parser.add_argument("--json", type=output_file)

@@ -43,7 +43,7 @@ SILENT = Tissue("air-coupled", 1540.0, 1.54, 0.0)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("."))
     arguments = parser.parse_args()
@@ -57,13 +57,16 @@ def main() -> None:
 def fit_speckle(sequence: TrackedSequence):
     """Display and one tissue to the left part of image 20, where the phantom is homogeneous."""
     # The scanner's settings were not recorded; with these speckle is about as large as in the image.
-    beam = {"frequency_mhz": 6.6, "fractional_bandwidth": 0.35, "aperture_mm": 9.0}
-    field = estimate_field(sequence.images, width_mm=WIDTH_MM, scan_lines=256, **beam)
+    field = estimate_field(
+        sequence.images, width_mm=WIDTH_MM, scan_lines=256, frequency_mhz=6.6, fractional_bandwidth=0.35,
+        aperture_mm=9.0,
+    )  # fmt: skip
     window = rows, columns = field.window
     pixel = field.image_to_probe[0, 0], field.image_to_probe[1, 1]
     left, top = (field.image_to_probe @ [columns.start - 0.5, rows.start - 0.5, 0, 1])[:2]
     real = np.ascontiguousarray(sequence.images[20][window])
-    grid = ImageGrid(*real.shape, float(left), float(top), (float(pixel[0]), float(pixel[1])))
+    height, width = real.shape
+    grid = ImageGrid(height, width, float(left), float(top), (float(pixel[0]), float(pixel[1])))
     region = np.zeros(real.shape, bool)
     region[round(8 / pixel[1]) : round(42 / pixel[1]), round(4 / pixel[0]) : round(18 / pixel[0])] = True
     free = {"display": None, "phantom": None, "phantom.attenuation_db_cm_mhz": (0.1, 3.0)}

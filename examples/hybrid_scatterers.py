@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from SlicerUSSim.Logic import SimulationSettings, TissueTable, UltrasoundSimulator, segment_mri
 from SlicerUSSim.Logic.mri import demo_mri
-from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose, slice_under_probe
+from SlicerUSSim.Logic.probe import PROBES, ImageGrid, craniotomy_pose, slice_under_probe
 
 VARIANTS = {
     "labels alone (paper)": {},
@@ -28,7 +28,7 @@ REGION_MM = (-40.0, 40.0, 15.0, 95.0)  # left, right, top, bottom: sulci, ventri
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("-o", "--out", default="hybrid.png")
     parser.add_argument("--patients", type=int, default=24)
     arguments = parser.parse_args()
@@ -46,11 +46,10 @@ def main() -> None:
         images = []
         for seed in range(arguments.patients):
             simulator.settings = replace(simulator.settings, seed=seed)
-            frame = simulator.simulate(probe, pose)
-            images.append(frame.image)
+            images.append(simulator.simulate(probe, pose).image)
         show(axes[0, column], images[0], probe, name)
         show(axes[1, column], np.mean(images, axis=0), probe, "expected level", 30, 150)
-    under = slice_under_probe(mri, frame.grid, pose)
+    under = slice_under_probe(mri, ImageGrid.for_probe(probe, None), pose)
     show(axes[0, 0], 255.0 * under / under.max(), probe, "MRI")
     axes[1, 0].axis("off")
     figure.savefig(arguments.out, dpi=90)

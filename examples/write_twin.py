@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.verification import make_twin
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?", default=Path("ussim-twin"))
     parser.add_argument("--seed", type=int, default=0, help="which patient")
     arguments = parser.parse_args()

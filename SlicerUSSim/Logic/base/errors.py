@@ -6,6 +6,9 @@ import importlib.util
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TypeVar
+
+_T = TypeVar("_T")
 
 
 class SimulationError(Exception):
@@ -23,8 +26,8 @@ class Cancelled(SimulationError):  # noqa: N818, what the user wanted is no erro
         super().__init__("cancelled")
 
 
-def require(condition: bool, message: str) -> None:
-    """Raise SimulationError(message) unless `condition` holds."""
+def require(condition: object, message: str) -> None:
+    """Raise SimulationError(message) unless `condition` is true."""
     if not condition:
         raise SimulationError(message)
 
@@ -33,6 +36,13 @@ def require_package(module: str, distribution: str, purpose: str) -> None:
     """Raise SimulationError, saying what to install, if `module`, which is in a pip `distribution`, is missing."""
     if importlib.util.find_spec(module) is None:
         raise SimulationError(f"{purpose} needs {distribution}; install it with: pip install {distribution}")
+
+
+def required(value: _T | None, message: str) -> _T:
+    """`value`; raises SimulationError(message) where there is none."""
+    if value is None:
+        raise SimulationError(message)
+    return value
 
 
 def require_between(owner: str, name: str, value: float, low: float, high: float) -> None:
@@ -69,7 +79,7 @@ def collected_warnings() -> Iterator[list[Warning]]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield ours
-    ours += [w.message for w in caught if is_our_warning(w.category)]
+    ours += [w.message for w in caught if isinstance(w.message, Warning) and is_our_warning(w.category)]
 
 
 def warn_again(warning: Warning) -> None:

@@ -18,8 +18,9 @@ So one image costs a weighted sum, compression and scan conversion.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.fitting.parameters import SCATTERING
-from SlicerUSSim.Logic.imaging.bmode import Compressor
+from SlicerUSSim.Logic.imaging.bmode import BasebandSignal, Compressor
 from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
 from SlicerUSSim.Logic.imaging.scattering import EchoLines
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -38,21 +39,15 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
+if TYPE_CHECKING:
+    from pyopencl import Buffer
+
 _BANDS = CONSTANTS["BANDS"]
 #: Memory that bases and paths of all images may take; more is asked for by mistake.
 _MOST_BYTES = 4 * 2**30
 #: Attenuation over the whole depth with which path lengths are measured: large against the tracer's tolerance, small
 #: against its threshold.
 _PROBING_DB = 100.0
-
-
-@dataclass(frozen=True)
-class Signal:
-    """A baseband signal on the device, as Compressor takes it."""
-
-    iq: object
-    lines: int
-    samples: int
 
 
 class AppearanceModel:
@@ -74,7 +69,7 @@ class AppearanceModel:
         simulator: UltrasoundSimulator,
         probe: Probe,
         poses: Iterable[np.ndarray],
-        varied: dict[str, Iterable[str]],
+        varied: Mapping[str, Iterable[str]],
         grid: ImageGrid | None = None,
     ) -> None:
         self.simulator, self.probe, self._grid = simulator, probe, grid
@@ -122,7 +117,7 @@ class AppearanceModel:
         """The pixels of the images."""
         return self._grid or ImageGrid.for_probe(self.probe, display.image_size)
 
-    def run(self, number: int, tissues: TissueTable, display: DisplaySettings):
+    def run(self, number: int, tissues: TissueTable, display: DisplaySettings) -> Buffer:
         """Enqueue the image at pose `number`; returns its device buffer, which the next image overwrites."""
         acquisition, acquisition_buffer = self._acquisitions[number], self._acquisition_buffers[number]
         lines, samples = int(acquisition["scan_lines"]), int(acquisition["samples"])
@@ -143,7 +138,7 @@ class AppearanceModel:
             iq,
             np.int32(samples),
         )
-        self._compressor.run(acquisition, display, Signal(iq, lines, samples))
+        self._compressor.run(acquisition, display, BasebandSignal(iq, lines, samples))
         self._converter.run(acquisition_buffer, acquisition, self.grid(display), self._compressor)
         return self._converter.image
 
@@ -169,7 +164,7 @@ class AppearanceModel:
             f"most {_MOST_BYTES / 2**30:.0f}; choose fewer images or free parameters",
         )
 
-    def _buffer(self, kind: str, number: int):
+    def _buffer(self, kind: str, number: int) -> Buffer:
         acquisition = self._acquisitions[number]
         values = int(acquisition["scan_lines"]) * int(acquisition["samples"])
         count = 2 * self._base_count if kind == "bases" else max(len(self.attenuating), 1)
@@ -222,9 +217,7 @@ class AppearanceModel:
         simulator.beam.run(acquisition_buffer, acquisition, self._mixed, self._lines)
         simulator.pulse.run(acquisition, simulator.axial_sigma_mm(self.probe), self._lines)
         nbytes = int(acquisition["scan_lines"]) * int(acquisition["samples"]) * 8
-        device.cl.enqueue_copy(
-            device.queue, self._buffer("bases", number), simulator.pulse.iq, byte_count=nbytes, dst_offset=base * nbytes
-        )
+        device.copy(simulator.pulse.signal.iq, self._buffer("bases", number), nbytes, base * nbytes)
 
     def _roles(self, place: int) -> np.ndarray:
         """(MAX_TISSUES,) int32: what scatters in which part while tissue `place` is computed."""
@@ -305,7 +298,7 @@ class AppearanceModel:
                 tracer.segment_counts,
                 one,
             )
-            device.cl.enqueue_copy(device.queue, paths, one, byte_count=nbytes, dst_offset=place * nbytes)
+            device.copy(one, paths, nbytes, place * nbytes)
 
     def _path_weights(self, tissues: TissueTable) -> np.ndarray:
         """(attenuating tissues,) exponent of two per neper of the paths."""

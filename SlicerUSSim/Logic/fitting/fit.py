@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -67,44 +68,50 @@ def fit(
     display = display or DisplaySettings()
     masks = [tracked.mask] * len(tracked.images)
     given = tracked
-    common = dict(free=free, masks=masks, grid=tracked.grid, seed=seed, settings=settings, progress=progress)
+    appearance_at = partial(
+        optimize_appearance, simulator, tracked.probe, references=tracked.images, free=free, display=display,
+        grid=tracked.grid, masks=masks, seed=seed, settings=settings, progress=progress,
+    )  # fmt: skip
     registration = None
     if register:
-        tracked, registration = _registered(
-            simulator, tracked, display, max(int(_FIRST_SHARE * max_evaluations), 1), common
-        )
-    appearance = optimize_appearance(
-        simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=restarts,
-        max_evaluations=max_evaluations, resume=resume, checkpoint=checkpoint, **common,
-    )  # fmt: skip
+        step_from = partial(
+            register_poses, simulator, tracked.probe, references=tracked.images, grid=tracked.grid, masks=masks,
+            settings=settings, progress=progress,
+        )  # fmt: skip
+        short = partial(appearance_at, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1))
+        tracked, registration = _registered(simulator, tracked, short, step_from)
+    appearance = appearance_at(
+        tracked.poses, restarts=restarts, max_evaluations=max_evaluations, resume=resume, checkpoint=checkpoint
+    )
     before = simulated(simulator, given, simulator.medium.tissues, display)
     after = simulated(simulator, tracked, appearance.tissues, appearance.display)
     return Fit(appearance, registration, tracked, before, after)
 
 
 def _registered(
-    simulator: UltrasoundSimulator, tracked: TrackedImages, display: DisplaySettings, evaluations: int, common: dict
+    simulator: UltrasoundSimulator,
+    tracked: TrackedImages,
+    appearance_at: Callable[..., AppearanceResult],
+    step_from: Callable[..., Registration],
 ) -> tuple[TrackedImages, Registration]:
-    """The images at the poses where a short fit comes closest, and how they were moved there; its costs are theirs."""
+    """The images at the poses where a short fit comes closest, and how they were moved there; its costs are theirs.
+
+    `appearance_at` poses is a short fit, `step_from` poses a registration, which is yet to be told display and bounds.
+    """
     candidates: list[tuple[float, TrackedImages, Registration]] = []
     moved = Registration.none(tracked.poses)
 
     def fitted() -> AppearanceResult:
-        result = optimize_appearance(
-            simulator, tracked.probe, tracked.poses, tracked.images, display=display, restarts=0,
-            max_evaluations=evaluations, **common,
-        )  # fmt: skip
+        result = appearance_at(tracked.poses)
         candidates.append((result.cost_after, tracked, moved))
         return result
 
     for bound, most in _ROUNDS:
         first = fitted()
         with simulator.with_tissues(first.tissues):
-            step = register_poses(
-                simulator, tracked.probe, tracked.poses, tracked.images, display=first.display, grid=tracked.grid,
-                masks=common["masks"], settings=common["settings"], range_mm=bound, range_deg=bound,
-                max_evaluations=most, progress=common["progress"],
-            )  # fmt: skip
+            step = step_from(
+                tracked.poses, display=first.display, range_mm=bound, range_deg=bound, max_evaluations=most
+            )
         moved = step.after(moved)
         tracked = replace(tracked, poses=step.poses)
     fitted()

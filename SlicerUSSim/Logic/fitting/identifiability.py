@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from math import log10
+from typing import TypeAlias
 
 import numpy as np
 
@@ -18,7 +19,9 @@ from SlicerUSSim.Logic.fitting.parameters import SCATTERING, FreeParameters
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
-State = tuple[TissueTable, DisplaySettings]
+State: TypeAlias = tuple[TissueTable, DisplaySettings]
+#: (parameters,) between 0 and 1 within the bounds
+Units: TypeAlias = "Sequence[float] | np.ndarray"
 
 #: Half the spread within which a parameter counts as determined.
 _TOLERANCES = {
@@ -82,10 +85,10 @@ class Identifiability:
     def of(
         cls,
         quantities: Sequence[Quantity],
-        state_of: Callable[[Sequence[float]], State],
-        best: Sequence[float],
-        as_good: Sequence[Sequence[float]],
-        again: Sequence[Sequence[float]],
+        state_of: Callable[[Units], State],
+        best: Units,
+        as_good: Sequence[Units],
+        again: Sequence[Units],
         restarts: int,
         cost_tolerance: float,
     ) -> Identifiability:

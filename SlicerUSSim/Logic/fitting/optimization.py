@@ -18,7 +18,13 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require_between
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
-from SlicerUSSim.Logic.fitting.identifiability import Identifiability, equal_variance_draws, quantities_of
+from SlicerUSSim.Logic.fitting.identifiability import (
+    Identifiability,
+    State,
+    Units,
+    equal_variance_draws,
+    quantities_of,
+)
 from SlicerUSSim.Logic.fitting.parameters import Bounds, FreeParameters
 from SlicerUSSim.Logic.fitting.search import (
     GLOBAL_ALGORITHM,
@@ -280,7 +286,7 @@ def _identifiability(
     as_good = [entry.units for entry in met if entry.cost <= best_cost + tolerance]
     again = [units for units, excess in found if excess <= tolerance]
 
-    def state_of(units) -> tuple[TissueTable, DisplaySettings]:
+    def state_of(units: Units) -> State:
         return parameters.apply(np.asarray(units), cost.tissues, cost.display)
 
     quantities = quantities_of(parameters, cost.model.probe.frequency_mhz, cost.tissues)

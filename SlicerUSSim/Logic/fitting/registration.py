@@ -147,7 +147,7 @@ def register_poses(
     return Registration(matrix, [matrix @ pose for pose in poses], centre, shift, before, after, search.history)
 
 
-def rigid_from(values: Sequence[float]) -> np.ndarray:
+def rigid_from(values: Sequence[float] | np.ndarray) -> np.ndarray:
     """(4, 4) from three translations (mm) and a rotation vector (degrees)."""
     from scipy.spatial.transform import Rotation
 

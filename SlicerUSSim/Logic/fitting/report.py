@@ -179,7 +179,8 @@ def _histograms(tracked: TrackedImages, before: list, after: list, simulator: Ul
     simulated = [grey_levels_per_tissue(tracked, images, simulator) for images in (before, after)]
     columns = max(len(rows), 1)
     figure = Figure(figsize=(3.2 * columns, 2.6), facecolor=_PAPER, dpi=110, layout="constrained")
-    for axis, name in zip(figure.subplots(1, columns, squeeze=False)[0], rows, strict=False):
+    axes = figure.subplots(1, columns, squeeze=False)[0]
+    for axis, name in zip(axes, rows, strict=False):
         _dark(axis)
         for pixels, colour, label in (
             (simulated[0][name], _BEFORE, "before"),
@@ -191,7 +192,7 @@ def _histograms(tracked: TrackedImages, before: list, after: list, simulator: Ul
         axis.set_title(name, color=colour_of(name), fontsize=10)
         axis.set_xlabel("grey level", fontsize=8)
         axis.set_yticks([])
-    axis.legend(facecolor=_PAPER, labelcolor=_INK, edgecolor="#444444", fontsize=8)
+    axes[-1].legend(facecolor=_PAPER, labelcolor=_INK, edgecolor="#444444", fontsize=8)
     return _figure_png(figure)
 
 

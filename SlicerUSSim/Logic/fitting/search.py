@@ -90,17 +90,17 @@ class Search:
 
         def evaluate(units: np.ndarray, _gradient) -> float:
             if len(self.history) - first >= budget:  # some algorithms take a few more than they are allowed
-                weak().force_stop()
+                itself.force_stop()
                 return float("inf")
             try:
                 return self.evaluate(stage, units)
             except BaseException as error:  # through nlopt's C++, which would lose what kind it was
                 failure.append(error)
-                weak().force_stop()
+                itself.force_stop()
                 return float("inf")
 
         search = self._optimiser(algorithm, len(start), step)
-        weak = weakref.ref(search)  # which holds `evaluate` where Python's garbage collector does not see it
+        itself = weakref.proxy(search)  # which holds `evaluate` where Python's garbage collector does not see it
         self.evaluate(stage, start)
         if budget > 1:
             nlopt.srand(self.seed + 1)

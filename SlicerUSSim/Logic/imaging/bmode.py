@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
 from SlicerUSSim.Logic.imaging.scattering import EchoLines
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+
+if TYPE_CHECKING:
+    from pyopencl import Buffer
+
+
+@dataclass(frozen=True, eq=False)
+class BasebandSignal:
+    """A complex baseband signal on the device, of whole blocks of samples."""
+
+    #: float2 [line][sample]
+    iq: Buffer
+    lines: int
+    samples: int
 
 
 class PulseFilter:
@@ -18,6 +34,10 @@ class PulseFilter:
         self.kernel = device.kernels("bmode.cl", device.lanes)["convolve_pulse"]
         self.workspace = Workspace(device)
         self._sigma: float | None = None
+        # Of the pulse with that sigma, and of the frame convolved last
+        self._pulse: Buffer
+        self._reach: int
+        self.signal: BasebandSignal
         #: What the signal was made for, if whoever made it says so (UltrasoundSimulator.render)
         self.made_for: object = None
 
@@ -28,25 +48,25 @@ class PulseFilter:
         if sigma != self._sigma:
             taps = pulse_taps(sigma)
             self._pulse, self._reach, self._sigma = self.device.upload(taps), taps.size // 2, sigma
-        self.lines, self.samples = int(acquisition["scan_lines"]), int(acquisition["samples"])
-        nbytes = self.lines * self.samples * 8
-        self.iq = self.workspace.get("iq", nbytes)
+        count, samples = int(acquisition["scan_lines"]), int(acquisition["samples"])
+        iq = self.workspace.get("iq", count * samples * 8)
+        self.signal = BasebandSignal(iq, count, samples)
         self.device.run(
             self.kernel,
-            (self.samples // self.device.lanes, self.lines),
+            (samples // self.device.lanes, count),
             lines.re,
             lines.im,
             np.int32(lines.stride),
             self._pulse,
             np.int32(self._reach),
-            self.iq,
-            np.int32(self.samples),
+            iq,
+            np.int32(samples),
         )
 
     def download(self, samples: int) -> np.ndarray:
         """(scan_lines, samples) complex64 baseband signal of the frame convolved last."""
-        iq = self.device.download(self.iq, (self.lines, self.samples), np.complex64)
-        return iq[:, :samples]
+        signal = self.signal
+        return self.device.download(signal.iq, (signal.lines, signal.samples), np.complex64)[:, :samples]
 
 
 class Compressor:
@@ -56,8 +76,13 @@ class Compressor:
         self.device = device
         self.kernel = device.kernels("bmode.cl", device.lanes)["compress"]
         self.workspace = Workspace(device)
+        # Of the frame compressed last: its size, float32 and uint8 [line][sample]
+        self.lines: int
+        self.samples: int
+        self.envelope: Buffer
+        self.grey: Buffer
 
-    def run(self, acquisition: np.ndarray, display: DisplaySettings, signal: PulseFilter) -> None:
+    def run(self, acquisition: np.ndarray, display: DisplaySettings, signal: BasebandSignal) -> None:
         """Enqueue the grey levels of every line."""
         self.lines, self.samples = signal.lines, signal.samples
         self.envelope = self.workspace.get("envelope", self.lines * self.samples * 4)

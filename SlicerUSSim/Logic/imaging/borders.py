@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 
+if TYPE_CHECKING:
+    from pyopencl import Buffer
+
 _SLAB = 48  # planes at a time: what is between the passes stays small whatever the volume
 
 
-def smoothed_indicators(device: Device, group_buffer, dims, present: set[int], fields: int):
+def smoothed_indicators(device: Device, group_buffer: Buffer, dims, present: set[int], fields: int) -> Buffer:
     """Device buffer ushort [field][k][j][i]: where each of the first `fields` groups is, smoothed by a Gaussian.
 
     `group_buffer` holds uint8 groups with flags, `dims` (i, j, k) voxels, `present` the groups that occur. Fields of

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
@@ -12,9 +13,12 @@ from SlicerUSSim.Logic.base.errors import require, require_between
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.frame import Frame
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+
+if TYPE_CHECKING:
+    from pyopencl import Buffer
 
 _MOST_VOXELS = 400_000_000
 _WIDEST_GAP_MM = 10.0  # farther apart, neighbouring images are two sweeps rather than one with a hole
@@ -54,7 +58,7 @@ class Compounder:
     device : see opencl.devices.choose_device.
     """
 
-    def __init__(self, grid: Volume, probe: Probe, device: str | Device | None = None) -> None:
+    def __init__(self, grid: Volume, probe: Probe, device: DeviceChoice = None) -> None:
         self.grid = grid
         self.probe = probe
         self.device = Device.get(device)
@@ -64,13 +68,16 @@ class Compounder:
         self._sum, self._weight = (self.device.zeros(4 * grid.array.size) for _ in range(2))
         self._to_image = self.device.empty(12 * 4)
         self._pixels: ImageGrid | None = None
+        # Of images with these pixels: uint8, which are in the field, and room for means
+        self._field: Buffer
+        self._mean: Buffer
         self._poses: list[np.ndarray] = []
 
     def add(self, frame: Frame) -> None:
         """Put one image into the volume."""
         self.add_buffer(self.device.upload(frame.image), frame.grid, frame.probe_to_ras)
 
-    def add_buffer(self, image, pixels: ImageGrid, probe_to_ras: np.ndarray) -> None:
+    def add_buffer(self, image: Buffer, pixels: ImageGrid, probe_to_ras: np.ndarray) -> None:
         """The same for an image that is on the device already (UltrasoundSimulator.render)."""
         self._prepare(pixels)
         shape = pixels.columns, pixels.rows
@@ -158,7 +165,7 @@ def _filled(values: np.ndarray, known: np.ndarray, hole_voxels: np.ndarray) -> n
     What is a gap is found by closing the known region with an ellipsoid of that size; beyond its outline stays empty.
     """
     pad = [int(np.ceil(h / 2)) + 1 for h in hole_voxels]
-    sampling = tuple(2.0 / np.maximum(hole_voxels, 1e-3))  # distances in half holes
+    sampling = 2.0 / np.maximum(hole_voxels, 1e-3)  # distances in half holes
     around = np.pad(known, [(p, p) for p in pad])
     around = _distance_to(around, sampling) <= 1.0 + 1e-4
     around = _distance_to(~around, sampling) > 1.0 + 1e-4
@@ -176,7 +183,7 @@ def _filled(values: np.ndarray, known: np.ndarray, hole_voxels: np.ndarray) -> n
     return result
 
 
-def _distance_to(places: np.ndarray, sampling: tuple[float, float, float]) -> np.ndarray:
+def _distance_to(places: np.ndarray, sampling: np.ndarray) -> np.ndarray:
     """Distance of every voxel (k, j, i) to the nearest of `places`, 0 there; voxels are `sampling` apart."""
     import SimpleITK as sitk  # on all cores: four times as fast as scipy's
 

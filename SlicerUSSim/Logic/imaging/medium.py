@@ -9,6 +9,8 @@ without stairs.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy import ndimage, special
 
@@ -19,6 +21,9 @@ from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Membrane
+
+if TYPE_CHECKING:
+    from pyopencl import Buffer
 
 _FARTHEST_SIGMAS = 2.2  # where the stored distance ends
 # Smoothed indicators take two bytes a voxel and group: so many groups, so many voxels in all; but always two groups.
@@ -49,14 +54,21 @@ class Medium:
         self.dims = np.array(array.shape[::-1]) + 2 * _PAD
         self._check(tissues)
         padded = np.pad(array, _PAD)
+        #: uint16 [k][j][i]: label, flags and fluid distance; uint8 [k][j][i]: acoustic groups; and their indicators
+        self.voxel_buffer: Buffer
+        self.group_buffer: Buffer
+        self.smooth_buffer: Buffer
+        #: How many groups have a smoothed indicator
+        self.smooth_groups: int
+        #: Half the membrane in the unit of the fluid distance; negative: none
+        self.membrane_reach: float
         #: layout.TISSUE per label, as the device has it
         self.rows = self._tissue_rows(tissues)
         self._upload(padded, tissues)
         self._upload_groups(padded)
         self.has_texture = texture is not None
-        no_texture = np.zeros(1, np.uint32)
         self.texture_buffer = device.upload(
-            np.pad(texture, _PAD, constant_values=128 << 16) if self.has_texture else no_texture
+            np.zeros(1, np.uint32) if texture is None else np.pad(texture, _PAD, constant_values=128 << 16)
         )
         self.tissue_buffer = device.upload(self.rows)
         #: Counts the changes of tissues

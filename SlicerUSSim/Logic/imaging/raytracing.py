@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from SlicerUSSim.Logic.imaging.medium import Medium
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, HIT, SEGMENT
+
+if TYPE_CHECKING:
+    from pyopencl import Buffer
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +48,19 @@ class RayTracer:
         self._quantile_key: tuple | None = None
         self._root_key: tuple | None = None
         self._overflown = device.zeros(4)
+        # What these keys stand for
+        self._quantiles: Buffer
+        self._roots: Buffer
+        #: (traced lines, elevational rays) of the frame traced last, and its tree: see layout.SEGMENT and layout.HIT
+        self.shape: tuple[int, int]
+        self.segments: Buffer
+        self.segment_counts: Buffer
+        self.hits: Buffer
+        self.hit_counts: Buffer
+        self.cut: Buffer
+        self._place: Callable[[np.ndarray], np.ndarray]
 
-    def run(self, acquisition_buffer, acquisition: np.ndarray, medium: Medium) -> None:
+    def run(self, acquisition_buffer: Buffer, acquisition: np.ndarray, medium: Medium) -> None:
         """Enqueue the tracing of one frame: a layout.ACQUISITION record, and the same on the device."""
         traced, rays = int(acquisition["traced_lines"]), int(acquisition["elevational_rays"])
         self.shape = traced, rays

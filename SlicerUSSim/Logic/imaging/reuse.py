@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
@@ -25,7 +25,7 @@ class ReusedSimulator:
         labels: Volume,
         tissues: TissueTable,
         settings: SimulationSettings,
-        device: str | Device | None = None,
+        device: DeviceChoice = None,
         texture: Texture | None = None,
     ) -> UltrasoundSimulator:
         """A simulator for these inputs; voxels count as the same for as long as `labels_version` is the same.

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from SlicerUSSim.Logic.imaging.bmode import Compressor
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+
+if TYPE_CHECKING:
+    from pyopencl import Buffer
 
 
 class ScanConverter:
@@ -17,8 +22,11 @@ class ScanConverter:
         self.average = device.kernels("bmode.cl", device.lanes)["average_depth"]
         self.convert = device.kernels("scan_conversion.cl", device.lanes)["scan_convert"]
         self.workspace = Workspace(device)
+        # Of the frame converted last; the image is uint8 [row][column]
+        self.grid: ImageGrid
+        self.image: Buffer
 
-    def run(self, acquisition_buffer, acquisition: np.ndarray, grid: ImageGrid, lines: Compressor) -> None:
+    def run(self, acquisition_buffer: Buffer, acquisition: np.ndarray, grid: ImageGrid, lines: Compressor) -> None:
         """Enqueue the conversion of one frame."""
         self.grid = grid
         self.image = self.workspace.get("image", grid.rows * grid.columns)

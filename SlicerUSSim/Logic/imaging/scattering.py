@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from SlicerUSSim.Logic.imaging.medium import Medium
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+
+if TYPE_CHECKING:
+    from pyopencl import Buffer
 
 
 class EchoLines:
@@ -17,6 +22,11 @@ class EchoLines:
         self.device = device
         self.workspace = Workspace(device)
         self._shape: tuple[int, int] | None = None
+        # Of the frame that there is room for: see prepare
+        self.re: Buffer
+        self.im: Buffer
+        #: Samples from one line to the next, pads included
+        self.stride: int
 
     def prepare(self, lines: int, samples: int) -> None:
         """Make room for a frame. Kernels write every sample between the pads, so only a new shape is cleared."""
@@ -31,8 +41,8 @@ class EchoLines:
 
     def clear(self) -> None:
         """Set everything to zero."""
-        for buffer in (self.re, self.im):
-            self.device.cl.enqueue_fill_buffer(self.device.queue, buffer, np.float32(0), 0, buffer.size)
+        self.device.clear(self.re)
+        self.device.clear(self.im)
 
 
 class Scatterers:
@@ -43,12 +53,12 @@ class Scatterers:
 
     def run(
         self,
-        acquisition_buffer,
+        acquisition_buffer: Buffer,
         acquisition: np.ndarray,
         medium: Medium,
         tree: RayTracer,
         lines: EchoLines,
-        varied: tuple = (),
+        varied: tuple[Buffer, ...] = (),
     ) -> None:
         """Enqueue the speckle of one frame; it overwrites `lines`.
 
@@ -81,7 +91,7 @@ class InterfaceEchoes:
         self.device = device
         self.kernel = device.kernels("interfaces.cl")["interface_echoes"]
 
-    def run(self, acquisition_buffer, acquisition: np.ndarray, tree: RayTracer, lines: EchoLines) -> None:
+    def run(self, acquisition_buffer: Buffer, acquisition: np.ndarray, tree: RayTracer, lines: EchoLines) -> None:
         """Enqueue the interface echoes of one frame; they are added to `lines`."""
         self.device.run(
             self.kernel,
@@ -102,7 +112,7 @@ class LateralBeam:
         self.device = device
         self.kernel = device.kernels("beam.cl", device.lanes)["lateral_beam"]
 
-    def run(self, acquisition_buffer, acquisition: np.ndarray, traced: EchoLines, scanned: EchoLines) -> None:
+    def run(self, acquisition_buffer: Buffer, acquisition: np.ndarray, traced: EchoLines, scanned: EchoLines) -> None:
         """Enqueue the lateral convolution of one frame; it overwrites `scanned`."""
         self.device.run(
             self.kernel,

@@ -6,10 +6,11 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
@@ -20,12 +21,15 @@ from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer, RayTree
 from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
 from SlicerUSSim.Logic.imaging.scattering import EchoLines, InterfaceEchoes, LateralBeam, Scatterers
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import NOMINAL_SPEED_M_S, Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
+
+if TYPE_CHECKING:
+    from pyopencl import Buffer
 
 
 class EmptyViewWarning(UserWarning):
@@ -58,7 +62,7 @@ class UltrasoundSimulator:
         labels: Volume,
         tissues: TissueTable,
         settings: SimulationSettings | None = None,
-        device: str | Device | None = None,
+        device: DeviceChoice = None,
         texture: Texture | None = None,
     ) -> None:
         self.settings = settings or SimulationSettings()
@@ -123,7 +127,7 @@ class UltrasoundSimulator:
         display: DisplaySettings,
         grid: ImageGrid,
         timings: dict[str, float] | None = None,
-    ):
+    ) -> Buffer:
         """Enqueue all stages of one frame; returns the device buffer of its image, which the next frame overwrites.
 
         Where only the display or the pixels have changed since the last frame, its echoes are used again.
@@ -136,7 +140,7 @@ class UltrasoundSimulator:
             self._echoes(probe, acquisition, timings)
             self.pulse.made_for = inputs
         with self._stage("B-mode", timings):
-            self.compressor.run(acquisition, display, self.pulse)
+            self.compressor.run(acquisition, display, self.pulse.signal)
         with self._stage("scan conversion", timings):
             self.converter.run(self._acquisition_buffer, acquisition, grid, self.compressor)
         return self.converter.image
@@ -321,7 +325,7 @@ class UltrasoundSimulator:
             )
 
     @contextmanager
-    def _stage(self, name: str, timings: dict[str, float]):
+    def _stage(self, name: str, timings: dict[str, float]) -> Iterator[None]:
         if not self.profiling:
             yield
             return
@@ -335,8 +339,8 @@ def _packed_texture(texture: Texture | None, labels: Volume, settings: Simulatio
     """The texture as the device reads it, or None if the settings ask for none."""
     if not settings.needs_texture:
         return None
-    require(
-        texture is not None,
+    texture = required(
+        texture,
         f"partial_volume {settings.partial_volume}, mri_modulation_db {settings.mri_modulation_db:g} need a texture; "
         "pass segmentation.texture(), or Texture.from_mri(mri, labels) for a label map of your own",
     )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 
 
 def guided_filter(
-    image: np.ndarray, mask: np.ndarray, radius: int, epsilon: float, device: str | Device | None = None
+    image: np.ndarray, mask: np.ndarray, radius: int, epsilon: float, device: DeviceChoice = None
 ) -> np.ndarray:
     """(k, j, i) float32 self-guided filter of `image` inside the boolean `mask` (He et al., ECCV 2010).
 

@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 def demo_mri() -> tuple[Volume, str]:
     """(MRI, where it comes from): the MNI152 T1 that nilearn carries, or a phantom made by code without nilearn."""
     package = importlib.util.find_spec("nilearn")
-    if package is not None:
+    if package is not None and package.origin is not None:
         path = Path(package.origin).parent / "datasets/data/mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz"
         if path.exists():
             return Volume.read(path), "MNI152 2009a T1 (nilearn)"

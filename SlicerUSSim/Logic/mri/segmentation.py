@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from scipy import ndimage
@@ -13,7 +14,7 @@ from SlicerUSSim.Logic.base.errors import require, require_between
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.guided_filter import guided_filter
 from SlicerUSSim.Logic.mri.mixture import classify, fit_mixture, mixture_posteriors
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
 
 #: Tissue names per contrast and number of classes, in the order of intensity.
@@ -90,7 +91,7 @@ def segment_mri(
     filter_epsilon: float | None = None,
     bias_correction: bool = False,
     thin_sulci: bool = False,
-    device: str | Device | None = None,
+    device: DeviceChoice = None,
     progress: Callable[[float], None] | None = None,
 ) -> Segmentation:
     """Label the tissues of a brain MRI by intensity.
@@ -141,7 +142,7 @@ def segment_mri(
         middles = _sulcal_middles(filtered, labels, grey + 1, means[csf], means[grey], noise)
         # CSF less than two voxels thick is such a sulcus too; left as CSF it would be a chain of droplets, each a lens.
         is_csf = labels == csf + 1
-        middles |= is_csf & ~ndimage.binary_opening(is_csf, np.ones((2, 2, 2)))
+        middles |= is_csf & ~cast(np.ndarray, ndimage.binary_opening(is_csf, np.ones((2, 2, 2))))
         labels[middles] = classes + 1
         names = (*names, "leptomeninges")
     report(1.0)
@@ -164,7 +165,7 @@ def estimate_noise(image: np.ndarray, mask: np.ndarray) -> float:
     From the difference of every voxel to its six neighbours (Coupe et al., Medical Image Analysis 14(4) 2010), by the
     median absolute deviation, so that borders do not count. Every other slice is used.
     """
-    inner = ndimage.binary_erosion(mask[::2], np.ones((1, 3, 3)))
+    inner = cast(np.ndarray, ndimage.binary_erosion(mask[::2], np.ones((1, 3, 3))))
     if inner.sum() < 1000:
         return 0.0
     image = image.astype(np.float32, copy=False)
@@ -225,10 +226,11 @@ def _foreground(intensity: np.ndarray) -> np.ndarray:
     from skimage.filters import threshold_otsu
 
     inside = intensity > 0.5 * threshold_otsu(intensity)  # half: Otsu alone cuts CSF off a T1
-    components, count = ndimage.label(inside)
+    # What scipy returns depends on arguments, and scipy has no types that say how: hence the casts.
+    components, count = cast(tuple[np.ndarray, int], ndimage.label(inside))
     if count > 1:
         inside = components == np.argmax(np.bincount(components.ravel())[1:]) + 1
-    return ndimage.binary_fill_holes(inside)
+    return cast(np.ndarray, ndimage.binary_fill_holes(inside))
 
 
 def _given_mask(mask: Volume, mri: Volume) -> np.ndarray:

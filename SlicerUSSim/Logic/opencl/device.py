@@ -7,6 +7,7 @@ import warnings
 from collections import deque
 from functools import cache, lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -14,6 +15,14 @@ from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, shared_source
 from SlicerUSSim.Logic.opencl.runtimes import load_pyopencl
+
+if TYPE_CHECKING:
+    from pyopencl import Buffer, Event, Kernel
+
+#: What says which device computes; see devices.choose_device
+DeviceChoice: TypeAlias = "str | DeviceInfo | Device | None"
+
+_ZERO = np.zeros(1, np.float32)
 
 
 class Device:
@@ -42,18 +51,18 @@ class Device:
         #: twice; short for a GPU, which one frame shall fill. A divisor of CONSTANTS["BLOCK"]
         self.chunk = 16 if info.kind == "GPU" else CONSTANTS["BLOCK"]
         self.profiling = False
-        self._events: list[tuple[str, object]] = []
-        self._writes: deque = deque(maxlen=64)
-        self._kernels: dict[tuple, dict[str, object]] = {}
+        self._events: list[tuple[str, Event]] = []
+        self._writes: deque[Event] = deque(maxlen=64)
+        self._kernels: dict[tuple, dict[str, Kernel]] = {}
 
     @staticmethod
-    def get(device: str | DeviceInfo | Device | None = None) -> Device:
+    def get(device: DeviceChoice = None) -> Device:
         """The Device for a choice (see choose_device); the same object for the same hardware."""
         if isinstance(device, Device):
             return device
         return _open_device(choose_device(device)[0])
 
-    def kernels(self, file_name: str, lanes: int = 1, *defines: str) -> dict[str, object]:
+    def kernels(self, file_name: str, lanes: int = 1, *defines: str) -> dict[str, Kernel]:
         """The kernels of kernels/`file_name`, built once; each work-item computes `lanes` values side by side.
 
         `defines` are preprocessor names that choose a variant.
@@ -80,7 +89,7 @@ class Device:
             self._kernels[key] = {kernel.function_name: kernel for kernel in program.all_kernels()}
         return self._kernels[key]
 
-    def run(self, kernel, global_size: tuple[int, ...], *arguments, heavy: bool = False) -> None:
+    def run(self, kernel: Kernel, global_size: tuple[int, ...], *arguments, heavy: bool = False) -> None:
         """Enqueue a kernel; its profiling event is kept if `profiling` is on.
 
         `heavy` is for work-items with large private arrays: on a processor each is then a group of its own, since PoCL
@@ -91,36 +100,44 @@ class Device:
         if self.profiling:
             self._events.append((kernel.function_name, event))
 
-    def upload(self, array: np.ndarray):
+    def upload(self, array: np.ndarray) -> Buffer:
         """A new read-only device buffer holding a copy of `array`."""
         flags = self.cl.mem_flags
         self._check_size(array.nbytes)
         return self.cl.Buffer(self.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=np.ascontiguousarray(array))
 
-    def empty(self, nbytes: int):
+    def empty(self, nbytes: int) -> Buffer:
         """A new uninitialised device buffer."""
         self._check_size(nbytes)
         return self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size=max(int(nbytes), 4))
 
-    def zeros(self, nbytes: int):
+    def zeros(self, nbytes: int) -> Buffer:
         """A new device buffer of zeros; `nbytes` is a multiple of four."""
         buffer = self.empty(nbytes)
-        self.cl.enqueue_fill_buffer(self.queue, buffer, np.float32(0), 0, buffer.size)
+        self.clear(buffer)
         return buffer
 
-    def write(self, buffer, array: np.ndarray) -> None:
+    def clear(self, buffer: Buffer) -> None:
+        """Fill a buffer, whose size is a multiple of four, with zeros in its turn."""
+        self.cl.enqueue_fill_buffer(self.queue, buffer, _ZERO, 0, buffer.size)
+
+    def copy(self, source: Buffer, target: Buffer, nbytes: int, target_offset: int = 0) -> None:
+        """Copy the first `nbytes` of a buffer to `target_offset` (bytes) of another, in their turn."""
+        self.cl.enqueue_copy(self.queue, target, source, byte_count=nbytes, dst_offset=target_offset)
+
+    def write(self, buffer: Buffer, array: np.ndarray) -> None:
         """Copy `array` into a buffer that is at least as large, in its turn; nothing is waited for."""
         # An event keeps its array alive, and waits for the copy when it is dropped itself.
         event = self.cl.enqueue_copy(self.queue, buffer, array.copy(), is_blocking=False)
         self._writes.append(event)
 
-    def mark(self):
+    def mark(self) -> Event:
         """An event that completes when everything enqueued so far has; its wait() waits for that."""
         marker = self.cl.enqueue_marker(self.queue)
         self.queue.flush()
         return marker
 
-    def download(self, buffer, shape, dtype) -> np.ndarray:
+    def download(self, buffer: Buffer, shape: int | tuple[int, ...], dtype) -> np.ndarray:
         """A new host array with the buffer's content; waits for everything enqueued before."""
         array = np.empty(shape, dtype)
         if array.nbytes:
@@ -188,9 +205,9 @@ class Workspace:
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        self._buffers: dict[str, object] = {}
+        self._buffers: dict[str, Buffer] = {}
 
-    def get(self, name: str, nbytes: int):
+    def get(self, name: str, nbytes: int) -> Buffer:
         """A buffer of at least `nbytes`; its content is whatever the last frame left."""
         buffer = self._buffers.get(name)
         if buffer is None or buffer.size < nbytes:

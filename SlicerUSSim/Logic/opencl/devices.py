@@ -11,9 +11,13 @@ import os
 import platform
 import sys
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.opencl.runtimes import INTEL_RUNTIME, load_pyopencl
+
+if TYPE_CHECKING:
+    import pyopencl
 
 _EMULATOR_RANK = 9
 #: What pip installs of Intel's runtime for processors, by sys.platform; there are wheels for x86-64 only.
@@ -31,7 +35,7 @@ class DeviceInfo:
     compute_units: int
     memory_mb: int
     rank: int
-    handle: object = field(repr=False, compare=False)
+    handle: pyopencl.Device = field(repr=False, compare=False)
 
     @property
     def is_emulator(self) -> bool:
@@ -67,7 +71,7 @@ def list_devices() -> list[DeviceInfo]:
     return sorted(devices, key=lambda device: device.rank)
 
 
-def _describe(cl, index, cl_platform, handle) -> DeviceInfo:
+def _describe(cl, index: str, cl_platform: pyopencl.Platform, handle: pyopencl.Device) -> DeviceInfo:
     is_gpu = bool(handle.type & cl.device_type.GPU)
     is_cpu = bool(handle.type & cl.device_type.CPU)
     platform_name = cl_platform.name.strip()

@@ -139,8 +139,8 @@ _C_TYPES = {np.dtype(_FLOAT): "float", np.dtype(_INT): "int", np.dtype(_UINT): "
 
 def _c_struct(name: str, dtype: np.dtype) -> str:
     members = []
-    for field_name, (field, _offset) in dtype.fields.items():
-        base, shape = field.subdtype or (field, ())
+    for field_name in dtype.names or ():
+        base, shape = dtype[field_name].base, dtype[field_name].shape
         members.append(f"  {_C_TYPES[base]} {field_name}{f'[{shape[0]}]' if shape else ''};")
     return "\n".join(["typedef struct {", *members, f"}} {name};"])
 

@@ -7,6 +7,7 @@ Probe frame (millimetres): origin at the centre of the probe face, +x lateral (l
 from __future__ import annotations
 
 from dataclasses import MISSING, asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,8 @@ NOMINAL_SPEED_M_S = 1540.0
 #: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
 MAIN_LOBE = 1.21
 FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
+#: None, until the probe knows its depth: Any, since nobody who has a probe meets it
+_BY_DEPTH: Any = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,23 +32,24 @@ class Probe:
     Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
     """
 
-    # depth_mm is declared by each kind, so that it can be given by position.
     scan_lines: int = 192
     frequency_mhz: float = 5.0
     #: Fractional -6 dB bandwidth of the two-way pulse.
     fractional_bandwidth: float = 0.5
-    #: Transmit focus; None puts it at 60 % of the depth.
-    focus_mm: float | None = None
+    #: Transmit focus; left out (in JSON also null), it lies at 60 % of the depth.
+    focus_mm: float = _BY_DEPTH
     #: Lateral size of the fully open aperture.
     aperture_mm: float = 12.0
     #: Smallest f-number of the receive aperture (it opens with depth until it reaches aperture_mm).
     receive_f_number: float = 2.5
     #: Height of the elements.
     elevation_aperture_mm: float = 7.0
-    #: Focus of the lens; None puts it at 60 % of the depth.
-    elevation_focus_mm: float | None = None
+    #: Focus of the lens; left out (in JSON also null), it lies at 60 % of the depth.
+    elevation_focus_mm: float = _BY_DEPTH
 
     def __post_init__(self) -> None:
+        # A field of each kind, so that it can be given by position after what is the kind's own.
+        self.depth_mm: float
         owner = type(self).__name__
         require_between(owner, "depth_mm", self.depth_mm, 1, 400)
         require_between(owner, "scan_lines", self.scan_lines, 2, 4096)
@@ -285,8 +289,8 @@ def probe_from_dict(values: dict, source: str = "probe") -> Probe:
     """The probe described by plain values (see Probe.to_dict). Raises SimulationError for an unknown kind or name."""
     require(isinstance(values, dict), f'{source}: is a {type(values).__name__}, expected an object with a "kind"')
     kinds = {name: kind for kind, name in _KIND_NAMES.items()}
-    kind = values.get("kind")
-    require(kind in kinds, f"{source}: kind is {kind!r}, expected one of {', '.join(kinds)}")
+    kind = str(values.get("kind"))
+    require(kind in kinds, f"{source}: kind is {values.get('kind')!r}, expected one of {', '.join(kinds)}")
     arguments = {name: value for name, value in values.items() if name != "kind"}
     known = {field.name for field in fields(kinds[kind])}
     for name in arguments:

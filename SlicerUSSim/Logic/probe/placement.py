@@ -43,7 +43,7 @@ def surface_point(foreground: Volume, target_ras, outward_ras) -> np.ndarray:
     distance = np.arange(0.0, 500.0, 0.25)
     points = target + distance[:, None] * outward
     inside = sample(foreground, points, order=0) > 0
-    require(bool(inside.any()), f"no tissue from {target.tolist()} in direction {outward.round(3).tolist()}")
+    require(inside.any(), f"no tissue from {target.tolist()} in direction {outward.round(3).tolist()}")
     return points[np.flatnonzero(inside)[-1]]
 
 
@@ -53,7 +53,7 @@ def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standof
     `brain` is a mask or label map (non-zero inside). The view crosses cortex, a lateral ventricle and the midline.
     """
     inside = brain.array > 0
-    require(bool(inside.any()), "the brain mask is empty, expected voxels inside")
+    require(inside.any(), "the brain mask is empty, expected voxels inside")
     centre_kji = np.array(ndimage.center_of_mass(inside))
     centre = brain.ijk_to_ras[:3] @ np.append(centre_kji[::-1], 1.0)
     tilt = np.deg2rad(tilt_deg)

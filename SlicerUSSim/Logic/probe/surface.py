@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import mutable
 from vtkmodules.vtkCommonDataModel import vtkPolyData, vtkStaticCellLocator
@@ -66,7 +67,7 @@ class PatientSurface:
         self.polydata: vtkPolyData = _closed_surface(labels)
         points = vtk_to_numpy(self.polydata.GetPoints().GetData()).astype(float)
         self._normals = vtk_to_numpy(self.polydata.GetPointData().GetNormals()).astype(float)
-        self._tree = cKDTree(points)
+        self._tree = KDTree(points)
         self._locator = vtkStaticCellLocator()
         self._locator.SetDataSet(self.polydata)
         self._locator.BuildLocator()
@@ -79,14 +80,14 @@ class PatientSurface:
 
     def nearest(self, point) -> np.ndarray:
         """(3,) the point of the surface that is closest to `point`."""
-        closest, cell, part, distance = [0.0, 0.0, 0.0], mutable(0), mutable(0), mutable(0.0)
+        closest, cell, part, distance = [0.0, 0.0, 0.0], _written(0), _written(0), _written(0.0)
         self._locator.FindClosestPoint(list(map(float, point)), closest, cell, part, distance)
         return np.array(closest)
 
     def hit(self, start, end) -> np.ndarray | None:
         """(3,) where the line from `start` to `end` first meets the surface, or None."""
-        t, point, parametric = mutable(0.0), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
-        part, cell = mutable(0), mutable(0)
+        t, point, parametric = _written(0.0), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        part, cell = _written(0), _written(0)
         met = self._locator.IntersectWithLine(
             list(map(float, start)), list(map(float, end)), 1e-6, t, point, parametric, part, cell
         )
@@ -155,14 +156,25 @@ class PatientSurface:
         return carried(probe_to_ras, there + lift * new, -probe_to_ras[:3, 1] if upright else old, new)
 
 
+def _written(start: float) -> Any:
+    """A number that a method of VTK writes into. Any: VTK's type stubs ask for a plain number there."""
+    return mutable(start)
+
+
+def _distance_mm(outside: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Distance of every voxel (k, j, i) of `outside` to the nearest that is not; voxels are `size` mm."""
+    # What scipy returns depends on arguments, and scipy has no types that say how.
+    return cast(np.ndarray, ndimage.distance_transform_edt(outside, sampling=size))
+
+
 def _closed_surface(labels: Volume) -> vtkPolyData:
     spacing = np.array(labels.spacing_mm)[::-1]  # k, j, i
     step = np.maximum(1, np.round(_VOXEL_MM / spacing)).astype(int)
     margin = np.ceil((_CLOSING_MM + 3 * _SMOOTHING_MM) / (step * spacing)).astype(int)
     inside = np.pad(_coarse(labels.array > 0, step), [(m, m) for m in margin])
     size = step * spacing
-    near = ndimage.distance_transform_edt(~inside, sampling=size) <= _CLOSING_MM
-    closed = ndimage.distance_transform_edt(near, sampling=size) > _CLOSING_MM
+    near = _distance_mm(~inside, size) <= _CLOSING_MM
+    closed = _distance_mm(near, size) > _CLOSING_MM
     soft = ndimage.gaussian_filter((closed | inside).astype(np.float32), _SMOOTHING_MM / size)
 
     contour = vtkFlyingEdges3D()
@@ -201,4 +213,4 @@ def _coarse(inside: np.ndarray, step: np.ndarray) -> np.ndarray:
     wanted = -(-np.array(inside.shape) // step) * step
     padded = np.pad(inside, [(0, extra) for extra in wanted - inside.shape])
     k, j, i = wanted // step
-    return padded.reshape(k, step[0], j, step[1], i, step[2]).any(axis=(1, 3, 5))
+    return np.any(padded.reshape(k, step[0], j, step[1], i, step[2]), axis=(1, 3, 5))

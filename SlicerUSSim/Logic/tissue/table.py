@@ -139,7 +139,7 @@ class TissueTable(Mapping):
 
     def to_dict(self) -> dict:
         """Plain values; from_dict reads them back."""
-        values = {"tissues": {str(label): _plain(tissue) for label, tissue in self.items()}}
+        values: dict[str, dict] = {"tissues": {str(label): _plain(tissue) for label, tissue in self.items()}}
         if self.membrane is not None:
             values["membrane"] = {
                 "tissue": _plain(self.membrane.tissue),

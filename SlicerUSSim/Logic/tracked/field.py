@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from scipy import ndimage
@@ -133,11 +134,12 @@ def _field_pixels(brightest: np.ndarray) -> np.ndarray:
     """(rows, columns) bool: the largest connected bright part, without holes and thin attachments."""
     bright = ndimage.binary_closing(brightest > _DARK, iterations=3)
     bright = ndimage.binary_opening(bright, structure=np.ones((9, 9)))
-    labels, count = ndimage.label(bright)
+    # What scipy returns depends on arguments, and scipy has no types that say how: hence the casts.
+    labels, count = cast(tuple[np.ndarray, int], ndimage.label(bright))
     require(count > 0, "the images are black: no field is found")
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
-    return ndimage.binary_fill_holes(labels == sizes.argmax())
+    return cast(np.ndarray, ndimage.binary_fill_holes(labels == sizes.argmax()))
 
 
 def _sides(bright: np.ndarray, scale: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:

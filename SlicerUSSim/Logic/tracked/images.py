@@ -81,7 +81,8 @@ class TrackedImages:
         left, top = (field.image_to_probe @ [columns.start - 0.5, rows.start - 0.5, 0.0, 1.0])[:2]
         size = field.image_to_probe[0, 0], field.image_to_probe[1, 1]
         mask = field.mask[window]
-        grid = ImageGrid(*mask.shape, float(left), float(top), (float(size[0]), float(size[1])))
+        height, width = mask.shape
+        grid = ImageGrid(height, width, float(left), float(top), (float(size[0]), float(size[1])))
         cropped = [np.ascontiguousarray(image[window]) for image in images]
         return cls(field.probe, poses, cropped, grid, mask, kept, field)
 

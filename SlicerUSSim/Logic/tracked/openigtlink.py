@@ -135,7 +135,7 @@ class TrackerLink:
                 self.sent += 1
 
     def _receive(self, peer: socket.socket) -> None:
-        from pyigtl.messages import MessageBase
+        from pyigtl.messages import MessageBase, TransformMessage
 
         header = MessageBase.parse_header(_exactly(peer, MessageBase.IGTL_HEADER_SIZE))
         size = header["body_size"]
@@ -143,7 +143,7 @@ class TrackerLink:
         body = _exactly(peer, size)
         if header["message_type"] != "TRANSFORM":
             return
-        message = MessageBase.create_message("TRANSFORM")
+        message = TransformMessage()
         message.unpack(header, body)
         if self._device is None:
             self._device = message.device_name

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, check_rigid, is_singular
 
@@ -107,12 +107,10 @@ def read_tags(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray | None]:
     """
     path = Path(path)
     text = _mni_text(path, "MNI Tag Point File")
-    volumes = re.search(r"Volumes\s*=\s*(\d+)", text)
-    points = re.search(r"Points\s*=(.*)", text, re.DOTALL)
-    require(
-        volumes is not None and int(volumes.group(1)) in (1, 2) and points is not None,
-        f"{path}: has no points of one or two volumes, expected an MNI tag file",
-    )
+    nothing = f"{path}: has no points of one or two volumes, expected an MNI tag file"
+    volumes = required(re.search(r"Volumes\s*=\s*(\d+)", text), nothing)
+    points = required(re.search(r"Points\s*=(.*)", text, re.DOTALL), nothing)
+    require(int(volumes.group(1)) in (1, 2), nothing)
     per_point = 3 * int(volumes.group(1))
     rows = []
     for line in points.group(1).split("\n"):

@@ -252,12 +252,12 @@ def frame_numbers(text: str, count: int) -> list[int]:
     numbers: list[int] = []
     for part in text.split(","):
         try:
-            ends = [int(end) if end.strip() else None for end in part.split(":")]
-            if not 1 <= len(ends) <= 3 or ends == [None] or (len(ends) == 3 and ends[2] == 0):
-                raise ValueError
-        except ValueError:
+            if ":" in part:
+                numbers += range(count)[slice(*(int(end) if end.strip() else None for end in part.split(":")))]
+            else:
+                numbers.append(int(part))
+        except (TypeError, ValueError):  # no numbers; more than three of them; a step of 0
             raise SimulationError(f"frames are {text!r}, expected such as 0,5,10 or 0:20:5") from None
-        numbers += [ends[0]] if len(ends) == 1 else list(range(count))[slice(*ends)]
     require(bool(numbers), f"frames {text} choose none of the {count} images, expected at least one")
     return numbers
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 from scipy.optimize import brentq
@@ -49,8 +49,14 @@ class Echo:
     shown_mm: tuple[float, float]
     #: (lateral, depth) of the object it comes from
     object_mm: tuple[float, float]
-    #: In dB re the first echo of the phantom; None where theory says nothing
-    level_db: float | None = None
+
+
+@dataclass(frozen=True)
+class EchoLevel(Echo):
+    """Theory: the image shows an echo here, and how strong it is."""
+
+    #: In dB re the first echo of the phantom
+    level_db: float
 
 
 @dataclass(frozen=True)
@@ -74,8 +80,12 @@ class Level:
     level_db: float
 
 
+#: What theory says of a phantom's image
+Expected = TypeVar("Expected", bound="Echo | LevelChange | Level", covariant=True)
+
+
 @dataclass(frozen=True, eq=False)
-class Phantom:
+class Phantom(Generic[Expected]):
     """A test object: labels, tissues, the pose to look at it from, and what its image must show."""
 
     name: str
@@ -84,14 +94,14 @@ class Phantom:
     #: (4, 4)
     probe_to_ras: np.ndarray
     #: What a given probe sees, by theory
-    expected: Callable[[Probe], tuple[Echo | LevelChange | Level, ...]] = lambda probe: ()
+    expected: Callable[[Probe], tuple[Expected, ...]]
     #: The same object without the effect it demonstrates, for comparison
     reference: TissueTable | None = None
     #: Centre of a sphere
     centre_ras: tuple[float, float, float] | None = None
 
 
-def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence=1.0):
+def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence: float | np.ndarray = 1.0) -> np.ndarray:
     """Pressure reflection coefficient r of a border between two fluids; 1 beyond the critical angle.
 
     r = (Z2 cos i - Z1 cos t) / (Z2 cos i + Z1 cos t), sin t / c2 = sin i / c1 (docs/physics.md#3-rays).
@@ -108,7 +118,7 @@ def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence=1.0):
 
 def attenuating_block(
     attenuation_db_cm_mhz: float = 1.2, rotation: np.ndarray | None = None, *, thickness_mm: float = 12.0
-) -> Phantom:
+) -> Phantom[LevelChange]:
     """Shadow, or enhancement with less attenuation than the background's: a block in the middle of speckle.
 
     Behind it the mean level changes by -2 (alpha_block - alpha_background) f d dB (docs/physics.md#3-rays).
@@ -134,7 +144,7 @@ def attenuating_block(
 
 def speed_block(
     speed_m_s: float = 1450.0, rotation: np.ndarray | None = None, *, thickness_mm: float = 16.0
-) -> Phantom:
+) -> Phantom[Echo]:
     """Range distortion: a wire behind a block of another speed of sound moves by d (c_ref / c - 1)."""
     block = replace(BACKGROUND, name="block", speed_of_sound_m_s=speed_m_s)
     top, wire, radius = 12.0, (0.0, 40.0), 0.8
@@ -154,7 +164,7 @@ def speed_block(
     )
 
 
-def mirror(rotation: np.ndarray | None = None, *, tilt_deg: float = 30.0) -> Phantom:
+def mirror(rotation: np.ndarray | None = None, *, tilt_deg: float = 30.0) -> Phantom[Echo]:
     """Mirroring: a rod before an oblique strong reflector appears again behind it, at its mirror image."""
     tilt = np.radians(tilt_deg)
     point, normal = np.array([0.0, 30.0]), np.array([-np.sin(tilt), -np.cos(tilt)])  # towards the probe
@@ -180,7 +190,7 @@ def mirror(rotation: np.ndarray | None = None, *, tilt_deg: float = 30.0) -> Pha
 
 def refracting_wedge(
     rotation: np.ndarray | None = None, *, tilt_deg: float = 25.0, speeds_m_s: tuple[float, float] = (1450.0, 1620.0)
-) -> Phantom:
+) -> Phantom[Echo]:
     """Refraction: wires behind an oblique interface are shown where the unbent ray would have met them."""
     tilt, radius = np.radians(tilt_deg), 0.6
     point, normal = np.array([0.0, 20.0]), np.array([np.sin(tilt), -np.cos(tilt)])
@@ -208,7 +218,7 @@ def refracting_wedge(
 
 def parallel_plates(
     rotation: np.ndarray | None = None, *, gap_mm: float = 7.2, speed_m_s: float = 1600.0, spacing_mm: float = 0.2
-) -> Phantom:
+) -> Phantom[EchoLevel]:
     """Reverberation between two plane borders: an echo every d c_ref / c, each weaker by 20 log10(r1 r2) dB."""
     top = 15.0
     above, gap = FLUID, Tissue("gap", speed_m_s, 9.0, 0.0)
@@ -219,10 +229,10 @@ def parallel_plates(
 
     def expected(probe: Probe):
         apart = gap_mm * REFERENCE_SPEED_M_S / speed_m_s
-        fall = 20.0 * np.log10(reflection_coefficient(gap, above) * reflection_coefficient(gap, below))
+        fall = float(20.0 * np.log10(reflection_coefficient(gap, above) * reflection_coefficient(gap, below)))
         far = top + gap_mm
         return tuple(
-            Echo(f"bounce {n}" if n else "far side", (0.0, top + (n + 1) * apart), (0.0, far), n * fall)
+            EchoLevel(f"bounce {n}" if n else "far side", (0.0, top + (n + 1) * apart), (0.0, far), n * fall)
             for n in range(3)
         )
 
@@ -237,7 +247,9 @@ def parallel_plates(
     )
 
 
-def curved_mirror(rotation: np.ndarray | None = None, *, radius_mm: float = 12.0, is_sphere: bool = True) -> Phantom:
+def curved_mirror(
+    rotation: np.ndarray | None = None, *, radius_mm: float = 12.0, is_sphere: bool = True
+) -> Phantom[Level]:
     """A steel ball or a rod across the image, in speckle that it mirrors, thinner the further away.
 
     A convex mirror of radius r has the focal length r/2, so at a distance l a narrow beam is 1 + 2 l / r times as wide:
@@ -256,7 +268,7 @@ def curved_mirror(rotation: np.ndarray | None = None, *, radius_mm: float = 12.0
         for away in (3.0, 6.0, 10.0):
             wider = (1.0 + 2.0 * away / radius_mm) ** (2 if is_sphere else 1)
             region = (-1.5, 1.5, top + away - 1.0, top + away + 1.0)
-            level = direct + 20 * np.log10(reflectance) - 10 * np.log10(wider)
+            level = float(direct + 20 * np.log10(reflectance) - 10 * np.log10(wider))
             levels.append(Level(f"{away:.0f} mm", region, level))
         return tuple(levels)
 
@@ -267,7 +279,7 @@ def curved_mirror(rotation: np.ndarray | None = None, *, radius_mm: float = 12.0
 # ---- resolution and speckle -----------------------------------------------------------------------------------------
 
 
-def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0.2) -> Phantom:
+def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0.2) -> Phantom[Echo | LevelChange]:
     """A quality-assurance phantom: wires every 10 mm of depth, black cysts, and blocks 6 dB above and below."""
     radius = 0.4
     # None is on another's scan line, or on a cyst's, for any kind of probe.
@@ -309,7 +321,7 @@ def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0
     return _phantom("wires and cysts", label, table, rotation, spacing_mm, expected, reference)
 
 
-def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom:
+def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom[Level]:
     """One tissue everywhere: the level is Var of its scatterers, the envelope Rayleigh; the PSF sets correlations."""
 
     def expected(probe: Probe):
@@ -322,7 +334,7 @@ def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = N
     return _phantom("uniform speckle", lambda x, y, z: np.ones_like(x + y + z), tissues, rotation, 1.0, expected)
 
 
-def thin_rod(rotation: np.ndarray | None = None, *, depth_mm: float = 30.0, width_mm: float = 1.2) -> Phantom:
+def thin_rod(rotation: np.ndarray | None = None, *, depth_mm: float = 30.0, width_mm: float = 1.2) -> Phantom[Echo]:
     """A thin echogenic bar along the lateral axis, square in section, in a fluid: shows how thick the slice is."""
 
     def label(x, y, z):
@@ -344,14 +356,14 @@ def layered(
     tilt_deg: float = 0.0,
     spacing_mm: float = 0.5,
     half_width_mm: float = 50.0,
-) -> Phantom:
+) -> Phantom[Echo]:
     """Plane layers of labels 1, 2, ... with borders at the given depths on the axis, tilted about z."""
     require(len(tissues) == len(borders_mm) + 1, f"{len(tissues)} tissues and {len(borders_mm)} borders do not fit")
     tilt = np.radians(tilt_deg)
 
     def label(x, y, z):
         along = np.sin(tilt) * x + np.cos(tilt) * y
-        return 1 + sum((along > np.cos(tilt) * border).astype(np.uint8) for border in borders_mm)
+        return sum((along > np.cos(tilt) * border for border in borders_mm), np.ones(along.shape, np.uint8))
 
     def expected(probe: Probe):
         if tilt_deg != 0.0:
@@ -370,7 +382,7 @@ def layered(
     return _phantom("layers", label, table, rotation, spacing_mm, expected, box=box)
 
 
-def small_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.0, half_mm: float = 2.0) -> Phantom:
+def small_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.0, half_mm: float = 2.0) -> Phantom[Echo]:
     """A square plate, small against the beam's changes and fine against its width, that faces the probe."""
 
     def label(x, y, z):
@@ -390,7 +402,7 @@ def voxel_sphere(
     radius_mm: float = 20.0,
     spacing_mm: float = 1.0,
     centre_mm=(0.31, 0.17, -0.42),
-) -> Phantom:
+) -> Phantom[Echo]:
     """A sphere on coarse voxels, its centre nowhere special on them (docs/physics.md#2-interfaces).
 
     `centre_mm` is in RAS; the probe face is 29 mm before it.
@@ -417,7 +429,9 @@ def voxel_sphere(
     return Phantom("voxel sphere", volume, tissues, pose, expected, centre_ras=tuple(centre))
 
 
-def voxel_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, spacing_mm: float = 1.0) -> Phantom:
+def voxel_sheet(
+    rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, spacing_mm: float = 1.0
+) -> Phantom[Echo]:
     """A sheet one voxel thick across the beam (falx, dura); an oblique one has voxels that touch by edges at least."""
     thickness = spacing_mm if rotation is None or np.allclose(np.abs(rotation).max(axis=0), 1.0) else 1.5 * spacing_mm
 
@@ -441,10 +455,19 @@ def _facing(depth_mm: float) -> Callable[[Probe], tuple[Echo, ...]]:
     return lambda probe: (Echo("face", (0.0, depth_mm), (0.0, depth_mm)),)
 
 
-def _phantom(name, label, tissues, rotation, spacing_mm, expected=None, reference=None, box=None) -> Phantom:
+def _phantom(
+    name: str,
+    label: Callable[..., np.ndarray],
+    tissues: TissueTable,
+    rotation: np.ndarray | None,
+    spacing_mm: float,
+    expected: Callable[[Probe], tuple[Expected, ...]],
+    reference: TissueTable | None = None,
+    box: _Box | None = None,
+) -> Phantom[Expected]:
     pose = _pose(rotation)
     labels = _voxelise(label, pose[:3, :3], spacing_mm, box or _Box())
-    return Phantom(name, labels, tissues, pose, expected or (lambda probe: ()), reference)
+    return Phantom(name, labels, tissues, pose, expected, reference)
 
 
 def _pose(rotation: np.ndarray | None) -> np.ndarray:
@@ -515,7 +538,7 @@ def _shown_behind_plane(probe, target, radius, point, normal, speeds_m_s) -> tup
         return direction[0] * to_target[1] - direction[1] * to_target[0]
 
     end = 0.9 * abs(probe.first_line)
-    position = brentq(miss, -end, end)
+    position = cast(float, brentq(miss, -end, end))  # one of several things that it returns, as arguments say
     before, crossing, _ = bent(position)
     behind = np.linalg.norm(target - crossing) - radius
     depth = REFERENCE_SPEED_M_S * (before / speeds_m_s[0] + behind / speeds_m_s[1])

@@ -15,7 +15,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.probe.arrays import PhasedProbe, Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, sample, surface_point, tilt_sweep
@@ -71,7 +71,7 @@ def make_twin(
     crossing: bool = False,
     display: DisplaySettings | None = None,
     display_is_known: bool = False,
-    device: str | Device | None = None,
+    device: DeviceChoice = None,
 ) -> Twin:
     """Patient number `seed` on true `labels` (1 is CSF), seen in `frames` images of a tilted probe.
 
@@ -116,7 +116,7 @@ def _own_view(random: np.random.Generator, labels: Volume, probe: Probe, frames:
     Over a sulcus the CSF in front of the face mirrors and bends what passes it, and half a voxel decides where to: a
     surgeon slides the probe until the window is good.
     """
-    best: tuple[float, list[np.ndarray]] | None = None
+    places: list[tuple[float, list[np.ndarray]]] = []
     for _ in range(_PLACES):
         pose = craniotomy_pose(labels, probe, tilt_deg=random.uniform(24.0, 42.0))
         target = pose @ [random.uniform(-4.0, 4.0), 0.5 * probe.depth_mm, random.uniform(-12.0, 12.0), 1.0]
@@ -124,9 +124,8 @@ def _own_view(random: np.random.Generator, labels: Volume, probe: Probe, frames:
         face = surface_point(labels, target[:3], outward) - _PRESSED_MM * outward
         poses = tilt_sweep(pose_looking_at(face, target[:3], lateral_ras=pose[:3, 0]), _TILT_DEG, frames)
         blocked = float(np.mean([_fluid_before(labels, pose, probe) for pose in poses]))
-        if best is None or blocked < best[0]:
-            best = blocked, poses
-    return best[1]
+        places.append((blocked, poses))
+    return min(places, key=lambda place: place[0])[1]
 
 
 def _fluid_before(labels: Volume, pose: np.ndarray, probe: Probe) -> float:

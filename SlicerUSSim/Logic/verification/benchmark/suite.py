@@ -9,6 +9,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
@@ -80,12 +81,16 @@ class _DeviceBenchmark:
         self.info, self.mri, self.repeat, self.progress = info, mri, repeat, progress
         self.device = Device.get(info)
         self.images: dict[str, np.ndarray] = {}
+        # Made on the way: what later measurements start from
+        self.segmentation: Segmentation
+        self.poses: dict[str, np.ndarray]
+        self.simulator: UltrasoundSimulator
 
     def run(self, brief: bool) -> dict:
         self._tell("memory and arithmetic")
         machine = Machine.measure(self.device)
         self._tell("segmentation")
-        numbers = {"kind": self.info.kind, **asdict(machine), "frames": {}}
+        numbers: dict[str, Any] = {"kind": self.info.kind, **asdict(machine), "frames": {}}
         numbers["segmentation"] = measured(self._segment, min(self.repeat, 5))
         self.poses = {name: craniotomy_pose(self.segmentation.labels, probe) for name, probe in FRAMES.items()}
         names = self.segmentation.tissue_names
@@ -104,7 +109,7 @@ class _DeviceBenchmark:
         self.progress(f"{self.info.index} {what}")
 
     def _segment(self) -> None:
-        self.segmentation: Segmentation = segment_mri(self.mri, device=self.device)
+        self.segmentation = segment_mri(self.mri, device=self.device)
 
     def _frame(self, name: str, machine: Machine) -> dict:
         probe, pose, simulator = FRAMES[name], self.poses[name], self.simulator
@@ -114,7 +119,7 @@ class _DeviceBenchmark:
             self.images[name] = simulator.simulate(probe, pose).image
 
         gains = iter(np.linspace(-3.0, 3.0, self.repeat + 1))
-        numbers = {
+        numbers: dict[str, dict] = {
             "whole": measured(whole, self.repeat),
             "display changed": measured(
                 lambda: simulator.simulate(probe, pose, DisplaySettings(gain_db=float(next(gains)))), self.repeat

@@ -8,10 +8,9 @@ LOG2_E = np.float32(1.44269504089)
 LN10_OVER_20 = np.float32(0.11512925465)
 
 
-def f32(*values):
-    """Scalars or arrays as float32."""
-    converted = tuple(np.asarray(value, np.float32) for value in values)
-    return converted if len(converted) > 1 else converted[0]
+def f32(value) -> np.ndarray:
+    """A scalar or an array as float32."""
+    return np.asarray(value, np.float32)
 
 
 def exp2(x: np.ndarray) -> np.ndarray:
@@ -63,7 +62,7 @@ def hash_mix(x: np.ndarray) -> np.ndarray:
 
 def gaussian(bits: np.ndarray) -> np.ndarray:
     """N(0, 1) from 32 random bits: the sum of four bytes with a cubic correction."""
-    total = sum((bits >> np.uint32(8 * byte)) & np.uint32(255) for byte in range(4))
+    total = sum(((bits >> np.uint32(8 * byte)) & np.uint32(255) for byte in range(4)), np.uint32(0))
     z = (total.astype(np.float32) - f32(510)) * f32(0.00676579)
     return z * (f32(0.94903328) + f32(0.01864238) * z * z)
 

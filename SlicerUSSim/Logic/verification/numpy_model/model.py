@@ -75,7 +75,7 @@ class NumpyModel:
 def _convolved(lines: np.ndarray, taps: np.ndarray) -> np.ndarray:
     reach = len(taps) // 2
     padded = np.pad(lines, ((0, 0), (reach, reach)))
-    return sum(tap * padded[:, k : k + lines.shape[1]] for k, tap in enumerate(taps))
+    return sum((tap * padded[:, k : k + lines.shape[1]] for k, tap in enumerate(taps)), np.zeros_like(lines))
 
 
 def compressed(acquisition: np.ndarray, display: DisplaySettings, iq: np.ndarray) -> np.ndarray:
@@ -89,7 +89,7 @@ def compressed(acquisition: np.ndarray, display: DisplaySettings, iq: np.ndarray
             + (np.uint32(noise_seed(acquisition)) + line * np.uint32(0x85EBCA77))
         )
         iq = iq + noise * (gaussian(key) + 1j * gaussian(hash_mix(key + np.uint32(0x9E3779B9))))
-    power = iq.real**2 + iq.imag**2 + f32(1e-30)
+    power = np.real(iq) ** 2 + np.imag(iq) ** 2 + f32(1e-30)
     tgc_db = index * (
         2.0 * display.tgc_db_cm_mhz * float(acquisition["frequency_mhz"]) * float(acquisition["sample_mm"]) * 0.1
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from copy import copy
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -44,29 +45,35 @@ class Rays:
     blind_until: np.ndarray
     reflections: np.ndarray
     label: np.ndarray
-    # The node: course in voxels, where it ends, what happened since it began
-    start: np.ndarray = field(default=None)
-    step: np.ndarray = field(default=None)
-    aside: np.ndarray = field(default=None)
-    depth_per_mm: np.ndarray = field(default=None)
-    to_depth: np.ndarray = field(default=None)
-    leave: np.ndarray = field(default=None)
-    inside: np.ndarray = field(default=None)
-    since: np.ndarray = field(default=None)
-    spent: np.ndarray = field(default=None)
-    open: np.ndarray = field(default=None)
-    spent_open: np.ndarray = field(default=None)
+    # The node, which Tracer._begin fills in: course in voxels, where it ends, what happened since it began
+    start: np.ndarray = field(init=False)
+    step: np.ndarray = field(init=False)
+    aside: np.ndarray = field(init=False)
+    depth_per_mm: np.ndarray = field(init=False)
+    to_depth: np.ndarray = field(init=False)
+    leave: np.ndarray = field(init=False)
+    inside: np.ndarray = field(init=False)
+    since: np.ndarray = field(init=False)
+    spent: np.ndarray = field(init=False)
+    open: np.ndarray = field(init=False)
+    spent_open: np.ndarray = field(init=False)
 
     def __len__(self) -> int:
         return len(self.line)
 
     def of(self, which: np.ndarray) -> Rays:
         """A copy of some rows."""
-        return Rays(*(None if v is None else v[which] for v in (getattr(self, f.name) for f in fields(self))))
+        return self._with({name: rows[which] for name, rows in vars(self).items()})
 
     @staticmethod
     def joined(parts: list[Rays]) -> Rays:
-        return Rays(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Rays)))
+        """All rows of some rays, which are at nodes all or none."""
+        return parts[0]._with({name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
+
+    def _with(self, values: dict[str, np.ndarray]) -> Rays:
+        made = copy(self)
+        vars(made).update(values)
+        return made
 
 
 class Tracer:

@@ -4,222 +4,24 @@ A check measures one phenomenon for one orientation of its phantom on the voxels
 outcome is rows of a table (predicted, measured, tolerance) and a picture. `ussim validate` runs them all.
 """
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-import os
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from SlicerUSSim.Logic.base.lazy import lazy_exports
 
-import numpy as np
-from scipy.spatial.transform import Rotation
+if TYPE_CHECKING:
+    from .checks import (
+        ORIENTATIONS as ORIENTATIONS,
+        PROBES as PROBES,
+        Check as Check,
+        Outcome as Outcome,
+        Row as Row,
+    )
+    from .run import (
+        Finding as Finding,
+        Report as Report,
+        all_checks as all_checks,
+        chosen_checks as chosen_checks,
+        validate as validate,
+    )
 
-from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.probe.arrays import ConvexProbe, LinearProbe, PhasedProbe, Probe
-
-#: How the phantoms, and the probes with them, lie on the voxels: along them, and two oblique ways.
-ORIENTATIONS: dict[str, np.ndarray] = {
-    "aligned": np.eye(3),
-    "oblique": Rotation.from_euler("xyz", [20, 33, 11], degrees=True).as_matrix(),
-    "diagonal": Rotation.from_euler("xyz", [45, 40, 10], degrees=True).as_matrix(),
-}
-
-_FOCUS = {"scan_lines": 161, "focus_mm": 30.0, "elevation_focus_mm": 30.0}
-PROBES: dict[str, Probe] = {
-    "linear": LinearProbe(36.0, 52.0, **_FOCUS),
-    "convex": ConvexProbe(60.0, 36.0, 52.0, **_FOCUS),
-    "phased": PhasedProbe(70.0, 52.0, **_FOCUS),
-}
-
-
-@dataclass(frozen=True)
-class Row:
-    """One number: what theory predicts and what was measured."""
-
-    #: What is measured, and on which probe or at which depth
-    quantity: str
-    unit: str
-    predicted: float
-    measured: float
-    tolerance: float
-    #: "within": |measured - predicted| <= tolerance; "at most" and "at least": predicted + or - tolerance is a limit
-    kind: str = "within"
-
-    @property
-    def passed(self) -> bool:
-        """Whether the measured number is as predicted; not for one that is not finite."""
-        off = self.measured - self.predicted
-        if self.kind == "at most":
-            return bool(off <= self.tolerance)
-        if self.kind == "at least":
-            return bool(-off <= self.tolerance)
-        return bool(abs(off) <= self.tolerance)
-
-    @property
-    def limits(self) -> str:
-        """What the measured number may be, in words."""
-        if self.kind == "at most":
-            return f"≤ {self.predicted + self.tolerance:.3g}"
-        if self.kind == "at least":
-            return f"≥ {self.predicted - self.tolerance:.3g}"
-        return f"± {self.tolerance:.3g}"
-
-    @property
-    def strain(self) -> float:
-        """How near the measured number is to its limit: 0 as predicted, 1 at the limit, above it failed."""
-        if np.isnan(self.measured):  # what was to be measured was not there
-            return float("inf")
-        if self.kind == "within":
-            off = abs(self.measured - self.predicted)
-            return off / self.tolerance if self.tolerance > 0 else float(off > 0)
-        limit = self.predicted + (self.tolerance if self.kind == "at most" else -self.tolerance)
-        pair = (self.measured, limit) if self.kind == "at most" else (limit, self.measured)
-        # Of numbers of one sign, the share of the limit; a limit of zero or of another sign says only yes or no.
-        return pair[0] / pair[1] if min(pair) > 0 else float(not self.passed)
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What one check found in one orientation."""
-
-    rows: tuple[Row, ...]
-    #: Writes the picture to a path; None where there is nothing to see
-    draw: Callable[[Path], None] | None = None
-
-
-@dataclass(frozen=True)
-class Check:
-    """One phenomenon. `measure(rotation, device)` gives an Outcome."""
-
-    name: str
-    #: What theory says, in one line
-    claim: str
-    measure: Callable[[np.ndarray, object], Outcome]
-    orientations: tuple[str, ...] = tuple(ORIENTATIONS)
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A row with the check and the orientation it belongs to."""
-
-    check: str
-    orientation: str
-    row: Row
-
-
-@dataclass(frozen=True, eq=False)
-class Report:
-    """All rows of a validation."""
-
-    findings: tuple[Finding, ...]
-    device: str
-    pictures: tuple[str, ...] = ()
-
-    @property
-    def failed(self) -> tuple[Finding, ...]:
-        """The rows that are not as predicted."""
-        return tuple(finding for finding in self.findings if not finding.row.passed)
-
-    def to_dict(self) -> dict:
-        """Plain values, one entry per row."""
-        return {
-            "device": self.device,
-            "passed": not self.failed,
-            "pictures": list(self.pictures),
-            "rows": [
-                {"check": f.check, "orientation": f.orientation, **asdict(f.row), "passed": f.row.passed}
-                # What is no number, because the echo to be measured was not there, has no place in JSON either.
-                | {"measured": float(f.row.measured) if np.isfinite(f.row.measured) else None}
-                for f in self.findings
-            ],
-        }
-
-    def to_markdown(self) -> str:
-        """The table, a section per check, with its claim and its picture."""
-        lines = ["# Validation", "", f"Device: {self.device}. {self.summary()}", ""]
-        checks = {check.name: check for check in all_checks()}
-        rows = {
-            name: [f for f in self.findings if f.check == name]
-            for name in dict.fromkeys(f.check for f in self.findings)
-        }
-        lines += ["| check | rows | passed | nearest to its limit | share of it |", "|---|---|---|---|---|"]
-        for name, findings in rows.items():
-            passed = sum(f.row.passed for f in findings)
-            worst = max(findings, key=lambda f: f.row.strain)
-            near = f"{worst.row.quantity}, {worst.orientation} | {100 * worst.row.strain:.0f} %"
-            lines.append(f"| [{name}](#{_slug(name)}) | {len(findings)} | {passed} | {near} |")
-        lines.append("")
-        for name, findings in rows.items():
-            lines += [f"## {name}", "", checks[name].claim, ""]
-            if f"{_slug(name)}.png" in self.pictures:
-                lines += [f"![{name}]({_slug(name)}.png)", ""]
-            lines += ["| | orientation | predicted | measured | limit | |", "|---|---|---|---|---|---|"]
-            for finding in findings:
-                row, unit = finding.row, f" {finding.row.unit}" if finding.row.unit else ""
-                values = f"{row.predicted:.4g}{unit} | {row.measured:.4g}{unit} | {row.limits}"
-                verdict = "pass" if row.passed else "**FAIL**"
-                lines.append(f"| {row.quantity} | {finding.orientation} | {values} | {verdict} |")
-            lines.append("")
-        return "\n".join(lines)
-
-    def summary(self) -> str:
-        """One sentence: how many rows passed."""
-        return f"{len(self.findings) - len(self.failed)} of {len(self.findings)} rows passed."
-
-
-def all_checks() -> tuple[Check, ...]:
-    """Every check, in the order of the physics: rays, speckle, artefacts, space."""
-    from SlicerUSSim.Logic.verification.validation import artefacts, beams, rays, speckle
-
-    return (*rays.CHECKS, *speckle.CHECKS, *artefacts.CHECKS, *beams.CHECKS)
-
-
-def validate(
-    out: str | os.PathLike,
-    device=None,
-    only: Iterable[str] = (),
-    progress: Callable[[str], None] = lambda name: None,
-) -> Report:
-    """Run the checks (all, or those whose names contain one of `only`) and write report.md, report.json and pictures.
-
-    Raises SimulationError without matplotlib, for an `only` that no check has in its name, and for a folder that cannot
-    be made. A row that fails is no error: see Report.failed.
-    """
-    from SlicerUSSim.Logic.base.files import make_folder, write_json, written_whole
-    from SlicerUSSim.Logic.imaging.figures import require_matplotlib
-    from SlicerUSSim.Logic.opencl.device import Device
-
-    require_matplotlib()
-    checks = chosen_checks(only)
-    folder = make_folder(out)
-    opened = Device.get(device)
-    findings, pictures = [], []
-    for check in checks:
-        for orientation in check.orientations:
-            progress(f"{check.name}, {orientation}")
-            outcome = check.measure(ORIENTATIONS[orientation], opened)
-            findings += [Finding(check.name, orientation, row) for row in outcome.rows]
-            if outcome.draw is not None and orientation == check.orientations[0]:
-                name = f"{_slug(check.name)}.png"
-                outcome.draw(folder / name)
-                pictures.append(name)
-    report = Report(tuple(findings), str(opened.info), tuple(pictures))
-    write_json(folder / "report.json", report.to_dict())
-    with written_whole(folder / "report.md") as partial:
-        partial.write_text(report.to_markdown(), encoding="utf-8")
-    return report
-
-
-def chosen_checks(only: Iterable[str]) -> tuple[Check, ...]:
-    """The checks whose names contain one of the texts; all if there are none. SimulationError for one nobody has."""
-    wanted, checks = tuple(only), all_checks()
-    for text in wanted:
-        require(
-            any(text in check.name for check in checks),
-            f"no check has {text!r} in its name, expected part of: {', '.join(check.name for check in checks)}",
-        )
-    return tuple(check for check in checks if not wanted or any(text in check.name for text in wanted))
-
-
-def _slug(name: str) -> str:
-    return name.replace(" ", "-")
+lazy_exports(globals())

@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.verification.phantoms import (
     speed_block,
     wires_and_cysts,
 )
-from SlicerUSSim.Logic.verification.validation import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import View, draw_views
 
 _SEARCH_MM = 1.5  # around the predicted place; five times the widest tolerance
@@ -44,6 +44,7 @@ def _images(simulator: UltrasoundSimulator, phantom: Phantom, probes: dict[str, 
 
 def _images_and_reference(phantom: Phantom, device) -> tuple[dict[str, Frame], dict[str, Frame]]:
     """What each probe sees of the phantom, and of its reference."""
+    assert phantom.reference is not None, "of phantoms whose theory is about a change of level or place"
     simulator = _simulator(phantom, device)
     frames = _images(simulator, phantom)
     simulator.set_tissues(phantom.reference)
@@ -112,8 +113,11 @@ def mirroring(rotation: np.ndarray, device) -> Outcome:
 def curved_mirrors(rotation: np.ndarray, device) -> Outcome:
     """Speckle mirrored by a ball, a rod and a plane."""
     rows, views = [], []
-    for kind, shape in (("ball", {}), ("rod", {"is_sphere": False}), ("plane", {"radius_mm": 1e6})):
-        phantom = curved_mirror(rotation, **shape)
+    for kind, phantom in (
+        ("ball", curved_mirror(rotation)),
+        ("rod", curved_mirror(rotation, is_sphere=False)),
+        ("plane", curved_mirror(rotation, radius_mm=1e6)),
+    ):
         simulator = _simulator(phantom, device, replace(_SETTINGS, interfaces=False))
         seen = []
         for seed in range(12):
@@ -122,7 +126,7 @@ def curved_mirrors(rotation: np.ndarray, device) -> Outcome:
         for name, probe in PROBES.items():
             for level in phantom.expected(probe):
                 powers = [10 ** (region_level_db(frame[name], probe, level.region_mm) / 10) for frame in seen]
-                measured = 10 * np.log10(np.mean(powers))
+                measured = float(10 * np.log10(np.mean(powers)))
                 rows.append(Row(f"speckle {level.name} behind a {kind}, {name}", "dB", level.level_db, measured, 1.5))
         views.append(View(kind, phantom, PROBES["convex"], seen[0]["convex"]))
     return Outcome(tuple(rows), partial(draw_views, views=views))

@@ -18,13 +18,14 @@ from SlicerUSSim.Logic.probe.placement import elevational_motion, sample, slide_
 from SlicerUSSim.Logic.verification.measurement import depth_window, echo_near, full_width
 from SlicerUSSim.Logic.verification.phantoms import (
     FLUID,
+    Echo,
     layered,
     reflection_coefficient,
     small_sheet,
     thin_rod,
     wires_and_cysts,
 )
-from SlicerUSSim.Logic.verification.validation import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_cross_sections, draw_plots
 
 #: A border with FLUID that bends no ray
@@ -149,7 +150,9 @@ def resolution(rotation: np.ndarray, device) -> Outcome:
         fine = replace(probe, scan_lines=481)
         frame = simulator.simulate(fine, phantom.probe_to_ras)
         for wire in (
-            e for e in phantom.expected(fine) if e.name in ("wire at 20 mm", "wire at 30 mm", "wire at 40 mm")
+            e
+            for e in phantom.expected(fine)
+            if isinstance(e, Echo) and e.name in ("wire at 20 mm", "wire at 30 mm", "wire at 40 mm")
         ):
             depth = float(fine.line_through(*wire.shown_mm)[1])
             at = round(depth / frame.sample_interval_mm)

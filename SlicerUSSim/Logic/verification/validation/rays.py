@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.verification.phantoms import (
     voxel_sheet,
     voxel_sphere,
 )
-from SlicerUSSim.Logic.verification.validation import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, View, draw_plots, draw_views
 
 SLOW, FAST = Tissue("slow", 1450.0, 1.45, 0.3), Tissue("fast", 1650.0, 1.9, 0.9)

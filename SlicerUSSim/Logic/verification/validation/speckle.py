@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -14,8 +15,8 @@ from SlicerUSSim.Logic.probe.arrays import LinearProbe, Probe
 from SlicerUSSim.Logic.probe.placement import elevational_motion
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, fit_rayleigh, level_db
-from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, uniform_speckle
-from SlicerUSSim.Logic.verification.validation import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, Phantom, uniform_speckle
+from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import (
     Curve,
     Plot,
@@ -34,7 +35,9 @@ DEPTHS_MM = (10.0, 30.0, 46.0)
 SEEDS = range(8)
 
 
-def _simulators(rotation: np.ndarray, device, tissue: Tissue = SPECKLE, seeds=SEEDS, **settings):
+def _simulators(
+    rotation: np.ndarray, device, tissue: Tissue = SPECKLE, seeds: Sequence[int] = SEEDS, **settings
+) -> tuple[Phantom, list[UltrasoundSimulator]]:
     phantom = uniform_speckle(tissue, rotation)
     return phantom, [
         UltrasoundSimulator(phantom.labels, phantom.tissues, SimulationSettings(seed=seed, **settings), device)
@@ -117,7 +120,7 @@ def correlations(rotation: np.ndarray, device) -> Outcome:
 def coherence(rotation: np.ndarray, device) -> Outcome:
     """The probe moves along its own lateral axis by one scan line; the patient stays."""
     phantom, (simulator,) = _simulators(rotation, device, seeds=(0,))
-    rows = []
+    rows, images = [], {}
     probes = {"linear": replace(PROBES["linear"], width_mm=36.0, scan_lines=181)} | {
         name: PROBES[name] for name in ("convex", "phased")
     }

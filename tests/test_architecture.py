@@ -1,0 +1,348 @@
+"""Who imports whom: the rooms of DESIGN's line, read from the sources.
+
+    python -m tests.test_architecture [ROOT]
+
+prints rooms, levels and imports of the tree that holds SlicerUSSim/, to compare two states of it. A room is a package
+of Logic/ (or a single file there), Widget, Workstation, Command or the file that Slicer loads. What counts are imports
+at the top of a file, inside functions and for types alone; but not what a face re-exports, since whoever imports a name
+from a face is taken to import the module that defines it.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "SlicerUSSim"
+#: Each room knows rooms to its left only.
+ORDER = (
+    "base", "opencl", "probe", "tissue", "mri", "imaging", "tracked", "fitting", "vtk", "verification", "mrml",
+    "Widget", "module", "Workstation", "Command",
+)  # fmt: skip
+#: Libraries that take long to import, and the rooms whose files may do so at their top. Elsewhere it is left to the
+#: functions that need them, so that whoever wants something else does not wait.
+HEAVY = {
+    "pyopencl": set(),
+    "SimpleITK": set(),
+    "matplotlib": set(),
+    "vtk": {"base", "probe", "vtk", "mrml", "Widget", "module", "Workstation"},
+    "skimage": set(),
+    "nlopt": set(),
+    "slicer": {"mrml", "module", "Widget", "Workstation"},
+}
+#: Other names of the same
+_LIBRARIES = {"vtkmodules": "vtk"}
+
+Node = TypeVar("Node")
+
+
+@dataclass(frozen=True)
+class Import:
+    """One import of one thing."""
+
+    #: Module that imports, and the module or library that is imported
+    importer: str
+    imported: str
+    #: At the top of the file, so that it happens when the file is imported
+    at_top: bool
+
+
+class Tree:
+    """The modules of a source tree and their imports.
+
+    Parameters
+    ----------
+    root : the folder that holds SlicerUSSim/.
+    """
+
+    def __init__(self, root: Path) -> None:
+        folder = root / PACKAGE
+        self.paths = {_module_name(path, root): path for path in sorted(folder.rglob("*.py"))}
+        self.sources = {name: ast.parse(path.read_text()) for name, path in self.paths.items()}
+        #: {package: {name: module that defines it}}
+        self.faces = {name: _exports(name, source) for name, source in self.sources.items() if _is_face(source)}
+        self.imports = [found for name in self.paths for found in self.imports_of(name, self.sources[name])]
+
+    def imports_of(self, importer: str, source: ast.Module) -> Iterator[Import]:
+        """Every import of a file, with names from faces resolved."""
+        types_only = set(map(id, _in_type_checking(source)))
+        at_top = set(map(id, _executed(source))) - types_only
+        is_package = importer in self.paths and self.paths[importer].name == "__init__.py"
+        for node in ast.walk(source):
+            if id(node) in types_only and importer in self.faces:
+                continue
+            for imported in self._imported(node, importer, is_package):
+                yield Import(importer, imported, id(node) in at_top)
+
+    def _imported(self, node: ast.AST, importer: str, is_package: bool) -> Iterator[str]:
+        if isinstance(node, ast.Import):
+            yield from (self._home(alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            package = node.module or ""
+            if node.level:
+                parts = importer.split(".")
+                base = parts[: len(parts) - node.level + is_package]
+                package = ".".join([*base, *([node.module] if node.module else [])])
+            yield from (self._home(f"{package}.{alias.name}") for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            yield from (self._home(str(name.value)) for name in node.args[:1] if isinstance(name, ast.Constant))
+
+    def _home(self, name: str) -> str:
+        """The module that `name` is or comes from; for what is not of this tree, the library."""
+        if name.split(".")[0] != PACKAGE:
+            library = name.split(".")[0]
+            return _LIBRARIES.get(library, library)
+        while name not in self.paths:
+            package, _, last = name.rpartition(".")
+            if last in self.faces.get(package, {}):
+                return self.faces[package][last]
+            if not package:
+                return PACKAGE
+            name = package
+        return name
+
+    def edges(self) -> set[tuple[str, str]]:
+        """(importer, imported), both modules of this tree, neither a face."""
+        return {
+            (found.importer, found.imported)
+            for found in self.imports
+            if found.imported in self.paths and found.imported not in self.faces and found.importer not in self.faces
+            and found.importer != found.imported
+        }  # fmt: skip
+
+    def rooms(self) -> dict[str, list[str]]:
+        """{room: its modules}."""
+        rooms: dict[str, list[str]] = {}
+        for name in self.paths:
+            if name not in self.faces:
+                rooms.setdefault(room_of(name), []).append(name)
+        return rooms
+
+    def room_edges(self) -> dict[str, set[str]]:
+        """{room: rooms that it imports}."""
+        found: dict[str, set[str]] = {room: set() for room in self.rooms()}
+        for importer, imported in self.edges():
+            if room_of(importer) != room_of(imported):
+                found[room_of(importer)].add(room_of(imported))
+        return found
+
+    def libraries(self, *, at_top: bool) -> dict[str, set[str]]:
+        """{module: libraries it imports}, all of them or those at the top of the file."""
+        found: dict[str, set[str]] = {}
+        for entry in self.imports:
+            if entry.imported not in self.paths and (entry.at_top or not at_top):
+                found.setdefault(entry.importer, set()).add(entry.imported)
+        return found
+
+
+def _module_name(path: Path, root: Path) -> str:
+    parts = path.relative_to(root).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room_of(module: str) -> str:
+    """The room of a module: the package of Logic, or a file directly in it; the folder beside it; "module"."""
+    parts = module.split(".")[1:]
+    if not parts:
+        return PACKAGE
+    if parts[0] == "Logic":
+        return parts[1] if len(parts) > 1 else "Logic"
+    return parts[0] if parts[0] in ("Widget", "Workstation", "Command") else "module"
+
+
+def _is_type_checking(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
+
+
+def _in_type_checking(source: ast.Module) -> Iterator[ast.AST]:
+    for node in ast.walk(source):
+        if isinstance(node, ast.If) and _is_type_checking(node):
+            for statement in node.body:
+                yield from ast.walk(statement)
+
+
+def _executed(node: ast.AST) -> Iterator[ast.AST]:
+    """What runs when the file is imported: everything outside functions."""
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+            yield child
+            yield from _executed(child)
+
+
+def _is_face(source: ast.Module) -> bool:
+    return any(isinstance(node, ast.Call) and ast.unparse(node.func) == "lazy_exports" for node in ast.walk(source))
+
+
+def _exports(package: str, source: ast.Module) -> dict[str, str]:
+    return {
+        alias.asname or alias.name: f"{package}.{node.module}"
+        for node in _in_type_checking(source)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+
+def circles(edges: Mapping[Node, set[Node]]) -> list[list[Node]]:
+    """Groups of nodes that reach each other (Tarjan's strongly connected components of more than one)."""
+    order: dict[Node, int] = {}
+    low: dict[Node, int] = {}
+    stack: list[Node] = []
+    found: list[list[Node]] = []
+
+    def visit(node: Node) -> None:
+        order[node] = low[node] = len(order)
+        stack.append(node)
+        for following in edges.get(node, ()):
+            if following not in order:
+                visit(following)
+                low[node] = min(low[node], low[following])
+            elif following in stack:
+                low[node] = min(low[node], order[following])
+        if low[node] == order[node]:
+            group = stack[stack.index(node) :]
+            del stack[stack.index(node) :]
+            if len(group) > 1:
+                found.append(group)
+
+    for node in list(edges):
+        if node not in order:
+            visit(node)
+    return found
+
+
+def levels(edges: Mapping[str, set[str]]) -> dict[str, int]:
+    """{room: 1 for one that imports none, else one more than the highest it imports}; rooms in a circle share one."""
+    group = {member: tuple(members) for members in circles(edges) for member in members}
+    known: dict[str, int] = {}
+
+    def level(room: str) -> int:
+        if room not in known:
+            members = group.get(room, (room,))
+            below = {other for member in members for other in edges.get(member, ())} - set(members)
+            value = 1 + max(map(level, below), default=0)
+            known.update(dict.fromkeys(members, value))
+        return known[room]
+
+    return {room: level(room) for room in edges}
+
+
+@pytest.fixture(scope="module")
+def tree() -> Tree:
+    return Tree(ROOT)
+
+
+def test_the_rooms_are_those_of_the_design(tree):
+    assert set(tree.rooms()) == set(ORDER)
+
+
+def test_no_room_imports_one_that_stands_on_it(tree):
+    edges = tree.room_edges()
+    assert circles(edges) == []
+    wrong = {
+        f"{room} -> {other}" for room, others in edges.items() for other in others
+        if ORDER.index(other) >= ORDER.index(room)
+    }  # fmt: skip
+    assert wrong == set()
+    assert edges["base"] == set()
+
+
+def test_no_modules_of_a_room_import_each_other_in_a_circle(tree):
+    for room, members in tree.rooms().items():
+        edges = {module: {b for a, b in tree.edges() if a == module and b in members} for module in members}
+        assert circles(edges) == [], room
+
+
+def test_only_the_command_knows_the_workstation_and_what_verifies(tree):
+    edges = tree.room_edges()
+    for room in ("Workstation", "verification"):
+        assert {other for other, imported in edges.items() if room in imported} == {"Command"}
+
+
+def test_examples_and_benchmarks_know_no_workstation_and_no_panel(tree):
+    for path in [*(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]:
+        found = tree.imports_of(f"{path.parent.name}.{path.stem}", ast.parse(path.read_text()))
+        rooms = {room_of(entry.imported) for entry in found if entry.imported in tree.paths}
+        assert not rooms & {"Workstation", "Widget", "Command"}, path.name
+
+
+def test_slicer_and_qt_stay_where_they_belong(tree):
+    in_logic = {n: found for n, found in tree.libraries(at_top=False).items() if n.startswith(f"{PACKAGE}.Logic")}
+    assert {room_of(name) for name, found in in_logic.items() if "slicer" in found} == {"mrml"}
+    assert not {name for name, found in in_logic.items() if found & {"qt", "ctk", "PySide6", "trame", "click"}}
+
+
+def test_heavy_libraries_are_imported_by_functions_or_in_the_rooms_that_live_on_them(tree):
+    at_top = tree.libraries(at_top=True)
+    found = {
+        library: {room_of(name) for name, libraries in at_top.items() if library in libraries} for library in HEAVY
+    }
+    assert {library: rooms - HEAVY[library] for library, rooms in found.items() if rooms - HEAVY[library]} == {}
+
+
+def test_help_imports_no_library_that_takes_long():
+    code = """
+import json, sys
+from click.testing import CliRunner
+from SlicerUSSim.Command.cli import main
+assert CliRunner().invoke(main, ["--help"]).exit_code == 0
+print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {*HEAVY, "vtkmodules", "numpy", "scipy", "nibabel", "PIL", "trame"} & set(json.loads(done.stdout))
+
+
+def test_what_reads_the_imports_finds_them_all(tmp_path):
+    """The reader itself: relative and lazy imports, names from faces, those for types alone, circles and levels."""
+    files = {
+        "Logic/low/__init__.py": "from x import lazy_exports\nif TYPE_CHECKING:\n    from .a import A as A\n"
+        "lazy_exports(globals())\n",
+        "Logic/low/a.py": "import json\nclass A: ...\n",
+        "Logic/high/b.py": "from SlicerUSSim.Logic.low import A\ndef f():\n    import vtkmodules.util\n",
+        "Logic/high/c.py": "from . import b\nif TYPE_CHECKING:\n    from ..low.a import A\n",
+        "Logic/round.py": "import importlib\nimportlib.import_module('SlicerUSSim.Logic.high.c')\n",
+        "Widget/d.py": "import SlicerUSSim.Logic.round\n",
+    }
+    for name, text in files.items():
+        path = tmp_path / PACKAGE / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    found = Tree(tmp_path)
+    names = {(a.removeprefix(f"{PACKAGE}."), b.removeprefix(f"{PACKAGE}.")) for a, b in found.edges()}
+    assert names == {
+        ("Logic.high.b", "Logic.low.a"), ("Logic.high.c", "Logic.high.b"), ("Logic.high.c", "Logic.low.a"),
+        ("Logic.round", "Logic.high.c"), ("Widget.d", "Logic.round"),
+    }  # fmt: skip
+    assert levels(found.room_edges()) == {"low": 1, "high": 2, "round": 3, "Widget": 4}
+    assert found.libraries(at_top=False)[f"{PACKAGE}.Logic.high.b"] == {"vtk"}
+    assert f"{PACKAGE}.Logic.high.b" not in found.libraries(at_top=True)
+    assert found.libraries(at_top=True)[f"{PACKAGE}.Logic.low.a"] == {"json"}
+    assert [sorted(group) for group in circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}})] == [["b", "c"]]
+    assert levels({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == {"a": 2, "b": 1, "c": 1, "d": 3}
+
+
+def main(root: Path) -> None:
+    """Print what there is to compare."""
+    tree = Tree(root)
+    edges = tree.room_edges()
+    floor = levels(edges)
+    for room in sorted(edges, key=lambda name: (floor[name], name)):
+        print(f"{floor[room]:3d}  {room:16s} {', '.join(sorted(edges[room], key=lambda name: floor[name]))}")
+    between = sum(room_of(a) != room_of(b) for a, b in tree.edges())
+    print(
+        f"{len(tree.paths) - len(tree.faces)} modules, {len(edges)} rooms, {max(floor.values())} levels, "
+        f"{sum(map(len, edges.values()))} imports between rooms, {between} between modules of different rooms, "
+        f"{len(circles(edges))} circles between rooms"
+    )
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT)
