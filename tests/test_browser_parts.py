@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import io
 import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 from PIL import Image
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkFeatureEdges, vtkMassProperties, vtkTriangleFilter
 
-from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationError, TissueTable, UltrasoundSimulator
+from SlicerUSSim.Logic import (
+    ConvexProbe,
+    LinearProbe,
+    PhasedProbe,
+    SimulationError,
+    Tissue,
+    TissueTable,
+    UltrasoundSimulator,
+)
 from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.samples import head_mri
@@ -179,25 +190,61 @@ def test_a_cine_keeps_time_and_begins_anew_with_another_size():
         assert gif.info["duration"] == 250 and np.asarray(gif.convert("L"))[0, 0] == 50 * number
 
 
-def test_the_script_of_a_label_map_simulates_the_same_image(head, tmp_path):
+#: What breaks text that is pasted between quotes.
+NASTY = ["it's", 'a "b"', "back\\slash\\", "two\nlines", "'''", '"""', "\\N{x} {y} %s", "grüße ∎"]
+
+
+def run_again(script: str, folder) -> np.ndarray:
+    """The (rows, columns) image that a script writes."""
+    (folder / "again.py").write_text(script, encoding="utf-8")
+    done = subprocess.run([sys.executable, "again.py"], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return read_array(folder / "image.nrrd")[0][0]
+
+
+@pytest.mark.parametrize("nasty", ["", "'", '"', "\\", "\n", '"""', "'''\\"], ids=repr)
+def test_the_script_of_a_label_map_simulates_the_same_image_whatever_files_and_tissues_are_called(
+    head, tmp_path, nasty
+):
     # Labels that the scene numbers in another way: 7 for white matter, and 3 for grey matter.
     numbers = {"csf": 2, "grey matter": 3, "white matter": 7, "leptomeninges": 5}
     table = np.zeros(len(head.tissue_names) + 1, np.uint8)
     for label, name in enumerate(head.tissue_names, 1):
         table[label] = numbers[name]
-    head.labels.with_array(table[head.labels.array]).write(tmp_path / "labels.nii.gz")
+    file = tmp_path / f"my {nasty}labels.nii.gz"
+    head.labels.with_array(table[head.labels.array]).write(file)
     back = [0] * 8
     for label, name in enumerate(head.tissue_names, 1):
         back[numbers[name]] = label
     probe = PhasedProbe(60.0, 60.0, scan_lines=48)
-    preset = Preset(probe=probe, tissues=TissueTable.brain(head.tissue_names))
-    preset = preset.changed("display", gain_db=4.0)
+    tissues = TissueTable(
+        {
+            label: replace(tissue, name=f"{nasty}{tissue.name}{nasty}", sources={"mu0": f"measured {nasty}"})
+            for label, tissue in TissueTable.brain(head.tissue_names).items()
+        }
+    )
+    preset = Preset(probe=probe, tissues=tissues).changed("display", gain_db=4.0)
     pose = craniotomy_pose(head.labels, probe)
-    source = LabelSource(str(tmp_path / "labels.nii.gz"), True, relabelled=tuple(back))
-    (tmp_path / "again.py").write_text(python_script(source, preset, pose))
-    subprocess.run([sys.executable, "again.py"], cwd=tmp_path, check=True, capture_output=True)
+    script = python_script(LabelSource(str(file), True, relabelled=tuple(back)), preset, pose)
     frame = UltrasoundSimulator(head.labels, preset.tissues).simulate(probe, pose, preset.display)
-    assert np.array_equal(read_array(tmp_path / "image.nrrd")[0][0], frame.image)
+    assert np.array_equal(run_again(script, tmp_path), frame.image)
+
+
+@given(name=st.one_of(st.sampled_from(NASTY), st.text(min_size=1)).filter(str.strip), path=st.text(min_size=1))
+def test_a_script_means_the_very_names_it_was_given(name, path):
+    tissues = Preset().tissues.with_tissue(Tissue(name, 1540.0, 1.6, 0.5, sources={"mu0": name}))
+    preset = replace(Preset(), tissues=tissues)
+    source = LabelSource(path, mask=path, options={"contrast": name})
+    calls = {
+        ast.unparse(call.func): call
+        for call in ast.walk(ast.parse(python_script(source, preset, np.eye(4))))
+        if isinstance(call, ast.Call)
+    }
+    again = Preset.from_dict(ast.literal_eval(calls["Preset.from_dict"].args[0]))
+    assert again == preset and again.to_dict() == preset.to_dict()
+    assert ast.literal_eval(calls["Volume.read"].args[0]) == path
+    keywords = {keyword.arg: keyword.value for keyword in calls["segment_mri"].keywords}
+    assert ast.literal_eval(keywords["contrast"]) == name
 
 
 def test_the_script_of_an_mri_has_its_mask_and_options_and_the_texture_if_it_is_used():

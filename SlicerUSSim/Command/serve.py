@@ -47,8 +47,9 @@ _PORT = 8080
 )
 @click.option(
     "--igtl",
-    help="HOST:PORT of a tracker that sends TRANSFORM messages over OpenIGTLink, and gets the images; :PORT "
-    "waits for it to connect.",
+    help="HOST:PORT of a tracker that sends TRANSFORM messages over OpenIGTLink, and gets the images. :PORT waits for "
+    "one on this computer to connect, listen:HOST:PORT for one elsewhere (listen:0.0.0.0:18944). OpenIGTLink knows no "
+    "passwords: whoever reaches that port can move the probe and gets the images.",
 )
 @click.option("--igtl-device", help="Name of the transform to follow (default: the first that comes).")
 @device_option

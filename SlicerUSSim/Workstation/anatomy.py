@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from trame_server import Server
 from trame_server.utils.asynchronous import get_event_loop
 from trame_slicer.core import LayoutManager, SlicerApp
 from trame_slicer.rca_view import RemoteViewFactory
@@ -28,18 +30,16 @@ from SlicerUSSim.Logic.mrml.nodes import composite_of, display_of, node_called, 
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
 from SlicerUSSim.Logic.probe.surface import PatientSurface
+from SlicerUSSim.Workstation.state import ACROSS, IN_PLANE, SLICE_VIEWS
 
-#: Planes that a slice view follows the probe in: of the image, across it, and the patient's own.
-IN_PLANE, ACROSS = "In plane", "Across"
-PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
-#: The slice views with the plane that each begins with, by the names that Slicer gives them.
-SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
 THREED_VIEW = "ThreeD"
 #: Images per second of the view under the mouse, and of the others: on few cores the ultrasound image goes before them.
 _CORES = os.cpu_count() or 2
 _FAST, _SLOW = min(2.0 * _CORES, 20.0), min(0.75 * _CORES, 8.0)
 #: More mouse events than images would only keep the images waiting.
 _EVENTS_EVERY_S = 0.025
+#: Seconds after which a view itself knows its new size.
+_RESIZED_S = 0.05
 _LAYOUT = "Anatomy"
 #: Model nodes that show things, by what they show; they are not saved with the scene.
 _PATIENT, _BODY, _FIELD, _SEEN = "Patient surface", "Probe body", "Ultrasound field", "Ultrasound as shown"
@@ -54,19 +54,13 @@ class AnatomyViews:
     app : SlicerApp, with its scene.
     server : trame server that shows the views.
     view_ui : (server, view_id, view) adds what lies over a view.
-    resized : called when a slice view has got another size, and wants to follow anew.
     """
 
-    def __init__(
-        self,
-        app: SlicerApp,
-        server,
-        view_ui: Callable[[object, str, AbstractView], None],
-        resized: Callable[[], None],
-    ) -> None:
+    def __init__(self, app: SlicerApp, server: Server, view_ui: Callable[[Server, str, AbstractView], None]) -> None:
         self._app = app
         self.planes = dict(SLICE_VIEWS)
-        self.follows = True
+        self._follows = True
+        self._followed: tuple[np.ndarray, Probe] | None = None  # probe_to_world
         self._held: SliceView | None = None
         self._fitted: set[str] = set()
         self._blend = 1.0
@@ -83,30 +77,30 @@ class AnatomyViews:
         red, yellow, green = (
             ViewLayoutDefinition.axial_view(), ViewLayoutDefinition.sagittal_view(), ViewLayoutDefinition.coronal_view()
         )  # fmt: skip
-        rows = [
-            Layout(LayoutDirection.Horizontal, [threed, red]),
-            Layout(LayoutDirection.Horizontal, [yellow, green]),
-        ]
+        above = Layout(LayoutDirection.Horizontal, [threed, red])
+        below = Layout(LayoutDirection.Horizontal, [yellow, green])
         self.layout = LayoutManager(app.scene, app.view_manager, server)
-        self.layout.register_layout(_LAYOUT, Layout(LayoutDirection.Vertical, rows))
+        self.layout.register_layout(_LAYOUT, Layout(LayoutDirection.Vertical, [above, below]))
         self.layout.set_layout(_LAYOUT)
         # Without a GPU these cost more than all the rest, and depth peeling hides what is translucent.
         for view in (self.threed, *self.slices):
             view.render_window().SetMultiSamples(0)
-        self._resized = resized
         for view in self.slices:
-            # Once the view itself knows its new size.
-            view.interactor().AddObserver(
-                vtkCommand.WindowResizeEvent,
-                lambda *_, view=view: get_event_loop().call_later(0.05, self._fit_anew, view),
-            )
-        self.threed.get_view_node().SetUseDepthPeeling(False)
+            view.interactor().AddObserver(vtkCommand.WindowResizeEvent, self._on_resize(view))
+        _node(self.threed).SetUseDepthPeeling(False)
         self.threed.renderer().SetUseDepthPeeling(False)
         self.threed.renderer().SetUseDepthPeelingForVolumes(False)
 
+    def _on_resize(self, view: SliceView) -> Callable[..., None]:
+        def resized(*_: object) -> None:
+            get_event_loop().call_later(_RESIZED_S, self._fit_anew, view)
+
+        return resized
+
     def _fit_anew(self, view: SliceView) -> None:
         self._fitted.discard(view.get_singleton_tag())
-        self._resized()
+        if self._followed is not None:
+            self.follow(*self._followed)
 
     # ---- what there is -----------------------------------------------------------------------------------------
 
@@ -193,12 +187,12 @@ class AnatomyViews:
         for view in self.slices:
             view.set_foreground_opacity(share)
 
-    def show_labels(self, labels_node, on: bool) -> None:
+    def show_labels(self, labels_node: Any, on: bool) -> None:
         """Colour the tissues in the slice views; a label map only."""
-        can = on and labels_node is not None and labels_node.IsA("vtkMRMLLabelMapVolumeNode")
+        shown = labels_node if on and _is_label_map(labels_node) else None
         for view in self.slices:
-            composite = composite_of(view.get_view_node())
-            composite.SetLabelVolumeID(labels_node.GetID() if can else None)
+            composite: Any = composite_of(_node(view))
+            composite.SetLabelVolumeID(None if shown is None else shown.GetID())
             composite.SetLabelOpacity(0.35)
             view.schedule_render()
 
@@ -208,6 +202,10 @@ class AnatomyViews:
         """Let a slice view rest, while the probe is dragged in it; None: none."""
         self._held = view
 
+    def set_follow(self, on: bool) -> None:
+        """Let the slice views follow the probe, or rest."""
+        self._follows = on
+
     def set_plane(self, name: str, plane: str) -> None:
         """Choose the plane of a slice view."""
         self.planes[name] = plane
@@ -215,12 +213,13 @@ class AnatomyViews:
 
     def follow(self, probe_to_world: np.ndarray, probe: Probe) -> None:
         """Turn the slice views to where the probe now is."""
+        self._followed = (probe_to_world, probe)
         left, right, top, bottom = probe.image_bounds_mm()
         middle = (probe_to_world @ [0.5 * (left + right), 0.5 * (top + bottom), 0.0, 1.0])[:3]
         for view in self.slices:
-            name, node = view.get_singleton_tag(), view.get_view_node()
+            name, node = view.get_singleton_tag(), _node(view)
             fit = name not in self._fitted
-            if view is self._held or not (self.follows or fit):
+            if view is self._held or not (self._follows or fit):
                 continue
             plane = self.planes[name]
             was_modifying = node.StartModify()
@@ -281,3 +280,12 @@ class AnatomyViews:
 def _silent(make):
     """Makes views that do not draw themselves anew with every step of their making, some two hundred times."""
     return lambda **options: make(**options, scheduled_render_strategy=NoScheduleRendering())
+
+
+def _node(view: AbstractView) -> Any:
+    """The MRML node of a view."""
+    return view.get_view_node()
+
+
+def _is_label_map(node: Any) -> bool:
+    return node is not None and node.IsA("vtkMRMLLabelMapVolumeNode")

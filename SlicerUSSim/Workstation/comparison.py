@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from trame_server.utils.asynchronous import get_event_loop
@@ -14,7 +15,7 @@ from SlicerUSSim.Logic.fitting.similarity import Similarity, similarity
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.placement import slice_under_probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages
-from SlicerUSSim.Workstation.page import SIMULATED
+from SlicerUSSim.Workstation.state import ComparisonMode, SharedState
 from SlicerUSSim.Workstation.streams import ImageStream
 
 #: Seconds between two images of a sequence that is played.
@@ -55,25 +56,30 @@ class Comparison:
 
     Parameters
     ----------
-    state : of the trame server.
     move : takes the pose (4, 4) that a real image was taken at.
     """
 
-    def __init__(self, state, move: Callable[[np.ndarray], None]) -> None:
-        self._state, self._move = state, move
+    def __init__(self, shared: SharedState, move: Callable[[np.ndarray], None]) -> None:
+        self._shared, self._move = shared, move
         self._grid: ImageGrid | None = None  # of the simulated image
         self._real: RealImages | None = None
-        self._browser = None
+        self._browser: Any = None  # vtkMRMLSequenceBrowserNode
         self._playing: asyncio.Task | None = None
-        self._comparing = False
+        self._waiting: tuple[RealImages, int, np.ndarray, ImageGrid] | None = None  # to be compared
+        self._comparing: asyncio.Task | None = None
         #: Beside the simulated image, and over it
         self.streams = (ImageStream("real"), ImageStream("real-over"))
 
-    def take(self, tracked: TrackedImages, browser_node) -> None:
+    @property
+    def is_comparing(self) -> bool:
+        """Whether the page has yet to be told how alike the last images are."""
+        return self._comparing is not None
+
+    def take(self, tracked: TrackedImages, browser_node: Any) -> None:
         """Compare with these from now on."""
         self._real, self._browser = RealImages(tracked), browser_node
-        with self._state:
-            self._state.update({"sequence_length": len(self._real), "has_real": True})
+        with self._shared.changing() as now:
+            now.sequence.length = len(self._real)
         self.show(0)
 
     def show(self, number: int) -> None:
@@ -82,53 +88,57 @@ class Comparison:
             return
         number = int(np.clip(number, 0, len(self._real) - 1))
         tracked = self._real.tracked
-        with self._state:
-            self._state.update({"sequence_number": number, "real_name": f", image {tracked.numbers[number]}"})
+        with self._shared.changing() as now:
+            now.sequence.number, now.sequence.name = number, f"image {tracked.numbers[number]}"
         self._browser.SetSelectedItemNumber(number)
         self._move(tracked.poses[number])
         self.send()
 
     def send(self) -> None:
         """Send the real image to the pages, if they show it."""
-        if self._real is None or self._grid is None or self._state.comparison == SIMULATED:
+        sequence = self._shared.now.sequence
+        if self._real is None or self._grid is None or sequence.comparison is ComparisonMode.SIMULATED:
             return
-        image, _ = self._real.on_grid(self._state.sequence_number, self._grid)
+        image, _ = self._real.on_grid(sequence.number, self._grid)
         for stream in self.streams:
             stream.send(image)
 
     def compare(self, simulated: np.ndarray, grid: ImageGrid) -> None:
-        """Tell how alike a simulated image and the real one are; of images that come too fast, some."""
+        """Tell how alike a simulated image and the real one are; of images that come too fast, some and the last."""
         if grid != self._grid:
             self._grid = grid
             self.send()
-        if self._real is None or self._comparing:
+        if self._real is None:
             return
-        self._comparing = True
-        real, number = self._real, self._state.sequence_number
+        self._waiting = (self._real, self._shared.now.sequence.number, simulated, grid)
+        if self._comparing is None:
+            self._comparing = get_event_loop().create_task(self._compare_all())
 
-        async def compare() -> None:
-            try:
-                found = await asyncio.get_running_loop().run_in_executor(None, real.compared, number, simulated, grid)
-                text = f"cost {found.total:.3f} (ρ {found.bhattacharyya:.3f}, SAD {found.sad:.3f})"
-            except SimulationError as error:
-                text = str(error)
-            finally:
-                self._comparing = False
-            with self._state:
-                self._state.similarity = text
-
-        get_event_loop().create_task(compare())
+    async def _compare_all(self) -> None:
+        try:
+            while self._waiting is not None:
+                (real, number, image, grid), self._waiting = self._waiting, None
+                try:
+                    found = await asyncio.to_thread(real.compared, number, image, grid)
+                    text = f"cost {found.total:.3f} (ρ {found.bhattacharyya:.3f}, SAD {found.sad:.3f})"
+                except SimulationError as error:
+                    text = str(error)
+                with self._shared.changing() as now:
+                    now.sequence.similarity = text
+        finally:
+            self._comparing = None
 
     def play(self) -> None:
         """Play the sequence round and round, or stop."""
-        self._state.playing = self._playing is None
         if self._playing is not None:
             self._playing.cancel()
             self._playing = None
         elif self._real is not None:
             self._playing = get_event_loop().create_task(self._play_on())
+        with self._shared.changing() as now:
+            now.sequence.playing = self._playing is not None
 
     async def _play_on(self) -> None:
-        while True:
+        while self._real is not None:
             await asyncio.sleep(_PLAY_EVERY_S)
-            self.show((self._state.sequence_number + 1) % len(self._real))
+            self.show((self._shared.now.sequence.number + 1) % len(self._real))

@@ -9,9 +9,11 @@ from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from PIL import Image
+from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkOutputWindow
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
@@ -79,9 +81,8 @@ class Exports:
     Each is (file name, content, MIME type). Raises SimulationError where there is nothing to export.
     """
 
-    def __init__(self, app, logic: UltrasoundSceneLogic, opener: Opener) -> None:
-        self._app, self._logic, self._opener = app, logic, opener
-        self.cine = Cine()
+    def __init__(self, app: SlicerApp, logic: UltrasoundSceneLogic, opener: Opener, cine: Cine) -> None:
+        self._app, self._logic, self._opener, self._cine = app, logic, opener, cine
 
     async def export(self, kind: str) -> tuple[str, bytes, str]:
         """One kind; what takes long leaves the event loop free."""
@@ -90,7 +91,7 @@ class Exports:
         if kind == "mrb":
             return "ultrasound.mrb", scene_file(self._app), "application/zip"
         if kind == "gif":
-            content = await asyncio.get_running_loop().run_in_executor(None, self.cine.gif)
+            content = await asyncio.get_running_loop().run_in_executor(None, self._cine.gif)
             return "ultrasound.gif", content, "image/gif"
         image = self._logic.lastImage()
         if kind == "png":
@@ -99,9 +100,11 @@ class Exports:
 
     def script(self) -> str:
         """A script that gives the image on the screen again."""
-        parameters, preset = self._logic.parameters, self._logic.preset
-        labels, transform = parameters.labels, parameters.probe_transform
-        require(labels is not None and transform is not None, "there is no image yet, expected labels and a probe")
+        preset = self._logic.preset
+        labels: Any = self._logic.parameters.labels
+        transform: Any = self._logic.parameters.probe_transform
+        if labels is None or transform is None:
+            raise SimulationError("there is no image yet, expected labels and a probe")
         source = self._opener.source_of(labels)
         in_labels, moved = pose_in_labels(labels, probe_pose(transform))
         require(np.allclose(moved, np.eye(4)), f"{labels.GetName()!r} is scaled by a transform, expected a rigid one")
@@ -109,7 +112,7 @@ class Exports:
         return python_script(source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels)
 
 
-def scene_file(app) -> bytes:
+def scene_file(app: SlicerApp) -> bytes:
     """The scene of a SlicerApp as .mrb, which 3D Slicer opens. Raises SimulationError if it cannot be written."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "ultrasound.mrb"

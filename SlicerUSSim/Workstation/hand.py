@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic
+from typing import Any, cast
 
 import numpy as np
-from trame_slicer.views import AbstractView, SliceView, ThreeDView
+from trame_slicer.views import AbstractView, SliceView
 from vtkmodules.vtkCommonCore import mutable, vtkCommand
 from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
@@ -61,6 +62,7 @@ class ProbeHand:
     pose : gives (4, 4) probe_to_world, or None without a probe.
     move : takes the new one.
     surface : gives what the probe slides over, or None.
+    upright : whether sliding makes the probe stand along the normal of the surface, or keeps its angles to it.
     hold : told the slice view that a drag goes on in, and None at its end.
     """
 
@@ -69,11 +71,10 @@ class ProbeHand:
         pose: Callable[[], np.ndarray | None],
         move: Callable[[np.ndarray], None],
         surface: Callable[[], PatientSurface | None],
+        upright: Callable[[], bool],
         hold: Callable[[SliceView | None], None],
     ) -> None:
-        self._pose, self._move, self._surface, self._hold = pose, move, surface, hold
-        #: Whether sliding makes the probe stand along the normal of the surface, or keeps its angles to it
-        self.upright = True
+        self._pose, self._move, self._surface, self._upright, self._hold = pose, move, surface, upright, hold
         self._drag: _Drag | None = None
         self._last_press = (0.0, np.zeros(2))
         self._body = vtkStaticCellLocator()
@@ -104,7 +105,7 @@ class ProbeHand:
         elif surface is None:
             return False
         elif kind == "slide":
-            self._move(surface.slid(pose, pose[:3, 3] + pose[:3, [0, 2]] @ values, upright=self.upright))
+            self._move(surface.slid(pose, pose[:3, 3] + pose[:3, [0, 2]] @ values, upright=self._upright()))
         else:
             self._move(surface.held(pose, rock_deg=0.0, tilt_deg=0.0))
         return True
@@ -161,23 +162,29 @@ class ProbeHand:
         beside = abs(x) > 60.0 and y < 0  # far from the body
         return None if beside or self._surface() is None else _Drag(kind, pose, point, pixel, normal)
 
-    def _grab(self, view: ThreeDView, pose: np.ndarray, pixel: np.ndarray) -> _Drag | None:
+    def _grab(self, view: AbstractView, pose: np.ndarray, pixel: np.ndarray) -> _Drag | None:
         near, far = _ray(view, pixel)
         to_probe = np.linalg.inv(pose)
         start, end = (to_probe @ [*near, 1.0])[:3], (to_probe @ [*far, 1.0])[:3]
-        t, point, local = mutable(0.0), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
-        hit = self._body.IntersectWithLine(start.tolist(), end.tolist(), 1e-6, t, point, local, mutable(0), mutable(0))
-        kind = _kind(view)
-        if hit:
-            grabbed = np.array(point)
+        hit, kind = self._on_body(start, end), _kind(view)
+        if hit is not None:
+            grabbed = hit
         elif kind and (start[2] > 0) != (end[2] > 0):  # with a key also the field can be taken
             grabbed = start + start[2] / (start[2] - end[2]) * (end - start)
-            if not self._probe.holds(grabbed[0], grabbed[1]):
+            if self._probe is None or not self._probe.holds(grabbed[0], grabbed[1]):
                 return None
         else:
             return None
         direction = (far - near) / np.linalg.norm(far - near)
         return _Drag(kind or "slide", pose, (pose @ [*grabbed, 1.0])[:3], pixel, direction)
+
+    def _on_body(self, start: np.ndarray, end: np.ndarray) -> np.ndarray | None:
+        """(3,) where a line meets the probe's body first, all in the probe's frame, or None."""
+        point, local, by_reference = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], cast(Any, mutable)  # the stubs want numbers
+        hit = self._body.IntersectWithLine(
+            start.tolist(), end.tolist(), 1e-6, by_reference(0.0), point, local, by_reference(0), by_reference(0)
+        )
+        return np.array(point) if hit else None
 
     def _moved(self, view: AbstractView) -> bool:
         drag = self._drag
@@ -190,7 +197,7 @@ class ProbeHand:
         point = _in_slice(view, pixel) if isinstance(view, SliceView) else _on_plane(view, pixel, drag)
         face, surface = drag.pose[:3, 3], self._surface()
         if drag.kind == "slide" and surface is not None:
-            self._move(surface.slid(drag.pose, face + point - drag.point, upright=self.upright))
+            self._move(surface.slid(drag.pose, face + point - drag.point, upright=self._upright()))
         elif drag.kind == "swing" and min(np.linalg.norm(drag.point - face), np.linalg.norm(point - face)) > 1.0:
             self._move(carried(drag.pose, face, drag.point - face, point - face))
         return True
@@ -206,9 +213,9 @@ class ProbeHand:
             self.aim(_in_slice(view, pixel))
             return True
         found = None if surface is None else surface.hit(*_ray(view, pixel))
-        if found is None:
+        if pose is None or surface is None or found is None:
             return False
-        self._move(surface.slid(pose, found, upright=self.upright))
+        self._move(surface.slid(pose, found, upright=self._upright()))
         return True
 
 
@@ -222,25 +229,28 @@ def _kind(view: AbstractView) -> str:
 
 def _in_slice(view: SliceView, pixel: np.ndarray) -> np.ndarray:
     """(3,) in the world, of a pixel."""
-    return (matrix_array(view.get_view_node().GetXYToRAS()) @ [*pixel, 0.0, 1.0])[:3]
+    node: Any = view.get_view_node()
+    return (matrix_array(node.GetXYToRAS()) @ [*pixel, 0.0, 1.0])[:3]
 
 
 def _slice_normal(view: SliceView) -> np.ndarray:
-    return matrix_array(view.get_view_node().GetSliceToRAS())[:3, 2]
+    node: Any = view.get_view_node()
+    return matrix_array(node.GetSliceToRAS())[:3, 2]
 
 
-def _ray(view: ThreeDView, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _ray(view: AbstractView, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """((3,), (3,)) ends of what lies behind a pixel, in the world."""
     ends = []
+    x, y = pixel.tolist()
     for depth in (0.0, 1.0):
-        view.renderer().SetDisplayPoint(*pixel, depth)
+        view.renderer().SetDisplayPoint(x, y, depth)
         view.renderer().DisplayToWorld()
         point = np.array(view.renderer().GetWorldPoint())
         ends.append(point[:3] / point[3])
     return ends[0], ends[1]
 
 
-def _on_plane(view: ThreeDView, pixel: np.ndarray, drag: _Drag) -> np.ndarray:
+def _on_plane(view: AbstractView, pixel: np.ndarray, drag: _Drag) -> np.ndarray:
     """(3,) where the ray behind a pixel meets the plane through what was grabbed, which faces the viewer."""
     near, far = _ray(view, pixel)
     along = far - near

@@ -106,8 +106,9 @@ class Opener:
     def source_of(self, labels_node) -> LabelSource:
         """What labels were made of. Raises SimulationError where it were not files."""
         source = self._sources.get(_voxels_of(labels_node))
-        name = labels_node.GetName()
-        require(source is not None, f"{name!r} was not made from files here; save it, and open it with --labels")
+        if source is None:
+            name = labels_node.GetName()
+            raise SimulationError(f"{name!r} was not made from files here; save it, and open it with --labels")
         return source
 
     def sequence(self, sequence: TrackedSequence, name: str):

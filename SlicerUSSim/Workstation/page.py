@@ -1,21 +1,24 @@
 """The page: the panel's sections on the left, the ultrasound image, the anatomy around the probe.
 
-Written in trame's widgets; what happens on it goes to the workstation as triggers and changes of state.
+Written in trame's widgets. What it shows are fields of state.PageState, by their NAMES in trame's state; what happens
+on it goes to the workstation as triggers (Workstation._answer_pages) and as changes of those fields.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 
 from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import html, vuetify3 as v3
+from trame_server import Server
+from trame_slicer.core import LayoutManager
+from trame_slicer.views import AbstractView
 
-from SlicerUSSim.Logic.probe.arrays import PROBES
-from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS
-from SlicerUSSim.Workstation.anatomy import PLANES, SLICE_VIEWS
-from SlicerUSSim.Workstation.panel_view import CUSTOM_PROBE, state_key
 from SlicerUSSim.Workstation.sections import Control, Section
+from SlicerUSSim.Workstation.state import NAMES, PLANES, SLICE_VIEWS, ComparisonMode
 
 _STATIC = Path(__file__).parent / "static"
 #: What the page loads beside trame's own files.
@@ -35,16 +38,31 @@ _IN_PAGE = {
     "savePresetButton": "window.ussim.save('json')",
     "loadPresetButton": "window.document.getElementById('open-file').click()",
 }
-#: How simulated and real image are shown together.
-SIMULATED, BESIDE, BLINK, DIFFERENCE = COMPARISONS = ("Simulated", "Beside", "Blink", "Difference")
-#: The probe's pose as sliders: field of surface.SurfacePose, label, tip, range, step, unit.
+#: Colours of the slice views' names.
+_STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
+
+
+@dataclass(frozen=True)
+class PoseSlider:
+    """One number of the probe's pose."""
+
+    #: Field of surface.SurfacePose
+    name: str
+    label: str
+    tip: str
+    minimum: float
+    maximum: float
+    step: float
+    unit: str
+
+
 POSE_SLIDERS = (
-    ("right_deg", "Left - right", "Where on the patient, from the vertex of the head", -120.0, 120.0, 0.5, "°"),
-    ("front_deg", "Back - front", "Where on the patient, from the vertex of the head", -120.0, 120.0, 0.5, "°"),
-    ("rotate_deg", "Rotate", "About the probe's own axis (keys Q, E; Ctrl and drag)", -180.0, 180.0, 1.0, "°"),
-    ("rock_deg", "Rock", "In the image plane (keys A, D; Shift and drag)", -75.0, 75.0, 0.5, "°"),
-    ("tilt_deg", "Tilt", "Out of the image plane (keys W, S; Shift and drag)", -75.0, 75.0, 0.5, "°"),
-    ("lift_mm", "Lift", "Off the surface; negative is pressed in (keys +, -)", -10.0, 30.0, 0.5, "mm"),
+    PoseSlider("right_deg", "Left - right", "Where on the patient, from the vertex of the head", -120, 120, 0.5, "°"),
+    PoseSlider("front_deg", "Back - front", "Where on the patient, from the vertex of the head", -120, 120, 0.5, "°"),
+    PoseSlider("rotate_deg", "Rotate", "About the probe's own axis (keys Q, E; Ctrl and drag)", -180, 180, 1.0, "°"),
+    PoseSlider("rock_deg", "Rock", "In the image plane (keys A, D; Shift and drag)", -75, 75, 0.5, "°"),
+    PoseSlider("tilt_deg", "Tilt", "Out of the image plane (keys W, S; Shift and drag)", -75, 75, 0.5, "°"),
+    PoseSlider("lift_mm", "Lift", "Off the surface; negative is pressed in (keys +, -)", -10, 30, 0.5, "mm"),
 )
 _EXPORTS = (
     ("png", "Image (PNG)"),
@@ -57,9 +75,10 @@ _EXPORTS = (
 )
 
 
-def build_page(server, sections: tuple[Section, ...], layout) -> None:
-    """Lay the page out for a server; `layout` is the LayoutManager of the anatomy."""
+def build_page(server: Server, sections: tuple[Section, ...], layout: LayoutManager, keys: tuple[str, ...]) -> None:
+    """Lay the page out for a server; `layout` is the anatomy's, `keys` are those that the page passes on."""
     server.enable_module(MODULE)
+    server.state.trame__title = "SlicerUSSim"
     with VAppLayout(server) as page:
         page.root.theme = "dark"
         with v3.VNavigationDrawer(permanent=True, width=376, disable_resize_watcher=True, disable_route_watcher=True):
@@ -67,7 +86,7 @@ def build_page(server, sections: tuple[Section, ...], layout) -> None:
         with v3.VMain(style="height: 100vh"), html.Div(classes="ussim-main"):
             with html.Div(classes="ussim-image"):
                 _tools()
-                _screens()
+                _screens(keys)
                 _player()
                 _status()
             with html.Div(classes="ussim-anatomy"):
@@ -76,15 +95,15 @@ def build_page(server, sections: tuple[Section, ...], layout) -> None:
         _script_dialog()
 
 
-def view_tools(_server, _view_id: str, view) -> None:
+def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
     """What lies over a view of Slicer: for slices, the plane that it follows the probe in."""
     name = view.get_singleton_tag()
     with html.Div(classes="ussim-view-tool"):
         if name in SLICE_VIEWS:
-            html.Div(classes=f"ussim-stripe bg-{ {'Red': 'red', 'Yellow': 'yellow', 'Green': 'green'}[name] }")
+            html.Div(classes=f"ussim-stripe bg-{_STRIPES[name]}")
             options = "".join(f"<option>{plane}</option>" for plane in PLANES)
             html.Div(
-                f"""<select :value="planes['{name}']" id="plane-{name}"
+                f"""<select :value="{NAMES.views.planes}['{name}']" id="plane-{name}"
                     @change="trigger('plane', ['{name}', $event.target.value])">{options}</select>"""
             )
         else:
@@ -98,8 +117,8 @@ def view_tools(_server, _view_id: str, view) -> None:
 
 def _drawer(sections: tuple[Section, ...]) -> None:
     html.Div("Ultrasound Simulator", classes="text-subtitle-1 px-4 pt-2")
-    html.Div("{{ title }}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
-    with v3.VExpansionPanels(multiple=True, v_model=("open_sections",), variant="accordion"):
+    html.Div(f"{{{{ {NAMES.title} }}}}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
+    with v3.VExpansionPanels(multiple=True, v_model=(NAMES.open_sections,), variant="accordion"):
         for section in sections:
             if not section.title:
                 continue
@@ -119,17 +138,18 @@ def _drawer(sections: tuple[Section, ...]) -> None:
 
 def _open_file() -> None:
     v3.VFileInput(
-        label="Open an MRI, label map or tracked sequence", v_model=("opened_file", None), density="compact",
+        label="Open an MRI, label map or tracked sequence", v_model=(NAMES.opened_file, None), density="compact",
         hide_details=True, variant="outlined", id="open-file", classes="mb-1",
     )  # fmt: skip
 
 
 def _control(control: Control) -> None:
-    key = state_key(control)
+    key = f"{NAMES.panel.values}.{control.name}"
+    disabled = f"{NAMES.panel.can}.{control.name} === false"
     if control.kind == "slider":
         # A preset from elsewhere may go beyond what the slider offers.
         _slider(
-            key, control.label, control.tip, f"Math.min({control.minimum}, {key} ?? 0)",
+            key, control.name, control.label, control.tip, f"Math.min({control.minimum}, {key} ?? 0)",
             f"Math.max({control.maximum}, {key} ?? 0)", control.step, control.unit, control.decimals,
             f"trigger('set', ['{control.name}', $event])",
         )  # fmt: skip
@@ -148,14 +168,15 @@ def _control(control: Control) -> None:
         v3.VCheckbox(
             label=control.text, model_value=(key,), density="compact", hide_details=True, title=control.tip,
             update_modelValue=f"trigger('set', ['{control.name}', $event])", id=control.name,
-            disabled=(f"can.{control.name} === false",),
+            disabled=(disabled,),
         )  # fmt: skip
     elif control.kind in ("choice", "node"):
         if control.kind == "node":
-            options = f"""<option v-for="item in (node_items.{key} ?? [])" :value="item.value">{{{{ item.title }}}}
+            items = f"{NAMES.panel.nodes}.{control.name} ?? []"
+            options = f"""<option v-for="item in ({items})" :value="item.value">{{{{ item.title }}}}
             </option>"""
         else:
-            options = f"""<option v-for="item in choices.{control.name}">{{{{ item }}}}</option>"""
+            options = f"""<option v-for="item in {NAMES.panel.choices}.{control.name}">{{{{ item }}}}</option>"""
         html.Div(
             f"""<label for="{control.name}">{control.label}</label>
             <select id="{control.name}" :value="{key}"
@@ -166,7 +187,7 @@ def _control(control: Control) -> None:
         with v3.VBtn(
             control.text, size="small", classes="ma-1", id=control.name,
             click=_IN_PAGE.get(control.name, f"trigger('press', ['{control.name}'])"),
-            disabled=(f"can.{control.name} === false",), title=(f"tip.{control.name} ?? `{control.tip}`",),
+            disabled=(disabled,), title=(f"{NAMES.panel.tips}.{control.name} ?? `{control.tip}`",),
         ):  # fmt: skip
             pass
     elif control.name == "tissueTable":
@@ -174,21 +195,25 @@ def _control(control: Control) -> None:
     elif control.name == "freeList":
         html.Div(
             f"""<div style="font-size: 12px">{control.label}</div><div class="ussim-free" id="{control.name}">
-            <label v-for="entry in free_parameters" style="display: block"><input type="checkbox" :checked="entry.on"
+            <label v-for="entry in {NAMES.fit.free}" style="display: block"><input type="checkbox" :checked="entry.on"
             :aria-label="entry.name" @change="trigger('set_free', [entry.name, $event.target.checked])">
             {{{{ entry.name }}}}</label></div>""",
             title=control.tip,
         )
     elif control.name == "fitLabel":
-        html.Div("{{ fit_summary }}", id=control.name, style="white-space: pre-line; font-size: 12px")
+        html.Div(f"{{{{ {NAMES.fit.summary} }}}}", id=control.name, style="white-space: pre-line; font-size: 12px")
 
 
-def _slider(key, label, tip, minimum, maximum, step, unit, decimals, event) -> None:
+def _slider(
+    key: str, name: str, label: str, tip: str, minimum: str, maximum: str, step: float, unit: str, decimals: int,
+    event: str,
+) -> None:  # fmt: skip
+    """A slider with its number beside it; `key`, `minimum` and `maximum` are expressions of the page, `event` too."""
     with html.Div(classes="ussim-slider", title=tip):
         html.Div(label)
         v3.VSlider(
             model_value=(f"{key} ?? {minimum}",), min=(minimum,), max=(maximum,), step=step, density="compact",
-            hide_details=True, thumb_size=12, track_size=2, disabled=(f"{key} === null",), id=f"slider-{key}",
+            hide_details=True, thumb_size=12, track_size=2, disabled=(f"{key} === null",), id=f"slider-{name}",
             update_modelValue=event,
         )  # fmt: skip
         html.Div(f"{{{{ {key} === null ? '' : Number({key}).toFixed({decimals}) }}}} {unit}", classes="value")
@@ -199,8 +224,8 @@ def _tissue_table(control: Control) -> None:
     names = ", ".join(f"'{parameter}'" for parameter, _, _ in TISSUE_COLUMNS)
     html.Div(
         f"""<table class="ussim-table" id="{control.name}"><tr><th>Tissue</th>{heads}</tr>
-        <tr v-for="row in tissue_rows" :class="{{chosen: row.name === chosen_tissue}}"
-        @click="chosen_tissue = row.name">
+        <tr v-for="row in {NAMES.panel.tissues}" :class="{{chosen: row.name === {NAMES.panel.chosen_tissue}}}"
+        @click="{NAMES.panel.chosen_tissue} = row.name">
         <td>{{{{ row.name }}}}</td>
         <td v-for="(value, n) in row.values"><input :value="value" :title="row.sources[n]"
         :aria-label="row.name + ' ' + [{names}][n]"
@@ -211,55 +236,59 @@ def _tissue_table(control: Control) -> None:
 
 def _pose_sliders() -> None:
     v3.VDivider(classes="my-1")
-    for name, label, tip, minimum, maximum, step, unit in POSE_SLIDERS:
+    for slider in POSE_SLIDERS:
         _slider(
-            f"pose_{name}", label, tip, str(minimum), str(maximum), step, unit, 1,
-            f"trigger('set_pose', ['{name}', $event])",
+            f"({NAMES.pose}?.{slider.name} ?? null)", f"pose-{slider.name}", slider.label, slider.tip,
+            str(slider.minimum), str(slider.maximum), slider.step, slider.unit, 1,
+            f"trigger('set_pose', ['{slider.name}', $event])",
         )  # fmt: skip
     v3.VCheckbox(
-        label="Keep the probe along the surface normal", v_model=("upright",), density="compact", hide_details=True,
+        label="Keep the probe along the surface normal", v_model=(NAMES.upright,), density="compact", hide_details=True,
         title="When it slides; otherwise it keeps its angles to the surface", id="upright",
     )  # fmt: skip
     v3.VBtn(
         "Back to a craniotomy", size="small", classes="ma-1", id="place", click="trigger('press', ['placeButton'])",
-        disabled=("can.placeButton === false",), title="A coronal view through a parasagittal craniotomy",
+        disabled=(f"{NAMES.panel.can}.placeButton === false",),
+        title="A coronal view through a parasagittal craniotomy",
     )  # fmt: skip
     v3.VBtn("Stand upright", size="small", classes="ma-1", click="trigger('key', ['Home', false])", id="stand-upright")
 
 
 def _cost_curve() -> None:
-    with html.Div(v_if="fit_curve.length > 1", id="cost-curve"):
+    with html.Div(v_if=f"{NAMES.fit.curve}.length > 1", id="cost-curve"):
         v3.VSparkline(
-            model_value=("fit_curve",), color="orange", line_width=1.5, padding=4, height=70, smooth=False, fill=False
-        )
-        html.Div("{{ fit_costs }}", classes="text-caption")
+            model_value=(NAMES.fit.curve,), color="orange", line_width=1.5, padding=4, height=70, smooth=False,
+            fill=False,
+        )  # fmt: skip
+        html.Div(f"{{{{ {NAMES.fit.costs} }}}}", classes="text-caption")
 
 
 # ---- middle ----------------------------------------------------------------------------------------------------------
 
 
 def _tools() -> None:
+    live = f"{NAMES.panel.values}.liveCheckBox"
     with html.Div(classes="ussim-tool"):
         with v3.VBtn(
-            icon=True, size="small", variant="text", id="live", disabled=("can.liveCheckBox === false",),
-            click="trigger('set', ['liveCheckBox', !control_liveCheckBox])",
-            color=("control_liveCheckBox ? 'success' : undefined",),
+            icon=True, size="small", variant="text", id="live",
+            disabled=(f"{NAMES.panel.can}.liveCheckBox === false",),
+            click=f"trigger('set', ['liveCheckBox', !{live}])", color=(f"{live} ? 'success' : undefined",),
         ):  # fmt: skip
-            v3.VIcon(icon=("control_liveCheckBox ? 'mdi-play-circle' : 'mdi-snowflake'",))
+            v3.VIcon(icon=(f"{live} ? 'mdi-play-circle' : 'mdi-snowflake'",))
             v3.VTooltip("Live, or frozen", activator="parent")
         v3.VSpacer()
         html.Div("Blend", classes="text-caption")
         v3.VSlider(
-            v_model=("blend",), min=0, max=1, step=0.05, density="compact", hide_details=True, thumb_size=12,
+            v_model=(NAMES.views.blend,), min=0, max=1, step=0.05, density="compact", hide_details=True, thumb_size=12,
             track_size=2, style="max-width: 90px", id="blend",
         )  # fmt: skip
-        for state, icon, tip in (
-            ("show_tissues", "mdi-palette", "Colour the tissues in the slice views"),
-            ("follow", "mdi-crosshairs-gps", "Slice views follow the probe"),
-            ("show_latency", "mdi-timer-outline", "Measure the time from mouse to image"),
+        for state, name, icon, tip in (
+            (NAMES.views.show_tissues, "show-tissues", "mdi-palette", "Colour the tissues in the slice views"),
+            (NAMES.views.follow, "follow", "mdi-crosshairs-gps", "Slice views follow the probe"),
+            (NAMES.show_latency, "show-latency", "mdi-timer-outline", "Measure the time from mouse to image"),
         ):
             with v3.VBtn(
-                icon=True, size="small", variant="text", click=f"{state} = !{state}", id=state.replace("_", "-"),
+                icon=True, size="small", variant="text", click=f"{state} = !{state}", id=name,
                 color=(f"{state} ? 'primary' : undefined",),
             ):  # fmt: skip
                 v3.VIcon(icon)
@@ -273,93 +302,92 @@ def _tools() -> None:
                 v3.VListItem(title="Copy as Python", click="trigger('script')", id="export-python")
 
 
-def _screens() -> None:
-    with html.Div(classes=("{'ussim-screens': true, 'ussim-stacked': has_real && comparison === 'Beside'}",)):
+def _screens(keys: tuple[str, ...]) -> None:
+    there, mode = f"{NAMES.sequence.length} > 0", NAMES.sequence.comparison
+    beside, blink, over = (
+        f"{mode} === '{chosen.value}'"
+        for chosen in (ComparisonMode.BESIDE, ComparisonMode.BLINK, ComparisonMode.DIFFERENCE)
+    )
+    simulated = f"{mode} === '{ComparisonMode.SIMULATED.value}'"
+    with html.Div(classes=(f"{{'ussim-screens': true, 'ussim-stacked': {there} && {beside}}}",)):
         with html.Div(classes="ussim-screen"):
-            html.Div("{{ has_real && comparison !== 'Simulated' ? 'Simulated' : '' }}", classes="ussim-caption")
-            with html.Div(classes="ussim-frame", style=(_frame_style(),), id="ultrasound", v_show="us.w > 0"):
-                html.Div('<canvas data-stream="simulated"></canvas>')
+            html.Div(f"{{{{ {there} && !({simulated}) ? 'Simulated' : '' }}}}", classes="ussim-caption")
+            with html.Div(
+                classes="ussim-frame", style=(_frame_style(),), id="ultrasound", v_show=f"{NAMES.image} !== null"
+            ):
+                html.Div(f'<canvas data-stream="simulated" data-keys="{escape(" ".join(keys))}"></canvas>')
                 html.Div(
-                    """<canvas data-stream="real-over" :class="{blink: comparison === 'Blink',
-                    difference: comparison === 'Difference'}"></canvas>""",
-                    v_show="has_real && (comparison === 'Blink' || comparison === 'Difference')",
+                    f"""<canvas data-stream="real-over" :class="{{blink: {blink}, difference: {over}}}"></canvas>""",
+                    v_show=f"{there} && ({blink} || {over})",
                 )
-                html.Div((_STATIC / "overlay.html").read_text())
-        with html.Div(classes="ussim-screen", v_show="has_real && comparison === 'Beside'"):
-            html.Div("Real{{ real_name }}", classes="ussim-caption")
+                html.Div((_STATIC / "overlay.html").read_text(), v_for=f"us in {NAMES.image} ? [{NAMES.image}] : []")
+        with html.Div(classes="ussim-screen", v_show=f"{there} && {beside}"):
+            html.Div(f"Real, {{{{ {NAMES.sequence.name} }}}}", classes="ussim-caption")
             with html.Div(classes="ussim-frame", style=(_frame_style(),), id="real"):
                 html.Div('<canvas data-stream="real"></canvas>')
 
 
 def _frame_style() -> str:
+    width, height = f"({NAMES.image}?.w ?? 0)", f"({NAMES.image}?.h ?? 1)"
     return (
-        "`aspect-ratio: ${us.w} / ${us.h}; width: min(100cqw - 120px, (100cqh - 40px) * ${us.w / Math.max(us.h, 1)});`"
+        f"`aspect-ratio: ${{{width}}} / ${{{height}}}; "
+        f"width: min(100cqw - 120px, (100cqh - 40px) * ${{{width} / Math.max({height}, 1)}});`"
     )
 
 
 def _player() -> None:
-    with html.Div(classes="ussim-bar", v_if="has_real"):
-        with v3.VBtnToggle(v_model=("comparison",), density="compact", mandatory=True, id="comparison", divided=True):
-            for name in COMPARISONS:
-                v3.VBtn(name, value=name, size="small", id=f"compare-{name.lower()}")
+    number, length = NAMES.sequence.number, NAMES.sequence.length
+    with html.Div(classes="ussim-bar", v_if=f"{length} > 0"):
+        with v3.VBtnToggle(
+            v_model=(NAMES.sequence.comparison,), density="compact", mandatory=True, id="comparison", divided=True
+        ):
+            for mode in ComparisonMode:
+                v3.VBtn(mode.value, value=mode.value, size="small", id=f"compare-{mode.value.lower()}")
         html.Div(
-            "{{ similarity }}", classes="ussim-similarity", id="similarity",
+            f"{{{{ {NAMES.sequence.similarity} }}}}", classes="ussim-similarity", id="similarity",
             title="The paper's cost between simulated and real image: 0 for equal ones",
         )  # fmt: skip
-    with html.Div(classes="ussim-bar", v_if="sequence_length > 0", id="player"):
+    with html.Div(classes="ussim-bar", v_if=f"{length} > 0", id="player"):
         with v3.VBtn(icon=True, size="x-small", variant="text", click="trigger('play')", id="play"):
-            v3.VIcon(icon=("playing ? 'mdi-pause' : 'mdi-play'",))
+            v3.VIcon(icon=(f"{NAMES.sequence.playing} ? 'mdi-pause' : 'mdi-play'",))
         v3.VSlider(
-            model_value=("sequence_number",), min=0, max=("Math.max(sequence_length - 1, 1)",), step=1,
-            density="compact", hide_details=True, thumb_size=12, track_size=2, id="sequence-slider",
+            model_value=(number,), min=0, max=(f"Math.max({length} - 1, 1)",), step=1, density="compact",
+            hide_details=True, thumb_size=12, track_size=2, id="sequence-slider",
             update_modelValue="trigger('show_number', [$event])",
         )  # fmt: skip
-        html.Div("{{ sequence_number + 1 }} of {{ sequence_length }}", style="white-space: nowrap", id="sequence-text")
+        html.Div(f"{{{{ {number} + 1 }}}} of {{{{ {length} }}}}", style="white-space: nowrap", id="sequence-text")
 
 
 def _status() -> None:
+    messages = NAMES.messages
     with html.Div(classes="ussim-bar"):
-        with html.Div(v_if="progress_title", style="display: flex; gap: 8px; align-items: center", id="progress"):
-            html.Span("{{ progress_title }} {{ progress_share }} %")
-            v3.VProgressLinear(model_value=("progress_share",), color="orange", style="width: 140px")
+        with html.Div(
+            v_if=messages.progress_title, style="display: flex; gap: 8px; align-items: center", id="progress"
+        ):
+            html.Span(f"{{{{ {messages.progress_title} }}}} {{{{ {messages.progress_percent} }}}} %")
+            v3.VProgressLinear(model_value=(messages.progress_percent,), color="orange", style="width: 140px")
             v3.VBtn("Cancel", size="x-small", click="trigger('cancel')", id="cancel")
-        html.Span("{{ status }}", id="status")
+        html.Span(f"{{{{ {messages.status} }}}}", id="status")
         v3.VSpacer()
-        html.Span("{{ tracker_status }}", v_if="tracker_status", id="tracker")
-        html.Span(v_show="show_latency", id="ussim-latency")
+        html.Span(f"{{{{ {messages.tracker} }}}}", v_if=messages.tracker, id="tracker")
+        html.Span(v_if=NAMES.show_latency, id="ussim-latency")  # workstation.js measures while it is there
 
 
 def _messages() -> None:
     with html.Div(style="position: fixed; bottom: 44px; left: 400px; z-index: 3000; max-width: 60vw"):
         v3.VAlert(
-            "{{ message }}", v_for="(message, n) in errors", key=("n",), type="error", density="compact", closable=True,
-            classes="mb-1 ussim-error",
+            "{{ message }}", v_for=f"(message, n) in {NAMES.messages.errors}", key=("n",), type="error",
+            density="compact", closable=True, classes="mb-1 ussim-error",
             update_modelValue="trigger('dismiss', [n])",
         )  # fmt: skip
 
 
 def _script_dialog() -> None:
-    with v3.VDialog(v_model=("show_script",), max_width=900), v3.VCard(title="This image as a Python script"):
+    script = NAMES.script
+    with v3.VDialog(v_model=(script.is_open,), max_width=900), v3.VCard(title="This image as a Python script"):
         with v3.VCardText():
-            html.Div('<textarea id="ussim-script" class="ussim-script" readonly :value="script"></textarea>')
+            html.Div(f'<textarea id="ussim-script" class="ussim-script" readonly :value="{script.text}"></textarea>')
         with v3.VCardActions():
             v3.VSpacer()
-            v3.VBtn("Copy", click="window.ussim.copy(script)", id="copy-script")
-            v3.VBtn("Close", click="show_script = false")
-
-
-def initial_state(sections: tuple[Section, ...]) -> dict:
-    """What the page needs before anything is loaded."""
-    choices = {control.name: list(control.choices) for section in sections for control in section.controls}
-    choices |= {"probePresetComboBox": [CUSTOM_PROBE, *PROBES], "tissuePresetComboBox": list(TISSUES)}
-    return {
-        "title": "", "open_sections": [section.title for section in sections if section.is_open and section.title],
-        "choices": choices, "control_tissuePresetComboBox": next(iter(TISSUES)), "chosen_tissue": "", "us": _NO_IMAGE,
-        "planes": dict(SLICE_VIEWS), "blend": 0.6, "follow": True, "show_tissues": False, "show_latency": False,
-        "upright": True, "comparison": BESIDE, "has_real": False, "real_name": "", "similarity": "",
-        "sequence_length": 0, "sequence_number": 0, "playing": False, "tracker_status": "", "script": "",
-        "show_script": False, "opened_file": None, **{f"pose_{name}": None for name, *_ in POSE_SLIDERS},
-    }  # fmt: skip
-
-
-_NO_IMAGE = {"x": 0, "y": 0, "w": 0, "h": 1, "ticks": [], "focus": 0, "range": 0, "size": 1}
+            v3.VBtn("Copy", click=f"window.ussim.copy({script.text})", id="copy-script")
+            v3.VBtn("Close", click=f"{script.is_open} = false")

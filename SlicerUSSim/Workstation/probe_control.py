@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -12,15 +13,16 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version, read_labels
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, set_node_to_world
-from SlicerUSSim.Logic.probe.surface import PatientSurface
+from SlicerUSSim.Logic.probe.surface import PatientSurface, SurfacePose
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.hand import ProbeHand
-from SlicerUSSim.Workstation.page import POSE_SLIDERS
+from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks
 
 #: Seconds between two times that the slice views turn to the probe, and that the sliders are told where it is: both
 #: take time that the image then has to wait for.
 _TURN_EVERY_S, _TELL_EVERY_S = 0.12, 0.4
+_POSE_FIELDS = tuple(entry.name for entry in fields(SurfacePose))
 
 
 class ProbeControl:
@@ -28,19 +30,31 @@ class ProbeControl:
 
     Parameters
     ----------
-    state : of the trame server.
+    about_to_move : called when a hand is about to move the probe.
     """
 
-    def __init__(self, state, logic: UltrasoundSceneLogic, tasks: Tasks, views: AnatomyViews) -> None:
-        self._state, self._logic, self._tasks, self._views = state, logic, tasks, views
+    def __init__(
+        self,
+        shared: SharedState,
+        logic: UltrasoundSceneLogic,
+        tasks: Tasks,
+        views: AnatomyViews,
+        about_to_move: Callable[[], None],
+    ) -> None:
+        self._shared, self._logic, self._tasks, self._views = shared, logic, tasks, views
+        self._about_to_move = about_to_move
         self.surface: PatientSurface | None = None
         self._surface_version: object = None
         self._drawn: tuple | None = None
-        #: Called when a hand is about to move the probe
-        self.by_hand: Callable[[], None] = lambda: None
-        self.turn_slices = AtMost(_TURN_EVERY_S, self._turn_slices)
+        self._turn = AtMost(_TURN_EVERY_S, self._turn_slices)
         self._tell = AtMost(_TELL_EVERY_S, self._tell_pose)
-        self.hand = ProbeHand(self.pose, self._moved_by_hand, lambda: self.surface, self._hold)
+        self.hand = ProbeHand(
+            pose=self.pose,
+            move=self._move_by_hand,
+            surface=lambda: self.surface,
+            upright=lambda: shared.now.upright,
+            hold=self._hold,
+        )
         for view in (views.threed, *views.slices):
             self.hand.attach(view)
 
@@ -58,17 +72,22 @@ class ProbeControl:
         if transform is not None:
             set_node_to_world(transform, probe_to_world)
 
-    def moved(self, *_) -> None:
+    def moved(self) -> None:
         """The transform changed, whoever did it."""
-        self.turn_slices()
+        self._turn()
         self._tell()
+
+    @property
+    def is_told(self) -> bool:
+        """Whether views and sliders know where the probe is."""
+        return not (self._turn.is_waiting or self._tell.is_waiting)
 
     # ---- what the page asks for --------------------------------------------------------------------------------
 
     def set_pose(self, name: str, value: float) -> None:
-        """A slider of page.POSE_SLIDERS was moved."""
+        """The slider of a field of SurfacePose was moved."""
         pose = self.pose()
-        if pose is not None and self.surface is not None and name in {slider[0] for slider in POSE_SLIDERS}:
+        if pose is not None and self.surface is not None and name in _POSE_FIELDS:
             self.move(self.surface.held(pose, **{name: float(value)}))
 
     def aim_image(self, across: float, down: float) -> None:
@@ -88,23 +107,24 @@ class ProbeControl:
     def choose_plane(self, name: str, plane: str) -> None:
         """Let a slice view follow the probe in another plane."""
         self._views.set_plane(name, plane)
-        self._state.planes = dict(self._views.planes)
-        self.turn_slices()
+        with self._shared.changing() as now:
+            now.views.planes = dict(self._views.planes)
+        self._turn()
 
-    def follow_changed(self) -> None:
-        """The user wants the slice views to follow the probe, or to rest."""
-        self._views.follows = bool(self._state.follow)
-        self.turn_slices()
+    def set_follow(self, on: bool) -> None:
+        """Let the slice views follow the probe, or rest."""
+        self._views.set_follow(on)
+        self._turn()
 
-    def show_tissues(self) -> None:
+    def show_tissues(self, on: bool) -> None:
         """Colour the tissues in the slice views, or not."""
-        self._views.show_labels(self._logic.parameters.labels, bool(self._state.show_tissues))
+        self._views.show_labels(self._logic.parameters.labels, on)
 
     # ---- patient and probe in the views ------------------------------------------------------------------------
 
     def update_surface(self) -> None:
         """Make the surface anew if the labels are others; called in a task."""
-        labels = self._logic.parameters.labels
+        labels: Any = self._logic.parameters.labels
         if labels is None or (labels.IsA("vtkMRMLVolumeNode") and labels.GetImageData() is None):
             return
         version = labels_version(labels)
@@ -115,7 +135,7 @@ class ProbeControl:
         placed = Volume(volume.array, node_to_world(labels) @ volume.ijk_to_ras)
         self.surface = self._tasks.do(lambda: PatientSurface(placed))
         self._views.show_surface(self.surface)
-        self.show_tissues()
+        self.show_tissues(self._shared.now.views.show_tissues)
         self._tell()
 
     def draw(self) -> None:
@@ -129,8 +149,8 @@ class ProbeControl:
 
     # ---- inside ------------------------------------------------------------------------------------------------
 
-    def _moved_by_hand(self, probe_to_world: np.ndarray) -> None:
-        self.by_hand()
+    def _move_by_hand(self, probe_to_world: np.ndarray) -> None:
+        self._about_to_move()
         self.move(probe_to_world)
 
     def _hold(self, view) -> None:
@@ -147,6 +167,6 @@ class ProbeControl:
         pose = self.pose()
         if pose is None or self.surface is None:
             return
-        with self._state:
-            for name, value in asdict(self.surface.where(pose)).items():
-                self._state[f"pose_{name}"] = round(value, 2)
+        where = self.surface.where(pose)
+        with self._shared.changing() as now:
+            now.pose = SurfacePose(**{name: round(float(getattr(where, name)), 2) for name in _POSE_FIELDS})

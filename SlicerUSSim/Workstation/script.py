@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from pprint import pformat
+from textwrap import indent
 
 import numpy as np
 
@@ -11,17 +13,15 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 
 _TEMPLATE = '''"""The image of a SlicerUSSim workstation, again."""
 
-import json
-
 import numpy as np
 
 from SlicerUSSim.Logic import {imports}
 from SlicerUSSim.Logic.imaging.preset import Preset
 {more_imports}
 {labels}
-preset = Preset.from_dict(json.loads("""
-{preset}
-"""))
+preset = Preset.from_dict(
+    {preset}
+)
 probe_to_ras = np.array({pose})
 
 simulator = UltrasoundSimulator(labels, preset.tissues, preset.settings{texture})
@@ -71,7 +71,12 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         imports=", ".join(sorted(set(imports))),
         more_imports=more,
         labels="\n".join(lines),
-        preset=json.dumps(preset.to_dict(), indent=1),
+        preset=indent(pformat(_plain(preset), width=112, sort_dicts=False), "    ").strip(),
         pose=np.array2string(probe_to_ras, separator=", ", floatmode="unique", max_line_width=118),
         texture=", texture=segmentation.texture()" if needs_texture else "",
     )
+
+
+def _plain(preset: Preset) -> dict:
+    """The preset as its JSON file has it: of values that Python writes as literals, whatever names are made of."""
+    return json.loads(json.dumps(preset.to_dict()))

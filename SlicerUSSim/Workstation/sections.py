@@ -6,9 +6,11 @@ ranges and units, from one file that Qt Designer edits.
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 _UI_FILE = Path(__file__).parents[1] / "Resources" / "UI" / "USSim.ui"
 
@@ -68,10 +70,10 @@ class Section:
 
 def read_sections() -> tuple[Section, ...]:
     """The sections of the panel in their order; what stands outside of them comes last, under "" as title."""
-    root = ElementTree.parse(_UI_FILE).getroot().find("widget")
+    root = ElementTree.parse(_UI_FILE).getroot()
     sections, around = [], []
     labels = {
-        widget.get("name"): _properties(widget) for widget in root.iter("widget") if widget.get("class") == "QLabel"
+        widget.get("name", ""): _properties(widget) for widget in root.iter("widget") if widget.get("class") == "QLabel"
     }
     for widget in root.iter("widget"):
         if widget.get("class") != "ctkCollapsibleButton":
@@ -86,9 +88,9 @@ def read_sections() -> tuple[Section, ...]:
     return (*sections, Section("", True, tuple(_controls(rest, labels))))
 
 
-def _controls(widgets, labels: dict[str, dict[str, str]]):
+def _controls(widgets: list[Element], labels: dict[str, dict[str, str]]) -> Iterator[Control]:
     for widget in widgets:
-        kind, name = _KINDS.get(widget.get("class")), widget.get("name")
+        kind, name = _KINDS.get(widget.get("class", "")), widget.get("name", "")
         if kind is None or (name.endswith("Label") and name.removesuffix("Label") in {w.get("name") for w in widgets}):
             continue
         properties = _properties(widget)
@@ -111,6 +113,6 @@ def _controls(widgets, labels: dict[str, dict[str, str]]):
         )  # fmt: skip
 
 
-def _properties(widget) -> dict[str, str]:
+def _properties(widget: Element) -> dict[str, str]:
     """Name and text of the properties a widget has of its own."""
-    return {entry.get("name"): "".join(entry.itertext()).strip() for entry in widget.findall("property")}
+    return {entry.get("name", ""): "".join(entry.itertext()).strip() for entry in widget.findall("property")}

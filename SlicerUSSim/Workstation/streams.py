@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import time
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -22,10 +23,11 @@ class ImageStream:
 
     def __init__(self, name: str) -> None:
         self.area_name = name
-        self._streamer = None
+        self._streamer: Any = None
         self._waiting: tuple[np.ndarray, dict] | None = None
         self._last: tuple[bytes, dict] | None = None
         self._encoding = False
+        #: Number of the last image, from 1
         self.count = 0
 
     def send(self, image: np.ndarray, **about) -> None:
@@ -34,6 +36,11 @@ class ImageStream:
         if not self._encoding:
             self._encoding = True
             get_event_loop().create_task(self._encode_all())
+
+    @property
+    def is_sending(self) -> bool:
+        """Whether an image is on its way to the pages."""
+        return self._encoding
 
     def send_again(self) -> None:
         """Send the last image once more, to pages that have just opened."""

@@ -13,10 +13,12 @@ from typing import TypeVar
 from greenlet import getcurrent, greenlet
 from trame_server.utils.asynchronous import get_event_loop
 
+from SlicerUSSim.Logic.mrml.logic import AtOnce
+
 T = TypeVar("T")
 
 
-class Tasks:
+class Tasks(AtOnce):
     """Runs functions of the event loop that may wait for work; is what UltrasoundSceneLogic takes as `work`.
 
     Parameters
@@ -29,19 +31,27 @@ class Tasks:
         self._loop = get_event_loop()
         # One: what a device does for one task must not change what it does for another in its midst.
         self._executor = ThreadPoolExecutor(1, "ultrasound")
+        self._unfinished = 0
+
+    @property
+    def are_done(self) -> bool:
+        """Whether no task is under way, or about to start."""
+        return not self._unfinished
 
     def start(self, function: Callable[[], object]) -> None:
         """Call `function` soon, from the event loop, where it may wait for work."""
+        self._unfinished += 1
         self._loop.call_soon(self._start, function)
 
     def do(self, function: Callable[[], T]) -> T:
         """What `function` gives, called in the thread for work. Outside of a task the event loop waits as well."""
         waiting = getcurrent()
-        if waiting.parent is None:
+        event_loop = waiting.parent
+        if event_loop is None:
             return self._executor.submit(function).result()
         future = self._loop.run_in_executor(self._executor, function)
         future.add_done_callback(lambda _: waiting.switch())
-        waiting.parent.switch()
+        event_loop.switch()
         return future.result()
 
     def tell(self, function: Callable[[], None]) -> None:
@@ -58,6 +68,8 @@ class Tasks:
                 function()
             except Exception as error:
                 self._failed(error)
+            finally:
+                self._unfinished -= 1
 
         greenlet(run).switch()
 
@@ -68,6 +80,11 @@ class AtMost:
     def __init__(self, seconds: float, function: Callable[[], None]) -> None:
         self._seconds, self._function = seconds, function
         self._next, self._waiting = 0.0, False
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether the function is still to be called."""
+        return self._waiting
 
     def __call__(self) -> None:
         loop = get_event_loop()

@@ -6,10 +6,12 @@ pyigtl's own client and server notice a peer that has gone only when they fail t
 from __future__ import annotations
 
 import importlib.util
+import re
 import select
 import socket
 import threading
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,19 +26,37 @@ _RETRY_S, _STALLED_S = 0.25, 5.0
 #: No transform, image or string that concerns us is larger; whoever says so does not speak OpenIGTLink.
 _LARGEST_BYTES = 1 << 28
 
+#: A name or IPv4 address, or an IPv6 address in brackets.
+_HOST = r"\[[^\[\]]*:[^\[\]]*\]|[^\[\]:]+"
+_ADDRESS = re.compile(rf"(?:listen:(?P<ours>{_HOST})|(?!listen:)(?P<theirs>{_HOST})|):(?P<port>[0-9]{{1,5}})")
 
-def parse_address(text: str) -> tuple[str, int, bool]:
-    """(host, port, whether to wait for the other end to connect) of HOST:PORT, or of :PORT, where we wait.
 
-    Raises SimulationError for other text.
+class Address(NamedTuple):
+    """One end of a connection."""
+
+    host: str
+    port: int
+    #: Whether it is ours, where we wait for the other end to connect
+    listen: bool
+
+    def __str__(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def parse_address(text: str) -> Address:
+    """What --igtl says: HOST:PORT to connect to, :PORT to wait on loopback, listen:HOST:PORT to wait at an address.
+
+    IPv6 hosts are in brackets: [::1]:18944. Raises SimulationError for other text.
     """
-    host, _, port = text.rpartition(":")
+    match = _ADDRESS.fullmatch(text)
     require(
-        ":" in text and port.isdigit() and 0 < int(port) < 65536,
-        f"--igtl is {text!r}, expected HOST:PORT to connect to, or :PORT to wait for a connection (such as "
-        f"127.0.0.1:{DEFAULT_PORT})",
+        match is not None and 0 < int(match["port"]) < 65536,
+        f"--igtl is {text!r}, expected HOST:PORT to connect to (such as 127.0.0.1:{DEFAULT_PORT}), :PORT to wait for a "
+        "connection from this computer, or listen:HOST:PORT to wait at another address; IPv6 hosts in brackets",
     )
-    return host or "127.0.0.1", int(port), not host
+    assert match is not None
+    host = (match["ours"] or match["theirs"] or "127.0.0.1").strip("[]")
+    return Address(host, int(match["port"]), listen=match["theirs"] is None)
 
 
 class TrackerLink:
@@ -66,7 +86,7 @@ class TrackerLink:
             importlib.util.find_spec("pyigtl") is not None,
             'OpenIGTLink needs pyigtl; install it with: pip install "SlicerUSSim[serve]"',
         )
-        self._host, self._port, self._moved = host, port, moved
+        self._address, self._moved = Address(host, port, listen), moved
         self._device, self._image_name = device, image_name
         #: What to tell the user
         self.status = ""
@@ -94,7 +114,9 @@ class TrackerLink:
         self._wake()
 
     def stop(self) -> None:
-        """Close the connection and wait until nothing more comes."""
+        """Close the connection and wait until nothing more comes; once more does nothing."""
+        if self._stopping:
+            return
         self._stopping = True
         self._wake()
         self._thread.join()
@@ -161,8 +183,8 @@ class TrackerLink:
     def _connected(self) -> socket.socket | None:
         if self._listener is None:
             self.status = self.status or f"connecting to {self._peer_name}"
-            return socket.create_connection((self._host, self._port), timeout=_STALLED_S)
-        self.status = f"waiting for a connection to port {self._port}"
+            return socket.create_connection((self._address.host, self._address.port), timeout=_STALLED_S)
+        self.status = f"waiting for a connection at {self._address}"
         readable, _, _ = select.select([self._listener, self._wake_in], [], [])
         if self._wake_in in readable:
             self._awake()
@@ -170,13 +192,14 @@ class TrackerLink:
 
     def _listening(self) -> socket.socket:
         try:
-            return socket.create_server((self._host, self._port))
+            family = socket.AF_INET6 if ":" in self._address.host else socket.AF_INET
+            return socket.create_server((self._address.host, self._address.port), family=family)
         except OSError as error:
-            raise SimulationError(f"port {self._port} cannot be waited at ({error}); choose another") from None
+            raise SimulationError(f"cannot wait for a tracker at {self._address} ({error}); choose another") from None
 
     @property
     def _peer_name(self) -> str:
-        return "the other end" if self._listener is not None else f"{self._host}:{self._port}"
+        return "the other end" if self._listener is not None else str(self._address)
 
     def _wake(self) -> None:
         self._wake_out.send(b"!")

@@ -51,7 +51,8 @@
   };
 
   function showLatency() {
-    const place = document.getElementById("ussim-latency");
+    const place = document.getElementById("ussim-latency"); // there while the user wants it
+    workstation.measuring = Boolean(place);
     if (!place) return;
     const { count, median: middle, p95, rate } = workstation.summary();
     place.textContent = count
@@ -74,7 +75,7 @@
   );
   window.addEventListener("keydown", (event) => {
     if (isWriting(event.target) || event.ctrlKey || event.altKey || event.metaKey) return;
-    const keys = window.trame?.state?.get("probe_keys") ?? [];
+    const keys = canvasOf("simulated")?.dataset.keys.split(" ") ?? [];
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (!keys.includes(key)) return;
     event.preventDefault();
@@ -108,10 +109,7 @@
     connection.subscribe("trame.rca.topic.stream", draw);
     workstation.connected = true;
     window.trame.trigger("page_opened");
-    setInterval(() => {
-      workstation.measuring = Boolean(window.trame.state.get("show_latency"));
-      if (workstation.measuring) showLatency();
-    }, 300);
+    setInterval(showLatency, 300);
   }
   connect();
 })();

@@ -1,0 +1,32 @@
+"""Observed: one node at a time of those that play a role, whose changes are told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+
+class Observed:
+    """Observes whichever node plays a role now.
+
+    Parameters
+    ----------
+    event : name of an event of that node, such as "TransformModifiedEvent".
+    method : called when it happens.
+    """
+
+    def __init__(self, event: str, method: Callable[[], None]) -> None:
+        self._event, self._method = event, method
+        self._node: Any = None
+        self._tag = 0
+
+    def watch(self, node: Any) -> None:
+        """Observe this one from now on, or none."""
+        if node is self._node:
+            return
+        if self._node is not None:
+            self._node.RemoveObserver(self._tag)
+        self._node = node
+        if node is not None:
+            event = getattr(node, self._event, self._event)  # VTK knows its own events by name, MRML's by number
+            self._tag = node.AddObserver(event, lambda *_: self._method())

@@ -1,0 +1,130 @@
+"""Patient: MRI, labels and sequence that the workstation is about: taken from files, segmented, put under the probe."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from trame_slicer.core import SlicerApp
+
+from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mrml.label_nodes import labels_version
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Widget.presenter import PanelPresenter
+from SlicerUSSim.Workstation.anatomy import AnatomyViews
+from SlicerUSSim.Workstation.comparison import Comparison
+from SlicerUSSim.Workstation.opener import Files, Opener
+from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.state import SharedState
+from SlicerUSSim.Workstation.tasks import Tasks
+
+
+class Patient:
+    """Lets another patient, or more of the same one, take the place of what there was. All methods run in a task."""
+
+    def __init__(
+        self,
+        shared: SharedState,
+        app: SlicerApp,
+        logic: UltrasoundSceneLogic,
+        tasks: Tasks,
+        opener: Opener,
+        presenter: PanelPresenter,
+        views: AnatomyViews,
+        probe: ProbeControl,
+        comparison: Comparison,
+    ) -> None:
+        self._shared, self._scene, self._logic, self._tasks = shared, app.scene, logic, tasks
+        self._opener, self._presenter = opener, presenter
+        self._views, self._probe, self._comparison = views, probe, comparison
+
+    def begin(self, files: Files) -> None:
+        """Load what the workstation was started with, and show the first image."""
+        parameters = self._logic.parameters
+        with self._presenter.shown():
+            if files.preset is not None:
+                self._logic.preset = files.preset
+            parameters.contrast = files.contrast
+            if files.mri is not None or files.labels is None:
+                self._take_mri(files.mri)
+            if files.mask is not None:
+                parameters.mask = self._opener.mask(files.mask)
+            if files.labels is not None:
+                self._take_labels(files.labels)
+            else:
+                self.segment()
+            if files.sequence is not None:
+                self._take_sequence(files.sequence, files.sequence_name)
+
+    def open(self, name: str, content: bytes) -> None:
+        """Whatever file a page sent: an MRI, a label map, a tracked sequence, or settings."""
+        with self._presenter.shown(), self._opener.uploaded(name, content) as (path, kind):
+            if kind == "preset":
+                self._logic.preset = Preset.read(path)
+            elif kind == "sequence":
+                self._take_sequence(self._tasks.do(lambda: TrackedSequence.read(path)), name.split(".")[0])
+            elif kind == "labels":
+                self._take_labels(path)
+            else:
+                self._take_mri(path)
+                self.segment()
+
+    def segment(self) -> None:
+        """Label the MRI's tissues, and put a probe on the patient if there is none."""
+        parameters: Any = self._logic.parameters
+        if parameters.mri is not None and parameters.labels is None:
+            # A label map: ten times as fast to fill as a segmentation, and its tissues colour the slice views.
+            name = self._scene.GenerateUniqueName(f"{parameters.mri.GetName()} tissues")
+            parameters.labels = self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
+        labels, mri, mask = parameters.labels, parameters.mri, parameters.mask
+        options = {name: getattr(parameters, name) for name in ("contrast", "classes", "thin_sulci", "bias_correction")}
+        before = None if labels is None else labels_version(labels)
+        self._presenter.segment()
+        if labels is None or labels_version(labels) == before:
+            if labels is not None and labels.IsA("vtkMRMLVolumeNode") and labels.GetImageData() is None:
+                self._scene.RemoveNode(labels)  # made for this, and nothing came of it
+            return
+        self._opener.segmented(labels, mri, mask, options)
+        self._labels_ready()
+
+    def place_probe(self) -> None:
+        """Put the probe where a craniotomy might be."""
+        self._presenter.placeProbe()
+        self._probe.look()
+
+    # ---- inside ------------------------------------------------------------------------------------------------
+
+    def _take_labels(self, path: str) -> None:
+        node = self._opener.labels(path)
+        if self._logic.parameters.mri is None:
+            self._take_volume(node)
+        self._logic.parameters.labels = node
+        self._labels_ready()
+
+    def _take_mri(self, path: str | None) -> None:
+        parameters = self._logic.parameters
+        node = self._opener.mri(path)
+        self._logic.stopLiveUpdate()  # until there are labels of it
+        parameters.mri, parameters.labels, parameters.mask = node, None, None
+        self._take_volume(node)
+
+    def _take_volume(self, node: Any) -> None:
+        with self._shared.changing() as now:
+            now.title = node.GetName()
+        self._views.show_volume(node)
+
+    def _take_sequence(self, sequence: TrackedSequence, name: str) -> None:
+        """The probe goes where the images were taken, and is the one that took them."""
+        tracked, browser, images = self._opener.sequence(sequence, name)
+        self._logic.preset = replace(self._logic.preset, probe=tracked.probe)
+        self._logic.parameters.real = images
+        self._comparison.take(tracked, browser)
+
+    def _labels_ready(self) -> None:
+        if self._logic.parameters.probe_transform is None:
+            self._presenter.placeProbe()
+        if not self._logic.isLive:
+            self._presenter.setLive(True)
+        self._probe.update_surface()  # which the first image does not need
+        self._probe.look()

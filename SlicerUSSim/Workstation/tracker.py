@@ -1,0 +1,66 @@
+"""Tracker: a TrackerLink that moves the probe and gets the images, and what the page says of it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import numpy as np
+from trame_server.utils.asynchronous import get_event_loop
+
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tracked.openigtlink import TrackerLink, parse_address
+from SlicerUSSim.Workstation.state import SharedState
+from SlicerUSSim.Workstation.tasks import Tasks
+
+#: Seconds between two looks at the connection's state.
+_LOOK_EVERY_S = 0.3
+
+
+class Tracker:
+    """The connection to a tracker, once there is one.
+
+    Parameters
+    ----------
+    move : takes the pose (4, 4) that a tracker says, in the event loop.
+    """
+
+    def __init__(self, shared: SharedState, tasks: Tasks, move: Callable[[np.ndarray], None]) -> None:
+        self._shared, self._tasks, self._move = shared, tasks, move
+        self._link: TrackerLink | None = None
+        self._telling: asyncio.Task | None = None
+
+    def start(self, address: str, device: str | None) -> None:
+        """Connect, or wait for it; `address` is what parse_address reads, `device` the transform to follow.
+
+        Raises SimulationError for another address, and for one that cannot be waited at.
+        """
+        host, port, listen = parse_address(address)
+        self._link = TrackerLink(host, port, self._moved, device=device, listen=listen)
+        self._telling = get_event_loop().create_task(self._tell(self._link))
+
+    @property
+    def is_on(self) -> bool:
+        """Whether anyone wants images."""
+        return self._link is not None
+
+    def send(self, image: Volume) -> None:
+        """Send an image with its place (RAS)."""
+        if self._link is not None:
+            self._link.send(image)
+
+    def stop(self) -> None:
+        """Let go of it."""
+        link, self._link = self._link, None
+        if link is not None:
+            link.stop()
+
+    def _moved(self, pose: np.ndarray) -> None:
+        self._tasks.tell(lambda: self._move(pose))
+
+    async def _tell(self, link: TrackerLink) -> None:
+        while self._link is link:
+            if self._shared.now.messages.tracker != link.status:
+                with self._shared.changing() as now:
+                    now.messages.tracker = link.status
+            await asyncio.sleep(_LOOK_EVERY_S)
