@@ -545,6 +545,30 @@ def test_a_sequence_of_transforms_becomes_one_of_images(bench):
         np.testing.assert_array_equal(pixels(images.GetNthDataNode(number)), expected(pose))
 
 
+@pytest.mark.parametrize(
+    "values, expected_values",
+    [
+        (("0.0", "0.0003", "0.0006"), ("0.0", "0.0003", "0.0006")),
+        (("0.5", "0.50", "0.500"), ("0.5", "0.500001", "0.500002")),
+        (("later", "sooner", "soon"), ("later", "sooner", "soon")),
+    ],
+)
+def test_no_image_is_lost_for_an_index_value_that_is_hardly_or_not_another(bench, values, expected_values):
+    poses = [ABOVE @ rigid(np.eye(3), [0, 0, z]) for z in (0, 1, 2)]
+    transforms, images = add(bench.scene, "Sequence", "tracking"), add(bench.scene, "Sequence", "images")
+    transforms.SetIndexType(transforms.TextIndex)  # which keeps any value
+    for value, pose in zip(values, poses, strict=True):
+        transforms.SetDataNodeAtValue(put(slicer.vtkMRMLLinearTransformNode(), pose), value)
+    if values[0][0].isdigit():
+        transforms.SetIndexType(transforms.NumericIndex)
+    assert bench.logic.simulateSequence(bench.labels, transforms, images) == 3
+    assert images.GetIndexType() == transforms.GetIndexType()
+    found = [images.GetNthIndexValue(number) for number in range(images.GetNumberOfDataNodes())]
+    assert tuple(found) == expected_values
+    for value, pose in zip(found, poses, strict=True):
+        np.testing.assert_array_equal(pixels(images.GetDataNodeAtValue(value, True)), expected(pose))
+
+
 def test_with_its_browser_a_sequence_plays_images_under_the_probe(bench):
     sequences = slicer.vtkSlicerSequencesLogic()
     sequences.SetMRMLScene(bench.scene)

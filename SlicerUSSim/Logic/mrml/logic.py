@@ -36,6 +36,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     write_outline,
 )
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
+from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_in_slice
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -185,7 +186,8 @@ class UltrasoundSceneLogic:
     ) -> int:
         """A sequence of simulated images from a vtkMRMLSequenceNode of linear transforms; returns how many.
 
-        Images are in the probe frame with the transforms' index values. With the browser of the transforms, its current
+        Images are in the probe frame with the transforms' index values (SequenceIndex says what becomes of values that
+        a sequence node cannot tell apart; no image is lost). With the browser of the transforms, its current
         transform's parents count, and the images are added to it, under that transform. `progress` is told the share
         done and may raise errors.Cancelled; `images_node` is then as it was.
         """
@@ -212,12 +214,7 @@ class UltrasoundSceneLogic:
                 progress((number + 1) / count)
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
 
-        images_node.RemoveAllDataNodes()
-        images_node.SetIndexName(transforms_node.GetIndexName())
-        images_node.SetIndexUnit(transforms_node.GetIndexUnit())
-        images_node.SetIndexType(transforms_node.GetIndexType())
-        for number, image in enumerate(images):
-            images_node.SetDataNodeAtValue(image, transforms_node.GetNthIndexValue(number))
+        SequenceIndex.of_node(transforms_node).fill(images_node, images)
         if browser_node is not None:
             if not browser_node.IsSynchronizedSequenceNode(images_node, True):
                 browser_node.AddSynchronizedSequenceNode(images_node)
