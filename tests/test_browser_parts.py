@@ -18,6 +18,7 @@ from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkFeatureEdges, vtkMass
 
 from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationError, TissueTable, UltrasoundSimulator
 from SlicerUSSim.Logic.base.volume import read_array
+from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
@@ -197,7 +198,8 @@ def test_the_script_of_a_label_map_simulates_the_same_image(head, tmp_path):
     source = LabelSource(str(tmp_path / "labels.nii.gz"), True, relabelled=tuple(back))
     (tmp_path / "again.py").write_text(python_script(source, preset, pose))
     subprocess.run([sys.executable, "again.py"], cwd=tmp_path, check=True, capture_output=True)
-    frame = UltrasoundSimulator(head.labels, preset.tissues).simulate(probe, pose, preset.display)
+    simulator = UltrasoundSimulator(head.labels, preset.tissues)
+    frame = simulator.simulate(probe, pose, preset.display, noise_seed=seed_of_pose(pose))
     assert np.array_equal(read_array(tmp_path / "image.nrrd")[0][0], frame.image)
 
 

@@ -134,6 +134,23 @@ def test_sweep_draws_the_same_images_on_the_same_pixels(folder):
     assert np.corrcoef(blocks)[0, 1] > 0.9
 
 
+def test_images_of_a_sweep_have_noise_by_their_number(folder, tmp_path):
+    sequence = TrackedSequence.read(folder / "tracked.igs.mha")
+    still = [0, 0, 0]  # the probe rests
+    sequence.select(still).write(tmp_path / "still.igs.mha")
+    Preset(PhasedProbe(70.0, 50.0, scan_lines=80)).changed("display", noise_db=-20.0).write(tmp_path / "noisy.json")
+    for name, options in (("all", ()), ("last", ("--frames", "2"))):
+        done = ussim(
+            "sweep", folder / "labels.nii.gz", "--sequence", tmp_path / "still.igs.mha", "--preset",
+            tmp_path / "noisy.json", "-o", tmp_path / f"{name}.igs.mha", *options,
+        )  # fmt: skip
+        assert done.exit_code == 0, done.output
+    images, (last,) = (TrackedSequence.read(tmp_path / f"{name}.igs.mha").images for name in ("all", "last"))
+    for number in (1, 2):
+        assert (images[number] != images[0]).mean() > 0.2
+    assert np.array_equal(last, images[2]) and not np.array_equal(images[1], images[2])
+
+
 def test_register_moves_the_poses_and_writes_the_transform(folder, monkeypatch):
     monkeypatch.setattr("SlicerUSSim.Logic.fitting.fit._ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
     done = optimize(

@@ -160,7 +160,9 @@ def sweep(out: Path, **options) -> None:
     images = np.zeros((len(tracked.poses), *tracked.field.mask.shape), np.uint8)
     with Share("sweep") as progress:
         for number, pose in enumerate(tracked.poses):
-            frame = scene.simulator.simulate(tracked.probe, pose, scene.display, tracked.grid)
+            frame = scene.simulator.simulate(
+                tracked.probe, pose, scene.display, tracked.grid, noise_seed=tracked.numbers[number]
+            )
             images[number][tracked.field.window] = frame.image
             progress((number + 1) / len(tracked.poses))
     sequence.with_images(tracked.numbers, images).write(out)

@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.fitting.fit import Fit, fit
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -149,8 +150,9 @@ class UltrasoundSceneLogic:
     ) -> Frame:
         """The image under the probe, into a scalar volume node that is put under the probe's transform.
 
-        `labels_node` is a label map or a segmentation; its names choose the tissues, see scene_nodes.read_labels.
-        `warned` is told what there is to warn of.
+        `labels_node` is a label map or a segmentation; its names choose the tissues, see label_nodes.read_labels. Every
+        pose in the labels' frame has amplifier noise of its own (noise.seed_of_pose). `warned` is told what there is to
+        warn of.
         """
         self._check_output(labels_node, output_node)
         probe_to_world = probe_pose(probe_transform_node)
@@ -187,9 +189,9 @@ class UltrasoundSceneLogic:
         """A sequence of simulated images from a vtkMRMLSequenceNode of linear transforms; returns how many.
 
         Images are in the probe frame with the transforms' index values (SequenceIndex says what becomes of values that
-        a sequence node cannot tell apart; no image is lost). With the browser of the transforms, its current
-        transform's parents count, and the images are added to it, under that transform. `progress` is told the share
-        done and may raise errors.Cancelled; `images_node` is then as it was.
+        a sequence node cannot tell apart; no image is lost), and their numbers say which noise they have. With the
+        browser of the transforms, its current transform's parents count, and the images are added to it, under that
+        transform. `progress` is told the share done and may raise errors.Cancelled; `images_node` is then as it was.
         """
         require_node(transforms_node, "vtkMRMLSequenceNode", use="sequence of transforms")
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
@@ -205,7 +207,7 @@ class UltrasoundSceneLogic:
             item = transforms_node.GetNthDataNode(number)
             require_node(item, "vtkMRMLTransformNode", use=f"item {number} of {named(transforms_node)}")
             pose = check_rigid(f"item {number} of {named(transforms_node)}", to_world @ node_to_world(item))
-            frame = self._frame(labels_node, pose)
+            frame = self._frame(labels_node, pose, noise_seed=number)
             image = self.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
             image.UnRegister(None)
             write_image(image, frame)
@@ -403,15 +405,23 @@ class UltrasoundSceneLogic:
             self._labelled = (version, read_labels(labels_node, self.preset.tissues))
         return self._labelled[1]
 
-    def _frame(self, labels_node, probe_to_world: np.ndarray, warned: Callable[[Warning], None] = warn_again) -> Frame:
+    def _frame(
+        self,
+        labels_node,
+        probe_to_world: np.ndarray,
+        warned: Callable[[Warning], None] = warn_again,
+        noise_seed: int | None = None,
+    ) -> Frame:
+        """The image at a pose; its draw of the noise is the pose's own unless another is given."""
         labelled = self._read_labels(labels_node)
         pose, moved = pose_in_labels(labels_node, probe_to_world)
         simulator, preset = self._simulator_for(labels_node, labelled, moved), self.preset
+        noise_seed = seed_of_pose(pose) if noise_seed is None else noise_seed
 
         def compute() -> tuple[Frame, list[Warning]]:
             # Collected within the work: Python can do that for one thing at a time only.
             with collected_warnings() as caught:
-                return simulator().simulate(preset.probe, pose, preset.display), caught
+                return simulator().simulate(preset.probe, pose, preset.display, noise_seed=noise_seed), caught
 
         frame, caught = self._work.do(compute)
         for warning in caught:
