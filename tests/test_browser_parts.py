@@ -28,6 +28,7 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.base.volume import read_array
+from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
@@ -45,8 +46,8 @@ pytest.importorskip("trame_slicer", reason="the workstation comes with: pip inst
 from SlicerUSSim.Logic.mrml.fit_nodes import tracked_images  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.mrml.nodes import probe_pose, set_node_to_world, write_volume  # noqa: E402
-from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, SequenceIndex, add_sequence  # noqa: E402
 from SlicerUSSim.Workstation.export import Cine  # noqa: E402
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
 
@@ -226,7 +227,9 @@ def test_the_script_of_a_label_map_simulates_the_same_image_whatever_files_and_t
     preset = Preset(probe=probe, tissues=tissues).changed("display", gain_db=4.0)
     pose = craniotomy_pose(head.labels, probe)
     script = python_script(LabelSource(str(file), True, relabelled=tuple(back)), preset, pose)
-    frame = UltrasoundSimulator(head.labels, preset.tissues).simulate(probe, pose, preset.display)
+    frame = UltrasoundSimulator(head.labels, preset.tissues).simulate(
+        probe, pose, preset.display, noise_seed=seed_of_pose(pose)
+    )
     assert np.array_equal(run_again(script, tmp_path), frame.image)
 
 
@@ -261,31 +264,69 @@ def test_the_script_of_an_mri_has_its_mask_and_options_and_the_texture_if_it_is_
 # ---- sequences as nodes ----------------------------------------------------------------------------------------------
 
 
-def test_a_sequence_as_nodes_holds_the_images_and_the_browser_moves_the_probe(head):
+@pytest.fixture(scope="module")
+def recorded(head):
+    """(probe, poses, TrackedSequence) of four images, the second of which was not tracked."""
     probe = PhasedProbe(75.0, 70.0, scan_lines=64)
     poses = tilt_sweep(craniotomy_pose(head.labels, probe), 10.0, 4)
     simulator = UltrasoundSimulator(head.labels, TissueTable.brain(head.tissue_names))
     images = np.stack([frame.image for frame in simulator.sweep(probe, poses)])
     to_probe = ImageGrid.for_probe(probe, None).image_to_probe
     transforms = [{"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in poses]
-    transforms[1] = {"ImageToProbe": to_probe}  # not tracked
-    sequence = TrackedSequence(images, tuple(transforms), 0.1 * np.arange(4))
-    kept = [poses[0], poses[2], poses[3]]
+    transforms[1] = {"ImageToProbe": to_probe}
+    return probe, poses, TrackedSequence(images, tuple(transforms), 0.1 * np.arange(4))
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        [0.0, 0.1, 0.2, 0.3],
+        [0.5, 0.5, 0.5, 0.5],
+        [0.0, 0.0, 0.0, 0.3],
+        [0.3, 0.2, 0.1, 0.0],
+        [0.0, 2e-4, 4e-4, 6e-4],  # a fast scanner; a sequence node takes what is within a millisecond for one
+        [1.7e9, 1.7e9, 1.7e9 + 1e-3, 1.7e9 + 1e-3],  # as a computer's clock has them
+        [np.nan, np.nan, np.nan, np.nan],
+        [0.0, 0.1, np.nan, 0.3],
+    ],
+)
+def test_a_sequence_as_nodes_holds_the_images_and_the_browser_moves_the_probe(recorded, times):
+    probe, poses, sequence = recorded
+    sequence = replace(sequence, timestamps=times)
+    kept, numbers = [poses[0], poses[2], poses[3]], [0, 2, 3]
     scene = slicer.vtkMRMLScene()
     logic = slicer.vtkSlicerSequencesLogic()
     logic.SetMRMLScene(scene)
     transform = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
     browser, node = add_sequence(scene, sequence, "sweep", poses=kept, probe_transform_node=transform)
     assert browser.GetNumberOfItems() == 3 and node.GetNumberOfDataNodes() == 3
+    shown = browser.GetProxyNode(node)
     for number, pose in enumerate(kept):
         browser.SetSelectedItemNumber(number)
         logic.UpdateProxyNodesFromSequences(browser)
         assert np.allclose(probe_pose(transform), pose, atol=1e-6)
+        image = read_volume(shown)
+        assert np.array_equal(image.array[0], sequence.images[numbers[number]])
+        in_world = sequence.pose(numbers[number], "ImageToReference")
+        assert np.allclose(node_to_world(shown) @ image.ijk_to_ras, in_world, atol=1e-6)
     found = tracked_images(node, None, probe)
     assert len(found.images) == 3
     for pose, expected in zip(found.poses, kept, strict=True):
         assert np.allclose(pose[:3, 1], expected[:3, 1], atol=0.01)
         assert np.linalg.norm(pose[:3, 3] - expected[:3, 3]) < 1.0  # the field is found in the images
+
+
+def test_times_that_tell_images_apart_are_their_index_and_equal_ones_follow_each_other():
+    assert SequenceIndex.of_times([0.0, 0.1, 2.0]) == SequenceIndex(("0.000000", "0.100000", "2.000000"))
+    assert SequenceIndex.of_times([0.1, 0.1, 0.1, 0.3]).values == ("0.100000", "0.100001", "0.100002", "0.300000")
+    assert SequenceIndex.of_times([5.0, np.nan, 1.0]).values == ("5.000000", "5.000001", "5.000002")
+    assert SequenceIndex(("b", "a", "b"), is_text=True).values == ("b", "a", "b (2)")
+    sequence = TrackedSequence(np.ones((3, 8, 8), np.uint8), ({"ImageToReference": np.eye(4)},) * 3, [0.2, 0.2, np.nan])
+    scene, logic = slicer.vtkMRMLScene(), slicer.vtkSlicerSequencesLogic()
+    logic.SetMRMLScene(scene)
+    _, images = add_sequence(scene, sequence, "sweep")
+    assert [images.GetNthDataNode(number).GetAttribute(TIME) for number in range(3)] == ["0.200000", "0.200000", None]
+    assert (images.GetIndexName(), images.GetIndexUnit(), images.GetIndexTypeAsString()) == ("time", "s", "numeric")
 
 
 def test_nothing_tracked_is_said():

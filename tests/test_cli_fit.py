@@ -85,6 +85,38 @@ def test_optimize_writes_result_report_preset_and_state(folder):
     assert "(0 evaluations)" in again.output
 
 
+def test_a_state_is_not_resumed_with_other_images_or_another_mri(folder, tmp_path):
+    state, few = tmp_path / "state.json", ("--evaluations", 4, "--restarts", 0, "--free", "gain_db")
+
+    def run(mri, sequence):
+        return ussim(
+            "optimize", mri, "--sequence", sequence, "--probe", folder / "probe.json", "--mri-modulation", 3, "-o",
+            tmp_path / "result.json", "--state", state, *few,
+        )  # fmt: skip
+
+    mri, sequence = head_mri(2.0), TrackedSequence.read(folder / "tracked.igs.mha")
+    mri.write(tmp_path / "mri.nii.gz")
+    # A second scan that is segmented alike but for single voxels, and a recording in another order.
+    ripple = 1.0 + 0.02 * (np.indices(mri.array.shape).sum(axis=0) % 2)
+    mri.with_array(mri.array * ripple).write(tmp_path / "again.nii.gz")
+    sequence.with_images([0, 1, 2], sequence.images[::-1]).write(tmp_path / "swapped.igs.mha")
+    tracked = folder / "tracked.igs.mha"
+    assert run(tmp_path / "mri.nii.gz", tracked).exit_code == 0
+    kept = state.read_text()
+    (tmp_path / "result.json").unlink()
+    for files, other in (
+        ((tmp_path / "again.nii.gz", tracked), "texture"),
+        ((tmp_path / "mri.nii.gz", tmp_path / "swapped.igs.mha"), "reference images"),
+    ):
+        done = run(*files)
+        assert done.exit_code == 2
+        (line,) = [line for line in done.output.splitlines() if line.startswith("ussim:")]
+        assert "another problem: other" in line and other in line
+        assert state.read_text() == kept and not (tmp_path / "result.json").exists()
+    again = run(tmp_path / "mri.nii.gz", tracked)
+    assert again.exit_code == 0 and "(0 evaluations)" in again.output
+
+
 def test_sweep_draws_the_same_images_on_the_same_pixels(folder):
     done = ussim(
         "sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "--probe", folder / "probe.json",
@@ -102,6 +134,23 @@ def test_sweep_draws_the_same_images_on_the_same_pixels(folder):
         for s, n in ((real, 2), (simulated, 0))
     ]
     assert np.corrcoef(blocks)[0, 1] > 0.9
+
+
+def test_images_of_a_sweep_have_noise_by_their_number(folder, tmp_path):
+    sequence = TrackedSequence.read(folder / "tracked.igs.mha")
+    still = [0, 0, 0]  # the probe rests
+    sequence.select(still).write(tmp_path / "still.igs.mha")
+    Preset(PhasedProbe(70.0, 50.0, scan_lines=80)).changed("display", noise_db=-20.0).write(tmp_path / "noisy.json")
+    for name, options in (("all", ()), ("last", ("--frames", "2"))):
+        done = ussim(
+            "sweep", folder / "labels.nii.gz", "--sequence", tmp_path / "still.igs.mha", "--preset",
+            tmp_path / "noisy.json", "-o", tmp_path / f"{name}.igs.mha", *options,
+        )  # fmt: skip
+        assert done.exit_code == 0, done.output
+    images, (last,) = (TrackedSequence.read(tmp_path / f"{name}.igs.mha").images for name in ("all", "last"))
+    for number in (1, 2):
+        assert (images[number] != images[0]).mean() > 0.2
+    assert np.array_equal(last, images[2]) and not np.array_equal(images[1], images[2])
 
 
 @pytest.mark.parametrize("has_given_map", [False, True])

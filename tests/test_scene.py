@@ -21,9 +21,11 @@ from SlicerUSSim.Logic import (  # noqa: E402
     LinearProbe,
     Preset,
     SimulationError,
+    Tissue,
     TissueTable,
     UltrasoundSimulator,
     Volume,
+    seed_of_pose,
     segment_mri,
 )
 from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
@@ -92,8 +94,11 @@ def volume_node(scene, volume: Volume, name: str = "MRI"):
     return node
 
 
-def expected(pose: np.ndarray) -> np.ndarray:
-    return UltrasoundSimulator(cyst(), PRESET.tissues).simulate(PRESET.probe, pose, PRESET.display).image
+def expected(pose: np.ndarray, noise_seed: int | None = None) -> np.ndarray:
+    """(rows, columns) with the noise of the pose, unless another is given."""
+    noise_seed = seed_of_pose(pose) if noise_seed is None else noise_seed
+    simulator = UltrasoundSimulator(cyst(), PRESET.tissues)
+    return simulator.simulate(PRESET.probe, pose, PRESET.display, noise_seed=noise_seed).image
 
 
 @pytest.fixture
@@ -140,13 +145,55 @@ def test_any_chain_of_rigid_parents_gives_the_same_image_as_their_product(bench)
     np.testing.assert_allclose(in_world, b @ a @ ABOVE @ geometry, atol=1e-9)
 
 
+def noisy(bench) -> None:
+    """Nothing but noise, of which the image is full."""
+    fluid = TissueTable({0: FLUID, 1: Tissue("speckle", 1540.0, 1.54, 0.0), 2: FLUID})
+    display = DisplaySettings(noise_db=-5.0, tgc_db_cm_mhz=0.0, image_size=(96, 64))
+    bench.logic.preset = Preset(PRESET.probe, display, PRESET.settings, fluid)
+
+
+def likeness(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
+
+
+def test_noise_lives_while_the_probe_moves_and_is_the_same_where_it_was(bench):
+    noisy(bench)
+    bench.live()
+    first = pixels(bench.image)
+    put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 0, 0.5]))
+    other = pixels(bench.image)
+    assert first.std() > 5 and abs(likeness(first, other)) < 0.1
+    put(bench.probe, ABOVE)
+    np.testing.assert_array_equal(pixels(bench.image), first)
+    turned = put(add(bench.scene, "LinearTransform"), rigid(Rotation.random(random_state=4).as_matrix(), [9, 8, 7]))
+    before = pixels(bench.image)
+    bench.labels.SetAndObserveTransformNodeID(turned.GetID())  # patient and probe together: the same pose
+    bench.probe.SetAndObserveTransformNodeID(turned.GetID())
+    np.testing.assert_array_equal(pixels(bench.image), before)
+    bench.logic.preset = bench.logic.preset.changed("display", gain_db=1.0)  # brighter, not another noise
+    assert likeness(pixels(bench.image), before) > 0.99
+
+
+def test_images_of_a_sequence_have_noise_of_their_own_even_at_one_pose(bench):
+    noisy(bench)
+    images = add(bench.scene, "Sequence", "images")
+    bench.logic.simulateSequence(bench.labels, sequence_of(bench.scene, [ABOVE] * 3), images)
+    shown = [pixels(images.GetNthDataNode(number)) for number in range(3)]
+    assert shown[0].std() > 5
+    assert all(abs(likeness(a, b)) < 0.1 for a, b in ((shown[0], shown[1]), (shown[1], shown[2]), (shown[0], shown[2])))
+    bench.logic.simulateSequence(bench.labels, sequence_of(bench.scene, [ABOVE] * 3), images)
+    for number, image in enumerate(shown):
+        np.testing.assert_array_equal(pixels(images.GetNthDataNode(number)), image)
+
+
 def test_labels_under_a_scaling_transform_are_scaled(bench):
     scale = put(add(bench.scene, "LinearTransform"), np.diag([1.0, 1.2, 1.0, 1.0]))
     bench.labels.SetAndObserveTransformNodeID(scale.GetID())
     image = bench.simulate().image
     volume = cyst()
     stretched = Volume(volume.array, np.diag([1.0, 1.2, 1.0, 1.0]) @ volume.ijk_to_ras)
-    true = UltrasoundSimulator(stretched, PRESET.tissues).simulate(PRESET.probe, ABOVE, PRESET.display).image
+    simulator = UltrasoundSimulator(stretched, PRESET.tissues)
+    true = simulator.simulate(PRESET.probe, ABOVE, PRESET.display, noise_seed=seed_of_pose(ABOVE)).image
     np.testing.assert_array_equal(image, true)
 
 
@@ -243,8 +290,9 @@ def test_segment_names_and_colours_tissues_where_the_mri_is(kind):
     probe, image = add(scene, "LinearTransform"), add(scene, "ScalarVolume")
     logic.placeProbe(labels, probe)
     frame = logic.simulate(labels, probe, image)
+    pose = np.linalg.inv(node_to_world(moved)) @ node_to_world(probe)
     direct = UltrasoundSimulator(result.labels, TissueTable.brain(result.tissue_names)).simulate(
-        Preset().probe, np.linalg.inv(node_to_world(moved)) @ node_to_world(probe)
+        Preset().probe, pose, noise_seed=seed_of_pose(pose)
     )
     assert frame.image.mean() > 15 and np.mean(frame.image != direct.image) < 0.02
 
@@ -555,7 +603,31 @@ def test_a_sequence_of_transforms_becomes_one_of_images(bench):
     assert count == 3 and shares == [1 / 3, 2 / 3, 1.0] and images.GetIndexName() == "time"
     for number, pose in enumerate(poses):
         assert images.GetNthIndexValue(number) == str(number / 10)
-        np.testing.assert_array_equal(pixels(images.GetNthDataNode(number)), expected(pose))
+        np.testing.assert_array_equal(pixels(images.GetNthDataNode(number)), expected(pose, number))
+
+
+@pytest.mark.parametrize(
+    "values, expected_values",
+    [
+        (("0.0", "0.0003", "0.0006"), ("0.0", "0.0003", "0.0006")),
+        (("0.5", "0.50", "0.500"), ("0.5", "0.500001", "0.500002")),
+        (("later", "sooner", "soon"), ("later", "sooner", "soon")),
+    ],
+)
+def test_no_image_is_lost_for_an_index_value_that_is_hardly_or_not_another(bench, values, expected_values):
+    poses = [ABOVE @ rigid(np.eye(3), [0, 0, z]) for z in (0, 1, 2)]
+    transforms, images = add(bench.scene, "Sequence", "tracking"), add(bench.scene, "Sequence", "images")
+    transforms.SetIndexType(transforms.TextIndex)  # which keeps any value
+    for value, pose in zip(values, poses, strict=True):
+        transforms.SetDataNodeAtValue(put(slicer.vtkMRMLLinearTransformNode(), pose), value)
+    if values[0][0].isdigit():
+        transforms.SetIndexType(transforms.NumericIndex)
+    assert bench.logic.simulateSequence(bench.labels, transforms, images) == 3
+    assert images.GetIndexType() == transforms.GetIndexType()
+    found = [images.GetNthIndexValue(number) for number in range(images.GetNumberOfDataNodes())]
+    assert tuple(found) == expected_values
+    for number, (value, pose) in enumerate(zip(found, poses, strict=True)):
+        np.testing.assert_array_equal(pixels(images.GetDataNodeAtValue(value, True)), expected(pose, number))
 
 
 def test_with_its_browser_a_sequence_plays_images_under_the_probe(bench):
@@ -572,7 +644,7 @@ def test_with_its_browser_a_sequence_plays_images_under_the_probe(bench):
     sequences.UpdateProxyNodesFromSequences(browser)
     shown = browser.GetProxyNode(images)
     assert shown.GetParentTransformNode() is browser.GetProxyNode(transforms)
-    np.testing.assert_array_equal(pixels(shown), expected(ABOVE @ rigid(np.eye(3), [0, 0, 1.5])))
+    np.testing.assert_array_equal(pixels(shown), expected(ABOVE @ rigid(np.eye(3), [0, 0, 1.5]), 1))
 
 
 def test_a_sequence_that_fails_or_is_cancelled_leaves_the_old_images(bench):
@@ -720,7 +792,8 @@ def test_hybrid_scatterers_take_the_texture_of_the_last_segmentation(kind):
     direct = UltrasoundSimulator(
         segmentation.labels, logic.preset.tissues, logic.preset.settings, texture=segmentation.texture()
     )
-    true = direct.simulate(logic.preset.probe, node_to_world(probe), logic.preset.display).image
+    pose = node_to_world(probe)
+    true = direct.simulate(logic.preset.probe, pose, logic.preset.display, noise_seed=seed_of_pose(pose)).image
     assert (hybrid != true).mean() < 0.01
     if kind == "Segmentation":
         labels.GetSegmentation().GetNthSegment(0).SetName("Cerebrospinal fluid")

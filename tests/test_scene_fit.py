@@ -42,7 +42,7 @@ def brain():
 class Scene:
     """A patient with a tracked sequence: image under ImageToProbe (fixed) under ProbeToReference (recorded)."""
 
-    def __init__(self, brain, moved: np.ndarray | None = None) -> None:
+    def __init__(self, brain, step_s: float = 0.5) -> None:
         segmentation, twin = brain
         self.twin = twin
         self.scene = scene = slicer.vtkMRMLScene()
@@ -61,13 +61,17 @@ class Scene:
         self.calibration.SetMatrixTransformToParent(vtk_matrix(tracked.transforms[0]["ImageToProbe"]))
         self.images = scene.AddNewNodeByClass("vtkMRMLSequenceNode", "Images")
         self.poses = scene.AddNewNodeByClass("vtkMRMLSequenceNode", "ProbeToReference")
+        for node in (self.images, self.poses):
+            node.SetNumericIndexValueTolerance(1e-9)  # while they are filled, so that any step is kept
         for number, image in enumerate(tracked.images):
             item = slicer.vtkMRMLScalarVolumeNode()
             write_volume(item, Volume(image[None], np.eye(4)))
-            self.images.SetDataNodeAtValue(item, f"{0.5 * number}")
+            self.images.SetDataNodeAtValue(item, f"{step_s * number}")
             pose = slicer.vtkMRMLLinearTransformNode()
             pose.SetMatrixTransformToParent(vtk_matrix(tracked.transforms[number]["ProbeToReference"]))
-            self.poses.SetDataNodeAtValue(pose, f"{0.5 * number}")
+            self.poses.SetDataNodeAtValue(pose, f"{step_s * number}")
+        for node in (self.images, self.poses):
+            node.SetNumericIndexValueTolerance(1e-3)  # as they come
         self.browser = scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", "Sweep")
         self.browser.SetAndObserveMasterSequenceNodeID(self.images.GetID())
         self.browser.AddSynchronizedSequenceNodeID(self.poses.GetID())
@@ -102,6 +106,13 @@ def test_a_tracked_sequence_is_fitted_where_its_transforms_say(scene, found):
         assert np.allclose(pose[:3, 3], expected[:3, 3], atol=0.5)  # to a pixel or two: the face is found in the image
         assert np.allclose(pose[:3, :3], expected[:3, :3], atol=1e-5)
     assert found.appearance.cost_after < found.appearance.cost_before
+
+
+def test_images_that_a_sequence_node_takes_for_one_keep_their_own_transforms(brain, scene, found):
+    own = Scene(brain, step_s=3e-4)
+    poses = own.optimize(max_evaluations=1).tracked.poses
+    for pose, expected in zip(poses, found.tracked.poses, strict=True):
+        np.testing.assert_allclose(pose, expected, atol=1e-9)
 
 
 def test_frames_are_chosen_by_number(scene):

@@ -278,7 +278,7 @@ def test_a_sweep_is_the_frames_of_its_poses(solid):
     frames = list(solid.sweep(PROBES["linear"], poses, QUIET, progress=seen.append))
     assert seen == [1, 2, 3]
     for frame, pose in zip(frames, poses, strict=True):
-        np.testing.assert_array_equal(frame.image, solid.simulate(PROBES["linear"], pose, QUIET).image)
+        np.testing.assert_array_equal(frame.image, solid.simulate(PROBES["linear"], pose, QUIET).image)  # no noise
 
 
 def kernels_of(sim, *arguments) -> set[str]:

@@ -77,6 +77,53 @@ def test_replace_changes_one_tissue_and_the_membrane_by_name():
         table.replace("white matter", mu9=0.3)
 
 
+def test_replace_changes_every_label_of_a_name_and_the_membrane_with_them():
+    """Left and right hemisphere have labels of their own; sulci can be labelled and be the membrane besides."""
+    louder = replace(TISSUES["white matter"], speed_of_sound_m_s=1550.0)
+    members = {1: TISSUES["white matter"], 2: TISSUES["leptomeninges"], 3: louder}
+    table = TissueTable(members, Membrane(TISSUES["leptomeninges"], 0.7))
+    changed = table.replace("white matter", mu0=0.5).replace("leptomeninges", sigma0=0.9)
+    assert changed[1] == replace(members[1], mu0=0.5) and changed[3] == replace(louder, mu0=0.5)
+    assert changed[2] == replace(members[2], sigma0=0.9) == changed.membrane.tissue
+    assert changed.membrane.thickness_mm == 0.7 and changed[0] == table[0]
+    assert changed == table.with_tissue(changed[2]).replace("white matter", mu0=0.5)  # the other way to say it
+
+
+@pytest.mark.parametrize(
+    "arguments, changes, message",
+    [
+        (
+            ["bone"],
+            {"mu0": 0.3},
+            "no tissue named 'bone', expected one of: coupling, csf, grey matter, white",
+        ),
+        (["csf"], {"mu9": 1}, "'mu9' is not a tissue parameter that can be replaced, expected one of: speed_of_sound"),
+        (["csf"], {"name": "liquor"}, "'name' is not a tissue parameter that can be replaced, expected one of: speed"),
+        (["csf"], {"mu0": 1e6}, "tissue 'csf': mu0 is 1000000.0, expected a number between -100 and 100"),
+    ],
+)
+def test_replace_refuses_names_and_parameters_that_are_none(arguments, changes, message):
+    with pytest.raises(SimulationError) as caught:
+        TissueTable.brain().replace(*arguments, **changes)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_name_means_the_same_tissue_to_labels_membrane_and_label_maps():
+    quiet, loud = (replace(TISSUES["white matter"], mu0=mu0) for mu0 in (0.1, 0.9))
+    table = TissueTable({1: quiet, 2: loud}).for_names(["White-Matter", "white matter"])
+    assert table[table.label_of("white matter")] == table[1] == table[2] == quiet  # the first, for everybody
+    tuned = TissueTable.brain().replace("leptomeninges", mu0=1.3).for_names(["csf", "leptomeninges"])
+    assert tuned[2].mu0 == tuned.membrane.tissue.mu0 == 1.3
+    both = TissueTable({1: quiet, 2: replace(loud, name="White Matter")}).for_names(["White Matter", "WHITE_MATTER"])
+    assert (both[1].mu0, both[2].mu0) == (0.9, 0.1)  # a name as it is written goes before one that is like it
+
+
+def test_a_full_table_refuses_another_tissue():
+    full = TissueTable({label: replace(TISSUES["bone"], name=f"bone {label}") for label in range(63)})
+    with pytest.raises(SimulationError, match="tissue label is 63, expected a whole number from 0 to 62"):
+        full.with_tissue(TISSUES["csf"])
+
+
 @pytest.mark.parametrize(
     "change, message",
     [

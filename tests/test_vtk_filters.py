@@ -32,6 +32,7 @@ from SlicerUSSim.Logic import (
     TissueTable,
     UltrasoundSimulator,
     Volume,
+    seed_of_pose,
     segment_mri,
 )
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
@@ -74,7 +75,8 @@ def executes(algorithm) -> bool:
 def test_the_image_is_the_simulators_at_the_probes_place():
     algorithm = simulation()
     algorithm.Update()
-    frame = UltrasoundSimulator(cyst(), TISSUES).simulate(PROBE, rigid(np.eye(3), [0, -15, 0]), DISPLAY)
+    pose = rigid(np.eye(3), [0, -15, 0])
+    frame = UltrasoundSimulator(cyst(), TISSUES).simulate(PROBE, pose, DISPLAY, noise_seed=seed_of_pose(pose))
     volume = Volume.from_vtk(algorithm.GetOutput())
     np.testing.assert_array_equal(volume.array[0], frame.image)
     np.testing.assert_allclose(volume.ijk_to_ras, frame.to_volume().ijk_to_ras, atol=1e-12)
@@ -99,6 +101,20 @@ def test_it_executes_when_something_changes_and_only_then():
         if name not in ("transform", "labels"):  # those are other objects each time
             change()
         assert not executes(algorithm), f"{name}, set to what it was"
+
+
+def test_every_pose_has_noise_of_its_own_and_has_it_again():
+    fluid = block(lambda x, y, z: np.full_like(x, 2), (12, 16, 8))
+    algorithm, matrix = simulation(fluid), vtkMatrix4x4()
+    algorithm.SetDisplay(DisplaySettings(noise_db=-20.0, tgc_db_cm_mhz=0.0, image_size=(96, 64)))
+    algorithm.SetProbeTransform(matrix)
+    noise = []
+    for place in (-15.0, -14.0, -15.0):
+        matrix.SetElement(1, 3, place)
+        algorithm.Update()
+        noise.append(algorithm.GetFrame().envelope.ravel())
+    assert abs(np.corrcoef(noise[0], noise[1])[0, 1]) < 0.03 and noise[0].std() > 0
+    np.testing.assert_array_equal(noise[0], noise[2])
 
 
 def test_a_transform_deep_in_a_chain_moves_the_image():

@@ -32,9 +32,9 @@ def sweep(patient: PatientOptions, tracking: SequenceOptions, out: Path) -> None
     rows, columns = real.field.mask.shape
     simulated = np.zeros((len(real.poses), rows, columns), np.uint8)
     with Share("sweep") as progress:
-        for number, pose in enumerate(real.poses):
-            frame = simulator.simulate(real.probe, pose, display, real.grid)
-            simulated[number][real.field.window] = frame.image
-            progress((number + 1) / len(real.poses))
+        for place, (number, pose) in enumerate(zip(real.numbers, real.poses, strict=True)):
+            frame = simulator.simulate(real.probe, pose, display, real.grid, noise_seed=number)
+            simulated[place][real.field.window] = frame.image
+            progress((place + 1) / len(real.poses))
     tracked.sequence.with_images(real.numbers, simulated).write(out)
     click.echo(f"wrote {out} ({len(simulated)} images of {columns}x{rows})")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .fitting.optimization import AppearanceResult as AppearanceResult, optimize_appearance as optimize_appearance
     from .fitting.similarity import similarity as similarity
     from .imaging.frame import Frame as Frame
+    from .imaging.noise import seed_of_pose as seed_of_pose
     from .imaging.preset import Preset as Preset
     from .imaging.simulator import UltrasoundSimulator as UltrasoundSimulator
     from .mri.segmentation import Segmentation as Segmentation, segment_mri as segment_mri

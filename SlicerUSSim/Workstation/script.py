@@ -16,6 +16,7 @@ _TEMPLATE = '''"""The image of a SlicerUSSim workstation, again."""
 import numpy as np
 
 from SlicerUSSim.Logic import {imports}
+from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 {more_imports}
 {labels}
@@ -25,7 +26,7 @@ preset = Preset.from_dict(
 probe_to_ras = np.array({pose})
 
 simulator = UltrasoundSimulator(labels, preset.tissues, preset.settings{texture})
-frame = simulator.simulate(preset.probe, probe_to_ras, preset.display)
+frame = simulator.simulate(preset.probe, probe_to_ras, preset.display, noise_seed=seed_of_pose(probe_to_ras))
 frame.to_volume().write("image.nrrd")  # frame.image is a (rows, columns) uint8 array
 print(frame.image.shape, "pixels, mean", frame.image.mean())
 '''

@@ -8,7 +8,6 @@ same answer, and an interrupted run is resumed by replaying what it had evaluate
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
@@ -17,7 +16,9 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require_between
 from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
+from SlicerUSSim.Logic.fitting.fingerprint import fingerprint
 from SlicerUSSim.Logic.fitting.identifiability import (
     Identifiability,
     State,
@@ -36,6 +37,7 @@ from SlicerUSSim.Logic.fitting.search import (
 )
 from SlicerUSSim.Logic.fitting.similarity import Similarity, SimilaritySettings
 from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
+from SlicerUSSim.Logic.imaging.medium import as_labels
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -178,11 +180,12 @@ def optimize_appearance(
     seed : of the search; that of scatterers and noise is the simulator's.
     algorithms : nlopt's names of the global algorithm (None for none) and the local one.
     progress : told after every evaluation; may raise errors.Cancelled.
-    resume : the state of an earlier, shorter run on the same problem.
+    resume : the state of an earlier run on the same problem, shorter or broken off: what was the same is not computed
+        again.
     checkpoint : told the state at the end, and when something ends the run before (Cancelled, an interrupt).
 
     Raises SimulationError for what FreeParameters, AppearanceModel and AppearanceCost refuse, and for the state of
-    another problem.
+    another problem, which it says what is different about.
     """
     started = perf_counter()
     display = display or DisplaySettings()
@@ -194,9 +197,7 @@ def optimize_appearance(
     poses, references = list(poses), [np.asarray(reference) for reference in references]
     model = AppearanceModel(simulator, probe, poses, parameters.varied(), grid)
     cost = AppearanceCost(model, parameters, references, masks, tissues, display, settings)
-    problem = _fingerprint(
-        parameters, probe, poses, references, masks, grid, tissues, display, settings, simulator, seed
-    )
+    problem = _problem(cost, references, masks, settings, algorithms, seed)
     limit = max_evaluations + restarts * (int(_SHARES[1] * max_evaluations) + 1) + _DRAWS
 
     def describe(units: np.ndarray) -> dict[str, float]:
@@ -304,17 +305,36 @@ def _with_source(tissues: TissueTable, parameters: FreeParameters) -> TissueTabl
     return tissues
 
 
-def _fingerprint(parameters, probe, poses, references, masks, grid, tissues, display, settings, simulator, seed) -> str:
-    """What makes two problems the same one."""
-    digest = hashlib.sha256()
-    plain = (list(parameters), probe, grid, tissues.to_dict(), display, settings, simulator.settings, seed)
-    digest.update(repr(plain).encode())
-    for array in (
-        *poses,
-        *references,
-        *(masks or ()),
-        simulator.medium.labels.array,
-        simulator.medium.labels.ijk_to_ras,
-    ):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+def _problem(
+    cost: AppearanceCost,
+    references: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray] | None,
+    settings: SimilaritySettings,
+    algorithms: tuple[str | None, str],
+    seed: int,
+) -> dict[str, str]:
+    """{what: its fingerprint} of everything that an evaluation's place and cost follow from.
+
+    Not the number of evaluations and restarts: a longer run begins as a shorter one does, and is compared with it step
+    by step. Nor the device: all draw the same images.
+    """
+    model, tissues = cost.model, cost.tissues
+    simulator, medium = model.simulator, model.simulator.medium
+    parts = {
+        "free parameters": tuple(cost.parameters),
+        "probe": model.probe,
+        "poses": model.poses,
+        "reference images": list(references),
+        "masks": None if masks is None else [np.asarray(mask, bool) for mask in masks],
+        "pixels": model.grid(cost.display),
+        "display": cost.display,
+        "tissues": (dict(tissues), tissues.membrane),
+        "labels": (as_labels(medium.labels.array), medium.labels.ijk_to_ras),
+        "texture": medium.packed_texture(),
+        "simulation settings": simulator.settings,
+        "similarity settings": settings,
+        "algorithms": algorithms,
+        "seed": seed,
+        "version": __version__,
+    }
+    return {name: fingerprint(part) for name, part in parts.items()}

@@ -57,7 +57,8 @@ class Search:
     limit : how many evaluations there will be at most, for progress.
     seed : of algorithms that draw random numbers.
     progress : told after every evaluation; may raise errors.Cancelled.
-    replayed : the history of an earlier run: what it evaluated in the same order is not computed again.
+    replayed : the history of an earlier run: as long as stage and position are those, in its order, they are not
+        computed again.
     """
 
     def __init__(
@@ -122,7 +123,11 @@ class Search:
         place = len(self.history)
         key = tuple(np.clip(units, 0.0, 1.0).tolist())
         known = self.replayed[place] if place < len(self.replayed) else None
-        if known is not None and known.stage == stage and known.units == key:
+        if known is not None and (known.stage, known.units) != (stage, key):
+            # From here on it is another run, in which even an equal position may have another cost: what a stage
+            # compares with comes from the stages before it.
+            self.replayed, known = self.replayed[:place], None
+        if known is not None:
             cost = known.cost
         else:
             cost = self.cost(np.array(key))
@@ -147,8 +152,9 @@ class Search:
         return self.best(stage).cost
 
     def state(self) -> list:
-        """The history as plain values; `history_from` reads it back."""
-        return [[entry.stage, list(entry.units), entry.cost] for entry in self.history]
+        """The history as plain values; `history_from` reads it back. A replay that was broken off keeps its rest."""
+        known = self.history + self.replayed[len(self.history) :]
+        return [[entry.stage, list(entry.units), entry.cost] for entry in known]
 
     def _optimiser(self, algorithm: str, parameters: int, step: float):
         import nlopt
@@ -173,17 +179,22 @@ class Search:
         return search
 
 
-def history_from(state: dict | None, problem: str) -> list[Evaluation]:
-    """The evaluations of an earlier run from {"problem": ..., "history": ...}.
+def history_from(state: dict | None, problem: dict[str, str]) -> list[Evaluation]:
+    """The evaluations of an earlier run from {"problem": {what: fingerprint}, "history": ...}.
 
-    Raises SimulationError if it was on another problem, or is no such thing.
+    Raises SimulationError if it was on another problem, naming what differs, or is no such thing.
     """
     if state is None:
         return []
     try:
-        known = state["problem"]
+        known = dict(state["problem"])
         history = [Evaluation(str(stage), tuple(map(float, units)), float(c)) for stage, units, c in state["history"]]
     except (KeyError, TypeError, ValueError):
         raise SimulationError("the state to resume is not one of an optimisation (problem and history)") from None
-    require(known == problem, "the state to resume is of another problem: other images, poses, parameters or settings")
+    other = [what for what in problem if known.get(what) != problem[what]]
+    require(
+        not other,
+        f"the state to resume is of another problem: other {', '.join(other)}; begin without it, or resume with what "
+        "it was made of",
+    )
     return history

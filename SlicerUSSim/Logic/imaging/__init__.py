@@ -10,6 +10,7 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 if TYPE_CHECKING:
     from .compounding import Compounder as Compounder, sweep_grid as sweep_grid
     from .frame import Frame as Frame
+    from .noise import seed_of_pose as seed_of_pose
     from .preset import Preset as Preset
     from .reuse import ReusedSimulator as ReusedSimulator
     from .simulator import (

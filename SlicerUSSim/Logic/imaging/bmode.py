@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
+from SlicerUSSim.Logic.imaging.noise import noise_key
 from SlicerUSSim.Logic.imaging.scattering import EchoLines
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
@@ -82,8 +83,10 @@ class Compressor:
         self.envelope: Buffer
         self.grey: Buffer
 
-    def run(self, acquisition: np.ndarray, display: DisplaySettings, signal: BasebandSignal) -> None:
-        """Enqueue the grey levels of every line."""
+    def run(
+        self, acquisition: np.ndarray, display: DisplaySettings, signal: BasebandSignal, noise_seed: int = 0
+    ) -> None:
+        """Enqueue the grey levels of every line; `noise_seed` is the draw of the noise."""
         self.lines, self.samples = signal.lines, signal.samples
         self.envelope = self.workspace.get("envelope", self.lines * self.samples * 4)
         self.grey = self.workspace.get("grey", self.lines * self.samples)
@@ -97,7 +100,7 @@ class Compressor:
             signal.iq,
             np.int32(self.samples),
             np.float32(noise),
-            np.uint32(noise_seed(acquisition)),
+            np.uint32(noise_key(acquisition, noise_seed)),
             np.float32(tgc),
             np.float32(FULL_SCALE_DB - display.gain_db),
             np.float32(display.dynamic_range_db),
@@ -110,11 +113,6 @@ class Compressor:
         shape = self.lines, self.samples
         envelope = self.device.download(self.envelope, shape, np.float32)[:, :samples]
         return envelope, self.device.download(self.grey, shape, np.uint8)[:, :samples]
-
-
-def noise_seed(acquisition: np.ndarray) -> int:
-    """What starts the hash of the amplifier noise: it has nothing in common with that of the scatterers."""
-    return (int(acquisition["seed"]) * 0x9E3779B1 + 0x7F4A7C15) % 2**32
 
 
 def pulse_taps(sigma: float) -> np.ndarray:

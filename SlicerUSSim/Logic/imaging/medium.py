@@ -82,6 +82,12 @@ class Medium:
         matrix[:, 3] += _PAD
         return matrix
 
+    def packed_texture(self) -> np.ndarray | None:
+        """(k, j, i) uint32 with a margin, the texture as the device has it; None without one."""
+        if not self.has_texture:
+            return None
+        return self.device.download(self.texture_buffer, tuple(self.dims[::-1]), np.uint32)
+
     def set_tissues(self, tissues: TissueTable) -> None:
         """Change tissue parameters; voxels are touched only if the membrane's place or the acoustic groups change."""
         self._check(tissues)

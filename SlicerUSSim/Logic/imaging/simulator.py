@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.imaging.bmode import Compressor, PulseFilter
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
+from SlicerUSSim.Logic.imaging.noise import stirred
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer, RayTree
 from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
 from SlicerUSSim.Logic.imaging.scattering import EchoLines, InterfaceEchoes, LateralBeam, Scatterers
@@ -87,20 +88,23 @@ class UltrasoundSimulator:
         probe_to_ras: np.ndarray,
         display: DisplaySettings | None = None,
         grid: ImageGrid | None = None,
+        *,
+        noise_seed: int = 0,
     ) -> Frame:
         """The image that `probe` sees at the pose `probe_to_ras` (4, 4).
 
         `grid` are its pixels, those of a real image to compare with, say; by default they just hold the imaged field,
-        as many as display.image_size says.
+        as many as display.image_size says. `noise_seed` says which draw of the amplifier noise it has (noise.py): 0 is
+        that of the settings' seed alone, seed_of_pose(probe_to_ras) one for this pose.
         Warns with EmptyViewWarning (and gives a black image) if the field misses the volume.
-        Raises SimulationError for a pose that is not rigid.
+        Raises SimulationError for a pose that is not rigid and a noise_seed that is not a whole number of 32 bits.
         """
         display = display or DisplaySettings()
         grid = grid or ImageGrid.for_probe(probe, display.image_size)
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self._warn_if_empty(probe, pose)
         timings: dict[str, float] = {}
-        self.render(probe, pose, display, grid, timings)
+        self.render(probe, pose, display, grid, timings, noise_seed=noise_seed)
         with self._stage("download", timings):
             samples = self._sample_count(probe)
             iq = self.pulse.download(samples)
@@ -127,10 +131,12 @@ class UltrasoundSimulator:
         display: DisplaySettings,
         grid: ImageGrid,
         timings: dict[str, float] | None = None,
+        *,
+        noise_seed: int = 0,
     ) -> Buffer:
         """Enqueue all stages of one frame; returns the device buffer of its image, which the next frame overwrites.
 
-        Where only the display or the pixels have changed since the last frame, its echoes are used again.
+        Where only the display, the noise or the pixels have changed since the last frame, its echoes are used again.
         """
         timings = {} if timings is None else timings
         with self._stage("upload", timings):
@@ -140,7 +146,7 @@ class UltrasoundSimulator:
             self._echoes(probe, acquisition, timings)
             self.pulse.made_for = inputs
         with self._stage("B-mode", timings):
-            self.compressor.run(acquisition, display, self.pulse.signal)
+            self.compressor.run(acquisition, display, self.pulse.signal, noise_seed)
         with self._stage("scan conversion", timings):
             self.converter.run(self._acquisition_buffer, acquisition, grid, self.compressor)
         return self.converter.image
@@ -182,11 +188,14 @@ class UltrasoundSimulator:
         display: DisplaySettings | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> Iterator[Frame]:
-        """One Frame per pose, as they are computed; `progress` is told how many are done."""
-        for count, pose in enumerate(poses, 1):
-            yield self.simulate(probe, pose, display)
+        """One Frame per pose, as they are computed; `progress` is told how many are done.
+
+        Each has noise of its own: its number, from 0, is its noise_seed.
+        """
+        for number, pose in enumerate(poses):
+            yield self.simulate(probe, pose, display, noise_seed=number)
             if progress is not None:
-                progress(count)
+                progress(number + 1)
 
     def volume(
         self,
@@ -203,7 +212,8 @@ class UltrasoundSimulator:
 
         `like` gives the grid (the MRI, say); without it the grid lies along the patient's axes with `spacing_mm`.
         `hole_mm` is how wide a gap between images is filled (default: as wide as the sweep's widest, 10 mm at most).
-        The grey levels are uint8; where no image came near, 0. Raises SimulationError as sweep_grid and Compounder do.
+        The grey levels are uint8; where no image came near, 0. The images have the noise that sweep() gives them.
+        Raises SimulationError as sweep_grid and Compounder do.
         """
         poses = list(poses)
         grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
@@ -211,17 +221,18 @@ class UltrasoundSimulator:
         display = display or DisplaySettings()
         pixels = ImageGrid.for_probe(probe, display.image_size)
         before = None
-        for count, pose in enumerate(poses, 1):
+        for number, pose in enumerate(poses):
             pose = check_rigid("probe_to_ras", pose)
             self._warn_if_empty(probe, pose)
-            compounder.add_buffer(self.render(probe, pose, display, pixels), pixels, pose)
+            image = self.render(probe, pose, display, pixels, noise_seed=number)
+            compounder.add_buffer(image, pixels, pose)
             # One image is prepared while the device computes the one before, and no more than one.
             done = self.device.mark()
             if before is not None:
                 before.wait()
             before = done
             if progress is not None:
-                progress(count)
+                progress(number + 1)
         self._warn_if_overflown(len(poses))
         return compounder.volume(hole_mm)
 
@@ -352,10 +363,8 @@ def _packed_texture(texture: Texture | None, labels: Volume, settings: Simulatio
 
 
 def _mixed(seed: int) -> int:
-    """The seed with all its bits stirred (the kernels' hash), so that neighbouring seeds have nothing in common."""
-    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
-        seed = ((seed ^ (seed >> shift)) * factor) % 2**32
-    return seed ^ (seed >> 16) ^ 0x2545F491
+    """The seed with all its bits stirred, so that neighbouring seeds have nothing in common."""
+    return stirred(seed) ^ 0x2545F491
 
 
 def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:

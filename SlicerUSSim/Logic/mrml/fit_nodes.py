@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 from time import perf_counter
 
 import numpy as np
@@ -25,6 +26,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     require_node,
     write_volume,
 )
+from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, number_in
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
@@ -90,26 +92,35 @@ def _sequence(sequence_node) -> TrackedSequence:
         image = item.GetImageData()
         require(image is not None and image.GetDimensions()[2] == 1, f"{use} is not one slice, expected an image")
         array = Volume.from_vtk(image, ijk_to_ras(item)).array[0]
-        slices.append((array, _to_world_at(browser, parent, index) @ ijk_to_ras(item)))
-        try:
-            times.append(float(index))
-        except ValueError:  # sequences may be indexed by text
-            times.append(float(number))
+        slices.append((array, _to_world_at(browser, parent, number, index) @ ijk_to_ras(item)))
+        time = number_in(item.GetAttribute(TIME) or index)
+        times.append(time if isfinite(time) else float(number))  # sequences may be indexed by text
     return _of_slices(slices, times)
 
 
-def _to_world_at(browser, transform_node, index: str) -> np.ndarray:
-    """(4, 4) of a chain of transforms, each as its sequence in the browser has it at this index value."""
+def _to_world_at(browser, transform_node, number: int, index: str) -> np.ndarray:
+    """(4, 4) of a chain of transforms, each as its sequence in the browser has it for the item of this index value."""
     matrix, to_parent = np.eye(4), vtkMatrix4x4()
     while transform_node is not None:
         recorded = browser.GetSequenceNode(transform_node)
-        item = transform_node if recorded is None else recorded.GetDataNodeAtValue(index, False)
+        item = transform_node if recorded is None else _recorded_at(recorded, number, index)
         if item is None or not item.IsA("vtkMRMLLinearTransformNode"):
             raise SimulationError(f"{named(transform_node)} has no linear transform at {index}")
         item.GetMatrixTransformToParent(to_parent)
         matrix = matrix_array(to_parent) @ matrix
         transform_node = transform_node.GetParentTransformNode()
     return matrix
+
+
+def _recorded_at(sequence_node, number: int, index: str):
+    """The item that goes with item `number` of another sequence, whose index value is `index`; None if there is none.
+
+    By its value, unless both sequences have that in the same place: of several values that a sequence node takes for
+    one, it would give the first.
+    """
+    if number < sequence_node.GetNumberOfDataNodes() and sequence_node.GetNthIndexValue(number) == index:
+        return sequence_node.GetNthDataNode(number)
+    return sequence_node.GetDataNodeAtValue(index, False)
 
 
 def _of_slices(slices: list[tuple[np.ndarray, np.ndarray]], times: list[float]) -> TrackedSequence:

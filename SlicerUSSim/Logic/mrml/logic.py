@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.fitting.fit import Fit, fit
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -44,6 +45,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     write_outline,
 )
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
+from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_in_slice
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -156,8 +158,9 @@ class UltrasoundSceneLogic:
     ) -> Frame:
         """The image under the probe, into a scalar volume node that is put under the probe's transform.
 
-        `labels_node` is a label map or a segmentation; its names choose the tissues, see label_nodes.read_labels.
-        `warned` is told what there is to warn of.
+        `labels_node` is a label map or a segmentation; its names choose the tissues, see label_nodes.read_labels. Every
+        pose in the labels' frame has amplifier noise of its own (noise.seed_of_pose). `warned` is told what there is to
+        warn of.
         """
         self._check_output(labels_node, output_node)
         probe_to_world = probe_pose(probe_transform_node)
@@ -194,9 +197,10 @@ class UltrasoundSceneLogic:
     ) -> int:
         """A sequence of simulated images from a vtkMRMLSequenceNode of linear transforms; returns how many.
 
-        Images are in the probe frame with the transforms' index values. With the browser of the transforms, its current
-        transform's parents count, and the images are added to it, under that transform. `progress` is told the share
-        done and may raise errors.Cancelled; `images_node` is then as it was.
+        Images are in the probe frame with the transforms' index values (SequenceIndex says what becomes of values that
+        a sequence node cannot tell apart; no image is lost), and their numbers say which noise they have. With the
+        browser of the transforms, its current transform's parents count, and the images are added to it, under that
+        transform. `progress` is told the share done and may raise errors.Cancelled; `images_node` is then as it was.
         """
         require_node(transforms_node, "vtkMRMLSequenceNode", use="sequence of transforms")
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
@@ -212,7 +216,7 @@ class UltrasoundSceneLogic:
             item = transforms_node.GetNthDataNode(number)
             require_node(item, "vtkMRMLTransformNode", use=f"item {number} of {named(transforms_node)}")
             pose = check_rigid(f"item {number} of {named(transforms_node)}", to_world @ node_to_world(item))
-            frame = self._frame(self._patient(labels_node), pose, warn_again)
+            frame = self._frame(self._patient(labels_node), pose, warn_again, noise_seed=number)
             image = self.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
             image.UnRegister(None)
             write_image(image, frame)
@@ -221,12 +225,7 @@ class UltrasoundSceneLogic:
                 progress((number + 1) / count)
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
 
-        images_node.RemoveAllDataNodes()
-        images_node.SetIndexName(transforms_node.GetIndexName())
-        images_node.SetIndexUnit(transforms_node.GetIndexUnit())
-        images_node.SetIndexType(transforms_node.GetIndexType())
-        for number, image in enumerate(images):
-            images_node.SetDataNodeAtValue(image, transforms_node.GetNthIndexValue(number))
+        SequenceIndex.of_node(transforms_node).fill(images_node, images)
         if browser_node is not None:
             if not browser_node.IsSynchronizedSequenceNode(images_node, True):
                 browser_node.AddSynchronizedSequenceNode(images_node)
@@ -415,14 +414,23 @@ class UltrasoundSceneLogic:
     def _patient(self, labels_node) -> Patient:
         return self._patients.read(labels_node, self.preset.tissues)
 
-    def _frame(self, patient: Patient, probe_to_world: np.ndarray, warned: Callable[[Warning], None]) -> Frame:
+    def _frame(
+        self,
+        patient: Patient,
+        probe_to_world: np.ndarray,
+        warned: Callable[[Warning], None],
+        noise_seed: int | None = None,
+    ) -> Frame:
+        """The image at a pose; its draw of the noise is the pose's own unless another is given."""
         preset, texture = self.preset, self._texture_of(patient)
+        pose = patient.pose(probe_to_world)
+        seed = seed_of_pose(pose) if noise_seed is None else noise_seed
 
         def compute() -> tuple[Frame, list[Warning]]:
             # Collected within the work: Python can do that for one thing at a time only.
             with collected_warnings() as caught:
                 simulator = self._simulator(patient, preset, texture)
-                return simulator.simulate(preset.probe, patient.pose(probe_to_world), preset.display), caught
+                return simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed), caught
 
         frame, caught = self._work.do(compute)
         for warning in caught:

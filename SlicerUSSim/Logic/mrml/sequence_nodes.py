@@ -1,8 +1,11 @@
-"""A tracked sequence as nodes: images, the transforms they were taken at, and a browser that plays both."""
+"""Sequences as nodes: what their items are found by, and tracked images with a browser that plays them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import inf, isfinite, nan, ulp
 
 import numpy as np
 
@@ -11,6 +14,88 @@ from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.mrml.libraries import slicer
 from SlicerUSSim.Logic.mrml.nodes import write_volume
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+
+#: Attribute of an image in a sequence: when it was taken, in seconds, whatever its index value is.
+TIME = "SlicerUSSim.time"
+#: Numbers closer than the first are one index value to a sequence node, unless it is told otherwise; by the second a
+#: made-up value follows the one before.
+_TOLERANCE, _STEP = 1e-3, 1e-6
+
+
+@dataclass(frozen=True)
+class SequenceIndex:
+    """What the items of sequences are found by: the same for all that a browser shall play together.
+
+    A sequence node keeps one item for each index value, in the order of the numbers, and takes numbers within its
+    tolerance of each other (a millisecond) for one. So that every item stays, and where it was, a number that is not
+    larger than the one before it, or is none, becomes the one before and a millionth, and the tolerance less than the
+    smallest step. Recorded times thus stay what they are but for images that have equal ones.
+    """
+
+    values: tuple[str, ...]
+    name: str = "time"
+    unit: str = "s"
+    is_text: bool = False
+    tolerance: float = _TOLERANCE
+
+    def __post_init__(self) -> None:
+        values = _distinct(self.values) if self.is_text else _rising(self.values)
+        object.__setattr__(self, "values", values)
+        if not self.is_text:
+            steps = [float(after) - float(before) for before, after in pairwise(values)]
+            object.__setattr__(self, "tolerance", min([self.tolerance, *(0.5 * step for step in steps)]))
+
+    @classmethod
+    def of_times(cls, seconds: Iterable[float]) -> SequenceIndex:
+        """Of items recorded at these times, to a microsecond."""
+        return cls(tuple(f"{time:.6f}" for time in seconds))
+
+    @classmethod
+    def of_node(cls, sequence_node) -> SequenceIndex:
+        """That of a vtkMRMLSequenceNode."""
+        count = sequence_node.GetNumberOfDataNodes()
+        return cls(
+            tuple(sequence_node.GetNthIndexValue(number) for number in range(count)),
+            sequence_node.GetIndexName(),
+            sequence_node.GetIndexUnit(),
+            sequence_node.GetIndexType() == sequence_node.TextIndex,
+            sequence_node.GetNumericIndexValueTolerance(),
+        )
+
+    def fill(self, sequence_node, items: Iterable) -> None:
+        """Put `items`, a data node for each value, into a vtkMRMLSequenceNode in place of what it held."""
+        sequence_node.RemoveAllDataNodes()
+        sequence_node.SetIndexName(self.name)
+        sequence_node.SetIndexUnit(self.unit)
+        sequence_node.SetIndexType(sequence_node.TextIndex if self.is_text else sequence_node.NumericIndex)
+        sequence_node.SetNumericIndexValueTolerance(self.tolerance)
+        for value, item in zip(self.values, items, strict=True):
+            sequence_node.SetDataNodeAtValue(item, value)
+
+
+def _distinct(texts: Sequence[str]) -> tuple[str, ...]:
+    """The same, but one that was there before has its number behind it."""
+    return tuple(f"{text} ({n})" if text in texts[:n] else text for n, text in enumerate(texts))
+
+
+def _rising(texts: Sequence[str]) -> tuple[str, ...]:
+    """The same numbers as long as they rise."""
+    risen, last = [], -inf
+    for text in texts:
+        value = number_in(text)
+        if not (isfinite(value) and value > last):
+            text = f"{last + max(_STEP, 2.0 * ulp(last)) if risen else 0.0:.6f}"
+        risen.append(text)
+        last = float(text)
+    return tuple(risen)
+
+
+def number_in(text: str) -> float:
+    """The number that an index value is; NaN for text."""
+    try:
+        return float(text)
+    except ValueError:
+        return nan
 
 
 def add_sequence(
@@ -26,23 +111,18 @@ def add_sequence(
 
     The images are in pixels under recorded transforms, which take them to the world (RAS); `path` and `to_ras` (4, 4)
     are those of TrackedImages.of. Images that were not tracked are left out. `poses`, one probe_to_ras (4, 4) for each
-    image that is kept, become a sequence too, which `probe_transform_node` follows when the browser plays.
+    image that is kept, become a sequence too, which `probe_transform_node` follows when the browser plays. All three
+    are found by the images' times (SequenceIndex says what becomes of equal ones); an image's own is its attribute
+    TIME.
     Raises SimulationError if no image was tracked.
     """
     numbers = [number for number in range(len(sequence)) if sequence.has_pose(number, path)] or [0]
     matrices = [sequence.pose(number, path) for number in numbers]
     to_ras = np.eye(4) if to_ras is None else to_ras
+    index = SequenceIndex.of_times(sequence.timestamps[numbers])
     images, transforms = _sequence_node(scene, name), _sequence_node(scene, f"{name} transforms")
-    for number, matrix in zip(numbers, matrices, strict=True):
-        index = f"{sequence.timestamps[number]:.6f}"
-        image = slicer.vtkMRMLScalarVolumeNode()
-        image.SetName(name)
-        write_volume(image, Volume(sequence.images[number][None], np.eye(4)))
-        images.SetDataNodeAtValue(image, index)
-        transform = slicer.vtkMRMLLinearTransformNode()
-        transform.SetName(f"{name} transform")
-        transform.SetMatrixTransformToParent(vtk_matrix(to_ras @ matrix))
-        transforms.SetDataNodeAtValue(transform, index)
+    index.fill(images, (_image(name, sequence, number) for number in numbers))
+    index.fill(transforms, (_transform(f"{name} transform", to_ras @ matrix) for matrix in matrices))
     browser = scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", scene.GenerateUniqueName(f"{name} browser"))
     browser.SetAndObserveMasterSequenceNodeID(transforms.GetID())
     browser.AddSynchronizedSequenceNodeID(images.GetID())
@@ -55,11 +135,7 @@ def add_sequence(
     browser.AddProxyNode(shown, images, False)
     if len(poses):
         held = _sequence_node(scene, f"{name} probe")
-        for number, pose in zip(numbers, poses, strict=True):
-            transform = slicer.vtkMRMLLinearTransformNode()
-            transform.SetName(f"{name} probe")
-            transform.SetMatrixTransformToParent(vtk_matrix(pose))
-            held.SetDataNodeAtValue(transform, f"{sequence.timestamps[number]:.6f}")
+        index.fill(held, (_transform(f"{name} probe", pose) for pose in poses))
         browser.AddSynchronizedSequenceNodeID(held.GetID())
         if probe_transform_node is not None:
             browser.AddProxyNode(probe_transform_node, held, False)
@@ -67,7 +143,22 @@ def add_sequence(
 
 
 def _sequence_node(scene, name: str):
-    node = scene.AddNewNodeByClass("vtkMRMLSequenceNode", scene.GenerateUniqueName(name))
-    node.SetIndexName("time")
-    node.SetIndexUnit("s")
+    return scene.AddNewNodeByClass("vtkMRMLSequenceNode", scene.GenerateUniqueName(name))
+
+
+def _image(name: str, sequence: TrackedSequence, number: int):
+    """A volume node with one image, in pixels."""
+    node = slicer.vtkMRMLScalarVolumeNode()
+    node.SetName(name)
+    write_volume(node, Volume(sequence.images[number][None], np.eye(4)))
+    if isfinite(sequence.timestamps[number]):
+        node.SetAttribute(TIME, f"{sequence.timestamps[number]:.6f}")
+    return node
+
+
+def _transform(name: str, matrix: np.ndarray):
+    """A linear transform node."""
+    node = slicer.vtkMRMLLinearTransformNode()
+    node.SetName(name)
+    node.SetMatrixTransformToParent(vtk_matrix(matrix))
     return node

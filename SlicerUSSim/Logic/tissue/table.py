@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
@@ -91,38 +91,51 @@ class TissueTable(Mapping):
 
     def with_tissue(self, tissue: Tissue) -> TissueTable:
         """A new table in which everything of that name, the membrane too, is `tissue`; added if nothing is."""
-        labels = [label for label, old in self.items() if old.name == tissue.name]
-        membrane = self.membrane
-        if membrane is not None and membrane.tissue.name == tissue.name:
-            membrane = replace(membrane, tissue=tissue)
-        elif not labels:
-            labels = [next(label for label in range(MAX_LABEL + 1) if label not in self)]
-        return TissueTable({**self, **dict.fromkeys(labels, tissue)}, membrane)
+        if any(old.name == tissue.name for old in self.all_tissues()):
+            return self._changed(tissue.name, lambda _: tissue)
+        free = next(label for label in range(MAX_LABEL + 2) if label not in self)  # a full table refuses the last
+        return TissueTable({**self, free: tissue}, self.membrane)
 
-    def replace(self, name: str, **changes) -> TissueTable:
-        """A new table in which the tissue `name` (the membrane's too) has the given parameters changed."""
-        known = {field.name for field in fields(Tissue)}
+    def replace(self, name: str, /, **changes) -> TissueTable:
+        """A new table in which everything called `name`, the membrane too, has the given parameters changed.
+
+        Names stay: membrane, label maps and fits know tissues by them. Raises SimulationError that lists the names or
+        the parameters for one that does not exist.
+        """
+        known = [field.name for field in fields(Tissue) if field.name != "name"]
         for parameter in changes:
             require(
                 parameter in known,
-                f"{parameter!r} is not a tissue parameter, expected one of: {', '.join(sorted(known))}",
+                f"{parameter!r} is not a tissue parameter that can be replaced, expected one of: {', '.join(known)}",
             )
-        if self.membrane is not None and name == self.membrane.tissue.name and name not in self.names():
-            return TissueTable(self, replace(self.membrane, tissue=replace(self.membrane.tissue, **changes)))
-        label = self.label_of(name)
-        return TissueTable({**self, label: replace(self[label], **changes)}, self.membrane)
+        self.tissue(name)  # which refuses a name that nothing has
+        return self._changed(name, lambda tissue: replace(tissue, **changes))
+
+    def _changed(self, name: str, change: Callable[[Tissue], Tissue]) -> TissueTable:
+        """A new table in which `change` was made to everything called `name`."""
+
+        def after(tissue: Tissue) -> Tissue:
+            return change(tissue) if tissue.name == name else tissue
+
+        membrane = self.membrane
+        if membrane is not None:
+            membrane = replace(membrane, tissue=after(membrane.tissue))
+        return TissueTable({label: after(tissue) for label, tissue in self.items()}, membrane)
 
     def for_names(self, names: Iterable[str]) -> TissueTable:
-        """A table for labels 1, 2, ... named `names`: every tissue from this table if it has one of that name, else
-        from the presets; coupling medium and membrane stay.
+        """A table for labels 1, 2, ... named `names`: every tissue from this table, the membrane's too, if it has one
+        of that name (or else of that name in other case, hyphens and underscores), else from the presets; coupling
+        medium and membrane stay. Of several with one name it is the first, as in `label_of` and `tissue`.
 
         Raises SimulationError that lists the names nobody knows.
         """
-        mine = {plain_name(tissue.name): tissue for tissue in self.values()}
+        last_first = self.all_tissues()[::-1]
+        mine = {plain_name(tissue.name): tissue for tissue in last_first}
+        exactly = {tissue.name: tissue for tissue in last_first}
         table, unknown = {0: self[0]}, []
         for label, name in enumerate(names, 1):
             try:
-                table[label] = mine.get(plain_name(name)) or tissue_named(name)
+                table[label] = exactly.get(name) or mine.get(plain_name(name)) or tissue_named(name)
             except SimulationError:
                 unknown.append(name)
         require(

@@ -88,7 +88,8 @@ def make_twin(
         turned = poses[frames // 2] @ np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
         poses += tilt_sweep(turned, _TILT_DEG, frames)
     real = UltrasoundSimulator(labels, true_tissues, SimulationSettings(seed=50_000 + seed), device)
-    references = [frame.image for frame in real.sweep(probe, poses, true_display)]
+    # All with one draw of the noise, as twins have been since their tables were published.
+    references = [real.simulate(probe, pose, true_display).image for pose in poses]
     mistaken = mistaken_labels(labels, tissues, random)
     simulator = UltrasoundSimulator(mistaken, tissues, SimulationSettings(seed=seed), device)
     return Twin(seed, simulator, display, probe, poses, references, labels, true_tissues, true_display)

@@ -28,6 +28,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, set_scalars
 from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
@@ -193,7 +194,8 @@ class UltrasoundSimulationFilter(_ImageFilter):
     """Tissue labels (port 0) to the B-mode image under the probe (output 0) and the outline of its field (output 1).
 
     The image is one slice at the probe's place. The filter executes again when the labels, the probe's transform (with
-    whatever it is concatenated from), or a parameter changes, and only then. Labels are told apart by the names that
+    whatever it is concatenated from), or a parameter changes, and only then. Every pose has amplifier noise of its own
+    (noise.seed_of_pose). Labels are told apart by the names that
     SegmentationFilter gave them (field data "TissueNames"); without names, by the labels of the tissue table.
     """
 
@@ -295,7 +297,8 @@ class UltrasoundSimulationFilter(_ImageFilter):
         simulator = self._simulator.get(
             labels.GetMTime(), Volume.from_vtk(labels), tissues, self._settings, self._device, self._texture
         )
-        self._frame = simulator.simulate(self._probe, self._pose(), self._display)
+        pose = self._pose()
+        self._frame = simulator.simulate(self._probe, pose, self._display, noise_seed=seed_of_pose(pose))
         image = vtkImageData.GetData(outInfo, 0)
         image.ShallowCopy(self._frame.to_vtk())
         if self._field_alpha:

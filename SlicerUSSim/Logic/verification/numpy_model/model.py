@@ -9,7 +9,8 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
-from SlicerUSSim.Logic.imaging.bmode import noise_seed, pulse_taps
+from SlicerUSSim.Logic.imaging.bmode import pulse_taps
+from SlicerUSSim.Logic.imaging.noise import noise_key
 from SlicerUSSim.Logic.imaging.raytracing import beam_quantiles, line_roots
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -38,7 +39,13 @@ class NumpyModel:
         self.timings_ms: dict[str, float] = {}
 
     def simulate(
-        self, probe: Probe, probe_to_ras: np.ndarray, display: DisplaySettings | None = None, grid=None
+        self,
+        probe: Probe,
+        probe_to_ras: np.ndarray,
+        display: DisplaySettings | None = None,
+        grid: ImageGrid | None = None,
+        *,
+        noise_seed: int = 0,
     ) -> np.ndarray:
         """(rows, columns) uint8 image; arguments as UltrasoundSimulator.simulate has them."""
         display, settings = display or DisplaySettings(), self.simulator.settings
@@ -63,7 +70,7 @@ class NumpyModel:
         clock.append(perf_counter())
         iq = _convolved(lines, pulse_taps(self.simulator.axial_sigma_mm(probe) / float(acquisition["sample_mm"])))
         clock.append(perf_counter())
-        grey = compressed(acquisition, display, iq)
+        grey = compressed(acquisition, display, iq, noise_seed)
         clock.append(perf_counter())
         image = scan_converted(acquisition, grid, grey)
         clock.append(perf_counter())
@@ -78,7 +85,7 @@ def _convolved(lines: np.ndarray, taps: np.ndarray) -> np.ndarray:
     return sum((tap * padded[:, k : k + lines.shape[1]] for k, tap in enumerate(taps)), np.zeros_like(lines))
 
 
-def compressed(acquisition: np.ndarray, display: DisplaySettings, iq: np.ndarray) -> np.ndarray:
+def compressed(acquisition: np.ndarray, display: DisplaySettings, iq: np.ndarray, noise_seed: int = 0) -> np.ndarray:
     """(scan lines, samples) uint8: amplifier noise, time-gain compensation, envelope, log compression."""
     index = np.arange(iq.shape[1])
     if display.noise_db is not None:
@@ -86,7 +93,7 @@ def compressed(acquisition: np.ndarray, display: DisplaySettings, iq: np.ndarray
         line = np.arange(len(iq), dtype=np.uint32)[:, None]
         key = hash_mix(
             index.astype(np.uint32) * np.uint32(0x9E3779B1)
-            + (np.uint32(noise_seed(acquisition)) + line * np.uint32(0x85EBCA77))
+            + (np.uint32(noise_key(acquisition, noise_seed)) + line * np.uint32(0x85EBCA77))
         )
         iq = iq + noise * (gaussian(key) + 1j * gaussian(hash_mix(key + np.uint32(0x9E3779B9))))
     power = np.real(iq) ** 2 + np.imag(iq) ** 2 + f32(1e-30)
