@@ -21,11 +21,11 @@ import numpy as np
 from SlicerUSSim.Logic import DisplaySettings, TissueTable, Volume, optimize_appearance, segment_mri
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, SimilaritySettings
-from SlicerUSSim.Logic.fitting.fit import fit, simulated
 from SlicerUSSim.Logic.fitting.identifiability import variance_db
 from SlicerUSSim.Logic.fitting.optimization import AppearanceCost
 from SlicerUSSim.Logic.fitting.registration import rigid_from, rotation_deg
 from SlicerUSSim.Logic.fitting.report import grey_levels_per_tissue
+from SlicerUSSim.Logic.fitting.tracked_fit import fit, simulated
 from SlicerUSSim.Logic.imaging import TreeOverflowWarning
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.probe import ImageGrid

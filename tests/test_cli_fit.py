@@ -20,8 +20,8 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.base.files import write_json
-from SlicerUSSim.Logic.fitting.fit import fit
 from SlicerUSSim.Logic.fitting.registration import rigid_from
+from SlicerUSSim.Logic.fitting.tracked_fit import fit
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.placement import tilt_sweep
 from SlicerUSSim.Logic.tracked import TrackedImages, read_pose, write_pose
@@ -156,8 +156,12 @@ def test_images_of_a_sweep_have_noise_by_their_number(folder, tmp_path):
 @pytest.mark.parametrize("has_given_map", [False, True])
 def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tmp_path, monkeypatch, has_given_map):
     fits = []
-    monkeypatch.setattr("SlicerUSSim.Logic.fitting.fit._ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
-    monkeypatch.setattr("SlicerUSSim.Logic.fitting.fit.fit", lambda *a, **b: fits.append(fit(*a, **b)) or fits[-1])
+    monkeypatch.setattr(
+        "SlicerUSSim.Logic.fitting.tracked_fit._ROUNDS", ((8.0, 60), (4.0, 40))
+    )  # how well: test_registration
+    monkeypatch.setattr(
+        "SlicerUSSim.Logic.fitting.tracked_fit.fit", lambda *a, **b: fits.append(fit(*a, **b)) or fits[-1]
+    )
     given_map = rigid_from([1.5, -1.0, 2.0, 2.0, -1.0, 1.5]) if has_given_map else np.eye(4)
     write_pose(tmp_path / "given.json", given_map)
     done = optimize(

@@ -101,11 +101,11 @@ def test_a_star_import_gives_the_public_names_and_no_others():
 
 def test_similarity_is_a_function_whatever_was_imported_before():
     code = """
-import SlicerUSSim.Logic.fitting.similarity
+import SlicerUSSim.Logic.fitting.image_similarity
 import SlicerUSSim.Logic
 from SlicerUSSim.Logic import similarity
 from SlicerUSSim.Logic.fitting import similarity as the_same
-from SlicerUSSim.Logic.fitting.similarity import SimilaritySettings
+from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 print(similarity.__name__, similarity is the_same is SlicerUSSim.Logic.similarity)
 """
     assert fresh(code) == "similarity True"

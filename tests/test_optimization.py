@@ -22,8 +22,8 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.fitting.identifiability import variance_db
+from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.search import Evaluation, Search
-from SlicerUSSim.Logic.fitting.similarity import SimilaritySettings
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.verification.twins import make_twin

@@ -216,7 +216,9 @@ def test_geometry_can_be_estimated(scene):
 
 
 def test_registration_is_written_as_a_transform_of_the_tracking(brain, monkeypatch):
-    monkeypatch.setattr("SlicerUSSim.Logic.fitting.fit._ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
+    monkeypatch.setattr(
+        "SlicerUSSim.Logic.fitting.tracked_fit._ROUNDS", ((8.0, 60), (4.0, 40))
+    )  # how well: test_registration
     own = Scene(brain)
     away = np.eye(4)
     away[:3, 3] = 1.5, -1.0, 2.0

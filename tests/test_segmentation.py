@@ -8,7 +8,7 @@ from hypothesis import given, strategies as st
 from scipy.ndimage import uniform_filter
 
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
-from SlicerUSSim.Logic.mri.guided_filter import guided_filter
+from SlicerUSSim.Logic.mri.filtering import guided_filter
 from SlicerUSSim.Logic.mri.mixture import fit_mixture
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import estimate_noise

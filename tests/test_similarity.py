@@ -6,7 +6,7 @@ from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
 
 from SlicerUSSim.Logic import LinearProbe, SimulationError, similarity
-from SlicerUSSim.Logic.fitting.similarity import PatchComparison, SimilaritySettings
+from SlicerUSSim.Logic.fitting.image_similarity import PatchComparison, SimilaritySettings
 from SlicerUSSim.Logic.opencl.device import Device
 from tests.conftest import SPECKLE, block, simulator
 
@@ -109,7 +109,7 @@ def test_bad_input_is_refused_in_one_line():
 
 
 def test_the_public_name_can_be_called_whatever_was_imported_before():
-    import SlicerUSSim.Logic.fitting.similarity  # noqa: F401
+    import SlicerUSSim.Logic.fitting.image_similarity  # noqa: F401
     from SlicerUSSim.Logic import similarity as found
 
     assert found(np.zeros((8, 8), np.uint8), np.zeros((8, 8), np.uint8), (1.0, 1.0)).total == 0.0

@@ -62,7 +62,7 @@ def optimize(
 ) -> None:
     """Fit display and tissue parameters until simulated and tracked real ultrasound agree."""
     from SlicerUSSim.Logic.base.files import read_json, require_place, write_json
-    from SlicerUSSim.Logic.fitting.fit import fit
+    from SlicerUSSim.Logic.fitting.tracked_fit import fit
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
     from SlicerUSSim.Logic.tracked.pose_files import write_pose

@@ -8,9 +8,9 @@ from typing import Protocol
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.fitting.fit import Fit
 from SlicerUSSim.Logic.fitting.parameters import FreeParameters, all_names
 from SlicerUSSim.Logic.fitting.search import Progress
+from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED, CostPlot
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic

@@ -5,22 +5,20 @@ Widgets are read and written by property() and setProperty(), which PythonQt and
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from contextlib import contextmanager
-from typing import Any
+
+import qt
+import slicer
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED
-from SlicerUSSim.Logic.mrml.libraries import slicer
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter, TissueRow
 
-#: All of Qt, as PythonQt gives it; nothing outside of Slicer has it.
-qt: Any = importlib.import_module("qt")
 _CUSTOM = "custom"
 #: Property that holds a value, and signal that tells of another one, by what a widget has.
 _VALUES = (

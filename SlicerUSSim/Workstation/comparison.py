@@ -11,7 +11,7 @@ from trame_server.utils.asynchronous import get_event_loop
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.fitting.similarity import Similarity, similarity
+from SlicerUSSim.Logic.fitting.image_similarity import Similarity, similarity
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.placement import slice_under_probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages

@@ -1,35 +1,19 @@
 """lazy_exports: the face of a package, whose public names are imported when they are first used.
 
 So an import of one name does not pay for the others (vtk, scipy), and the command answers --help at once. A face
-declares its names once, in the imports under `if TYPE_CHECKING`, which editors and type checkers read too.
+declares its names once, in the imports under `if TYPE_CHECKING`, which editors and type checkers read too. No name may
+be that of a module in the package: importing the module would put it in the name's place.
 """
 
 from __future__ import annotations
 
 import importlib
-import sys
 from functools import cache
-from types import ModuleType
-
-
-class _Face(ModuleType):
-    """A package in which a module's name stands for what the module defines by that name, if it does.
-
-    `fitting.similarity` is then the function whether the module it comes from was imported before or not. The module is
-    what `from SlicerUSSim.Logic.fitting.similarity import ...` reads, as ever.
-    """
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if isinstance(value, ModuleType):  # how an import binds a module in its package
-            own = vars(value).get(name)
-            value = value if own is None or isinstance(own, ModuleType) else own
-        super().__setattr__(name, value)
 
 
 def lazy_exports(namespace: dict) -> None:
     """Give a package's `namespace` (its globals()) the names that its source imports under `if TYPE_CHECKING`."""
     package = namespace["__name__"]
-    sys.modules[package].__class__ = _Face
 
     @cache
     def homes() -> dict[str, str]:

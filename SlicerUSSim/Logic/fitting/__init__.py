@@ -9,12 +9,16 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .appearance import AppearanceModel as AppearanceModel
-    from .fit import Fit as Fit, fit as fit
+    from .image_similarity import (
+        Similarity as Similarity,
+        SimilaritySettings as SimilaritySettings,
+        similarity as similarity,
+    )
     from .optimization import AppearanceResult as AppearanceResult, optimize_appearance as optimize_appearance
     from .parameters import FreeParameters as FreeParameters
     from .registration import Registration as Registration, register_poses as register_poses
     from .report import write_report as write_report
     from .search import Progress as Progress
-    from .similarity import Similarity as Similarity, SimilaritySettings as SimilaritySettings, similarity as similarity
+    from .tracked_fit import Fit as Fit, fit as fit
 
 lazy_exports(globals())

@@ -26,6 +26,7 @@ from SlicerUSSim.Logic.fitting.identifiability import (
     equal_variance_draws,
     quantities_of,
 )
+from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings
 from SlicerUSSim.Logic.fitting.parameters import Bounds, FreeParameters
 from SlicerUSSim.Logic.fitting.search import (
     GLOBAL_ALGORITHM,
@@ -35,7 +36,6 @@ from SlicerUSSim.Logic.fitting.search import (
     Search,
     history_from,
 )
-from SlicerUSSim.Logic.fitting.similarity import Similarity, SimilaritySettings
 from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
 from SlicerUSSim.Logic.imaging.medium import as_labels
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator

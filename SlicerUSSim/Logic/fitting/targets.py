@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.fitting.similarity import PatchComparison, Similarity, SimilaritySettings
+from SlicerUSSim.Logic.fitting.image_similarity import PatchComparison, Similarity, SimilaritySettings
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from .guided_filter import guided_filter as guided_filter
+    from .filtering import guided_filter as guided_filter
     from .samples import demo_mri as demo_mri, head_mri as head_mri
     from .segmentation import Segmentation as Segmentation, segment_mri as segment_mri
 

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require, require_between
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.guided_filter import guided_filter
+from SlicerUSSim.Logic.mri.filtering import guided_filter
 from SlicerUSSim.Logic.mri.mixture import classify, fit_mixture, mixture_posteriors
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation

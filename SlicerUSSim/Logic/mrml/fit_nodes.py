@@ -13,8 +13,8 @@ from vtkmodules.vtkCommonMath import vtkMatrix4x4
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
-from SlicerUSSim.Logic.fitting.fit import Fit
 from SlicerUSSim.Logic.fitting.search import Progress
+from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.mrml.nodes import (
     display_of,
     ijk_to_ras,

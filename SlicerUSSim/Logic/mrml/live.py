@@ -6,10 +6,10 @@ import weakref
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import slicer
 from vtkmodules.vtkCommonCore import VTK_OBJECT, vtkCommand
 
 from SlicerUSSim.Logic.base.errors import user_message
-from SlicerUSSim.Logic.mrml.libraries import slicer
 
 #: Event of an output volume: another live update now writes to it.
 _CLAIMED = vtkCommand.UserEvent + 7301

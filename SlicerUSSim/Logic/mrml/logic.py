@@ -14,8 +14,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError, collected_warnings, r
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
-from SlicerUSSim.Logic.fitting.fit import Fit, fit
 from SlicerUSSim.Logic.fitting.search import Progress
+from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset

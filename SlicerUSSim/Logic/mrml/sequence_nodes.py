@@ -8,10 +8,10 @@ from itertools import pairwise
 from math import inf, isfinite, nan, ulp
 
 import numpy as np
+import slicer
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
-from SlicerUSSim.Logic.mrml.libraries import slicer
 from SlicerUSSim.Logic.mrml.nodes import write_volume
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 

@@ -16,9 +16,9 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require_between
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
+from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.optimization import AppearanceCost
 from SlicerUSSim.Logic.fitting.parameters import FreeParameters
-from SlicerUSSim.Logic.fitting.similarity import SimilaritySettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri

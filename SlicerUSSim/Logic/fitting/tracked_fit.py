@@ -9,11 +9,11 @@ from functools import partial
 import numpy as np
 
 from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.optimization import AppearanceResult, optimize_appearance
 from SlicerUSSim.Logic.fitting.parameters import Bounds
 from SlicerUSSim.Logic.fitting.registration import Registration, register_poses
 from SlicerUSSim.Logic.fitting.search import Progress
-from SlicerUSSim.Logic.fitting.similarity import SimilaritySettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
