@@ -20,6 +20,7 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.base.files import write_json
+from SlicerUSSim.Logic.fitting import tracked_fit
 from SlicerUSSim.Logic.fitting.registration import rigid_from
 from SlicerUSSim.Logic.fitting.tracked_fit import fit
 from SlicerUSSim.Logic.mri.samples import head_mri
@@ -156,12 +157,8 @@ def test_images_of_a_sweep_have_noise_by_their_number(folder, tmp_path):
 @pytest.mark.parametrize("has_given_map", [False, True])
 def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tmp_path, monkeypatch, has_given_map):
     fits = []
-    monkeypatch.setattr(
-        "SlicerUSSim.Logic.fitting.tracked_fit._ROUNDS", ((8.0, 60), (4.0, 40))
-    )  # how well: test_registration
-    monkeypatch.setattr(
-        "SlicerUSSim.Logic.fitting.tracked_fit.fit", lambda *a, **b: fits.append(fit(*a, **b)) or fits[-1]
-    )
+    monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
+    monkeypatch.setattr(tracked_fit, "fit", lambda *a, **b: fits.append(fit(*a, **b)) or fits[-1])
     given_map = rigid_from([1.5, -1.0, 2.0, 2.0, -1.0, 1.5]) if has_given_map else np.eye(4)
     write_pose(tmp_path / "given.json", given_map)
     done = optimize(

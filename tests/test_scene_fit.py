@@ -21,6 +21,7 @@ from SlicerUSSim.Logic import (  # noqa: E402
 )
 from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.fitting import tracked_fit  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
@@ -216,9 +217,7 @@ def test_geometry_can_be_estimated(scene):
 
 
 def test_registration_is_written_as_a_transform_of_the_tracking(brain, monkeypatch):
-    monkeypatch.setattr(
-        "SlicerUSSim.Logic.fitting.tracked_fit._ROUNDS", ((8.0, 60), (4.0, 40))
-    )  # how well: test_registration
+    monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
     own = Scene(brain)
     away = np.eye(4)
     away[:3, 3] = 1.5, -1.0, 2.0
