@@ -27,7 +27,7 @@ POCL = fake("0:0", "pthread-Xeon", "Portable Computing Language", "CPU", 2)
 @pytest.fixture
 def three_devices(monkeypatch):
     monkeypatch.setattr(
-        "SlicerUSSim.Logic.opencl.devices.list_devices", lambda: sorted([POCL, INTEL, GPU], key=lambda d: d.rank)
+        "SlicerUSSim.Logic.opencl.device.list_devices", lambda: sorted([POCL, INTEL, GPU], key=lambda d: d.rank)
     )
     monkeypatch.delenv("PYOPENCL_CTX", raising=False)
     monkeypatch.delenv("USSIM_DEVICE", raising=False)
@@ -60,7 +60,7 @@ def test_an_unknown_choice_lists_what_there_is(three_devices, monkeypatch):
 
 
 def test_no_device_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("SlicerUSSim.Logic.opencl.devices.list_devices", lambda: [])
+    monkeypatch.setattr("SlicerUSSim.Logic.opencl.device.list_devices", lambda: [])
     with pytest.raises(SimulationError, match=r"pip install pocl-binary-distribution.*graphics driver"):
         choose_device()
 
