@@ -12,12 +12,13 @@ from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import SimulationError, phantoms, validation
+from SlicerUSSim.Logic import SimulationError
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.verification import phantoms
 from SlicerUSSim.Logic.verification.measurement import echo_near, fit_rayleigh, full_width, level_db
 from SlicerUSSim.Logic.verification.phantoms import Echo
-from SlicerUSSim.Logic.verification.validation import ORIENTATIONS, PROBES, Row, all_checks, validate
+from SlicerUSSim.Logic.verification.validation import ORIENTATIONS, PROBES, Outcome, Row, all_checks, run, validate
 
 CASES = [(check, orientation) for check in all_checks() for orientation in check.orientations]
 
@@ -134,9 +135,9 @@ def test_the_command_says_what_is_off_and_exits_with_one(tmp_path, monkeypatch):
     good = next(check for check in all_checks() if check.name == "thin sheet")
 
     def off(rotation, device):
-        return validation.Outcome((replace(good.measure(rotation, device).rows[0], predicted=2.0),))
+        return Outcome((replace(good.measure(rotation, device).rows[0], predicted=2.0),))
 
-    monkeypatch.setattr(validation, "all_checks", lambda: (replace(good, measure=off),))
+    monkeypatch.setattr(run, "all_checks", lambda: (replace(good, measure=off),))
     result = CliRunner().invoke(main, ["validate", "--out", str(tmp_path)])
     assert result.exit_code == 1
     assert "off: thin sheet, share of rays that see it, linear, oblique: 1" in result.output
