@@ -25,6 +25,7 @@ from playwright.sync_api import Page, sync_playwright
 from SlicerUSSim.Logic.base import write_json
 from SlicerUSSim.Logic.opencl import list_devices
 from SlicerUSSim.Logic.verification.benchmark.files import output_file
+from SlicerUSSim.Workstation.state import NAMES
 
 FLAGS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -75,10 +76,10 @@ def measured(browser, device: str, seconds: float, frames: int) -> dict:
         page.goto(url)
         page.wait_for_function("window.ussim && window.ussim.images > 0", timeout=120_000)
         result: dict[str, Any] = {"usable_s": perf_counter() - start}
-        page.wait_for_timeout(2000)
+        _rest(page)
         for name, (number, across, down) in GRIPS.items():
             page.evaluate("window.trame.trigger('press', ['placeButton'])")
-            page.wait_for_timeout(1500)
+            _rest(page)
             box = page.locator(".ussim-anatomy .remote-controlled-area").nth(number).bounding_box()
             result[name] = dragged(page, box["x"] + across * box["width"], box["y"] + down * box["height"], seconds)
         if frames:
@@ -92,13 +93,14 @@ def dragged(page: Page, x: float, y: float, seconds: float) -> dict[str, float]:
     page.mouse.move(x, y)
     page.mouse.down()
     images = _move(page, x, y, seconds)
-    page.evaluate("window.trame.state.set('show_latency', true)")
-    page.wait_for_timeout(500)
-    page.evaluate("window.ussim.measured.length = 0")
+    _set(page, NAMES.show_latency, True)
+    page.wait_for_function("window.ussim.measuring")
     _move(page, x, y, seconds)
     times = page.evaluate("window.ussim.measured")
     page.mouse.up()
-    page.evaluate("window.trame.state.set('show_latency', false)")
+    _set(page, NAMES.show_latency, False)
+    page.wait_for_function("!window.ussim.measuring")
+    page.evaluate("window.ussim.measured.length = 0")
     if len(times) < 5:
         raise SystemExit(f"benchmarks/dragging.py: only {len(times)} images came of dragging at {x:.0f}, {y:.0f}")
     return {
@@ -107,6 +109,17 @@ def dragged(page: Page, x: float, y: float, seconds: float) -> dict[str, float]:
         "p95_ms": float(np.percentile(times, 95)),
         "measured": len(times),
     }
+
+
+def _set(page: Page, name: object, value: object) -> None:
+    """Set one of NAMES on the page."""
+    page.evaluate("([name, value]) => window.trame.state.set(name, value)", [name, value])
+
+
+def _rest(page: Page) -> None:
+    """Wait until the server has done what it was asked for, and give the views a moment to be drawn."""
+    page.evaluate("window.trame.trigger('at_rest')")
+    page.wait_for_timeout(1500)
 
 
 def _move(page: Page, x: float, y: float, seconds: float) -> float:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import ast
 import asyncio
 import io
+import re
+import selectors
 import subprocess
 import sys
 import threading
-import time
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from PIL import Image
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkFeatureEdges, vtkMassProperties, vtkTriangleFilter
 
+import SlicerUSSim.Workstation as workstation_package
 from SlicerUSSim.Logic import (
     ConvexProbe,
     LinearProbe,
@@ -43,12 +46,26 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 pytest.importorskip("greenlet", reason="the workstation comes with: pip install '.[serve]'")
 pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
 
+from trame_server.state import State  # noqa: E402
+from trame_server.utils.typed_state import TypedState  # noqa: E402
+
 from SlicerUSSim.Logic.mrml.fit_nodes import tracked_images  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, SequenceIndex, add_sequence  # noqa: E402
+from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
+from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
 from SlicerUSSim.Workstation.export import Cine  # noqa: E402
+from SlicerUSSim.Workstation.state import (  # noqa: E402
+    NAMES,
+    ComparisonMode,
+    DepthTick,
+    ImageGeometry,
+    PageState,
+    SharedState,
+    TissueLine,
+)
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
 
 
@@ -61,11 +78,14 @@ def head():
 
 
 def run_in_loop(coroutine_function):
-    """What an async function gives in a loop of its own."""
-    loop = asyncio.new_event_loop()
+    """What an async function gives in a loop of its own; what it waits for and does not come fails."""
+    return run_in(asyncio.new_event_loop(), coroutine_function)
+
+
+def run_in(loop: asyncio.AbstractEventLoop, coroutine_function):
     asyncio.set_event_loop(loop)
     try:
-        return loop.run_until_complete(asyncio.wait_for(coroutine_function(), 60))
+        return loop.run_until_complete(asyncio.wait_for(coroutine_function(), 180))
     finally:
         asyncio.set_event_loop(None)
         loop.close()
@@ -74,9 +94,10 @@ def run_in_loop(coroutine_function):
 def test_while_work_is_done_the_event_loop_goes_on_and_results_come_back_to_their_tasks():
     async def scenario():
         tasks, seen, ticks = Tasks(seen_errors.append), [], 0
+        goes_on = threading.Event()
 
         def work(name: str):
-            time.sleep(0.1)
+            assert goes_on.wait(150), "the event loop stood still"
             return name, threading.get_ident()
 
         def task(name: str) -> None:
@@ -88,13 +109,16 @@ def test_while_work_is_done_the_event_loop_goes_on_and_results_come_back_to_thei
             tasks.start(lambda name=name: task(name))
         while len(seen) < 2:
             ticks += 1
+            if ticks == 5:  # the work is done only if the loop gets here
+                assert not tasks.are_done
+                goes_on.set()
             await asyncio.sleep(0.01)
         tasks.stop()
-        return seen, ticks
+        return seen, tasks.are_done
 
     seen_errors: list[Exception] = []
-    seen, ticks = run_in_loop(scenario)
-    assert seen == [("first", True, True), ("second", True, True)] and ticks > 8 and not seen_errors
+    seen, are_done = run_in_loop(scenario)
+    assert seen == [("first", True, True), ("second", True, True)] and are_done and not seen_errors
 
 
 def test_errors_of_work_reach_the_task_and_those_of_tasks_are_told():
@@ -119,18 +143,38 @@ def test_errors_of_work_reach_the_task_and_those_of_tasks_are_told():
     assert [type(error) for error in run_in_loop(scenario)] == [IndexError]
 
 
+class _NoWaiting(selectors.DefaultSelector):
+    """A selector of a loop whose clock stands still while something happens, and else jumps to the next timer."""
+
+    now = 0.0
+
+    def select(self, timeout=None):
+        ready = super().select(0)
+        if not ready and timeout:
+            self.now += timeout
+        return ready
+
+
 def test_what_is_called_too_often_is_called_once_more_at_the_end():
+    selector = _NoWaiting()
+    loop = asyncio.SelectorEventLoop(selector)
+    loop.time = lambda: selector.now
+
     async def scenario():
-        times: list[float] = []
-        often = AtMost(0.1, lambda: times.append(time.monotonic()))
-        for _ in range(30):
+        told: list[tuple[float, int]] = []
+        calls: list[int] = []
+        often = AtMost(0.1, lambda: told.append((loop.time(), len(calls))))
+        for number in range(31):  # from 0 to 0.3 s
+            calls.append(number)
             often()
             await asyncio.sleep(0.01)
-        await asyncio.sleep(0.2)
-        return times
+        assert often.is_waiting
+        await asyncio.sleep(1.0)
+        assert not often.is_waiting
+        return told
 
-    times = run_in_loop(scenario)
-    assert 3 <= len(times) <= 5 and min(np.diff(times)) > 0.09
+    times, numbers = zip(*run_in(loop, scenario), strict=True)
+    assert min(np.diff(times)) > 0.0999 and len(times) in (4, 5) and numbers[0] == 1 and numbers[-1] == 31
 
 
 def test_changes_that_come_while_an_image_is_computed_bring_one_more_of_the_last_pose(head):
@@ -145,33 +189,116 @@ def test_changes_that_come_while_an_image_is_computed_bring_one_more_of_the_last
         write_labels(labels, head.labels, head.tissue_names, labels)
         logic = UltrasoundSceneLogic(scene, work=tasks)
         set_node_to_world(transform, craniotomy_pose(head.labels, logic.preset.probe))
-        started = asyncio.Event()
 
-        def begin() -> None:
-            logic.startLiveUpdate(labels, transform, output, schedule=tasks.start, report=reports.append)
-            started.set()
+        async def done() -> None:
+            while not tasks.are_done:
+                await asyncio.sleep(0.01)
 
-        tasks.start(begin)
-        await started.wait()
-        start = probe_pose(transform)
-        images = len(reports)
+        tasks.start(
+            lambda: logic.startLiveUpdate(labels, transform, output, schedule=tasks.start, report=reports.append)
+        )
+        await done()
+        start, images = probe_pose(transform), len(reports)
+        goes_on = threading.Event()
+        tasks.start(lambda: tasks.do(goes_on.wait))  # images are computed one after the other, and after this
         for step in range(1, 40):
             set_node_to_world(transform, turned(start, rock_deg=0.5 * step))
-            await asyncio.sleep(0.002)
-        for _ in range(200):
-            await asyncio.sleep(0.01)
-            moved = np.linalg.inv(probe_pose(transform)) @ logic.lastImage().ijk_to_ras
-            if np.allclose(moved, logic.lastFrame.grid.slice_to_probe, atol=1e-6):
-                break
-        count = len(reports)
-        await asyncio.sleep(0.3)
+            await asyncio.sleep(0)
+        goes_on.set()
+        await done()
+        moved = np.linalg.inv(probe_pose(transform)) @ logic.lastImage().ijk_to_ras
         logic.stopLiveUpdate()
         tasks.stop()
         assert np.allclose(moved, logic.lastFrame.grid.slice_to_probe, atol=1e-6)
-        return count - images, len(reports) - count, errors, reports
+        return len(reports) - images, errors, reports
 
-    images, after, errors, reports = run_in_loop(scenario)
-    assert 1 <= images < 39 and after == 0 and not errors and not any(reports)
+    images, errors, reports = run_in_loop(scenario)
+    assert images == 2 and not errors and not any(reports)
+
+
+# ---- what page and control share -------------------------------------------------------------------------------------
+
+
+def test_what_control_writes_the_page_has_under_its_name_and_the_other_way_round():
+    state = State(ready=True)
+    shared, seen = SharedState(state), []
+    state.flush()  # of the defaults
+    shared.on_change(NAMES.views.blend, seen.append)
+    shared.on_change(NAMES.sequence.comparison, seen.append)
+    with shared.changing() as now:
+        now.panel.tissues = [TissueLine("csf", ["1"], ["a book"])]
+        now.image = ImageGeometry(w=3.0, ticks=[DepthTick(1.0, "")])
+    assert state[NAMES.panel.tissues][0]["values"] == ["1"] and state[NAMES.image]["ticks"][0]["y"] == 1.0
+    assert shared.now.panel.tissues == [TissueLine("csf", ["1"], ["a book"])]
+    assert shared.now.image == ImageGeometry(w=3.0, ticks=[DepthTick(1.0, "")])
+    with state:  # as a page does
+        state[NAMES.views.blend] = 1
+        state[NAMES.sequence.comparison] = "Blink"
+    assert seen == [1.0, ComparisonMode.BLINK] and shared.now.sequence.comparison is ComparisonMode.BLINK
+
+
+def test_every_value_that_is_shared_has_a_name_of_its_own_and_begins_as_it_is_declared():
+    state = State(ready=True)
+    shared = SharedState(state)
+
+    def leaves(names, values):
+        for entry in fields(values):
+            name, value = getattr(names, entry.name), getattr(values, entry.name)
+            yield from leaves(name, value) if is_dataclass(value) else [(name, value)]
+
+    declared = list(leaves(NAMES, PageState()))
+    assert len({name for name, _ in declared}) == len(declared) > 25
+    assert TypedState.as_dataclass(shared.now) == PageState()
+    assert {name for name, _ in declared} == set(state.to_dict())
+
+
+def test_only_what_assembles_everything_knows_the_page():
+    importers = set()
+    for file in Path(workstation_package.__path__[0]).glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+            module = getattr(node, "module", None) or ""
+            if any(f"{module}.{name}".endswith("Workstation.page") or module.endswith("page") for name in names):
+                importers.add(file.name)
+    assert importers == {"workstation.py"}
+
+
+def test_nothing_reads_or_writes_the_shared_state_by_a_string():
+    by_string = re.compile(r"""state\[|state\.update\(|\bstate\.(?!trame__)[a-z_]+ = """)
+    for file in Path(workstation_package.__path__[0]).glob("*.py"):
+        found = [line for line in file.read_text().splitlines() if by_string.search(line)]
+        assert not found, (file.name, found)
+
+
+def test_of_images_that_come_fast_the_last_is_compared(head):
+    probe = PhasedProbe(75.0, 70.0, scan_lines=48)
+    grid = ImageGrid.for_probe(probe, None)
+    pose = craniotomy_pose(head.labels, probe)
+    simulator = UltrasoundSimulator(head.labels, TissueTable.brain(head.tissue_names))
+    image = simulator.simulate(probe, pose).image
+    sequence = TrackedSequence(
+        image[None], ({"ImageToProbe": grid.image_to_probe, "ProbeToReference": pose},), np.zeros(1)
+    )
+    tracked = TrackedImages.of(sequence, path="ImageToReference", beam=probe, probe=probe)
+
+    class Browser:
+        def SetSelectedItemNumber(self, number: int) -> None:
+            self.number = number
+
+    async def scenario():
+        shared, moved = SharedState(State(ready=True)), []
+        comparison = Comparison(shared, moved.append)
+        comparison.take(tracked, Browser())
+        for simulated in (image // 2, np.zeros_like(image), image):  # one is compared while the others come
+            comparison.compare(simulated, grid)
+        while comparison.is_comparing or any(stream.is_sending for stream in comparison.streams):
+            await asyncio.sleep(0.01)
+        assert len(moved) == 1 and np.allclose(moved[0], pose)
+        return shared.now.sequence.similarity
+
+    cost = run_in_loop(scenario)
+    same = RealImages(tracked).compared(0, image, grid).total
+    assert cost.startswith(f"cost {same:.3f} ") and same < 0.5 * RealImages(tracked).compared(0, image // 2, grid).total
 
 
 # ---- export ----------------------------------------------------------------------------------------------------------

@@ -209,8 +209,11 @@ def drawn(page: Page) -> None:
     settled(page)
     for _ in range(2):
         counts = page.evaluate("() => { window.trame.trigger('page_opened'); return { ...window.viewImages }; }")
-        assert len(counts) == 4
-        page.wait_for_function("b => Object.entries(b).every(([name, n]) => window.viewImages[name] > n)", arg=counts)
+        page.wait_for_function(
+            """(before) => ['ThreeD', 'Red', 'Yellow', 'Green'].every(
+              (name) => (window.viewImages[name] ?? 0) > (before[name] ?? 0))""",
+            arg=counts,
+        )
 
 
 @contextlib.contextmanager

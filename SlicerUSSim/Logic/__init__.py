@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from .base.errors import SimulationError as SimulationError
     from .base.settings import DisplaySettings as DisplaySettings, SimulationSettings as SimulationSettings
     from .base.volume import Volume as Volume
+    from .fitting.image_similarity import similarity as similarity
     from .fitting.optimization import AppearanceResult as AppearanceResult, optimize_appearance as optimize_appearance
-    from .fitting.similarity import similarity as similarity
     from .imaging.frame import Frame as Frame
     from .imaging.noise import seed_of_pose as seed_of_pose
     from .imaging.preset import Preset as Preset
