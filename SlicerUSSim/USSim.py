@@ -192,6 +192,8 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
 
     def initializeParameterNode(self) -> None:
         """Make sure that the scene has a parameter node and that the panel shows it."""
+        if self.logic is None:
+            return  # entered, and not set up
         self.setParameterNode(self.logic.getParameterNode())
         if self.panel is not None:
             self.panel.presenter.chooseDefaultNodes()

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 MAX_LABEL = 62  # six bits in the device's label volume, and 63 is the membrane
 
 
-class TissueTable(Mapping):
+class TissueTable(Mapping[int, Tissue]):
     """Which tissue every label stands for: a read-only mapping {label: Tissue}, and the membrane, if any.
 
     Label 0 is the coupling medium around the patient and is added when it is not given.
