@@ -268,7 +268,10 @@ def test_only_the_command_knows_the_workstation_and_what_verifies(tree):
 
 
 def test_examples_and_benchmarks_know_no_workstation_and_no_panel(tree):
+    """But for the benchmark of the workstation itself."""
     for path in [*(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]:
+        if path.stem == "dragging":
+            continue
         found = tree.imports_of(f"{path.parent.name}.{path.stem}", ast.parse(path.read_text()))
         rooms = {room_of(entry.imported) for entry in found if entry.imported in tree.paths}
         assert not rooms & {"Workstation", "Widget", "Command"}, path.name

@@ -28,8 +28,8 @@ PUBLIC = {
     "SimulationSettings", "Tissue", "TissueTable", "TrackedSequence", "UltrasoundSimulator", "Volume", "list_devices",
     "optimize_appearance", "segment_mri", "similarity",
 }  # fmt: skip
-#: What earlier releases exported besides
-ALSO_PUBLIC = {"AppearanceResult", "Membrane", "Preset", "Texture"}
+#: What users needed besides
+ALSO_PUBLIC = {"AppearanceResult", "Membrane", "Preset", "Texture", "seed_of_pose"}
 
 
 def declared(package: str) -> dict[str, str]:
