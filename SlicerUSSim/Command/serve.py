@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import secrets
-import socket
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -116,6 +114,9 @@ def _require_workstation() -> None:
 
 def _run(server: Server | None, host: str, port: int) -> None:
     """Print the URL and serve until the command is interrupted."""
+    import secrets
+    import socket
+
     from SlicerUSSim.Workstation.access import guard, is_loopback
 
     assert server is not None  # trame's get_server is declared to give one or None
@@ -133,6 +134,8 @@ def _run(server: Server | None, host: str, port: int) -> None:
 
 def _usable_port(host: str, port: int | None) -> int:
     """`port`, or one that is free. Raises SimulationError for a host that is not ours and a port that is taken."""
+    import socket
+
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     reason = None
     for candidate in [port] if port is not None else [_PORT, 0]:
