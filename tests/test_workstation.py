@@ -12,6 +12,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 from time import monotonic
 
@@ -119,18 +120,29 @@ def opened(browser, address: str, problems: list[str] | None = None) -> Page:
     if problems is not None:
         page.on("pageerror", lambda error: problems.append(str(error)))
     page.set_default_timeout(1000 * PATIENCE_S)
+    page.on("websocket", lambda socket: socket.on("framesent", lambda frame: _sent(page, frame)))
     page.goto(address)
     loaded(page)
     return page
+
+
+#: Releases of the mouse in Slicer's views that pages have sent to their servers.
+_RELEASES: Counter[Page] = Counter()
+
+
+def _sent(page: Page, frame: bytes | str) -> None:
+    _RELEASES[page] += (frame if isinstance(frame, bytes) else frame.encode()).count(b"LeftButtonRelease")
 
 
 def loaded(page: Page) -> None:
     """Wait until the page shows an image, and let it count what comes of Slicer's views."""
     page.wait_for_function("window.ussim?.images > 0")
     page.evaluate(
-        """() => { const counts = window.viewImages = {};
-        window.trame.client.getConnection().getSession().subscribe('trame.rca.topic.stream', ([{ name, meta }]) => {
-          if (meta?.number === undefined) counts[name] = (counts[name] ?? 0) + 1; }); }"""
+        """() => {
+          const session = window.trame.client.getConnection().getSession();
+          const counts = window.viewImages = {};
+          session.subscribe('trame.rca.topic.stream', ([{ name, meta }]) => {
+            if (meta?.number === undefined) counts[name] = (counts[name] ?? 0) + 1; }); }"""
     )
 
 
@@ -185,12 +197,10 @@ def click(page: Page, selector: str) -> None:
     page.locator(selector).first.click()
 
 
-#: Until the server has nothing more to do, and neither has the page to tell it: it keeps mouse events for 25 ms.
+#: Until the server has nothing more to do; the second answer comes after all that it told the page before the first.
 _AT_REST = """async (patience) => {
-  const soon = () => new Promise((done) => setTimeout(done, 60));
   const late = new Promise((_, failed) => setTimeout(() => failed(new Error('it never came to rest')), patience));
   for (let before = null; ; ) {
-    await soon();
     const now = JSON.stringify(await Promise.race([window.trame.trigger('at_rest'), late]));
     if (now === before) return JSON.parse(now);
     before = now;
@@ -256,8 +266,16 @@ def picture(page: Page, box: dict) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(page.screenshot(clip=box))).convert("RGB")).astype(int)
 
 
+@contextlib.contextmanager
+def heard(page: Page, releases: int = 1):
+    """Wait until the page has told what the mouse does in Slicer's views, which it does piece by piece."""
+    before = _RELEASES[page]
+    yield
+    eventually(page, lambda: _RELEASES[page] >= before + releases)
+
+
 def drag(page: Page, start: tuple[float, float], by: tuple[float, float], key: str | None = None) -> None:
-    with _held(page, key):
+    with _held(page, key), heard(page):
         page.mouse.move(*start)
         page.mouse.down()
         for share in np.linspace(0, 1, 9)[1:]:
@@ -407,7 +425,8 @@ def test_a_double_click_aims_the_probe_at_a_structure(page):
     before = pose(page)
 
     def aimed() -> bool:
-        page.mouse.dblclick(*in_view(views(page)[2], 0.35, 0.6))  # across the image: the probe has to tilt
+        with heard(page, 2):
+            page.mouse.dblclick(*in_view(views(page)[2], 0.35, 0.6))  # across the image: the probe has to tilt
         settled(page)
         return pose(page) != before
 
