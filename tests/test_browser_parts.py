@@ -448,6 +448,8 @@ def test_times_that_tell_images_apart_are_their_index_and_equal_ones_follow_each
     assert SequenceIndex.of_times([0.1, 0.1, 0.1, 0.3]).values == ("0.100000", "0.100001", "0.100002", "0.300000")
     assert SequenceIndex.of_times([5.0, np.nan, 1.0]).values == ("5.000000", "5.000001", "5.000002")
     assert SequenceIndex(("b", "a", "b"), is_text=True).values == ("b", "a", "b (2)")
+    for texts in (("a", "a", "a (1)", "a"), ("a (2)", "a", "a"), ("a", "a", "a")):
+        assert len(set(SequenceIndex(texts, is_text=True).values)) == len(texts), texts
     sequence = TrackedSequence(np.ones((3, 8, 8), np.uint8), ({"ImageToReference": np.eye(4)},) * 3, [0.2, 0.2, np.nan])
     scene, logic = slicer.vtkMRMLScene(), slicer.vtkSlicerSequencesLogic()
     logic.SetMRMLScene(scene)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import compileall
 import importlib
 import importlib.util
 import inspect
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -151,3 +153,24 @@ def test_a_type_checker_knows_what_the_package_exports(tmp_path):
     assert revealed[0].startswith('Type of "UltrasoundSimulator.simulate" is "(self: UltrasoundSimulator, probe: Probe')
     assert revealed[0].endswith('-> Frame"')
     assert [text.split(" is ")[-1] for text in revealed[1:]] == ['"float"', '"float"']
+
+
+def test_faces_work_in_a_build_without_source_files(tmp_path):
+    """Slicer can be packaged with compiled files alone."""
+    copy = tmp_path / "SlicerUSSim" / "Logic"
+    shutil.copytree(LOGIC, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    assert compileall.compile_dir(copy, quiet=1, legacy=True)
+    for source in copy.rglob("*.py"):
+        source.unlink()
+    names = {face: sorted(declared(face)) for face in FACES if not face.endswith(".mrml")}
+    code = f"""
+import importlib, sys
+sys.path.insert(0, {str(tmp_path)!r})
+for face, names in {names!r}.items():
+    package = importlib.import_module(face)
+    assert package.__file__.startswith({str(tmp_path)!r}) and dir(package) == names, face
+    for name in names:
+        getattr(package, name)
+print("fine")
+"""
+    assert fresh(code) == "fine"

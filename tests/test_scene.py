@@ -210,7 +210,7 @@ def test_the_image_is_shown_from_black_to_white_whatever_is_in_it(bench):
 
 
 def test_the_outline_is_that_of_the_field(bench):
-    model = add(bench.scene, "Model", "fan")
+    model = add(bench.scene, "Model", "field")
     bench.logic.showOutline(model, bench.probe)
     bounds = [0.0] * 6
     model.GetRASBounds(bounds)
@@ -764,8 +764,16 @@ def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
     assert parameters.labels is None
     with pytest.raises(SimulationError, match="no 'label'"):
         parameters.label = bench.labels
-    with pytest.raises(SimulationError, match="classes is 'four', expected int"):
-        parameters.classes = "four"
+    with pytest.raises(SimulationError, match="no 'label'"):
+        parameters.label  # noqa: B018
+    for value in ("four", True, 4.0):
+        with pytest.raises(SimulationError, match=f"classes is {value!r}, expected int"):
+            parameters.classes = value
+    with pytest.raises(SimulationError, match="mri is a str, expected vtkMRMLScalarVolumeNode"):
+        parameters.mri = "Head"
+    node.SetParameter("classes", "many")  # a scene made by hand
+    with pytest.raises(SimulationError, match="classes is 'many', expected int"):
+        parameters.classes  # noqa: B018
     with pytest.raises(SimulationError, match=r"mri is a .*LinearTransformNode, expected vtkMRMLScalarVolumeNode"):
         parameters.mri = bench.probe
 

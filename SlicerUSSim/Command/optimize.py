@@ -11,7 +11,7 @@ from SlicerUSSim.Command.options import gathered
 from SlicerUSSim.Command.patient_options import PatientOptions
 from SlicerUSSim.Command.progress import Curve
 from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.version import __version__
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ _MOST_IMAGES = 6
 
 
 @click.command()
-@gathered(patient=PatientOptions, tracking=SequenceOptions)
+@gathered(patient=PatientOptions, recording=SequenceOptions)
 @click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Result: .json")
 @click.option(
     "--free",
@@ -38,7 +38,8 @@ _MOST_IMAGES = 6
 @click.option(
     "--state",
     type=click.Path(path_type=Path),
-    help="Keep what was evaluated here, and go on from there when run again: .json",
+    help="Keep what was evaluated here, and go on from there when run again, with --register only where that finds "
+    "the same poses again: .json",
 )
 @click.option("--register", is_flag=True, help="Also refine where the ultrasound lies in the MRI (rigid).")
 @click.option(
@@ -49,7 +50,7 @@ _MOST_IMAGES = 6
 )
 def optimize(
     patient: PatientOptions,
-    tracking: SequenceOptions,
+    recording: SequenceOptions,
     out: Path,
     free: tuple[str, ...],
     evaluations: int,
@@ -70,12 +71,16 @@ def optimize(
     places = [place for place in (out, report, save_preset, save_transform, state) if place]
     for place in places:
         require_place(place)
+        require(places.count(place) == 1, f"{place}: is given for two outputs, expected a file for each")
+    if save_transform:
+        is_json = save_transform.suffix.lower() == ".json"
+        require(is_json, f"--save-transform is {save_transform}, expected a name ending in .json")
     if report:
         require_matplotlib()
     if save_transform and not register:
         raise SimulationError("--save-transform needs --register")
     names = dict(_free_parameter(text) for text in free) or dict.fromkeys(("display", "white matter"))
-    tracked = open_tracked(patient, tracking, most=_MOST_IMAGES)
+    tracked = open_tracked(patient, recording, most=_MOST_IMAGES)
     simulator = tracked.examination.simulator
     with Curve("optimize") as curve:
         found = fit(
@@ -91,7 +96,7 @@ def optimize(
     if save_transform and found.registration:
         write_pose(save_transform, found.registration.correction @ tracked.reference_to_ras)
     if report:
-        _write_report(report, found, tracked, patient, tracking)
+        _write_report(report, found, tracked, patient, recording)
     _tell(found)
     click.echo("wrote " + ", ".join(map(str, places)))
 
@@ -109,7 +114,7 @@ def _free_parameter(text: str) -> tuple[str, tuple[float, float] | None]:
 
 
 def _write_report(
-    path: Path, found: Fit, tracked: TrackedExamination, patient: PatientOptions, tracking: SequenceOptions
+    path: Path, found: Fit, tracked: TrackedExamination, patient: PatientOptions, recording: SequenceOptions
 ) -> None:
     """--report, with all that it takes to do the same again."""
     from SlicerUSSim.Logic.fitting.report import write_report
@@ -117,12 +122,12 @@ def _write_report(
     simulator = tracked.examination.simulator
     provenance = (
         f"SlicerUSSim {__version__}, {simulator.device.info}. MRI or labels: {patient.source}. Sequence: "
-        f"{tracking.sequence}, images {', '.join(map(str, tracked.images.numbers))}. Probe: {tracked.images.probe}. "
+        f"{recording.sequence}, images {', '.join(map(str, tracked.images.numbers))}. Probe: {tracked.images.probe}. "
         f"Settings: {simulator.settings}."
     )
     write_report(
         path, found.appearance, found.tracked, found.before, found.after, simulator,
-        subtitle=f"{Path(tracking.sequence).name} on {Path(patient.source).name}", provenance=provenance,
+        subtitle=f"{Path(recording.sequence).name} on {Path(patient.source).name}", provenance=provenance,
     )  # fmt: skip
 
 

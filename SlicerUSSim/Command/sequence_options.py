@@ -83,7 +83,7 @@ class TrackedExamination:
     reference_to_ras: np.ndarray
 
 
-def open_tracked(patient: PatientOptions, tracking: SequenceOptions, most: int | None = None) -> TrackedExamination:
+def open_tracked(patient: PatientOptions, recording: SequenceOptions, most: int | None = None) -> TrackedExamination:
     """The TrackedExamination of a command's options; `most` is how many images are taken if none are chosen.
 
     What is cheap to check comes before what takes time. Raises SimulationError for everything that does not fit.
@@ -95,28 +95,28 @@ def open_tracked(patient: PatientOptions, tracking: SequenceOptions, most: int |
     from SlicerUSSim.Logic.tracked.images import TrackedImages
     from SlicerUSSim.Logic.tracked.sequence import frame_numbers
 
-    if tracking.field:
-        require_place(tracking.field)
-    to_ras = read_to_mri(tracking.to_mri) if tracking.to_mri else np.eye(4)
-    if tracking.cut:
-        cuts = _read_cuts(tracking.cut, tracking)
+    if recording.field:
+        require_place(recording.field)
+    to_ras = read_to_mri(recording.to_mri) if recording.to_mri else np.eye(4)
+    if recording.cut:
+        cuts = _read_cuts(recording.cut, recording)
         examination = open_examination(patient)
         known_probe, sequence = examination.probe, cuts.seen_by(examination.probe)
     else:
-        sequence = read_sequence(tracking.sequence, tracking.calibration)
+        sequence = read_sequence(recording.sequence, recording.calibration)
         examination = open_examination(patient)
         known_probe = examination.probe if patient.gives_probe else None
     images = TrackedImages.of(
         sequence,
-        None if tracking.frames is None else frame_numbers(tracking.frames, len(sequence)),
-        path=tracking.transform,
+        None if recording.frames is None else frame_numbers(recording.frames, len(sequence)),
+        path=recording.transform,
         reference_to_ras=to_ras,
         probe=known_probe,
         beam=examination.probe,
         most=most,
     )
-    if tracking.field:
-        draw_field(tracking.field, sequence.images[images.numbers[0]], images.field)
+    if recording.field:
+        draw_field(recording.field, sequence.images[images.numbers[0]], images.field)
     return TrackedExamination(examination, sequence, images, to_ras)
 
 
@@ -167,18 +167,18 @@ class _Cuts:
         return TrackedSequence.from_volume(self.volume, probe, self.poses)
 
 
-def _read_cuts(pose_file: str, tracking: SequenceOptions) -> _Cuts:
+def _read_cuts(pose_file: str, recording: SequenceOptions) -> _Cuts:
     """The volume of --sequence, to be cut at the pose of --cut and beside it."""
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
-    if tracking.cut_tilt is not None and tracking.cut_slide is not None:
+    if recording.cut_tilt is not None and recording.cut_slide is not None:
         raise SimulationError("expected either --cut-tilt DEGREES or --cut-slide MILLIMETRES, for cuts of one kind")
     pose = read_pose(pose_file)
     poses = [pose]
-    if tracking.cut_tilt is not None:
-        poses = tilt_sweep(pose, tracking.cut_tilt, tracking.cuts)
-    elif tracking.cut_slide is not None:
-        poses = slide_sweep(pose, tracking.cut_slide, tracking.cuts)
-    return _Cuts(Volume.read(tracking.sequence), poses)
+    if recording.cut_tilt is not None:
+        poses = tilt_sweep(pose, recording.cut_tilt, recording.cuts)
+    elif recording.cut_slide is not None:
+        poses = slide_sweep(pose, recording.cut_slide, recording.cuts)
+    return _Cuts(Volume.read(recording.sequence), poses)

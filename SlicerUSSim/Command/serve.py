@@ -75,9 +75,9 @@ def serve(
         if not Path(file).exists():
             raise SimulationError(f"{file}: no such file")
     if igtl is not None:
-        from SlicerUSSim.Logic.tracked.openigtlink import parse_address
+        from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
 
-        parse_address(igtl)
+        require_usable(parse_address(igtl))
     port = _usable_port(host, port)
 
     from SlicerUSSim.Logic.base.volume import Volume

@@ -13,11 +13,11 @@ from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
 
 
 @click.command()
-@gathered(patient=PatientOptions, tracking=SequenceOptions)
+@gathered(patient=PatientOptions, recording=SequenceOptions)
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), required=True, help="Sequence: .igs.mha .seq.mha .mhd or .nrrd"
 )
-def sweep(patient: PatientOptions, tracking: SequenceOptions, out: Path) -> None:
+def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> None:
     """Simulate the images of a tracked sequence: what its probe saw, on the same pixels."""
     import numpy as np
 
@@ -26,7 +26,7 @@ def sweep(patient: PatientOptions, tracking: SequenceOptions, out: Path) -> None
 
     require_sequence_name(out)
     require_place(out)
-    tracked = open_tracked(patient, tracking)
+    tracked = open_tracked(patient, recording)
     simulator, display = tracked.examination.simulator, tracked.examination.display
     real = tracked.images
     rows, columns = real.field.mask.shape

@@ -14,7 +14,7 @@ NO_NOISE_DB = -150.0
 
 
 @dataclass(frozen=True)
-class Field:
+class PresetField:
     """How a value of the preset is shown, and read back."""
 
     shown: Callable[[Any], Any] = lambda value: value
@@ -29,12 +29,12 @@ def _amplitude(db: float) -> float:
     return 10.0 ** (db / 20.0)
 
 
-_PLAIN = Field()
-_WHOLE = Field(meant=round)
-_LEVEL = Field(_db, _amplitude)
+_PLAIN = PresetField()
+_WHOLE = PresetField(meant=round)
+_LEVEL = PresetField(_db, _amplitude)
 
 #: By "section.name" of the preset.
-FIELDS: dict[str, Field] = {
+FIELDS: dict[str, PresetField] = {
     "probe.kind": _PLAIN,
     "probe.width_mm": _PLAIN,
     "probe.radius_mm": _PLAIN,
@@ -42,11 +42,11 @@ FIELDS: dict[str, Field] = {
     "probe.depth_mm": _PLAIN,
     "probe.frequency_mhz": _PLAIN,
     "probe.scan_lines": _WHOLE,
-    "probe.focus_mm": Field(meant=lambda value: value or None),  # 0 is the default place
+    "probe.focus_mm": PresetField(meant=lambda value: value or None),  # 0 is the default place
     "display.gain_db": _PLAIN,
     "display.dynamic_range_db": _PLAIN,
     "display.tgc_db_cm_mhz": _PLAIN,
-    "display.noise_db": Field(
+    "display.noise_db": PresetField(
         lambda value: NO_NOISE_DB if value is None else value, lambda value: None if value <= NO_NOISE_DB else value
     ),
     "settings.seed": _WHOLE,

@@ -8,7 +8,7 @@ from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Widget.presenter import PanelPresenter
-from SlicerUSSim.Workstation.patient import Patient
+from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 
@@ -17,13 +17,13 @@ class Buttons:
     """Does what a button says, by its name in Resources/UI."""
 
     def __init__(
-        self, shared: SharedState, app: SlicerApp, tasks: Tasks, presenter: PanelPresenter, patient: Patient
+        self, shared: SharedState, app: SlicerApp, tasks: Tasks, presenter: PanelPresenter, loading: Loading
     ) -> None:
         self._shared, self._scene, self._tasks, self._presenter = shared, app.scene, tasks, presenter
         fits = presenter.fits
         self._actions: dict[str, Callable[[], None]] = {
-            "segmentButton": patient.segment,
-            "placeButton": patient.place_probe,
+            "segmentButton": loading.segment,
+            "placeButton": loading.place_probe,
             "simulateButton": presenter.simulate,
             "resetTissuesButton": presenter.resetTissues,
             "assignTissueButton": self._assign_tissue,

@@ -16,7 +16,6 @@ _TEMPLATE = '''"""The image of a SlicerUSSim workstation, again."""
 import numpy as np
 
 from SlicerUSSim.Logic import {imports}
-from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 {more_imports}
 {labels}
@@ -49,7 +48,7 @@ class LabelSource:
 
 def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray) -> str:
     """A script that simulates what `preset`, whose tissues are by label, shows at a pose (4, 4) in these labels."""
-    imports, more, lines = ["UltrasoundSimulator"], "", []
+    imports, more, lines = ["UltrasoundSimulator", "seed_of_pose"], "", []
     is_demo = not source.path
     if is_demo:
         more = "from SlicerUSSim.Logic.mri.samples import demo_mri\n"

@@ -21,12 +21,12 @@ from SlicerUSSim.Workstation.export import Cine, Exports
 from SlicerUSSim.Workstation.hand import KEYS
 from SlicerUSSim.Workstation.image_flow import ImageFlow
 from SlicerUSSim.Workstation.latency import LatencyStamps
+from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.observed import Observed
 from SlicerUSSim.Workstation.opener import Files, Opener
 from SlicerUSSim.Workstation.page import build_page, view_tools
 from SlicerUSSim.Workstation.panel import BrowserPanel
-from SlicerUSSim.Workstation.patient import Patient
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.sections import read_sections
 from SlicerUSSim.Workstation.state import NAMES, SharedState
@@ -68,7 +68,7 @@ class Workstation:
         self._images = ImageFlow(shared, logic, self._views, self._comparison, cine, self._tracker, stamps)
         opener = Opener(app.scene, logic, tasks, files)
         self._exports = Exports(app, logic, opener, cine)
-        self._patient = Patient(
+        self._loading = Loading(
             shared, app, logic, tasks, opener, presenter, self._views, self._probe, self._comparison
         )  # fmt: skip
 
@@ -77,7 +77,7 @@ class Workstation:
         self._image_node = Observed("ImageDataModifiedEvent", self._images.image_changed)
         self._parameter_node = Observed("ModifiedEvent", self._parameters_changed)
         self._parameter_node.watch(logic.parameters.node)
-        self._answer_pages(Buttons(shared, app, tasks, presenter, self._patient), stamps)
+        self._answer_pages(Buttons(shared, app, tasks, presenter, self._loading), stamps)
         self._follow_pages()
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
@@ -138,7 +138,7 @@ class Workstation:
         self._tasks.start(lambda: self._open(name, content))
 
     def _open(self, name: str, content: bytes) -> None:
-        self._patient.open(name, content)
+        self._loading.open(name, content)
         self._panel.refresh()
 
     async def _export(self, kind: str) -> list[object] | None:
@@ -181,7 +181,7 @@ class Workstation:
         if files.tracker is not None:
             with self._presenter.shown():
                 self._tracker.start(files.tracker, files.tracker_device)
-        self._patient.begin(files)
+        self._loading.begin(files)
         self._panel.refresh()
 
     def _parameters_changed(self) -> None:

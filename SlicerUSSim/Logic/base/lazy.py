@@ -9,15 +9,19 @@ from __future__ import annotations
 
 import importlib
 from functools import cache
+from types import CodeType
 
 
 def lazy_exports(namespace: dict) -> None:
-    """Give a package's `namespace` (its globals()) the names that its source imports under `if TYPE_CHECKING`."""
+    """Give a package's `namespace` (its globals()) the names that its code imports under `if TYPE_CHECKING`."""
     package = namespace["__name__"]
+    needed = frozenset(namespace)
 
     @cache
     def homes() -> dict[str, str]:
-        return _declared(package, namespace["__spec__"].loader.get_source(package))
+        declared = _imports(namespace["__spec__"].loader.get_code(package))
+        # What the face itself needs, which is imported at once.
+        return {name: f"{package}.{module}" for name, module in declared.items() if name not in needed}
 
     def getattr_(name: str):
         if name == "__all__":
@@ -30,19 +34,17 @@ def lazy_exports(namespace: dict) -> None:
     namespace.update(__getattr__=getattr_, __dir__=lambda: sorted(homes()))
 
 
-def _declared(package: str, source: str) -> dict[str, str]:
-    """{public name: module that defines it} of a face."""
-    import ast  # not before it is needed: it takes longer to import than the rest of this package
+def _imports(code: CodeType) -> dict[str, str]:
+    """{name: module} of all `from module import name` in the code of a module, whether they are executed or not.
 
-    blocks = [
-        node.body
-        for node in ast.parse(source).body
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
-    ]
-    return {
-        alias.name: f"{package}.{entry.module}"
-        for block in blocks
-        for entry in block
-        if isinstance(entry, ast.ImportFrom)
-        for alias in entry.names
-    }
+    Read from the code and not from its text, which a build may leave out.
+    """
+    import dis  # not before it is needed: it takes longer to import than the rest of this package
+
+    found, module = {}, ""
+    for instruction in dis.get_instructions(code):
+        if instruction.opname == "IMPORT_NAME":
+            module = instruction.argval
+        elif instruction.opname == "IMPORT_FROM":
+            found[instruction.argval] = module
+    return found

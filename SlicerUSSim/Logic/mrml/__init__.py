@@ -1,6 +1,6 @@
 """The simulator on the nodes of a MRML scene, in 3D Slicer or with its libraries alone.
 
-The only room that imports `slicer`; "scene" means the MRML scene and nothing else.
+The only room of Logic that imports `slicer`; "scene" means the MRML scene and nothing else.
 """
 
 from typing import TYPE_CHECKING

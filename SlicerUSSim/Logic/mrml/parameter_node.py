@@ -6,7 +6,7 @@ them there. So a scene made by a script opens in the module, and the other way r
 
 from __future__ import annotations
 
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
@@ -28,7 +28,7 @@ class NodeParameter:
 
     def __set__(self, parameters: SceneParameters, value) -> None:
         require(
-            value is None or any(value.IsA(kind) for kind in self.classes),
+            value is None or (hasattr(value, "IsA") and any(value.IsA(kind) for kind in self.classes)),
             f"scene parameter {self.name} is a {type(value).__name__}, expected {' or '.join(self.classes)}",
         )
         node = parameters.node
@@ -54,11 +54,14 @@ class ValueParameter(Generic[T]):
         if text == "":
             return self.default
         kind: Any = type(self.default)
-        return text == "True" if kind is bool else kind(text)
+        try:
+            return text == "True" if kind is bool else kind(text)
+        except ValueError:
+            raise SimulationError(f"scene parameter {self.name} is {text!r}, expected {kind.__name__}") from None
 
     def __set__(self, parameters: SceneParameters, value: T) -> None:
         kind = type(self.default)
-        require(isinstance(value, kind), f"scene parameter {self.name} is {value!r}, expected {kind.__name__}")
+        require(type(value) is kind, f"scene parameter {self.name} is {value!r}, expected {kind.__name__}")
         parameters.node.SetParameter(self.name, str(value))
 
 
@@ -107,10 +110,15 @@ class SceneParameters:
         node.SetAttribute("ModuleName", MODULE_NAME)  # which closing a scene may remove
         return node
 
-    def __setattr__(self, name: str, value) -> None:
-        if name not in NODE_PARAMETERS and name not in VALUE_PARAMETERS:
+    if not TYPE_CHECKING:  # a type checker knows the names
+
+        def __getattr__(self, name: str):
             raise SimulationError(f"scene parameters have no {name!r}")
-        object.__setattr__(self, name, value)
+
+        def __setattr__(self, name: str, value) -> None:
+            if name not in NODE_PARAMETERS and name not in VALUE_PARAMETERS:
+                raise SimulationError(f"scene parameters have no {name!r}")
+            object.__setattr__(self, name, value)
 
 
 #: {role: classes of nodes that can play it}

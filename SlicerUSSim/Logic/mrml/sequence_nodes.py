@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import count, pairwise
 from math import inf, isfinite, nan, ulp
 
 import numpy as np
@@ -74,8 +74,14 @@ class SequenceIndex:
 
 
 def _distinct(texts: Sequence[str]) -> tuple[str, ...]:
-    """The same, but one that was there before has its number behind it."""
-    return tuple(f"{text} ({n})" if text in texts[:n] else text for n, text in enumerate(texts))
+    """The same, but one that was there before has a number behind it that makes it another."""
+    found: list[str] = []
+    for place, text in enumerate(texts):
+        others = {*texts, *found}
+        if text in found:
+            text = next(name for name in (f"{text} ({n})" for n in count(place)) if name not in others)
+        found.append(text)
+    return tuple(found)
 
 
 def _rising(texts: Sequence[str]) -> tuple[str, ...]:

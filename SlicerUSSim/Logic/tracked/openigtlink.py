@@ -59,6 +59,16 @@ def parse_address(text: str) -> Address:
     return Address(host, int(match["port"]), listen=match["theirs"] is None)
 
 
+def require_usable(address: Address) -> None:
+    """Raise SimulationError where a TrackerLink could not be made: without pyigtl, or where nobody can listen."""
+    require(
+        importlib.util.find_spec("pyigtl") is not None,
+        'OpenIGTLink needs pyigtl; install it with: pip install "SlicerUSSim[serve]"',
+    )
+    if address.listen:
+        _listening(address).close()
+
+
 class TrackerLink:
     """One OpenIGTLink connection that is kept up until stop().
 
@@ -82,11 +92,8 @@ class TrackerLink:
         listen: bool = False,
         image_name: str = "SlicerUSSim",
     ) -> None:
-        require(
-            importlib.util.find_spec("pyigtl") is not None,
-            'OpenIGTLink needs pyigtl; install it with: pip install "SlicerUSSim[serve]"',
-        )
         self._address, self._moved = Address(host, port, listen), moved
+        require_usable(self._address)
         self._device, self._image_name = device, image_name
         #: What to tell the user
         self.status = ""
@@ -98,7 +105,7 @@ class TrackerLink:
         self._wake_out, self._wake_in = socket.socketpair()
         self._wake_in.setblocking(False)
         self._stopping = False
-        self._listener = self._listening() if listen else None
+        self._listener = _listening(self._address) if listen else None
         self._thread = threading.Thread(target=self._run, name="OpenIGTLink", daemon=True)
         self._thread.start()
 
@@ -190,13 +197,6 @@ class TrackerLink:
             self._awake()
         return self._listener.accept()[0] if self._listener in readable else None
 
-    def _listening(self) -> socket.socket:
-        try:
-            family = socket.AF_INET6 if ":" in self._address.host else socket.AF_INET
-            return socket.create_server((self._address.host, self._address.port), family=family)
-        except OSError as error:
-            raise SimulationError(f"cannot wait for a tracker at {self._address} ({error}); choose another") from None
-
     @property
     def _peer_name(self) -> str:
         return "the other end" if self._listener is not None else str(self._address)
@@ -216,6 +216,15 @@ class TrackerLink:
         if self._stopping:
             return
         self._awake()
+
+
+def _listening(address: Address) -> socket.socket:
+    """A socket that waits there. Raises SimulationError where that cannot be."""
+    try:
+        family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
+        return socket.create_server((address.host, address.port), family=family)
+    except OSError as error:
+        raise SimulationError(f"cannot wait for a tracker at {address} ({error}); choose another") from None
 
 
 def _exactly(peer: socket.socket, count: int) -> bytes:

@@ -61,7 +61,7 @@ class EchoLevel(Echo):
 
 @dataclass(frozen=True)
 class LevelChange:
-    """Theory: in this region the mean level differs from that of the phantom's `reference` tissues."""
+    """Theory: in this region the mean level differs from that of the phantom's `baseline` tissues."""
 
     name: str
     #: (left, right, top, bottom) in the probe frame
@@ -96,7 +96,7 @@ class Phantom(Generic[Expected]):
     #: What a given probe sees, by theory
     expected: Callable[[Probe], tuple[Expected, ...]]
     #: The same object without the effect it demonstrates, for comparison
-    reference: TissueTable | None = None
+    baseline: TissueTable | None = None
     #: Centre of a sphere
     centre_ras: tuple[float, float, float] | None = None
 
@@ -315,10 +315,10 @@ def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0
         return echoes + levels
 
     table = TissueTable(tissues)
-    reference = table
+    baseline = table
     for number in changes_db:
-        reference = reference.replace(tissues[number].name, mu0=BACKGROUND.mu0, sigma0=BACKGROUND.sigma0)
-    return _phantom("wires and cysts", label, table, rotation, spacing_mm, expected, reference)
+        baseline = baseline.replace(tissues[number].name, mu0=BACKGROUND.mu0, sigma0=BACKGROUND.sigma0)
+    return _phantom("wires and cysts", label, table, rotation, spacing_mm, expected, baseline)
 
 
 def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom[Level]:
@@ -462,12 +462,12 @@ def _phantom(
     rotation: np.ndarray | None,
     spacing_mm: float,
     expected: Callable[[Probe], tuple[Expected, ...]],
-    reference: TissueTable | None = None,
+    baseline: TissueTable | None = None,
     box: _Box | None = None,
 ) -> Phantom[Expected]:
     pose = _pose(rotation)
     labels = _voxelise(label, pose[:3, :3], spacing_mm, box or _Box())
-    return Phantom(name, labels, tissues, pose, expected, reference)
+    return Phantom(name, labels, tissues, pose, expected, baseline)
 
 
 def _pose(rotation: np.ndarray | None) -> np.ndarray:

@@ -42,18 +42,18 @@ def _images(simulator: UltrasoundSimulator, phantom: Phantom, probes: dict[str, 
     return {name: simulator.simulate(probe, phantom.probe_to_ras, _DISPLAY) for name, probe in probes.items()}
 
 
-def _images_and_reference(phantom: Phantom, device) -> tuple[dict[str, Frame], dict[str, Frame]]:
-    """What each probe sees of the phantom, and of its reference."""
-    assert phantom.reference is not None, "of phantoms whose theory is about a change of level or place"
+def _images_and_baseline(phantom: Phantom, device) -> tuple[dict[str, Frame], dict[str, Frame]]:
+    """What each probe sees of the phantom, and of its baseline."""
+    assert phantom.baseline is not None, "of phantoms whose theory is about a change of level or place"
     simulator = _simulator(phantom, device)
     frames = _images(simulator, phantom)
-    simulator.set_tissues(phantom.reference)
+    simulator.set_tissues(phantom.baseline)
     return frames, _images(simulator, phantom)
 
 
-def _level_row(quantity: str, change: LevelChange, probe: Probe, frame: Frame, reference: Frame) -> Row:
-    """How far a region's level is from that of the reference."""
-    seen, plain = (region_level_db(image, probe, change.region_mm) for image in (frame, reference))
+def _level_row(quantity: str, change: LevelChange, probe: Probe, frame: Frame, baseline: Frame) -> Row:
+    """How far a region's level is from that of the baseline."""
+    seen, plain = (region_level_db(image, probe, change.region_mm) for image in (frame, baseline))
     return Row(quantity, "dB", change.change_db, seen - plain, 0.5)
 
 
@@ -62,7 +62,7 @@ def shadow_and_enhancement(rotation: np.ndarray, device) -> Outcome:
     rows, views = [], []
     for kind, attenuation in (("shadow", 1.2), ("enhancement", 0.1)):
         phantom = attenuating_block(attenuation, rotation)
-        frames, plain = _images_and_reference(phantom, device)
+        frames, plain = _images_and_baseline(phantom, device)
         for name, probe in PROBES.items():
             (change,) = phantom.expected(probe)
             rows.append(_level_row(f"level behind, {kind}, {name}", change, probe, frames[name], plain[name]))
@@ -75,7 +75,7 @@ def range_distortion(rotation: np.ndarray, device) -> Outcome:
     rows, views = [], []
     for kind, speed in (("slow", 1450.0), ("fast", 1650.0)):
         phantom = speed_block(speed, rotation)
-        frames, plain = _images_and_reference(phantom, device)
+        frames, plain = _images_and_baseline(phantom, device)
         for name, probe in PROBES.items():
             (wire,) = phantom.expected(probe)
             shown = echo_near(frames[name], probe, wire.shown_mm, _SEARCH_MM)[1]
@@ -167,7 +167,7 @@ def reverberation(rotation: np.ndarray, device) -> Outcome:
 def wires_cysts_and_contrast(rotation: np.ndarray, device) -> Outcome:
     """A quality-assurance phantom: places of wires, levels of cysts and contrast targets."""
     phantom = wires_and_cysts(rotation)
-    frames, plain = _images_and_reference(phantom, device)
+    frames, plain = _images_and_baseline(phantom, device)
     placed = _displacements(phantom, frames, "convex")
     rows = list(placed.rows)
     for name, probe in PROBES.items():

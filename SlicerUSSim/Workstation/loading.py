@@ -1,4 +1,4 @@
-"""Patient: MRI, labels and sequence that the workstation is about: taken from files, segmented, put under the probe."""
+"""Loading: MRI, labels and sequence that the workstation is about: taken from files, segmented, put under the probe."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 
 
-class Patient:
+class Loading:
     """Lets another patient, or more of the same one, take the place of what there was. All methods run in a task."""
 
     def __init__(
