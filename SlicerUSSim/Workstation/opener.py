@@ -43,7 +43,7 @@ class Files:
     #: From pixels to where the patient lies, and from there to the MRI; see TrackedImages.of
     transform: str = "ImageToReference"
     to_ras: np.ndarray | None = None
-    #: OpenIGTLink, as tracking.parse_address reads it, and the transform to follow
+    #: OpenIGTLink, as openigtlink.parse_address reads it, and the transform to follow
     tracker: str | None = None
     tracker_device: str | None = None
     #: What has been read of these files already

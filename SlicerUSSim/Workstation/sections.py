@@ -43,7 +43,7 @@ class Control:
     label: str
     text: str
     tip: str
-    #: What it shows: a field of the preset (fields.FIELDS), a value or a node of the scene (scene_parameters), or ""
+    #: What it shows: a field of the preset (fields.FIELDS), a value or a node of the scene (mrml.parameter_node), or ""
     field: str
     value: str
     node: str

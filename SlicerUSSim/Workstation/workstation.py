@@ -43,7 +43,7 @@ class Workstation:
     Parameters
     ----------
     files : what to begin with.
-    device : see device.choose_device.
+    device : see opencl.devices.choose_device.
     """
 
     def __init__(self, files: Files, device: str | None = None) -> None:
