@@ -95,12 +95,12 @@ def dragged(page: Page, x: float, y: float, seconds: float) -> dict[str, float]:
     images = _move(page, x, y, seconds)
     _set(page, NAMES.show_latency, True)
     page.wait_for_function("window.ussim.measuring")
+    _rest(page)
+    page.evaluate("window.ussim.measured.length = 0")  # of images that still bore the stamp of an earlier drag
     _move(page, x, y, seconds)
     times = page.evaluate("window.ussim.measured")
     page.mouse.up()
     _set(page, NAMES.show_latency, False)
-    page.wait_for_function("!window.ussim.measuring")
-    page.evaluate("window.ussim.measured.length = 0")
     if len(times) < 5:
         raise SystemExit(f"benchmarks/dragging.py: only {len(times)} images came of dragging at {x:.0f}, {y:.0f}")
     return {
