@@ -11,8 +11,8 @@ from a face is taken to import the module that defines it.
 from __future__ import annotations
 
 import ast
-import re
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -24,8 +24,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "SlicerUSSim"
-#: The rooms in the order of docs/architecture.md's table, each of which knows those before it; the module file is no room
-#: there, and knows all but the workstation and the command.
+#: The rooms in the order of the table in docs/architecture.md, each of which knows those before it. The file of the module
+#: is no room there, and knows all but the workstation and the command.
 _TABLE = re.findall(r"^\| \[(\w+)\]", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"), re.MULTILINE)
 ORDER = [room for entry in _TABLE for room in (["module", entry] if entry == "Workstation" else [entry])]
 #: Libraries that take long to import, and the rooms whose files may do so at their top. Elsewhere it is left to the

@@ -231,6 +231,8 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
         (["--calibration", "nowhere.xml"], "nowhere.xml: cannot be read"),
         (["--to-mri", "nowhere.tag"], "nowhere.tag: no such file"),
         (["--save-transform", "there.json"], "--save-transform needs --register"),
+        (["--register", "--save-transform", "there.tfm"], "there.tfm, expected a name ending in .json"),
+        (["--state", "result.json"], "is given for 2 outputs, expected a file for each"),
         (["--report", "/nowhere/report.html"], "the folder /nowhere does not exist"),
         (["--state", "probe.json"], "is not one of an optimisation"),
     ],

@@ -46,7 +46,10 @@ def scene(membrane: bool = True):
 
 
 @pytest.mark.parametrize("kind", PROBES)
-@pytest.mark.parametrize("turn", [np.eye(3), [[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]]])
+@pytest.mark.parametrize(
+    "turn",
+    [np.eye(3), pytest.param([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]], marks=pytest.mark.slow)],
+)
 def test_the_kernels_draw_what_numpy_draws(kind, turn):
     labels, tissues = scene()
     simulator = UltrasoundSimulator(labels, tissues)

@@ -127,7 +127,12 @@ def test_simulator_is_left_as_it_was(twin, result):
 
 
 @pytest.mark.parametrize(
-    "algorithms", [("GN_DIRECT_L", "LN_SBPLX"), ("GN_CRS2_LM", "LN_NELDERMEAD"), (None, "LN_COBYLA")]
+    "algorithms",
+    [
+        pytest.param(("GN_DIRECT_L", "LN_SBPLX"), marks=pytest.mark.slow),
+        pytest.param(("GN_CRS2_LM", "LN_NELDERMEAD"), marks=pytest.mark.slow),
+        (None, "LN_COBYLA"),
+    ],
 )
 def test_other_algorithms_find_it_too(twin, result, algorithms):
     other = optimise(twin, ["display", "white matter"], max_evaluations=300, algorithms=algorithms)

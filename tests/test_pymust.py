@@ -222,6 +222,7 @@ def test_focused_speckle_has_the_same_correlation_lengths(scatterers, depth, lat
     assert ours[1] == pytest.approx(theirs[1], rel=0.15)
 
 
+@pytest.mark.slow
 def test_attenuation_lowers_the_level_of_speckle_by_as_much(scatterers):
     """From the near to the middle and the far window, within 1 dB."""
     delays, lateral = np.zeros((1, 128)), np.arange(-6, 6.01, 0.2)

@@ -853,6 +853,7 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
         (["missing.nii.gz"], "missing.nii.gz: no such file"),
         (["{broken}"], "broken.nii.gz: cannot be read"),
         (["--igtl", "nowhere"], "--igtl is 'nowhere', expected HOST:PORT"),
+        (["--igtl", "listen:203.0.113.7:18944"], "cannot wait for a tracker at 203.0.113.7:18944"),
         (["--sequence", "{broken}"], "broken.nii.gz"),
         (["--host", "203.0.113.7"], "cannot listen at 203.0.113.7"),
         (["--device", "no such device"], "no such device"),

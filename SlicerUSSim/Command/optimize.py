@@ -71,7 +71,8 @@ def optimize(
     places = [place for place in (out, report, save_preset, save_transform, state) if place]
     for place in places:
         require_place(place)
-        require(places.count(place) == 1, f"{place}: is given for two outputs, expected a file for each")
+        same = [other for other in places if other.resolve() == place.resolve()]
+        require(len(same) == 1, f"{place}: is given for {len(same)} outputs, expected a file for each")
     if save_transform:
         is_json = save_transform.suffix.lower() == ".json"
         require(is_json, f"--save-transform is {save_transform}, expected a name ending in .json")
