@@ -24,8 +24,9 @@ def _feed(digest, value: object) -> None:
     if value is None or isinstance(value, str):
         _feed_bytes(digest, type(value).__name__, repr(value).encode())
     elif isinstance(value, bool | int | float | np.generic):
-        _feed_bytes(digest, "number", repr(float(value)).encode())  # 1 and 1.0 are equal
-    elif isinstance(value, np.ndarray):
+        whole = float(value).is_integer()  # 1 and 1.0 are equal, and 2**53 and 2**53 + 1 are not
+        _feed_bytes(digest, "number", repr(int(value) if whole else float(value)).encode())
+    elif isinstance(value, np.ndarray) and not value.dtype.hasobject:
         _feed_bytes(digest, f"array {value.dtype.str} {value.shape}", np.ascontiguousarray(value).data)
     elif isinstance(value, Mapping):
         _feed(digest, [*value.items()])
