@@ -154,7 +154,7 @@ def test_images_of_a_sweep_have_noise_by_their_number(folder, tmp_path):
     assert np.array_equal(last, images[2]) and not np.array_equal(images[1], images[2])
 
 
-@pytest.mark.parametrize("has_given_map", [False, True])
+@pytest.mark.parametrize("has_given_map", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tmp_path, monkeypatch, has_given_map):
     fits = []
     monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration

@@ -69,7 +69,7 @@ def test_the_kernels_draw_what_numpy_draws(kind, turn):
     "settings",
     [
         SimulationSettings(scattering=False, reflection_spreading=False),
-        SimulationSettings(interfaces=False, seed=7, scatterers_per_mm3=10),
+        pytest.param(SimulationSettings(interfaces=False, seed=7, scatterers_per_mm3=10), marks=pytest.mark.slow),
         SimulationSettings(interface_reflection="energy", max_ray_depth=2, reference_speed_m_s=1480),
     ],
 )

@@ -95,7 +95,7 @@ def test_net_fall_with_depth_and_relative_echogenicity_are_recovered(twin, resul
     assert variance_db(found) == pytest.approx(variance_db(true), abs=1.5)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_attenuation_and_echogenicity_are_recovered_when_the_display_is_known(brain, seed):
     twin = make_twin(*brain, seed, probe=SMALL, display_is_known=True)
     result = optimise(twin, ["white matter"])

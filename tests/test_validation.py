@@ -20,12 +20,20 @@ from SlicerUSSim.Logic.verification.measurement import echo_near, fit_rayleigh, 
 from SlicerUSSim.Logic.verification.phantoms import Echo
 from SlicerUSSim.Logic.verification.validation import ORIENTATIONS, PROBES, Outcome, Row, all_checks, run, validate
 
-CASES = [(check, orientation) for check in all_checks() for orientation in check.orientations]
+#: All of them; of the two oblique orientations the suite takes one, and the slow tests the other.
+CASES = [
+    pytest.param(
+        check,
+        orientation,
+        id=f"{check.name}-{orientation}",
+        marks=[pytest.mark.slow] if orientation == "diagonal" and "oblique" in check.orientations else [],
+    )
+    for check in all_checks()
+    for orientation in check.orientations
+]
 
 
-@pytest.mark.parametrize(
-    ("check", "orientation"), CASES, ids=[f"{check.name}-{orientation}" for check, orientation in CASES]
-)
+@pytest.mark.parametrize(("check", "orientation"), CASES)
 def test_theory_and_simulation_agree(check, orientation):
     outcome = check.measure(ORIENTATIONS[orientation], None)
     assert outcome.rows
