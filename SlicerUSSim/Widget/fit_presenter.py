@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Protocol
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.parameters import FreeParameters, all_names
 from SlicerUSSim.Logic.fitting.search import Progress
@@ -139,7 +139,7 @@ class FitPresenter:
         """Take the result into the preset; what registration found becomes a transform to put above the tracking."""
         panel = self._panel
         with panel.shown():
-            found, labels = self._required("nothing to apply, fit first")
+            found, labels = required(self._fit, "nothing to apply, fit first")
             before = panel.logic.applyFit(found)
             if found.registration is not None:
                 transform = node_called(self._panel.logic.scene, "LinearTransform", _REGISTRATION)
@@ -150,9 +150,8 @@ class FitPresenter:
     def revert(self) -> None:
         """Back to what was before Apply."""
         with self._panel.shown():
-            if self._before is None:
-                raise SimulationError("nothing to revert to, apply a fit first")
-            self._panel.logic.preset, self._before = self._before, None
+            self._panel.logic.preset = required(self._before, "nothing to revert to, apply a fit first")
+            self._before = None
         self._panel.view.refresh()
 
     # ---- compare -----------------------------------------------------------------------------------------------
@@ -164,7 +163,7 @@ class FitPresenter:
     def compare(self, kind: str, number: int) -> None:
         """Show one image of the fit in the slice view: one of scene_fit.COMPARED."""
         with self._panel.shown():
-            self._required("nothing to show, fit first")
+            required(self._fit, "nothing to show, fit first")
             require(kind in COMPARED, f"nothing is called {kind!r}, expected one of {', '.join(COMPARED)}")
             self._show(kind, number)
 
@@ -176,7 +175,7 @@ class FitPresenter:
             composite.SetForegroundOpacity(0.0 if composite.GetForegroundOpacity() > 0.5 else 1.0)
 
     def _show(self, kind: str, number: int) -> None:
-        found, labels = self._required("nothing to show, fit first")
+        found, labels = required(self._fit, "nothing to show, fit first")
         logic = self._panel.logic
         require_node(labels, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map of the fit")
         nodes = {name: node_called(self._panel.logic.scene, "ScalarVolume", f"Fit: {name}") for name in COMPARED}
@@ -184,12 +183,6 @@ class FitPresenter:
         view = self._panel.view.sliceNode()
         if view is not None:
             logic.showFitInSlice(view, found, labels, nodes[kind], nodes["real"], number)
-
-    def _required(self, message: str) -> tuple[Fit, object]:
-        """The last fit and the labels it is of. Raises SimulationError(message) if there is none."""
-        if self._fit is None:
-            raise SimulationError(message)
-        return self._fit
 
     @property
     def _parameters(self) -> SceneParameters:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
 
-from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, user_message
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
@@ -266,9 +266,10 @@ class PanelPresenter:
     def _change_tissue(self, name: str, change: Callable[[Tissue], Tissue]) -> None:
         """Change a tissue of the table in use; one that the preset did not have is added to it."""
         preset, used = self._preset(), self.tissueTable()
-        old = next((tissue for tissue in used.all_tissues() if same_name(tissue.name, name)), None)
-        if old is None:
-            raise SimulationError(f"no tissue is called {name!r}, expected one of {', '.join(used.names())}")
+        old = required(
+            next((tissue for tissue in used.all_tissues() if same_name(tissue.name, name)), None),
+            f"no tissue is called {name!r}, expected one of {', '.join(used.names())}",
+        )
         self.logic.preset = replace(preset, tissues=preset.tissues.with_tissue(change(old)))
 
     def _nodes(self):

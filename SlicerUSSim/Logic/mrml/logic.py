@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, collected_warnings, require, warn_again
+from SlicerUSSim.Logic.base.errors import SimulationError, collected_warnings, require, required, warn_again
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
@@ -181,9 +181,7 @@ class UltrasoundSceneLogic:
 
         Raises SimulationError if there is none.
         """
-        if self._last is None:
-            raise SimulationError("there is no image yet, simulate one first")
-        frame, probe_to_world = self._last
+        frame, probe_to_world = required(self._last, "there is no image yet, simulate one first")
         return Volume(frame.image[None], probe_to_world @ frame.grid.slice_to_probe)
 
     def simulateSequence(
@@ -329,10 +327,9 @@ class UltrasoundSceneLogic:
     def writeRegistration(self, found: Fit, labels_node, transform_node) -> None:
         """Put what registration moved the ultrasound by into a linear transform: the last parent of its tracking."""
         require_node(transform_node, "vtkMRMLLinearTransformNode", use="registration")
-        if found.registration is None:
-            raise SimulationError("the fit was made without registration")
+        registration = required(found.registration, "the fit was made without registration")
         to_world = self._fit_to_world(labels_node)
-        set_node_to_world(transform_node, to_world @ found.registration.correction @ np.linalg.inv(to_world))
+        set_node_to_world(transform_node, to_world @ registration.correction @ np.linalg.inv(to_world))
 
     def showFit(self, found: Fit, labels_node, nodes: Mapping[str, object], number: int | None = None) -> None:
         """Put one image of a fit, the first by default, into volume nodes: {"real": ..., "before": ..., "after": ...,

@@ -61,10 +61,7 @@ def parse_address(text: str) -> Address:
 
 def require_usable(address: Address) -> None:
     """Raise SimulationError where a TrackerLink could not be made: without pyigtl, or where nobody can listen."""
-    require(
-        importlib.util.find_spec("pyigtl") is not None,
-        'OpenIGTLink needs pyigtl; install it with: pip install "SlicerUSSim[serve]"',
-    )
+    _require_pyigtl()
     if address.listen:
         _listening(address).close()
 
@@ -93,7 +90,7 @@ class TrackerLink:
         image_name: str = "SlicerUSSim",
     ) -> None:
         self._address, self._moved = Address(host, port, listen), moved
-        require_usable(self._address)
+        _require_pyigtl()
         self._device, self._image_name = device, image_name
         #: What to tell the user
         self.status = ""
@@ -216,6 +213,13 @@ class TrackerLink:
         if self._stopping:
             return
         self._awake()
+
+
+def _require_pyigtl() -> None:
+    require(
+        importlib.util.find_spec("pyigtl") is not None,
+        'OpenIGTLink needs pyigtl; install it with: pip install "SlicerUSSim[serve]"',
+    )
 
 
 def _listening(address: Address) -> socket.socket:
