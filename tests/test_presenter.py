@@ -82,7 +82,7 @@ def test_from_mri_to_live_image(presenter):
 @pytest.mark.parametrize(
     ("act", "message"),
     [
-        (lambda p: p.setValue("display.gain_db", 1000.0), "display: DisplaySettings: gain_db is 1000.0"),
+        (lambda p: p.setValue("display.gain_db", 1000.0), "display: gain_db is 1000.0"),
         (lambda p: p.chooseProbe("loud"), "no probe is called 'loud', expected one of phased"),
         (lambda p: p.setTissue("csf", "mu0", "nan"), "tissue 'csf': mu0 is 'nan', expected a number"),
         (lambda p: p.setTissue("bone marrow", "mu0", "1"), "no tissue is called 'bone marrow'"),

@@ -44,10 +44,10 @@ def test_changing_the_kind_of_probe_keeps_what_both_have():
         ({"probes": {}}, "has 'probes', expected probe, display"),
         ({"display": {"gain": 3}}, "display: 'gain' is unknown, expected one of gain_db"),
         ({"display": {"gain_db": "loud"}}, "gain_db is 'loud', expected a number between -200 and 200"),
-        ({"display": {"image_size": 5}}, "display: a value has the wrong type"),
+        ({"display": {"image_size": 5}}, "display: image_size is 5, expected 2 whole numbers between 8 and 8192"),
         ({"settings": []}, "settings: is a list, expected an object"),
         ({"probe": {"kind": "sector"}}, "probe: kind is 'sector'"),
-        ({"tissues": {"1": {"name": "x"}}}, "not a tissue table"),
+        ({"tissues": {"1": {"name": "x"}}}, "tissue 1: lacks speed_of_sound_m_s, impedance_mrayl, attenuation_db_cm_mhz"),
         ([], "is a list, expected an object"),
     ],
 )

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+_DEEPEST_NESTING = 16
 
 
 def require_place(path: Path) -> None:
@@ -52,14 +55,46 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
         os.rmdir(folder)
 
 
-def read_json(path: str | os.PathLike):
-    """The content of a JSON file. Raises SimulationError naming the file."""
+def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):
+    """The content of a JSON file.
+
+    Raises SimulationError naming the file: where it cannot be read, is larger than `most_bytes` or nested deeper than
+    anything of ours, and where JSON leaves open what is meant: a name given twice, NaN and infinities.
+    """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        size = Path(path).stat().st_size
+        require(size <= most_bytes, f"{path}: has {size} bytes, expected at most {most_bytes}")
+        text = Path(path).read_text(encoding="utf-8")
+        _check_nesting(path, text)
+        return json.loads(text, object_pairs_hook=_distinct, parse_constant=_refused)
     except OSError as error:
         raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SimulationError(f"{path}: is not JSON ({error})") from None
+
+
+def _check_nesting(path: str | os.PathLike, text: str) -> None:
+    depth = 0
+    for bracket in re.finditer(r'"(?:[^"\\]|\\.)*"|[\[{]|[\]}]', text):
+        if bracket[0] in ("[", "{"):
+            depth += 1
+            require(depth <= _DEEPEST_NESTING, f"{path}: is nested deeper than {_DEEPEST_NESTING} levels")
+        elif bracket[0] in ("]", "}"):
+            depth -= 1
+
+
+def _distinct(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    """The object of these pairs, in which every name stands once."""
+    found: dict[str, object] = {}
+    for name, value in pairs:
+        if name in found:
+            raise ValueError(f"{name!r} is given twice")
+        found[name] = value
+    return found
+
+
+def _refused(constant: str) -> float:
+    raise ValueError(f"{constant} is no number")
 
 
 def write_json(path: str | os.PathLike, values) -> None:

@@ -23,14 +23,6 @@ State: TypeAlias = tuple[TissueTable, DisplaySettings]
 #: (parameters,) between 0 and 1 within the bounds
 Units: TypeAlias = "Sequence[float] | np.ndarray"
 
-#: Half the spread within which a parameter counts as determined.
-_TOLERANCES = {
-    "attenuation_db_cm_mhz": 0.1, "mu0": 0.05, "mu1": 0.1, "sigma0": 0.05, "gain_db": 1.5, "dynamic_range_db": 3.0,
-    "tgc_db_cm_mhz": 0.1, "noise_db": 3.0,
-}  # fmt: skip
-_UNITS = {"attenuation_db_cm_mhz": "dB/(cm MHz)", "tgc_db_cm_mhz": "dB/(cm MHz)", "gain_db": "dB", "noise_db": "dB",
-          "dynamic_range_db": "dB"}  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Quantity:
@@ -172,8 +164,7 @@ def variance_db(tissue: Tissue) -> float:
 def quantities_of(parameters: FreeParameters, frequency_mhz: float, tissues: TissueTable) -> list[Quantity]:
     """The free parameters, and combinations of them that images can tell (docs/optimization.md#what-can-be-known)."""
     quantities = [
-        Quantity(p.name, _UNITS.get(p.attribute, ""), _TOLERANCES[p.attribute], _reader(p.tissue, p.attribute))
-        for p in parameters
+        Quantity(p.name, p.declaration.unit, p.fit.tolerance, _reader(p.tissue, p.attribute)) for p in parameters
     ]
     varied = parameters.varied()
     brightened = [name for name, names in varied.items() if names & SCATTERING]

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import require, require_between
+from SlicerUSSim.Logic.base.declaration import Declared, parameter
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 
@@ -34,25 +35,21 @@ class Similarity:
 
 
 @dataclass(frozen=True)
-class SimilaritySettings:
+class SimilaritySettings(Declared):
     """What is compared with what."""
 
-    #: Side of the square patches; larger than the image compares it as a whole
-    patch_mm: float = 5.0
-    #: Of the histograms
-    bins: int = 32
-    #: lambda, the weight of the absolute difference
-    sad_weight: float = 1.0
-    #: The weight of the histograms: 1 is the paper, 0 leaves the absolute difference alone
-    histogram_weight: float = 1.0
-
-    def __post_init__(self) -> None:
-        owner = "SimilaritySettings"
-        require_between(owner, "patch_mm", self.patch_mm, 0.01, 1e6)
-        require_between(owner, "bins", self.bins, 2, CONSTANTS["MAX_BINS"])
-        require(int(self.bins) == self.bins, f"{owner}: bins is {self.bins!r}, expected a whole number")
-        require_between(owner, "sad_weight", self.sad_weight, 0, 1e3)
-        require_between(owner, "histogram_weight", self.histogram_weight, 0, 1e3)
+    patch_mm: float = parameter(
+        5.0, "Patches", "Side of the square patches; larger than the image compares it as a whole", unit="mm",
+        bounds=(0.01, 1e6),
+    )  # fmt: skip
+    bins: int = parameter(32, "Bins", "Bins of the histograms", bounds=(2, CONSTANTS["MAX_BINS"]))
+    sad_weight: float = parameter(
+        1.0, "Weight of the difference", "Weight of the absolute difference", symbol="λ", bounds=(0, 1e3)
+    )
+    histogram_weight: float = parameter(
+        1.0, "Weight of the histograms", "Weight of the histograms; 0 leaves the absolute difference alone",
+        bounds=(0, 1e3), source="1 is the paper",
+    )  # fmt: skip
 
     def patch_pixels(self, shape: tuple[int, int], pixel_spacing_mm: tuple[float, float]) -> tuple[int, int]:
         """(rows, columns) of a patch in an image of `shape` (rows, columns); `pixel_spacing_mm` is (column, row)."""

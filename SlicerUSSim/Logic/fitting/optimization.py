@@ -36,6 +36,7 @@ from SlicerUSSim.Logic.fitting.search import (
     Search,
     history_from,
 )
+from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
 from SlicerUSSim.Logic.imaging.medium import as_labels
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -155,8 +156,8 @@ def optimize_appearance(
     display: DisplaySettings | None = None,
     grid: ImageGrid | None = None,
     masks: Sequence[np.ndarray] | None = None,
-    max_evaluations: int = 600,
-    restarts: int = 2,
+    max_evaluations: int = FitSettings.evaluations,
+    restarts: int = FitSettings.restarts,
     seed: int = 0,
     settings: SimilaritySettings | None = None,
     algorithms: tuple[str | None, str] = (GLOBAL_ALGORITHM, LOCAL_ALGORITHM),

@@ -9,35 +9,27 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from math import exp, log
+from typing import cast
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.declaration import Fit, Parameter as Declaration, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.tissue.names import same_name
 from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 Bounds = tuple[float, float]
 
-#: What a scanner's console reaches. Noise is in dB re tissue of unit scatterer variance.
-DISPLAY_BOUNDS: dict[str, Bounds] = {
-    "gain_db": (-30.0, 30.0),
-    "dynamic_range_db": (30.0, 90.0),
-    "tgc_db_cm_mhz": (0.0, 1.2),
-    "noise_db": (-120.0, -30.0),
-}
-#: What soft tissue reaches: attenuation from blood to tendon (Duck 1990); echogenicity over some 40 dB.
-TISSUE_BOUNDS: dict[str, Bounds] = {
-    "attenuation_db_cm_mhz": (0.1, 1.2),
-    "mu0": (0.02, 1.5),
-    "mu1": (-1.0, 1.5),
-    "sigma0": (0.02, 1.0),
-}
+#: Declarations of what can be fitted, by name: of the display and of a tissue.
+DISPLAY_PARAMETERS = {entry.name: entry for entry in parameters_of(DisplaySettings) if entry.fit is not None}
+TISSUE_PARAMETERS = {entry.name: entry for entry in parameters_of(Tissue) if entry.fit is not None}
+#: Default bounds of those.
+DISPLAY_BOUNDS: dict[str, Bounds] = {name: (e.fit.low, e.fit.high) for name, e in DISPLAY_PARAMETERS.items() if e.fit}
+TISSUE_BOUNDS: dict[str, Bounds] = {name: (e.fit.low, e.fit.high) for name, e in TISSUE_PARAMETERS.items() if e.fit}
 #: Those of them that make a tissue's scatterers.
 SCATTERING = frozenset(("mu0", "mu1", "sigma0"))
-#: Echo amplitudes are compared by their ratios.
-_LOGARITHMIC = ("mu0", "sigma0")
-_NO_NOISE_DB = -120.0
 
 
 @dataclass(frozen=True)
@@ -66,8 +58,18 @@ class Parameter:
         return self.name.rpartition(".")[2]
 
     @property
+    def declaration(self) -> Declaration:
+        """What is known of it, whatever its bounds are here."""
+        return (TISSUE_PARAMETERS if self.tissue else DISPLAY_PARAMETERS)[self.attribute]
+
+    @property
+    def fit(self) -> Fit:
+        """How it is searched, and when it counts as determined."""
+        return cast(Fit, self.declaration.fit)
+
+    @property
     def _is_logarithmic(self) -> bool:
-        return self.attribute in _LOGARITHMIC and self.low > 0.0
+        return self.fit.is_logarithmic and self.low > 0.0
 
     def value(self, unit: float) -> float:
         """The value at `unit` between 0 (low) and 1 (high)."""
@@ -132,7 +134,8 @@ class FreeParameters(tuple):
         """(parameters,) values that tissues and display have now."""
         known = {tissue.name: tissue for tissue in tissues.all_tissues()}
         values = [getattr(known[p.tissue] if p.tissue else display, p.attribute) for p in self]
-        return np.array([_NO_NOISE_DB if value is None else value for value in values], float)
+        # No value at all, as no noise, is the lowest.
+        return np.array([p.fit.low if value is None else value for p, value in zip(self, values, strict=True)], float)
 
     def apply(
         self, units: np.ndarray, tissues: TissueTable, display: DisplaySettings

@@ -14,6 +14,7 @@ from SlicerUSSim.Logic.fitting.optimization import AppearanceResult, optimize_ap
 from SlicerUSSim.Logic.fitting.parameters import Bounds
 from SlicerUSSim.Logic.fitting.registration import Registration, register_poses
 from SlicerUSSim.Logic.fitting.search import Progress
+from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
@@ -51,8 +52,8 @@ def fit(
     free: Iterable[str] | Mapping[str, Bounds | None],
     display: DisplaySettings | None = None,
     register: bool = False,
-    max_evaluations: int = 500,
-    restarts: int = 2,
+    max_evaluations: int = FitSettings.evaluations,
+    restarts: int = FitSettings.restarts,
     seed: int = 0,
     settings: SimilaritySettings | None = None,
     progress: Callable[[Progress], None] | None = None,

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.declaration import Parameter, built, parameters_of
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.probe.arrays import PROBES, Probe, probe_from_dict
+from SlicerUSSim.Logic.probe.arrays import PROBE_KIND, PROBE_KINDS, PROBES, Probe, probe_from_dict
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
+#: {name: class} of the sections of a preset that are one dataclass each.
+SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
+    "display": DisplaySettings,
+    "settings": SimulationSettings,
+}
 #: What segment_mri labels with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
@@ -32,21 +39,18 @@ class Preset:
         the depth.
         Raises SimulationError for an unknown section or name and for a value out of range.
         """
-        require(
-            section in ("probe", "display", "settings"),
-            f"preset has no section {section!r}, expected probe, display or settings",
-        )
+        _check_section(section)
         if section == "probe":
             return replace(self, probe=_changed_probe(self.probe, values))
-        old = getattr(self, section)
-        return replace(self, **{section: _from_dict(type(old), {**asdict(old), **values}, section)})
+        old = asdict(getattr(self, section))
+        changed: dict[str, Any] = {section: built(SECTIONS[section], {**old, **values}, section)}
+        return replace(self, **changed)
 
     def to_dict(self) -> dict:
         """Plain values; from_dict reads them back."""
         return {
             "probe": self.probe.to_dict(),
-            "display": asdict(self.display),
-            "settings": asdict(self.settings),
+            **{name: asdict(getattr(self, name)) for name in SECTIONS},
             **self.tissues.to_dict(),
         }
 
@@ -56,17 +60,17 @@ class Preset:
 
         Raises SimulationError naming `source` and what is wrong in it.
         """
-        known = ("probe", "display", "settings", "tissues", "membrane")
+        known = ("probe", *SECTIONS, "tissues", "membrane")
         require(isinstance(values, dict), f"{source}: is a {type(values).__name__}, expected an object")
         for name in values:
             require(name in known, f"{source}: has {name!r}, expected {', '.join(known)}")
-        sections = {}
+        sections: dict[str, Any] = {}
         if "probe" in values:
             sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")
-        for name, kind in (("display", DisplaySettings), ("settings", SimulationSettings)):
+        for name, kind in SECTIONS.items():
             if name in values:
-                sections[name] = _from_dict(kind, values[name], f"{source}: {name}")
-        if "tissues" in values:
+                sections[name] = built(kind, values[name], f"{source}: {name}")
+        if "tissues" in values or "membrane" in values:
             sections["tissues"] = TissueTable.from_dict(values, source)
         return cls(**sections)
 
@@ -80,17 +84,20 @@ class Preset:
         write_json(path, self.to_dict())
 
 
-def _from_dict(kind: type, values: dict, source: str):
-    require(isinstance(values, dict), f"{source}: is a {type(values).__name__}, expected an object")
-    known = [entry.name for entry in fields(kind)]
-    for name in values:
-        require(name in known, f"{source}: {name!r} is unknown, expected one of {', '.join(known)}")
-    try:
-        return kind(**values)
-    except SimulationError as error:
-        raise SimulationError(f"{source}: {error}") from None
-    except (TypeError, ValueError) as error:
-        raise SimulationError(f"{source}: a value has the wrong type ({error})") from None
+def preset_parameters() -> dict[str, Parameter]:
+    """{"section.name": Parameter} of all in probe, display and settings; the probe's are those of every kind."""
+    found = {"probe.kind": PROBE_KIND}
+    for kind in PROBE_KINDS.values():
+        found |= {f"probe.{entry.name}": entry for entry in parameters_of(kind)}
+    for section, owner in SECTIONS.items():
+        found |= {f"{section}.{entry.name}": entry for entry in parameters_of(owner)}
+    return found
+
+
+def _check_section(section: str) -> None:
+    require(
+        section in ("probe", *SECTIONS), f"preset has no section {section!r}, expected probe, {' or '.join(SECTIONS)}"
+    )
 
 
 def _changed_probe(probe: Probe, values: dict) -> Probe:
@@ -100,7 +107,7 @@ def _changed_probe(probe: Probe, values: dict) -> Probe:
         old |= {name: None for name in ("focus_mm", "elevation_focus_mm") if old[name] == default}
     kind = values.get("kind", old["kind"])
     if kind != old["kind"]:
-        require(kind in PROBES, f"probe: kind is {kind!r}, expected linear, convex or phased")
+        PROBE_KIND.checked("probe", kind)
         needed = PROBES[kind].to_dict()
         old = {name: old.get(name, value) for name, value in needed.items()}
     return probe_from_dict({**old, **values}, "probe")

@@ -10,10 +10,11 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import require, require_between
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.filtering import guided_filter
 from SlicerUSSim.Logic.mri.mixture import classify, fit_mixture, mixture_posteriors
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
 
@@ -84,12 +85,12 @@ class Segmentation:
 def segment_mri(
     mri: Volume,
     *,
-    classes: int = 3,
-    contrast: str = "t1",
+    classes: int = SegmentationSettings.classes,
+    contrast: str = SegmentationSettings.contrast,
     mask: Volume | None = None,
-    filter_radius: int = 1,
-    filter_epsilon: float | None = None,
-    bias_correction: bool = False,
+    filter_radius: int = SegmentationSettings.filter_radius,
+    filter_epsilon: float | None = SegmentationSettings.filter_epsilon,
+    bias_correction: bool = SegmentationSettings.bias_correction,
     thin_sulci: bool = False,
     device: DeviceChoice = None,
     progress: Callable[[float], None] | None = None,
@@ -113,10 +114,8 @@ def segment_mri(
     constant, and a mask that does not fit or is empty.
     """
     report = progress or (lambda share: None)
-    names = _class_names(contrast, classes)
-    require_between("segment_mri", "filter_radius", filter_radius, 0, 64)
-    if filter_epsilon is not None:
-        require_between("segment_mri", "filter_epsilon", filter_epsilon, 0, float("inf"))
+    settings = SegmentationSettings(contrast, classes, thin_sulci, bias_correction, filter_radius, filter_epsilon)
+    names = _class_names(settings.contrast, settings.classes)
     intensity = _finite(mri)
     foreground = _foreground(intensity) if mask is None else _given_mask(mask, mri)
     report(0.2)
@@ -125,8 +124,8 @@ def segment_mri(
         report(0.6)
 
     noise = estimate_noise(intensity, foreground)
-    epsilon = (_EPSILON_PER_NOISE * noise) ** 2 if filter_epsilon is None else float(filter_epsilon)
-    filtered = guided_filter(intensity, foreground, int(filter_radius), epsilon, device)
+    epsilon = (_EPSILON_PER_NOISE * noise) ** 2 if settings.filter_epsilon is None else settings.filter_epsilon
+    filtered = guided_filter(intensity, foreground, settings.filter_radius, epsilon, device)
     report(0.8)
 
     values = filtered[foreground]
@@ -205,7 +204,6 @@ def _sulcal_middles(
 
 
 def _class_names(contrast: str, classes: int) -> tuple[str, ...]:
-    require(contrast in _CLASS_NAMES, f"contrast is {contrast!r}, expected one of {', '.join(_CLASS_NAMES)}")
     known = _CLASS_NAMES[contrast]
     require(
         classes in known, f"classes is {classes!r}, expected {' or '.join(map(str, known))} for contrast {contrast}"

@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.fitting.search import Progress
+from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
@@ -22,6 +23,7 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot, tracked_images, write_compared
 from SlicerUSSim.Logic.mrml.label_nodes import (
     LABEL_CLASSES,
@@ -125,11 +127,11 @@ class UltrasoundSceneLogic:
         labels_node,
         *,
         mask_node=None,
-        classes: int = 3,
-        contrast: str = "t1",
-        filter_radius: int = 1,
-        bias_correction: bool = False,
-        thin_sulci: bool = True,
+        classes: int = SegmentationSettings.classes,
+        contrast: str = SegmentationSettings.contrast,
+        filter_radius: int = SegmentationSettings.filter_radius,
+        bias_correction: bool = SegmentationSettings.bias_correction,
+        thin_sulci: bool = SegmentationSettings.thin_sulci,
         progress: Callable[[float], None] | None = None,
     ) -> Segmentation:
         """Label the tissues of a scalar volume into a label map or segmentation node, with names and colours.
@@ -272,8 +274,8 @@ class UltrasoundSceneLogic:
         free: Iterable[str] | Mapping[str, tuple[float, float] | None] = ("display", "white matter"),
         register: bool = False,
         estimate_geometry: bool = False,
-        max_evaluations: int = 500,
-        restarts: int = 2,
+        max_evaluations: int = FitSettings.evaluations,
+        restarts: int = FitSettings.restarts,
         plot: CostPlot | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> Fit:

@@ -6,12 +6,13 @@ Probe frame (millimetres): origin at the centre of the probe face, +x lateral (l
 
 from __future__ import annotations
 
-from dataclasses import MISSING, asdict, dataclass, fields
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between
+from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, built, parameter, parameters_of
+from SlicerUSSim.Logic.base.errors import require
 
 NOMINAL_SPEED_M_S = 1540.0
 #: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
@@ -19,10 +20,12 @@ MAIN_LOBE = 1.21
 FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 #: None, until the probe knows its depth: Any, since nobody who has a probe meets it
 _BY_DEPTH: Any = None
+#: {what a preset calls it: class} of every kind of probe
+PROBE_KINDS: dict[str, type[Probe]] = {}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Probe:
+class Probe(Declared):
     """What all probes share. Use LinearProbe, ConvexProbe or PhasedProbe.
 
     The two-way beam (amplitude, docs/physics.md#4-beam-and-pulse) is Gaussian across its axis. Laterally it is the
@@ -32,42 +35,50 @@ class Probe:
     Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
     """
 
-    scan_lines: int = 192
-    frequency_mhz: float = 5.0
-    #: Fractional -6 dB bandwidth of the two-way pulse.
-    fractional_bandwidth: float = 0.5
-    #: Transmit focus; left out (in JSON also null), it lies at 60 % of the depth.
-    focus_mm: float = _BY_DEPTH
-    #: Lateral size of the fully open aperture.
-    aperture_mm: float = 12.0
-    #: Smallest f-number of the receive aperture (it opens with depth until it reaches aperture_mm).
-    receive_f_number: float = 2.5
-    #: Height of the elements.
-    elevation_aperture_mm: float = 7.0
-    #: Focus of the lens; left out (in JSON also null), it lies at 60 % of the depth.
-    elevation_focus_mm: float = _BY_DEPTH
+    scan_lines: int = parameter(
+        192, "Scan lines", "Number of scan lines in an image", bounds=(2, 4096), shown=Shown(16, 512)
+    )
+    frequency_mhz: float = parameter(
+        5.0, "Frequency", "Centre frequency of the pulse; the resolution gets finer with it, the penetration less",
+        unit="MHz", bounds=(0.5, 40), shown=Shown(1, 20, 0.1, is_slider=True),
+    )  # fmt: skip
+    fractional_bandwidth: float = parameter(
+        0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
+    )
+    focus_mm: float = parameter(
+        _BY_DEPTH, "Focus", "Depth of the transmit focus; 0: at 60 % of the depth", unit="mm", bounds=(0.1, 1000),
+        shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
+        note="Left out, in JSON also null: at 60 % of the depth",
+    )  # fmt: skip
+    aperture_mm: float = parameter(
+        12.0, "Aperture", "Lateral size of the fully open aperture", unit="mm", bounds=(0.5, 200)
+    )
+    receive_f_number: float = parameter(
+        2.5, "Receive f-number", "Smallest f-number of the receive aperture", bounds=(0.5, 20),
+        note="The receive aperture opens with depth until it reaches the full aperture",
+    )  # fmt: skip
+    elevation_aperture_mm: float = parameter(
+        7.0, "Elevational aperture", "Height of the elements", unit="mm", bounds=(0.5, 100)
+    )
+    elevation_focus_mm: float = parameter(
+        _BY_DEPTH, "Elevational focus", "Focus of the lens", unit="mm", bounds=(0.1, 1000), can_be_none=True,
+        note="Left out, in JSON also null: at 60 % of the depth",
+    )  # fmt: skip
+
+    #: What the kind is called in a preset, and what it is
+    kind: ClassVar[str]
+    geometry: ClassVar[str]
 
     def __post_init__(self) -> None:
         # A field of each kind, so that it can be given by position after what is the kind's own.
         self.depth_mm: float
-        owner = type(self).__name__
-        require_between(owner, "depth_mm", self.depth_mm, 1, 400)
-        require_between(owner, "scan_lines", self.scan_lines, 2, 4096)
-        require(
-            int(self.scan_lines) == self.scan_lines,
-            f"{owner}: scan_lines is {self.scan_lines}, expected a whole number",
-        )
-        require_between(owner, "frequency_mhz", self.frequency_mhz, 0.5, 40)
-        require_between(owner, "fractional_bandwidth", self.fractional_bandwidth, 0.05, 1.5)
-        require_between(owner, "aperture_mm", self.aperture_mm, 0.5, 200)
-        require_between(owner, "receive_f_number", self.receive_f_number, 0.5, 20)
-        require_between(owner, "elevation_aperture_mm", self.elevation_aperture_mm, 0.5, 100)
+        super().__post_init__()
         for name in ("focus_mm", "elevation_focus_mm"):
-            value = getattr(self, name)
-            if value is None:
+            if getattr(self, name) is None:
                 object.__setattr__(self, name, self.default_focus_mm(self.depth_mm))
-            else:
-                require_between(owner, name, value, 0.1, 1000)
+
+    def __init_subclass__(cls) -> None:
+        PROBE_KINDS[cls.kind] = cls
 
     @staticmethod
     def default_focus_mm(depth_mm: float) -> float:
@@ -217,19 +228,30 @@ class Probe:
 
     def to_dict(self) -> dict:
         """Plain values, with the kind of probe under "kind"; probe_from_dict reads it back."""
-        return {"kind": _KIND_NAMES[type(self)], **asdict(self)}
+        return {"kind": self.kind, **asdict(self)}
+
+
+def _own(label: str, tip: str, unit: str, bounds: tuple[float, float], shown: Shown) -> Any:
+    """A parameter of one kind of probe, which has to be given."""
+    return parameter(label=label, tip=tip, unit=unit, bounds=bounds, shown=shown)
+
+
+def _depth_mm() -> Any:
+    return _own("Depth", "Depth of the image", "mm", (1, 400), Shown(10, 300, is_slider=True))
+
+
+def _field_of_view_deg() -> Any:
+    return _own("Field of view", "Angle between the outermost scan lines", "°", (1, 170), Shown(5, 170))
 
 
 @dataclass(frozen=True)
 class LinearProbe(Probe):
     """A flat array with parallel scan lines over `width_mm`."""
 
-    width_mm: float
-    depth_mm: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_between("LinearProbe", "width_mm", self.width_mm, 1, 400)
+    kind = "linear"
+    geometry = "parallel scan lines"
+    width_mm: float = _own("Width", "Distance between the outermost scan lines", "mm", (1, 400), Shown(5, 200))
+    depth_mm: float = _depth_mm()
 
     @property
     def apex_radius_mm(self) -> float:
@@ -244,14 +266,11 @@ class LinearProbe(Probe):
 class ConvexProbe(Probe):
     """A curved array of radius `radius_mm`; scan lines leave it at right angles over `field_of_view_deg`."""
 
-    radius_mm: float
-    field_of_view_deg: float
-    depth_mm: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_between("ConvexProbe", "radius_mm", self.radius_mm, 1, 400)
-        require_between("ConvexProbe", "field_of_view_deg", self.field_of_view_deg, 1, 170)
+    kind = "convex"
+    geometry = "curved array"
+    radius_mm: float = _own("Radius", "Radius of curvature of the array", "mm", (1, 400), Shown(2, 200))
+    field_of_view_deg: float = _field_of_view_deg()
+    depth_mm: float = _depth_mm()
 
     @property
     def apex_radius_mm(self) -> float:
@@ -266,12 +285,10 @@ class ConvexProbe(Probe):
 class PhasedProbe(Probe):
     """A small array that steers: every scan line starts at the centre of the face, over `field_of_view_deg`."""
 
-    field_of_view_deg: float
-    depth_mm: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_between("PhasedProbe", "field_of_view_deg", self.field_of_view_deg, 1, 170)
+    kind = "phased"
+    geometry = "small array that steers"
+    field_of_view_deg: float = _field_of_view_deg()
+    depth_mm: float = _depth_mm()
 
     @property
     def apex_radius_mm(self) -> float:
@@ -282,29 +299,28 @@ class PhasedProbe(Probe):
         return np.deg2rad(self.field_of_view_deg) / (self.scan_lines - 1)
 
 
-_KIND_NAMES = {LinearProbe: "linear", ConvexProbe: "convex", PhasedProbe: "phased"}
+PROBE_KIND = Parameter(
+    name="kind", type=str, default="phased", label="Kind", choices=tuple(PROBE_KINDS), shown=True,
+    tip="; ".join(f"{name}: {kind.geometry}" for name, kind in PROBE_KINDS.items()),
+)  # fmt: skip
 
 
 def probe_from_dict(values: dict, source: str = "probe") -> Probe:
-    """The probe described by plain values (see Probe.to_dict). Raises SimulationError for an unknown kind or name."""
-    require(isinstance(values, dict), f'{source}: is a {type(values).__name__}, expected an object with a "kind"')
-    kinds = {name: kind for kind, name in _KIND_NAMES.items()}
-    kind = str(values.get("kind"))
-    require(kind in kinds, f"{source}: kind is {values.get('kind')!r}, expected one of {', '.join(kinds)}")
+    """The probe described by plain values (see Probe.to_dict).
+
+    Raises SimulationError that names `source`, for an unknown kind or name, a missing value and one that is refused.
+    """
+    require(isinstance(values, dict), f'{source}: expected an object with a "kind", got {values!r:.80}')
+    kind: Any = values.get("kind")
+    PROBE_KIND.checked(source, kind)
     arguments = {name: value for name, value in values.items() if name != "kind"}
-    known = {field.name for field in fields(kinds[kind])}
+    known = sorted(entry.name for entry in parameters_of(PROBE_KINDS[kind]))
     for name in arguments:
         require(
             name in known,
-            f"{source}: {name} is not a parameter of a {kind} probe, expected one of {', '.join(sorted(known))}",
+            f"{source}: {name} is not a parameter of a {kind} probe, expected one of {', '.join(known)}",
         )
-    try:
-        return kinds[kind](**arguments)
-    except SimulationError as error:
-        raise SimulationError(f"{source}: {error}") from None
-    except TypeError:
-        needed = {field.name for field in fields(kinds[kind]) if field.default is MISSING} - set(arguments)
-        raise SimulationError(f"{source}: a {kind} probe also needs {', '.join(sorted(needed))}") from None
+    return built(PROBE_KINDS[kind], arguments, source)
 
 
 #: Probes to start from, by name: PROBES["phased"].

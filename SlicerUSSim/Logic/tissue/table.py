@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.declaration import built, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
@@ -102,7 +103,7 @@ class TissueTable(Mapping[int, Tissue]):
         Names stay: membrane, label maps and fits know tissues by them. Raises SimulationError that lists the names or
         the parameters for one that does not exist.
         """
-        known = [field.name for field in fields(Tissue) if field.name != "name"]
+        known = [field.name for field in parameters_of(Tissue) if field.name != "name"]
         for parameter in changes:
             require(
                 parameter in known,
@@ -168,16 +169,17 @@ class TissueTable(Mapping[int, Tissue]):
             isinstance(values, dict) and isinstance(values.get("tissues"), dict),
             f'{source}: expected {{"tissues": {{"1": {{...}}}}}}',
         )
-        try:
-            table = {int(label): Tissue(**tissue) for label, tissue in values["tissues"].items()}
-            membrane = values.get("membrane")
-            if membrane is not None:
-                membrane = Membrane(**{**membrane, "tissue": Tissue(**membrane["tissue"])})
-            return cls(table, membrane)
-        except SimulationError as error:
-            raise SimulationError(f"{source}: {error}") from None
-        except (TypeError, ValueError, KeyError, AttributeError) as error:
-            raise SimulationError(f"{source}: not a tissue table ({error})") from None
+        table = {
+            _label(label, source): built(Tissue, tissue, f"{source}: tissue {label}")
+            for label, tissue in values["tissues"].items()
+        }
+        membrane = values.get("membrane")
+        if membrane is not None:
+            within = f"{source}: membrane"
+            require(isinstance(membrane, dict), f"{within}: is {membrane!r:.80}, expected an object")
+            tissue = built(Tissue, membrane.get("tissue"), f"{within}: tissue")
+            membrane = built(Membrane, {**membrane, "tissue": tissue}, within)
+        return cls(table, membrane)
 
     @classmethod
     def read(cls, path: str | os.PathLike) -> TissueTable:
@@ -187,6 +189,13 @@ class TissueTable(Mapping[int, Tissue]):
     def write(self, path: str | os.PathLike) -> None:
         """Write the table as JSON, whole or not at all."""
         write_json(path, self.to_dict())
+
+
+def _label(text: str, source: str) -> int:
+    """The label that a JSON file names. Raises SimulationError for a text that is not just its digits."""
+    known = {str(label): label for label in range(MAX_LABEL + 1)}
+    require(text in known, f"{source}: tissue label is {text!r}, expected a whole number from 0 to {MAX_LABEL}")
+    return known[text]
 
 
 def _plain(tissue: Tissue) -> dict:

@@ -8,41 +8,52 @@ N(0, 1).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from statistics import NormalDist
 
-from SlicerUSSim.Logic.base.errors import require, require_between
+from SlicerUSSim.Logic.base.declaration import Declared, Fit, parameter, parameters_of
+from SlicerUSSim.Logic.base.errors import require
+
+_ECHOGENICITY = "Bounds of a fit: echogenicity over some 40 dB"
 
 
 @dataclass(frozen=True)
-class Tissue:
+class Tissue(Declared):
     """One tissue. Raises SimulationError, naming the tissue and the value, for anything out of physical range."""
 
-    name: str
-    #: c [m/s]
-    speed_of_sound_m_s: float
-    #: Z [MRayl]
-    impedance_mrayl: float
-    #: alpha [dB/(cm MHz)], one way
-    attenuation_db_cm_mhz: float
-    #: Mean scatterer amplitude
-    mu0: float = 0.0
-    #: Existence threshold; the share of lattice sites that hold a scatterer is 1 - Phi(mu1)
-    mu1: float = 0.0
-    #: Standard deviation of the scatterer amplitude
-    sigma0: float = 0.0
-    #: Where the numbers come from, per parameter
-    sources: Mapping[str, str] = field(default_factory=dict, compare=False)
+    name: str = parameter(label="Tissue", tip="Name of the tissue")
+    speed_of_sound_m_s: float = parameter(
+        label="Speed of sound", tip="Speed of sound", unit="m/s", symbol="c", bounds=(100, 10_000)
+    )
+    impedance_mrayl: float = parameter(
+        label="Impedance", tip="Acoustic impedance", unit="MRayl", symbol="Z", bounds=(1e-5, 100)
+    )
+    attenuation_db_cm_mhz: float = parameter(
+        label="Attenuation", tip="Attenuation, one way", unit="dB/(cm MHz)", symbol="α", bounds=(0, 100),
+        fit=Fit(0.1, 1.2, tolerance=0.1), source="Bounds of a fit: from blood to tendon (Duck 1990)",
+    )  # fmt: skip
+    mu0: float = parameter(
+        0.0, "Mean amplitude", "Mean amplitude of scatterers", symbol="μ₀", bounds=(-100, 100),
+        fit=Fit(0.02, 1.5, tolerance=0.05, is_logarithmic=True), source=_ECHOGENICITY,
+    )  # fmt: skip
+    mu1: float = parameter(
+        0.0, "Threshold", "Threshold of scatterers: the share 1 - Φ(μ₁) of sites holds one", symbol="μ₁",
+        bounds=(-10, 10), fit=Fit(-1.0, 1.5, tolerance=0.1), source=_ECHOGENICITY,
+    )  # fmt: skip
+    sigma0: float = parameter(
+        0.0, "Deviation", "Standard deviation of the scatterers' amplitude", symbol="σ₀", bounds=(0, 100),
+        fit=Fit(0.02, 1.0, tolerance=0.05, is_logarithmic=True), source=_ECHOGENICITY,
+    )  # fmt: skip
+    sources: Mapping[str, str] = parameter(
+        default_factory=dict, label="Sources", tip="Where the numbers come from, by parameter", compare=False
+    )
 
     def __post_init__(self) -> None:
-        owner = f"tissue {self.name!r}"
         require(isinstance(self.name, str) and bool(self.name.strip()), f"tissue name is {self.name!r}, expected text")
-        require_between(owner, "speed_of_sound_m_s", self.speed_of_sound_m_s, 100, 10000)
-        require_between(owner, "impedance_mrayl", self.impedance_mrayl, 1e-5, 100)
-        require_between(owner, "attenuation_db_cm_mhz", self.attenuation_db_cm_mhz, 0, 100)
-        require_between(owner, "mu0", self.mu0, -100, 100)
-        require_between(owner, "mu1", self.mu1, -10, 10)
-        require_between(owner, "sigma0", self.sigma0, 0, 100)
+        super().__post_init__()
+
+    def _owner(self) -> str:
+        return f"tissue {self.name!r}"
 
     @property
     def scatterer_share(self) -> float:
@@ -57,7 +68,7 @@ class Tissue:
 
 
 @dataclass(frozen=True)
-class Membrane:
+class Membrane(Declared):
     """A thin scattering layer along the border between fluid and brain: leptomeninges outside, ependyma inside.
 
     An MRI shows it as partial volume at best, so the label map cannot hold it; the simulator finds it from the labels,
@@ -65,11 +76,21 @@ class Membrane:
     """
 
     tissue: Tissue
-    #: Thickness of the layer, centred on the border
-    thickness_mm: float = 1.0
-    #: Names of the tissues on its fluid side; thin sulci, whose two sides meet, count as one sheet
-    fluids: tuple[str, ...] = ("csf", "coupling", "leptomeninges")
+    thickness_mm: float = parameter(
+        1.0, "Thickness", "Thickness of the layer, centred on the border", unit="mm", bounds=(0, 10)
+    )
+    fluids: tuple[str, ...] = parameter(
+        ("csf", "coupling", "leptomeninges"), "Fluids", "Names of the tissues on its fluid side",
+        note="Thin sulci, whose two sides meet, count as one sheet",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
-        require_between("membrane", "thickness_mm", self.thickness_mm, 0, 10)
-        object.__setattr__(self, "fluids", tuple(self.fluids))
+        require(isinstance(self.tissue, Tissue), f"membrane: tissue is {self.tissue!r:.80}, expected a Tissue")
+        super().__post_init__()
+
+    def _owner(self) -> str:
+        return "membrane"
+
+
+#: The parameters that are numbers, in the order of a tissue table.
+TISSUE_PARAMETERS = tuple(entry for entry in parameters_of(Tissue) if entry.type is float)

@@ -1,0 +1,276 @@
+"""One declaration per parameter: parameter() says at the field of a dataclass all that is known of it.
+
+From there come the checks, JSON, the command's options, the fields of panel and page, what a scene remembers, the
+optimiser's bounds, the report and docs/parameters.md. Types are checked strictly (msgspec): true is no number, "5" is
+no 5, 3.0 is no seed, and nan is nothing.
+
+    @dataclass(frozen=True)
+    class DisplaySettings(Declared):
+        gain_db: float = parameter(0.0, "Gain", "Brightness of all echoes", unit="dB", bounds=(-200, 200))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import MISSING, dataclass, field, fields, replace
+from functools import cache, cached_property
+from math import log10
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The range that a panel offers for a number, in the unit that it is shown in."""
+
+    low: float
+    high: float
+    step: float = 1.0
+    #: A slider beside the number
+    is_slider: bool = False
+    #: An amplitude that is shown as its level in dB
+    as_db: bool = False
+    #: The number that stands for None, and for all below it
+    none_at: float | None = None
+
+    @property
+    def decimals(self) -> int:
+        """Decimals that the step needs."""
+        return max(0, -int(log10(self.step) // 1))
+
+    def number(self, value: float | None) -> float | None:
+        """What is shown for a value."""
+        if value is None:
+            return self.none_at
+        return 20.0 * log10(value) if self.as_db else value
+
+    def value(self, number: float) -> float | None:
+        """What is meant by a number that was entered."""
+        if self.none_at is not None and number <= self.none_at:
+            return None
+        return 10.0 ** (number / 20.0) if self.as_db else number
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a parameter is fitted to real ultrasound."""
+
+    #: Default bounds of the search
+    low: float
+    high: float
+    #: Half the spread of equally good fits within which it counts as determined
+    tolerance: float
+    #: Searched by its logarithm: amplitudes are compared by their ratios
+    is_logarithmic: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """Everything that is known of a parameter."""
+
+    #: Of the field, and its type; None where it may be None is left out
+    name: str = ""
+    type: Any = None
+    default: Any = None
+    #: Whether it has to be given
+    is_required: bool = False
+    #: Whether None may be given, by its type or because the owner puts something in its place
+    can_be_none: bool = False
+    #: As people say it
+    label: str
+    #: One sentence without a full stop, which tool tips, --help and the documentation show
+    tip: str
+    unit: str = ""
+    #: The formula sign
+    symbol: str = ""
+    #: Smallest and largest value; of each element of a tuple
+    bounds: tuple[float, float] | None = None
+    #: What a text can be
+    choices: tuple[str, ...] = ()
+    #: What else one should know, and where default or bounds come from
+    note: str = ""
+    source: str = ""
+    #: None: panels do not show it. Ticks and choices need no range: True
+    shown: Shown | bool | None = None
+    #: None: it cannot be fitted
+    fit: Fit | None = None
+    #: Name of the command's option, such as "gain" or "thin-sulci/no-thin-sulci"; None: it has none of its own
+    option: str | None = None
+
+    @property
+    def full_label(self) -> str:
+        """The label with the unit."""
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+    @property
+    def expected(self) -> str:
+        """What a value has to be, in words."""
+        kind = get_origin(self.type) or self.type
+        if self.choices:
+            words = f"one of {', '.join(self.choices)}"
+        elif kind is bool:
+            words = "true or false"
+        elif kind in (int, float):
+            words = "a whole number" if kind is int else "a number"
+            words += "" if self.bounds is None else f" between {self.bounds[0]:.10g} and {self.bounds[1]:.10g}"
+        elif kind is tuple and self.bounds is not None:
+            count = len(get_args(self.type))
+            words = f"{count} whole numbers between {self.bounds[0]:g} and {self.bounds[1]:g}"
+        elif kind is tuple:
+            words = "a list of texts"
+        else:
+            words = "text" if kind is str else "an object of texts"
+        return words + (" or none" if self.can_be_none else "")
+
+    @cached_property
+    def _accepted(self) -> Any:
+        """The type as msgspec checks it."""
+        if self.choices:
+            return Literal[self.choices]
+        if self.bounds is None:
+            return self.type
+        meta = msgspec.Meta(ge=self.bounds[0], le=self.bounds[1])
+        if get_origin(self.type) is tuple:
+            return tuple[tuple(Annotated[kind, meta] for kind in get_args(self.type))]
+        return Annotated[self.type, meta]
+
+    def checked(self, owner: str, value: Any) -> Any:
+        """The value in its type; whole numbers will do for a float. Raises SimulationError that says what is expected.
+
+        A numpy scalar counts as the Python number that it is.
+        """
+        if value is None and self.can_be_none:
+            return None
+        plain = _plain(value)
+        try:
+            return msgspec.convert(plain, self._accepted, strict=True)
+        except msgspec.ValidationError:
+            raise SimulationError(f"{owner}: {self.name} is {_short(value)}, expected {self.expected}") from None
+
+    def from_text(self, owner: str, text: str) -> Any:
+        """The value that a text stands for, as the command and a scene write it. Raises SimulationError for others."""
+        kind = get_origin(self.type) or self.type
+        value: Any = text
+        if self.can_be_none and text.lower() == "none":
+            value = None
+        elif kind is bool:
+            value = {"true": True, "false": False}.get(text.lower(), text)
+        elif kind in (int, float):
+            with suppress(ValueError):  # what is no number is then refused as the text that it is
+                value = kind(text)
+        return self.checked(owner, value)
+
+
+def parameter(
+    default: Any = MISSING,
+    label: str = "",
+    tip: str = "",
+    *,
+    compare: bool = True,
+    default_factory: Any = MISSING,
+    **more: Any,
+) -> Any:
+    """The field of a dataclass, with what Parameter knows of it."""
+    metadata = {"parameter": Parameter(label=label, tip=tip, **more)}
+    if default_factory is not MISSING:
+        return field(default_factory=default_factory, compare=compare, metadata=metadata)
+    return field(default=default, compare=compare, metadata=metadata)
+
+
+@cache
+def parameters_of(kind: type) -> tuple[Parameter, ...]:
+    """The declared parameters of a dataclass, in the order of its fields."""
+    hints = get_type_hints(kind)
+    found = []
+    for entry in fields(kind):
+        if "parameter" in entry.metadata:
+            hint, can_be_none = _without_none(hints[entry.name])
+            found.append(
+                replace(
+                    entry.metadata["parameter"],
+                    name=entry.name,
+                    type=hint,
+                    default=None if entry.default is MISSING else entry.default,
+                    is_required=entry.default is MISSING and entry.default_factory is MISSING,
+                    can_be_none=can_be_none or entry.metadata["parameter"].can_be_none,
+                )
+            )
+    return tuple(found)
+
+
+def parameter_of(kind: type, name: str) -> Parameter:
+    """One of them by name. Raises SimulationError that lists the names if there is none."""
+    known = {entry.name: entry for entry in parameters_of(kind)}
+    require(name in known, f"{kind.__name__} has no {name!r}, expected one of {', '.join(known)}")
+    return known[name]
+
+
+class Declared:
+    """Base of frozen dataclasses whose fields are declared with parameter(): they are checked on construction.
+
+    Raises SimulationError that names the value and says what is expected.
+    """
+
+    def __post_init__(self) -> None:
+        owner = self._owner()
+        for entry in parameters_of(type(self)):
+            object.__setattr__(self, entry.name, entry.checked(owner, getattr(self, entry.name)))
+
+    def _owner(self) -> str:
+        """What the values belong to, for messages."""
+        return type(self).__name__
+
+
+def built(kind: type[_T], values: Any, source: str) -> _T:
+    """A `kind` from plain values, such as those of a JSON file.
+
+    Raises SimulationError that names `source` and the parameter: for what is no object, for a name that is unknown or
+    missing, and for a value that is refused.
+    """
+    require(isinstance(values, Mapping), f"{source}: is {_kind_of(values)}, expected an object")
+    known = [entry.name for entry in fields(kind)]  # type: ignore[arg-type], of dataclasses
+    for name in values:
+        require(name in known, f"{source}: {name!r} is unknown, expected one of {', '.join(known)}")
+    missing = [
+        entry.name
+        for entry in fields(kind)  # type: ignore[arg-type]
+        if entry.default is MISSING and entry.default_factory is MISSING and entry.name not in values
+    ]
+    require(not missing, f"{source}: lacks {', '.join(missing)}")
+    for entry in parameters_of(kind):
+        if entry.name in values:
+            entry.checked(source, values[entry.name])
+    try:
+        return kind(**values)
+    except SimulationError as error:
+        raise SimulationError(f"{source}: {error}") from None
+
+
+def _without_none(hint: Any) -> tuple[Any, bool]:
+    if get_origin(hint) in (Union, UnionType) and NoneType in get_args(hint):
+        (only,) = (kind for kind in get_args(hint) if kind is not NoneType)
+        return only, True
+    return hint, False
+
+
+def _kind_of(value: Any) -> str:
+    """The kind of a JSON value, in words."""
+    kinds = {list: "a list", str: "a text", bool: "true or false", NoneType: "null"}
+    return next((words for kind, words in kinds.items() if isinstance(value, kind)), "a number")
+
+
+def _plain(value: Any) -> Any:
+    """A numpy scalar as the Python value that it is."""
+    return value.item() if getattr(value, "ndim", None) == 0 else value
+
+
+def _short(value: Any) -> str:
+    text = repr(_plain(value))
+    return text if len(text) <= 80 else f"{text[:77]}..."
