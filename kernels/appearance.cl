@@ -1,4 +1,4 @@
-// Images of one pose as a function of what may be varied in them (docs/optimization.md#how-it-is-fast): parts of the
+// Images of one pose as a function of what may be varied in them (docs/optimization.md#efficient-evaluation): parts of the
 // echoes are mixed before the beam and the pulse, which are linear too, and again for every image (appearance.py).
 //
 // Buffers: parts float [part][values]; lengths, path float [scan line][sample]; bases and iq float2 [scan

@@ -1,5 +1,5 @@
 // compare_patches: the local histograms of two images and their absolute difference
-// (docs/optimization.md#the-cost, equations 4 and 5 of the paper). One work-item compares one square patch; global size
+// (docs/optimization.md#cost-function, equations 4 and 5 of the paper). One work-item compares one square patch; global size
 // (patch columns, patch rows).
 //
 // Buffers: image, reference uchar [row][column]; inside uchar likewise, 0 where a pixel does not count; result float

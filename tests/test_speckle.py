@@ -58,7 +58,7 @@ def test_the_same_pose_gives_the_same_bits_and_another_seed_another_patient(simu
 
 
 def test_the_signal_is_linear_in_mu0_and_sigma0():
-    """What docs/optimization.md#how-it-is-fast builds on: RF(mu0, sigma0) = mu0 RF(1, 0) + sigma0 RF(0, 1)."""
+    """What docs/optimization.md#efficient-evaluation builds on: RF(mu0, sigma0) = mu0 RF(1, 0) + sigma0 RF(0, 1)."""
     pose = rigid(ORIENTATIONS["oblique"], [0, -25, 0])
     rf = {
         (mu0, sigma0): simulator(SOLID, replace(SPECKLE, mu0=mu0, sigma0=sigma0)).simulate(LINEAR, pose).iq
