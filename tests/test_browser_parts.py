@@ -306,7 +306,7 @@ def test_of_images_that_come_fast_the_last_is_compared(head):
 
 def test_a_cine_keeps_time_and_begins_anew_with_another_size():
     cine = Cine()
-    with pytest.raises(SimulationError, match="holds 0 images"):
+    with pytest.raises(SimulationError, match="has 0 images"):
         cine.gif()
     cine.add(np.zeros((10, 10), np.uint8), 0.0)
     for number in range(4):
