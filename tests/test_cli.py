@@ -94,7 +94,7 @@ def test_the_demo_without_nilearn_says_that_it_uses_a_phantom(monkeypatch):
         importlib.util, "find_spec", lambda name, *rest: None if name == "nilearn" else find(name, *rest)
     )
     volume, source = demo_mri()
-    assert "phantom made by code" in source and volume.array.max() > 0
+    assert "synthetic head phantom" in source and volume.array.max() > 0
 
 
 def test_segment_writes_labels_and_their_tissues(labels, head):

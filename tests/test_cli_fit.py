@@ -221,8 +221,8 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
     "options, message",
     [
         (["--frames", "9"], "image 9 does not exist, expected 0 to 2"),
-        (["--frames", "one"], "frames are 'one', expected such as 0,5,10 or 0:20:5"),
-        (["--frames", "5:9"], "choose none of the 3 images"),
+        (["--frames", "one"], "frames are 'one', expected numbers such as 0,5,10 or 0:20:5"),
+        (["--frames", "5:9"], "frames are '5:9', expected at least one of the 3 images"),
         (["--transform", "ImageToPatient"], "no path from Image to Patient"),
         (["--free", "brightness"], "no free parameter 'brightness'"),
         (["--free", "gain_db=5:1"], "bounds of gain_db are 5.0 to 1.0, expected two numbers, the smaller one first"),

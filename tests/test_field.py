@@ -61,10 +61,10 @@ def test_size_of_a_pixel_follows_from_what_is_known():
     assert by_width.image_to_probe[0, 0] == pytest.approx(grid.pixel_spacing_mm[0], rel=0.01)
     assert estimate_field(image, depth_mm=50.0).probe.to_dict()["width_mm"] == pytest.approx(38.0, abs=0.3)
     for options in ({}, {"width_mm": 38.0, "depth_mm": 50.0}):
-        with pytest.raises(SimulationError, match="how large a pixel is"):
+        with pytest.raises(SimulationError, match="pixel size is not known"):
             estimate_field(image, **options)
     sector, _ = screen(ConvexProbe(20, 70, 80))
-    with pytest.raises(SimulationError, match="width_mm is known of linear probes only"):
+    with pytest.raises(SimulationError, match="width_mm is for linear probes only"):
         estimate_field(sector, width_mm=38.0)
 
 
@@ -73,7 +73,7 @@ def test_size_of_a_pixel_follows_from_what_is_known():
     [
         (np.zeros((50, 60), np.uint8), "black"),
         (np.full((3, 0, 4), 9, np.uint8), "expected (n, rows, columns)"),
-        (np.tri(200, 200, dtype=np.uint8) * 99, "no probe's field"),
+        (np.tri(200, 200, dtype=np.uint8) * 99, "not a probe's field"),
     ],
 )
 def test_images_without_a_fan_are_refused(image, message):
@@ -132,9 +132,9 @@ def test_a_given_probe_keeps_its_beam_and_gets_the_place_of_the_field():
     found = TrackedImages.of(sequence, [1], probe=probe)
     assert found.probe is probe and found.numbers == [1]
     assert np.allclose(found.poses[0], TrackedImages.of(sequence).poses[1], atol=0.4)
-    with pytest.raises(SimulationError, match="field of a convex probe, but the probe given is linear"):
+    with pytest.raises(SimulationError, match="the probe is linear, expected convex as in the images"):
         TrackedImages.of(sequence, probe=LinearProbe(40, 80))
-    with pytest.raises(SimulationError, match="mm deep, but the probe given sees 120 mm"):
+    with pytest.raises(SimulationError, match="the probe's depth is 120 mm, expected"):
         TrackedImages.of(sequence, probe=ConvexProbe(40, 60, 120))
 
 

@@ -227,11 +227,11 @@ def test_slicer_reads_the_transforms_that_are_written(tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (("UltrasoundImageOrientation = MF", "UltrasoundImageOrientation = QX"), "'QX', expected such as MF"),
-        (("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "1 0 0"), "holds 3 numbers, expected 16"),
+        (("UltrasoundImageOrientation = MF", "UltrasoundImageOrientation = QX"), "'QX', expected a code such as MF"),
+        (("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "1 0 0"), "has 3 numbers, expected 16"),
         (("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "one"), "expected 16 numbers"),
         (("Timestamp = 10.5", "Timestamp = noon"), "'noon', expected seconds"),
-        (("Seq_Frame0001_Timestamp", "Seq_Frame0007_Timestamp"), "has Seq_Frame0007_Timestamp, but 2 images"),
+        (("Seq_Frame0001_Timestamp", "Seq_Frame0007_Timestamp"), "has the field Seq_Frame0007_Timestamp"),
         (("Seq_Frame0000_ProbeToTrackerTransform =", "Seq_Frame0000_ProbeTransform ="), "ProbeTo"),
     ],
 )

@@ -645,7 +645,7 @@ def test_errors_of_a_fit_are_one_line(session):
     session.ui.fitFramesLineEdit.setText("first")
     session.ui.fitFramesLineEdit.editingFinished.emit()
     session.ui.fitButton.click()
-    assert "frames are 'first', expected such as 0,5,10" in session.app.errors[2]
+    assert "frames are 'first', expected numbers such as 0,5,10" in session.app.errors[2]
     session.panel.presenter.fits.apply()
     session.panel.presenter.fits.revert()
     session.panel.presenter.fits.compare("after", 0)

@@ -1,4 +1,4 @@
-"""How alike two B-mode images are: equations 4 and 5 of Salehi et al., MICCAI 2015 (docs/optimization.md#cost-function).
+"""Similarity of B-mode images: equations 4 and 5 of Salehi et al., MICCAI 2015 (docs/optimization.md#cost-function).
 
     L(A, B) = rho(A, B) + lambda SAD(A, B),    rho = mean over patches of sqrt(1 - sum_j sqrt(P_j Q_j))
 
