@@ -366,7 +366,7 @@ class ScriptedLoadableModuleTest(unittest.TestCase):
 
 
 class Application:
-    """slicer.app, and what message boxes said."""
+    """slicer.app, with the texts of message boxes."""
 
     def __init__(self) -> None:
         self.qt = QtWidgets.QApplication.instance() or QtWidgets.QApplication([])
@@ -375,7 +375,7 @@ class Application:
         self.answer = True
         self.started: list = []
         self.shown: list[str] = []
-        #: What pip was told: packages, and what the file of constraints said
+        #: Arguments of pip: packages, and the content of the file of constraints
         self.installed: list[str] = []
         self.constraints = ""
         #: --testing, in which message boxes answer themselves

@@ -24,8 +24,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "SlicerUSSim"
-#: The rooms as the table in docs/architecture.md has them, each of which knows those before it. The module's file is
-#: none of them, and knows all but the workstation and the command.
+#: The rooms in the order of the table in docs/architecture.md, each of which may import those before it. The module's
+#: file is not one of them, and may import all but the workstation and the command.
 _TABLE = re.findall(r"^\| \[(\w+)\]", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"), re.MULTILINE)
 ORDER = [room for entry in _TABLE for room in (["module", entry] if entry == "Workstation" else [entry])]
 #: Libraries that take long to import, and the rooms whose files may do so at their top. Elsewhere it is left to the

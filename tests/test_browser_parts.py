@@ -78,7 +78,7 @@ def head():
 
 
 def run_in_loop(coroutine_function):
-    """What an async function gives in a loop of its own; what it waits for and does not come fails."""
+    """The result of an async function in a separate event loop; fails if it waits too long."""
     return run_in(asyncio.new_event_loop(), coroutine_function)
 
 

@@ -26,7 +26,7 @@ ENTRY_FILE = ROOT / "USSim.json"
 
 
 def tool(name: str) -> str | None:
-    """The program of a pip package, beside this Python, or of the system."""
+    """The program of a pip package, next to this Python, or of the system."""
     return shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
 
 
@@ -131,7 +131,7 @@ def test_the_built_module_loads_from_its_own_folder(build):
 @needs_cmake
 @needs_slicer
 def test_the_installed_module_simulates_beside_other_extensions_with_its_own_kernels(installed):
-    """Another extension's Logic lies on sys.path there, and is left alone."""
+    """Another extension's Logic on sys.path is not affected."""
     package = installed / "SlicerUSSim"
     result = load(installed, self_test=True)
     assert_loaded_from(result, installed / "USSim.py", package, package / "kernels")

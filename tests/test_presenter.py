@@ -17,7 +17,7 @@ from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 
 
 class PlainView:
-    """Remembers what it was told; its event loop is a list."""
+    """Records all calls; its event loop is a list."""
 
     def __init__(self) -> None:
         self.errors, self.status, self.waiting, self.shares, self.refreshed = [], [], [], [], 0

@@ -203,7 +203,7 @@ def correlation_length(pairs, spacing: float) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize(("depth", "lateral_tolerance"), [(12.0, 0.3), (30.0, 0.15), (39.0, 0.3)])
 def test_focused_speckle_has_the_same_correlation_lengths(scatterers, depth, lateral_tolerance):
-    """Within 15 %, axially everywhere, laterally in the focus (the module's docstring says why)."""
+    """Within 15 %, axially at all depths, laterally in the focus (for the reason see the module's docstring)."""
     array = focused_probe()
     along = depth + np.arange(-3, 3, 0.04)
     near = [values[abs(scatterers[1] - depth) < 5.0] for values in scatterers]

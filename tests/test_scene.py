@@ -1,4 +1,4 @@
-"""The scene logic on real MRML nodes: what goes in, where the image lies, what live update does and when it ends."""
+"""The scene logic on real MRML nodes: inputs, position of the image, live update and its end."""
 
 from __future__ import annotations
 
@@ -373,7 +373,7 @@ def test_slicers_default_colours_do_not_make_bone_of_grey_matter(bench):
     labels.SetAndObserveDisplayNodeID(display.GetID())
     display.SetAndObserveColorNodeID(colours.GetID())
     assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["speckle", "fluid"]
-    colours.SetName("mine")  # a table somebody chose means what it says
+    colours.SetName("mine")  # a table chosen by the user is used by its names
     with pytest.raises(SimulationError, match="no tissue is called"):
         bench.logic.preset = Preset(tissues=TissueTable({}))
         bench.logic.tissues(labels)
@@ -382,7 +382,7 @@ def test_slicers_default_colours_do_not_make_bone_of_grey_matter(bench):
 
 
 def test_labels_without_names_follow_the_tissues_that_have_their_numbers(bench):
-    """They are read again when the same names stand for other labels: once the old ones stayed, without an error."""
+    """They are read again when the same names belong to other labels; formerly the old ones remained."""
     labels = add(bench.scene, "LabelMapVolume", "labels.nii")
     write_volume(labels, cyst())
     assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["speckle", "fluid"]

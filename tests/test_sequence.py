@@ -32,7 +32,7 @@ def rigid(seed: int) -> np.ndarray:
 
 
 def chain(count: int = 3) -> TrackedSequence:
-    """Images that can be told apart and turned, tracked along ImageToProbe, ProbeToTracker, ReferenceToTracker."""
+    """Asymmetric, distinguishable images, tracked along ImageToProbe, ProbeToTracker, ReferenceToTracker."""
     images = np.random.default_rng(0).integers(0, 256, (count, 20, 30), dtype=np.uint8)
     transforms = tuple(
         {"ProbeToTracker": rigid(10 + n), "ReferenceToTracker": rigid(20 + n), "ImageToProbe": rigid(30)}

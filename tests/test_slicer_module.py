@@ -123,7 +123,7 @@ class Session:
 
 @pytest.fixture
 def simulation_error(module):
-    """The class as the module imported it, whatever else is imported under that name."""
+    """The class as imported by the module, independent of other imports of that name."""
     return lambda: importlib.import_module("SlicerUSSim.Logic.base.errors").SimulationError
 
 
@@ -340,7 +340,7 @@ def test_the_first_image_takes_a_volume_and_two_clicks(session):
     session.parameters.mri = None
     assert not session.ui.segmentButton.isEnabled() and not session.ui.liveCheckBox.isEnabled()
     session.head()
-    session.widget.enter()  # the only volume is taken for the MRI
+    session.widget.enter()  # the only volume is used as the MRI
     assert session.parameters.mri.GetName() == "Head" and session.ui.segmentButton.isEnabled()
     session.ui.segmentButton.click()
     labels = session.parameters.labels

@@ -1,4 +1,4 @@
-"""Speckle of one patient, whatever looks at it: sparse lines, small motions, other sides; linear in mu0 and sigma0."""
+"""Speckle is fixed in the patient: with sparse lines, small motions, other directions; linear in mu0 and sigma0."""
 
 from __future__ import annotations
 

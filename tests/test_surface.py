@@ -1,4 +1,4 @@
-"""Where a probe lies on a patient, and how it is slid, rocked, tilted and rotated there."""
+"""Position of a probe on the patient's surface, and sliding, rocking, tilting and rotating it."""
 
 from __future__ import annotations
 

@@ -207,7 +207,7 @@ def test_phantoms_echo_from_where_they_say(make, orientation):
     for probe in PROBES.values():
         frame = simulator.simulate(probe, phantom.probe_to_ras)
         (echo,) = phantom.expected(probe)
-        # A sheet's faces are only as good as its one voxel; a bar's brightest grain lies anywhere in its 1.2 mm.
+        # The faces of a sheet have errors of up to a voxel; the brightest grain of a bar can be anywhere in its 1.2 mm.
         tolerance = {"voxel sheet": 0.5, "thin rod": 0.9}.get(phantom.name, 0.3)
         assert echo_near(frame, probe, echo.shown_mm, 1.5)[1] == pytest.approx(echo.shown_mm[1], abs=tolerance)
 

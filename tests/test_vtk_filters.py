@@ -178,7 +178,7 @@ def test_the_information_pass_knows_the_geometry_before_anything_is_computed(ang
     np.testing.assert_allclose(promised["SPACING"], output.GetSpacing(), rtol=1e-9)
     np.testing.assert_allclose(promised["ORIGIN"], output.GetOrigin(), atol=1e-9)
     np.testing.assert_allclose(promised["DIRECTION"], output.GetDirectionMatrix().GetData(), atol=1e-6)
-    # The cyst is seen where it is: black in the middle of the image, whatever the pose.
+    # The cyst appears at its position, black in the middle of the image, for every pose.
     picture = Volume.from_vtk(output).array[0].astype(float)
     assert picture[58:68, 28:36].mean() < 0.3 * picture[8:24, 10:54].mean()
 

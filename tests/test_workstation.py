@@ -189,7 +189,7 @@ def pose(page: Page) -> dict[str, float]:
 
 
 def cost(page: Page) -> float:
-    """Between simulated and real image, as the page says it."""
+    """The cost of simulated and real image as shown on the page."""
     return float(re.match(r"cost ([0-9.]+)", state(page, NAMES.sequence.similarity))[1])
 
 
@@ -197,7 +197,7 @@ def click(page: Page, selector: str) -> None:
     page.locator(selector).first.click()
 
 
-#: Until the server has nothing more to do; the second answer comes after all that it told the page before the first.
+#: Waits until the server is idle; the second answer arrives after all messages sent to the page before the first.
 _AT_REST = """async (patience) => {
   const late = new Promise((_, failed) => setTimeout(() => failed(new Error('it never came to rest')), patience));
   for (let before = null; ; ) {
@@ -268,7 +268,7 @@ def picture(page: Page, box: dict) -> np.ndarray:
 
 @contextlib.contextmanager
 def heard(page: Page, releases: int = 1):
-    """Wait until the page has told what the mouse does in Slicer's views, which it does piece by piece."""
+    """Wait until the page has sent all mouse events in Slicer's views, which it sends one at a time."""
     before = _RELEASES[page]
     yield
     eventually(page, lambda: _RELEASES[page] >= before + releases)
@@ -280,7 +280,7 @@ def drag(page: Page, start: tuple[float, float], by: tuple[float, float], key: s
         page.mouse.down()
         for share in np.linspace(0, 1, 9)[1:]:
             page.mouse.move(start[0] + share * by[0], start[1] + share * by[1])
-            page.evaluate("() => new Promise(requestAnimationFrame)")  # as often as a browser tells of a mouse
+            page.evaluate("() => new Promise(requestAnimationFrame)")  # the rate of a browser's mouse events
         page.mouse.up()
     settled(page)
 
@@ -572,7 +572,7 @@ def test_a_sequence_plays_beside_the_simulation_and_the_cost_follows(page):
     for _ in range(4):
         page.keyboard.press("Shift+ArrowRight")
     settled(page)
-    assert cost(page) > at_the_pose  # elsewhere the images are less alike
+    assert cost(page) > at_the_pose  # away from the recorded pose the cost is higher
 
 
 def test_real_and_simulated_blink_or_are_subtracted(page):
