@@ -224,7 +224,7 @@ def evaluation(labels: Volume, tissues: TissueTable, patients: int, device) -> d
         )  # fmt: skip
         random = np.random.default_rng(0)
         results[name] = best_ms(lambda c=cost, p=parameters, r=random: c(r.random(len(p))))
-        results[f"recomputing the bases: {name}"] = best_ms(lambda m=model: (m.anchor(tissues), m.device.queue.finish()), 5)
+        results[f"bases: {name}"] = best_ms(lambda m=model: (m.anchor(tissues), m.device.queue.finish()), 5)
     print(f"\n{simulator.device.info}\n")
     table(["", "best ms", "median ms"], [[name, *values] for name, values in results.items()])
     return results

@@ -1,4 +1,4 @@
-"""As much of the Slicer application as the scripted module touches, on PySide6 and slicer-core's MRML libraries.
+"""A substitute for the parts of the Slicer application that the scripted module uses, on PySide6 and slicer-core.
 
 Slicer's scripted-module base classes, PythonQt and CTK cannot be installed; these stand in for them, so that the panel
 runs, is clicked and is looked at. What they promise is what Slicer's sources do: the loader, the lifecycle, signals and
@@ -410,7 +410,7 @@ def _qt_name(name: str):
 
 
 def start() -> Application:
-    """Put the stand-ins where the module looks for them; pytest's monkeypatch of sys.modules takes them away again."""
+    """Install the stand-ins where the module imports them; pytest's monkeypatch of sys.modules removes them again."""
     # The scene's pointer type is PythonQt's: MRMLWidget hands the scene on instead of the .ui file's connections.
     QtCore.QLoggingCategory.setFilterRules("qt.core.qobject.connect=false")
     qt = types.ModuleType("qt")

@@ -1,4 +1,4 @@
-"""What the workstation is made of, without a browser: tasks, cines, scripts, sequences as nodes, the probe's shape."""
+"""Parts of the workstation without a browser: tasks, cine loops, scripts, sequences as nodes, the probe's shape."""
 
 from __future__ import annotations
 
@@ -323,7 +323,7 @@ NASTY = ["it's", 'a "b"', "back\\slash\\", "two\nlines", "'''", '"""', "\\N{x} {
 
 
 def run_again(script: str, folder) -> np.ndarray:
-    """The (rows, columns) image that a script writes."""
+    """The (rows, columns) image written by a script."""
     (folder / "again.py").write_text(script, encoding="utf-8")
     done = subprocess.run([sys.executable, "again.py"], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""The ussim command: what it writes, and that a mistake is one line on stderr, exit 2, and nothing half-written."""
+"""The ussim command: its output; errors give one line on stderr, exit status 2, and no incomplete files."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_devices_says_which_is_used():
 
 
 def bad_inputs(folder):
-    """(arguments, part of the message) for every mistake a user can make."""
+    """(arguments, part of the message) for user errors."""
     np.savetxt(folder / "three.txt", np.eye(3))
     np.savetxt(folder / "scaled.txt", np.eye(4) * 2)
     np.savetxt(folder / "singular.txt", np.zeros((4, 4)))

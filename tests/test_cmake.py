@@ -1,4 +1,4 @@
-"""The extension: built and installed with a stand-in for Slicer, loaded from there, fit for the Extensions Index.
+"""The extension: built and installed with a substitute for Slicer, loaded from there, valid for the Extensions Index.
 
 tests/slicer_cmake/SlicerConfig.cmake lays files out as Slicer's build does. The Index's rules are those of
 scripts/check_description_files.py and schemas/slicer-extension-catalog-entry-schema-v1.0.2.json in
@@ -96,7 +96,7 @@ def test_the_module_its_resources_and_one_folder_are_installed_and_nothing_else(
 
 @needs_cmake
 def test_every_installed_resource_bears_the_modules_name(installed):
-    """Other extensions' resources lie in the same folders: Resources/UI/Settings.ui would be anybody's."""
+    """Resources of other extensions are in the same folders: a name such as Resources/UI/Settings.ui could conflict."""
     mine = files(ROOT / "SlicerUSSim" / "Resources")
     assert mine and all("USSim" in Path(path).parts or Path(path).stem == "USSim" for path in mine)
 

@@ -1,4 +1,4 @@
-"""The imaged field, found in images: simulated ones whose geometry is known, and real ones."""
+"""The imaged field estimated from images: simulated images with known geometry, and real images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The panel's presenter without any Qt: another view, as a browser's would be."""
+"""The panel's presenter without Qt, with another view, as in the browser."""
 
 from __future__ import annotations
 

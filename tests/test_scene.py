@@ -146,7 +146,7 @@ def test_any_chain_of_rigid_parents_gives_the_same_image_as_their_product(bench)
 
 
 def noisy(bench) -> None:
-    """Nothing but noise, of which the image is full."""
+    """Noise only, which fills the image."""
     fluid = TissueTable({0: FLUID, 1: Tissue("speckle", 1540.0, 1.54, 0.0), 2: FLUID})
     display = DisplaySettings(noise_db=-5.0, tgc_db_cm_mhz=0.0, image_size=(96, 64))
     bench.logic.preset = Preset(PRESET.probe, display, PRESET.settings, fluid)
@@ -812,7 +812,7 @@ def test_hybrid_scatterers_take_the_texture_of_the_last_segmentation(kind):
 
 
 def test_slicers_own_slice_view_shows_the_image_upright_and_not_mirrored(bench):
-    """Through vtkMRMLSliceLogic, which is what draws Slicer's slice views."""
+    """Through vtkMRMLSliceLogic, which renders Slicer's slice views."""
     application = slicer.vtkSlicerApplicationLogic()
     application.SetMRMLScene(bench.scene)
     application.GetColorLogic().SetMRMLScene(bench.scene)

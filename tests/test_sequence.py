@@ -145,7 +145,7 @@ def test_a_sequence_is_written_whole_or_not_at_all(tmp_path):
 
 
 def plus_file(path: Path, orientation: str, pixels: np.ndarray, image_type: str = "BRIGHTNESS") -> None:
-    """A file as Plus writes it, byte by byte, so that our own writer does not check itself."""
+    """A file as Plus writes it, byte by byte, independent of this package's writer."""
     count, rows, columns = pixels.shape
     lines = [
         "ObjectType = Image", "NDims = 3", "AnatomicalOrientation = RAI", "BinaryData = True",

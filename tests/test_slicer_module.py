@@ -1,4 +1,4 @@
-"""The scripted module as Slicer loads and runs it, on stand-ins for what only the Slicer application has."""
+"""The scripted module as loaded and run by Slicer, with stand-ins for parts of the Slicer application."""
 
 from __future__ import annotations
 
@@ -682,7 +682,7 @@ def test_reloading_the_module_brings_new_code(module):
 
 
 def test_the_panel_looks_as_it_should(session, tmp_path):
-    """A picture of the panel, with every section open, in which every control is visible and none is cut off."""
+    """A figure of the panel with all sections open, in which every control is completely visible."""
     session.segmented()
     session.ui.simulateButton.click()
     for button in session.parent.findChildren(stand_in.CollapsibleButton):
@@ -796,7 +796,7 @@ def test_a_slicer_that_has_pip_ensure_is_left_to_it(bare_slicer, simulation_erro
 
 
 def test_on_windows_without_a_device_intels_runtime_is_offered(bare_slicer, simulation_error, monkeypatch):
-    """Untested on Windows: what is held here is what the module asks and does."""
+    """Untested on Windows: this tests only the questions and actions of the module."""
     app = bare_slicer.app
     app.installed = ["pyopencl"]
     devices = importlib.import_module("SlicerUSSim.Logic.opencl.devices")

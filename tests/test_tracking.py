@@ -28,7 +28,7 @@ def free_port() -> int:
 
 
 def until(condition, seconds: float = 120.0):
-    """What `condition` comes to give, once it is true; on a busy machine that may take long."""
+    """Wait until `condition` returns a true value, and return it; this may take long on a busy machine."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         result = condition()

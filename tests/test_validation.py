@@ -1,4 +1,4 @@
-"""Every row of the validation, the phantoms it measures, and that it would notice if the physics were wrong."""
+"""Every row of the validation, its phantoms, and its sensitivity to wrong physics."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_an_echo_that_was_not_there_is_farther_from_its_limit_than_any_other(kin
     ],
 )
 def test_wrong_physics_fails_the_check_of_its_phenomenon(monkeypatch, check, wrong):
-    """The same measurement on a simulator that ignores or distorts what the check is about."""
+    """The same measurement on a simulator in which the phenomenon of the check is missing or wrong."""
 
     class Distorted(UltrasoundSimulator):
         def __init__(self, labels, tissues, settings=None, device=None):

@@ -1,4 +1,4 @@
-"""Volume: geometry survives every way in and out, and bad files are refused in one line."""
+"""Volume: geometry is preserved by all conversions, and invalid files give an error of one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The VTK filters: they execute when they must and only then, and their images are where the probe is."""
+"""The VTK filters: they execute only when necessary, and their images have the position of the probe."""
 
 from __future__ import annotations
 
@@ -376,7 +376,7 @@ def test_an_image_actor_shows_it_where_it_is():
 
 
 def seen_along_z(actor, pose: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """(rows, columns) of a window that just holds the image plane of PROBE, 20 mm wide and 30 mm deep."""
+    """(rows, columns) of a window that shows exactly the image plane of PROBE, 20 mm wide and 30 mm deep."""
     renderer, window = vtkRenderer(), vtkRenderWindow()
     renderer.AddViewProp(actor)
     camera = renderer.GetActiveCamera()
