@@ -6,10 +6,10 @@ Needs pip install "SlicerUSSim[demo]" PyMUST zea jax; a simulator that is not in
 
 Frame A has 196 scan lines of a 64-element phased array. PyMUST and zea compute the channel data of one transmission
 from point scatterers, so an image of 196 focused lines takes 196 of them, each with the scatterers inside its beam
-(2.25 standard deviations to either side, as many per cubic millimetre as this simulator has). One transmission is timed
-with growing numbers of scatterers; a straight line through the times gives what those of one beam take. Beamforming,
-which they leave to their user, is not counted, nor that they know neither interfaces nor refraction; they compute the
-wave field, which this simulator does not.
+(2.25 standard deviations to either side, at this simulator's density). One transmission is timed with increasing
+numbers of scatterers, and the time for those of one beam is extrapolated linearly. Beamforming, which is left to the
+user of PyMUST and zea, is not included. They do not model interfaces or refraction, but they compute the wave field,
+which this simulator does not.
 """
 
 from __future__ import annotations
