@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import asdict, dataclass, field, fields, replace
 
@@ -10,6 +11,8 @@ from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.probe.arrays import PROBES, Probe, probe_from_dict
 from SlicerUSSim.Logic.tissue.table import TissueTable
+
+_log = logging.getLogger(__name__)
 
 #: What segment_mri labels with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
@@ -68,6 +71,9 @@ class Preset:
                 sections[name] = _from_dict(kind, values[name], f"{source}: {name}")
         if "tissues" in values:
             sections["tissues"] = TissueTable.from_dict(values, source)
+        missing = [name for name in known[:-1] if name not in values]
+        if missing:
+            _log.info("%s: says nothing of %s, for which the default is taken", source, ", ".join(missing))
         return cls(**sections)
 
     @classmethod
