@@ -47,8 +47,8 @@ def log_nifti_geometry(image, ijk_to_ras: np.ndarray, name: str) -> None:
     off = {form: _distance_mm(matrix, ijk_to_ras, size) for form, matrix in forms.items()}
     used = min(off, key=lambda form: off[form])
     codes = f"sform code {sform_code}, qform code {qform_code}"
-    one, other = list(forms.values())[0], list(forms.values())[-1]
-    apart = _distance_mm(one, other, size)
+    matrices = list(forms.values())
+    apart = _distance_mm(matrices[0], matrices[-1], size)
     if apart > _SAME_MM:
         _log.warning(
             "%s: its sform and its qform are up to %.1f mm apart (%s); the %s is used, as ITK chooses",

@@ -75,7 +75,7 @@ class Volume:
         else:
             values = np.unique(array)
             found, is_labels = f"{len(values)} whole numbers from {values[0]} to {values[-1]}", len(values) <= 32
-        _log.info("a volume of %s is taken for %s", found, "a label map" if is_labels else "an MRI")
+        _log.info("the volume holds %s, as %s does", found, "a label map" if is_labels else "an MRI")
         return is_labels
 
     # ---- files -------------------------------------------------------------------------------------------------

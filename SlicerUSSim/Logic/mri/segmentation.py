@@ -154,7 +154,7 @@ def segment_mri(
     timed("mixture")
     _log.info(
         "%s taken for classes of %s after %d iterations: %s", ", ".join(names), contrast, len(likelihoods),
-        "; ".join(f"{m:.4g} ± {d:.3g} ({w:.0%})" for m, d, w in zip(means, deviations, weights, strict=True)),
+        "; ".join(f"mean {m:.4g} sd {d:.3g} share {w:.0%}" for m, d, w in zip(means, deviations, weights, strict=True)),
     )  # fmt: skip
     if thin_sulci:
         csf, grey = names.index("csf"), names.index("grey matter")

@@ -77,7 +77,7 @@ class Device:
         """
         key = (file_name, lanes, *defines)
         if key in self._kernels:
-            _log.debug("%s %s: built before in this process", file_name, key[1:])
+            _log.debug("%s (%s): built before in this process", file_name, ", ".join(map(str, key[1:])))
         else:
             started = perf_counter()
             source = shared_source() + "\n" + _with_includes(kernel_folder(), file_name)
