@@ -34,7 +34,7 @@ def log_nifti_geometry(image, ijk_to_ras: np.ndarray, name: str) -> None:
             # ITK does not pass on which way the third axis goes: of the two, the one that is nearer.
             both = [_qform(header, scale, way) for way in (1.0, -1.0)]
             forms["qform"] = min(both, key=lambda matrix: _distance_mm(matrix, ijk_to_ras, image.GetSize()))
-    except (KeyError, ValueError):  # ITK writes these for people
+    except (KeyError, ValueError):  # the form of these fields is not documented
         return
     if not unit_name:
         _log.info("%s: NIfTI without a unit of length, taken for millimetres", name)

@@ -77,7 +77,9 @@ class TrackedImages:
         chosen = sequence.select(kept)
         if numbers is None:
             _log.info("images chosen: %d of %d: %s", len(kept), len(sequence), _listed(kept))
-        _log.info("%s is composed of %s", path, ", ".join(sequence.composition(kept[0], path)) or "nothing")
+        steps = sequence.composition(kept[0], path)
+        if steps != [path]:
+            _log.info("%s is composed of %s", path, ", ".join(steps))
         images = _as_uint8(chosen.images)
         for number, image in zip(kept, images, strict=True):
             require(int(image.max()) > 0, f"image {number} of the sequence is black")
