@@ -206,10 +206,12 @@ class TrackerLink:
         except SimulationError as error:  # a tracker that loses sight of its tool may send anything
             self._refuse(str(error))
             return
+        following = f"connected to {self._peer_name}, following {self._device}"
         if self._refused:
             _log.info("OpenIGTLink: poses are used again, %d were refused", self._refused)
             self._refused = 0
-        self._say(f"connected to {self._peer_name}, following {self._device}")
+            self.status = following  # which is no news
+        self._say(following)
         self.received += 1
         self._moved(pose)
 
