@@ -258,9 +258,12 @@ def test_verbose_counts_before_and_after_the_subcommand(files, before, after, le
 
 
 def test_a_command_leaves_the_loggers_as_they_were(files):
-    last = logging.lastResort.level
+    def state():
+        return list(OURS.handlers), OURS.level, OURS.propagate, logging.lastResort.level
+
+    before = state()
     simulate(files, ["-vv"])
-    assert (OURS.handlers, OURS.level, OURS.propagate, logging.lastResort.level) == ([], logging.NOTSET, True, last)
+    assert state() == before
 
 
 def test_warnings_are_shown_without_being_asked_for_and_other_packages_are_not(files, monkeypatch):
