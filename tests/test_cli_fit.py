@@ -286,7 +286,7 @@ def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
 def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["write_twin.py", str(tmp_path), "--seed", "4"])
     example("write_twin").main()
-    assert "tracked.igs.mha" in capsys.readouterr().out
+    assert "tracked.igs.mha" in capsys.readouterr().err
     done = ussim(
         "optimize", tmp_path / "labels.nii.gz", "--sequence", tmp_path / "tracked.igs.mha", "--probe",
         tmp_path / "probe.json", "--frames", "1", "--free", "display", "--evaluations", 30, "--restarts", 0, "-o",

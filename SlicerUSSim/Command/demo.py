@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.options import device_option
-from SlicerUSSim.Command.progress import Steps
+from SlicerUSSim.Command.progress import Steps, note
 
 PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # probe.PROBES, which would import numpy
 
@@ -33,10 +33,11 @@ def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -
 
     settings = SimulationSettings(seed=seed)
     volume, source = (Volume.read(mri), os.path.abspath(mri)) if mri else demo_mri()
-    click.echo(f"MRI: {source}, {'x'.join(map(str, volume.array.shape[::-1]))} voxels")
+    note(f"MRI: {source}, {'x'.join(map(str, volume.array.shape[::-1]))} voxels")
     with Steps(5) as step:
         summary = run_whole_line(out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step)
     times = summary["milliseconds"]
-    click.echo(f"device: {summary['device']}")
-    click.echo(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")
-    click.echo(f"wrote {out / 'figure.png'} and nine more files beside it")
+    note(f"device: {summary['device']}")
+    note(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")
+    note(f"wrote {out / 'figure.png'} and nine more files beside it")
+    click.echo(out / "figure.png")

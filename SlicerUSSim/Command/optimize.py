@@ -9,7 +9,7 @@ import click
 
 from SlicerUSSim.Command.options import gathered
 from SlicerUSSim.Command.patient_options import PatientOptions
-from SlicerUSSim.Command.progress import Curve
+from SlicerUSSim.Command.progress import Curve, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.version import __version__
@@ -99,7 +99,7 @@ def optimize(
     if report:
         _write_report(report, found, tracked, patient, recording)
     _tell(found)
-    click.echo("wrote " + ", ".join(map(str, places)))
+    note("wrote " + ", ".join(map(str, places)))
 
 
 def _free_parameter(text: str) -> tuple[str, tuple[float, float] | None]:

@@ -12,6 +12,9 @@ import click
 
 Command = Callable[..., None]
 
+#: Under which a click.Context keeps how often --verbose was given, before the subcommand and after it
+_VERBOSITY = "SlicerUSSim.verbosity"
+
 device_option = click.option(
     "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
 )
@@ -27,6 +30,26 @@ sulci_option = click.option(
     "--thin-sulci/--no-thin-sulci", default=True, show_default=True,
     help="Label sulci too narrow to reach CSF intensity as leptomeninges.",
 )  # fmt: skip
+
+
+def verbose_option(command: click.Command) -> click.Command:
+    """The command with --verbose, which may stand before the subcommand, after it, or at both places."""
+    command.params.append(
+        click.Option(
+            ["-v", "--verbose"], count=True, expose_value=False, callback=_set_verbosity,
+            help="Say on stderr what is chosen and what inputs are taken for; -vv: times and caches too.",
+        )
+    )  # fmt: skip
+    return command
+
+
+def _set_verbosity(ctx: click.Context, _: click.Parameter, count: int) -> None:
+    ctx.meta[_VERBOSITY] = ctx.meta.get(_VERBOSITY, 0) + count
+    if isinstance(ctx.command, click.Group):
+        return  # the subcommand, which has the same option, adds its own and shows the log
+    from SlicerUSSim.Command.log import show_log  # which --help does not wait for
+
+    show_log(ctx, ctx.meta[_VERBOSITY])
 
 
 def declared(option: Callable[[Command], Command]) -> Any:

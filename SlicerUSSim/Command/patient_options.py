@@ -127,18 +127,28 @@ def open_examination(patient: PatientOptions) -> Examination:
 
     What is cheap to check comes before what takes time. Raises SimulationError for everything that does not fit.
     """
+    import logging  # not at the top: --help does not wait for it
+
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 
+    log = logging.getLogger(__name__)
     preset = patient.changed_preset()
     volume = Volume.read(patient.mri_or_labels)
     is_labels = volume.looks_like_labels() if patient.is_labels is None else patient.is_labels
+    if patient.is_labels is None:
+        kinds = ("a label map", "--mri") if is_labels else ("an MRI, to be segmented", "--labels")
+        log.info("%s is taken for %s; %s says otherwise", patient.mri_or_labels, *kinds)
     if is_labels and preset.settings.needs_texture:
         raise SimulationError(
             f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need the MRI it came from"
         )
     labels, tissues, texture = volume, preset.tissues, None
     table = _tissues_from_file(patient, is_labels)
+    if table is None:
+        log.info("tissues: %s", "the preset's" if patient.preset else "presets of the brain")
+    else:
+        log.info("tissues: %s", patient.tissues or "the table beside the label map")
     if not is_labels:
         segmentation = _segmented(volume, patient)
         labels, tissues = segmentation.labels, preset.tissues.for_names(segmentation.tissue_names)

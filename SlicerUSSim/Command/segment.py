@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.options import check_output, contrast_option, device_option, mask_option, sulci_option
-from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Command.progress import Share, note
 
 
 @click.command()
@@ -50,4 +50,4 @@ def segment(
         zip(result.tissue_names, result.means, result.standard_deviations, result.weights, strict=False), 1
     ):
         click.echo(f"label {label}: {name:14s} mean {mean:8.2f}  sd {sd:7.2f}  share {weight:5.1%}")
-    click.echo(f"wrote {out} and {tissues_beside(out)}")
+    note(f"wrote {out} and {tissues_beside(out)}")

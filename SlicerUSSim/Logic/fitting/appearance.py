@@ -18,8 +18,10 @@ So one image costs a weighted sum, compression and scan conversion.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,6 +43,8 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
+
+_log = logging.getLogger(__name__)
 
 _BANDS = CONSTANTS["BANDS"]
 #: Memory that bases and paths of all images may take; more is asked for by mistake.
@@ -96,6 +100,7 @@ class AppearanceModel:
 
     def anchor(self, tissues: TissueTable) -> None:
         """Compute the bases anew for these tissues, for which the model is then exact."""
+        started = perf_counter()
         simulator = self.simulator
         self.tissues = tissues
         self._weighted: TissueTable | None = None  # the weights on the device are for these tissues
@@ -107,6 +112,10 @@ class AppearanceModel:
             for number in range(len(self.poses)):
                 self._measure_paths(number)
                 self._compute_bases(number)
+        _log.debug(
+            "bases of %d images, %d each: computed in %.0f ms", len(self.poses), self._base_count,
+            (perf_counter() - started) * 1e3,
+        )  # fmt: skip
 
     def image(self, number: int, tissues: TissueTable, display: DisplaySettings) -> np.ndarray:
         """(rows, columns) uint8 image at pose `number`."""

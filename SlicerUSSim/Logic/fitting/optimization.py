@@ -8,6 +8,7 @@ same answer, and an interrupted run is resumed by replaying what it had evaluate
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
@@ -43,6 +44,8 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.table import TissueTable
+
+_log = logging.getLogger(__name__)
 
 #: The search for the best, stage by stage; afterwards come "redraw n", "restart n" and "draw".
 STAGES = ("global", "local", "polish")
@@ -204,7 +207,13 @@ def optimize_appearance(
     def describe(units: np.ndarray) -> dict[str, float]:
         return dict(zip(parameters.names, parameters.values(units).tolist(), strict=True))
 
-    search = Search(cost, describe, limit, seed, progress, history_from(resume, problem))
+    history = history_from(resume, problem)
+    _log.info(
+        "fit of %d images, %d free parameters: %s", len(references), len(parameters.names), ", ".join(parameters.names)
+    )
+    if history:
+        _log.info("%d evaluations of an earlier run are used again", len(history))
+    search = Search(cost, describe, limit, seed, progress, history)
 
     start = parameters.units(tissues, display)
     before = cost.of_each(tissues, display)

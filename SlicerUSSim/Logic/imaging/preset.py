@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -12,6 +13,8 @@ from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.probe.arrays import PROBE_KIND, PROBE_KINDS, PROBES, Probe, probe_from_dict
 from SlicerUSSim.Logic.tissue.table import TissueTable
+
+_log = logging.getLogger(__name__)
 
 #: {name: class} of the sections of a preset that are one dataclass each.
 SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
@@ -72,6 +75,9 @@ class Preset:
                 sections[name] = built(kind, values[name], f"{source}: {name}")
         if "tissues" in values or "membrane" in values:
             sections["tissues"] = TissueTable.from_dict(values, source)
+        missing = [name for name in known[:-1] if name not in values]
+        if missing:
+            _log.info("%s: says nothing of %s, for which the default is taken", source, ", ".join(missing))
         return cls(**sections)
 
     @classmethod

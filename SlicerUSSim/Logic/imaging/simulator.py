@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -31,6 +32,8 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
+
+_log = logging.getLogger(__name__)
 
 
 class EmptyViewWarning(UserWarning):
@@ -143,8 +146,11 @@ class UltrasoundSimulator:
             acquisition = self._upload_acquisition(probe, pose)
         inputs = (acquisition.tobytes(), self.settings, self.medium.version)
         if self.profiling or self.pulse.made_for != inputs:
+            _log.debug("frame: rays and echoes computed")
             self._echoes(probe, acquisition, timings)
             self.pulse.made_for = inputs
+        else:
+            _log.debug("frame: the echoes of the last one used again")
         with self._stage("B-mode", timings):
             self.compressor.run(acquisition, display, self.pulse.signal, noise_seed)
         with self._stage("scan conversion", timings):
@@ -217,6 +223,10 @@ class UltrasoundSimulator:
         """
         poses = list(poses)
         grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
+        _log.info(
+            "%d images are compounded in %s voxels %s", len(poses), "x".join(map(str, grid.array.shape[::-1])),
+            "along the patient's axes" if like is None else "of the grid given",
+        )  # fmt: skip
         compounder = Compounder(grid, probe, self.device)
         display = display or DisplaySettings()
         pixels = ImageGrid.for_probe(probe, display.image_size)

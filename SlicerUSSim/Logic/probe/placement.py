@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
@@ -10,6 +12,8 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+
+_log = logging.getLogger(__name__)
 
 
 def pose_looking_at(face_ras, target_ras, lateral_ras=(1.0, 0.0, 0.0)) -> np.ndarray:
@@ -60,7 +64,12 @@ def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standof
     outward = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
     target = centre + [0.0, 0.0, 2.0]
     face = surface_point(brain, target, outward) + standoff_mm * outward
+    _log.info("probe placed by itself: coronal view from RAS %s, %.0f degrees from the midline", _point(face), tilt_deg)
     return pose_looking_at(face, target, lateral_ras=(1.0, 0.0, 0.0))
+
+
+def _point(ras: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.1f}" for value in ras) + ") mm"
 
 
 def pose_in_slice(foreground: Volume, slice_to_ras: np.ndarray, target_ras=None) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, replace
@@ -15,6 +16,8 @@ from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
+
+_log = logging.getLogger(__name__)
 
 MAX_LABEL = 62  # six bits in the device's label volume, and 63 is the membrane
 
@@ -65,7 +68,8 @@ class TissueTable(Mapping[int, Tissue]):
     @classmethod
     def named(cls, tissue_names: Iterable[str], membrane: Membrane | None = None) -> TissueTable:
         """Presets for labels 1, 2, ... by name, for the body as for the brain. SimulationError for a new one."""
-        return cls({label: tissue_named(name) for label, name in enumerate(tissue_names, 1)}, membrane)
+        table = {label: _preset(label, name) for label, name in enumerate(tissue_names, 1)}
+        return cls(table, membrane)
 
     def label_of(self, name: str) -> int:
         """The label of a tissue by name. Raises SimulationError if the table has none of that name."""
@@ -136,7 +140,7 @@ class TissueTable(Mapping[int, Tissue]):
         table, unknown = {0: self[0]}, []
         for label, name in enumerate(names, 1):
             try:
-                table[label] = exactly.get(name) or mine.get(plain_name(name)) or tissue_named(name)
+                table[label] = exactly.get(name) or mine.get(plain_name(name)) or _preset(label, name)
             except SimulationError:
                 unknown.append(name)
         require(
@@ -196,6 +200,13 @@ def _label(text: str, source: str) -> int:
     known = {str(label): label for label in range(MAX_LABEL + 1)}
     require(text in known, f"{source}: tissue label is {text!r}, expected a whole number from 0 to {MAX_LABEL}")
     return known[text]
+
+
+def _preset(label: int, name: str) -> Tissue:
+    tissue = tissue_named(name)
+    if tissue.name != name:
+        _log.info("label %d, %r, is taken for %s", label, name, tissue.name)
+    return tissue
 
 
 def _plain(tissue: Tissue) -> dict:

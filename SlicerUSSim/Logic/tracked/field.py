@@ -6,6 +6,7 @@ what is ever bright; its two straight sides say whether lines are parallel or me
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass, replace
 from typing import cast
@@ -16,6 +17,8 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.probe.arrays import Probe, probe_from_dict
+
+_log = logging.getLogger(__name__)
 
 #: Grey levels above this are not the black around the field.
 _DARK = 4
@@ -111,6 +114,10 @@ def estimate_field(
         f"the bright part of the images is no probe's field (the best one fits {overlap:.0%}); give the probe and its "
         "place",
     )
+    sizes = ", ".join(f"{name} {value:.1f}" for name, value in geometry.items())
+    _log.info("field found in the images: %s probe (%s), covers what is bright to %.0f %%", kind, sizes, 100 * overlap)
+    if pixel_spacing_mm is None:
+        _log.info("pixels are %.3g mm large, from the size that was given", scale[0])
     return replace(field, overlap=overlap)
 
 
