@@ -202,23 +202,27 @@ def _parameter(line: str, where: dict[str, str] | None) -> list[str]:
     return [f"    {names}", "        " + _inline(found[2], where)]
 
 
+_MARKS = re.compile(
+    r"(?P<literal>``.+?``)|`(?P<code>[^`]+)`(?P<glued>(?=\w))?|\bdocs/(?P<page>\w+)\.md(#[\w-]+)?"
+    r"|(?<![.\w])(?P<name>[A-Z][a-z]+[A-Z]\w+)(?!\w)|(?P<bar>\|)"
+)
+
+
 def _inline(line: str, where: dict[str, str] | None) -> str:
     """`name` as code, or as a link where it is known, as names such as TissueTable are; docs/page.md as a link."""
-    where = where or {}
+    known = where or {}
 
-    def code(found: re.Match) -> str:
-        name, _, attribute = found[1].removesuffix("()").partition(".")
-        if name in where and re.fullmatch(r"\w*", attribute):
-            return f":py:obj:`{found[1]} <{where[name]}{'.' * bool(attribute)}{attribute}>`"
-        return f"``{found[1]}``"
+    def marked(found: re.Match) -> str:
+        if found["code"]:
+            end = "" if found["glued"] is None else r"\ "
+            name, _, attribute = found["code"].removesuffix("()").partition(".")
+            if name in known and re.fullmatch(r"\w*", attribute):
+                return f":py:obj:`{found['code']} <{'.'.join(filter(None, (known[name], attribute)))}>`{end}"
+            return f"``{found['code']}``{end}"
+        if found["page"]:
+            return f":doc:`docs/{found['page']}.md </docs/{found['page']}>`"
+        if found["name"] in known:
+            return f":py:obj:`{found['name']} <{known[found['name']]}>`"
+        return r"\|" if found["bar"] else found[0]  # |r| is a magnitude here, and a substitution in reST
 
-    def link(found: re.Match) -> str:
-        return f":py:obj:`{found[0]} <{where[found[0]]}>`" if found[0] in where else found[0]
-
-    parts = re.split(r"(``.+?``)", line)
-    for n in range(0, len(parts), 2):
-        text = parts[n].replace("|", r"\|")  # |r| is a magnitude here, and a substitution in reST
-        text = re.sub(r"(?<![`.\w])[A-Z][a-z]+[A-Z]\w+\b(?![`.])", link, text)
-        text = re.sub(r"(?<![`:\w])`([^`]+)`(?![`_])", code, text)
-        parts[n] = re.sub(r"\bdocs/(\w+)\.md(#[\w-]+)?", r":doc:`docs/\1.md </docs/\1>`", text)
-    return "".join(parts)
+    return _MARKS.sub(marked, line)

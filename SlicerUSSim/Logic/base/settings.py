@@ -12,7 +12,12 @@ FULL_SCALE_DB = 23.0
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """What the physics needs beside tissues, probe and pose."""
+    """What the physics needs beside tissues, probe and pose.
+
+    >>> from SlicerUSSim.Logic import SimulationSettings
+    >>> SimulationSettings(seed=7, reflections=False).max_ray_depth
+    6
+    """
 
     #: Which patient's speckle, and which amplifier noise
     seed: int = 0
@@ -92,7 +97,13 @@ class SimulationSettings:
 
 @dataclass(frozen=True)
 class DisplaySettings:
-    """What a scanner's console does to the echoes."""
+    """What a scanner's console does to the echoes.
+
+    >>> from dataclasses import replace
+    >>> from SlicerUSSim.Logic import DisplaySettings
+    >>> replace(DisplaySettings(gain_db=3.0), dynamic_range_db=60.0).gain_db
+    3.0
+    """
 
     gain_db: float = 0.0
     dynamic_range_db: float = 55.0

@@ -16,7 +16,13 @@ from SlicerUSSim.Logic.base.errors import require, require_between
 
 @dataclass(frozen=True)
 class Tissue:
-    """One tissue. Raises SimulationError, naming the tissue and the value, for anything out of physical range."""
+    """One tissue. Raises SimulationError, naming the tissue and the value, for anything out of physical range.
+
+    >>> from SlicerUSSim.Logic import Tissue
+    >>> tumour = Tissue("tumour", 1550.0, 1.62, 0.6, mu0=0.4, sigma0=0.2)
+    >>> round(tumour.scatterer_variance, 3)
+    0.06
+    """
 
     name: str
     #: c [m/s]
