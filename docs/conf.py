@@ -9,6 +9,7 @@ taken from the network.
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import json
 import re
 import sys
@@ -48,6 +49,7 @@ smartquotes = False  # quotation marks in docstrings are often code
 myst_heading_anchors = 4  # the anchors that GitHub makes
 
 autosummary_generate = False
+autodoc_inherit_docstrings = False
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True, "undoc-members": True}
@@ -92,6 +94,11 @@ def rewrite_docstring(app, what, name, obj, options, lines: list[str]) -> None:
     lines[:] = reference.docstring_as_rest(lines, reference.homes())
 
 
+def skip_undocumented(app, what, name, obj, skip: bool, options) -> bool | None:
+    """Fields are shown without a comment too, methods only with a docstring: VTK's are none of a user's business."""
+    return True if inspect.isroutine(obj) and not obj.__doc__ else None
+
+
 def shorten_defaults(app, what, name, obj, options, signature: str | None, returns: str | None):
     """Defaults that are objects, without what is in them; and in a form that Sphinx can parse."""
     if signature is None:
@@ -112,5 +119,6 @@ def setup(app) -> None:
     reference.write_pages(ROOT / "docs" / "reference", main)
     app.connect("source-read", adapt_page)
     app.connect("autodoc-process-docstring", rewrite_docstring)
+    app.connect("autodoc-skip-member", skip_undocumented)
     app.connect("autodoc-process-signature", shorten_defaults)
     app.connect("build-finished", write_first_page)

@@ -145,15 +145,27 @@ def write_pages(folder: Path, group: click.Group) -> None:
 def _entry(room: str, module: str, name: str) -> str:
     """The directive that describes a public name, in reST."""
     text = (LOGIC / room / f"{module}.py").read_text(encoding="utf-8")
-    for node in ast.parse(text).body:
+    body = ast.parse(text).body
+    for node in body:
         if isinstance(node, ast.ClassDef) and node.name == name:
-            return f".. autoclass:: {name}\n" + "   :show-inheritance:\n" * bool(node.bases)
+            return f".. autoclass:: {name}\n{_inheritance(node, body)}"
         if isinstance(node, ast.FunctionDef) and node.name == name:
             return f".. autofunction:: {name}\n"
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         if name in (target.id for target in targets if isinstance(target, ast.Name)):
             return f".. py:data:: {name}\n\n   {_comment_above(text.splitlines(), node.lineno - 1)}\n"
     raise ValueError(f"{room}/__init__.py exports {name}, which {module}.py does not define")
+
+
+def _inheritance(node: ast.ClassDef, body: list[ast.stmt]) -> str:
+    """What belongs below the directive of a class: its bases, or the methods of one that is not public, in reST."""
+    bases = {ast.unparse(base) for base in node.bases}
+    hidden = [base for base in body if isinstance(base, ast.ClassDef) and base.name in bases and base.name[0] == "_"]
+    if hidden or not bases:
+        methods = [entry for base in hidden for entry in base.body if isinstance(entry, ast.FunctionDef)]
+        public = [method.name for method in methods if method.name[0] != "_" and ast.get_docstring(method)]
+        return "".join(f"\n   .. automethod:: {name}\n" for name in public)
+    return "   :show-inheritance:\n"
 
 
 def _comment_above(lines: list[str], number: int) -> str:
