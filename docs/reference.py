@@ -3,7 +3,7 @@
 Nothing here imports Sphinx; conf.py connects it. It is written as reST into docs/reference, which is not kept in git.
 
 Docstrings of this package are plain text with three conventions: names in `single backticks`, "Parameters" underlined
-with hyphens and then `name : text`, and docs/page.md#heading.
+with hyphens and then `name : text`, and pages such as docs/physics.md, with or without a heading.
 """
 
 from __future__ import annotations
