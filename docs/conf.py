@@ -65,6 +65,8 @@ PAGES = {
     "Change it": ["docs/architecture", "docs/developer", "CONTRIBUTING", "CHANGELOG"],
 }
 
+_NAMED = {page for pages in PAGES.values() for page in pages}
+PAGES["How it works"] += sorted({f"docs/{page.stem}" for page in (ROOT / "docs").glob("*.md")} - _NAMED)
 
 REPOSITORY = json.loads((ROOT / "USSim.json").read_text(encoding="utf-8"))["scm_url"].removesuffix(".git")
 
