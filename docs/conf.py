@@ -92,7 +92,11 @@ def _without_folders(folder: Path, target: str) -> str:
 
 
 def rewrite_docstring(app, what, name, obj, options, lines: list[str]) -> None:
-    """Docstrings of this package as reST."""
+    """Docstrings of this package as reST; a field without one has what its declaration says."""
+    if what == "attribute" and not "".join(lines):
+        owner, _, field = name.rpartition(".")
+        room, _, kind = owner.rpartition(".")
+        lines[:] = reference.field_text(getattr(sys.modules.get(room), kind, None), field)
     lines[:] = reference.docstring_as_rest(lines, reference.homes())
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ast
 import re
+from dataclasses import fields, is_dataclass
 from inspect import cleandoc
 from pathlib import Path
 
@@ -203,6 +204,23 @@ def docstring_as_rest(lines: list[str], where: dict[str, str] | None = None) -> 
             out.append(_inline(line, where))
         number += 1
     return out
+
+
+def field_text(owner: object, name: str) -> list[str]:
+    """What the declaration of a dataclass' field says of it (metadata "parameter"), as the lines of a docstring."""
+    known = {entry.name: entry for entry in fields(owner)} if is_dataclass(owner) else {}
+    declared = known[name].metadata.get("parameter") if name in known else None
+    if declared is None:
+        return []
+    said = {
+        key: getattr(declared, key, None) for key in ("symbol", "tip", "unit", "bounds", "choices", "note", "source")
+    }
+    values = (
+        f"{said['bounds'][0]:.10g} to {said['bounds'][1]:.10g}" if said["bounds"] else ", ".join(said["choices"] or ())
+    )
+    about = "; ".join(filter(None, (said["symbol"], values and f"{values} {said['unit'] or ''}".strip())))
+    first = f"{said['tip']}{f' ({about})' if about else ''}."
+    return [" ".join([first, *(f"{said[key]}." for key in ("note", "source") if said[key])])]
 
 
 def _parameter(line: str, where: dict[str, str] | None) -> list[str]:

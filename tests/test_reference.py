@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -78,6 +80,19 @@ def test_parameters_become_a_definition_list():
         "    ``a``, ``b``", "        (rows, columns).", "",
         "Raises SimulationError for others.",
     ]  # fmt: skip
+
+
+def test_a_field_without_a_comment_has_what_its_declaration_says():
+    about = SimpleNamespace(tip="Depth of the image", unit="mm", bounds=(1, 400), note="Of the field", source="")
+
+    @dataclass
+    class Declared:
+        depth_mm: float = field(default=1.0, metadata={"parameter": about})
+        plain: float = 0.0
+
+    assert reference.field_text(Declared, "depth_mm") == ["Depth of the image (1 to 400 mm). Of the field."]
+    assert reference.field_text(Declared, "plain") == reference.field_text(Declared, "missing") == []
+    assert reference.field_text(None, "depth_mm") == []
 
 
 @pytest.mark.parametrize(
