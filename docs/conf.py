@@ -8,6 +8,7 @@ taken from the network.
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import inspect
 import json
@@ -19,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
 import reference  # noqa: E402
+from sphinx.pycode import ModuleAnalyzer  # noqa: E402
 
 from SlicerUSSim.Command.cli import main  # noqa: E402
 from SlicerUSSim.Logic.base.version import __version__  # noqa: E402
@@ -49,7 +51,6 @@ smartquotes = False  # quotation marks in docstrings are often code
 myst_heading_anchors = 4  # the anchors that GitHub makes
 
 autosummary_generate = False
-autodoc_inherit_docstrings = False
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True, "undoc-members": True}
@@ -92,17 +93,26 @@ def _without_folders(folder: Path, target: str) -> str:
 
 
 def rewrite_docstring(app, what, name, obj, options, lines: list[str]) -> None:
-    """Docstrings of this package as reST; a field without one has what its declaration says."""
-    if what == "attribute" and not "".join(lines):
-        owner, _, field = name.rpartition(".")
-        room, _, kind = owner.rpartition(".")
-        lines[:] = reference.field_text(getattr(sys.modules.get(room), kind, None), field)
+    """Docstrings of this package as reST."""
     lines[:] = reference.docstring_as_rest(lines, reference.homes())
 
 
 def skip_undocumented(app, what, name, obj, skip: bool, options) -> bool | None:
     """Fields are shown without a comment too, methods only with a docstring: VTK's are none of a user's business."""
     return True if inspect.isroutine(obj) and not obj.__doc__ else None
+
+
+def describe_declared_fields() -> None:
+    """Fields that are declared with a description have it in the place of a comment above them."""
+    for name, home in reference.homes().items():
+        room = home.rpartition(".")[0]
+        if room.endswith(".mrml"):  # which declares none, and cannot be imported everywhere
+            continue
+        for owner in getattr(getattr(importlib.import_module(room), name), "__mro__", ()):
+            for field, text in reference.declared_fields(owner).items():
+                analyzer = ModuleAnalyzer.for_module(owner.__module__)
+                analyzer.analyze()
+                analyzer.attr_docs[owner.__qualname__, field] = [text, ""]
 
 
 def shorten_defaults(app, what, name, obj, options, signature: str | None, returns: str | None):
@@ -122,6 +132,7 @@ def write_first_page(app, exception) -> None:
 
 def setup(app) -> None:
     """Called by Sphinx."""
+    describe_declared_fields()
     reference.write_pages(ROOT / "docs" / "reference", main)
     app.connect("source-read", adapt_page)
     app.connect("autodoc-process-docstring", rewrite_docstring)

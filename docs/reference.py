@@ -11,7 +11,7 @@ from __future__ import annotations
 import ast
 import re
 from dataclasses import fields, is_dataclass
-from inspect import cleandoc
+from inspect import cleandoc, get_annotations
 from pathlib import Path
 
 import click
@@ -206,21 +206,20 @@ def docstring_as_rest(lines: list[str], where: dict[str, str] | None = None) -> 
     return out
 
 
-def field_text(owner: object, name: str) -> list[str]:
-    """What the declaration of a dataclass' field says of it (metadata "parameter"), as the lines of a docstring."""
-    known = {entry.name: entry for entry in fields(owner)} if is_dataclass(owner) else {}
-    declared = known[name].metadata.get("parameter") if name in known else None
-    if declared is None:
-        return []
-    said = {
-        key: getattr(declared, key, None) for key in ("symbol", "tip", "unit", "bounds", "choices", "note", "source")
-    }
-    values = (
-        f"{said['bounds'][0]:.10g} to {said['bounds'][1]:.10g}" if said["bounds"] else ", ".join(said["choices"] or ())
-    )
-    about = "; ".join(filter(None, (said["symbol"], values and f"{values} {said['unit'] or ''}".strip())))
-    first = f"{said['tip']}{f' ({about})' if about else ''}."
-    return [" ".join([first, *(f"{said[key]}." for key in ("note", "source") if said[key])])]
+def declared_fields(owner: type) -> dict[str, str]:
+    """{field: what its declaration says} of the fields of a dataclass that have one (metadata "parameter")."""
+    own = get_annotations(owner) if is_dataclass(owner) else {}
+    entries = [entry for entry in fields(owner) if entry.name in own and "parameter" in entry.metadata] if own else []
+    return {entry.name: _described(entry.metadata["parameter"]) for entry in entries}
+
+
+def _described(about: object) -> str:
+    keys = ("symbol", "tip", "unit", "bounds", "choices", "note", "source")
+    said = {key: getattr(about, key, None) or "" for key in keys}
+    values = f"{said['bounds'][0]:.10g} to {said['bounds'][1]:.10g}" if said["bounds"] else ", ".join(said["choices"])
+    brackets = "; ".join(filter(None, (said["symbol"], f"{values} {said['unit']}".strip())))
+    first = f"{said['tip']}{f' ({brackets})' if brackets else ''}."
+    return " ".join([first, *(f"{said[key]}." for key in ("note", "source") if said[key])])
 
 
 def _parameter(line: str, where: dict[str, str] | None) -> list[str]:

@@ -49,6 +49,10 @@ def test_every_room_and_every_name_of_the_package_is_on_the_first_page():
 
 def test_a_constant_is_described_by_the_comment_above_it():
     assert ".. py:data:: PROBES\n\n   Probes to start from, by name" in reference.room_page("probe")
+    for room in reference.rooms():
+        assert not re.findall(r"py:data:: (\w+)\n\n *\n", reference.room_page(room)), (
+            "needs a comment that begins with #:"
+        )
 
 
 def test_a_class_shows_the_methods_of_a_base_that_is_not_public():
@@ -90,9 +94,8 @@ def test_a_field_without_a_comment_has_what_its_declaration_says():
         depth_mm: float = field(default=1.0, metadata={"parameter": about})
         plain: float = 0.0
 
-    assert reference.field_text(Declared, "depth_mm") == ["Depth of the image (1 to 400 mm). Of the field."]
-    assert reference.field_text(Declared, "plain") == reference.field_text(Declared, "missing") == []
-    assert reference.field_text(None, "depth_mm") == []
+    assert reference.declared_fields(Declared) == {"depth_mm": "Depth of the image (1 to 400 mm). Of the field."}
+    assert reference.declared_fields(int) == {}
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
+#: (4, 4) of homogeneous points in millimetres: from LPS, which ITK counts in, to RAS; its own inverse.
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
