@@ -12,7 +12,12 @@ FULL_SCALE_DB = 23.0
 
 @dataclass(frozen=True)
 class SimulationSettings(Declared):
-    """What the physics needs beside tissues, probe and pose."""
+    """What the physics needs beside tissues, probe and pose.
+
+    >>> from SlicerUSSim.Logic import SimulationSettings
+    >>> SimulationSettings(seed=7, reflections=False).max_ray_depth
+    6
+    """
 
     seed: int = parameter(
         0, "Seed", "Which speckle and noise: another number is another patient", bounds=(0, 2**32 - 1),
@@ -95,7 +100,13 @@ class SimulationSettings(Declared):
 
 @dataclass(frozen=True)
 class DisplaySettings(Declared):
-    """What a scanner's console does to the echoes."""
+    """What a scanner's console does to the echoes.
+
+    >>> from dataclasses import replace
+    >>> from SlicerUSSim.Logic import DisplaySettings
+    >>> replace(DisplaySettings(gain_db=3.0), dynamic_range_db=60.0).gain_db
+    3.0
+    """
 
     gain_db: float = parameter(
         0.0, "Gain", "Brightness of all echoes", unit="dB", bounds=(-200, 200),

@@ -31,6 +31,17 @@ class Volume:
     ijk_to_ras : (4, 4) takes homogeneous voxel indices (i, j, k, 1) of voxel *centres* to RAS millimetres.
 
     Raises SimulationError for an array that is not 3D or not numeric, and for a singular or non-affine matrix.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import Volume
+    >>> mri = Volume(np.zeros((20, 30, 40), np.float32), np.diag([0.5, 0.5, 2.0, 1.0]))
+    >>> mri.spacing_mm.tolist()
+    [0.5, 0.5, 2.0]
+    >>> (mri.ijk_to_ras @ [39, 29, 19, 1])[:3].tolist()  # the centre of the last voxel, RAS mm
+    [19.5, 14.5, 38.0]
+    >>> mri.write("mri.nii.gz")
+    >>> Volume.read("mri.nii.gz").array.shape
+    (20, 30, 40)
     """
 
     array: np.ndarray

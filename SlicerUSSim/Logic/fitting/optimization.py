@@ -190,6 +190,23 @@ def optimize_appearance(
 
     Raises SimulationError for what FreeParameters, AppearanceModel and AppearanceCost refuse, and for the state of
     another problem, which it says what is different about.
+
+    The gain of one image, found again:
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import LinearProbe, TissueTable, UltrasoundSimulator, Volume
+    >>> from SlicerUSSim.Logic import DisplaySettings, optimize_appearance
+    >>> from SlicerUSSim.Logic.probe import pose_looking_at
+    >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+    >>> simulator = UltrasoundSimulator(labels, TissueTable.named(["liver"]))
+    >>> probe = LinearProbe(width_mm=20, depth_mm=30, scan_lines=64)
+    >>> pose = pose_looking_at(face_ras=(20, 20, 39), target_ras=(20, 20, 0))
+    >>> reference = simulator.simulate(probe, pose, DisplaySettings(gain_db=6.0)).image
+    >>> found = optimize_appearance(simulator, probe, [pose], [reference], free=["gain_db"], max_evaluations=30)
+    >>> round(found.display.gain_db, 2)
+    6.0
+    >>> found.cost_after < found.cost_before
+    True
     """
     started = perf_counter()
     display = display or DisplaySettings()

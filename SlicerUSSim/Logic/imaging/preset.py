@@ -27,7 +27,16 @@ _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
 @dataclass(frozen=True)
 class Preset:
-    """Probe, console, physics and tissues. The default is a cranial phased array and the brain's tissues."""
+    """Probe, console, physics and tissues. The default is a cranial phased array and the brain's tissues.
+
+    >>> from SlicerUSSim.Logic import Preset
+    >>> preset = Preset().changed("probe", kind="convex", depth_mm=110).changed("display", gain_db=3)
+    >>> preset.probe.focus_mm
+    66.0
+    >>> preset.write("preset.json")
+    >>> Preset.read("preset.json") == preset
+    True
+    """
 
     probe: Probe = PROBES["phased"]
     display: DisplaySettings = field(default_factory=DisplaySettings)

@@ -59,6 +59,16 @@ class UltrasoundSimulator:
 
     Raises SimulationError for labels without a tissue, settings that need a texture where there is none or it does not
     fit, and where no device can be used.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import LinearProbe, TissueTable, UltrasoundSimulator, Volume
+    >>> from SlicerUSSim.Logic.probe import pose_looking_at
+    >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+    >>> simulator = UltrasoundSimulator(labels, TissueTable.named(["liver"]))
+    >>> probe = LinearProbe(width_mm=20, depth_mm=30, scan_lines=64)
+    >>> frame = simulator.simulate(probe, pose_looking_at(face_ras=(20, 20, 39), target_ras=(20, 20, 0)))
+    >>> frame.image.shape, frame.image.dtype  # rows, columns
+    ((512, 342), dtype('uint8'))
     """
 
     def __init__(
@@ -220,6 +230,17 @@ class UltrasoundSimulator:
         `hole_mm` is how wide a gap between images is filled (default: as wide as the sweep's widest, 10 mm at most).
         The grey levels are uint8; where no image came near, 0. The images have the noise that sweep() gives them.
         Raises SimulationError as sweep_grid and Compounder do.
+
+        >>> import numpy as np
+        >>> from SlicerUSSim.Logic import LinearProbe, TissueTable, UltrasoundSimulator, Volume
+        >>> from SlicerUSSim.Logic.probe import pose_looking_at, slide_sweep
+        >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+        >>> simulator = UltrasoundSimulator(labels, TissueTable.named(["liver"]))
+        >>> probe = LinearProbe(width_mm=20, depth_mm=30, scan_lines=64)
+        >>> pose = pose_looking_at(face_ras=(20, 20, 39), target_ras=(20, 20, 0))
+        >>> volume = simulator.volume(probe, slide_sweep(pose, length_mm=8, frames=9), spacing_mm=1.0)
+        >>> volume.spacing_mm.tolist()
+        [1.0, 1.0, 1.0]
         """
         poses = list(poses)
         grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)

@@ -116,6 +116,14 @@ def segment_mri(
 
     Raises SimulationError for a contrast or number of classes that is not known, an image that is not finite or
     constant, and a mask that does not fit or is empty.
+
+    >>> from SlicerUSSim.Logic import segment_mri
+    >>> from SlicerUSSim.Logic.mri import head_mri
+    >>> segmentation = segment_mri(head_mri(spacing_mm=3.0), contrast="t1")
+    >>> segmentation.tissue_names  # of labels 1, 2, 3
+    ('csf', 'grey matter', 'white matter')
+    >>> segmentation.labels.array.dtype
+    dtype('uint8')
     """
     report = progress or (lambda share: None)
     settings = SegmentationSettings(contrast, classes, thin_sulci, bias_correction, filter_radius, filter_epsilon)

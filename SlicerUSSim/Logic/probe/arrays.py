@@ -33,6 +33,13 @@ class Probe(Declared):
     aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both ways at one
     depth.
     Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
+
+    >>> from dataclasses import replace
+    >>> from SlicerUSSim.Logic.probe import PROBES
+    >>> sorted(PROBES)
+    ['abdominal', 'convex', 'linear', 'microconvex', 'phased']
+    >>> replace(PROBES["convex"], frequency_mhz=3.5).depth_mm
+    100.0
     """
 
     scan_lines: int = parameter(
@@ -264,7 +271,15 @@ class LinearProbe(Probe):
 
 @dataclass(frozen=True)
 class ConvexProbe(Probe):
-    """A curved array of radius `radius_mm`; scan lines leave it at right angles over `field_of_view_deg`."""
+    """A curved array of radius `radius_mm`; scan lines leave it at right angles over `field_of_view_deg`.
+
+    >>> from SlicerUSSim.Logic import ConvexProbe
+    >>> probe = ConvexProbe(radius_mm=40, field_of_view_deg=60, depth_mm=100)
+    >>> probe.focus_mm
+    60.0
+    >>> probe.origins_mm().shape  # (scan_lines, 3)
+    (192, 3)
+    """
 
     kind = "convex"
     geometry = "curved array"
@@ -309,6 +324,11 @@ def probe_from_dict(values: dict, source: str = "probe") -> Probe:
     """The probe described by plain values (see Probe.to_dict).
 
     Raises SimulationError that names `source`, for an unknown kind or name, a missing value and one that is refused.
+
+    >>> from SlicerUSSim.Logic.probe import probe_from_dict
+    >>> probe = probe_from_dict({"kind": "linear", "width_mm": 38, "depth_mm": 40, "frequency_mhz": 9})
+    >>> round(probe.wavelength_mm, 3)
+    0.171
     """
     require(isinstance(values, dict), f'{source}: expected an object with a "kind", got {values!r:.80}')
     kind: Any = values.get("kind")

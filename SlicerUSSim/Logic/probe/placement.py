@@ -21,6 +21,11 @@ def pose_looking_at(face_ras, target_ras, lateral_ras=(1.0, 0.0, 0.0)) -> np.nda
 
     `lateral_ras` is the direction the image's left-to-right axis should have as nearly as possible.
     Raises SimulationError if the points coincide or `lateral_ras` lies along the axis.
+
+    >>> from SlicerUSSim.Logic.probe import pose_looking_at
+    >>> pose = pose_looking_at(face_ras=(0, 0, 70), target_ras=(0, 0, 0))
+    >>> float(pose[2, 1])  # the axis of the probe, straight down
+    -1.0
     """
     face, target, lateral = (np.asarray(v, dtype=float) for v in (face_ras, target_ras, lateral_ras))
     depth = target - face
@@ -55,6 +60,12 @@ def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standof
     """(4, 4) probe_to_ras of a coronal view through a parasagittal craniotomy, aimed below the centre of the brain.
 
     `brain` is a mask or label map (non-zero inside). The view crosses cortex, a lateral ventricle and the midline.
+
+    >>> from SlicerUSSim.Logic.mri import head_mri
+    >>> from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose
+    >>> pose = craniotomy_pose(head_mri(spacing_mm=4.0), PROBES["phased"])
+    >>> bool(pose[2, 3] > 50)  # the face is above the centre of the brain, mm
+    True
     """
     inside = brain.array > 0
     require(inside.any(), "the brain mask is empty, expected voxels inside")
@@ -94,6 +105,11 @@ def turned(probe_to_ras: np.ndarray, *, rock_deg=0.0, tilt_deg=0.0, rotate_deg=0
 
     Rocking stays in the image plane (about z), tilting leaves it (about the lateral axis x), rotating is about the
     probe's own axis (y); positive as rotations about these axes. The names are AIUM's.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic.probe import turned
+    >>> round(float(turned(np.eye(4), tilt_deg=90)[2, 1]), 3)  # the axis points along +z
+    1.0
     """
     motion = np.eye(4)
     motion[:3, :3] = Rotation.from_euler("ZXY", [rock_deg, tilt_deg, rotate_deg], degrees=True).as_matrix()
@@ -151,7 +167,14 @@ def slide_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int) -> list
 
 def tilt_sweep(probe_to_ras: np.ndarray, angle_deg: float, frames: int) -> list[np.ndarray]:
     """Poses (4, 4) of a probe that tilts about the lateral axis of its face, `angle_deg` in all, as a matrix array or a
-    wobbling one scans."""
+    wobbling one scans.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic.probe import tilt_sweep
+    >>> poses = tilt_sweep(np.eye(4), angle_deg=60, frames=7)
+    >>> [round(float(np.rad2deg(np.arcsin(pose[2, 1])))) for pose in poses]
+    [-30, -20, -10, 0, 10, 20, 30]
+    """
     return [probe_to_ras @ elevational_motion(angle_deg=share * angle_deg) for share in _shares(frames)]
 
 

@@ -27,6 +27,7 @@ _DENSITY = f"density ({_ITIS}) x speed of sound"
 # Grey and white matter share Szabo's speed for brain and one impedance: published differences between them are smaller
 # than between publications, and a difference would bend rays at every voxel of a border that is not a sharp interface.
 # fmt: off
+#: Tissues by name, each number with its source: TISSUES["white matter"].
 TISSUES: dict[str, Tissue] = {
     tissue.name: tissue
     for tissue in (

@@ -27,6 +27,13 @@ class TissueTable(Mapping[int, Tissue]):
 
     Label 0 is the coupling medium around the patient and is added when it is not given.
     Raises SimulationError for labels outside 0..62.
+
+    >>> from SlicerUSSim.Logic import TissueTable
+    >>> tissues = TissueTable.brain(["csf", "grey matter", "white matter"])
+    >>> tissues.names()
+    ['coupling', 'csf', 'grey matter', 'white matter']
+    >>> tissues.replace("white matter", attenuation_db_cm_mhz=0.45)[3].attenuation_db_cm_mhz
+    0.45
     """
 
     def __init__(self, tissues: Mapping[int, Tissue], membrane: Membrane | None = None) -> None:

@@ -19,7 +19,13 @@ _ECHOGENICITY = "Bounds of a fit: echogenicity over some 40 dB"
 
 @dataclass(frozen=True)
 class Tissue(Declared):
-    """One tissue. Raises SimulationError, naming the tissue and the value, for anything out of physical range."""
+    """One tissue. Raises SimulationError, naming the tissue and the value, for anything out of physical range.
+
+    >>> from SlicerUSSim.Logic import Tissue
+    >>> tumour = Tissue("tumour", 1550.0, 1.62, 0.6, mu0=0.4, sigma0=0.2)
+    >>> round(tumour.scatterer_variance, 3)
+    0.06
+    """
 
     name: str = parameter(label="Tissue", tip="Name of the tissue")
     speed_of_sound_m_s: float = parameter(

@@ -43,6 +43,18 @@ class TrackedSequence:
     """Tracked images of one sweep.
 
     Raises SimulationError if images, transforms and timestamps are not as many, and for matrices that are not 4x4.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import TrackedSequence
+    >>> probe_to_reference = np.eye(4)
+    >>> probe_to_reference[:3, 3] = [10, 20, 30]
+    >>> sequence = TrackedSequence(np.zeros((1, 64, 48), np.uint8), ({"ProbeToReference": probe_to_reference},), [0.0])
+    >>> sequence = sequence.with_transforms({"ImageToProbe": np.diag([0.2, 0.2, 0.2, 1.0])})
+    >>> sequence.pose(0, "ImageToReference")[:3, 3].tolist()  # composed of the two
+    [10.0, 20.0, 30.0]
+    >>> sequence.write("tracked.igs.mha")
+    >>> len(TrackedSequence.read("tracked.igs.mha"))
+    1
     """
 
     #: [n, row, column]; for RF data [n, scan line, sample]

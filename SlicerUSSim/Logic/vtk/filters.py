@@ -197,6 +197,23 @@ class UltrasoundSimulationFilter(_ImageFilter):
     whatever it is concatenated from), or a parameter changes, and only then. Every pose has amplifier noise of its own
     (noise.seed_of_pose). Labels are told apart by the names that
     SegmentationFilter gave them (field data "TissueNames"); without names, by the labels of the tissue table.
+
+    >>> import numpy as np
+    >>> from vtkmodules.vtkCommonTransforms import vtkTransform
+    >>> from SlicerUSSim.Logic import LinearProbe, TissueTable, Volume
+    >>> from SlicerUSSim.Logic.vtk import UltrasoundSimulationFilter
+    >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+    >>> simulation = UltrasoundSimulationFilter()
+    >>> simulation.SetInputData(labels.to_vtk())
+    >>> simulation.SetTissues(TissueTable.named(["liver"]))
+    >>> simulation.SetProbe(LinearProbe(width_mm=20, depth_mm=30, scan_lines=64))
+    >>> transform = vtkTransform()  # the face in the middle of the upper side, looking down
+    >>> transform.Translate(20, 20, 39)
+    >>> transform.RotateX(-90)
+    >>> simulation.SetProbeTransform(transform)
+    >>> simulation.Update()
+    >>> simulation.GetOutput().GetDimensions()
+    (342, 512, 1)
     """
 
     def __init__(self) -> None:
