@@ -152,7 +152,7 @@ class Parameter:
         try:
             return msgspec.convert(plain, self._accepted, strict=True)
         except msgspec.ValidationError:
-            raise SimulationError(f"{owner}: {self.name} is {_short(value)}, expected {self.expected}") from None
+            raise SimulationError(f"{owner}: {self.name} is {short(value)}, expected {self.expected}") from None
 
     def from_text(self, owner: str, text: str) -> Any:
         """The value that a text stands for, as the command and a scene write it. Raises SimulationError for others."""
@@ -163,8 +163,9 @@ class Parameter:
         elif kind is bool:
             value = {"true": True, "false": False}.get(text.lower(), text)
         elif kind in (int, float):
-            with suppress(ValueError):  # what is no number is then refused as the text that it is
-                value = kind(text)
+            value = _number(kind, text)
+        elif kind is tuple:
+            value = tuple(_number(get_args(self.type)[0], part.strip()) for part in text.split(",") if part.strip())
         return self.checked(owner, value)
 
 
@@ -234,10 +235,10 @@ def built(kind: type[_T], values: Any, source: str) -> _T:
     Raises SimulationError that names `source` and the parameter: for what is no object, for a name that is unknown or
     missing, and for a value that is refused.
     """
-    require(isinstance(values, Mapping), f"{source}: is {_kind_of(values)}, expected an object")
+    require(isinstance(values, Mapping), f"{source}: is {kind_of(values)}, expected an object")
     known = [entry.name for entry in fields(kind)]  # type: ignore[arg-type], of dataclasses
     for name in values:
-        require(name in known, f"{source}: {name!r} is unknown, expected one of {', '.join(known)}")
+        require(name in known, f"{source}: {short(name)} is unknown, expected one of {', '.join(known)}")
     missing = [
         entry.name
         for entry in fields(kind)  # type: ignore[arg-type]
@@ -260,17 +261,28 @@ def _without_none(hint: Any) -> tuple[Any, bool]:
     return hint, False
 
 
-def _kind_of(value: Any) -> str:
+def _number(kind: type, text: str) -> Any:
+    """The number that a text stands for; any other text as it is, which is then refused, or meant."""
+    if kind in (int, float) and "_" not in text:  # which Python takes in numbers, and nobody else
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
+def kind_of(value: Any) -> str:
     """The kind of a JSON value, in words."""
     kinds = {list: "a list", str: "a text", bool: "true or false", NoneType: "null"}
     return next((words for kind, words in kinds.items() if isinstance(value, kind)), "a number")
 
 
 def _plain(value: Any) -> Any:
-    """A numpy scalar as the Python value that it is."""
+    """A numpy scalar as the Python value that it is, in lists and tuples too."""
+    if isinstance(value, list | tuple):
+        return (tuple if isinstance(value, tuple) else list)(map(_plain, value))
     return value.item() if getattr(value, "ndim", None) == 0 else value
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
+    """A value as messages show it."""
     text = repr(_plain(value))
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -51,12 +51,12 @@ class SimulationSettings(Declared):
     )  # fmt: skip
     partial_volume: bool = parameter(
         False, "Mixed tissues at borders",
-        "Scatterers take their tissue by the probabilities of the segmentation; needs Segment in this session",
+        "Scatterers take their tissue by the probabilities of the segmentation; needs the MRI to be segmented now",
         shown=True, option="partial-volume/hard-labels", source="False is the paper",
     )  # fmt: skip
     mri_modulation_db: float = parameter(
         0.0, "MRI in tissues",
-        "How far scatterers follow the MRI inside a tissue, per standard deviation; needs Segment in this session",
+        "How far scatterers follow the MRI in a tissue, per standard deviation; needs the MRI to be segmented now",
         unit="dB", bounds=(-6, 6), shown=Shown(-6, 6, 0.1, is_slider=True), option="mri-modulation",
         note="Negative where bright means echo-poor", source="0 is the paper",
     )  # fmt: skip

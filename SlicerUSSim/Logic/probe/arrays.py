@@ -11,7 +11,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, built, parameter, parameters_of
+from SlicerUSSim.Logic.base.declaration import (
+    Declared,
+    Parameter,
+    Shown,
+    built,
+    kind_of,
+    parameter,
+    parameters_of,
+    short,
+)
 from SlicerUSSim.Logic.base.errors import require
 
 NOMINAL_SPEED_M_S = 1540.0
@@ -310,15 +319,16 @@ def probe_from_dict(values: dict, source: str = "probe") -> Probe:
 
     Raises SimulationError that names `source`, for an unknown kind or name, a missing value and one that is refused.
     """
-    require(isinstance(values, dict), f'{source}: expected an object with a "kind", got {values!r:.80}')
-    kind: Any = values.get("kind")
+    require(isinstance(values, dict), f'{source}: is {kind_of(values)}, expected an object with a "kind"')
+    require("kind" in values, f"{source}: lacks kind, expected {PROBE_KIND.expected}")
+    kind: Any = values["kind"]
     PROBE_KIND.checked(source, kind)
     arguments = {name: value for name, value in values.items() if name != "kind"}
     known = sorted(entry.name for entry in parameters_of(PROBE_KINDS[kind]))
     for name in arguments:
         require(
             name in known,
-            f"{source}: {name} is not a parameter of a {kind} probe, expected one of {', '.join(known)}",
+            f"{source}: {short(name)[1:-1]} is not a parameter of a {kind} probe, expected one of {', '.join(known)}",
         )
     return built(PROBE_KINDS[kind], arguments, source)
 
