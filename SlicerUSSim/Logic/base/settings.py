@@ -110,7 +110,8 @@ class DisplaySettings(Declared):
         bounds=(0, 20), shown=Shown(0, 2, 0.01, is_slider=True), option="tgc", fit=Fit(0.0, 1.2, tolerance=0.1),
     )  # fmt: skip
     noise_db: float | None = parameter(
-        -80.0, "Noise", "Noise of the amplifier before TGC, relative to tissue of unit scatterer variance; -150: none",
+        -80.0, "Noise",
+        "Noise of the amplifier before TGC, relative to tissue of unit scatterer variance; -150 in a panel: none",
         unit="dB", bounds=(-300, 100), shown=Shown(-150, 0, is_slider=True, none_at=-150.0), option="noise",
         fit=Fit(-120, -30, tolerance=3.0),
     )  # fmt: skip

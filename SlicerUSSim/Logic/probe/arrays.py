@@ -55,9 +55,9 @@ class Probe(Declared):
         0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
     )
     focus_mm: float = parameter(
-        _BY_DEPTH, "Focus", "Depth of the transmit focus; 0: at 60 % of the depth", unit="mm", bounds=(0.1, 1000),
-        shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
-        note="Left out, in JSON also null: at 60 % of the depth",
+        _BY_DEPTH, "Focus", "Depth of the transmit focus; none, or 0 in a panel: at 60 % of the depth", unit="mm",
+        bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
+        note="It then moves with the depth",
     )  # fmt: skip
     aperture_mm: float = parameter(
         12.0, "Aperture", "Lateral size of the fully open aperture", unit="mm", bounds=(0.5, 200)
@@ -70,8 +70,8 @@ class Probe(Declared):
         7.0, "Elevational aperture", "Height of the elements", unit="mm", bounds=(0.5, 100)
     )
     elevation_focus_mm: float = parameter(
-        _BY_DEPTH, "Elevational focus", "Focus of the lens", unit="mm", bounds=(0.1, 1000), can_be_none=True,
-        note="Left out, in JSON also null: at 60 % of the depth",
+        _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: at 60 % of the depth", unit="mm",
+        bounds=(0.1, 1000), can_be_none=True, note="It then moves with the depth",
     )  # fmt: skip
 
     #: What the kind is called in a preset, and what it is
