@@ -138,8 +138,8 @@ PAIR = parameter_of(DisplaySettings, "image_size")
 TEXTS = parameter_of(Membrane, "fluids")
 OBJECT = parameter_of(Tissue, "sources")
 OPTIONAL = parameter_of(DisplaySettings, "noise_db")
-NO_NUMBERS = [True, False, "5", "false", "", None, [], [5], {}, math.nan, math.inf, -math.inf, 10**400, -(10**400),
-              5 + 0j, b"5", np.nan, np.bool_(True), np.array([5.0])]  # fmt: skip
+NO_NUMBERS = [True, False, "5", "false", "", None, [], [5], {}, math.nan, math.inf, -math.inf, 10**400, -(10**5000),
+              5 + 0j, b"5", np.nan, np.bool_(True), np.eye(3)]  # fmt: skip
 
 
 @pytest.mark.parametrize(

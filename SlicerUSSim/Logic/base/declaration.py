@@ -283,6 +283,9 @@ def _plain(value: Any) -> Any:
 
 
 def short(value: Any) -> str:
-    """A value as messages show it."""
-    text = repr(_plain(value))
+    """A value as messages show it: one line that is not long."""
+    try:
+        text = " ".join(repr(_plain(value)).splitlines())
+    except ValueError:  # from 4300 digits on
+        text = "a huge number"
     return text if len(text) <= 80 else f"{text[:77]}..."
