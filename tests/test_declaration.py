@@ -151,7 +151,7 @@ NO_NUMBERS = [True, False, "5", "false", "", None, [], [5], {}, math.nan, math.i
         (TICK, [0, 1, 1.0, "true", "false", "", None, [], np.int64(1)], "true or false"),
         (TEXT, [5, True, None, [], b"x"], "text"),
         (CHOICE, ["c", "", "A", 0, True, None, ["a"]], "one of a, b"),
-        (PAIR, [5, "8x8", [8], [8, 8, 8], [8, 8.0], [8, True], [8, "8"], [8, 7], [8, 8193], {}, [8, None]],
+        (PAIR, [5, "8x8", [8], [8, 8, 8], [8, 8.0], [8, True], [8, "8"], [8, 7], [8, 8193], [8, 10**400], {}, [8, None]],
          "2 whole numbers between 8 and 8192 or none"),
         (TEXTS, ["csf", {"csf": 1}, [5], [None], None, 5], "a list of texts"),
         (OBJECT, [[], "x", {"mu0": 5}, {"mu0": None}, None], "an object of texts"),

@@ -25,6 +25,9 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 _T = TypeVar("_T")
 
+#: More than any parameter can be
+_HUGE = 10**300
+
 
 @dataclass(frozen=True)
 class Shown:
@@ -149,10 +152,11 @@ class Parameter:
         if value is None and self.can_be_none:
             return None
         plain = _plain(value)
-        try:
-            return msgspec.convert(plain, self._accepted, strict=True)
-        except msgspec.ValidationError:
-            raise SimulationError(f"{owner}: {self.name} is {short(value)}, expected {self.expected}") from None
+        # msgspec before 0.22 fails at whole numbers that no float can hold.
+        if not (isinstance(plain, int) and abs(plain) > _HUGE):
+            with suppress(msgspec.ValidationError):
+                return msgspec.convert(plain, self._accepted, strict=True)
+        raise SimulationError(f"{owner}: {self.name} is {short(value)}, expected {self.expected}")
 
     def from_text(self, owner: str, text: str) -> Any:
         """The value that a text stands for, as the command and a scene write it. Raises SimulationError for others."""
