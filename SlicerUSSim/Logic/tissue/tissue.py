@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import NormalDist
 
-from SlicerUSSim.Logic.base.declaration import Declared, Fit, parameter, parameters_of
+from SlicerUSSim.Logic.base.declaration import Declared, Fit, parameter, parameters_of, short
 from SlicerUSSim.Logic.base.errors import require
 
 _ECHOGENICITY = "Bounds of a fit: echogenicity over some 40 dB"
@@ -49,7 +49,8 @@ class Tissue(Declared):
     )
 
     def __post_init__(self) -> None:
-        require(isinstance(self.name, str) and bool(self.name.strip()), f"tissue name is {self.name!r}, expected text")
+        is_named = isinstance(self.name, str) and self.name.strip() and self.name.isprintable()
+        require(is_named, f"tissue name is {short(self.name)}, expected text in one line")
         super().__post_init__()
 
     def _owner(self) -> str:
