@@ -17,7 +17,7 @@ PARAMETERS = {"speed_of_sound_m_s", "impedance_mrayl", "attenuation_db_cm_mhz", 
 
 tissues = st.builds(
     Tissue,
-    st.text(min_size=1).filter(str.strip),
+    st.text(min_size=1).filter(lambda name: name.strip() and name.splitlines() == [name]),
     st.floats(100, 10000),
     st.floats(1e-3, 50),
     st.floats(0, 50),

@@ -17,6 +17,13 @@ from SlicerUSSim.Logic.base.errors import require
 _ECHOGENICITY = "Bounds of a fit: echogenicity over some 40 dB"
 
 
+def _is_line(name: object) -> bool:
+    """Whether a name is one that messages and files can show: one line, not empty, without half characters."""
+    if not isinstance(name, str) or not name.strip():
+        return False
+    return name.splitlines() == [name] and name == name.encode(errors="ignore").decode()
+
+
 @dataclass(frozen=True)
 class Tissue(Declared):
     """One tissue. Raises SimulationError, naming the tissue and the value, for anything out of physical range."""
@@ -49,8 +56,7 @@ class Tissue(Declared):
     )
 
     def __post_init__(self) -> None:
-        is_named = isinstance(self.name, str) and self.name.strip() and self.name.isprintable()
-        require(is_named, f"tissue name is {short(self.name)}, expected text in one line")
+        require(_is_line(self.name), f"tissue name is {short(self.name)}, expected text in one line")
         super().__post_init__()
 
     def _owner(self) -> str:
