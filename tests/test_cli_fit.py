@@ -76,7 +76,10 @@ def test_optimize_writes_result_report_preset_and_state(folder):
     report = (folder / "report.html").read_text()
     assert report.count("data:image/png;base64,") >= 3 * 4 + 3
     assert not re.search(r"(src|href)=\"(?!data:)", report)  # nothing outside the file
-    for words in ("simulated, before", "real", "Blink", "white matter.mu0", "net fall", "Var of white matter"):
+    for words in (
+        "simulated, before", "real", "Blink", "white matter.mu0", "net fall", "Var of white matter",
+        "<td>Mean amplitude μ₀</td>", 'title="Mean amplitude of scatterers.', "<td>dB/(cm MHz)</td>",
+    ):  # fmt: skip
         assert words in report
 
     again = optimize(

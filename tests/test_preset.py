@@ -47,7 +47,10 @@ def test_changing_the_kind_of_probe_keeps_what_both_have():
         ({"display": {"image_size": 5}}, "display: image_size is 5, expected 2 whole numbers between 8 and 8192"),
         ({"settings": []}, "settings: is a list, expected an object"),
         ({"probe": {"kind": "sector"}}, "probe: kind is 'sector'"),
-        ({"tissues": {"1": {"name": "x"}}}, "tissue 1: lacks speed_of_sound_m_s, impedance_mrayl, attenuation_db_cm_mhz"),
+        (
+            {"tissues": {"1": {"name": "x"}}},
+            "tissue 1: lacks speed_of_sound_m_s, impedance_mrayl, attenuation_db_cm_mhz",
+        ),
         ([], "is a list, expected an object"),
     ],
 )

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import click
 
-from SlicerUSSim.Command.options import device_option
+from SlicerUSSim.Command.options import device_option, parameter_option
 from SlicerUSSim.Command.progress import Steps, note
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 
 PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # probe.PROBES, which would import numpy
 
@@ -21,12 +22,11 @@ PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # prob
     "--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain that nilearn carries)."
 )
 @click.option("--probe", "kind", type=click.Choice(PROBE_NAMES), default="phased", show_default=True)
-@click.option("--seed", type=int, default=0, show_default=True, help="Which speckle and noise.")
+@parameter_option(SimulationSettings, "seed")
 @device_option
 def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -> None:
     """The whole line on a real brain MRI: segmentation, a craniotomy view, pictures."""
     from SlicerUSSim.Command.whole_line import run_whole_line
-    from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.samples import demo_mri
     from SlicerUSSim.Logic.probe.arrays import PROBES

@@ -7,7 +7,7 @@ import os
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from SlicerUSSim.Logic.base.declaration import Parameter, built, parameters_of
+from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parameters_of, short
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
@@ -73,9 +73,9 @@ class Preset:
         Raises SimulationError naming `source` and what is wrong in it.
         """
         known = ("probe", *SECTIONS, "tissues", "membrane")
-        require(isinstance(values, dict), f"{source}: is a {type(values).__name__}, expected an object")
+        require(isinstance(values, dict), f"{source}: is {kind_of(values)}, expected an object")
         for name in values:
-            require(name in known, f"{source}: has {name!r}, expected {', '.join(known)}")
+            require(name in known, f"{source}: has {short(name)}, expected {', '.join(known)}")
         sections: dict[str, Any] = {}
         if "probe" in values:
             sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")

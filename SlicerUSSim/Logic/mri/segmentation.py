@@ -12,6 +12,7 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.filtering import guided_filter
@@ -126,8 +127,8 @@ def segment_mri(
     dtype('uint8')
     """
     report = progress or (lambda share: None)
+    names = _class_names(contrast, classes)
     settings = SegmentationSettings(contrast, classes, thin_sulci, bias_correction, filter_radius, filter_epsilon)
-    names = _class_names(settings.contrast, settings.classes)
     timed = _StepTimes()
     intensity = _finite(mri)
     foreground = _foreground(intensity) if mask is None else _given_mask(mask, mri)
@@ -251,9 +252,12 @@ def _sulcal_middles(
 
 
 def _class_names(contrast: str, classes: int) -> tuple[str, ...]:
+    """The names of the classes. Raises SimulationError that says how many go with the contrast."""
+    contrast = parameter_of(SegmentationSettings, "contrast").checked("segmentation", contrast)
     known = _CLASS_NAMES[contrast]
     require(
-        classes in known, f"classes is {classes!r}, expected {' or '.join(map(str, known))} for contrast {contrast}"
+        classes in tuple(known),
+        f"classes is {classes!r}, expected {' or '.join(map(str, known))} for contrast {contrast}",
     )
     return known[classes]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.declaration import built, parameters_of
+from SlicerUSSim.Logic.base.declaration import built, kind_of, parameters_of, short
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
@@ -40,7 +40,7 @@ class TissueTable(Mapping[int, Tissue]):
         table = {}
         for label, tissue in tissues.items():
             require(
-                isinstance(label, int | np.integer) and 0 <= label <= MAX_LABEL,
+                isinstance(label, int | np.integer) and not isinstance(label, bool) and 0 <= label <= MAX_LABEL,
                 f"tissue label is {label!r}, expected a whole number from 0 to {MAX_LABEL}",
             )
             require(isinstance(tissue, Tissue), f"label {label}: {tissue!r} is not a Tissue")
@@ -176,20 +176,21 @@ class TissueTable(Mapping[int, Tissue]):
     @classmethod
     def from_dict(cls, values: dict, source: str = "tissues") -> TissueTable:
         """The table described by to_dict. Raises SimulationError naming `source` and what is wrong in it."""
-        require(
-            isinstance(values, dict) and isinstance(values.get("tissues"), dict),
-            f'{source}: expected {{"tissues": {{"1": {{...}}}}}}',
-        )
+        expected = 'expected {"tissues": {"1": {...}}}'
+        require(isinstance(values, dict), f"{source}: is {kind_of(values)}, {expected}")
+        require("tissues" in values, f"{source}: lacks tissues, {expected}")
+        tissues = values["tissues"]
+        require(isinstance(tissues, dict), f"{source}: tissues is {kind_of(tissues)}, {expected}")
         table = {
             _label(label, source): built(Tissue, tissue, f"{source}: tissue {label}")
-            for label, tissue in values["tissues"].items()
+            for label, tissue in tissues.items()
         }
         membrane = values.get("membrane")
         if membrane is not None:
             within = f"{source}: membrane"
-            require(isinstance(membrane, dict), f"{within}: is {membrane!r:.80}, expected an object")
-            tissue = built(Tissue, membrane.get("tissue"), f"{within}: tissue")
-            membrane = built(Membrane, {**membrane, "tissue": tissue}, within)
+            if isinstance(membrane, dict) and "tissue" in membrane:
+                membrane = {**membrane, "tissue": built(Tissue, membrane["tissue"], f"{within}: tissue")}
+            membrane = built(Membrane, membrane, within)
         return cls(table, membrane)
 
     @classmethod
@@ -205,7 +206,7 @@ class TissueTable(Mapping[int, Tissue]):
 def _label(text: str, source: str) -> int:
     """The label that a JSON file names. Raises SimulationError for a text that is not just its digits."""
     known = {str(label): label for label in range(MAX_LABEL + 1)}
-    require(text in known, f"{source}: tissue label is {text!r}, expected a whole number from 0 to {MAX_LABEL}")
+    require(text in known, f"{source}: tissue label is {short(text)}, expected a whole number from 0 to {MAX_LABEL}")
     return known[text]
 
 

@@ -11,10 +11,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import NormalDist
 
-from SlicerUSSim.Logic.base.declaration import Declared, Fit, parameter, parameters_of
+from SlicerUSSim.Logic.base.declaration import Declared, Fit, parameter, parameters_of, short
 from SlicerUSSim.Logic.base.errors import require
 
 _ECHOGENICITY = "Bounds of a fit: echogenicity over some 40 dB"
+
+
+def _is_line(name: object) -> bool:
+    """Whether a name is one that messages and files can show: one line, not empty, without half characters."""
+    if not isinstance(name, str) or not name.strip():
+        return False
+    return name.splitlines() == [name] and name == name.encode(errors="ignore").decode()
 
 
 @dataclass(frozen=True)
@@ -55,7 +62,7 @@ class Tissue(Declared):
     )
 
     def __post_init__(self) -> None:
-        require(isinstance(self.name, str) and bool(self.name.strip()), f"tissue name is {self.name!r}, expected text")
+        require(_is_line(self.name), f"tissue name is {short(self.name)}, expected text in one line")
         super().__post_init__()
 
     def _owner(self) -> str:

@@ -13,6 +13,8 @@ ErrorEvent with one line, and the text of GetErrorMessage; the output is then em
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 from vtkmodules.util.vtkAlgorithm import VTKPythonAlgorithmBase
 from vtkmodules.vtkCommonCore import VTK_UNSIGNED_CHAR, vtkCommand, vtkOutputWindow, vtkStringArray
@@ -32,6 +34,7 @@ from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.shape import outline_polydata
@@ -113,34 +116,38 @@ class SegmentationFilter(_ImageFilter):
     """An MRI (port 0), and a mask if the brain is not stripped (port 1, optional), to uint8 tissue labels.
 
     The names of the labels travel with the output as field data "TissueNames"; UltrasoundSimulationFilter knows its
-    tissues by them. See segmentation.segment_mri for what the parameters mean and what is refused.
+    tissues by them. Parameters and defaults are those of SegmentationSettings; segmentation.segment_mri says what is
+    refused.
     """
 
     def __init__(self) -> None:
         super().__init__(nInputPorts=2)
-        self._classes, self._contrast = 3, "t1"
-        self._filter_radius, self._bias_correction, self._thin_sulci = 1, False, True
+        self._values = asdict(SegmentationSettings())
         self._segmentation: Segmentation | None = None
 
     def SetClasses(self, classes: int) -> None:
-        """Number of tissues that intensity tells apart; 3."""
-        self._change("_classes", classes)
+        """Number of tissues that intensity tells apart."""
+        self._set("classes", classes)
 
     def SetContrast(self, contrast: str) -> None:
         """ "t1", "t1gd", "t2" or "flair"."""
-        self._change("_contrast", contrast)
+        self._set("contrast", contrast)
 
     def SetFilterRadius(self, voxels: int) -> None:
-        """Radius of the guided filter; 1, and 0 for none."""
-        self._change("_filter_radius", voxels)
+        """Radius of the guided filter; 0 for none."""
+        self._set("filter_radius", voxels)
+
+    def SetFilterEpsilon(self, epsilon: float | None) -> None:
+        """Strength of the guided filter, squared intensity; None: from the noise in the image."""
+        self._set("filter_epsilon", epsilon)
 
     def SetBiasCorrection(self, on: bool) -> None:
-        """N4 first, for scans with an intensity gradient; off."""
-        self._change("_bias_correction", bool(on))
+        """N4 first, for scans with an intensity gradient."""
+        self._set("bias_correction", bool(on))
 
     def SetThinSulci(self, on: bool) -> None:
-        """Label sulci too narrow to reach CSF intensity as leptomeninges; on."""
-        self._change("_thin_sulci", bool(on))
+        """Label sulci too narrow to reach CSF intensity as leptomeninges."""
+        self._set("thin_sulci", bool(on))
 
     def SetMaskConnection(self, port) -> None:
         """Where the mask comes from: an image on the MRI's grid, not zero inside."""
@@ -173,16 +180,18 @@ class SegmentationFilter(_ImageFilter):
         mri = vtkImageData.GetData(inInfo[0])
         masked = inInfo[1].GetNumberOfInformationObjects() > 0
         self._segmentation = segment_mri(
-            Volume.from_vtk(mri), classes=self._classes, contrast=self._contrast,
-            mask=Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None,
-            filter_radius=self._filter_radius, bias_correction=self._bias_correction, thin_sulci=self._thin_sulci,
-            device=self._device, progress=self._report,
+            Volume.from_vtk(mri), mask=Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None,
+            **self._values, device=self._device, progress=self._report,
         )  # fmt: skip
         output = vtkImageData.GetData(outInfo)
         output.CopyStructure(mri)
         set_scalars(output, self._segmentation.labels.array)
         set_tissue_names(output, self._segmentation.tissue_names)
         return 1
+
+    def _set(self, name: str, value) -> None:
+        """Keep a value, which the next update checks."""
+        self._change("_values", {**self._values, name: value})
 
     def _report(self, share: float) -> None:
         self.UpdateProgress(share)
