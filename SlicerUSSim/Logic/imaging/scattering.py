@@ -10,7 +10,7 @@ from scipy.integrate import trapezoid
 from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device
-from SlicerUSSim.Logic.opencl.layout import CONSTANTS, HIT
+from SlicerUSSim.Logic.opencl.layout import HIT
 
 if TYPE_CHECKING:
     from pyopencl import Buffer

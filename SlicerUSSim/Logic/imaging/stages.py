@@ -1,4 +1,7 @@
-"""The stages of an image in their order: the lists that simulator, appearance model, benchmark and numpy model share."""
+"""The stages of an image in their order: what simulator, appearance model, benchmark and numpy model go by.
+
+How to add one is in docs/architecture.md#a-stage-more.
+"""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def elevational_quantiles(traced: int, rays: int) -> np.ndarray:
 
 
 def pulse_taps(sigma: float) -> np.ndarray:
-    """(2 n + 1,) float32 envelope of the pulse, `sigma` samples wide with the triangle that impulses are placed with."""
+    """(2 n + 1,) float32 envelope of the pulse: with the triangle that places impulses it is `sigma` samples wide."""
     own = np.sqrt(np.maximum(sigma * sigma - 1.0 / 6.0, 0.25))
     at = np.arange(np.ceil(3.7 * own) + 1.0)
     half = sigma / own * np.exp(-(at * at) / (2.0 * own * own))

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.verification.numpy_model.elementary import LOG2_E, dot, exp, exp2, f32, length, log, ramp, sum8
-from SlicerUSSim.Logic.verification.numpy_model.medium import HostMedium
+from SlicerUSSim.Logic.verification.numpy_model.medium import WIDE_SIGMA, HostMedium
 
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])  # (x, y, z) of the corners of a cell
 _FINE_SIGMA = f32(1.5)
@@ -119,7 +118,7 @@ class Labels:
         known, difference, both, up, down = known[fits], difference[fits], both[fits], up[fits], down[fits]
         slope, bends = f32(0.5) * (up - down), up + down - (f32(2) * difference)[:, None]
         laplacian = bends[:, 0] + bends[:, 1] + bends[:, 2]
-        wide = f32(CONSTANTS["WIDE_SIGMA"])
+        wide = f32(WIDE_SIGMA)
         variance = wide * wide + f32(1) / f32(6)
         steepness, sigma = np.maximum(length(slope), f32(1e-6)), np.sqrt(variance)
         share = f32(0.5) - f32(0.5) * difference / both

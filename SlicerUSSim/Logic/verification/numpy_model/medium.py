@@ -9,6 +9,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
+WIDE_SIGMA = 3.0  # of the Gaussian that smooths the indicators, voxels
 _FARTHEST = 2.2  # standard deviations, where the fluid distance ends; it takes eight bits
 _SHARES = 4095  # steps of the smoothed indicator that it is computed from
 _MOST_GROUPS, _MOST_VALUES = 6, 100_000_000  # of the smoothed indicators of acoustic groups
@@ -47,7 +48,7 @@ class HostMedium:
         if len(groups) > 1:
             for number in groups[groups < self.smooth_groups]:
                 share = ndimage.gaussian_filter(
-                    (self.group == number).astype(np.float32), CONSTANTS["WIDE_SIGMA"], mode="nearest", truncate=2.5
+                    (self.group == number).astype(np.float32), WIDE_SIGMA, mode="nearest", truncate=2.5
                 )
                 self.smooth[number] = np.rint(65535.0 * np.clip(share, 0.0, 1.0))
         #: (k, j, i) uint8 about 127.5, and half the membrane in its unit; None and -1 without a membrane
