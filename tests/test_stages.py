@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.bmode import Compressor
 from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
 from SlicerUSSim.Logic.imaging.scattering import LateralBeam
-from SlicerUSSim.Logic.imaging.stage import Stage, Work
+from SlicerUSSim.Logic.imaging.stage import FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl import device as opencl_device
 from SlicerUSSim.Logic.opencl.device import Workspace, kernel_folder
 from SlicerUSSim.Logic.verification.benchmark import suite
@@ -58,7 +59,7 @@ def test_the_simulator_runs_the_stages_of_the_list_in_its_order():
 def test_every_stage_knows_its_work_and_has_one_twin(plain, kind):
     stage, frame = plain.stage(kind), plain.device_frame(PROBE, POSE)
     work = stage.work(frame, plain.trace(PROBE, POSE))
-    assert work.operations >= 0 and work.bytes > 0 or kind.name == "interfaces"  # these tissues have none
+    assert (work.operations >= 0 and work.bytes > 0) or kind.name == "interfaces"  # these tissues have none
     assert callable(twin_of(stage))
     assert kind.has_own_twin() != (kind.name in TWINS)
 
@@ -114,6 +115,10 @@ class Display(DisplaySettings):
     edge: float = 0.0
 
 
+def _chosen(frame: FrameInputs) -> Display:
+    return cast(Display, frame.display)
+
+
 class LateralSmoothing(Stage):
     """After compression: grey levels of neighbouring scan lines flow together."""
 
@@ -125,12 +130,12 @@ class LateralSmoothing(Stage):
         self.workspace = Workspace(device)
 
     def run(self, frame) -> None:
-        if not frame.display.smoothing:
+        if not _chosen(frame).smoothing:
             return
         lines, samples = frame.line_shape
         smooth = self.workspace.get("grey", lines * samples)
         size = samples // self.device.lanes, lines
-        self.device.run(self.kernel, size, frame.grey, np.int32(samples), np.float32(frame.display.smoothing), smooth)
+        self.device.run(self.kernel, size, frame.grey, np.int32(samples), np.float32(_chosen(frame).smoothing), smooth)
         frame.grey = smooth
 
     def work(self, frame, tree) -> Work:
@@ -140,7 +145,7 @@ class LateralSmoothing(Stage):
     def on_host(self, frame) -> None:
         grey = np.pad(frame.grey.astype(np.float32), ((1, 1), (0, 0)), mode="edge")
         beside = 0.5 * (grey[:-2] + grey[2:])
-        frame.grey = (grey[1:-1] + np.float32(frame.display.smoothing) * (beside - grey[1:-1]) + 0.5).astype(np.uint8)
+        frame.grey = (grey[1:-1] + np.float32(_chosen(frame).smoothing) * (beside - grey[1:-1]) + 0.5).astype(np.uint8)
 
 
 SMOOTHING_SOURCE = """
@@ -166,7 +171,7 @@ class EdgeEnhancement(Stage):
         self.workspace = Workspace(device)
 
     def run(self, frame) -> None:
-        display, (lines, samples) = frame.display, frame.line_shape
+        display, (lines, samples) = _chosen(frame), frame.line_shape
         if not display.edge:
             return
         enhanced = self.workspace.get("envelope", 4 * lines * samples)
@@ -182,7 +187,7 @@ class EdgeEnhancement(Stage):
         return Work(9 * lines * samples, 30 * lines * samples)
 
     def on_host(self, frame) -> None:
-        display, samples = frame.display, frame.line_shape[1]
+        display, samples = _chosen(frame), frame.line_shape[1]
         n = np.arange(samples)
         around = 0.5 * (frame.envelope[:, np.maximum(n - 4, 0)] + frame.envelope[:, np.minimum(n + 4, samples - 1)])
         frame.envelope = np.maximum(frame.envelope + display.edge * (frame.envelope - around), 1e-6).astype(np.float32)
@@ -212,7 +217,7 @@ def added(request, monkeypatch, tmp_path):
     (folder / "lateral_smoothing.cl").write_text(SMOOTHING_SOURCE)
     (folder / "edge_enhancement.cl").write_text(EDGE_SOURCE)
     monkeypatch.setattr(opencl_device, "kernel_folder", lambda: folder)
-    assert stages.DISPLAY_STAGES == (Compressor, ScanConverter)
+    assert (Compressor, ScanConverter) == stages.DISPLAY_STAGES
     monkeypatch.setattr(stages, "DISPLAY_STAGES", (Compressor, request.param, ScanConverter))
     return request.param
 
@@ -228,7 +233,12 @@ def test_the_simulator_uses_an_added_stage(added, plain):
     assert np.array_equal(on.iq, off.iq) and not np.array_equal(on.bmode, off.bmode)
     assert np.array_equal(on.envelope, off.envelope) == (added is LateralSmoothing)
     found.profiling = True
-    assert list(found.simulate(PROBE, POSE, ON).timings_ms)[-4:] == ["B-mode", added.name, "scan conversion", "download"]
+    assert list(found.simulate(PROBE, POSE, ON).timings_ms)[-4:] == [
+        "B-mode",
+        added.name,
+        "scan conversion",
+        "download",
+    ]
 
 
 def test_the_appearance_model_uses_an_added_stage(added):

@@ -98,9 +98,9 @@ def line_roots(acquisition: np.ndarray) -> np.ndarray:
     at = float(acquisition["first_line"]) + (n - float(acquisition["guard_lines"])) * step
     if acquisition["linear"]:
         return np.column_stack([at, 0 * at, 0 * at, 0 * at + 1.0]).astype(np.float32)
-    towards = np.exp(1j * (0.5 * np.pi - at))  # y is depth; the apex lies a radius above the face
-    start = float(acquisition["apex_radius_mm"]) * (towards - 1j)
-    return np.column_stack([start.real, start.imag, towards.real, towards.imag]).astype(np.float32)
+    towards = np.column_stack([np.sin(at), np.cos(at)])
+    start = float(acquisition["apex_radius_mm"]) * (towards - [0.0, 1.0])  # the apex lies a radius above the face
+    return np.column_stack([start, towards]).astype(np.float32)
 
 
 def elevational_quantiles(traced: int, rays: int) -> np.ndarray:
@@ -157,7 +157,7 @@ def _traced_lines(probe: Probe, settings: SimulationSettings) -> tuple[int, int]
     depth = np.linspace(0.0, probe.depth_mm, 65)
     waist = _one_way_sigma(probe, probe.focus_mm / probe.aperture_mm)
     transmit = waist * np.hypot(1.0, (depth - probe.focus_mm) / _rayleigh_mm(probe, waist))
-    receive = _one_way_sigma(probe, np.maximum(probe.receive_f_number, depth / probe.aperture_mm))
+    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
     lateral = (transmit**-2.0 + receive**-2.0) ** -0.5
     _, spacing, radius = _geometry(probe)
     apart = spacing * (np.ones_like(depth) if isinstance(probe, LinearProbe) else radius + depth)
