@@ -56,7 +56,7 @@ def test_the_simulator_runs_the_stages_of_the_list_in_its_order():
 
 
 @pytest.mark.parametrize("kind", ALL_STAGES, ids=lambda kind: kind.name)
-def test_every_stage_knows_its_work_and_has_one_twin(plain, kind):
+def test_every_stage_has_its_work_and_one_twin(plain, kind):
     stage, frame = plain.stage(kind), plain.device_frame(PROBE, POSE)
     work = stage.work(frame, plain.trace(PROBE, POSE))
     assert (work.operations >= 0 and work.bytes > 0) or kind.name == "interfaces"  # these tissues have none

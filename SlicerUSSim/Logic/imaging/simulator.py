@@ -179,8 +179,9 @@ class UltrasoundSimulator:
         return [*self.impulse_stages, *self.linear_stages, *self.display_stages]
 
     def stage(self, kind: type[StageKind]) -> StageKind:
-        """The stage of one class, such as scattering.Scatterers."""
-        return next(stage for stage in self.stages if isinstance(stage, kind))
+        """The stage of one class, such as scattering.Scatterers. Raises SimulationError if the lists lack it."""
+        found = next((stage for stage in self.stages if isinstance(stage, kind)), None)
+        return required(found, f"no stage is a {kind.__name__}, see imaging/stages.py")
 
     def trace(self, probe: Probe, probe_to_ras: np.ndarray) -> RayTree:
         """The ray tree alone, on the host: segments along the beam axes and interface hits."""

@@ -2,7 +2,7 @@
 
 A new *display* stage, which changes grey levels or pixels but not echoes, is one class and one line: a Stage with
 `run`, `work` and `on_host`, and its place in stages.DISPLAY_STAGES. Simulator, appearance model, benchmark and numpy
-model take it from there. What it lets a user choose is a field of DisplaySettings, which it finds in `frame.display`.
+model take it from there. What a user can choose about it is a field of DisplaySettings, read from `frame.display`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Work:
 
 @dataclass(eq=False)
 class FrameInputs:
-    """What the stages of one frame know before the first of them runs."""
+    """What is given to the stages of one frame."""
 
     probe: Probe
     settings: SimulationSettings

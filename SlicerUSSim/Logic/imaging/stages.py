@@ -1,4 +1,4 @@
-"""The stages of an image in their order: what simulator, appearance model, benchmark and numpy model go by.
+"""The stages of an image in their order: shared by simulator, appearance model, benchmark and numpy model.
 
 How to add one is in docs/architecture.md#a-stage-more.
 """
