@@ -133,10 +133,10 @@ def drawn_labels(acquisition, labels: Labels, voxel: np.ndarray, random: np.ndar
     here, f = labels.cells(voxel)
     threshold = ((random[:, None] >> np.array([0, 5, 10], np.uint32)) & np.uint32(31)).astype(np.float32) + f32(0.5)
     corner = here + (f * f32(32) > threshold) @ labels.steps
-    label = (labels.voxels[corner] & CONSTANTS["LABEL_MASK"]).astype(int)
-    if acquisition["membrane_reach"] < 0:
+    label = labels.label[corner].astype(int)
+    if labels.distance is None:
         return label
-    distance = (labels.voxels[here[:, None] + labels.corner_steps] >> 8).astype(np.float32)
+    distance = labels.distance[here[:, None] + labels.corner_steps].astype(np.float32)
     for axis in range(3):  # x first
         distance = distance[:, ::2] + f[:, axis : axis + 1] * (distance[:, 1::2] - distance[:, ::2])
     label[np.abs(distance[:, 0] - f32(127.5)) < acquisition["membrane_reach"]] = CONSTANTS["MEMBRANE_LABEL"]
