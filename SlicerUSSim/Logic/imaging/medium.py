@@ -33,6 +33,7 @@ _FARTHEST_SIGMAS = 2.2  # where the stored distance ends
 # Smoothed indicators take two bytes a voxel and group: so many groups, so many voxels in all; but always two groups.
 _MOST_SMOOTHED_GROUPS = 6
 _SMOOTHED_VOXELS = 100_000_000
+_TISSUE_ATTRIBUTES = tuple(name for name in TISSUE.names or () if name != "group")
 _PAD = 1  # one voxel of coupling medium around the volume, so that a clamped look-up outside finds it
 
 
@@ -132,14 +133,9 @@ class Medium:
         groups: dict[tuple[float, float], int] = {}
         for label, tissue in members.items():
             acoustics = (tissue.speed_of_sound_m_s, tissue.impedance_mrayl)
-            rows[label] = (
-                *acoustics,
-                tissue.attenuation_db_cm_mhz,
-                tissue.mu0,
-                tissue.sigma0,
-                tissue.scatterer_share,
-                groups.setdefault(acoustics, len(groups)),
-            )
+            for name in _TISSUE_ATTRIBUTES:
+                rows[label][name] = getattr(tissue, name)
+            rows[label]["group"] = groups.setdefault(acoustics, len(groups))
         return rows
 
     def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.declaration import parameters_of
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
@@ -323,6 +324,10 @@ class UltrasoundSimulator:
         transmit, elevation = probe.transmit_waist(), probe.elevation_waist()
         axial_sigma = self.axial_sigma_mm(probe)
         acquisition = np.zeros((), ACQUISITION)
+        for owner in (probe, settings):
+            for parameter in parameters_of(type(owner)):
+                if parameter.name in acquisition.dtype.names:
+                    acquisition[parameter.name] = getattr(owner, parameter.name)
         acquisition["ras_to_voxel"] = medium.ras_to_voxel.ravel()
         acquisition["dims"] = medium.dims
         acquisition["voxel_mm"] = medium.labels.spacing_mm.min()
@@ -333,10 +338,6 @@ class UltrasoundSimulator:
         acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
         acquisition["first_line"] = probe.first_line
         acquisition["line_spacing"] = probe.line_spacing
-        acquisition["scan_lines"] = probe.scan_lines
-        acquisition["depth_mm"] = probe.depth_mm
-        acquisition["frequency_mhz"] = probe.frequency_mhz
-        acquisition["reference_speed_m_s"] = settings.reference_speed_m_s
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
         acquisition["sample_mm"] = self._sample_mm(probe)
         acquisition["samples"] = -(-self._sample_count(probe) // block) * block
@@ -345,19 +346,13 @@ class UltrasoundSimulator:
         acquisition["elevation_sigma"] = elevation[0] / np.sqrt(2.0)
         acquisition["elevation_focus"], acquisition["elevation_rayleigh"] = elevation[1:]
         acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
-        acquisition["intensity_threshold"] = settings.intensity_threshold
-        acquisition["reflection_threshold"] = settings.reflection_threshold
-        acquisition["reflection_spreading"] = settings.reflection_spreading
-        acquisition["elevational_rays"] = settings.elevational_rays
         lateral, guard = _traced_lines_for(probe, settings)
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard
         acquisition["traced_lines"] = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
         acquisition["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
         acquisition["interface_is_energy"] = settings.interface_reflection == "energy"
-        acquisition["specular_exponent"] = settings.specular_exponent
         acquisition["cell_mm"] = settings.scatterers_per_mm3 ** (-1.0 / 3.0)
         acquisition["seed"] = _mixed(settings.seed)
-        acquisition["beam_cutoff"] = settings.beam_cutoff
         # The integral of the squared point spread function is pi^1.5 times the product of the three sigmas.
         acquisition["speckle_scale"] = (settings.scatterers_per_mm3 * np.pi**1.5 * axial_sigma) ** -0.5
         return acquisition

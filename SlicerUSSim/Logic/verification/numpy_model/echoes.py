@@ -104,7 +104,7 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     rows = acquisition["ras_to_voxel"].reshape(3, 4)[:, order]
     voxel = np.stack([at[n] + p[0] * r[0] + p[1] * r[1] + p[2] * r[2] for n, r in enumerate(rows)], axis=-1)
     tissue = tissues[drawn_labels(acquisition, labels, voxel, key2)]
-    share = tissue["share"]
+    share = tissue["scatterer_share"]
     exists = ((key2 >> np.uint32(16)).astype(np.float32) + f32(0.5) < share * f32(65536)).astype(np.float32)
     strength = tissue["mu0"] * (exists - share) + tissue["sigma0"] * gaussian(key1) * exists
     amplitude = exp2(np.clip(gain[0] + t * (gain[1] - gain[0]) - r2, f32(-100), f32(100)))

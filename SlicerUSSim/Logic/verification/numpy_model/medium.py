@@ -8,6 +8,7 @@ from scipy import ndimage, special
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 
 WIDE_SIGMA = 3.0  # of the Gaussian that smooths the indicators, voxels
 _FARTHEST = 2.2  # standard deviations, where the fluid distance ends; it takes eight bits
@@ -86,7 +87,8 @@ def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
         if acoustics not in known:
             known.append(acoustics)
         row = rows[label]
-        row["speed_m_s"], row["impedance"] = acoustics
-        row["attenuation"], row["mu0"], row["sigma0"] = tissue.attenuation_db_cm_mhz, tissue.mu0, tissue.sigma0
-        row["share"], row["group"] = special.ndtr(-tissue.mu1), known.index(acoustics)
+        for parameter in TISSUE_PARAMETERS:
+            if parameter.name in rows.dtype.names:
+                row[parameter.name] = getattr(tissue, parameter.name)
+        row["scatterer_share"], row["group"] = special.ndtr(-tissue.mu1), known.index(acoustics)
     return rows
