@@ -326,7 +326,7 @@ class UltrasoundSimulator:
         acquisition = np.zeros((), ACQUISITION)
         for owner in (probe, settings):
             for parameter in parameters_of(type(owner)):
-                if parameter.name in acquisition.dtype.names:
+                if parameter.name in (ACQUISITION.names or ()):
                     acquisition[parameter.name] = getattr(owner, parameter.name)
         acquisition["ras_to_voxel"] = medium.ras_to_voxel.ravel()
         acquisition["dims"] = medium.dims

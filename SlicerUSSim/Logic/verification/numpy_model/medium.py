@@ -88,7 +88,7 @@ def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
             known.append(acoustics)
         row = rows[label]
         for parameter in TISSUE_PARAMETERS:
-            if parameter.name in rows.dtype.names:
+            if parameter.name in (TISSUE.names or ()):
                 row[parameter.name] = getattr(tissue, parameter.name)
         row["scatterer_share"], row["group"] = special.ndtr(-tissue.mu1), known.index(acoustics)
     return rows
