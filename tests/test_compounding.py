@@ -117,6 +117,21 @@ def test_images_that_overlap_are_averaged():
     assert set(np.unique(values)) == {0, 90}
 
 
+@pytest.mark.parametrize(("near", "far"), [(0.0, 0.5), (0.25, -0.5), (0.1, 0.9), (-0.3, 0.3)])
+def test_an_image_counts_the_less_the_farther_off_its_plane_is(near, far):
+    """Two images beside a layer of voxels 1 mm apart: weights fall linearly to zero at one voxel."""
+    matrix = np.diag([1.0, 1.0, 1.0, 1.0])
+    matrix[:3, 3] = -20.0, 0.0, -3.0
+    compounder = Compounder(Volume(np.zeros((7, 40, 40), np.uint8), matrix), PROBE)
+    for offset, grey in ((near, 60), (far, 240)):
+        pose = rigid(np.eye(3), [0, 0, offset])
+        compounder.add(painted(PROBE, pose, lambda p, grey=grey: grey + 0 * p[..., 0]))
+    weights = 1 - np.abs([near, far])
+    layer = compounder.volume(0).array[3]
+    assert (layer > 0).sum() > 500
+    np.testing.assert_allclose(layer[layer > 0], weights @ [60, 240] / weights.sum(), atol=1.0)
+
+
 def test_a_simulated_volume_shows_a_cyst_where_it_is():
     """Slide and tilt in an oblique pose; the cyst's centre within half a voxel."""
     rotation = Rotation.from_euler("xyz", [20, 33, 11], degrees=True).as_matrix()
