@@ -78,8 +78,8 @@ def specular_echoes(rotation: np.ndarray, device) -> Outcome:
 def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
     """A plane that leans out of the image plane: over a Gaussian beam its echo is the Gaussian's Fourier transform.
 
-    Where the beam is wide, rays meet a steep plane at ranges a pulse and more apart. The integral over each ray's stratum
-    still vanishes there, as that over the whole beam does; without it the plane would show as one thin line per ray.
+    Where the beam is wide, rays meet a steep plane at ranges a pulse and more apart. The integral over each ray's
+    stratum still vanishes there, as that over the whole beam does; without it the plane would show as a line per ray.
     """
     phantom = layered([FLUID, BEHIND], [25.0], rotation, spacing_mm=0.25, half_width_mm=14.0)
     settings = SimulationSettings(scattering=False, specular_exponent=0.0)
