@@ -108,6 +108,20 @@ def test_holes_between_images_are_filled_and_nothing_else_is(kind):
     assert not whole.array[outside].any()
 
 
+def test_the_grid_of_a_sweep_just_holds_its_field():
+    """A voxel of margin on each side, and less than a voxel more."""
+    poses = slide_sweep(rigid(np.eye(3), [3, -5, 11]), 12, 5)
+    for spacing in (0.8, 1.7):
+        grid = sweep_grid(PROBE, poses, spacing)
+        points = np.concatenate([PROBE.outline_mm() @ pose[:3, :3].T + pose[:3, 3] for pose in poses])
+        first = grid.ijk_to_ras[:3, 3]
+        last = first + spacing * (np.array(grid.array.shape[::-1]) - 1)
+        np.testing.assert_allclose(first, points.min(axis=0) - spacing)
+        beyond = (last - points.max(axis=0)) / spacing
+        assert (beyond >= 1 - 1e-9).all() and (beyond < 2).all()
+    assert np.allclose(sweep_grid(PROBE, poses).spacing_mm, 0.5)
+
+
 def test_images_that_overlap_are_averaged():
     pose = rigid(np.eye(3), [0, 0, 0])
     compounder = Compounder(sweep_grid(PROBE, [pose], 1.0), PROBE)

@@ -158,6 +158,23 @@ def test_combinations_stay_where_their_parts_trade_off():
         assert found[name].is_determined is False, name
 
 
+def test_tolerances_are_those_of_the_documentation():
+    """docs/optimization.md: attenuation 0.1 dB/(cm MHz), Var and gain 1.5 dB, dynamic range 3 dB."""
+    found, _ = spreads_of([], [{}])
+    frequency_mhz = 5.0
+    for name, tolerance in (
+        ("white matter.attenuation_db_cm_mhz", 0.1),
+        ("tgc_db_cm_mhz", 0.1),
+        ("net fall with depth in white matter", 2 * 0.1 * frequency_mhz),
+        ("Var of white matter", 1.5),
+        ("Var of white matter re grey matter", 1.5),
+        ("Var of white matter with gain", 1.5),
+        ("gain_db", 1.5),
+        ("dynamic_range_db", 3.0),
+    ):
+        assert found[name].tolerance == pytest.approx(tolerance), name
+
+
 def test_grey_level_at_the_face_is_that_of_the_display():
     """10 dB more are 10 / 60 of the grey levels of a display of 60 dB."""
     loud, plain = (

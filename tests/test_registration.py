@@ -83,17 +83,45 @@ def test_settings_of_the_simulator_stay_when_it_is_cancelled(twin):
 SMALL = LinearProbe(24, 24, scan_lines=48, focus_mm=12, elevation_focus_mm=12)
 
 
-def test_the_cost_found_is_that_of_images_at_the_corrected_poses():
-    """At oblique poses, where correction @ pose and pose @ correction lie apart; costs by plain simulations."""
+def cysts() -> tuple[UltrasoundSimulator, np.ndarray]:
+    """A simulator of a few dark spheres in speckle, turned by the (4, 4) rotation beside it."""
     rotation = rigid_from([0, 0, 0, 10, 25, 65])
     holes = ((-5, -4, 0), (4, 0, 3), (-1, 5, -3), (7, -7, -2))
     labels = block(
         lambda x, y, z: 1 + sum((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2 < 9 for a, b, c in holes), (22, 22, 12)
     )
     dark = replace(SPECKLE, name="dark", mu0=0.05, sigma0=0.02)
-    seen = UltrasoundSimulator(
-        Volume(labels.array, rotation @ labels.ijk_to_ras), TissueTable({0: FLUID, 1: SPECKLE, 2: dark})
+    turned = Volume(labels.array, rotation @ labels.ijk_to_ras)
+    return UltrasoundSimulator(turned, TissueTable({0: FLUID, 1: SPECKLE, 2: dark})), rotation
+
+
+def test_the_coarse_search_compares_the_same_field_at_half_the_resolution():
+    """Half the scan lines, pixels twice as large, fewer scatterers and rays: the first cost is that of such images."""
+    seen, rotation = cysts()
+    display = DisplaySettings(image_size=(96, 92))
+    grid = ImageGrid.for_probe(SMALL, display.image_size)
+    pose = rotation @ rigid_from([0, -12, 0, 0, 0, 0])
+    reference = seen.simulate(SMALL, pose @ rigid_from([1, 0, 0, 0, 0, 0]), display, grid).image
+    shown = grid.field(SMALL) & (np.arange(grid.columns) > grid.columns // 3)
+    found = register_poses(
+        seen, SMALL, [pose], [reference], display=display, grid=grid, masks=[shown], max_evaluations=2
     )
+    pixels = ImageGrid(
+        grid.rows // 2, grid.columns // 2, grid.left_mm, grid.top_mm,
+        (2 * grid.pixel_spacing_mm[0], 2 * grid.pixel_spacing_mm[1]),
+    )  # fmt: skip
+    shape = pixels.rows, 2, pixels.columns, 2
+    smaller = [image.astype(float).reshape(shape).mean((1, 3)) for image in (reference, shown)]
+    seen.settings = replace(seen.settings, scatterers_per_mm3=8.0, elevational_rays=3, max_ray_depth=1)
+    image = seen.simulate(replace(SMALL, scan_lines=SMALL.scan_lines // 2), pose, display, pixels).image
+    expected = similarity(image, smaller[0].round().astype(np.uint8), pixels.pixel_spacing_mm, mask=smaller[1] == 1.0)
+    first = found.history[0]
+    assert first.stage == "coarse" and first.cost == pytest.approx(expected.total, abs=2e-3)
+
+
+def test_the_cost_found_is_that_of_images_at_the_corrected_poses():
+    """At oblique poses, where correction @ pose and pose @ correction lie apart; costs by plain simulations."""
+    seen, rotation = cysts()
     display = DisplaySettings(image_size=(96, 96))
     grid = ImageGrid.for_probe(SMALL, display.image_size)
     true = [rotation @ rigid_from([0, -12, z, 0, 0, 0]) for z in (-2, 2)]

@@ -173,6 +173,15 @@ def test_an_mri_beside_any_label_map_gives_its_intensity():
     assert not flat.deviation.any()
 
 
+def test_the_medium_gives_its_texture_back_as_the_kernels_read_it():
+    known = texture(0.4, np.linspace(-2, 2, SOLID.array.size, dtype=np.float32).reshape(SOLID.array.shape))
+    settings = SimulationSettings(partial_volume=True, mri_modulation_db=2.0)
+    packed = UltrasoundSimulator(SOLID, TABLE, settings, texture=known).medium.packed_texture()
+    inner = (slice(1, -1),) * 3  # without the margin of coupling medium
+    np.testing.assert_array_equal(packed[inner], known.packed(SOLID.array, True, 2.0))
+    assert UltrasoundSimulator(SOLID, TABLE).medium.packed_texture() is None
+
+
 def test_textures_that_do_not_fit_are_refused():
     with pytest.raises(SimulationError, match=r"mri_modulation_db 2 need a texture; pass segmentation\.texture"):
         UltrasoundSimulator(SOLID, TABLE, SimulationSettings(mri_modulation_db=2.0))
