@@ -339,6 +339,20 @@ def test_search_finds_the_lowest_point_and_keeps_its_history(algorithm):
     assert search.best_cost("here") == min(entry.cost for entry in search.history)
 
 
+def test_each_algorithm_is_the_one_named_but_for_a_single_parameter():
+    """BOBYQA needs two parameters or more, so one parameter is searched by another."""
+
+    def path(algorithm, start):
+        search = Search(lambda units: float(((units - 0.3) ** 2).sum()), lambda units: {}, 30)
+        search.minimise(algorithm, "here", np.array(start), 30)
+        return [entry.units for entry in search.history]
+
+    names = "LN_BOBYQA", "LN_SBPLX", "LN_NELDERMEAD"
+    paths = {name: path(name, [0.8, 0.6, 0.1]) for name in names}
+    assert paths[names[0]] != paths[names[1]] != paths[names[2]] != paths[names[0]]
+    assert path("LN_BOBYQA", [0.8]) == path("LN_SBPLX", [0.8])
+
+
 # ---- mistakes --------------------------------------------------------------------------------------------------------
 
 

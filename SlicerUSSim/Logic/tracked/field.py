@@ -207,7 +207,7 @@ def _sector(points: np.ndarray, left, right, scale) -> tuple[str, dict[str, floa
     # The face is a circle about the apex: the first bright pixel of each direction, one pixel wide, lies on it, and the
     # pixel's centre half a pixel behind it on average.
     directions = max(int(2.0 * half * radius.min() / scale[0]), 20)
-    bins = (0.5 * (angle / half + 1.0) * directions).astype(int)
+    bins = np.minimum((0.5 * (angle / half + 1.0) * directions).astype(int), directions - 1)
     first = np.full(directions, np.inf)
     np.minimum.at(first, bins, radius)
     middle = first[directions // 8 : directions - directions // 8]
