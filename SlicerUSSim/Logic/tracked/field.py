@@ -179,7 +179,9 @@ def _sides(bright: np.ndarray, scale: np.ndarray) -> tuple[tuple[float, float], 
         slope, start = (
             np.polyfit(points[near, 1], points[near, 0], 1) if near.sum() > 10 else (slope, p[0] - slope * p[1])
         )
-        found.append((float(start), float(slope)))
+        # The centres of border pixels lie half a pixel inside on average, along rows or, for flat sides, columns.
+        outward = 0.5 * max(scale[0], abs(slope) * scale[1]) * (1.0 if is_right else -1.0)
+        found.append((float(start) + outward, float(slope)))
     return found[0], found[1]
 
 
@@ -205,13 +207,21 @@ def _sector(points: np.ndarray, left, right, scale) -> tuple[str, dict[str, floa
     apex = np.array([left[0] + left[1] * depth, depth])
     half = 0.5 * (np.arctan(right[1]) - np.arctan(left[1]))
     away = points - apex
-    radius = np.hypot(*away.T)
-    angle = np.abs(np.arctan2(away[:, 0], away[:, 1]))
-    outer = float(np.percentile(radius[angle < half], 99.9) + 0.5 * scale[1])
-    # The face is a circle about the apex: each direction's first bright pixel lies on it.
-    bins = np.clip((angle / half * 20).astype(int), 0, 19)
-    first = np.array([radius[bins == n].min() for n in range(15) if (bins == n).any()])
-    inner = max(float(np.median(first) - 0.5 * scale[1]), 0.0)
+    radius, angle = np.hypot(*away.T), np.arctan2(away[:, 0], away[:, 1])
+    in_sides = np.abs(angle) < half
+    require(bool(in_sides.any()), "the bright part of the images is no probe's field, it lies beside its own sides")
+    radius, angle = radius[in_sides], angle[in_sides]
+    # The face is a circle about the apex: the first bright pixel of each direction, one pixel wide, lies on it, and the
+    # pixel's centre half a pixel behind it on average.
+    directions = max(int(2.0 * half * radius.min() / scale[0]), 20)
+    bins = np.minimum((0.5 * (angle / half + 1.0) * directions).astype(int), directions - 1)
+    first = np.full(directions, np.inf)
+    np.minimum.at(first, bins, radius)
+    middle = first[directions // 8 : directions - directions // 8]
+    inner = max(float(np.median(middle[np.isfinite(middle)]) - 0.5 * scale[1]), 0.0)
+    # Pixels are spread evenly over the area, so their squared radii are, and the last of them follow from the others.
+    share = 0.999
+    outer = float(np.sqrt(inner**2 + (np.percentile(radius**2, 100.0 * share) - inner**2) / share))
     opening = {"field_of_view_deg": float(2.0 * np.rad2deg(half))}
     if inner < _POINT_SHARE * outer:
         return "phased", {**opening, "depth_mm": outer}, apex
