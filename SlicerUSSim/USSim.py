@@ -6,6 +6,7 @@ Slicer.
 
 import importlib.machinery
 import importlib.util
+import logging
 import sys
 import unittest
 from pathlib import Path
@@ -53,6 +54,10 @@ def bindPackage() -> None:
 
 
 bindPackage()
+
+# Slicer's own loggers take everything from the level of debugging on, which would be several lines for each live image.
+if logging.getLogger("SlicerUSSim").level == logging.NOTSET:
+    logging.getLogger("SlicerUSSim").setLevel(logging.INFO)
 
 # Slicer runs this file at start-up; what takes time to import is imported when the module is first used.
 

@@ -116,7 +116,8 @@ def main(path: Path) -> None:
     require(again.preset == logic.preset, "the preset has changed on its way through the file")
     frame = again.simulate(nodes.labels, nodes.probe_transform, nodes.output)
     same = float(np.mean(frame.image == read_volume(logic.parameters.output).array[0]))
-    print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB); read back, it simulates the same image ({same:.2%})")
+    print(f"read back, the scene simulates the same image ({same:.2%})")
+    print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)", file=sys.stderr)
 
 
 if __name__ == "__main__":

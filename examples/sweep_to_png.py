@@ -22,4 +22,4 @@ for tilt_deg in np.linspace(-15, 15, 16):  # rock the probe about its lateral ax
     poses.append(middle @ np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]]))
 for number, frame in enumerate(simulator.sweep(probe, poses)):
     write_png(out / f"{number:02d}.png", frame.image)
-print(f"wrote {len(poses)} images to {out}")
+print(f"wrote {len(poses)} images to {out}", file=sys.stderr)

@@ -175,4 +175,4 @@ if __name__ == "__main__":
     scene = build(demo_mri()[0])
     scene.window.Render()
     write_png(scene.window, out)
-    print(f"wrote {out}")
+    print(f"wrote {out}", file=sys.stderr)

@@ -11,6 +11,7 @@ labels.nii.gz is the same brain with a slightly wrong segmentation (SlicerUSSim/
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -35,7 +36,7 @@ def main() -> None:
     twin.sequence().write(folder / "tracked.igs.mha")
     write_json(folder / "probe.json", twin.probe.to_dict())
     write_json(folder / "truth.json", {"display": asdict(twin.true_display), **twin.true_tissues.to_dict()})
-    print(f"wrote labels.nii.gz, labels.json, tracked.igs.mha, probe.json, truth.json in {folder}")
+    print(f"wrote labels.nii.gz, labels.json, tracked.igs.mha, probe.json, truth.json in {folder}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -4,15 +4,7 @@
 // Buffers: re, im float [scan line][stride], LINE_PAD zeros on either side of the samples; pulse float [2 reach + 1];
 // iq float2 (real, imaginary), envelope float and grey uchar [scan line][samples].
 
-#include "common.clh"
-
-#if LANES == 1
-#define GREY_LANES(pointer) ((float)*(pointer))
-#define STORE_GREY(value, pointer) (*(pointer) = (uchar)(value))
-#else
-#define GREY_LANES(pointer) TO_FLOATN(JOIN(vload, LANES)(0, pointer))
-#define STORE_GREY(value, pointer) JOIN(vstore, LANES)(JOIN(convert_uchar, LANES)(value), 0, pointer)
-#endif
+#include "display.clh"
 
 // The axial part of the point spread function. The pulse is exp(-x^2 / 2 sx^2) cos(2 pi f x). Baseband impulses contain
 // the phase of the carrier, so only the Gaussian envelope remains, and the magnitude needs no Hilbert transform.
@@ -47,8 +39,7 @@ __kernel void compress(__global const float *iq, int samples, float noise, uint 
   const floatn tgc_db = TO_FLOATN(index) * tgc_per_sample;
   const floatn level_db = 3.01029996f * log2_fast(power) + tgc_db;
   STORE_LANES(sqrt(power) * exp2_fast(clamp(tgc_db * 0.166096405f, -100.0f, 100.0f)), envelope + here);
-  floatn value = clamp(255.0f * (1.0f + (level_db - level_of_white_db) / dynamic_range_db), 0.0f, 255.0f) + 0.5f;
-  STORE_GREY(value, grey + here);
+  STORE_GREY(grey_level(level_db, level_of_white_db, dynamic_range_db), grey + here);
 }
 
 // Mean grey level over `width` samples about each sample, the depth range of one pixel of the image. Single samples

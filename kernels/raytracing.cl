@@ -176,7 +176,7 @@ inline float next_border(__global const ushort *voxels, __global const uchar *gr
 
 // Two-way amplitude decay in nepers per mm: 10^(-alpha f 2 l / 20) with l in cm.
 inline float decay_in(__constant const Acquisition *acquisition, Tissue tissue) {
-  return tissue.attenuation * acquisition->frequency_mhz * 0.2f * LN10_OVER_20;
+  return tissue.attenuation_db_cm_mhz * acquisition->frequency_mhz * 0.2f * LN10_OVER_20;
 }
 
 // The tube (tube_after) behind a mirror of curvature k at angle of incidence i in the plane of the offset: a ray beside
@@ -230,11 +230,11 @@ typedef struct {
 inline Interface interface_between(Tissue here, Tissue behind, float3 direction, float3 normal) {
   Interface result;
   result.cos_in = clamp(-dot3(direction, normal), 0.01f, 1.0f);
-  result.speed_ratio = behind.speed_m_s / here.speed_m_s;
+  result.speed_ratio = behind.speed_of_sound_m_s / here.speed_of_sound_m_s;
   float sin2_out = result.speed_ratio * result.speed_ratio * (1.0f - result.cos_in * result.cos_in);
   result.is_total = sin2_out >= 1.0f;
   result.cos_out = sqrt(fmax(0.0f, 1.0f - sin2_out));
-  float z_in = here.impedance * result.cos_out, z_out = behind.impedance * result.cos_in;
+  float z_in = here.impedance_mrayl * result.cos_out, z_out = behind.impedance_mrayl * result.cos_in;
   result.pressure = result.is_total ? 1.0f : (z_out - z_in) / (z_out + z_in);
   return result;
 }
@@ -306,7 +306,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       course.path = ray.path;
       if (ray.label < 0) ray.label = label_at(voxels, groups, acquisition, course_at(acquisition, &course, 0.0f));
       Tissue here = tissues[ray.label], behind = here;
-      const float depth_per_mm = acquisition->reference_speed_m_s / here.speed_m_s;
+      const float depth_per_mm = acquisition->reference_speed_m_s / here.speed_of_sound_m_s;
       const float to_depth = (acquisition->depth_mm - ray.depth) / depth_per_mm;
       const float2 span =
           volume_span(acquisition, &course, 3.0f + fabs(quantile) * 4.0f / acquisition->voxel_mm, to_depth);

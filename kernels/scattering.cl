@@ -212,7 +212,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
       continue;
     }
 #endif
-    const float p = tissues[label].share;
+    const float p = tissues[label].scatterer_share;
     const int exists = (random_[j] >> 16) + 0.5f < p * 65536.0f;
     const float strength = tissues[label].mu0 * (exists - p) + tissues[label].sigma0 * t0_[j] * exists;
     add_echo(sum, b, part_[j], right_[j], gain * strength, re_[j], im_[j]);

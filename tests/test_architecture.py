@@ -296,7 +296,8 @@ def test_help_imports_no_library_that_takes_long():
 import json, sys
 from click.testing import CliRunner
 from SlicerUSSim.Command.cli import main
-assert CliRunner().invoke(main, ["--help"]).exit_code == 0
+for arguments in (["--help"], ["simulate", "--help"], ["segment", "--help"], ["optimize", "--help"]):
+    assert CliRunner().invoke(main, arguments).exit_code == 0
 print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -13,14 +13,16 @@ from scipy.integrate import trapezoid
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import ConvexProbe, SimulationError
+from SlicerUSSim.Logic.imaging.scattering import scatterer_counts
+from SlicerUSSim.Logic.imaging.stage import Work
 from SlicerUSSim.Logic.opencl.devices import choose_device
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.verification.benchmark import suite
 from SlicerUSSim.Logic.verification.benchmark.files import output_file, result_file
-from SlicerUSSim.Logic.verification.benchmark.machine import Machine, Work
+from SlicerUSSim.Logic.verification.benchmark.machine import Machine
 from SlicerUSSim.Logic.verification.benchmark.suite import run_benchmark
 from SlicerUSSim.Logic.verification.benchmark.tables import comparison
-from SlicerUSSim.Logic.verification.benchmark.work import frame_work, scatterer_counts
+from SlicerUSSim.Logic.verification.benchmark.work import frame_work
 from tests.conftest import SPECKLE, block, rigid, simulator
 
 STAGES = {"ray tree", "scatterers", "interfaces", "beam", "pulse", "B-mode", "scan conversion"}
@@ -58,7 +60,7 @@ def test_scatterers_are_counted_by_the_volume_of_the_beam(solid):
     probe, pose = ConvexProbe(30, 50, 30, scan_lines=64), rigid(np.eye(3), [0, -20, 0])
     tree = solid.trace(probe, pose)
     inside = (tree.segment_line >= 0) & (tree.segment_line <= 63)
-    found, looked_at = scatterer_counts(solid, probe, solid.acquisition(probe, pose), tree.segments[inside])
+    found, looked_at = scatterer_counts(solid.device_frame(probe, pose), tree.segments[inside], solid.device.chunk)
     depth = np.linspace(0, 30, 1001)
     height = 2 * solid.settings.beam_cutoff * probe.beam_sigma_mm(depth)[1]
     width = np.deg2rad(50) * (30 + depth) * 64 / 63  # half a strip beyond either edge

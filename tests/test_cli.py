@@ -274,6 +274,25 @@ def test_a_preset_gives_the_same_image_and_options_go_before_it(head, labels, tm
     assert quieter.mean() < whole.mean()
 
 
+def test_set_changes_the_tissues_of_labels_and_of_an_mri(head, labels, tmp_path):
+    def image(source, *options):
+        out = tmp_path / "image.png"
+        result = ussim("simulate", source, "--pose", "auto", "-o", out, *options)
+        assert result.exit_code == 0, result.output
+        return np.asarray(Image.open(out)).astype(float)
+
+    for source in (labels, head):
+        plain = image(source)
+        louder = image(source, "--set", "white matter.mu0=1.0", "--set", "membrane.thickness_mm=0.5")
+        assert louder.mean() > plain.mean() + 1
+        smaller = image(source, "--set", "probe.depth_mm=60", "--set", "display.image_size=100,120")
+        assert smaller.shape == (100, 120)
+    for source, name in ((labels, "liver"), (head, "liver"), (head, "lver")):
+        result = ussim("simulate", source, "--pose", "auto", "-o", tmp_path / "o.png", "--set", f"{name}.mu0=1")
+        assert result.exit_code == 2 and f"--set: no tissue '{name}', expected " in result.stderr
+        assert not (tmp_path / "o.png").exists()
+
+
 def test_the_command_offers_every_probe_there_is():
     options = {option.name: option for option in main.commands["demo"].params}
     assert list(options["kind"].type.choices) == list(PROBES)

@@ -76,7 +76,10 @@ def test_optimize_writes_result_report_preset_and_state(folder):
     report = (folder / "report.html").read_text()
     assert report.count("data:image/png;base64,") >= 3 * 4 + 3
     assert not re.search(r"(src|href)=\"(?!data:)", report)  # nothing outside the file
-    for words in ("simulated, before", "real", "Blink", "white matter.mu0", "net fall", "Var of white matter"):
+    for words in (
+        "simulated, before", "real", "Blink", "white matter.mu0", "net fall", "Var of white matter",
+        "<td>Mean amplitude μ₀</td>", 'title="Mean amplitude of scatterers.', "<td>dB/(cm MHz)</td>",
+    ):  # fmt: skip
         assert words in report
 
     again = optimize(
@@ -286,7 +289,7 @@ def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
 def test_the_example_writes_a_twin_that_optimize_reads(mni, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["write_twin.py", str(tmp_path), "--seed", "4"])
     example("write_twin").main()
-    assert "tracked.igs.mha" in capsys.readouterr().out
+    assert "tracked.igs.mha" in capsys.readouterr().err
     done = ussim(
         "optimize", tmp_path / "labels.nii.gz", "--sequence", tmp_path / "tracked.igs.mha", "--probe",
         tmp_path / "probe.json", "--frames", "1", "--free", "display", "--evaluations", 30, "--restarts", 0, "-o",

@@ -108,6 +108,20 @@ def test_holes_between_images_are_filled_and_nothing_else_is(kind):
     assert not whole.array[outside].any()
 
 
+def test_the_grid_of_a_sweep_just_holds_its_field():
+    """A voxel of margin on each side, and less than a voxel more."""
+    poses = slide_sweep(rigid(np.eye(3), [3, -5, 11]), 12, 5)
+    for spacing in (0.8, 1.7):
+        grid = sweep_grid(PROBE, poses, spacing)
+        points = np.concatenate([PROBE.outline_mm() @ pose[:3, :3].T + pose[:3, 3] for pose in poses])
+        first = grid.ijk_to_ras[:3, 3]
+        last = first + spacing * (np.array(grid.array.shape[::-1]) - 1)
+        np.testing.assert_allclose(first, points.min(axis=0) - spacing)
+        beyond = (last - points.max(axis=0)) / spacing
+        assert (beyond >= 1 - 1e-9).all() and (beyond < 2).all()
+    assert np.allclose(sweep_grid(PROBE, poses).spacing_mm, 0.5)
+
+
 def test_images_that_overlap_are_averaged():
     pose = rigid(np.eye(3), [0, 0, 0])
     compounder = Compounder(sweep_grid(PROBE, [pose], 1.0), PROBE)
@@ -115,6 +129,21 @@ def test_images_that_overlap_are_averaged():
         compounder.add(painted(PROBE, pose, lambda p, grey=grey: grey + 0 * p[..., 0]))
     values = compounder.volume(0).array
     assert set(np.unique(values)) == {0, 90}
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.0, 0.5), (0.25, -0.5), (0.1, 0.9), (-0.3, 0.3)])
+def test_an_image_counts_the_less_the_farther_off_its_plane_is(near, far):
+    """Two images beside a layer of voxels 1 mm apart: weights fall linearly to zero at one voxel."""
+    matrix = np.diag([1.0, 1.0, 1.0, 1.0])
+    matrix[:3, 3] = -20.0, 0.0, -3.0
+    compounder = Compounder(Volume(np.zeros((7, 40, 40), np.uint8), matrix), PROBE)
+    for offset, grey in ((near, 60), (far, 240)):
+        pose = rigid(np.eye(3), [0, 0, offset])
+        compounder.add(painted(PROBE, pose, lambda p, grey=grey: grey + 0 * p[..., 0]))
+    weights = 1 - np.abs([near, far])
+    layer = compounder.volume(0).array[3]
+    assert (layer > 0).sum() > 500
+    np.testing.assert_allclose(layer[layer > 0], weights @ [60, 240] / weights.sum(), atol=1.0)
 
 
 def test_a_simulated_volume_shows_a_cyst_where_it_is():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, strategies as st
@@ -52,6 +54,28 @@ def test_geometry_is_found_from_the_image(probe):
     expected = np.linalg.inv(grid.image_to_probe)[:2, 3] + [60, 15]
     assert np.abs(face - expected).max() < 6.0
     assert field.overlap > 0.95
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [LinearProbe(38, 50), ConvexProbe(40, 60, 80), ConvexProbe(15, 70, 60), PhasedProbe(70, 80)],
+    ids=["linear", "convex", "micro-convex", "phased"],
+)
+def test_edges_of_the_field_are_those_of_pixels_not_of_their_centres(kind):
+    """Over pixels that lie anywhere on the field the estimate is right on average: half a pixel would be seen."""
+    random, spacing, errors = np.random.default_rng(0), 0.25, []
+    outline = kind.outline_mm()[:, :2]
+    for _ in range(12):
+        sizes = [name for name in ("depth_mm", "width_mm", "radius_mm") if name in kind.to_dict()]
+        probe = replace(kind, **{name: getattr(kind, name) + random.uniform(0, 2 * spacing) for name in sizes})
+        left, top = outline.min(axis=0) - spacing * random.uniform(20, 21, 2)
+        columns, rows = (int(size / spacing) + 50 for size in np.ptp(outline, axis=0))
+        x, y = np.meshgrid(left + spacing * np.arange(columns), top + spacing * np.arange(rows))
+        found = estimate_field(np.where(probe.holds(x, y), 100, 0).astype(np.uint8), (spacing, spacing))
+        wrong_by = [found.probe.to_dict()[name] - probe.to_dict()[name] for name in sizes]
+        face = (np.linalg.inv(found.image_to_probe) @ [0, 0, 0, 1])[:2] * spacing + [left, top]
+        errors.append([*wrong_by, *face])
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.25 * spacing
 
 
 def test_size_of_a_pixel_follows_from_what_is_known():

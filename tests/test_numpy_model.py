@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -18,8 +22,20 @@ from SlicerUSSim.Logic import (
     list_devices,
     seed_of_pose,
 )
+from SlicerUSSim.Logic.imaging import bmode, medium, noise, raytracing
+from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
+from SlicerUSSim.Logic.probe.arrays import PROBES as STANDARD_PROBES
 from SlicerUSSim.Logic.tissue.tissue import Membrane
+from SlicerUSSim.Logic.verification import numpy_model
 from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
+from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
+    acquisition_record,
+    axial_sigma_mm,
+    elevational_quantiles,
+    line_roots,
+    noise_key,
+    pulse_taps,
+)
 from tests.conftest import block, rigid
 
 FLUID = Tissue("fluid", 1520, 1.52, 0.0, 0.0, 0.0, 0.0)
@@ -100,3 +116,196 @@ def test_numpy_has_no_texture_and_says_so():
     simulator.settings = SimulationSettings(mri_modulation_db=2.0)
     with pytest.raises(SimulationError, match="expected partial_volume and mri_modulation_db 0"):
         NumpyModel(simulator)
+
+
+# ---- it shares nothing with what it checks ---------------------------------------------------------------------------
+
+#: What files of the numpy model may take from the rooms of what they check: the simulator as the one who knows label
+#: map, tissues, settings and the names of the stages; what a stage is; names and formats of records.
+MAY_SHARE = {
+    "imaging.simulator.UltrasoundSimulator", "imaging.stage.HostFrame", "imaging.stage.Stage",
+    "opencl.layout.ACQUISITION", "opencl.layout.CONSTANTS", "opencl.layout.HIT", "opencl.layout.SEGMENT",
+    "opencl.layout.TISSUE",
+}  # fmt: skip
+#: Numbers of formats and codes, not of the model
+MAY_SHARE_CONSTANTS = {"BLOCK", "MAX_TISSUES", "MEMBRANE_LABEL"}
+#: What it reads of the simulator
+MAY_READ = {"settings", "stages", "medium"}
+
+
+def test_it_imports_nothing_of_what_it_checks():
+    taken, constants, read = set(), set(), set()
+    for path in Path(numpy_model.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                assert not any(alias.name.startswith("SlicerUSSim") for alias in node.names), path
+            elif isinstance(node, ast.ImportFrom) and str(node.module).startswith("SlicerUSSim.Logic."):
+                module = str(node.module).removeprefix("SlicerUSSim.Logic.")
+                taken |= {f"{module}.{alias.name}" for alias in node.names}
+            elif isinstance(node, ast.Subscript) and ast.unparse(node.value) == "CONSTANTS":
+                constants.add(ast.literal_eval(node.slice))
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("simulator", "self.simulator"):
+                read.add(node.attr)
+    assert {name for name in taken if name.split(".")[0] in ("imaging", "opencl")} == MAY_SHARE
+    assert {name for name in taken if name.startswith("probe.arrays")} == {
+        f"probe.arrays.{name}" for name in ("ConvexProbe", "LinearProbe", "PhasedProbe", "Probe")
+    }
+    assert constants <= MAY_SHARE_CONSTANTS
+    assert read <= MAY_READ
+
+
+def test_of_a_probe_it_reads_only_what_a_user_gives():
+    fields = {name for probe in STANDARD_PROBES.values() for name in probe.to_dict()}
+    folder = Path(numpy_model.__file__).parent
+    for path in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "probe":
+                assert node.attr in fields, f"{path.name}: probe.{node.attr}"
+
+
+def test_nothing_is_computed_on_the_device(monkeypatch):
+    labels, tissues = scene()
+    simulator = UltrasoundSimulator(labels, tissues)
+
+    def refused(*arguments, **options):
+        raise AssertionError("the device was used")
+
+    for name in ("run", "download", "upload", "write"):
+        monkeypatch.setattr(simulator.device, name, refused)
+    NumpyModel(simulator).simulate(SMALL, rigid(np.eye(3), [1.0, -4.0, 0.5]))
+
+
+# ---- record, lines, pulse and medium are those of the simulator ------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        SimulationSettings(),
+        SimulationSettings(
+            seed=77, reference_speed_m_s=1480, samples_per_cycle=6, interface_gain_db=31, lateral_rays=3
+        ),
+        SimulationSettings(reflections=False, scatterers_per_mm3=99, beam_cutoff=3.0, interface_reflection="energy"),
+    ],
+)
+@pytest.mark.parametrize("name", STANDARD_PROBES)
+def test_the_record_of_a_frame_follows_from_the_equations(name, settings):
+    labels, tissues = scene()
+    simulator = UltrasoundSimulator(labels, tissues, settings)
+    pose = rigid(np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]]), [1.0, -4.0, 0.5])
+    probe = replace(STANDARD_PROBES[name], focus_mm=31.0, fractional_bandwidth=0.63)
+    record, expected = (
+        simulator.acquisition(probe, pose),
+        acquisition_record(probe, pose, settings, NumpyModel(simulator).medium),
+    )
+    for field in ACQUISITION.names or ():
+        np.testing.assert_allclose(record[field], expected[field], rtol=1e-6, atol=1e-5, err_msg=field)
+    assert simulator.axial_sigma_mm(probe) == pytest.approx(axial_sigma_mm(probe, settings))
+    np.testing.assert_allclose(raytracing.line_roots(record), line_roots(expected), atol=1e-5)
+    traced, rays = int(record["traced_lines"]), int(record["elevational_rays"])
+    np.testing.assert_allclose(raytracing.beam_quantiles(traced, rays), elevational_quantiles(traced, rays), atol=1e-5)
+    assert noise.noise_key(record, 12345) == noise_key(expected, 12345)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.7, 2.0, 11.5])
+def test_the_pulse_follows_from_the_equations(sigma):
+    np.testing.assert_allclose(bmode.pulse_taps(sigma), pulse_taps(sigma), rtol=1e-5)
+
+
+def test_the_medium_is_the_same_on_the_host():
+    labels, tissues = scene()
+    found = UltrasoundSimulator(labels, tissues).medium
+    model = NumpyModel(UltrasoundSimulator(labels, tissues)).medium
+    shape, download = model.label.shape, found.device.download
+    voxels = download(found.voxel_buffer, shape, np.uint16)
+    assert np.array_equal(voxels & CONSTANTS["LABEL_MASK"], model.label)
+    assert model.distance is not None and np.abs((voxels >> 8).astype(int) - model.distance).max() <= 1
+    assert np.array_equal(download(found.group_buffer, shape, np.uint8) & CONSTANTS["GROUP_MASK"], model.group)
+    smooth = download(found.smooth_buffer, (found.smooth_groups, *shape), np.uint16)
+    assert model.smooth_groups == found.smooth_groups
+    assert np.abs(smooth.astype(int) - model.smooth).max() <= 2  # of 65535
+    for name in found.rows.dtype.names or ():
+        np.testing.assert_allclose(found.rows[name], model.rows[name], rtol=1e-6)
+
+
+def test_changed_tissues_are_taken_up():
+    labels, tissues = scene()
+    simulator = UltrasoundSimulator(labels, tissues)
+    model, pose = NumpyModel(simulator), rigid(np.eye(3), [1.0, -4.0, 0.5])
+    simulator.set_tissues(tissues.replace("brain", mu0=1.2, attenuation_db_cm_mhz=0.1))
+    difference = np.abs(simulator.simulate(SMALL, pose).image.astype(int) - model.simulate(SMALL, pose))
+    assert (difference <= 1).mean() > 0.99
+
+
+# ---- so it notices what is wrong -------------------------------------------------------------------------------------
+
+#: Quick in numpy, and everything about it counts: its aperture is fully open from 7.5 mm on
+SMALL = ConvexProbe(20, 24, 18, scan_lines=24, frequency_mhz=4, aperture_mm=3.0)
+WRONG_RECORDS = {
+    "elevation_sigma": 1.1, "elevation_focus": 1.1, "elevation_rayleigh": 1.2, "transmit_sigma": 1.2,
+    "transmit_focus": 1.2, "transmit_rayleigh": 1.3, "receive_sigma_min": 1.1, "receive_sigma_slope": 1.1,
+    "speckle_scale": 1.05, "cell_mm": 1.01, "cycles_per_mm": 1.01, "sample_mm": 1.01, "line_spacing": 1.01,
+    "first_line": 1.02, "apex_radius_mm": 1.05, "interface_gain": 1.1, "membrane_reach": 1.2, "beam_cutoff": 0.9,
+    "reference_speed_m_s": 1.01, "frequency_mhz": 1.1, "specular_exponent": 1.3,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def compared():
+    """The share of pixels of a new simulator within one grey level of one image of the numpy model."""
+    labels, tissues = scene()
+    pose, display = rigid(np.eye(3), [1.0, -4.0, 0.5]), DisplaySettings(noise_db=-30.0, image_size=(120, 60))
+    expected = NumpyModel(UltrasoundSimulator(labels, tissues)).simulate(SMALL, pose, display, noise_seed=3)
+
+    def share() -> float:
+        image = UltrasoundSimulator(labels, tissues).simulate(SMALL, pose, display, noise_seed=3).image
+        return float((np.abs(image.astype(int) - expected) <= 1).mean())
+
+    return share
+
+
+def test_the_small_image_is_as_in_numpy(compared):
+    assert compared() > 0.999
+
+
+@pytest.mark.parametrize("field", WRONG_RECORDS)
+def test_a_wrong_value_in_the_record_is_noticed(compared, monkeypatch, field):
+    right = UltrasoundSimulator.acquisition
+
+    def wrong(self, probe, pose):
+        record = right(self, probe, pose)
+        record[field] *= WRONG_RECORDS[field]
+        return record
+
+    monkeypatch.setattr(UltrasoundSimulator, "acquisition", wrong)
+    assert compared() < 0.99
+
+
+def _moved_distance(right):
+    def wrong(*arguments):
+        distance, reach = right(*arguments)
+        return np.roll(distance, 1, axis=2), reach
+
+    return wrong
+
+
+SHIFT = np.array([0.05, 0.0, 0.0, 0.0], np.float32)
+WRONG_STEPS = {
+    "pulse": (bmode, "pulse_taps", lambda right: lambda sigma: right(1.1 * sigma)),
+    "rays across the beam": (raytracing, "beam_quantiles", lambda right: lambda *n: np.float32(0.7) * right(*n)),
+    "places of lines": (
+        raytracing,
+        "line_roots",
+        lambda right: lambda a: right(a) + SHIFT,
+    ),
+    "noise": (bmode, "noise_key", lambda right: lambda *n: right(*n) ^ 1),
+    "smoothed indicators": (medium, "smoothed_indicators", lambda right: lambda d, g, n, p, f: right(d, g, n, {0}, f)),
+    "fluid distance": (medium.Medium, "_fluid_distance", _moved_distance),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_STEPS)
+def test_a_wrong_step_is_noticed(compared, monkeypatch, what):
+    owner, name, spoil = WRONG_STEPS[what]
+    monkeypatch.setattr(owner, name, spoil(getattr(owner, name)))
+    assert compared() < 0.99

@@ -116,6 +116,48 @@ def test_it_says_what_cannot_be_known(result):
     assert json.loads(json.dumps(result.to_dict()))["identifiability"]["cost_tolerance"] > 0
 
 
+def test_equally_good_is_what_another_draw_of_the_speckle_could_make_of_the_best(result):
+    """The tolerance, how many solutions lie within it, and that no other widens a spread."""
+    found = result.identifiability
+
+    def of(stage):
+        return [entry for entry in result.history if entry.stage == stage]
+
+    best = min(entry.cost for entry in of("polish"))
+    redrawn = [of(f"redraw {n}")[0].cost for n in (1, 2)]
+    tolerance = max(np.std([best, *redrawn]), 0.01 * best)
+    assert found.cost_tolerance == pytest.approx(tolerance) and tolerance < 0.1 * best
+    entries = [entry for stage in ("local", "polish", "draw") for entry in of(stage)]
+    as_good = [entry for entry in entries if entry.cost <= best + tolerance]
+    assert 0 < len(as_good) < len(entries)
+    again = [min(of(f"restart {n}"), key=lambda entry: entry.cost) for n in (1, 2)]
+    again = [entry for entry, cost in zip(again, redrawn, strict=True) if entry.cost - cost <= tolerance]
+    assert found.restarts_as_good == len(again) and found.solutions == len(as_good) + len(again)
+    values = np.array([result.parameters.values(np.array(entry.units)) for entry in [*as_good, *again]])
+    for parameter, column in zip(result.parameters, values.T, strict=True):
+        spread = found[parameter.name]
+        assert (spread.low, spread.high) == pytest.approx((column.min(), column.max())), parameter.name
+
+
+def test_the_last_search_sees_what_whole_simulations_show(twin):
+    """Far from the presets the cost is approximate until it is computed anew about the best of the search before."""
+    from SlicerUSSim.Logic import similarity
+
+    found = optimize_appearance(
+        twin.simulator, twin.probe, twin.poses[:1], twin.references[:1], display=twin.display, restarts=0,
+        free={"white matter.attenuation_db_cm_mhz": (0.9, 1.2), "white matter.mu1": (1.0, 1.5)}, max_evaluations=12,
+    )  # fmt: skip
+    last = next(entry for entry in found.history if entry.stage == "polish")
+    before = [entry.cost for entry in found.history if entry.stage == "local" and entry.units == last.units]
+    tissues, display = found.parameters.apply(np.array(last.units), twin.simulator.medium.tissues, twin.display)
+    with twin.simulator.with_tissues(tissues):
+        frame = twin.simulator.simulate(twin.probe, twin.poses[0], display)
+    field = ImageGrid.for_probe(twin.probe, None).field(twin.probe)
+    whole = similarity(frame.image, twin.references[0], frame.pixel_spacing_mm, mask=field).total
+    assert abs(before[0] - whole) > 1e-4
+    assert last.cost == pytest.approx(whole, abs=1e-5)
+
+
 def test_sources_say_what_was_fitted(result):
     sources = white(result.tissues).sources
     assert sources["mu0"] == "fitted to tracked ultrasound" and "Szabo" in sources["speed_of_sound_m_s"]
@@ -295,6 +337,20 @@ def test_search_finds_the_lowest_point_and_keeps_its_history(algorithm):
     assert np.abs(best - goal).max() < 0.05
     assert search.computed == len(search.history) <= 400
     assert search.best_cost("here") == min(entry.cost for entry in search.history)
+
+
+def test_each_algorithm_is_the_one_named_but_for_a_single_parameter():
+    """BOBYQA needs two parameters or more, so one parameter is searched by another."""
+
+    def path(algorithm, start):
+        search = Search(lambda units: float(((units - 0.3) ** 2).sum()), lambda units: {}, 30)
+        search.minimise(algorithm, "here", np.array(start), 30)
+        return [entry.units for entry in search.history]
+
+    names = "LN_BOBYQA", "LN_SBPLX", "LN_NELDERMEAD"
+    paths = {name: path(name, [0.8, 0.6, 0.1]) for name in names}
+    assert paths[names[0]] != paths[names[1]] != paths[names[2]] != paths[names[0]]
+    assert path("LN_BOBYQA", [0.8]) == path("LN_SBPLX", [0.8])
 
 
 # ---- mistakes --------------------------------------------------------------------------------------------------------

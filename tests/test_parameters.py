@@ -25,6 +25,16 @@ def test_groups_stand_for_all_of_their_own():
     assert len(mixed) == 4 and (mixed[0].low, mixed[0].high) == (-3.0, 3.0)
 
 
+def test_bounds_are_those_of_the_documentation():
+    """docs/optimization.md says them in words."""
+    expected = {
+        "gain_db": (-30, 30), "dynamic_range_db": (30, 90), "tgc_db_cm_mhz": (0, 1.2), "noise_db": (-120, -30),
+        "white matter.attenuation_db_cm_mhz": (0.1, 1.2), "white matter.mu0": (0.02, 1.5),
+        "white matter.mu1": (-1, 1.5), "white matter.sigma0": (0.02, 1),
+    }  # fmt: skip
+    assert {p.name: (p.low, p.high) for p in of(["display", "white matter"])} == expected
+
+
 @given(st.lists(st.floats(0, 1), min_size=8, max_size=8))
 def test_positions_and_values_are_inverse(units):
     parameters = of(["display", "white matter"])

@@ -38,6 +38,14 @@ def test_changing_the_kind_of_probe_keeps_what_both_have():
     assert isinstance(linear, LinearProbe) and linear.width_mm == 25.0
 
 
+@pytest.mark.parametrize("focus_mm", [20.0, 85.0])
+def test_a_focus_that_was_chosen_stays_at_another_depth_and_one_that_was_not_follows(focus_mm):
+    preset = Preset(PROBES["linear"]).changed("probe", depth_mm=80.0, focus_mm=focus_mm)
+    deeper = preset.changed("probe", depth_mm=100.0).probe
+    assert deeper.focus_mm == focus_mm
+    assert deeper.elevation_focus_mm == type(deeper).default_focus_mm(100.0) == pytest.approx(60.0)
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -47,7 +55,10 @@ def test_changing_the_kind_of_probe_keeps_what_both_have():
         ({"display": {"image_size": 5}}, "display: image_size is 5, expected 2 whole numbers between 8 and 8192"),
         ({"settings": []}, "settings: is a list, expected an object"),
         ({"probe": {"kind": "sector"}}, "probe: kind is 'sector'"),
-        ({"tissues": {"1": {"name": "x"}}}, "tissue 1: lacks speed_of_sound_m_s, impedance_mrayl, attenuation_db_cm_mhz"),
+        (
+            {"tissues": {"1": {"name": "x"}}},
+            "tissue 1: lacks speed_of_sound_m_s, impedance_mrayl, attenuation_db_cm_mhz",
+        ),
         ([], "is a list, expected an object"),
     ],
 )

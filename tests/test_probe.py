@@ -87,8 +87,8 @@ def test_probes_survive_json(depth, count, frequency, kind):
     "values, message",
     [
         ({"kind": "convex", "radius_mm": 60, "field_of_view_deg": 70, "depth_mm": 120, "frequency_mhz": -5.0},
-         r"probe.json: ConvexProbe: frequency_mhz is -5.0, expected a number"),
-        ({"kind": "convex", "radius_mm": 60, "field_of_view_deg": 70}, "probe also needs depth_mm"),
+         r"probe.json: frequency_mhz is -5.0, expected a number between 0.5 and 40"),
+        ({"kind": "convex", "radius_mm": 60, "field_of_view_deg": 70}, "probe.json: lacks depth_mm"),
         ({"kind": "ring"}, "kind is 'ring', expected one of linear, convex, phased"),
         ({"kind": "linear", "width_mm": 40, "depth_mm": 50, "colour": 3}, "colour is not a parameter of a linear"),
         ({"kind": "linear", "width_mm": "wide", "depth_mm": 50}, "width_mm is 'wide'"),

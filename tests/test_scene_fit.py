@@ -22,6 +22,8 @@ from SlicerUSSim.Logic import (  # noqa: E402
 from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.fitting import tracked_fit  # noqa: E402
+from SlicerUSSim.Logic.fitting.registration import Registration, rigid_from  # noqa: E402
+from SlicerUSSim.Logic.fitting.tracked_fit import Fit  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
@@ -232,6 +234,21 @@ def test_registration_is_written_as_a_transform_of_the_tracking(brain, monkeypat
     assert found.registration.cost_after <= found.registration.cost_before
     with pytest.raises(SimulationError, match="without registration"):
         own.logic.writeRegistration(own.optimize(max_evaluations=5), own.labels, registration)
+
+
+def test_a_registration_of_labels_that_were_moved_is_written_for_where_they_are(brain):
+    """What moves a point of the ultrasound beside the labels moves it in the room as well."""
+    own = Scene(brain)
+    room = own.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "room")
+    to_world = rigid_from([30, -10, 5, 20, -35, 50])
+    room.SetMatrixTransformToParent(vtk_matrix(to_world))
+    own.labels.SetAndObserveTransformNodeID(room.GetID())
+    correction = rigid_from([1, -2, 3, 10, 5, -15])
+    moved = Registration(correction, [], np.zeros(3), 0.0, 0.5, 0.4, [])
+    node = own.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "registration")
+    own.logic.writeRegistration(Fit(None, moved, None, [], []), own.labels, node)
+    point = np.array([12.0, -7.0, 3.0, 1.0])  # in the frame of the labels
+    assert np.allclose(node_to_world(node) @ to_world @ point, to_world @ correction @ point, atol=1e-6)
 
 
 def test_cancelling_leaves_the_scene_as_it_was(brain):

@@ -9,7 +9,7 @@ from scipy.ndimage import uniform_filter
 
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.filtering import guided_filter
-from SlicerUSSim.Logic.mri.mixture import fit_mixture
+from SlicerUSSim.Logic.mri.mixture import classify, fit_mixture
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import estimate_noise
 
@@ -79,6 +79,37 @@ def test_a_known_mixture_is_recovered():
     np.testing.assert_allclose(means, [40, 90, 120], atol=0.5)
     np.testing.assert_allclose(deviations, [6, 8, 5], rtol=0.05)
     np.testing.assert_allclose(weights, [1 / 6, 1 / 2, 1 / 3], atol=0.01)
+
+
+@given(
+    st.lists(st.tuples(st.floats(0, 200), st.floats(1, 60), st.floats(0.01, 1)), min_size=2, max_size=4),
+    st.floats(20, 200),
+)
+def test_brighter_voxels_never_have_a_darker_class(classes, beyond):
+    """Whatever widths the classes have, and as far beyond the outermost as intensities go."""
+    means, deviations, weights = (np.array(column) for column in zip(*sorted(classes), strict=True))
+    values = np.linspace(means[0] - beyond, means[-1] + beyond, 400, dtype=np.float32)
+    labels = classify(values, means, deviations, weights / weights.sum())
+    assert (np.diff(labels.astype(int)) >= 0).all()
+    step = values[1] - values[0]
+    assert (labels[values < means[0] - step] == 1).all()
+    assert (labels[values > means[-1] + step] == len(means)).all()
+
+
+def test_bright_voxels_beyond_white_matter_are_white_matter():
+    """CSF is the widest class: by its posterior alone, both tails of the image and vessels would be its."""
+    rng = np.random.default_rng(7)
+    image = np.full((30, 40, 40), 90.0)
+    image[:, :, 20:] = 120.0
+    image += rng.normal(0, 2.0, image.shape)
+    image[:, :10] = rng.normal(50, 25.0, image[:, :10].shape)
+    image[10:20, 30:32, 30:32] = 190.0
+    mri = Volume(image.astype(np.float32), np.eye(4))
+    result = segment_mri(mri, mask=mri.with_array(np.ones(image.shape, np.uint8)), filter_radius=0)
+    assert result.standard_deviations[0] > 3 * result.standard_deviations[1:].max()
+    assert (result.labels.array[10:20, 30:32, 30:32] == 3).all()
+    in_order = result.labels.array.ravel()[np.argsort(image.astype(np.float32).ravel(), kind="stable")]
+    assert (np.diff(in_order.astype(int)) >= 0).all()
 
 
 @pytest.mark.parametrize("radius", [1, 2, 5])

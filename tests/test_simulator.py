@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from inspect import signature
 
 import numpy as np
 import pytest
@@ -22,8 +23,10 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
     Volume,
 )
+from SlicerUSSim.Logic.imaging.compounding import sweep_grid
 from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning
 from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.table import MAX_LABEL
 from SlicerUSSim.Logic.verification.measurement import level_db
 from SlicerUSSim.Logic.verification.validation import ORIENTATIONS
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
@@ -263,13 +266,27 @@ def test_poses_that_are_not_rigid_are_refused(solid, pose, message):
         (np.full((4, 4, 4), 3), "label 3 has no tissue"),
         (np.full((4, 4, 4), 0.5), "fractions"),
         (np.full((4, 4, 4), -1), "from -1"),
-        (np.full((4, 4, 4), 63, np.uint8), "label 63"),
+        (np.full((4, 4, 4), MAX_LABEL + 1, np.uint8), f"holds label {MAX_LABEL + 1}, expected 0 to {MAX_LABEL}"),
+        (np.full((4, 4, 4), 200, np.uint8), f"holds label 200, expected 0 to {MAX_LABEL}"),
+        (np.full((4, 4, 4), 200), f"from 200 to 200, expected whole numbers from 0 to {MAX_LABEL}"),
         (np.full((4, 4, 4), np.nan), "from nan"),
     ],
 )
 def test_labels_that_cannot_be_used_are_refused(array, message):
     with pytest.raises(SimulationError, match=message):
         UltrasoundSimulator(Volume(array, np.eye(4)), TissueTable({1: SPECKLE}))
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int16, np.float32])
+def test_the_largest_label_can_be_used(kind):
+    labels = Volume(np.full((4, 4, 4), MAX_LABEL, kind), np.eye(4))
+    medium = UltrasoundSimulator(labels, TissueTable({0: FLUID, MAX_LABEL: SPECKLE})).medium
+    assert list(medium.present) == [MAX_LABEL]
+
+
+def test_a_volume_has_the_spacing_of_a_sweep_grid_if_none_is_given():
+    defaults = [signature(f).parameters["spacing_mm"].default for f in (UltrasoundSimulator.volume, sweep_grid)]
+    assert defaults[0] == defaults[1] == 0.5
 
 
 def test_a_sweep_is_the_frames_of_its_poses(solid):

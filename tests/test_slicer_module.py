@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import json
+import logging
 import os
 import pkgutil
 import re
@@ -47,6 +48,7 @@ def module():
     loaded = load_source_as_module("USSim", MODULE_FILE)
     loaded.app = app
     yield loaded
+    logging.getLogger("SlicerUSSim").setLevel(logging.NOTSET)
     for name in set(sys.modules) - set(before):
         if name.split(".")[0] in ("USSim", "SlicerUSSim", "qt") or name.startswith("slicer."):
             del sys.modules[name]
@@ -55,6 +57,11 @@ def module():
         for name in set(vars(target)) - set(values):
             delattr(target, name)
         vars(target).update(values)
+
+
+def test_slicers_log_gets_choices_once_and_nothing_for_each_live_image(module):
+    ours = logging.getLogger("SlicerUSSim")
+    assert ours.level == logging.INFO and not ours.handlers and ours.propagate
 
 
 class Session:

@@ -67,16 +67,19 @@ def test_mixed_tissues_echo_with_the_mean_of_their_variances(share):
 
 
 def test_amplitudes_follow_the_mri_and_the_tissue_keeps_its_power():
+    """Against the same scatterers without the MRI, so that the draw of the speckle does not count."""
     x = (np.arange(SOLID.array.shape[2]) * 1.0 - 30.0) * np.ones(SOLID.array.shape)
-    known = texture(deviation=np.sign(x).astype(np.float32))
-    found = frames(known, mri_modulation_db=2.0)
-    levels = [
-        10 * np.log10(np.mean([10 ** (region_level_db(f, PROBE, (a, b, 3, 43)) / 10) for f in found]))
-        for a, b in ((-16, -2), (2, 16))
-    ]
-    assert levels[1] - levels[0] == pytest.approx(4.0, abs=0.5)
-    power = np.mean([10 ** (level / 10) for level in levels])
-    assert 10 * np.log10(power) == pytest.approx(10 * np.log10(SPECKLE.scatterer_variance), abs=0.5)
+    bright = x > 10.0  # a third of the tissue: gains of +-6 dB alone would raise its mean power by 1.7 dB
+    deviation = np.where(bright, 1.0, -1.0).astype(np.float32)
+    power = (bright.mean() * 10**0.6 + (1 - bright.mean()) * 10**-0.6, np.array([10**-0.6, 10**0.6]))
+    expected = 10 * np.log10(power[1] / power[0])
+    plain, found = frames(), frames(texture(deviation=deviation), mri_modulation_db=6.0)
+    for (a, b), level in zip(((-16, 8), (12, 17)), expected, strict=True):
+        change = [
+            region_level_db(f, PROBE, (a, b, 3, 43)) - region_level_db(p, PROBE, (a, b, 3, 43))
+            for f, p in zip(found, plain, strict=True)
+        ]
+        assert np.mean(change) == pytest.approx(level, abs=0.15)
 
 
 def test_the_mri_changes_smoothly_not_voxel_by_voxel():
@@ -168,6 +171,15 @@ def test_an_mri_beside_any_label_map_gives_its_intensity():
     assert known.deviation.mean() == pytest.approx(0, abs=1e-3) and not known.second_share.any()
     flat = Texture.from_mri(SOLID.with_array(np.full(array.shape, 7.0)), SOLID)
     assert not flat.deviation.any()
+
+
+def test_the_medium_gives_its_texture_back_as_the_kernels_read_it():
+    known = texture(0.4, np.linspace(-2, 2, SOLID.array.size, dtype=np.float32).reshape(SOLID.array.shape))
+    settings = SimulationSettings(partial_volume=True, mri_modulation_db=2.0)
+    packed = UltrasoundSimulator(SOLID, TABLE, settings, texture=known).medium.packed_texture()
+    inner = (slice(1, -1),) * 3  # without the margin of coupling medium
+    np.testing.assert_array_equal(packed[inner], known.packed(SOLID.array, True, 2.0))
+    assert UltrasoundSimulator(SOLID, TABLE).medium.packed_texture() is None
 
 
 def test_textures_that_do_not_fit_are_refused():

@@ -17,7 +17,7 @@ PARAMETERS = {"speed_of_sound_m_s", "impedance_mrayl", "attenuation_db_cm_mhz", 
 
 tissues = st.builds(
     Tissue,
-    st.text(min_size=1).filter(str.strip),
+    st.text(min_size=1).filter(lambda name: name.strip() and name.splitlines() == [name]),
     st.floats(100, 10000),
     st.floats(1e-3, 50),
     st.floats(0, 50),
@@ -151,10 +151,10 @@ def test_tables_refuse_labels_and_files_they_cannot_use(tmp_path):
     path = tmp_path / "tissues.json"
     for text, message in (
         ("{", "is not JSON"),
-        ("[]", 'expected {"tissues"'),
-        ('{"tissues": {"1": {"name": "x"}}}', "not a tissue table"),
+        ("[]", 'is a list, expected {"tissues"'),
+        ('{"tissues": {"1": {"name": "x"}}}', "tissue 1: lacks speed_of_sound_m_s, impedance_mrayl"),
         ('{"tissues": {"1": {"name": "x", "speed_of_sound_m_s": 1, "impedance_mrayl": 1, "attenuation_db_cm_mhz": 1}}}',
-         "speed_of_sound_m_s is 1"),
+         "tissue 1: speed_of_sound_m_s is 1, expected a number between 100 and 10000"),
     ):  # fmt: skip
         path.write_text(text)
         with pytest.raises(SimulationError, match=r"tissues\.json: .*" + message.replace("{", "\\{")):
@@ -170,7 +170,10 @@ def test_tables_refuse_labels_and_files_they_cannot_use(tmp_path):
         (lambda: SimulationSettings(elevational_rays=2.5), "expected a whole number"),
         (lambda: SimulationSettings(interface_reflection="loud"), "expected one of pressure, energy"),
         (lambda: DisplaySettings(dynamic_range_db=0), "dynamic_range_db is 0"),
-        (lambda: DisplaySettings(image_size=(0, 5)), "image_size rows is 0"),
+        (
+            lambda: DisplaySettings(image_size=(0, 5)),
+            r"image_size is \(0, 5\), expected 2 whole numbers between 8 and 8192",
+        ),
         (lambda: DisplaySettings(noise_db=float("inf")), "noise_db is inf"),
     ],
 )

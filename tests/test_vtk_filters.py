@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 import vtkmodules.vtkRenderingOpenGL2  # noqa: F401, makes rendering work at all
@@ -37,6 +39,7 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.vtk.filters import SegmentationFilter, UltrasoundSimulationFilter
 from tests.conftest import FLUID, SPECKLE, block, example, rigid
 
@@ -282,6 +285,33 @@ def test_segmentation_labels_as_the_function_does_and_names_travel():
     algorithm.Update()
     assert segmentation.GetSegmentation().tissue_names[0] == "white matter"
     assert algorithm._simulator._simulator.medium.tissues[1].name == "white matter"
+
+
+def test_segmentation_has_the_declared_defaults_and_refuses_when_it_updates():
+    segmentation = SegmentationFilter()
+    assert segmentation._values == asdict(SegmentationSettings())
+    segmentation.SetInputData(head_mri(4.0).to_vtk())
+    errors = []
+    segmentation.AddObserver("ErrorEvent", lambda *_: errors.append(segmentation.GetErrorMessage()))
+    segmentation.GetExecutive().AddObserver("ErrorEvent", lambda *_: None)
+    for change, message in (
+        (
+            lambda: segmentation.SetFilterEpsilon(-1.0),
+            "segmentation: filter_epsilon is -1.0, expected a number between",
+        ),
+        (lambda: segmentation.SetClasses("3"), "classes is '3', expected 3 for contrast t1"),
+        (lambda: segmentation.SetContrast("ct"), "segmentation: contrast is 'ct', expected one of t1, t1gd, t2, flair"),
+    ):
+        time = segmentation.GetMTime()
+        change()
+        assert segmentation.GetMTime() > time and not errors
+        segmentation.Update()
+        assert errors.pop().startswith(message)
+    segmentation.SetContrast("t1")
+    segmentation.SetClasses(3)
+    segmentation.SetFilterEpsilon(None)
+    segmentation.Update()
+    assert not errors and segmentation.GetErrorMessage() == ""
 
 
 def test_segmentation_takes_a_mask_and_can_be_stopped():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import click
@@ -12,7 +13,12 @@ from SlicerUSSim.Logic.base.version import __version__
 
 
 @click.command()
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Keep the numbers in this file.")
+@click.option(
+    "--json",
+    "json_file",
+    type=click.Path(path_type=Path),
+    help="Keep the numbers in this file; -: print them instead of the table.",
+)
 @click.option("--repeat", default=30, show_default=True, help="Calls per measurement; best and median are shown.")
 @click.option("--brief", is_flag=True, help="Frame A and the segmentation only, a few calls each.")
 @device_option
@@ -28,14 +34,15 @@ def bench(ctx: click.Context, json_file: Path | None, repeat: int, brief: bool, 
     from SlicerUSSim.Logic.verification.benchmark.suite import run_benchmark
     from SlicerUSSim.Logic.verification.benchmark.tables import table_of
 
-    if json_file:
+    prints_json = str(json_file) == "-"
+    if json_file and not prints_json:
         require_place(json_file)
     devices = devices_to_measure(device)
     steps = len(devices) * (3 if brief else 6) + 1
     with Steps(steps) as step:
         result = run_benchmark(devices, repeat=min(repeat, 5) if brief else repeat, brief=brief, progress=step)
     result = {"version": __version__, **result}
-    click.echo(table_of(result))
-    if json_file:
+    click.echo(json.dumps(result, indent=2) if prints_json else table_of(result))
+    if json_file and not prints_json:
         write_json(json_file, result)
     ctx.exit(1 if result["wrong"] else 0)

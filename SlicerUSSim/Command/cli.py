@@ -14,6 +14,8 @@ from SlicerUSSim.Command.bench import bench
 from SlicerUSSim.Command.demo import demo
 from SlicerUSSim.Command.devices import devices
 from SlicerUSSim.Command.optimize import optimize
+from SlicerUSSim.Command.options import verbose_option
+from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.segment import segment
 from SlicerUSSim.Command.serve import serve
 from SlicerUSSim.Command.simulate import simulate
@@ -48,11 +50,12 @@ def main() -> None:
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     """Our own warnings are one line; those of the libraries are not for the user of a command."""
     if is_our_warning(category):
-        click.echo(f"ussim: warning: {message}", err=True)
+        note(f"ussim: warning: {message}")
 
 
 for command in (bench, demo, devices, optimize, segment, serve, simulate, sweep, validate, volume):
-    main.add_command(command)
+    main.add_command(verbose_option(command))
+verbose_option(main)
 
 if __name__ == "__main__":
     main()

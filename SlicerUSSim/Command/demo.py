@@ -7,8 +7,9 @@ from pathlib import Path
 
 import click
 
-from SlicerUSSim.Command.options import device_option
-from SlicerUSSim.Command.progress import Steps
+from SlicerUSSim.Command.options import device_option, parameter_option
+from SlicerUSSim.Command.progress import Steps, note
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 
 PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # probe.PROBES, which would import numpy
 
@@ -21,22 +22,22 @@ PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # prob
     "--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain that nilearn carries)."
 )
 @click.option("--probe", "kind", type=click.Choice(PROBE_NAMES), default="phased", show_default=True)
-@click.option("--seed", type=int, default=0, show_default=True, help="Which speckle and noise.")
+@parameter_option(SimulationSettings, "seed")
 @device_option
 def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -> None:
     """The whole line on a real brain MRI: segmentation, a craniotomy view, pictures."""
     from SlicerUSSim.Command.whole_line import run_whole_line
-    from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.samples import demo_mri
     from SlicerUSSim.Logic.probe.arrays import PROBES
 
     settings = SimulationSettings(seed=seed)
     volume, source = (Volume.read(mri), os.path.abspath(mri)) if mri else demo_mri()
-    click.echo(f"MRI: {source}, {'x'.join(map(str, volume.array.shape[::-1]))} voxels")
+    note(f"MRI: {source}, {'x'.join(map(str, volume.array.shape[::-1]))} voxels")
     with Steps(5) as step:
         summary = run_whole_line(out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step)
     times = summary["milliseconds"]
-    click.echo(f"device: {summary['device']}")
-    click.echo(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")
-    click.echo(f"wrote {out / 'figure.png'} and nine more files beside it")
+    note(f"device: {summary['device']}")
+    note(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")
+    note(f"wrote {out / 'figure.png'} and nine more files beside it")
+    click.echo(out / "figure.png")

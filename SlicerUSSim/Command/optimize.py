@@ -9,16 +9,19 @@ import click
 
 from SlicerUSSim.Command.options import gathered
 from SlicerUSSim.Command.patient_options import PatientOptions
-from SlicerUSSim.Command.progress import Curve
+from SlicerUSSim.Command.progress import Curve, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.version import __version__
+from SlicerUSSim.Logic.fitting.settings import FitSettings
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.fitting import Fit
 
 #: Images that are fitted if none are chosen.
 _MOST_IMAGES = 6
+#: A state holds every evaluation of the cost.
+_STATE_BYTES = 2**30
 
 
 @click.command()
@@ -31,8 +34,7 @@ _MOST_IMAGES = 6
     help='Free parameters: "display", a tissue, one of either ("gain_db", "white matter.mu0"), with bounds if wanted; '
     'may be repeated (default: display and "white matter").',
 )
-@click.option("--evaluations", type=click.IntRange(1), default=500, show_default=True, help="Of the cost, at most.")
-@click.option("--restarts", type=click.IntRange(0), default=2, show_default=True, help="For what fits equally well.")
+@gathered(settings=FitSettings)
 @click.option("--report", type=click.Path(path_type=Path), help="Self-contained report: .html")
 @click.option("--save-preset", type=click.Path(path_type=Path), help="Preset with what was found: .json")
 @click.option(
@@ -41,7 +43,6 @@ _MOST_IMAGES = 6
     help="Keep what was evaluated here, and go on from there when run again, with --register only where that finds "
     "the same poses again: .json",
 )
-@click.option("--register", is_flag=True, help="Also refine where the ultrasound lies in the MRI (rigid).")
 @click.option(
     "--save-transform",
     type=click.Path(path_type=Path),
@@ -53,12 +54,10 @@ def optimize(
     recording: SequenceOptions,
     out: Path,
     free: tuple[str, ...],
-    evaluations: int,
-    restarts: int,
+    settings: FitSettings,
     report: Path | None,
     save_preset: Path | None,
     state: Path | None,
-    register: bool,
     save_transform: Path | None,
 ) -> None:
     """Fit display and tissue parameters until simulated and tracked real ultrasound agree."""
@@ -78,16 +77,16 @@ def optimize(
         require(is_json, f"--save-transform is {save_transform}, expected a name ending in .json")
     if report:
         require_matplotlib()
-    if save_transform and not register:
+    if save_transform and not settings.register:
         raise SimulationError("--save-transform needs --register")
     names = dict(_free_parameter(text) for text in free) or dict.fromkeys(("display", "white matter"))
     tracked = open_tracked(patient, recording, most=_MOST_IMAGES)
     simulator = tracked.examination.simulator
     with Curve("optimize") as curve:
         found = fit(
-            simulator, tracked.images, free=names, display=tracked.examination.display, register=register,
-            max_evaluations=evaluations, restarts=restarts, progress=curve,
-            resume=read_json(state) if state and state.exists() else None,
+            simulator, tracked.images, free=names, display=tracked.examination.display,
+            register=settings.register, max_evaluations=settings.evaluations, restarts=settings.restarts,
+            progress=curve, resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
             checkpoint=(lambda reached: write_json(state, reached)) if state else None,
         )  # fmt: skip
     write_json(out, found.to_dict())
@@ -99,7 +98,7 @@ def optimize(
     if report:
         _write_report(report, found, tracked, patient, recording)
     _tell(found)
-    click.echo("wrote " + ", ".join(map(str, places)))
+    note("wrote " + ", ".join(map(str, places)))
 
 
 def _free_parameter(text: str) -> tuple[str, tuple[float, float] | None]:

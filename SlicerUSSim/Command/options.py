@@ -1,61 +1,180 @@
-"""Options that several commands share, and how options that belong together become one parameter of a command."""
+"""Options that several commands share, those of declared parameters, and how options become one parameter of a command.
+
+What is known of a parameter stands at its declaration (base/declaration.py): name, help, default and checks of its
+option come from there.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import field, fields
+from collections.abc import Callable, Iterable
+from dataclasses import Field, field, fields
 from functools import wraps
 from pathlib import Path
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
+
+from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter_of, parameters_of
 
 Command = Callable[..., None]
+Decorator = Callable[[Command], Command]
+
+#: In place of an option that was not given, where None could be what was meant.
+_NOT_GIVEN = object()
+
+#: Under which a click.Context keeps how often --verbose was given, before the subcommand and after it
+_VERBOSITY = "SlicerUSSim.verbosity"
 
 device_option = click.option(
     "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
 )
-contrast_option = click.option(
-    "--contrast",
-    type=click.Choice(["t1", "t1gd", "t2", "flair"]),
-    default="t1",
-    show_default=True,
-    help="MRI contrast.",
-)
 mask_option = click.option("--mask", type=click.Path(), help="Foreground on the MRI's grid (default: found by Otsu).")
-sulci_option = click.option(
-    "--thin-sulci/--no-thin-sulci", default=True, show_default=True,
-    help="Label sulci too narrow to reach CSF intensity as leptomeninges.",
-)  # fmt: skip
 
 
-def declared(option: Callable[[Command], Command]) -> Any:
+def verbose_option(command: click.Command) -> click.Command:
+    """The command with --verbose, which may stand before the subcommand, after it, or at both places."""
+    command.params.append(
+        click.Option(
+            ["-v", "--verbose"], count=True, expose_value=False, callback=_set_verbosity,
+            help="Say on stderr what is chosen and what inputs are taken for; -vv: times and caches too.",
+        )
+    )  # fmt: skip
+    return command
+
+
+def _set_verbosity(ctx: click.Context, _: click.Parameter, count: int) -> None:
+    ctx.meta[_VERBOSITY] = ctx.meta.get(_VERBOSITY, 0) + count
+    if isinstance(ctx.command, click.Group):
+        return  # the subcommand, which has the same option, adds its own and shows the log
+    from SlicerUSSim.Command.log import show_log  # which --help does not wait for
+
+    show_log(ctx, ctx.meta[_VERBOSITY])
+
+
+# ---- options of declared parameters ----------------------------------------------------------------------------------
+
+
+class ParameterType(click.ParamType):
+    """The values of a declared parameter. What is refused is a SimulationError that names option and parameter."""
+
+    def __init__(self, entry: Parameter) -> None:
+        self.entry = entry
+        self.name = "|".join(entry.choices) or {int: "integer", float: "number"}.get(entry.type, "text")
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        option = param.opts[0] if param else self.entry.name
+        return self.entry.from_text(option, value) if isinstance(value, str) else value
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        return [CompletionItem(choice) for choice in self.entry.choices if choice.startswith(incomplete)]
+
+
+def parameter_option(kind: type, name: str) -> Decorator:
+    """The option of one parameter of `kind`, called as the parameter in the command; without it the default."""
+    return _option(parameter_of(kind, name))
+
+
+def _option(entry: Parameter, of_preset: bool = False) -> Decorator:
+    """With `of_preset`, None for a flag and _NOT_GIVEN for others stand for an option that was not given."""
+    assert entry.option is not None, f"{entry.name} has no option"
+    names = "/".join(f"--{name}" for name in entry.option.split("/"))
+    if entry.type is bool:
+        return click.option(
+            names, entry.name, default=None if of_preset else entry.default, help=help_text(entry, of_preset)
+        )
+    kind = ParameterType(entry)
+    return click.option(
+        names, entry.name, type=kind, default=_NOT_GIVEN if of_preset else entry.default,
+        metavar=f"[{kind.name}]" if entry.choices else kind.name.upper(), help=help_text(entry, of_preset),
+    )  # fmt: skip
+
+
+def help_text(entry: Parameter, of_preset: bool = False) -> str:
+    """What --help says of a parameter: "Gain [dB]: brightness of all echoes (default: the preset's, 0)."."""
+    if entry.type is bool:
+        text, default = entry.tip, f"--{(entry.option or '').split('/')[not entry.default]}"
+    else:
+        tip = entry.tip[0].lower() + entry.tip[1:] if entry.tip[1:2].islower() else entry.tip
+        says_it = not entry.unit and tip.startswith(entry.label.lower())
+        text = entry.tip if says_it else f"{entry.full_label}: {tip}"
+        default = written(entry.default)
+    whose = "the preset's, " if of_preset else ""
+    return f"{text} (default: {whose}{default})."
+
+
+def written(value: Any) -> str:
+    """A value as an option takes it."""
+    if isinstance(value, bool) or value is None:
+        return str(value).lower()
+    return f"{value:.10g}" if isinstance(value, int | float) else str(value)
+
+
+# ---- options that become one parameter of a command ------------------------------------------------------------------
+
+
+def declared(option: Decorator) -> Any:
     """A field of a dataclass of options, which a click.option or click.argument of the same name fills."""
-    return field(metadata={"option": option})
+    return field(metadata={"options": (option,)})
+
+
+def declared_parameters(kind: type, names: Iterable[str] | None = None, *, of_preset: bool = False) -> Any:
+    """A field of a dataclass of options: {name: value} of the parameters of `kind` that have an option.
+
+    `names` chooses among them. With `of_preset` it holds only what was given, and
+    --help says that the preset goes before the default.
+    """
+    entries = [entry for entry in parameters_of(kind) if entry.option and (names is None or entry.name in names)]
+    return field(
+        metadata={
+            "options": tuple(_option(entry, of_preset) for entry in entries),
+            "names": tuple(entry.name for entry in entries),
+            "flags": {entry.name for entry in entries if entry.type is bool},
+        }
+    )
 
 
 def gathered(**kinds: type) -> Callable[[Command], Command]:
     """Decorator: the command takes the options declared in these dataclasses, and gets one parameter for each.
 
-    With gathered(patient=PatientOptions) the command's parameter `patient` is a PatientOptions.
+    With gathered(patient=PatientOptions) the command's parameter `patient` is a PatientOptions; with
+    gathered(settings=FitSettings) `settings` is a FitSettings, whose parameters without an option have their defaults.
     """
 
     def decorate(command: Command) -> Command:
         @wraps(command)
         def with_options(**given: Any) -> None:
-            options = {
-                name: kind(**{entry.name: given.pop(entry.name) for entry in fields(kind)})
-                for name, kind in kinds.items()
-            }
+            options = {name: _filled(kind, given) for name, kind in kinds.items()}
             command(**options, **given)
 
-        declarations = [entry.metadata["option"] for kind in kinds.values() for entry in fields(kind)]
         decorated: Command = with_options
-        for option in reversed(declarations):  # the last one applied is the first one of --help
-            decorated = option(decorated)
+        for option in reversed([option for kind in kinds.values() for option in _options_of(kind)]):
+            decorated = option(decorated)  # the last one applied is the first one of --help
         return decorated
 
     return decorate
+
+
+def _options_of(kind: type) -> list[Decorator]:
+    if issubclass(kind, Declared):
+        return [_option(entry) for entry in parameters_of(kind) if entry.option]
+    return [option for entry in fields(kind) for option in entry.metadata["options"]]  # type: ignore[arg-type]
+
+
+def _filled(kind: type, given: dict[str, Any]) -> Any:
+    """A `kind` of what click was given, which is taken out of it."""
+    if issubclass(kind, Declared):
+        return kind(**{entry.name: given.pop(entry.name) for entry in parameters_of(kind) if entry.option})
+    return kind(**{entry.name: _value(entry, given) for entry in fields(kind)})  # type: ignore[arg-type]
+
+
+def _value(entry: Field, given: dict[str, Any]) -> Any:
+    names = entry.metadata.get("names")
+    if names is None:
+        return given.pop(entry.name)
+    values = {name: given.pop(name) for name in names}
+    flags = entry.metadata["flags"]
+    return {name: value for name, value in values.items() if value is not (None if name in flags else _NOT_GIVEN)}
 
 
 def check_output(out: Path, png: bool = False) -> None:

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from SlicerUSSim.Command.options import contrast_option, declared, device_option, mask_option, sulci_option
+from SlicerUSSim.Command.options import declared, declared_parameters, device_option, mask_option
 from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from SlicerUSSim.Logic.base import DisplaySettings, Volume
+    from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.imaging import Preset, UltrasoundSimulator
     from SlicerUSSim.Logic.mri import Segmentation
     from SlicerUSSim.Logic.probe import Probe
@@ -55,37 +59,20 @@ class PatientOptions:
             help="Tissue table as JSON (default: the preset's, the file beside the labels, or brain).",
         )
     )  # fmt: skip
-    contrast: str = declared(contrast_option)
+    #: {parameter: value}
+    segmentation: Mapping[str, Any] = declared_parameters(SegmentationSettings, ("contrast", "thin_sulci"))
     mask: str | None = declared(mask_option)
-    thin_sulci: bool = declared(sulci_option)
-    partial_volume: bool | None = declared(
-        click.option(
-            "--partial-volume/--hard-labels", default=None,
-            help="Scatterers take their tissue by the segmentation's probabilities (from an MRI only).",
-        )
-    )  # fmt: skip
-    mri_modulation: float | None = declared(
-        click.option(
-            "--mri-modulation", type=float,
-            help="Scatterers follow the MRI inside tissues, dB per standard deviation (from an MRI only).",
-        )
-    )  # fmt: skip
-    gain: float | None = declared(click.option("--gain", type=float, help="Gain [dB] (default: the preset's, 0)."))
-    dynamic_range: float | None = declared(
-        click.option("--dynamic-range", type=float, help="Dynamic range [dB] (default: the preset's, 55).")
-    )
-    tgc: float | None = declared(
-        click.option("--tgc", type=float, help="Time-gain compensation [dB/(cm MHz)] (default: the preset's, 0.5).")
-    )
-    seed: int | None = declared(
-        click.option("--seed", type=int, help="Which speckle and noise (default: the preset's, 0).")
-    )
+    #: {parameter: value} of those that were given
+    display: Mapping[str, Any] = declared_parameters(DisplaySettings, of_preset=True)
+    settings: Mapping[str, Any] = declared_parameters(SimulationSettings, of_preset=True)
+    #: NAME=VALUE
+    changes: tuple[str, ...] = declared(set_option)
     device: str | None = declared(device_option)
 
     @property
     def gives_probe(self) -> bool:
         """Whether the probe was chosen, and is not just the one there is by default."""
-        return bool(self.probe or self.preset)
+        return bool(self.probe or self.preset) or Changes.of(self.changes).gives_geometry
 
     @property
     def source(self) -> str:
@@ -101,14 +88,12 @@ class PatientOptions:
         from SlicerUSSim.Logic.imaging.preset import Preset
         from SlicerUSSim.Logic.probe.arrays import probe_from_dict
 
+        changes = Changes.of(self.changes)
         preset = Preset.read(self.preset) if self.preset else Preset()
-        preset = preset.changed(
-            "display", **_given(gain_db=self.gain, dynamic_range_db=self.dynamic_range, tgc_db_cm_mhz=self.tgc)
-        ).changed(
-            "settings",
-            **_given(seed=self.seed, partial_volume=self.partial_volume, mri_modulation_db=self.mri_modulation),
-        )
-        return replace(preset, probe=probe_from_dict(read_json(self.probe), self.probe)) if self.probe else preset
+        preset = preset.changed("display", **self.display).changed("settings", **self.settings)
+        if self.probe:
+            preset = replace(preset, probe=probe_from_dict(read_json(self.probe), self.probe))
+        return changes.to_preset(preset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,25 +112,43 @@ def open_examination(patient: PatientOptions) -> Examination:
 
     What is cheap to check comes before what takes time. Raises SimulationError for everything that does not fit.
     """
+    import logging  # not at the top: --help does not wait for it
+
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+    from SlicerUSSim.Logic.tissue.presets import TISSUES
 
+    log = logging.getLogger(__name__)
     preset = patient.changed_preset()
     volume = Volume.read(patient.mri_or_labels)
     is_labels = volume.looks_like_labels() if patient.is_labels is None else patient.is_labels
+    if patient.is_labels is None:
+        kinds = ("a label map", "--mri") if is_labels else ("an MRI, to be segmented", "--labels")
+        log.info("%s is taken for %s; %s says otherwise", patient.mri_or_labels, *kinds)
     if is_labels and preset.settings.needs_texture:
         raise SimulationError(
             f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need the MRI it came from"
         )
-    labels, tissues, texture = volume, preset.tissues, None
+    changes = Changes.of(patient.changes)
     table = _tissues_from_file(patient, is_labels)
+    if table is None:
+        log.info("tissues: %s", "the preset's" if patient.preset else "presets of the brain")
+    else:
+        log.info("tissues: %s", patient.tissues or "the table beside the label map")
+    tissues = preset.tissues if table is None else table
+    is_known = is_labels or table is not None
+    if is_known:
+        tissues = changes.to_tissues(tissues)
+    else:  # what the tissues are is known when the MRI is segmented
+        changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
+    labels, texture = volume, None
     if not is_labels:
         segmentation = _segmented(volume, patient)
-        labels, tissues = segmentation.labels, preset.tissues.for_names(segmentation.tissue_names)
+        labels = segmentation.labels
+        if not is_known:
+            tissues = changes.to_tissues(tissues.for_names(segmentation.tissue_names))
         texture = segmentation.texture() if preset.settings.needs_texture else None
-    simulator = UltrasoundSimulator(
-        labels, tissues if table is None else table, preset.settings, patient.device, texture
-    )
+    simulator = UltrasoundSimulator(labels, tissues, preset.settings, patient.device, texture)
     return Examination(simulator, preset.probe, preset.display, is_labels)
 
 
@@ -177,11 +180,6 @@ def _segmented(mri: Volume, patient: PatientOptions) -> Segmentation:
 
     with Share("segment") as progress:
         return segment_mri(
-            mri, contrast=patient.contrast, mask=Volume.read(patient.mask) if patient.mask else None,
-            thin_sulci=patient.thin_sulci, device=patient.device, progress=progress,
+            mri, **patient.segmentation, mask=Volume.read(patient.mask) if patient.mask else None,
+            device=patient.device, progress=progress,
         )  # fmt: skip
-
-
-def _given(**options) -> dict:
-    """The options that were given."""
-    return {name: value for name, value in options.items() if value is not None}

@@ -1,4 +1,4 @@
-"""Progress bars on stderr for commands."""
+"""Progress bars and remarks on stderr for commands: stdout has the answer alone."""
 
 from __future__ import annotations
 
@@ -6,10 +6,22 @@ import sys
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+import click
+
 if TYPE_CHECKING:
     from typing_extensions import Self
 
     from SlicerUSSim.Logic.fitting import Progress
+
+
+def note(text: str) -> None:
+    """A line on stderr, above a progress bar that is being drawn."""
+    if "tqdm" in sys.modules:
+        from tqdm import tqdm
+
+        tqdm.write(text, file=sys.stderr)
+    else:
+        click.echo(text, err=True)
 
 
 class _Bar:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import click
 
-from SlicerUSSim.Command.options import check_output, contrast_option, device_option, mask_option, sulci_option
-from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Command.options import check_output, device_option, gathered, mask_option
+from SlicerUSSim.Command.progress import Share, note
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 
 @click.command()
@@ -19,19 +21,10 @@ from SlicerUSSim.Command.progress import Share
     required=True,
     help="Label map; its tissues go to a .json beside it.",
 )
-@contrast_option
-@click.option("--classes", type=int, default=3, show_default=True, help="Number of tissues.")
+@gathered(settings=SegmentationSettings)
 @mask_option
-@click.option(
-    "--radius", type=int, default=1, show_default=True, help="Radius of the guided filter in voxels; 0: none."
-)
-@click.option("--bias-correction", is_flag=True, help="Run N4 first.")
-@sulci_option
 @device_option
-def segment(
-    mri: str, out: Path, contrast: str, classes: int, mask: str | None, radius: int, bias_correction: bool,
-    thin_sulci: bool, device: str | None,
-) -> None:  # fmt: skip
+def segment(mri: str, out: Path, settings: SegmentationSettings, mask: str | None, device: str | None) -> None:
     """Label the tissues of a skull-stripped brain MRI."""
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
@@ -41,8 +34,7 @@ def segment(
     volume = Volume.read(mri)
     with Share("segment") as progress:
         result = segment_mri(
-            volume, classes=classes, contrast=contrast, mask=Volume.read(mask) if mask else None, filter_radius=radius,
-            bias_correction=bias_correction, thin_sulci=thin_sulci, device=device, progress=progress,
+            volume, **asdict(settings), mask=Volume.read(mask) if mask else None, device=device, progress=progress,
         )  # fmt: skip
     result.labels.write(out)
     TissueTable.brain(result.tissue_names).write(tissues_beside(out))
@@ -50,4 +42,4 @@ def segment(
         zip(result.tissue_names, result.means, result.standard_deviations, result.weights, strict=False), 1
     ):
         click.echo(f"label {label}: {name:14s} mean {mean:8.2f}  sd {sd:7.2f}  share {weight:5.1%}")
-    click.echo(f"wrote {out} and {tissues_beside(out)}")
+    note(f"wrote {out} and {tissues_beside(out)}")

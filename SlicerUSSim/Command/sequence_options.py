@@ -10,6 +10,7 @@ import click
 
 from SlicerUSSim.Command.options import declared
 from SlicerUSSim.Command.patient_options import Examination, PatientOptions, open_examination
+from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import SimulationError
 
 if TYPE_CHECKING:
@@ -148,7 +149,7 @@ def read_to_mri(path: str) -> np.ndarray:
     if in_ultrasound is None:
         raise SimulationError(f"{path}: has points of one volume, expected pairs in MRI and ultrasound")
     to_ras, left = rigid_between(in_ultrasound, in_mri)
-    click.echo(f"{len(in_mri)} landmarks agree to {left:.2f} mm (root mean square)")
+    note(f"{len(in_mri)} landmarks agree to {left:.2f} mm (root mean square)")
     return to_ras
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from SlicerUSSim.Command.options import contrast_option, device_option, mask_option
+from SlicerUSSim.Command.options import device_option, mask_option, parameter_option
 from SlicerUSSim.Command.sequence_options import (
     calibration_option,
     read_sequence,
@@ -19,6 +19,7 @@ from SlicerUSSim.Command.sequence_options import (
     transform_option,
 )
 from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 if TYPE_CHECKING:
     from trame_server import Server
@@ -34,7 +35,7 @@ _PORT = 8080
 @calibration_option
 @to_mri_option
 @click.option("--preset", type=click.Path(), help="Probe, display, settings and tissues as JSON.")
-@contrast_option
+@parameter_option(SegmentationSettings, "contrast")
 @mask_option
 @click.option("--port", type=click.IntRange(0, 65535), help=f"Port (default: {_PORT}, or a free one if it is taken).")
 @click.option(

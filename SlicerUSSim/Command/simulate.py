@@ -8,6 +8,7 @@ import click
 
 from SlicerUSSim.Command.options import check_output, gathered
 from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option
+from SlicerUSSim.Command.progress import note
 
 
 @click.command()
@@ -28,4 +29,4 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
     else:
         frame.to_volume().write(out)
     kind = "labels" if examination.is_labels else "MRI"
-    click.echo(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {kind})")
+    note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {kind})")

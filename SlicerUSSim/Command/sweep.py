@@ -8,7 +8,7 @@ import click
 
 from SlicerUSSim.Command.options import gathered
 from SlicerUSSim.Command.patient_options import PatientOptions
-from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
 
 
@@ -37,4 +37,4 @@ def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> Non
             simulated[place][real.field.window] = frame.image
             progress((place + 1) / len(real.poses))
     tracked.sequence.with_images(real.numbers, simulated).write(out)
-    click.echo(f"wrote {out} ({len(simulated)} images of {columns}x{rows})")
+    note(f"wrote {out} ({len(simulated)} images of {columns}x{rows})")

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.options import device_option
-from SlicerUSSim.Command.progress import Steps
+from SlicerUSSim.Command.progress import Steps, note
 
 
 @click.command()
@@ -35,5 +35,6 @@ def validate(ctx: click.Context, out: Path, only: tuple[str, ...], device: str |
             f"off: {finding.check}, {row.quantity}, {finding.orientation}: {row.measured:.4g} {row.unit}, "
             f"predicted {row.predicted:.4g} ({row.limits})"
         )
-    click.echo(f"{report.summary()} Wrote {out / 'report.md'}, report.json and {len(report.pictures)} pictures.")
+    click.echo(report.summary())
+    note(f"wrote {out / 'report.md'}, report.json and {len(report.pictures)} pictures")
     ctx.exit(1 if report.failed else 0)

@@ -8,7 +8,7 @@ import click
 
 from SlicerUSSim.Command.options import check_output, gathered
 from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option
-from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Logic.base.errors import SimulationError
 
 
@@ -44,4 +44,4 @@ def volume(
             progress=lambda done: progress(done / frames),
         )  # fmt: skip
     result.write(out)
-    click.echo(f"wrote {out} ({'x'.join(map(str, result.array.shape[::-1]))} voxels from {frames} images)")
+    note(f"wrote {out} ({'x'.join(map(str, result.array.shape[::-1]))} voxels from {frames} images)")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import traceback
+import logging
 
 from SlicerUSSim.Logic.base.errors import user_message
 from SlicerUSSim.Workstation.state import SharedState
+
+_log = logging.getLogger(__name__)
 
 #: Number of messages; more would cover the page.
 _MOST = 5
@@ -19,6 +21,7 @@ class Messages:
 
     def show(self, message: str) -> None:
         """Add a line."""
+        _log.warning("%s", message)
         with self._shared.changing() as now:
             now.messages.errors = [*now.messages.errors, message][-_MOST:]
 
@@ -28,9 +31,9 @@ class Messages:
             now.messages.errors = [message for n, message in enumerate(now.messages.errors) if n != number]
 
     def failed(self, error: Exception) -> None:
-        """Show an uncaught exception; an internal error is also printed with its traceback."""
+        """Show an uncaught exception; an internal error is also logged with its traceback."""
         message = user_message(error)
         if message is None:
-            traceback.print_exception(error)
+            _log.error("a mistake of the program", exc_info=error)
             message = f"something went wrong ({type(error).__name__}: {error})"
         self.show(message)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -24,6 +25,8 @@ from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.tasks import Tasks
+
+_log = logging.getLogger(__name__)
 
 #: Attribute of a node: the file from which it was read; "" for the demo brain.
 FILE = "SlicerUSSim.file"
@@ -79,6 +82,7 @@ class Opener:
         """A label map node; its tissues come from the .json file next to it, or from the preset."""
         volume = self._volume(path)
         beside, preset = tissues_beside(Path(path)), self._logic.preset
+        _log.info("%s: tissues of %s", path, beside if beside.exists() else "the preset")
         tissues = TissueTable.read(beside) if beside.exists() else preset.tissues
         _require_labels(volume, path)
         values = [int(label) for label in np.unique(volume.array) if label]
@@ -140,6 +144,7 @@ class Opener:
                 else:
                     volume = self._volumes[str(path)] = self._volume(str(path))
                     kind = "labels" if volume.looks_like_labels() else "mri"
+                    _log.info("%s: opened as %s", name, "a label map" if kind == "labels" else "an MRI")
                 yield str(path), kind
             except SimulationError as error:  # the user knows only the file name, not the temporary folder
                 raise SimulationError(str(error).replace(folder + os.sep, "")) from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
@@ -18,6 +19,8 @@ from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.hand import ProbeHand
 from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks
+
+_log = logging.getLogger(__name__)
 
 #: Seconds between two updates of the slice views, and of the sliders: both delay the image.
 _TURN_EVERY_S, _TELL_EVERY_S = 0.12, 0.4
@@ -45,6 +48,7 @@ class ProbeControl:
         self.surface: PatientSurface | None = None
         self._surface_version: object = None
         self._drawn: tuple | None = None
+        self._refused = False  # whether the last pose was
         self._turn = AtMost(_TURN_EVERY_S, self._turn_slices)
         self._tell = AtMost(_TELL_EVERY_S, self._tell_pose)
         self.hand = ProbeHand(
@@ -70,6 +74,10 @@ class ProbeControl:
         transform = self._logic.parameters.probe_transform
         if transform is not None:
             set_node_to_world(transform, probe_to_world)
+            self._refused = False
+        elif not self._refused:
+            _log.warning("a pose is refused: there is no probe to move yet")
+            self._refused = True
 
     def moved(self) -> None:
         """Update views and sliders after any change of the transform."""

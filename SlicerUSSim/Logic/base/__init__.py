@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from .declaration import Parameter as Parameter, parameters_of as parameters_of
     from .errors import Cancelled as Cancelled, SimulationError as SimulationError, user_message as user_message
     from .files import read_json as read_json, write_json as write_json, written_whole as written_whole
     from .settings import DisplaySettings as DisplaySettings, SimulationSettings as SimulationSettings

@@ -25,6 +25,9 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 _T = TypeVar("_T")
 
+#: More than any parameter can be
+_HUGE = 10**300
+
 
 @dataclass(frozen=True)
 class Shown:
@@ -149,10 +152,11 @@ class Parameter:
         if value is None and self.can_be_none:
             return None
         plain = _plain(value)
-        try:
-            return msgspec.convert(plain, self._accepted, strict=True)
-        except msgspec.ValidationError:
-            raise SimulationError(f"{owner}: {self.name} is {_short(value)}, expected {self.expected}") from None
+        # msgspec before 0.22 fails at whole numbers that no float can hold.
+        if not (isinstance(plain, int) and abs(plain) > _HUGE):
+            with suppress(msgspec.ValidationError):
+                return msgspec.convert(plain, self._accepted, strict=True)
+        raise SimulationError(f"{owner}: {self.name} is {short(value)}, expected {self.expected}")
 
     def from_text(self, owner: str, text: str) -> Any:
         """The value that a text stands for, as the command and a scene write it. Raises SimulationError for others."""
@@ -163,8 +167,9 @@ class Parameter:
         elif kind is bool:
             value = {"true": True, "false": False}.get(text.lower(), text)
         elif kind in (int, float):
-            with suppress(ValueError):  # what is no number is then refused as the text that it is
-                value = kind(text)
+            value = _number(kind, text)
+        elif kind is tuple:
+            value = tuple(_number(get_args(self.type)[0], part.strip()) for part in text.split(",") if part.strip())
         return self.checked(owner, value)
 
 
@@ -234,10 +239,10 @@ def built(kind: type[_T], values: Any, source: str) -> _T:
     Raises SimulationError that names `source` and the parameter: for what is no object, for a name that is unknown or
     missing, and for a value that is refused.
     """
-    require(isinstance(values, Mapping), f"{source}: is {_kind_of(values)}, expected an object")
+    require(isinstance(values, Mapping), f"{source}: is {kind_of(values)}, expected an object")
     known = [entry.name for entry in fields(kind)]  # type: ignore[arg-type], of dataclasses
     for name in values:
-        require(name in known, f"{source}: {name!r} is unknown, expected one of {', '.join(known)}")
+        require(name in known, f"{source}: {short(name)} is unknown, expected one of {', '.join(known)}")
     missing = [
         entry.name
         for entry in fields(kind)  # type: ignore[arg-type]
@@ -260,17 +265,31 @@ def _without_none(hint: Any) -> tuple[Any, bool]:
     return hint, False
 
 
-def _kind_of(value: Any) -> str:
+def _number(kind: type, text: str) -> Any:
+    """The number that a text stands for; any other text as it is, which is then refused, or meant."""
+    if kind in (int, float) and "_" not in text:  # which Python takes in numbers, and nobody else
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
+def kind_of(value: Any) -> str:
     """The kind of a JSON value, in words."""
     kinds = {list: "a list", str: "a text", bool: "true or false", NoneType: "null"}
     return next((words for kind, words in kinds.items() if isinstance(value, kind)), "a number")
 
 
 def _plain(value: Any) -> Any:
-    """A numpy scalar as the Python value that it is."""
+    """A numpy scalar as the Python value that it is, in lists and tuples too."""
+    if isinstance(value, list | tuple):
+        return (tuple if isinstance(value, tuple) else list)(map(_plain, value))
     return value.item() if getattr(value, "ndim", None) == 0 else value
 
 
-def _short(value: Any) -> str:
-    text = repr(_plain(value))
+def short(value: Any) -> str:
+    """A value as messages show it: one line that is not long."""
+    try:
+        text = " ".join(repr(_plain(value)).splitlines())
+    except ValueError:  # from 4300 digits on
+        text = "a huge number"
     return text if len(text) <= 80 else f"{text[:77]}..."

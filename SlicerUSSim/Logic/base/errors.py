@@ -16,6 +16,14 @@ class SimulationError(Exception):
 
     The message is one line; it names the value, says what was expected and, where that is not obvious, what to do.
     The command line prints it and exits with status 2; the Slicer panel shows it in one message box.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import SimulationError, Volume
+    >>> try:
+    ...     Volume(np.zeros((20, 30)), np.eye(4))
+    ... except SimulationError as error:
+    ...     print(error)
+    volume has 2 dimensions (20, 30), expected 3
     """
 
 

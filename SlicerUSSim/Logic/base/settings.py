@@ -12,7 +12,12 @@ FULL_SCALE_DB = 23.0
 
 @dataclass(frozen=True)
 class SimulationSettings(Declared):
-    """What the physics needs beside tissues, probe and pose."""
+    """What the physics needs beside tissues, probe and pose.
+
+    >>> from SlicerUSSim.Logic import SimulationSettings
+    >>> SimulationSettings(seed=7, reflections=False).max_ray_depth
+    6
+    """
 
     seed: int = parameter(
         0, "Seed", "Which speckle and noise: another number is another patient", bounds=(0, 2**32 - 1),
@@ -51,12 +56,12 @@ class SimulationSettings(Declared):
     )  # fmt: skip
     partial_volume: bool = parameter(
         False, "Mixed tissues at borders",
-        "Scatterers take their tissue by the probabilities of the segmentation; needs Segment in this session",
+        "Scatterers take their tissue by the probabilities of the segmentation; needs the MRI to be segmented now",
         shown=True, option="partial-volume/hard-labels", source="False is the paper",
     )  # fmt: skip
     mri_modulation_db: float = parameter(
         0.0, "MRI in tissues",
-        "How far scatterers follow the MRI inside a tissue, per standard deviation; needs Segment in this session",
+        "How far scatterers follow the MRI in a tissue, per standard deviation; needs the MRI to be segmented now",
         unit="dB", bounds=(-6, 6), shown=Shown(-6, 6, 0.1, is_slider=True), option="mri-modulation",
         note="Negative where bright means echo-poor", source="0 is the paper",
     )  # fmt: skip
@@ -95,7 +100,13 @@ class SimulationSettings(Declared):
 
 @dataclass(frozen=True)
 class DisplaySettings(Declared):
-    """What a scanner's console does to the echoes."""
+    """What a scanner's console does to the echoes.
+
+    >>> from dataclasses import replace
+    >>> from SlicerUSSim.Logic import DisplaySettings
+    >>> replace(DisplaySettings(gain_db=3.0), dynamic_range_db=60.0).gain_db
+    3.0
+    """
 
     gain_db: float = parameter(
         0.0, "Gain", "Brightness of all echoes", unit="dB", bounds=(-200, 200),
@@ -110,7 +121,8 @@ class DisplaySettings(Declared):
         bounds=(0, 20), shown=Shown(0, 2, 0.01, is_slider=True), option="tgc", fit=Fit(0.0, 1.2, tolerance=0.1),
     )  # fmt: skip
     noise_db: float | None = parameter(
-        -80.0, "Noise", "Noise of the amplifier before TGC, relative to tissue of unit scatterer variance; -150: none",
+        -80.0, "Noise",
+        "Noise of the amplifier before TGC, relative to tissue of unit scatterer variance; -150 in a panel: none",
         unit="dB", bounds=(-300, 100), shown=Shown(-150, 0, is_slider=True, none_at=-150.0), option="noise",
         fit=Fit(-120, -30, tolerance=3.0),
     )  # fmt: skip

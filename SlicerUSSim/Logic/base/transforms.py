@@ -6,6 +6,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
+#: (4, 4) of homogeneous points in millimetres: from LPS, which ITK counts in, to RAS; its own inverse.
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
@@ -49,6 +50,13 @@ def rigid_between(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, flo
     """((4, 4) rigid map that takes points (n, 3) onto others best, root mean square distance left, mm).
 
     Arun et al., IEEE PAMI 9(5) 1987. Raises SimulationError for fewer than three points or different numbers of them.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic.base import rigid_between
+    >>> landmarks = np.array([[0.0, 0, 0], [50, 0, 0], [0, 40, 0], [0, 0, 30]])
+    >>> matrix, left_mm = rigid_between(landmarks, landmarks + [5.0, 4.0, -2.0])
+    >>> matrix[:3, 3].round(3).tolist(), round(left_mm, 3)
+    ([5.0, 4.0, -2.0], 0.0)
     """
     points, onto = np.asarray(points, float), np.asarray(onto, float)
     require(

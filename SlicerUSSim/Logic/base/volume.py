@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,13 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
 from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.nifti import log_nifti_geometry
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
 
+_log = logging.getLogger(__name__)
+
+#: Largest side of a volume that is no mistake in its unit.
+_SMALLEST_MM, _LARGEST_MM = 5.0, 2500.0
 WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
 
 
@@ -25,6 +31,17 @@ class Volume:
     ijk_to_ras : (4, 4) takes homogeneous voxel indices (i, j, k, 1) of voxel *centres* to RAS millimetres.
 
     Raises SimulationError for an array that is not 3D or not numeric, and for a singular or non-affine matrix.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import Volume
+    >>> mri = Volume(np.zeros((20, 30, 40), np.float32), np.diag([0.5, 0.5, 2.0, 1.0]))
+    >>> mri.spacing_mm.tolist()
+    [0.5, 0.5, 2.0]
+    >>> (mri.ijk_to_ras @ [39, 29, 19, 1])[:3].tolist()  # the centre of the last voxel, RAS mm
+    [19.5, 14.5, 38.0]
+    >>> mri.write("mri.nii.gz")
+    >>> Volume.read("mri.nii.gz").array.shape
+    (20, 30, 40)
     """
 
     array: np.ndarray
@@ -62,7 +79,15 @@ class Volume:
     def looks_like_labels(self) -> bool:
         """Whether the image holds few whole numbers, none negative, as a label map does and an MRI does not."""
         array = self.array
-        return bool(np.issubdtype(array.dtype, np.integer)) and int(array.min()) >= 0 and len(np.unique(array)) <= 32
+        if not np.issubdtype(array.dtype, np.integer):
+            found, is_labels = f"{array.dtype} numbers", False
+        elif int(array.min()) < 0:
+            found, is_labels = f"negative numbers (down to {array.min()})", False
+        else:
+            values = np.unique(array)
+            found, is_labels = f"{len(values)} whole numbers from {values[0]} to {values[-1]}", len(values) <= 32
+        _log.info("the volume holds %s, as %s does", found, "a label map" if is_labels else "an MRI")
+        return is_labels
 
     # ---- files -------------------------------------------------------------------------------------------------
 
@@ -75,14 +100,20 @@ class Volume:
         path = Path(path)
         require(path.exists(), f"{path}: no such file or folder")
         if path.suffix.lower() == ".vti":
-            return cls._read_vti(path)
-        if path.is_dir():
-            return cls.from_sitk(_read_dicom_series(path), name=str(path))
-        if not is_minc1(path):
-            return cls.from_sitk(read_itk_image(path), name=str(path))
-        array, ijk_to_ras = _read_minc1(path)
-        _require_volume(array.shape[::-1], str(path))
-        return cls(array, ijk_to_ras)
+            volume = cls._read_vti(path)
+            _log.info("%s: its coordinates are taken for RAS millimetres, since VTI files do not say", path)
+        elif path.is_dir():
+            volume = cls.from_sitk(_read_dicom_series(path), name=str(path))
+        elif not is_minc1(path):
+            image = read_itk_image(path)
+            volume = cls.from_sitk(image, name=str(path))
+            log_nifti_geometry(image, volume.ijk_to_ras, str(path))
+        else:
+            array, ijk_to_ras = _read_minc1(path)
+            _require_volume(array.shape[::-1], str(path))
+            volume = cls(array, ijk_to_ras)
+        _log_size(volume, path)
+        return volume
 
     @classmethod
     def from_sitk(cls, image, name: str = "image") -> Volume:
@@ -91,6 +122,7 @@ class Volume:
 
         if image.GetDimension() == 4 and image.GetSize()[3] == 1:
             image = image[..., 0]  # NIfTI files often carry a time axis of length one
+            _log.info("%s: has a time axis of length one, which is left out", name)
         _require_volume(image.GetSize(), name)
         channels = image.GetNumberOfComponentsPerPixel()
         require(channels == 1, f"{name}: has {channels} components per voxel, expected 1")
@@ -190,6 +222,27 @@ class Volume:
         require(writer.Write() == 1, f"{path}: cannot be written")
 
 
+def _log_size(volume: Volume, path: Path) -> None:
+    """Log what was read, and warn of a size that no patient has: lengths are taken for millimetres."""
+    size = volume.spacing_mm * volume.array.shape[::-1]
+    _log.info(
+        "%s: %s voxels of %s mm, %s, i, j, k towards %s", path, "x".join(map(str, volume.array.shape[::-1])),
+        "x".join(f"{round(mm, 3):g}" for mm in volume.spacing_mm), volume.array.dtype, axis_letters(volume.ijk_to_ras),
+    )  # fmt: skip
+    if not _SMALLEST_MM <= size.max() <= _LARGEST_MM:
+        _log.warning(
+            "%s: is %s mm large if its lengths are millimetres, as they are taken; check its voxel size", path,
+            "x".join(f"{round(mm, 3):g}" for mm in size),
+        )  # fmt: skip
+
+
+def axis_letters(ijk_to_ras: np.ndarray) -> str:
+    """Where the axes i, j, k of a (4, 4) ijk_to_ras point, nearly: "RAS", "LPS", ..."""
+    axes = ijk_to_ras[:3, :3].T
+    main = np.abs(axes).argmax(axis=1)
+    return "".join("RAS"[n] if axis[n] > 0 else "LPI"[n] for axis, n in zip(axes, main, strict=True))
+
+
 def require_image_name(path: Path) -> None:
     """Raise SimulationError unless Volume.write knows the format that the name stands for."""
     require(
@@ -261,6 +314,7 @@ def _read_minc1(path: Path) -> tuple[np.ndarray, np.ndarray]:
     whole = values.round()
     if np.issubdtype(image.get_data_dtype(), np.integer) and np.abs(values - whole).max() < 1e-3:
         values = whole.astype(np.int32)  # nibabel scales to floating point whatever the file holds
+        _log.info("%s: its values are taken for whole numbers, as it stores them", path)
     # nibabel counts (z, y, x) as the file does, in millimetres of the MNI's world, which is RAS.
     return values, np.array(image.affine)[:, [2, 1, 0, 3]]
 
@@ -275,7 +329,9 @@ def _read_dicom_series(folder: Path):
         f"{folder}: holds {len(series)} DICOM series, expected 1; put the one to use in its own folder",
     )
     reader = sitk.ImageSeriesReader()
-    reader.SetFileNames(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0]))
+    files = sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0])
+    _log.info("%s: DICOM series %s of %d files", folder, series[0], len(files))
+    reader.SetFileNames(files)
     try:
         return reader.Execute()
     except RuntimeError as error:

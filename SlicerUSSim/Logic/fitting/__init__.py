@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .registration import Registration as Registration, register_poses as register_poses
     from .report import write_report as write_report
     from .search import Progress as Progress
+    from .settings import FitSettings as FitSettings
     from .tracked_fit import Fit as Fit, fit as fit
 
 lazy_exports(globals())

@@ -13,13 +13,15 @@ all values:
   beam straddles the edge of a shadow, and for echoes of reflected rays. At the anchor alpha_0 nothing is approximated,
   and `anchor` moves it.
 
-So one image costs a weighted sum, compression and scan conversion.
+So one image costs a weighted sum and the display stages (stages.py).
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,12 +30,13 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.fitting.parameters import SCATTERING
-from SlicerUSSim.Logic.imaging.bmode import BasebandSignal, Compressor
-from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
-from SlicerUSSim.Logic.imaging.scattering import EchoLines
+from SlicerUSSim.Logic.imaging import stages
+from SlicerUSSim.Logic.imaging.scattering import InterfaceEchoes, Scatterers
+from SlicerUSSim.Logic.imaging.signals import EchoLines
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
-from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -41,6 +44,8 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
+
+_log = logging.getLogger(__name__)
 
 _BANDS = CONSTANTS["BANDS"]
 #: Memory that bases and paths of all images may take; more is asked for by mistake.
@@ -86,8 +91,9 @@ class AppearanceModel:
         mixing = device.kernels("appearance.cl", device.lanes)
         self._mix_parts, self._mix_bases = mixing["mix_parts"], mixing["mix_bases"]
         self._direct_path = device.kernels("appearance.cl")["direct_path"]
-        self._parts, self._mixed, self._lines = EchoLines(device), EchoLines(device), EchoLines(device)
-        self._compressor, self._converter = Compressor(device), ScanConverter(device)
+        self._parts, self._mixed = EchoLines(device), EchoLines(device)
+        self._scatterers, self._interfaces = simulator.stage(Scatterers), simulator.stage(InterfaceEchoes)
+        self._display_stages = [stage(device) for stage in stages.DISPLAY_STAGES]
         self._workspace = Workspace(device)
         self._part_weights_buffer = device.empty(4 * CONSTANTS["PARTS"])
         self._weights = device.empty(4 * self._base_count)
@@ -96,22 +102,24 @@ class AppearanceModel:
 
     def anchor(self, tissues: TissueTable) -> None:
         """Compute the bases anew for these tissues, for which the model is then exact."""
+        started = perf_counter()
         simulator = self.simulator
         self.tissues = tissues
         self._weighted: TissueTable | None = None  # the weights on the device are for these tissues
-        self._acquisitions = [simulator.acquisition(self.probe, pose) for pose in self.poses]
-        self._acquisition_buffers = [self.device.empty(ACQUISITION.itemsize) for _ in self.poses]
-        for acquisition, buffer in zip(self._acquisitions, self._acquisition_buffers, strict=True):
-            self.device.write(buffer, acquisition)
+        self._frames = [simulator.device_frame(self.probe, pose) for pose in self.poses]
+        simulator.forget_echoes()  # its stages make the bases
         with simulator.with_tissues(tissues):
             for number in range(len(self.poses)):
                 self._measure_paths(number)
                 self._compute_bases(number)
+        _log.debug(
+            "bases of %d images, %d each: computed in %.0f ms", len(self.poses), self._base_count,
+            (perf_counter() - started) * 1e3,
+        )  # fmt: skip
 
     def image(self, number: int, tissues: TissueTable, display: DisplaySettings) -> np.ndarray:
         """(rows, columns) uint8 image at pose `number`."""
-        self.run(number, tissues, display)
-        return self._converter.download()
+        return self._rendered(number, tissues, display).download("image")
 
     def grid(self, display: DisplaySettings) -> ImageGrid:
         """The pixels of the images."""
@@ -119,13 +127,16 @@ class AppearanceModel:
 
     def run(self, number: int, tissues: TissueTable, display: DisplaySettings) -> Buffer:
         """Enqueue the image at pose `number`; returns its device buffer, which the next image overwrites."""
-        acquisition, acquisition_buffer = self._acquisitions[number], self._acquisition_buffers[number]
-        lines, samples = int(acquisition["scan_lines"]), int(acquisition["samples"])
+        return self._rendered(number, tissues, display).image
+
+    def _rendered(self, number: int, tissues: TissueTable, display: DisplaySettings) -> DeviceFrame:
+        frame = replace(self._frames[number], display=display, grid=self.grid(display))
+        lines, samples = frame.line_shape
         if tissues is not self._weighted:  # a write waits for the images before it
             self.device.write(self._weights, self._base_weights(tissues))
             self.device.write(self._decays, self._path_weights(tissues))
             self._weighted = tissues
-        iq = self._workspace.get("iq", lines * samples * 8)
+        frame.iq = self._workspace.get("iq", lines * samples * 8)
         self.device.run(
             self._mix_bases,
             (samples // self.device.lanes, lines),
@@ -135,12 +146,12 @@ class AppearanceModel:
             self._buffer("paths", number),
             self._decays,
             np.int32(len(self.attenuating)),
-            iq,
+            frame.iq,
             np.int32(samples),
         )
-        self._compressor.run(acquisition, display, BasebandSignal(iq, lines, samples))
-        self._converter.run(acquisition_buffer, acquisition, self.grid(display), self._compressor)
-        return self._converter.image
+        for stage in self._display_stages:
+            stage.run(frame)
+        return frame
 
     # ---- bases -------------------------------------------------------------------------------------------------
 
@@ -165,31 +176,23 @@ class AppearanceModel:
         )
 
     def _buffer(self, kind: str, number: int) -> Buffer:
-        acquisition = self._acquisitions[number]
-        values = int(acquisition["scan_lines"]) * int(acquisition["samples"])
+        lines, samples = self._frames[number].line_shape
         count = 2 * self._base_count if kind == "bases" else max(len(self.attenuating), 1)
-        return self._workspace.get(f"{kind} {number}", 4 * count * values)
+        return self._workspace.get(f"{kind} {number}", 4 * count * lines * samples)
 
     def _compute_bases(self, number: int) -> None:
         """Trace, scatter tissue by tissue, and bring what is to be mixed later through beam and pulse."""
-        simulator, device = self.simulator, self.device
-        acquisition, acquisition_buffer, medium = (
-            self._acquisitions[number],
-            self._acquisition_buffers[number],
-            simulator.medium,
-        )
-        simulator.tracer.run(acquisition_buffer, acquisition, medium)
-        lines, samples = 2 * int(acquisition["traced_lines"]), int(acquisition["samples"])
+        device, frame = self.device, self._frames[number]
+        self.simulator.tracer.run(frame)
+        lines, (_, samples) = 2 * int(frame.acquisition["traced_lines"]), frame.line_shape
         self._parts.prepare(CONSTANTS["PARTS"] * lines, samples)
         self._mixed.prepare(lines, samples)
         done = 0
         for place in range(max(len(self.scattering), 1)):
             name = self.scattering[place] if self.scattering else None
-            if simulator.settings.scattering:
+            if frame.settings.scattering:
                 roles, tops = device.upload(self._roles(place)), device.upload(self._band_tops(name))
-                simulator.scatterers.run(
-                    acquisition_buffer, acquisition, medium, simulator.tracer, self._parts, varied=(roles, tops)
-                )
+                self._scatterers.scatter(frame, self._parts, varied=(roles, tops))
             else:
                 self._parts.clear()
             if place == 0:
@@ -201,23 +204,23 @@ class AppearanceModel:
                     done += 1
 
     def _keep(self, number: int, base: int, weights: np.ndarray, with_interfaces: bool = False) -> None:
-        """One base from the parts: a weighted sum, the beam, the pulse."""
-        simulator, device = self.simulator, self.device
-        acquisition, acquisition_buffer = self._acquisitions[number], self._acquisition_buffers[number]
-        values = self._mixed.stride * 2 * int(acquisition["traced_lines"])
+        """One base from the parts: a weighted sum, and the linear stages, beam and pulse."""
+        device, frame = self.device, self._frames[number]
+        values = self._mixed.stride * 2 * int(frame.acquisition["traced_lines"])
         device.write(self._part_weights_buffer, weights)
         for parts, mixed in ((self._parts.re, self._mixed.re), (self._parts.im, self._mixed.im)):
             device.run(
                 self._mix_parts, (values // device.lanes,), parts, self._part_weights_buffer, np.int32(weights.size),
                 np.int32(values), mixed,
             )  # fmt: skip
-        if with_interfaces and simulator.settings.interfaces:
-            simulator.interfaces.run(acquisition_buffer, acquisition, simulator.tracer, self._mixed)
-        self._lines.prepare(int(acquisition["scan_lines"]), int(acquisition["samples"]))
-        simulator.beam.run(acquisition_buffer, acquisition, self._mixed, self._lines)
-        simulator.pulse.run(acquisition, simulator.axial_sigma_mm(self.probe), self._lines)
-        nbytes = int(acquisition["scan_lines"]) * int(acquisition["samples"]) * 8
-        device.copy(simulator.pulse.signal.iq, self._buffer("bases", number), nbytes, base * nbytes)
+        frame.traced = self._mixed
+        if with_interfaces:
+            self._interfaces.run(frame)
+        for stage in self.simulator.linear_stages:
+            stage.run(frame)
+        lines, samples = frame.line_shape
+        nbytes = lines * samples * 8
+        device.copy(frame.iq, self._buffer("bases", number), nbytes, base * nbytes)
 
     def _roles(self, place: int) -> np.ndarray:
         """(MAX_TISSUES,) int32: what scatters in which part while tissue `place` is computed."""
@@ -282,20 +285,19 @@ class AppearanceModel:
     def _measure_paths(self, number: int) -> None:
         """Nepers lost in each attenuating tissue on the way to every sample, had it the probing attenuation."""
         simulator, device = self.simulator, self.device
-        acquisition, acquisition_buffer = self._acquisitions[number], self._acquisition_buffers[number]
-        paths = self._buffer("paths", number)
-        nbytes = int(acquisition["scan_lines"]) * int(acquisition["samples"]) * 4
+        frame, paths = self._frames[number], self._buffer("paths", number)
+        lines, samples = frame.line_shape
+        nbytes = lines * samples * 4
         one = self._workspace.get("path", nbytes)
         for place, name in enumerate(self.attenuating):
-            tracer = simulator.tracer
             with simulator.with_tissues(_only_attenuating(self.tissues, name, self._probing_db_cm_mhz)):
-                tracer.run(acquisition_buffer, acquisition, simulator.medium)
+                simulator.tracer.run(frame)
             device.run(
                 self._direct_path,
-                (int(acquisition["scan_lines"]),),
-                acquisition_buffer,
-                tracer.segments,
-                tracer.segment_counts,
+                (lines,),
+                frame.acquisition_buffer,
+                frame.tree.segments,
+                frame.tree.segment_counts,
                 one,
             )
             device.copy(one, paths, nbytes, place * nbytes)

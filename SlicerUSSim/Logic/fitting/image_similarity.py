@@ -89,6 +89,12 @@ def similarity(
     mask : (rows, columns) bool, the pixels inside both fields (default: all).
 
     Raises SimulationError for images that are not uint8 or differ in shape, and for a mask without pixels.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import similarity
+    >>> image = np.random.default_rng(0).integers(0, 256, (120, 100), np.uint8)
+    >>> similarity(image, image, pixel_spacing_mm=(0.2, 0.2)).total
+    0.0
     """
     settings = SimilaritySettings(patch_mm, bins, sad_weight)
     a, b = _as_image("first image", a), _as_image("second image", b)

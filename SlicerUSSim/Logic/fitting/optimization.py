@@ -8,6 +8,7 @@ same answer, and an interrupted run is resumed by replaying what it had evaluate
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
@@ -43,6 +44,8 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.table import TissueTable
+
+_log = logging.getLogger(__name__)
 
 #: The search for the best, stage by stage; afterwards come "redraw n", "restart n" and "draw".
 STAGES = ("global", "local", "polish")
@@ -187,6 +190,23 @@ def optimize_appearance(
 
     Raises SimulationError for what FreeParameters, AppearanceModel and AppearanceCost refuse, and for the state of
     another problem, which it says what is different about.
+
+    The gain of one image, found again:
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import LinearProbe, TissueTable, UltrasoundSimulator, Volume
+    >>> from SlicerUSSim.Logic import DisplaySettings, optimize_appearance
+    >>> from SlicerUSSim.Logic.probe import pose_looking_at
+    >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+    >>> simulator = UltrasoundSimulator(labels, TissueTable.named(["liver"]))
+    >>> probe = LinearProbe(width_mm=20, depth_mm=30, scan_lines=64)
+    >>> pose = pose_looking_at(face_ras=(20, 20, 39), target_ras=(20, 20, 0))
+    >>> reference = simulator.simulate(probe, pose, DisplaySettings(gain_db=6.0)).image
+    >>> found = optimize_appearance(simulator, probe, [pose], [reference], free=["gain_db"], max_evaluations=30)
+    >>> round(found.display.gain_db, 2)
+    6.0
+    >>> found.cost_after < found.cost_before
+    True
     """
     started = perf_counter()
     display = display or DisplaySettings()
@@ -204,7 +224,13 @@ def optimize_appearance(
     def describe(units: np.ndarray) -> dict[str, float]:
         return dict(zip(parameters.names, parameters.values(units).tolist(), strict=True))
 
-    search = Search(cost, describe, limit, seed, progress, history_from(resume, problem))
+    history = history_from(resume, problem)
+    _log.info(
+        "fit of %d images, %d free parameters: %s", len(references), len(parameters.names), ", ".join(parameters.names)
+    )
+    if history:
+        _log.info("%d evaluations of an earlier run are used again", len(history))
+    search = Search(cost, describe, limit, seed, progress, history)
 
     start = parameters.units(tissues, display)
     before = cost.of_each(tissues, display)

@@ -15,6 +15,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import STAGES, AppearanceResult
+from SlicerUSSim.Logic.fitting.parameters import Parameter
 from SlicerUSSim.Logic.imaging.figures import require_matplotlib
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.placement import slice_under_probe
@@ -114,11 +115,19 @@ def _trio(number: int, real: np.ndarray, before: np.ndarray, after: np.ndarray, 
 </figure>"""
 
 
-def _parameter_row(result: AppearanceResult, parameter) -> str:
-    spread = result.identifiability[parameter.name]
+def _explained(parameter: Parameter) -> str:
+    """The tool tip."""
+    declared = parameter.declaration
+    return ". ".join(text for text in (declared.tip, declared.note, declared.source) if text) + "."
+
+
+def _parameter_row(result: AppearanceResult, parameter: Parameter) -> str:
+    spread, declared = result.identifiability[parameter.name], parameter.declaration
     note = ' <span class="no">at its bound</span>' if parameter.name in result.at_bounds else ""
     return (
-        f"<tr><td>{html.escape(parameter.name)}{note}</td><td>{parameter.low:g} to {parameter.high:g}</td>"
+        f'<tr title="{html.escape(_explained(parameter))}"><td>{html.escape(parameter.name)}{note}</td>'
+        f"<td>{html.escape(f'{declared.label} {declared.symbol}'.strip())}</td><td>{html.escape(declared.unit)}</td>"
+        f"<td>{parameter.low:g} to {parameter.high:g}</td>"
         f"<td>{result.before[parameter.name]:.3f}</td><td>{result.after[parameter.name]:.3f}</td>{_spread_cells(spread)}</tr>"
     )
 

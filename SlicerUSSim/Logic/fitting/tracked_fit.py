@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,6 +19,8 @@ from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
+
+_log = logging.getLogger(__name__)
 
 #: Of the evaluations, how many a fit takes before registration.
 _FIRST_SHARE = 0.4
@@ -114,6 +117,10 @@ def _registered(
                 tracked.poses, display=first.display, range_mm=bound, range_deg=bound, max_evaluations=most
             )
         moved = step.after(moved)
+        _log.info(
+            "registration within %g mm and degrees: moved by %.2f mm and %.2f degrees in all", bound, moved.shift_mm,
+            moved.turn_deg,
+        )  # fmt: skip
         tracked = replace(tracked, poses=step.poses)
     fitted()
     cost, best, registration = min(candidates, key=lambda candidate: candidate[0])

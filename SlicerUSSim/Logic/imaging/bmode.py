@@ -2,117 +2,99 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
+from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB
 from SlicerUSSim.Logic.imaging.noise import noise_key
-from SlicerUSSim.Logic.imaging.scattering import EchoLines
+from SlicerUSSim.Logic.imaging.signals import RayTree
+from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
-
-@dataclass(frozen=True, eq=False)
-class BasebandSignal:
-    """A complex baseband signal on the device, of whole blocks of samples."""
-
-    #: float2 [line][sample]
-    iq: Buffer
-    lines: int
-    samples: int
+_PER_SAMPLE = 130  # operations: noise, TGC, envelope, log compression
 
 
-class PulseFilter:
+class PulseFilter(Stage):
     """Convolves the impulses with the envelope of the pulse; the result is the complex baseband signal."""
 
+    name = "pulse"
+
     def __init__(self, device: Device) -> None:
-        self.device = device
+        super().__init__(device)
         self.kernel = device.kernels("bmode.cl", device.lanes)["convolve_pulse"]
         self.workspace = Workspace(device)
         self._sigma: float | None = None
-        # Of the pulse with that sigma, and of the frame convolved last
+        # Of the pulse with that sigma
         self._pulse: Buffer
         self._reach: int
-        self.signal: BasebandSignal
-        #: What the signal was made for, if whoever made it says so (UltrasoundSimulator.render)
-        self.made_for: object = None
 
-    def run(self, acquisition: np.ndarray, axial_sigma_mm: float, lines: EchoLines) -> None:
-        """Enqueue the convolution of every line."""
-        self.made_for = None
-        sigma = axial_sigma_mm / float(acquisition["sample_mm"])
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the convolution of every line: the frame's `iq`."""
+        sigma = frame.axial_sigma_mm / float(frame.acquisition["sample_mm"])
         if sigma != self._sigma:
             taps = pulse_taps(sigma)
             self._pulse, self._reach, self._sigma = self.device.upload(taps), taps.size // 2, sigma
-        count, samples = int(acquisition["scan_lines"]), int(acquisition["samples"])
-        iq = self.workspace.get("iq", count * samples * 8)
-        self.signal = BasebandSignal(iq, count, samples)
+        lines, samples = frame.line_shape
+        frame.iq = self.workspace.get("iq", lines * samples * SAMPLE_BYTES)
         self.device.run(
             self.kernel,
-            (samples // self.device.lanes, count),
-            lines.re,
-            lines.im,
-            np.int32(lines.stride),
+            (samples // self.device.lanes, lines),
+            frame.scanned.re,
+            frame.scanned.im,
+            np.int32(frame.scanned.stride),
             self._pulse,
             np.int32(self._reach),
-            iq,
+            frame.iq,
             np.int32(samples),
         )
 
-    def download(self, samples: int) -> np.ndarray:
-        """(scan_lines, samples) complex64 baseband signal of the frame convolved last."""
-        signal = self.signal
-        return self.device.download(signal.iq, (signal.lines, signal.samples), np.complex64)[:, :samples]
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        lines, samples = frame.line_shape
+        taps = pulse_taps(frame.axial_sigma_mm / float(frame.acquisition["sample_mm"])).size
+        return Work(2 * lines * samples * SAMPLE_BYTES, 4 * taps * lines * samples)
 
 
-class Compressor:
+class Compressor(Stage):
     """Noise, TGC, envelope and log compression to eight bits."""
 
+    name = "B-mode"
+
     def __init__(self, device: Device) -> None:
-        self.device = device
+        super().__init__(device)
         self.kernel = device.kernels("bmode.cl", device.lanes)["compress"]
         self.workspace = Workspace(device)
-        # Of the frame compressed last: its size, float32 and uint8 [line][sample]
-        self.lines: int
-        self.samples: int
-        self.envelope: Buffer
-        self.grey: Buffer
 
-    def run(
-        self, acquisition: np.ndarray, display: DisplaySettings, signal: BasebandSignal, noise_seed: int = 0
-    ) -> None:
-        """Enqueue the grey levels of every line; `noise_seed` is the draw of the noise."""
-        self.lines, self.samples = signal.lines, signal.samples
-        self.envelope = self.workspace.get("envelope", self.lines * self.samples * 4)
-        self.grey = self.workspace.get("grey", self.lines * self.samples)
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the grey levels of every line: the frame's `envelope` and `grey`."""
+        display, acquisition, (lines, samples) = frame.display, frame.acquisition, frame.line_shape
+        frame.envelope = self.workspace.get("envelope", lines * samples * 4)
+        frame.grey = self.workspace.get("grey", lines * samples)
         # Two ways through `sample_mm` of depth each sample, in cm.
         tgc = 2.0 * display.tgc_db_cm_mhz * float(acquisition["frequency_mhz"]) * float(acquisition["sample_mm"]) * 0.1
         # Noise power is shared between the two quadrature components.
         noise = 0.0 if display.noise_db is None else 10.0 ** (display.noise_db / 20.0) / np.sqrt(2.0)
         self.device.run(
             self.kernel,
-            (self.samples // self.device.lanes, self.lines),
-            signal.iq,
-            np.int32(self.samples),
+            (samples // self.device.lanes, lines),
+            frame.iq,
+            np.int32(samples),
             np.float32(noise),
-            np.uint32(noise_key(acquisition, noise_seed)),
+            np.uint32(noise_key(acquisition, frame.noise_seed)),
             np.float32(tgc),
             np.float32(FULL_SCALE_DB - display.gain_db),
             np.float32(display.dynamic_range_db),
-            self.envelope,
-            self.grey,
+            frame.envelope,
+            frame.grey,
         )
 
-    def download(self, samples: int) -> tuple[np.ndarray, np.ndarray]:
-        """(envelope float32, grey uint8), both (scan_lines, samples), of the frame compressed last."""
-        shape = self.lines, self.samples
-        envelope = self.device.download(self.envelope, shape, np.float32)[:, :samples]
-        return envelope, self.device.download(self.grey, shape, np.uint8)[:, :samples]
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        lines, samples = frame.line_shape
+        return Work((SAMPLE_BYTES + 5) * lines * samples, _PER_SAMPLE * lines * samples)
 
 
 def pulse_taps(sigma: float) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,8 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
+
+_log = logging.getLogger(__name__)
 
 _MOST_VOXELS = 400_000_000
 _WIDEST_GAP_MM = 10.0  # farther apart, neighbouring images are two sweeps rather than one with a hole
@@ -115,6 +118,7 @@ class Compounder:
         """
         if hole_mm is None:
             hole_mm = min(self._widest_gap_mm(), _WIDEST_GAP_MM)
+            _log.info("holes up to %.1f mm are filled, the widest gap of the sweep or %g mm", hole_mm, _WIDEST_GAP_MM)
         require_between("Compounder.volume", "hole_mm", hole_mm, 0, 1000)
         total, weight = (
             self.device.download(buffer, self.grid.array.shape, np.float32) for buffer in (self._sum, self._weight)

@@ -9,6 +9,8 @@ without stairs.
 
 from __future__ import annotations
 
+import logging
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,10 +27,13 @@ from SlicerUSSim.Logic.tissue.tissue import Membrane
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
+_log = logging.getLogger(__name__)
+
 _FARTHEST_SIGMAS = 2.2  # where the stored distance ends
 # Smoothed indicators take two bytes a voxel and group: so many groups, so many voxels in all; but always two groups.
 _MOST_SMOOTHED_GROUPS = 6
 _SMOOTHED_VOXELS = 100_000_000
+_TISSUE_ATTRIBUTES = tuple(name for name in TISSUE.names or () if name != "group")
 _PAD = 1  # one voxel of coupling medium around the volume, so that a clamped look-up outside finds it
 
 
@@ -45,6 +50,7 @@ class Medium:
     """
 
     def __init__(self, labels: Volume, tissues: TissueTable, device: Device, texture: np.ndarray | None = None) -> None:
+        started = perf_counter()
         self.device = device
         self.labels = labels
         array = as_labels(labels.array)
@@ -74,6 +80,13 @@ class Medium:
         #: Counts the changes of tissues
         self.version = 0
         self.tissues = tissues
+        _log.debug(
+            "acoustic medium: %s voxels, labels %s, %d acoustic groups of which %d smoothed, %s membrane, %s texture, "
+            "%.0f ms", "x".join(map(str, array.shape[::-1])), " ".join(map(str, sorted(self.present))),
+            len({int(group) for group in self.rows["group"][self.present]}), self.smooth_groups,
+            "no" if self.membrane_reach < 0 else "a", "with" if self.has_texture else "no",
+            (perf_counter() - started) * 1e3,
+        )  # fmt: skip
 
     @property
     def ras_to_voxel(self) -> np.ndarray:
@@ -92,10 +105,12 @@ class Medium:
         """Change tissue parameters; voxels are touched only if the membrane's place or the acoustic groups change."""
         self._check(tissues)
         if _membrane_shape(tissues) != _membrane_shape(self.tissues):
+            _log.debug("the membrane is another one: voxels are uploaded again")
             self._upload(np.pad(as_labels(self.labels.array), _PAD), tissues)
         groups_before = self.rows["group"]
         self.rows = self._tissue_rows(tissues)
         if not np.array_equal(self.rows["group"], groups_before):
+            _log.debug("the acoustic groups are others: voxels are uploaded again")
             self._upload_groups(np.pad(as_labels(self.labels.array), _PAD))
         self.device.write(self.tissue_buffer, self.rows)
         self.version += 1
@@ -118,14 +133,9 @@ class Medium:
         groups: dict[tuple[float, float], int] = {}
         for label, tissue in members.items():
             acoustics = (tissue.speed_of_sound_m_s, tissue.impedance_mrayl)
-            rows[label] = (
-                *acoustics,
-                tissue.attenuation_db_cm_mhz,
-                tissue.mu0,
-                tissue.sigma0,
-                tissue.scatterer_share,
-                groups.setdefault(acoustics, len(groups)),
-            )
+            for name in _TISSUE_ATTRIBUTES:
+                rows[label][name] = getattr(tissue, name)
+            rows[label]["group"] = groups.setdefault(acoustics, len(groups))
         return rows
 
     def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:

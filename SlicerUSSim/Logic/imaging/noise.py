@@ -24,6 +24,15 @@ def seed_of_pose(probe_to_ras: np.ndarray) -> int:
 
     Poses are the same to a hundredth of a millimetre and 0.1 mrad, far more than the rounding of a product of parent
     transforms. Raises SimulationError for a matrix that is not affine.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import seed_of_pose
+    >>> from SlicerUSSim.Logic.probe import turned
+    >>> pose = np.eye(4)
+    >>> seed_of_pose(pose) == seed_of_pose(pose + 1e-9)
+    True
+    >>> seed_of_pose(pose) == seed_of_pose(turned(pose, rock_deg=1))
+    False
     """
     pose = check_affine("probe_to_ras", probe_to_ras)[:3]
     steps = np.floor(pose / [*[_AXES_STEP] * 3, _ORIGIN_STEP_MM] + _BEGINNING)

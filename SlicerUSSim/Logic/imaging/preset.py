@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from SlicerUSSim.Logic.base.declaration import Parameter, built, parameters_of
+from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parameters_of, short
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.probe.arrays import PROBE_KIND, PROBE_KINDS, PROBES, Probe, probe_from_dict
 from SlicerUSSim.Logic.tissue.table import TissueTable
+
+_log = logging.getLogger(__name__)
 
 #: {name: class} of the sections of a preset that are one dataclass each.
 SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
@@ -24,7 +27,16 @@ _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
 @dataclass(frozen=True)
 class Preset:
-    """Probe, console, physics and tissues. The default is a cranial phased array and the brain's tissues."""
+    """Probe, console, physics and tissues. The default is a cranial phased array and the brain's tissues.
+
+    >>> from SlicerUSSim.Logic import Preset
+    >>> preset = Preset().changed("probe", kind="convex", depth_mm=110).changed("display", gain_db=3)
+    >>> preset.probe.focus_mm
+    66.0
+    >>> preset.write("preset.json")
+    >>> Preset.read("preset.json") == preset
+    True
+    """
 
     probe: Probe = PROBES["phased"]
     display: DisplaySettings = field(default_factory=DisplaySettings)
@@ -61,9 +73,9 @@ class Preset:
         Raises SimulationError naming `source` and what is wrong in it.
         """
         known = ("probe", *SECTIONS, "tissues", "membrane")
-        require(isinstance(values, dict), f"{source}: is a {type(values).__name__}, expected an object")
+        require(isinstance(values, dict), f"{source}: is {kind_of(values)}, expected an object")
         for name in values:
-            require(name in known, f"{source}: has {name!r}, expected {', '.join(known)}")
+            require(name in known, f"{source}: has {short(name)}, expected {', '.join(known)}")
         sections: dict[str, Any] = {}
         if "probe" in values:
             sections["probe"] = probe_from_dict(values["probe"], f"{source}: probe")
@@ -72,6 +84,9 @@ class Preset:
                 sections[name] = built(kind, values[name], f"{source}: {name}")
         if "tissues" in values or "membrane" in values:
             sections["tissues"] = TissueTable.from_dict(values, source)
+        missing = [name for name in known[:-1] if name not in values]
+        if missing:
+            _log.info("%s: says nothing of %s, for which the default is taken", source, ", ".join(missing))
         return cls(**sections)
 
     @classmethod

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.imaging.medium import Medium
+from SlicerUSSim.Logic.imaging.signals import RayTree, TreeBuffers
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, HIT, SEGMENT
 
@@ -18,31 +17,19 @@ if TYPE_CHECKING:
     from pyopencl import Buffer
 
 
-@dataclass(frozen=True, eq=False)
-class RayTree:
-    """The tree of one frame, on the host.
-
-    segments : structured array (layout.SEGMENT) of every straight piece along the beam axes; `segment_line` (same
-        length) is its place among the scan lines: a fraction for a line traced between them, and outside
-        0..scan_lines - 1 for one beyond the edge of the field.
-    hits : structured array (layout.HIT) of every interface crossing of the elevational rays; `hit_line` is its place
-        among the scan lines and `hit_ray` its elevational ray.
-    cut_weight : (traced lines, 1 + elevational rays) weight of the branches that were not followed.
-    """
-
-    segments: np.ndarray
-    segment_line: np.ndarray
-    hits: np.ndarray
-    hit_line: np.ndarray
-    hit_ray: np.ndarray
-    cut_weight: np.ndarray
+# Operations counted in the kernel
+_PER_STEP = 35  # a look-up on the way: position, beam offset, clamp, index
+_PER_BORDER = 5 * 60 + 12 * 15 + 49 * 8 * 10  # bisection; stencil of 12 rows; 7 x 7 rows of eight voxels
+_BORDER_BYTES = 12 * 4 * 2 * 2 + 49 * 8  # the stencil's rows of two smoothed indicators; the voxels' groups
 
 
-class RayTracer:
+class RayTracer(Stage):
     """Traces all lines through a medium; the tree stays on the device for the stages that follow."""
 
+    name = "ray tree"
+
     def __init__(self, device: Device) -> None:
-        self.device = device
+        super().__init__(device)
         self.kernel = device.kernels("raytracing.cl")["trace"]
         self.workspace = Workspace(device)
         self._quantile_key: tuple | None = None
@@ -51,26 +38,24 @@ class RayTracer:
         # What these keys stand for
         self._quantiles: Buffer
         self._roots: Buffer
-        #: (traced lines, elevational rays) of the frame traced last, and its tree: see layout.SEGMENT and layout.HIT
+        #: (traced lines, elevational rays) of the frame traced last, its record and its tree
         self.shape: tuple[int, int]
-        self.segments: Buffer
-        self.segment_counts: Buffer
-        self.hits: Buffer
-        self.hit_counts: Buffer
-        self.cut: Buffer
-        self._place: Callable[[np.ndarray], np.ndarray]
+        self._acquisition: np.ndarray
+        self._tree: TreeBuffers
 
-    def run(self, acquisition_buffer: Buffer, acquisition: np.ndarray, medium: Medium) -> None:
-        """Enqueue the tracing of one frame: a layout.ACQUISITION record, and the same on the device."""
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the tracing of one frame: its `tree`."""
+        acquisition, medium = frame.acquisition, frame.medium
         traced, rays = int(acquisition["traced_lines"]), int(acquisition["elevational_rays"])
-        self.shape = traced, rays
-        self._place = lambda line: (line - float(acquisition["guard_lines"])) / float(acquisition["lateral_rays"])
+        self.shape, self._acquisition = (traced, rays), acquisition
         get = self.workspace.get
-        self.segments = get("segments", traced * CONSTANTS["MAX_SEGMENTS"] * SEGMENT.itemsize)
-        self.segment_counts = get("segment_counts", traced * 4)
-        self.hits = get("hits", traced * rays * CONSTANTS["MAX_HITS"] * HIT.itemsize)
-        self.hit_counts = get("hit_counts", traced * rays * 4)
-        self.cut = get("cut", traced * (rays + 1) * 4)
+        tree = frame.tree = self._tree = TreeBuffers(
+            segments=get("segments", traced * CONSTANTS["MAX_SEGMENTS"] * SEGMENT.itemsize),
+            segment_counts=get("segment_counts", traced * 4),
+            hits=get("hits", traced * rays * CONSTANTS["MAX_HITS"] * HIT.itemsize),
+            hit_counts=get("hit_counts", traced * rays * 4),
+            cut=get("cut", traced * (rays + 1) * 4),
+        )
         if self._quantile_key != (traced, rays):
             self._quantiles = self.device.upload(beam_quantiles(traced, rays))
             self._quantile_key = (traced, rays)
@@ -81,31 +66,38 @@ class RayTracer:
         self.device.run(
             self.kernel,
             (traced, rays + 1),
-            acquisition_buffer,
+            frame.acquisition_buffer,
             medium.voxel_buffer,
             medium.group_buffer,
             medium.smooth_buffer,
             medium.tissue_buffer,
             self._roots,
             self._quantiles,
-            self.segments,
-            self.segment_counts,
-            self.hits,
-            self.hit_counts,
-            self.cut,
+            tree.segments,
+            tree.segment_counts,
+            tree.hits,
+            tree.hit_counts,
+            tree.cut,
             self._overflown,
             heavy=True,
         )
 
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        rays = 1 + int(frame.acquisition["elevational_rays"])
+        steps = float(tree.segments["length_mm"].sum()) * rays / (0.5 * float(frame.acquisition["voxel_mm"]))
+        borders = len(tree.hits) * rays / (rays - 1)
+        return Work(
+            2 * steps + _BORDER_BYTES * borders + SEGMENT.itemsize * len(tree.segments) + HIT.itemsize * len(tree.hits),
+            _PER_STEP * steps + _PER_BORDER * borders,
+        )
+
     def download(self) -> RayTree:
         """The tree of the frame traced last."""
-        traced, rays = self.shape
-        segments = self.device.download(self.segments, (traced, CONSTANTS["MAX_SEGMENTS"]), SEGMENT)
-        counts = self.device.download(self.segment_counts, traced, np.int32)
-        kept = np.arange(CONSTANTS["MAX_SEGMENTS"]) < counts[:, None]
-        hits = self.device.download(self.hits, (traced, rays, CONSTANTS["MAX_HITS"]), HIT)
-        hit_counts = self.device.download(self.hit_counts, (traced, rays), np.int32)
-        hit_kept = np.arange(CONSTANTS["MAX_HITS"]) < hit_counts[..., None]
+        (traced, rays), tree, download = self.shape, self._tree, self.device.download
+        segments = download(tree.segments, (traced, CONSTANTS["MAX_SEGMENTS"]), SEGMENT)
+        kept = np.arange(CONSTANTS["MAX_SEGMENTS"]) < download(tree.segment_counts, traced, np.int32)[:, None]
+        hits = download(tree.hits, (traced, rays, CONSTANTS["MAX_HITS"]), HIT)
+        hit_kept = np.arange(CONSTANTS["MAX_HITS"]) < download(tree.hit_counts, (traced, rays), np.int32)[..., None]
         where = np.nonzero(hit_kept)
         return RayTree(
             segments=segments[kept],
@@ -113,8 +105,12 @@ class RayTracer:
             hits=hits[hit_kept],
             hit_line=self._place(where[0]),
             hit_ray=where[1],
-            cut_weight=self.device.download(self.cut, (traced, rays + 1), np.float32),
+            cut_weight=download(tree.cut, (traced, rays + 1), np.float32),
         )
+
+    def _place(self, line: np.ndarray) -> np.ndarray:
+        """Where traced lines lie among the scan lines."""
+        return (line - float(self._acquisition["guard_lines"])) / float(self._acquisition["lateral_rays"])
 
     def overflown_lines(self) -> int:
         """How many traced lines since the last call had more segments than there is room for."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Hashable
 
 from SlicerUSSim.Logic.base.settings import SimulationSettings
@@ -10,6 +11,8 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
+
+_log = logging.getLogger(__name__)
 
 
 class ReusedSimulator:
@@ -35,6 +38,7 @@ class ReusedSimulator:
         # Only how scatterers use the texture concerns what is on the device; other settings count per frame.
         wanted = (labels_version, texture, device, settings.partial_volume, settings.mri_modulation_db)
         if self._simulator is None or self._built_for != wanted:
+            _log.debug("a simulator is built: %s", "the first" if self._built_for is None else self._changed(wanted))
             self.forget()
             self._simulator = UltrasoundSimulator(labels, tissues, settings, device, texture)
             self._built_for = wanted
@@ -42,6 +46,11 @@ class ReusedSimulator:
             self._simulator.set_tissues(tissues)
         self._simulator.settings = settings
         return self._simulator
+
+    def _changed(self, wanted: tuple) -> str:
+        names = ("labels", "texture", "device", "partial_volume", "mri_modulation_db")
+        values = zip(names, wanted, self._built_for or wanted, strict=True)
+        return ", ".join(name for name, new, old in values if new != old) + " changed"
 
     def forget(self) -> None:
         """Give the device's memory back."""

@@ -5,77 +5,59 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.integrate import trapezoid
 
-from SlicerUSSim.Logic.imaging.medium import Medium
-from SlicerUSSim.Logic.imaging.raytracing import RayTracer
-from SlicerUSSim.Logic.opencl.device import Device, Workspace
-from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
+from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
+from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.layout import HIT
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
-
-class EchoLines:
-    """Complex baseband impulses per line, planar: re, im float32 [line][stride], zeros on either side."""
-
-    def __init__(self, device: Device) -> None:
-        self.device = device
-        self.workspace = Workspace(device)
-        self._shape: tuple[int, int] | None = None
-        # Of the frame that there is room for: see prepare
-        self.re: Buffer
-        self.im: Buffer
-        #: Samples from one line to the next, pads included
-        self.stride: int
-
-    def prepare(self, lines: int, samples: int) -> None:
-        """Make room for a frame. Kernels write every sample between the pads, so only a new shape is cleared."""
-        # An odd number of cache lines: the same sample of many lines then does not fall into the same few sets.
-        self.stride = (samples + 2 * CONSTANTS["LINE_PAD"]) // 16 * 16 + 16
-        self.stride += self.stride % 32 == 0 and 16
-        nbytes = lines * self.stride * 4
-        self.re, self.im = self.workspace.get("re", nbytes), self.workspace.get("im", nbytes)
-        if self._shape != (lines, samples):
-            self.clear()
-            self._shape = lines, samples
-
-    def clear(self) -> None:
-        """Set everything to zero."""
-        self.device.clear(self.re)
-        self.device.clear(self.im)
+# Operations counted in the kernels
+_PER_CELL = 180  # a lattice cell that is looked at: three hashes, place, pulse phase, amplitude
+_PER_SCATTERER = 40  # one that counts: label, strength, four impulses
+_PER_HIT = 40
+_PER_EDGE_PAIR = 16  # of the lateral beam, per sample
 
 
-class Scatterers:
+class Scatterers(Stage):
     """Adds speckle: every scatterer beside every ray segment."""
 
-    def __init__(self, device: Device) -> None:
-        self.device = device
+    name = "scatterers"
 
-    def run(
-        self,
-        acquisition_buffer: Buffer,
-        acquisition: np.ndarray,
-        medium: Medium,
-        tree: RayTracer,
-        lines: EchoLines,
-        varied: tuple[Buffer, ...] = (),
-    ) -> None:
+    def __init__(self, device: Device) -> None:
+        super().__init__(device)
+        self.lines = EchoLines(device)
+
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the speckle of one frame: its `traced` impulses, none if the settings want no scattering."""
+        frame.traced = self.lines
+        self.lines.prepare(2 * int(frame.acquisition["traced_lines"]), frame.line_shape[1])  # two edges of each strip
+        if frame.settings.scattering:
+            self.scatter(frame, self.lines)
+        else:
+            self.lines.clear()
+
+    def scatter(self, frame: DeviceFrame, lines: EchoLines, varied: tuple[Buffer, ...] = ()) -> None:
         """Enqueue the speckle of one frame; it overwrites `lines`.
 
         With `varied`, the device buffers of roles (MAX_TISSUES,) int32 and band tops (BANDS,) float32, it comes in
         CONSTANTS["PARTS"] parts one after the other: see kernels/scattering.cl and appearance.py.
         """
+        medium = frame.medium
         variant = (["TEXTURE"] if medium.has_texture else []) + (["VARIED"] if varied else [])
         variant.append(f"CHUNK={self.device.chunk}")
         self.device.run(
             self.device.kernels("scattering.cl", self.device.lanes, *variant)["scatter"],
-            (int(acquisition["samples"]) // self.device.chunk, int(acquisition["traced_lines"])),
-            acquisition_buffer,
+            (frame.line_shape[1] // self.device.chunk, int(frame.acquisition["traced_lines"])),
+            frame.acquisition_buffer,
             medium.voxel_buffer,
             medium.texture_buffer,
             medium.tissue_buffer,
-            tree.segments,
-            tree.segment_counts,
+            frame.tree.segments,
+            frame.tree.segment_counts,
             lines.re,
             lines.im,
             np.int32(lines.stride),
@@ -83,44 +65,96 @@ class Scatterers:
             heavy=True,
         )
 
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        traced, (_, samples) = int(frame.acquisition["traced_lines"]), frame.line_shape
+        inside, looked_at = scatterer_counts(frame, tree.segments, self.device.chunk)
+        return Work(2 * inside + 2 * traced * samples * SAMPLE_BYTES, _PER_CELL * looked_at + _PER_SCATTERER * inside)
 
-class InterfaceEchoes:
+
+class InterfaceEchoes(Stage):
     """Adds the echoes of the interfaces that the elevational rays hit."""
 
+    name = "interfaces"
+
     def __init__(self, device: Device) -> None:
-        self.device = device
+        super().__init__(device)
         self.kernel = device.kernels("interfaces.cl")["interface_echoes"]
 
-    def run(self, acquisition_buffer: Buffer, acquisition: np.ndarray, tree: RayTracer, lines: EchoLines) -> None:
-        """Enqueue the interface echoes of one frame; they are added to `lines`."""
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the interface echoes of one frame, if the settings want them; they are added to `traced`."""
+        if not frame.settings.interfaces:
+            return
         self.device.run(
             self.kernel,
-            (int(acquisition["traced_lines"]),),
-            acquisition_buffer,
-            tree.hits,
-            tree.hit_counts,
-            lines.re,
-            lines.im,
-            np.int32(lines.stride),
+            (int(frame.acquisition["traced_lines"]),),
+            frame.acquisition_buffer,
+            frame.tree.hits,
+            frame.tree.hit_counts,
+            frame.traced.re,
+            frame.traced.im,
+            np.int32(frame.traced.stride),
         )
 
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        return Work((HIT.itemsize + 8 * SAMPLE_BYTES) * len(tree.hits), _PER_HIT * len(tree.hits))
 
-class LateralBeam:
+
+class LateralBeam(Stage):
     """Spreads the impulses of the traced lines over the scan lines, as the lateral beam profile says."""
 
-    def __init__(self, device: Device) -> None:
-        self.device = device
-        self.kernel = device.kernels("beam.cl", device.lanes)["lateral_beam"]
+    name = "beam"
 
-    def run(self, acquisition_buffer: Buffer, acquisition: np.ndarray, traced: EchoLines, scanned: EchoLines) -> None:
-        """Enqueue the lateral convolution of one frame; it overwrites `scanned`."""
+    def __init__(self, device: Device) -> None:
+        super().__init__(device)
+        self.kernel = device.kernels("beam.cl", device.lanes)["lateral_beam"]
+        self.lines = EchoLines(device)
+
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the lateral convolution of one frame: its `scanned` impulses."""
+        scan_lines, samples = frame.line_shape
+        scanned = frame.scanned = self.lines
+        scanned.prepare(scan_lines, samples)
         self.device.run(
             self.kernel,
-            (int(acquisition["samples"]) // self.device.lanes, int(acquisition["scan_lines"])),
-            acquisition_buffer,
-            traced.re,
-            traced.im,
+            (samples // self.device.lanes, scan_lines),
+            frame.acquisition_buffer,
+            frame.traced.re,
+            frame.traced.im,
             scanned.re,
             scanned.im,
-            np.int32(traced.stride),
+            np.int32(frame.traced.stride),
         )
+
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        acquisition, probe, (scan_lines, samples) = frame.acquisition, frame.probe, frame.line_shape
+        traced = int(acquisition["traced_lines"])
+        depth = np.arange(samples) * float(acquisition["sample_mm"])
+        distance = probe.line_distance_mm(depth) / float(acquisition["lateral_rays"])
+        sigma = probe.beam_sigma_mm(depth)[0]
+        pairs = np.minimum(frame.settings.beam_cutoff * sigma / distance + 1, traced / 2)
+        return Work(
+            (2 * traced + scan_lines) * samples * SAMPLE_BYTES, _PER_EDGE_PAIR * scan_lines * float(pairs.sum())
+        )
+
+
+def scatterer_counts(frame: FrameInputs, segments: np.ndarray, chunk: int) -> tuple[float, float]:
+    """(scatterers inside the strips of all ray segments, lattice cells that have to be looked at for them).
+
+    `segments` are records of layout.SEGMENT, `chunk` the samples that one work-item fills.
+    """
+    acquisition, probe, settings = frame.acquisition, frame.probe, frame.settings
+    ends = segments["path_mm"], segments["path_mm"] + segments["length_mm"]
+    path = np.linspace(*ends, 17)  # (17, segments)
+    width = probe.line_distance_mm(path) / float(acquisition["lateral_rays"])
+    height = 2.0 * settings.beam_cutoff * probe.beam_sigma_mm(path)[1]
+    # A scatterer is up to half a cell from its cell's centre along each axis of the lattice.
+    slack = {
+        name: float(acquisition["cell_mm"]) * np.abs(segments[name]).sum(axis=1) for name in ("lateral", "elevational")
+    }
+    deep = float(acquisition["cell_mm"]) * np.abs(segments["direction"]).sum(axis=1)
+    length = chunk * float(acquisition["sample_mm"]) / segments["depth_per_mm"]
+    along = 1.0 + deep / np.minimum(length, np.maximum(segments["length_mm"], 1e-3))
+    density = settings.scatterers_per_mm3
+    inside = trapezoid(width * height, path, axis=0)
+    looked_at = along * trapezoid((width + slack["lateral"]) * (height + slack["elevational"]), path, axis=0)
+    return float(density * inside.sum()), float(density * looked_at.sum())

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.declaration import parameters_of
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.imaging.bmode import Compressor, PulseFilter
+from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
-from SlicerUSSim.Logic.imaging.raytracing import RayTracer, RayTree
-from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
-from SlicerUSSim.Logic.imaging.scattering import EchoLines, InterfaceEchoes, LateralBeam, Scatterers
+from SlicerUSSim.Logic.imaging.raytracing import RayTracer
+from SlicerUSSim.Logic.imaging.signals import RayTree
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import NOMINAL_SPEED_M_S, Probe
@@ -31,6 +33,10 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
+
+_log = logging.getLogger(__name__)
+
+StageKind = TypeVar("StageKind", bound=Stage)
 
 
 class EmptyViewWarning(UserWarning):
@@ -56,6 +62,16 @@ class UltrasoundSimulator:
 
     Raises SimulationError for labels without a tissue, settings that need a texture where there is none or it does not
     fit, and where no device can be used.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import LinearProbe, TissueTable, UltrasoundSimulator, Volume
+    >>> from SlicerUSSim.Logic.probe import pose_looking_at
+    >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+    >>> simulator = UltrasoundSimulator(labels, TissueTable.named(["liver"]))
+    >>> probe = LinearProbe(width_mm=20, depth_mm=30, scan_lines=64)
+    >>> frame = simulator.simulate(probe, pose_looking_at(face_ras=(20, 20, 39), target_ras=(20, 20, 0)))
+    >>> frame.image.shape, frame.image.dtype  # rows, columns
+    ((512, 342), dtype('uint8'))
     """
 
     def __init__(
@@ -69,16 +85,15 @@ class UltrasoundSimulator:
         self.settings = settings or SimulationSettings()
         self.device = Device.get(device)
         self.medium = Medium(labels, tissues, self.device, _packed_texture(texture, labels, self.settings))
-        self.tracer = RayTracer(self.device)
-        self.traced_lines = EchoLines(self.device)
-        self.scan_lines = EchoLines(self.device)
-        self.scatterers = Scatterers(self.device)
-        self.interfaces = InterfaceEchoes(self.device)
-        self.beam = LateralBeam(self.device)
-        self.pulse = PulseFilter(self.device)
-        self.compressor = Compressor(self.device)
-        self.converter = ScanConverter(self.device)
+        #: The stages of stages.py, from which the appearance model and those that verify take theirs
+        self.impulse_stages = [stage(self.device) for stage in stages.IMPULSE_STAGES]
+        self.linear_stages = [stage(self.device) for stage in stages.LINEAR_STAGES]
+        self.display_stages = [stage(self.device) for stage in stages.DISPLAY_STAGES]
+        self.tracer = self.stage(RayTracer)
         self._acquisition_buffer = self.device.empty(ACQUISITION.itemsize)
+        # The baseband signal of the last frame, and what it was made for
+        self._iq: Buffer
+        self._iq_made_for: tuple | None = None
         #: Measure every stage (Frame.timings_ms); each stage is then computed and waited for.
         self.profiling = False
 
@@ -104,12 +119,11 @@ class UltrasoundSimulator:
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self._warn_if_empty(probe, pose)
         timings: dict[str, float] = {}
-        self.render(probe, pose, display, grid, timings, noise_seed=noise_seed)
-        with self._stage("download", timings):
+        frame = self._rendered(probe, pose, display, grid, timings, noise_seed)
+        with self._timed("download", timings):
             samples = self._sample_count(probe)
-            iq = self.pulse.download(samples)
-            envelope, bmode = self.compressor.download(samples)
-            image = self.converter.download()
+            iq, envelope, bmode = (frame.download(name)[:, :samples] for name in ("iq", "envelope", "grey"))
+            image = frame.download("image")
             self._warn_if_overflown()
 
         return Frame(
@@ -138,47 +152,58 @@ class UltrasoundSimulator:
 
         Where only the display, the noise or the pixels have changed since the last frame, its echoes are used again.
         """
-        timings = {} if timings is None else timings
-        with self._stage("upload", timings):
-            acquisition = self._upload_acquisition(probe, pose)
-        inputs = (acquisition.tobytes(), self.settings, self.medium.version)
-        if self.profiling or self.pulse.made_for != inputs:
-            self._echoes(probe, acquisition, timings)
-            self.pulse.made_for = inputs
-        with self._stage("B-mode", timings):
-            self.compressor.run(acquisition, display, self.pulse.signal, noise_seed)
-        with self._stage("scan conversion", timings):
-            self.converter.run(self._acquisition_buffer, acquisition, grid, self.compressor)
-        return self.converter.image
+        return self._rendered(probe, pose, display, grid, {} if timings is None else timings, noise_seed).image
 
     def forget_echoes(self) -> None:
-        """Have the next frame computed from its rays on, though nothing may have changed (for measurements)."""
-        self.pulse.made_for = None
+        """Have the next frame computed from its rays on, though nothing may have changed.
 
-    def _echoes(self, probe: Probe, acquisition: np.ndarray, timings: dict[str, float]) -> None:
-        """Enqueue the stages up to the baseband signal, which depend on neither display nor pixels."""
-        with self._stage("ray tree", timings):
-            self.tracer.run(self._acquisition_buffer, acquisition, self.medium)
-        with self._stage("scatterers", timings):
-            samples = int(acquisition["samples"])
-            self.traced_lines.prepare(2 * int(acquisition["traced_lines"]), samples)  # two edges of each strip
-            if self.settings.scattering:
-                self.scatterers.run(self._acquisition_buffer, acquisition, self.medium, self.tracer, self.traced_lines)
-            else:
-                self.traced_lines.clear()
-        with self._stage("interfaces", timings):
-            if self.settings.interfaces:
-                self.interfaces.run(self._acquisition_buffer, acquisition, self.tracer, self.traced_lines)
-        with self._stage("beam", timings):
-            self.scan_lines.prepare(probe.scan_lines, samples)
-            self.beam.run(self._acquisition_buffer, acquisition, self.traced_lines, self.scan_lines)
-        with self._stage("pulse", timings):
-            self.pulse.run(acquisition, self.axial_sigma_mm(probe), self.scan_lines)
+        For measurements, and after the stages were run from outside: their buffers then hold another frame.
+        """
+        self._iq_made_for = None
+
+    def _rendered(
+        self,
+        probe: Probe,
+        pose: np.ndarray,
+        display: DisplaySettings,
+        grid: ImageGrid,
+        timings: dict[str, float],
+        noise_seed: int,
+    ) -> DeviceFrame:
+        with self._timed("upload", timings):
+            frame = self.device_frame(probe, pose, display, grid, noise_seed, self._acquisition_buffer)
+        # Up to the baseband signal nothing depends on display, noise or pixels.
+        inputs = (frame.acquisition.tobytes(), self.settings, self.medium.version)
+        if self.profiling or self._iq_made_for != inputs:
+            _log.debug("frame: rays and echoes computed")
+            self._iq_made_for = None
+            self._run([*self.impulse_stages, *self.linear_stages], frame, timings)
+            self._iq, self._iq_made_for = frame.iq, inputs
+        else:
+            _log.debug("frame: the echoes of the last one used again")
+        frame.iq = self._iq
+        self._run(self.display_stages, frame, timings)
+        return frame
+
+    def _run(self, chosen: Iterable[Stage], frame: DeviceFrame, timings: dict[str, float]) -> None:
+        for stage in chosen:
+            with self._timed(stage.name, timings):
+                stage.run(frame)
+
+    @property
+    def stages(self) -> list[Stage]:
+        """All stages in their order."""
+        return [*self.impulse_stages, *self.linear_stages, *self.display_stages]
+
+    def stage(self, kind: type[StageKind]) -> StageKind:
+        """The stage of one class, such as scattering.Scatterers. Raises SimulationError if the lists lack it."""
+        found = next((stage for stage in self.stages if isinstance(stage, kind)), None)
+        return required(found, f"no stage is a {kind.__name__}, see imaging/stages.py")
 
     def trace(self, probe: Probe, probe_to_ras: np.ndarray) -> RayTree:
         """The ray tree alone, on the host: segments along the beam axes and interface hits."""
-        acquisition = self._upload_acquisition(probe, check_rigid("probe_to_ras", probe_to_ras))
-        self.tracer.run(self._acquisition_buffer, acquisition, self.medium)
+        pose = check_rigid("probe_to_ras", probe_to_ras)
+        self.tracer.run(self.device_frame(probe, pose, buffer=self._acquisition_buffer))
         return self.tracer.download()
 
     def sweep(
@@ -214,9 +239,24 @@ class UltrasoundSimulator:
         `hole_mm` is how wide a gap between images is filled (default: as wide as the sweep's widest, 10 mm at most).
         The grey levels are uint8; where no image came near, 0. The images have the noise that sweep() gives them.
         Raises SimulationError as sweep_grid and Compounder do.
+
+        >>> import numpy as np
+        >>> from SlicerUSSim.Logic import LinearProbe, TissueTable, UltrasoundSimulator, Volume
+        >>> from SlicerUSSim.Logic.probe import pose_looking_at, slide_sweep
+        >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+        >>> simulator = UltrasoundSimulator(labels, TissueTable.named(["liver"]))
+        >>> probe = LinearProbe(width_mm=20, depth_mm=30, scan_lines=64)
+        >>> pose = pose_looking_at(face_ras=(20, 20, 39), target_ras=(20, 20, 0))
+        >>> volume = simulator.volume(probe, slide_sweep(pose, length_mm=8, frames=9), spacing_mm=1.0)
+        >>> volume.spacing_mm.tolist()
+        [1.0, 1.0, 1.0]
         """
         poses = list(poses)
         grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
+        _log.info(
+            "%d images are compounded in %s voxels %s", len(poses), "x".join(map(str, grid.array.shape[::-1])),
+            "along the patient's axes" if like is None else "of the grid given",
+        )  # fmt: skip
         compounder = Compounder(grid, probe, self.device)
         display = display or DisplaySettings()
         pixels = ImageGrid.for_probe(probe, display.image_size)
@@ -252,10 +292,30 @@ class UltrasoundSimulator:
 
     # ---- the acquisition record --------------------------------------------------------------------------------------
 
-    def _upload_acquisition(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
-        acquisition = self.acquisition(probe, pose)
-        self.device.write(self._acquisition_buffer, acquisition)
-        return acquisition
+    def device_frame(
+        self,
+        probe: Probe,
+        pose: np.ndarray,
+        display: DisplaySettings | None = None,
+        grid: ImageGrid | None = None,
+        noise_seed: int = 0,
+        buffer: Buffer | None = None,
+    ) -> DeviceFrame:
+        """What the stages of one frame start from; its record goes to `buffer`, by default a new one."""
+        display = display or DisplaySettings()
+        frame = DeviceFrame(
+            probe=probe,
+            settings=self.settings,
+            acquisition=self.acquisition(probe, pose),
+            axial_sigma_mm=self.axial_sigma_mm(probe),
+            display=display,
+            grid=grid or ImageGrid.for_probe(probe, display.image_size),
+            noise_seed=noise_seed,
+            acquisition_buffer=buffer or self.device.empty(ACQUISITION.itemsize),
+            medium=self.medium,
+        )
+        self.device.write(frame.acquisition_buffer, frame.acquisition)
+        return frame
 
     def acquisition(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
         """The record (layout.ACQUISITION) of what the stages need to know of one frame."""
@@ -264,6 +324,10 @@ class UltrasoundSimulator:
         transmit, elevation = probe.transmit_waist(), probe.elevation_waist()
         axial_sigma = self.axial_sigma_mm(probe)
         acquisition = np.zeros((), ACQUISITION)
+        for owner in (probe, settings):
+            for parameter in parameters_of(type(owner)):
+                if parameter.name in (ACQUISITION.names or ()):
+                    acquisition[parameter.name] = getattr(owner, parameter.name)
         acquisition["ras_to_voxel"] = medium.ras_to_voxel.ravel()
         acquisition["dims"] = medium.dims
         acquisition["voxel_mm"] = medium.labels.spacing_mm.min()
@@ -274,10 +338,6 @@ class UltrasoundSimulator:
         acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
         acquisition["first_line"] = probe.first_line
         acquisition["line_spacing"] = probe.line_spacing
-        acquisition["scan_lines"] = probe.scan_lines
-        acquisition["depth_mm"] = probe.depth_mm
-        acquisition["frequency_mhz"] = probe.frequency_mhz
-        acquisition["reference_speed_m_s"] = settings.reference_speed_m_s
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
         acquisition["sample_mm"] = self._sample_mm(probe)
         acquisition["samples"] = -(-self._sample_count(probe) // block) * block
@@ -286,19 +346,13 @@ class UltrasoundSimulator:
         acquisition["elevation_sigma"] = elevation[0] / np.sqrt(2.0)
         acquisition["elevation_focus"], acquisition["elevation_rayleigh"] = elevation[1:]
         acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
-        acquisition["intensity_threshold"] = settings.intensity_threshold
-        acquisition["reflection_threshold"] = settings.reflection_threshold
-        acquisition["reflection_spreading"] = settings.reflection_spreading
-        acquisition["elevational_rays"] = settings.elevational_rays
         lateral, guard = _traced_lines_for(probe, settings)
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard
         acquisition["traced_lines"] = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
         acquisition["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
         acquisition["interface_is_energy"] = settings.interface_reflection == "energy"
-        acquisition["specular_exponent"] = settings.specular_exponent
         acquisition["cell_mm"] = settings.scatterers_per_mm3 ** (-1.0 / 3.0)
         acquisition["seed"] = _mixed(settings.seed)
-        acquisition["beam_cutoff"] = settings.beam_cutoff
         # The integral of the squared point spread function is pi^1.5 times the product of the three sigmas.
         acquisition["speckle_scale"] = (settings.scatterers_per_mm3 * np.pi**1.5 * axial_sigma) ** -0.5
         return acquisition
@@ -336,7 +390,7 @@ class UltrasoundSimulator:
             )
 
     @contextmanager
-    def _stage(self, name: str, timings: dict[str, float]) -> Iterator[None]:
+    def _timed(self, name: str, timings: dict[str, float]) -> Iterator[None]:
         if not self.profiling:
             yield
             return

@@ -11,5 +11,6 @@ if TYPE_CHECKING:
     from .filtering import guided_filter as guided_filter
     from .samples import demo_mri as demo_mri, head_mri as head_mri
     from .segmentation import Segmentation as Segmentation, segment_mri as segment_mri
+    from .settings import SegmentationSettings as SegmentationSettings
 
 lazy_exports(globals())

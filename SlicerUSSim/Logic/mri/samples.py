@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 from pathlib import Path
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.volume import Volume
+
+_log = logging.getLogger(__name__)
 
 
 def demo_mri() -> tuple[Volume, str]:
@@ -16,7 +19,9 @@ def demo_mri() -> tuple[Volume, str]:
     if package is not None and package.origin is not None:
         path = Path(package.origin).parent / "datasets/data/mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz"
         if path.exists():
+            _log.info("demo MRI: the MNI152 brain that nilearn carries")
             return Volume.read(path), "MNI152 2009a T1 (nilearn)"
+    _log.info("demo MRI: the synthetic phantom, since nilearn is not installed")
     return head_mri(), 'synthetic head phantom (install "SlicerUSSim[demo]" for the MNI152 brain)'
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from time import perf_counter
 from typing import cast
 
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.filtering import guided_filter
@@ -17,6 +20,8 @@ from SlicerUSSim.Logic.mri.mixture import classify, fit_mixture, mixture_posteri
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
+
+_log = logging.getLogger(__name__)
 
 #: Tissue names per contrast and number of classes, in the order of intensity.
 _CLASS_NAMES = {
@@ -112,20 +117,39 @@ def segment_mri(
 
     Raises SimulationError for an unknown contrast or number of classes, an image that is constant or not finite, and a
     mask that is empty or on another grid.
+
+    >>> from SlicerUSSim.Logic import segment_mri
+    >>> from SlicerUSSim.Logic.mri import head_mri
+    >>> segmentation = segment_mri(head_mri(spacing_mm=3.0), contrast="t1")
+    >>> segmentation.tissue_names  # of labels 1, 2, 3
+    ('csf', 'grey matter', 'white matter')
+    >>> segmentation.labels.array.dtype
+    dtype('uint8')
     """
     report = progress or (lambda share: None)
+    names = _class_names(contrast, classes)
     settings = SegmentationSettings(contrast, classes, thin_sulci, bias_correction, filter_radius, filter_epsilon)
-    names = _class_names(settings.contrast, settings.classes)
+    timed = _StepTimes()
     intensity = _finite(mri)
     foreground = _foreground(intensity) if mask is None else _given_mask(mask, mri)
+    timed("foreground")
+    how = "found by Otsu's threshold" if mask is None else "as given"
+    _log.info("foreground %s: %.0f %% of the MRI's voxels", how, 100 * foreground.mean())
     report(0.2)
     if bias_correction:
         intensity = _without_bias(mri.with_array(intensity), foreground, lambda share: report(0.2 + 0.4 * share))
+        timed("bias correction")
         report(0.6)
 
     noise = estimate_noise(intensity, foreground)
     epsilon = (_EPSILON_PER_NOISE * noise) ** 2 if settings.filter_epsilon is None else settings.filter_epsilon
+    timed("noise")
     filtered = guided_filter(intensity, foreground, settings.filter_radius, epsilon, device)
+    timed("guided filter")
+    _log.info(
+        "noise %.3g in the unit of the MRI; guided filter: radius %d, epsilon %.3g",
+        noise, settings.filter_radius, epsilon,
+    )  # fmt: skip
     report(0.8)
 
     values = filtered[foreground]
@@ -136,6 +160,11 @@ def segment_mri(
     means, deviations, weights, likelihoods = fit_mixture(values, classes)
     labels = np.zeros(intensity.shape, np.uint8)
     labels[foreground] = classify(values, means, deviations, weights)
+    timed("mixture")
+    _log.info(
+        "%s taken for classes of %s after %d iterations: %s", ", ".join(names), contrast, len(likelihoods),
+        "; ".join(f"mean {m:.4g} sd {d:.3g} share {w:.0%}" for m, d, w in zip(means, deviations, weights, strict=True)),
+    )  # fmt: skip
     if thin_sulci:
         csf, grey = names.index("csf"), names.index("grey matter")
         middles = _sulcal_middles(filtered, labels, grey + 1, means[csf], means[grey], noise)
@@ -144,6 +173,9 @@ def segment_mri(
         middles |= is_csf & ~cast(np.ndarray, ndimage.binary_opening(is_csf, np.ones((2, 2, 2))))
         labels[middles] = classes + 1
         names = (*names, "leptomeninges")
+        timed("thin sulci")
+        _log.info("thin sulci: %d voxels become leptomeninges", int(middles.sum()))
+    _log.debug("segmentation: %s", timed)
     report(1.0)
     return Segmentation(
         labels=mri.with_array(labels),
@@ -156,6 +188,22 @@ def segment_mri(
         filter_epsilon=epsilon,
         _filtered=filtered,
     )
+
+
+class _StepTimes:
+    """Milliseconds of steps, for the log."""
+
+    def __init__(self) -> None:
+        self._last, self._steps = perf_counter(), []
+
+    def __call__(self, step: str) -> None:
+        """A step has ended."""
+        now = perf_counter()
+        self._steps.append(f"{step} {(now - self._last) * 1e3:.0f} ms")
+        self._last = now
+
+    def __str__(self) -> str:
+        return ", ".join(self._steps)
 
 
 def estimate_noise(image: np.ndarray, mask: np.ndarray) -> float:
@@ -204,9 +252,12 @@ def _sulcal_middles(
 
 
 def _class_names(contrast: str, classes: int) -> tuple[str, ...]:
+    """The names of the classes. Raises SimulationError that says how many go with the contrast."""
+    contrast = parameter_of(SegmentationSettings, "contrast").checked("segmentation", contrast)
     known = _CLASS_NAMES[contrast]
     require(
-        classes in known, f"classes is {classes!r}, expected {' or '.join(map(str, known))} for contrast {contrast}"
+        classes in tuple(known),
+        f"classes is {classes!r}, expected {' or '.join(map(str, known))} for contrast {contrast}",
     )
     return known[classes]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from math import isfinite
 from time import perf_counter
@@ -30,6 +31,8 @@ from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, number_in
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+
+_log = logging.getLogger(__name__)
 
 #: Images that a fit leaves to be compared, by what they show.
 COMPARED = ("real", "before", "after", "difference")
@@ -63,6 +66,7 @@ def tracked_images(
                 raise SimulationError(
                     f"{named(images_node)} is a 3D volume; choose a probe transform, which says where to cut it"
                 )
+            _log.info("%s is a 3D volume, cut where the probe is", named(images_node))
             placed = Volume(volume.array, node_to_world(images_node) @ volume.ijk_to_ras)
             sequence = TrackedSequence.from_volume(placed, probe, [probe_to_world])
             return TrackedImages.of(sequence, numbers, probe=probe)
@@ -83,6 +87,8 @@ def _sequence(sequence_node) -> TrackedSequence:
         None,
     )
     shown = None if browser is None else browser.GetProxyNode(sequence_node)
+    if shown is None:
+        _log.info("%s: no browser shows it, so its images are where their own geometry says", named(sequence_node))
     parent = None if shown is None else shown.GetParentTransformNode()
     slices, times = [], []
     for number in range(count):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 
@@ -26,6 +27,8 @@ from SlicerUSSim.Logic.mrml.nodes import (
 from SlicerUSSim.Logic.tissue.names import same_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
 from SlicerUSSim.Logic.tissue.table import TissueTable
+
+_log = logging.getLogger(__name__)
 
 #: Nodes that can hold labels.
 LABEL_CLASSES = ("vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode")
@@ -77,6 +80,7 @@ class PatientReader:
         version = (node_version, tuple((label, tissue.name) for label, tissue in tissues.items()))
         if self._read is None or self._read[0] != version:
             self._read = (version, read_labels(labels_node, tissues))
+            _log.debug("%s: labels read from the node", named(labels_node))
         labelled = self._read[1]
         world_to_patient, scaling = pose_in_labels(labels_node, np.eye(4))
         labels = Volume(labelled.volume.array, scaling @ labelled.volume.ijk_to_ras)
@@ -145,6 +149,9 @@ def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
         f"{named(labels_node)}: no tissue is called {', '.join(map(repr, unknown))}; rename to one of: "
         f"{', '.join([*tissues.names()[1:], *(name for name in TISSUES if name not in tissues.names())])}",
     )
+    taken = [f"{label} {names[label]!r} for {tissue}" for label, tissue in known.items() if names[label] != tissue]
+    if taken:
+        _log.info("%s: labels are taken by their names: %s", named(labels_node), ", ".join(taken))
     order = tuple(dict.fromkeys(known.values()))
     table = np.zeros(max(names, default=0) + 1, np.uint8)
     for label, tissue in known.items():
@@ -210,6 +217,8 @@ def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int
     colours, names = _colour_node(labels_node), {}
     # Slicer gives every label map this table, in which 2 is bone and 3 is skin, whatever they are.
     is_default = colours is not None and colours.GetName() == "GenericAnatomyColors"
+    if is_default:
+        _log.info("%s: has Slicer's default colours, so labels are tissues by their number", named(labels_node))
     for label in map(int, np.flatnonzero(np.bincount(values.ravel()))):
         if label == 0:
             continue
@@ -217,6 +226,11 @@ def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int
         if name in (None, "", "(none)"):
             name = f"label {label}"
         if label in tissues and (is_default or _tissue_name(name, tissues) is None):
+            if not is_default:
+                _log.info(
+                    "%s: label %d, %r, is taken by its number for %s", named(labels_node), label, name,
+                    tissues[label].name,
+                )  # fmt: skip
             name = tissues[label].name
         names[label] = name
     require(bool(names), f"label map {named(labels_node)} is empty, expected voxels that are not 0")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import weakref
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,6 +11,8 @@ import slicer
 from vtkmodules.vtkCommonCore import VTK_OBJECT, vtkCommand
 
 from SlicerUSSim.Logic.base.errors import user_message
+
+_log = logging.getLogger(__name__)
 
 #: Event of an output volume: another live update now writes to it.
 _CLAIMED = vtkCommand.UserEvent + 7301
@@ -43,6 +46,7 @@ class LiveUpdate:
         labels_node, transform_node, output_node = nodes.labels, nodes.probe_transform, nodes.output
         self._schedule, self._report, self._stopped = schedule, report, stopped
         self._pending = self._busy = False
+        self._logged = ""
         self._outlined = logic.preset.probe
         self._observed: list[tuple[Any, int]] = []
         self.running = True
@@ -142,6 +146,9 @@ class LiveUpdate:
                 raise
         finally:
             self._busy = False
+        if message and message != self._logged:
+            _log.warning("live update: %s", message)
+        self._logged = message
         if self._report is not None:
             self._report(message)
         if self._pending and self._schedule is not None and self.running:

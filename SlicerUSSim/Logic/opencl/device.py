@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import warnings
 from collections import deque
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -17,7 +19,9 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS, shared_source
 from SlicerUSSim.Logic.opencl.runtimes import load_pyopencl
 
 if TYPE_CHECKING:
-    from pyopencl import Buffer, Event, Kernel
+    from pyopencl import Buffer, Event, Kernel, Program
+
+_log = logging.getLogger(__name__)
 
 #: Choice of a device; see devices.choose_device
 DeviceChoice: TypeAlias = "str | DeviceInfo | Device | None"
@@ -60,7 +64,11 @@ class Device:
         """The Device for a choice (see choose_device); the same object for the same hardware."""
         if isinstance(device, Device):
             return device
-        return _open_device(choose_device(device)[0])
+        info, reason = choose_device(device)
+        if info not in _opened:
+            _log.info("OpenCL device: %s; %s", info, reason)
+            _opened[info] = Device(info)
+        return _opened[info]
 
     def kernels(self, file_name: str, lanes: int = 1, *defines: str) -> dict[str, Kernel]:
         """The kernels of kernels/`file_name`, built once; each work-item computes a vector of `lanes` values.
@@ -68,7 +76,10 @@ class Device:
         `defines` are preprocessor names that select a variant. Raises SimulationError if the build fails.
         """
         key = (file_name, lanes, *defines)
-        if key not in self._kernels:
+        if key in self._kernels:
+            _log.debug("%s (%s): built before in this process", file_name, ", ".join(map(str, key[1:])))
+        else:
+            started = perf_counter()
             source = shared_source() + "\n" + _with_includes(kernel_folder(), file_name)
             options = ["-cl-std=CL1.2", "-cl-no-signed-zeros", f"-DLANES={lanes}"]
             if self.info.handle.single_fp_config & self.cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
@@ -86,6 +97,11 @@ class Device:
                     f"OpenCL device {self.info} cannot build {file_name} ({lines[0]}); try another device "
                     "(`ussim devices` lists them)"
                 ) from error
+            _log.debug(
+                "%s: %s in %.0f ms with %s", file_name,
+                "taken from pyopencl's cache" if _was_cached(program) else "built",
+                (perf_counter() - started) * 1e3, " ".join(options),
+            )  # fmt: skip
             self._kernels[key] = {kernel.function_name: kernel for kernel in program.all_kernels()}
         return self._kernels[key]
 
@@ -162,9 +178,15 @@ class Device:
             )
 
 
-@cache
-def _open_device(info: DeviceInfo) -> Device:
-    return Device(info)
+#: One per device and process
+_opened: dict[DeviceInfo, Device] = {}
+
+
+def _was_cached(program: Program) -> bool:
+    """Whether pyopencl had the binary on disk. PoCL has a cache of its own, which only the time shows."""
+    # pyopencl's own, for its messages: (what, whether it was cached, seconds)
+    info = getattr(program, "_build_duration_info", None)
+    return bool(info and info[1])
 
 
 def _vector_lanes(info: DeviceInfo) -> int:

@@ -7,6 +7,7 @@ device or platform name).
 
 from __future__ import annotations
 
+import logging
 import os
 import platform
 import sys
@@ -18,6 +19,8 @@ from SlicerUSSim.Logic.opencl.runtimes import INTEL_RUNTIME, load_pyopencl
 
 if TYPE_CHECKING:
     import pyopencl
+
+_log = logging.getLogger(__name__)
 
 _EMULATOR_RANK = 9
 #: Packages of Intel's runtime for processors, by sys.platform; there are wheels for x86-64 only.
@@ -110,6 +113,7 @@ def choose_device(device: str | DeviceInfo | None = None) -> tuple[DeviceInfo, s
     if isinstance(device, DeviceInfo):
         return device, "chosen by argument"
     devices = list_devices()
+    _log.debug("OpenCL devices: %s", "; ".join(map(str, devices)) or "none")
     if not devices:
         raise SimulationError(f"no OpenCL device found; {_how_to_get_one()}")
     for choice, source in (

@@ -34,6 +34,7 @@ CONSTANTS = {
 
 _FLOAT, _INT, _UINT = np.float32, np.int32, np.uint32
 
+#: Fields called as a parameter of Probe or SimulationSettings have its value, unless the simulator says otherwise.
 ACQUISITION = np.dtype(
     [
         # medium
@@ -84,14 +85,15 @@ ACQUISITION = np.dtype(
     ]
 )
 
+#: All but the group are attributes of a Tissue, by which the medium fills them.
 TISSUE = np.dtype(
     [
-        ("speed_m_s", _FLOAT),
-        ("impedance", _FLOAT),
-        ("attenuation", _FLOAT),
+        ("speed_of_sound_m_s", _FLOAT),
+        ("impedance_mrayl", _FLOAT),
+        ("attenuation_db_cm_mhz", _FLOAT),
         ("mu0", _FLOAT),
         ("sigma0", _FLOAT),
-        ("share", _FLOAT),  # p = 1 - Phi(mu1)
+        ("scatterer_share", _FLOAT),  # p = 1 - Phi(mu1)
         ("group", _INT),  # tissues of one speed and impedance: no interface between them
     ]
 )

@@ -9,6 +9,7 @@ processor that LLVM 14 knows and whose instructions this processor has.
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
 import re
 import shutil
@@ -17,6 +18,8 @@ import sys
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import require
+
+_log = logging.getLogger(__name__)
 
 # The oldest Intel processor of each of PoCL's x86 kernel libraries, and the /proc/cpuinfo flags it needs.
 # PoCL selects its library by these flags, and the name must match the library.
@@ -27,6 +30,7 @@ _KNOWN_PROCESSORS = (
     ("nehalem", {"sse4_1", "sse4_2"}),
 )
 _DEVICE_STRUCT_BYTES = 4096
+_NOT_NAMED = "PoCL's compiler does not know this processor, and it cannot be named to it: %s; kernels may not build"
 
 
 def name_unknown_processor(handle) -> str | None:
@@ -40,19 +44,23 @@ def name_unknown_processor(handle) -> str | None:
     flags = _processor_flags()
     name = next((name for name, needed in _KNOWN_PROCESSORS if needed <= flags), None)
     if name is None:
+        _log.warning("PoCL's compiler does not know this processor, and no older one is like it: kernels may not build")
         return None
     try:
         # Reading a wrong pointer through /proc/self/mem is an error; dereferencing it would end the process.
         memory = os.open("/proc/self/mem", os.O_RDONLY)
-    except OSError:
+    except OSError as error:
+        _log.warning(_NOT_NAMED, f"its memory cannot be read ({error.strerror})")
         return None
     try:
         address = _find_string(memory, handle.int_ptr, b"generic\0")
     finally:
         os.close(memory)
     if address is None or _usable_bytes(address) <= len(name):
+        _log.warning(_NOT_NAMED, "the name is not where PoCL 3.0 has it")
         return None
     ctypes.memmove(address, name.encode() + b"\0", len(name) + 1)
+    _log.info("PoCL's compiler does not know this processor; kernels are built for %s", name)
     return name
 
 

@@ -7,6 +7,7 @@ is imported: by a folder of .icd files on Linux, by OCL_ICD_FILENAMES on Windows
 from __future__ import annotations
 
 import importlib.metadata
+import logging
 import os
 import re
 import sys
@@ -15,6 +16,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError
+
+_log = logging.getLogger(__name__)
 
 #: The distribution of Intel's runtime for processors
 INTEL_RUNTIME = "intel-opencl-rt"
@@ -53,6 +56,7 @@ def _add_to_icd_filenames() -> None:
     named = [path for path in os.environ.get("OCL_ICD_FILENAMES", "").split(";") if path]
     if str(library) not in named:
         os.environ["OCL_ICD_FILENAMES"] = ";".join([*named, str(library)])
+        _log.debug("OpenCL runtime installed by pip: %s", library)
 
 
 def _point_at_vendors_folder() -> None:
@@ -86,8 +90,12 @@ def _point_at_vendors_folder() -> None:
                 partial = folder / f"{name}.{os.getpid()}"
                 partial.write_text(library)
                 partial.replace(folder / name)
-    except OSError:
-        return  # a read-only home directory: the loader's default folders still work
+    except OSError as error:  # a read-only home directory: the loader's default folders still work
+        _log.warning(
+            "Intel's OpenCL runtime is installed but not used: %s cannot be written (%s)", folder, error.strerror
+        )
+        return
+    _log.debug("OpenCL runtimes: %s", ", ".join(libraries.values()))
     os.environ["OCL_ICD_VENDORS"] = str(folder)
 
 

@@ -11,7 +11,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, built, parameter, parameters_of
+from SlicerUSSim.Logic.base.declaration import (
+    Declared,
+    Parameter,
+    Shown,
+    built,
+    kind_of,
+    parameter,
+    parameters_of,
+    short,
+)
 from SlicerUSSim.Logic.base.errors import require
 
 NOMINAL_SPEED_M_S = 1540.0
@@ -33,6 +42,13 @@ class Probe(Declared):
     aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both ways at one
     depth.
     Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
+
+    >>> from dataclasses import replace
+    >>> from SlicerUSSim.Logic.probe import PROBES
+    >>> sorted(PROBES)
+    ['abdominal', 'convex', 'linear', 'microconvex', 'phased']
+    >>> replace(PROBES["convex"], frequency_mhz=3.5).depth_mm
+    100.0
     """
 
     scan_lines: int = parameter(
@@ -46,9 +62,9 @@ class Probe(Declared):
         0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
     )
     focus_mm: float = parameter(
-        _BY_DEPTH, "Focus", "Depth of the transmit focus; 0: at 60 % of the depth", unit="mm", bounds=(0.1, 1000),
-        shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
-        note="Left out, in JSON also null: at 60 % of the depth",
+        _BY_DEPTH, "Focus", "Depth of the transmit focus; none, or 0 in a panel: at 60 % of the depth", unit="mm",
+        bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
+        note="It then moves with the depth",
     )  # fmt: skip
     aperture_mm: float = parameter(
         12.0, "Aperture", "Lateral size of the fully open aperture", unit="mm", bounds=(0.5, 200)
@@ -61,8 +77,8 @@ class Probe(Declared):
         7.0, "Elevational aperture", "Height of the elements", unit="mm", bounds=(0.5, 100)
     )
     elevation_focus_mm: float = parameter(
-        _BY_DEPTH, "Elevational focus", "Focus of the lens", unit="mm", bounds=(0.1, 1000), can_be_none=True,
-        note="Left out, in JSON also null: at 60 % of the depth",
+        _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: at 60 % of the depth", unit="mm",
+        bounds=(0.1, 1000), can_be_none=True, note="It then moves with the depth",
     )  # fmt: skip
 
     #: What the kind is called in a preset, and what it is
@@ -264,7 +280,15 @@ class LinearProbe(Probe):
 
 @dataclass(frozen=True)
 class ConvexProbe(Probe):
-    """A curved array of radius `radius_mm`; scan lines leave it at right angles over `field_of_view_deg`."""
+    """A curved array of radius `radius_mm`; scan lines leave it at right angles over `field_of_view_deg`.
+
+    >>> from SlicerUSSim.Logic import ConvexProbe
+    >>> probe = ConvexProbe(radius_mm=40, field_of_view_deg=60, depth_mm=100)
+    >>> probe.focus_mm
+    60.0
+    >>> probe.origins_mm().shape  # (scan_lines, 3)
+    (192, 3)
+    """
 
     kind = "convex"
     geometry = "curved array"
@@ -309,16 +333,22 @@ def probe_from_dict(values: dict, source: str = "probe") -> Probe:
     """The probe described by plain values (see Probe.to_dict).
 
     Raises SimulationError that names `source`, for an unknown kind or name, a missing value and one that is refused.
+
+    >>> from SlicerUSSim.Logic.probe import probe_from_dict
+    >>> probe = probe_from_dict({"kind": "linear", "width_mm": 38, "depth_mm": 40, "frequency_mhz": 9})
+    >>> round(probe.wavelength_mm, 3)
+    0.171
     """
-    require(isinstance(values, dict), f'{source}: expected an object with a "kind", got {values!r:.80}')
-    kind: Any = values.get("kind")
+    require(isinstance(values, dict), f'{source}: is {kind_of(values)}, expected an object with a "kind"')
+    require("kind" in values, f"{source}: lacks kind, expected {PROBE_KIND.expected}")
+    kind: Any = values["kind"]
     PROBE_KIND.checked(source, kind)
     arguments = {name: value for name, value in values.items() if name != "kind"}
     known = sorted(entry.name for entry in parameters_of(PROBE_KINDS[kind]))
     for name in arguments:
         require(
             name in known,
-            f"{source}: {name} is not a parameter of a {kind} probe, expected one of {', '.join(known)}",
+            f"{source}: {short(name)[1:-1]} is not a parameter of a {kind} probe, expected one of {', '.join(known)}",
         )
     return built(PROBE_KINDS[kind], arguments, source)
 

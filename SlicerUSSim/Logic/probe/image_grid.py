@@ -13,7 +13,15 @@ _DEFAULT_ROWS = 512
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """The pixels of the scan-converted image in the probe frame (millimetres)."""
+    """The pixels of the scan-converted image in the probe frame (millimetres).
+
+    >>> from SlicerUSSim.Logic.probe import PROBES, ImageGrid
+    >>> grid = ImageGrid.for_probe(PROBES["linear"], (400, 380))  # rows, columns
+    >>> [round(mm, 3) for mm in grid.pixel_spacing_mm]
+    [0.1, 0.1]
+    >>> (grid.image_to_probe @ [0, 0, 0, 1])[:3].round(2).tolist()  # the centre of the first pixel
+    [-18.95, 0.05, 0.0]
+    """
 
     rows: int
     columns: int

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
@@ -11,12 +13,19 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
+_log = logging.getLogger(__name__)
+
 
 def pose_looking_at(face_ras, target_ras, lateral_ras=(1.0, 0.0, 0.0)) -> np.ndarray:
     """(4, 4) probe_to_ras of a probe whose face centre is at `face_ras` and whose axis points to `target_ras` (mm).
 
     `lateral_ras` is the preferred direction of the image's left-to-right axis; its component along the probe axis is
     ignored. Raises SimulationError if the points coincide or `lateral_ras` is parallel to the axis.
+
+    >>> from SlicerUSSim.Logic.probe import pose_looking_at
+    >>> pose = pose_looking_at(face_ras=(0, 0, 70), target_ras=(0, 0, 0))
+    >>> float(pose[2, 1])  # the axis of the probe, straight down
+    -1.0
     """
     face, target, lateral = (np.asarray(v, dtype=float) for v in (face_ras, target_ras, lateral_ras))
     depth = target - face
@@ -51,6 +60,12 @@ def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standof
     """(4, 4) probe_to_ras of a coronal view through a parasagittal craniotomy, aimed below the centre of the brain.
 
     `brain` is a mask or label map (non-zero inside). The view crosses cortex, a lateral ventricle and the midline.
+
+    >>> from SlicerUSSim.Logic.mri import head_mri
+    >>> from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose
+    >>> pose = craniotomy_pose(head_mri(spacing_mm=4.0), PROBES["phased"])
+    >>> bool(pose[2, 3] > 50)  # the face is above the centre of the brain, mm
+    True
     """
     inside = brain.array > 0
     require(inside.any(), "the brain mask is empty, expected voxels inside")
@@ -60,7 +75,12 @@ def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standof
     outward = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
     target = centre + [0.0, 0.0, 2.0]
     face = surface_point(brain, target, outward) + standoff_mm * outward
+    _log.info("probe placed by itself: coronal view from RAS %s, %.0f degrees from the midline", _point(face), tilt_deg)
     return pose_looking_at(face, target, lateral_ras=(1.0, 0.0, 0.0))
+
+
+def _point(ras: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.1f}" for value in ras) + ") mm"
 
 
 def pose_in_slice(foreground: Volume, slice_to_ras: np.ndarray, target_ras=None) -> np.ndarray:
@@ -85,6 +105,11 @@ def turned(probe_to_ras: np.ndarray, *, rock_deg=0.0, tilt_deg=0.0, rotate_deg=0
 
     Rocking is in the image plane (about z), tilting out of it (about the lateral axis x), rotating about the probe axis
     (y); signs as rotations about these axes. The terms are those of the AIUM.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic.probe import turned
+    >>> round(float(turned(np.eye(4), tilt_deg=90)[2, 1]), 3)  # the axis points along +z
+    1.0
     """
     motion = np.eye(4)
     motion[:3, :3] = Rotation.from_euler("ZXY", [rock_deg, tilt_deg, rotate_deg], degrees=True).as_matrix()
@@ -142,7 +167,14 @@ def slide_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int) -> list
 
 def tilt_sweep(probe_to_ras: np.ndarray, angle_deg: float, frames: int) -> list[np.ndarray]:
     """Poses (4, 4) of a probe that tilts about the lateral axis of its face, `angle_deg` in total, as in the scan of a
-    matrix array or a mechanically swept array."""
+    matrix array or a mechanically swept array.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic.probe import tilt_sweep
+    >>> poses = tilt_sweep(np.eye(4), angle_deg=60, frames=7)
+    >>> [round(float(np.rad2deg(np.arcsin(pose[2, 1])))) for pose in poses]
+    [-30, -20, -10, 0, 10, 20, 30]
+    """
     return [probe_to_ras @ elevational_motion(angle_deg=share * angle_deg) for share in _shares(frames)]
 
 

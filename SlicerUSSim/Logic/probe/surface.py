@@ -60,6 +60,14 @@ class PatientSurface:
     labels : non-zero voxels are the patient. All points here are in the world frame of `labels.ijk_to_ras`.
 
     Raises SimulationError for labels that are all zero.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import Volume
+    >>> from SlicerUSSim.Logic.probe import PatientSurface
+    >>> surface = PatientSurface(Volume(np.ones((60, 60, 60), np.uint8), np.eye(4)))
+    >>> vertex = surface.at(right_deg=0, front_deg=0)
+    >>> round(float(surface.normal(vertex)[2]), 1)  # outward is straight up
+    1.0
     """
 
     def __init__(self, labels: Volume) -> None:

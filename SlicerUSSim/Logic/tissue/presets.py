@@ -27,6 +27,7 @@ _DENSITY = f"density ({_ITIS}) x speed of sound"
 # Grey and white matter share Szabo's speed of sound for brain and one impedance: published differences between them are
 # smaller than those between publications, and would refract rays at a border that is not a sharp interface.
 # fmt: off
+#: Tissues by name, each number with its source: TISSUES["white matter"].
 TISSUES: dict[str, Tissue] = {
     tissue.name: tissue
     for tissue in (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, replace
@@ -9,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.declaration import built, parameters_of
+from SlicerUSSim.Logic.base.declaration import built, kind_of, parameters_of, short
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
+
+_log = logging.getLogger(__name__)
 
 MAX_LABEL = 62  # six bits in the device's label volume, and 63 is the membrane
 
@@ -24,13 +27,20 @@ class TissueTable(Mapping[int, Tissue]):
 
     Label 0 is the coupling medium around the patient and is added when it is not given.
     Raises SimulationError for labels outside 0..62.
+
+    >>> from SlicerUSSim.Logic import TissueTable
+    >>> tissues = TissueTable.brain(["csf", "grey matter", "white matter"])
+    >>> tissues.names()
+    ['coupling', 'csf', 'grey matter', 'white matter']
+    >>> tissues.replace("white matter", attenuation_db_cm_mhz=0.45)[3].attenuation_db_cm_mhz
+    0.45
     """
 
     def __init__(self, tissues: Mapping[int, Tissue], membrane: Membrane | None = None) -> None:
         table = {}
         for label, tissue in tissues.items():
             require(
-                isinstance(label, int | np.integer) and 0 <= label <= MAX_LABEL,
+                isinstance(label, int | np.integer) and not isinstance(label, bool) and 0 <= label <= MAX_LABEL,
                 f"tissue label is {label!r}, expected a whole number from 0 to {MAX_LABEL}",
             )
             require(isinstance(tissue, Tissue), f"label {label}: {tissue!r} is not a Tissue")
@@ -65,7 +75,8 @@ class TissueTable(Mapping[int, Tissue]):
     @classmethod
     def named(cls, tissue_names: Iterable[str], membrane: Membrane | None = None) -> TissueTable:
         """Presets for labels 1, 2, ... by name, for the body as for the brain. SimulationError for a new one."""
-        return cls({label: tissue_named(name) for label, name in enumerate(tissue_names, 1)}, membrane)
+        table = {label: _preset(label, name) for label, name in enumerate(tissue_names, 1)}
+        return cls(table, membrane)
 
     def label_of(self, name: str) -> int:
         """The label of a tissue by name. Raises SimulationError if the table has none of that name."""
@@ -136,7 +147,7 @@ class TissueTable(Mapping[int, Tissue]):
         table, unknown = {0: self[0]}, []
         for label, name in enumerate(names, 1):
             try:
-                table[label] = exactly.get(name) or mine.get(plain_name(name)) or tissue_named(name)
+                table[label] = exactly.get(name) or mine.get(plain_name(name)) or _preset(label, name)
             except SimulationError:
                 unknown.append(name)
         require(
@@ -165,20 +176,21 @@ class TissueTable(Mapping[int, Tissue]):
     @classmethod
     def from_dict(cls, values: dict, source: str = "tissues") -> TissueTable:
         """The table described by to_dict. Raises SimulationError naming `source` and what is wrong in it."""
-        require(
-            isinstance(values, dict) and isinstance(values.get("tissues"), dict),
-            f'{source}: expected {{"tissues": {{"1": {{...}}}}}}',
-        )
+        expected = 'expected {"tissues": {"1": {...}}}'
+        require(isinstance(values, dict), f"{source}: is {kind_of(values)}, {expected}")
+        require("tissues" in values, f"{source}: lacks tissues, {expected}")
+        tissues = values["tissues"]
+        require(isinstance(tissues, dict), f"{source}: tissues is {kind_of(tissues)}, {expected}")
         table = {
             _label(label, source): built(Tissue, tissue, f"{source}: tissue {label}")
-            for label, tissue in values["tissues"].items()
+            for label, tissue in tissues.items()
         }
         membrane = values.get("membrane")
         if membrane is not None:
             within = f"{source}: membrane"
-            require(isinstance(membrane, dict), f"{within}: is {membrane!r:.80}, expected an object")
-            tissue = built(Tissue, membrane.get("tissue"), f"{within}: tissue")
-            membrane = built(Membrane, {**membrane, "tissue": tissue}, within)
+            if isinstance(membrane, dict) and "tissue" in membrane:
+                membrane = {**membrane, "tissue": built(Tissue, membrane["tissue"], f"{within}: tissue")}
+            membrane = built(Membrane, membrane, within)
         return cls(table, membrane)
 
     @classmethod
@@ -194,8 +206,15 @@ class TissueTable(Mapping[int, Tissue]):
 def _label(text: str, source: str) -> int:
     """The label that a JSON file names. Raises SimulationError for a text that is not just its digits."""
     known = {str(label): label for label in range(MAX_LABEL + 1)}
-    require(text in known, f"{source}: tissue label is {text!r}, expected a whole number from 0 to {MAX_LABEL}")
+    require(text in known, f"{source}: tissue label is {short(text)}, expected a whole number from 0 to {MAX_LABEL}")
     return known[text]
+
+
+def _preset(label: int, name: str) -> Tissue:
+    tissue = tissue_named(name)
+    if tissue.name != name:
+        _log.info("label %d, %r, is taken for %s", label, name, tissue.name)
+    return tissue
 
 
 def _plain(tissue: Tissue) -> dict:

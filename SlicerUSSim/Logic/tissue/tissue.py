@@ -11,15 +11,28 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import NormalDist
 
-from SlicerUSSim.Logic.base.declaration import Declared, Fit, parameter, parameters_of
+from SlicerUSSim.Logic.base.declaration import Declared, Fit, parameter, parameters_of, short
 from SlicerUSSim.Logic.base.errors import require
 
 _ECHOGENICITY = "Bounds of a fit: echogenicity over some 40 dB"
 
 
+def _is_line(name: object) -> bool:
+    """Whether a name is one that messages and files can show: one line, not empty, without half characters."""
+    if not isinstance(name, str) or not name.strip():
+        return False
+    return name.splitlines() == [name] and name == name.encode(errors="ignore").decode()
+
+
 @dataclass(frozen=True)
 class Tissue(Declared):
-    """One tissue. Raises SimulationError, naming the tissue and the value, for anything out of physical range."""
+    """One tissue. Raises SimulationError, naming the tissue and the value, for anything out of physical range.
+
+    >>> from SlicerUSSim.Logic import Tissue
+    >>> tumour = Tissue("tumour", 1550.0, 1.62, 0.6, mu0=0.4, sigma0=0.2)
+    >>> round(tumour.scatterer_variance, 3)
+    0.06
+    """
 
     name: str = parameter(label="Tissue", tip="Name of the tissue")
     speed_of_sound_m_s: float = parameter(
@@ -49,7 +62,7 @@ class Tissue(Declared):
     )
 
     def __post_init__(self) -> None:
-        require(isinstance(self.name, str) and bool(self.name.strip()), f"tissue name is {self.name!r}, expected text")
+        require(_is_line(self.name), f"tissue name is {short(self.name)}, expected text in one line")
         super().__post_init__()
 
     def _owner(self) -> str:

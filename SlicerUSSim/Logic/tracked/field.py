@@ -6,6 +6,7 @@ pixels that are bright in any image. Its two straight sides show whether scan li
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass, replace
 from typing import cast
@@ -16,6 +17,8 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.probe.arrays import Probe, probe_from_dict
+
+_log = logging.getLogger(__name__)
 
 #: Largest grey level of the black background around the field.
 _DARK = 4
@@ -111,6 +114,10 @@ def estimate_field(
         f"the bright region of the images is not a probe's field (best overlap {overlap:.0%}); give the probe and its "
         "position",
     )
+    sizes = ", ".join(f"{name} {value:.1f}" for name, value in geometry.items())
+    _log.info("field found in the images: %s probe (%s), covers what is bright to %.0f %%", kind, sizes, 100 * overlap)
+    if pixel_spacing_mm is None:
+        _log.info("pixels are %.3g mm large, from the size that was given", scale[0])
     return replace(field, overlap=overlap)
 
 
@@ -172,7 +179,9 @@ def _sides(bright: np.ndarray, scale: np.ndarray) -> tuple[tuple[float, float], 
         slope, start = (
             np.polyfit(points[near, 1], points[near, 0], 1) if near.sum() > 10 else (slope, p[0] - slope * p[1])
         )
-        found.append((float(start), float(slope)))
+        # The centres of border pixels lie half a pixel inside on average, along rows or, for flat sides, columns.
+        outward = 0.5 * max(scale[0], abs(slope) * scale[1]) * (1.0 if is_right else -1.0)
+        found.append((float(start) + outward, float(slope)))
     return found[0], found[1]
 
 
@@ -198,13 +207,21 @@ def _sector(points: np.ndarray, left, right, scale) -> tuple[str, dict[str, floa
     apex = np.array([left[0] + left[1] * depth, depth])
     half = 0.5 * (np.arctan(right[1]) - np.arctan(left[1]))
     away = points - apex
-    radius = np.hypot(*away.T)
-    angle = np.abs(np.arctan2(away[:, 0], away[:, 1]))
-    outer = float(np.percentile(radius[angle < half], 99.9) + 0.5 * scale[1])
-    # The probe face is a circle about the apex, on which the first bright pixel of each direction lies.
-    bins = np.clip((angle / half * 20).astype(int), 0, 19)
-    first = np.array([radius[bins == n].min() for n in range(15) if (bins == n).any()])
-    inner = max(float(np.median(first) - 0.5 * scale[1]), 0.0)
+    radius, angle = np.hypot(*away.T), np.arctan2(away[:, 0], away[:, 1])
+    in_sides = np.abs(angle) < half
+    require(bool(in_sides.any()), "the bright part of the images is no probe's field, it lies beside its own sides")
+    radius, angle = radius[in_sides], angle[in_sides]
+    # The probe face is a circle about the apex. The first bright pixel of each direction, one pixel wide, lies on it;
+    # the pixel's centre is on average half a pixel deeper.
+    directions = max(int(2.0 * half * radius.min() / scale[0]), 20)
+    bins = np.minimum((0.5 * (angle / half + 1.0) * directions).astype(int), directions - 1)
+    first = np.full(directions, np.inf)
+    np.minimum.at(first, bins, radius)
+    middle = first[directions // 8 : directions - directions // 8]
+    inner = max(float(np.median(middle[np.isfinite(middle)]) - 0.5 * scale[1]), 0.0)
+    # Pixels are uniform over the area and therefore uniform in squared radius, so a percentile gives the outer radius.
+    share = 0.999
+    outer = float(np.sqrt(inner**2 + (np.percentile(radius**2, 100.0 * share) - inner**2) / share))
     opening = {"field_of_view_deg": float(2.0 * np.rad2deg(half))}
     if inner < _POINT_SHARE * outer:
         return "phased", {**opening, "depth_mm": outer}, apex

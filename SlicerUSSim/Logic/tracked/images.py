@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -13,6 +14,8 @@ from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tracked.field import ImagedField, estimate_field
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+
+_log = logging.getLogger(__name__)
 
 #: Largest cosine between the axes of an image that still counts as perpendicular.
 _SKEW = 1e-3
@@ -67,11 +70,18 @@ class TrackedImages:
             f"the sequence has {sequence.image_type} data, expected B-mode images (BRIGHTNESS)",
         )
         kept = [n for n in range(len(sequence)) if sequence.has_pose(n, path)] if numbers is None else list(numbers)
+        if numbers is None and 0 < len(kept) < len(sequence):
+            _log.warning("%d of %d images have no %s and are left out", len(sequence) - len(kept), len(sequence), path)
         if numbers is None and most is not None and len(kept) > most:
             kept = [kept[place] for place in np.linspace(0, len(kept) - 1, most).round().astype(int)]
         # If no image was tracked, the error for the first one names the missing transform.
         matrices = [sequence.pose(number, path) for number in kept or [0]]
         chosen = sequence.select(kept)
+        if numbers is None:
+            _log.info("images chosen: %d of %d: %s", len(kept), len(sequence), _listed(kept))
+        steps = sequence.composition(kept[0], path)
+        if steps != [path]:
+            _log.info("%s is composed of %s", path, ", ".join(steps))
         images = _as_uint8(chosen.images)
         for number, image in zip(kept, images, strict=True):
             require(int(image.max()) > 0, f"image {number} of the sequence is black")
@@ -89,9 +99,16 @@ class TrackedImages:
         return cls(field.probe, poses, cropped, grid, mask, kept, field)
 
 
+def _listed(numbers: Sequence[int]) -> str:
+    """Numbers for a message, the middle left out where there are many."""
+    texts = [str(number) for number in numbers]
+    return ", ".join(texts if len(texts) <= 12 else [*texts[:6], "...", *texts[-3:]])
+
+
 def _as_uint8(images: np.ndarray) -> np.ndarray:
     if images.dtype == np.uint8:
         return images
+    _log.info("images of %s numbers are rounded to grey levels", images.dtype)
     require(
         np.issubdtype(images.dtype, np.number) and images.min() >= 0 and images.max() <= 255,
         f"images are {images.dtype} from {images.min()} to {images.max()}, expected grey levels from 0 to 255",
@@ -119,6 +136,7 @@ def _located_field(
     if probe is None:
         shared = {field.name for field in fields(Probe)}
         known = {} if beam is None else {name: v for name, v in beam.to_dict().items() if name in shared}
+        _log.info("no probe is given: its geometry is looked for in the images, the rest is the preset's")
         return estimate_field(images, spacing, **known)
     if all("ImageToProbe" in entry for entry in sequence.transforms):
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
@@ -128,7 +146,9 @@ def _located_field(
         upright[2, 2] = image_to_probe[2, 2]
         if np.allclose(image_to_probe, upright, atol=1e-4) and abs(image_to_probe[2, 3]) < 1e-6:
             image_to_probe[2, 2] = 1.0
+            _log.info("the probe's place in the images is that of ImageToProbe, which is in the probe's own frame")
             return ImagedField.of(probe, image_to_probe, images.shape[1:])
+    _log.info("the probe's place is looked for in the images: no ImageToProbe in the probe's own frame")
     found = estimate_field(images, spacing)
     kinds = found.probe.to_dict()["kind"], probe.to_dict()["kind"]
     require(

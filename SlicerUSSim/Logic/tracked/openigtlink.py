@@ -6,6 +6,7 @@ pyigtl's client and server detect a lost peer only when sending to it fails, so 
 from __future__ import annotations
 
 import importlib.util
+import logging
 import re
 import select
 import socket
@@ -18,6 +19,8 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.transforms import check_rigid, nearest_rotation
 from SlicerUSSim.Logic.base.volume import Volume
+
+_log = logging.getLogger(__name__)
 
 #: The default port of OpenIGTLink.
 DEFAULT_PORT = 18944
@@ -97,6 +100,8 @@ class TrackerLink:
         self.status = ""
         #: Numbers of poses received and images sent
         self.received = self.sent = 0
+        self._refused = 0  # poses since the last that was used
+        self._passed_over: set[str] = set()
         self._outgoing: bytes | None = None
         self._lock = threading.Lock()
         # Wakes the loop to send an image or to stop.
@@ -140,14 +145,32 @@ class TrackerLink:
                 with peer:
                     self._serve(peer)
             except (OSError, ValueError, SimulationError) as error:
-                self.status = f"connection to {self._peer_name} lost ({error}), reconnecting"
+                self._say(f"connection to {self._peer_name} lost ({error}), reconnecting", logging.WARNING)
                 self._wait(_RETRY_S)
             except Exception as error:  # a message that cannot be parsed: drop the connection
-                self.status = f"invalid OpenIGTLink data from {self._peer_name} ({error}), reconnecting"
+                self._say(f"invalid OpenIGTLink data from {self._peer_name} ({error}), reconnecting", logging.WARNING)
                 self._wait(_RETRY_S)
 
+    def _say(self, status: str, level: int = logging.INFO) -> None:
+        """Another status, which the log has once."""
+        if status != self.status:
+            self.status = status
+            _log.log(level, "OpenIGTLink: %s", status)
+
+    def _notice(self, what: str) -> None:
+        """Something in the stream that is passed over, which the log has once."""
+        if what not in self._passed_over:
+            self._passed_over.add(what)
+            _log.info("OpenIGTLink: %s", what)
+
+    def _refuse(self, reason: str) -> None:
+        """A pose that is not used. Trackers send many, so the log has the first as a warning."""
+        self.status = reason
+        _log.log(logging.DEBUG if self._refused else logging.WARNING, "OpenIGTLink: pose refused: %s", reason)
+        self._refused += 1
+
     def _serve(self, peer: socket.socket) -> None:
-        self.status = f"connected to {self._peer_name}"
+        self._say(f"connected to {self._peer_name}")
         peer.settimeout(_STALLED_S)
         while not self._stopping:
             readable, _, _ = select.select([peer, self._wake_in], [], [])
@@ -169,27 +192,35 @@ class TrackerLink:
         require(size <= _LARGEST_BYTES, f"message size is {size} bytes, expected at most {_LARGEST_BYTES}")
         body = _exactly(peer, size)
         if header["message_type"] != "TRANSFORM":
+            self._notice(f"messages of type {header['message_type']!s} are passed over")
             return
         message = TransformMessage()
         message.unpack(header, body)
         if self._device is None:
             self._device = message.device_name
+            _log.info("OpenIGTLink: no transform was chosen, the first that came is followed: %r", self._device)
         if message.device_name != self._device:
+            self._notice(f"transform {message.device_name!r} is passed over, {self._device!r} is followed")
             return
         try:
             pose = check_rigid(f"transform {message.device_name!r}", _orthonormal(message.matrix))
         except SimulationError as error:  # a tracker may send any matrix while it does not see its tool
-            self.status = str(error)
+            self._refuse(str(error))
             return
-        self.status = f"connected to {self._peer_name}, following {self._device}"
+        following = f"connected to {self._peer_name}, following {self._device}"
+        if self._refused:
+            _log.info("OpenIGTLink: poses are used again, %d were refused", self._refused)
+            self._refused = 0
+            self.status = following  # which is no news
+        self._say(following)
         self.received += 1
         self._moved(pose)
 
     def _connected(self) -> socket.socket | None:
         if self._listener is None:
-            self.status = self.status or f"connecting to {self._peer_name}"
+            self._say(self.status or f"connecting to {self._peer_name}")
             return socket.create_connection((self._address.host, self._address.port), timeout=_STALLED_S)
-        self.status = f"waiting for a connection at {self._address}"
+        self._say(f"waiting for a connection at {self._address}")
         readable, _, _ = select.select([self._listener, self._wake_in], [], [])
         if self._wake_in in readable:
             self._awake()

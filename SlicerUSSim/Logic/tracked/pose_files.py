@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from pathlib import Path
@@ -11,6 +12,8 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, check_rigid, is_singular
+
+_log = logging.getLogger(__name__)
 
 _ITK_SUFFIXES = (".tfm", ".h5", ".hdf5", ".mat")
 
@@ -29,9 +32,13 @@ def read_pose(path: str | os.PathLike) -> np.ndarray:
         if isinstance(values, dict):
             require("probe_to_ras" in values, f'{path}: has no "probe_to_ras", expected a 4x4 matrix under that name')
             values = values["probe_to_ras"]
+        else:
+            _log.info("%s: a bare matrix, taken for probe_to_ras", path)
         return check_rigid(f"{path}: probe_to_ras", values)
     if path.suffix.lower() in _ITK_SUFFIXES or _starts_like_itk(path):
+        _log.info("%s: ITK transform, taken for the map from world to probe in LPS, as 3D Slicer saves it", path)
         return _read_itk(path)
+    _log.info("%s: 16 numbers, taken for probe_to_ras by rows", path)
     return check_rigid(f"{path}: probe_to_ras", _numbers(path))
 
 
@@ -138,6 +145,7 @@ def _read_xfm(path: Path) -> np.ndarray:
     except ValueError:
         raise SimulationError(f"{path}: Linear_Transform is not numeric, expected 12 numbers") from None
     if re.search(r"Invert_Flag\s*=\s*True", text):
+        _log.info("%s: Invert_Flag is set, the matrix is inverted", path)
         matrix = np.linalg.inv(matrix)
     return matrix
 

@@ -8,6 +8,7 @@ side of the probe, rows away from the probe. World frames are RAS in millimetres
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from collections import deque
@@ -21,6 +22,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, require_pack
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
+
+_log = logging.getLogger(__name__)
 
 #: File name endings that `write` accepts.
 SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".mhd", ".seq.nrrd", ".nrrd")
@@ -40,6 +43,18 @@ class TrackedSequence:
     """Tracked images of one sweep.
 
     Raises SimulationError if the numbers of images, transforms and timestamps differ, or for matrices that are not 4x4.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import TrackedSequence
+    >>> probe_to_reference = np.eye(4)
+    >>> probe_to_reference[:3, 3] = [10, 20, 30]
+    >>> sequence = TrackedSequence(np.zeros((1, 64, 48), np.uint8), ({"ProbeToReference": probe_to_reference},), [0.0])
+    >>> sequence = sequence.with_transforms({"ImageToProbe": np.diag([0.2, 0.2, 0.2, 1.0])})
+    >>> sequence.pose(0, "ImageToReference")[:3, 3].tolist()  # composed of the two
+    [10.0, 20.0, 30.0]
+    >>> sequence.write("tracked.igs.mha")
+    >>> len(TrackedSequence.read("tracked.igs.mha"))
+    1
     """
 
     #: [n, row, column], or [n, scan line, sample] for RF data
@@ -87,25 +102,33 @@ class TrackedSequence:
 
         Raises SimulationError for an image that does not exist, or if no path connects the two frames.
         """
+        return self._composed(number, name)[0]
+
+    def composition(self, number: int, name: str) -> list[str]:
+        """The names of the transforms of which `pose` composes one of image `number`, in the order in which they act;
+        an inverse has "inverse of" before it. Raises SimulationError as `pose` does."""
+        return self._composed(number, name)[1]
+
+    def _composed(self, number: int, name: str) -> tuple[np.ndarray, list[str]]:
         count = len(self)
         require(
             int(number) == number and 0 <= number < count, f"image {number} does not exist, expected 0 to {count - 1}"
         )
         entry = self.transforms[number]
-        steps: dict[str, list[tuple[str, np.ndarray]]] = {}
+        steps: dict[str, list[tuple[str, np.ndarray, str]]] = {}
         for known, matrix in entry.items():
             start, end = _ends(known)
-            steps.setdefault(start, []).append((end, matrix))
+            steps.setdefault(start, []).append((end, matrix, known))
             if not is_singular(matrix):
-                steps.setdefault(end, []).append((start, np.linalg.inv(matrix)))
+                steps.setdefault(end, []).append((start, np.linalg.inv(matrix), f"inverse of {known}"))
         source, target = self._asked_ends(name, set(steps))
-        found = {source: np.eye(4)}
+        found: dict[str, tuple[np.ndarray, list[str]]] = {source: (np.eye(4), [])}
         waiting = deque([source])
         while waiting and target not in found:
             here = waiting.popleft()
-            for there, matrix in steps.get(here, []):
+            for there, matrix, step in steps.get(here, []):
                 if there not in found:
-                    found[there] = matrix @ found[here]
+                    found[there] = matrix @ found[here][0], [*found[here][1], step]
                     waiting.append(there)
         if target not in found:
             raise SimulationError(
@@ -125,6 +148,11 @@ class TrackedSequence:
     def with_transforms(self, constant: Mapping[str, np.ndarray]) -> TrackedSequence:
         """The sequence with additional transforms that are constant over all images: a calibration, a registration."""
         constant = {name: _matrix(name, matrix) for name, matrix in constant.items()}
+        for name in constant:
+            replaced = any(name in entry for entry in self.transforms)
+            _log.info(
+                "%s %s", name, "takes the place of the sequence's own" if replaced else "is added to the sequence"
+            )
         return replace(self, transforms=tuple({**entry, **constant} for entry in self.transforms))
 
     def select(self, numbers: Sequence[int]) -> TrackedSequence:
@@ -215,6 +243,7 @@ class TrackedSequence:
         images = np.stack([image for image, _ in slices])
         if images.dtype != np.uint8:
             top = float(images.max())
+            _log.info("grey levels of the slices go to %g, %s", top, "scaled to 255" if top > 255.0 else "rounded")
             images = np.clip(images * (255.0 / top if top > 255.0 else 1.0), 0, 255).round().astype(np.uint8)
         return cls(images, tuple({"ImageToReference": m} for _, m in slices), np.arange(len(slices), dtype=float))
 
@@ -344,8 +373,19 @@ def _from_header(array: np.ndarray, header: Mapping[str, str], source: str) -> T
                 raise SimulationError(f"{source}: {key} is {text!r}, expected seconds") from None
         else:
             others[number][name] = text
+    left_out = sum(
+        1 for key in header if key.endswith("Transform") and header.get(f"{key}Status", _OK).strip().upper() != _OK
+    )
+    _log.info("%s: %d images, transforms %s", source, count, ", ".join(sorted(set().union(*transforms))) or "none")
+    if left_out:
+        _log.info("%s: %d transforms were not tracked (their status is not OK) and are left out", source, left_out)
+    if not np.isfinite(timestamps).all():
+        _log.info("%s: some images have no timestamp; their number is used instead", source)
     # Without timestamps the order of the images is used.
     timestamps = np.where(np.isfinite(timestamps), timestamps, np.arange(count))
+    for key, default in ((_TYPE, "BRIGHTNESS"), (_ORIENTATION, "rows away from the probe, columns to its mark")):
+        if key not in header:
+            _log.info("%s: has no %s, taken for %s", source, key, default)
     image_type = header.get(_TYPE, "BRIGHTNESS").strip()
     image_type = "BRIGHTNESS" if image_type == "RGB_COLOR" else image_type
     wanted = "MF" if image_type == "BRIGHTNESS" else "FM"
@@ -358,8 +398,11 @@ def _oriented(array: np.ndarray, orientation: str, wanted: str, source: str) -> 
     letters = orientation[:2]
     known = len(orientation) in (2, 3) and any(letters in (a + b, b + a) for a in "MU" for b in "FN")
     if orientation in ("XX", "XXX"):
+        _log.info("%s: its orientation is unknown (%s), images stay as they are", source, orientation)
         return array
     require(known, f"{source}: {_ORIENTATION} is {orientation!r}, expected a code such as MF, UF, MN or MFA")
+    if letters != wanted:
+        _log.info("%s: images are reoriented from %s to %s", source, letters, wanted)
     if letters[0] not in (wanted[0], _OPPOSITE[wanted[0]]):
         array, letters = array.swapaxes(1, 2), letters[::-1]
     if letters[0] != wanted[0]:
@@ -373,6 +416,7 @@ def _as_images(array: np.ndarray, components: int, source: str) -> np.ndarray:
     """[n, y, x] from an array with or without a slice axis of length 1, and with a colour axis if components > 1."""
     if components > 1:
         require(components in (3, 4), f"{source}: has {components} components per pixel, expected 1 or colours")
+        _log.info("%s: colours become grey (ITU-R BT.601)", source)
         array = (array[..., :3] @ np.array([0.299, 0.587, 0.114])).round().astype(array.dtype)  # ITU-R BT.601
     if array.ndim == 4:
         require(array.shape[1] == 1, f"{source}: has volumes of {array.shape[1]} slices, expected images")

@@ -13,6 +13,8 @@ reported by an ErrorEvent with one line, and by GetErrorMessage; the output is t
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 from vtkmodules.util.vtkAlgorithm import VTKPythonAlgorithmBase
 from vtkmodules.vtkCommonCore import VTK_UNSIGNED_CHAR, vtkCommand, vtkOutputWindow, vtkStringArray
@@ -32,6 +34,7 @@ from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.shape import outline_polydata
@@ -113,34 +116,37 @@ class SegmentationFilter(_ImageFilter):
     """From an MRI (port 0), and a mask if it is not skull-stripped (port 1, optional), to uint8 tissue labels.
 
     The names of the labels are field data "TissueNames" of the output, from which UltrasoundSimulationFilter identifies
-    the tissues. See segmentation.segment_mri for the parameters and errors.
+    the tissues. Parameters and defaults are those of SegmentationSettings, errors those of segmentation.segment_mri.
     """
 
     def __init__(self) -> None:
         super().__init__(nInputPorts=2)
-        self._classes, self._contrast = 3, "t1"
-        self._filter_radius, self._bias_correction, self._thin_sulci = 1, False, True
+        self._values = asdict(SegmentationSettings())
         self._segmentation: Segmentation | None = None
 
     def SetClasses(self, classes: int) -> None:
-        """Number of tissues to distinguish by intensity; default 3."""
-        self._change("_classes", classes)
+        """Number of tissues to distinguish by intensity."""
+        self._set("classes", classes)
 
     def SetContrast(self, contrast: str) -> None:
-        """ "t1" (default), "t1gd", "t2" or "flair"."""
-        self._change("_contrast", contrast)
+        """ "t1", "t1gd", "t2" or "flair"."""
+        self._set("contrast", contrast)
 
     def SetFilterRadius(self, voxels: int) -> None:
-        """Radius of the guided filter in voxels; default 1, 0 disables it."""
-        self._change("_filter_radius", voxels)
+        """Radius of the guided filter in voxels; 0 disables it."""
+        self._set("filter_radius", voxels)
+
+    def SetFilterEpsilon(self, epsilon: float | None) -> None:
+        """Strength of the guided filter, squared intensity; None: from the noise in the image."""
+        self._set("filter_epsilon", epsilon)
 
     def SetBiasCorrection(self, on: bool) -> None:
-        """Apply N4 first, for scans with an intensity gradient; default off."""
-        self._change("_bias_correction", bool(on))
+        """Apply N4 first, for scans with an intensity gradient."""
+        self._set("bias_correction", bool(on))
 
     def SetThinSulci(self, on: bool) -> None:
-        """Label sulci too narrow to reach CSF intensity as leptomeninges; default on."""
-        self._change("_thin_sulci", bool(on))
+        """Label sulci too narrow to reach CSF intensity as leptomeninges."""
+        self._set("thin_sulci", bool(on))
 
     def SetMaskConnection(self, port) -> None:
         """Set the output port that provides the mask: an image on the MRI's grid, non-zero inside."""
@@ -173,16 +179,18 @@ class SegmentationFilter(_ImageFilter):
         mri = vtkImageData.GetData(inInfo[0])
         masked = inInfo[1].GetNumberOfInformationObjects() > 0
         self._segmentation = segment_mri(
-            Volume.from_vtk(mri), classes=self._classes, contrast=self._contrast,
-            mask=Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None,
-            filter_radius=self._filter_radius, bias_correction=self._bias_correction, thin_sulci=self._thin_sulci,
-            device=self._device, progress=self._report,
+            Volume.from_vtk(mri), mask=Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None,
+            **self._values, device=self._device, progress=self._report,
         )  # fmt: skip
         output = vtkImageData.GetData(outInfo)
         output.CopyStructure(mri)
         set_scalars(output, self._segmentation.labels.array)
         set_tissue_names(output, self._segmentation.tissue_names)
         return 1
+
+    def _set(self, name: str, value) -> None:
+        """Keep a value, which the next update checks."""
+        self._change("_values", {**self._values, name: value})
 
     def _report(self, share: float) -> None:
         self.UpdateProgress(share)
@@ -197,6 +205,23 @@ class UltrasoundSimulationFilter(_ImageFilter):
     (including transforms from which it is concatenated) or a parameter has changed. Amplifier noise differs between
     poses (noise.seed_of_pose). Labels are identified by the names from SegmentationFilter (field data "TissueNames");
     without names, by the labels of the tissue table.
+
+    >>> import numpy as np
+    >>> from vtkmodules.vtkCommonTransforms import vtkTransform
+    >>> from SlicerUSSim.Logic import LinearProbe, TissueTable, Volume
+    >>> from SlicerUSSim.Logic.vtk import UltrasoundSimulationFilter
+    >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+    >>> simulation = UltrasoundSimulationFilter()
+    >>> simulation.SetInputData(labels.to_vtk())
+    >>> simulation.SetTissues(TissueTable.named(["liver"]))
+    >>> simulation.SetProbe(LinearProbe(width_mm=20, depth_mm=30, scan_lines=64))
+    >>> transform = vtkTransform()  # the face in the middle of the upper side, looking down
+    >>> transform.Translate(20, 20, 39)
+    >>> transform.RotateX(-90)
+    >>> simulation.SetProbeTransform(transform)
+    >>> simulation.Update()
+    >>> simulation.GetOutput().GetDimensions()
+    (342, 512, 1)
     """
 
     def __init__(self) -> None:

@@ -6,19 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from SlicerUSSim.Logic.imaging.stage import Work
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.verification.benchmark.timing import measured
 
 _CHAINS = 16  # kernels/machine.cl
 _MOVED_BYTES = 128 * 2**20  # each way: more than caches hold
-
-
-@dataclass(frozen=True)
-class Work:
-    """What has to be done: bytes to and from memory, each once; floating-point and integer operations."""
-
-    bytes: float
-    operations: float
 
 
 @dataclass(frozen=True)

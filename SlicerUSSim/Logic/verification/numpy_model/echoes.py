@@ -104,7 +104,7 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     rows = acquisition["ras_to_voxel"].reshape(3, 4)[:, order]
     voxel = np.stack([at[n] + p[0] * r[0] + p[1] * r[1] + p[2] * r[2] for n, r in enumerate(rows)], axis=-1)
     tissue = tissues[drawn_labels(acquisition, labels, voxel, key2)]
-    share = tissue["share"]
+    share = tissue["scatterer_share"]
     exists = ((key2 >> np.uint32(16)).astype(np.float32) + f32(0.5) < share * f32(65536)).astype(np.float32)
     strength = tissue["mu0"] * (exists - share) + tissue["sigma0"] * gaussian(key1) * exists
     amplitude = exp2(np.clip(gain[0] + t * (gain[1] - gain[0]) - r2, f32(-100), f32(100)))
@@ -133,10 +133,10 @@ def drawn_labels(acquisition, labels: Labels, voxel: np.ndarray, random: np.ndar
     here, f = labels.cells(voxel)
     threshold = ((random[:, None] >> np.array([0, 5, 10], np.uint32)) & np.uint32(31)).astype(np.float32) + f32(0.5)
     corner = here + (f * f32(32) > threshold) @ labels.steps
-    label = (labels.voxels[corner] & CONSTANTS["LABEL_MASK"]).astype(int)
-    if acquisition["membrane_reach"] < 0:
+    label = labels.label[corner].astype(int)
+    if labels.distance is None:
         return label
-    distance = (labels.voxels[here[:, None] + labels.corner_steps] >> 8).astype(np.float32)
+    distance = labels.distance[here[:, None] + labels.corner_steps].astype(np.float32)
     for axis in range(3):  # x first
         distance = distance[:, ::2] + f[:, axis : axis + 1] * (distance[:, 1::2] - distance[:, ::2])
     label[np.abs(distance[:, 0] - f32(127.5)) < acquisition["membrane_reach"]] = CONSTANTS["MEMBRANE_LABEL"]

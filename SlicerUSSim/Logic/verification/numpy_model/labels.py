@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
-from SlicerUSSim.Logic.imaging.medium import Medium
-from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.verification.numpy_model.elementary import LOG2_E, dot, exp, exp2, f32, length, log, ramp, sum8
+from SlicerUSSim.Logic.verification.numpy_model.medium import WIDE_SIGMA, HostMedium
 
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])  # (x, y, z) of the corners of a cell
 _FINE_SIGMA = f32(1.5)
@@ -15,18 +15,21 @@ _EIGHT = np.arange(8, dtype=np.float32)
 
 
 class Labels:
-    """What Medium uploaded, fetched back."""
+    """A medium, flat, so that many places are looked up at once."""
 
-    def __init__(self, medium: Medium) -> None:
-        shape = tuple(int(n) for n in medium.dims[::-1])
-        download = medium.device.download
+    def __init__(self, medium: HostMedium) -> None:
         self.dims = medium.dims.astype(np.int64)
-        self.voxels = download(medium.voxel_buffer, int(np.prod(shape)), np.uint16)
-        self.groups = download(medium.group_buffer, int(np.prod(shape)) + 8, np.uint8) & CONSTANTS["GROUP_MASK"]
-        self.smooth_groups = medium.smooth_groups
-        self.smooth = download(medium.smooth_buffer, (medium.smooth_groups, int(np.prod(shape))), np.uint16)
         self.steps = np.array([1, self.dims[0], self.dims[0] * self.dims[1]])
         self.corner_steps = _CORNERS @ self.steps
+        self.label = medium.label.ravel()
+        # Whether the eight voxels of the cell at (k, j, i) + {0, 1}^3 have one label
+        lowest, highest = (f(medium.label, 2, origin=-1) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+        self.one_label = (lowest == highest).ravel()
+        # Rows of eight voxels are read at once, the last one too.
+        self.groups = np.pad(medium.group.ravel(), (0, 8))
+        self.smooth_groups = medium.smooth_groups
+        self.smooth = medium.smooth.reshape(self.smooth_groups, -1)
+        self.distance = None if medium.distance is None else medium.distance.ravel()
 
     def cells(self, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(index of the cell, fraction (..., 3) inside it) of (..., 3) voxel positions, those outside moved in."""
@@ -43,8 +46,8 @@ class Labels:
     def at(self, voxel: np.ndarray) -> np.ndarray:
         """Labels at (..., 3) voxel positions: the group with the largest trilinear weight, in it the nearest corner."""
         here, f = self.cells(voxel)
-        labels = self.voxels[here] & CONSTANTS["LABEL_MASK"]
-        several = (self.voxels[here] & CONSTANTS["SAME_LABEL"]) == 0
+        labels = self.label[here]
+        several = ~self.one_label[here]
         if several.any():
             corners = here[several][:, None] + self.corner_steps
             weights, group = self.trilinear_weights(f[several]), self.groups[corners]
@@ -55,7 +58,7 @@ class Labels:
             one_group = (group == best).all(axis=-1)
             nearest[one_group] = (f[several][one_group] > f32(0.5)) @ [1, 2, 4]
             chosen = np.take_along_axis(corners, nearest[:, None], axis=-1)[:, 0]
-            labels[several] = self.voxels[chosen] & CONSTANTS["LABEL_MASK"]
+            labels[several] = self.label[chosen]
         return labels
 
     def borders(self, voxel, before, behind) -> tuple[np.ndarray, np.ndarray]:
@@ -115,7 +118,7 @@ class Labels:
         known, difference, both, up, down = known[fits], difference[fits], both[fits], up[fits], down[fits]
         slope, bends = f32(0.5) * (up - down), up + down - (f32(2) * difference)[:, None]
         laplacian = bends[:, 0] + bends[:, 1] + bends[:, 2]
-        wide = f32(CONSTANTS["WIDE_SIGMA"])
+        wide = f32(WIDE_SIGMA)
         variance = wide * wide + f32(1) / f32(6)
         steepness, sigma = np.maximum(length(slope), f32(1e-6)), np.sqrt(variance)
         share = f32(0.5) - f32(0.5) * difference / both

@@ -84,7 +84,7 @@ class Tracer:
         self.elevation_sigma = Beam(acquisition).elevation_sigma
         self.to_voxel = acquisition["ras_to_voxel"]
         self.voxel_mm = acquisition["voxel_mm"]
-        self.decay = tissues["attenuation"] * acquisition["frequency_mhz"] * f32(0.2) * LN10_OVER_20
+        self.decay = tissues["attenuation_db_cm_mhz"] * acquisition["frequency_mhz"] * f32(0.2) * LN10_OVER_20
 
     def run(self, roots: np.ndarray, quantiles: np.ndarray):
         """(segments, their lines, hits, their lines) for roots (lines, 4) and quantiles (lines, rays)."""
@@ -125,7 +125,7 @@ class Tracer:
         if unknown.any():
             some = rays.of(unknown)
             rays.label[unknown] = self.labels.at(self._place(some, zero[unknown]))
-        rays.depth_per_mm = acquisition["reference_speed_m_s"] / self.tissues["speed_m_s"][rays.label]
+        rays.depth_per_mm = acquisition["reference_speed_m_s"] / self.tissues["speed_of_sound_m_s"][rays.label]
         rays.to_depth = (acquisition["depth_mm"] - rays.depth) / rays.depth_per_mm
         margin = f32(3) + np.abs(rays.quantile) * f32(4) / self.voxel_mm
         enter, leave = zero, rays.to_depth
@@ -260,11 +260,11 @@ class Tracer:
         point = rays.axis + border[:, None] * rays.direction + aside
         tube = _tube_after(rays.tube, border)
         cos_in = np.clip(-dot(rays.direction, normal), f32(0.01), f32(1))
-        ratio = tissues["speed_m_s"][other] / tissues["speed_m_s"][rays.label]
+        ratio = tissues["speed_of_sound_m_s"][other] / tissues["speed_of_sound_m_s"][rays.label]
         sin2_out = ratio * ratio * (f32(1) - cos_in * cos_in)
         is_total = sin2_out >= 1
         cos_out = np.sqrt(np.maximum(f32(0), f32(1) - sin2_out))
-        z_in, z_out = tissues["impedance"][rays.label] * cos_out, tissues["impedance"][other] * cos_in
+        z_in, z_out = tissues["impedance_mrayl"][rays.label] * cos_out, tissues["impedance_mrayl"][other] * cos_in
         pressure = np.where(is_total, f32(1), (z_out - z_in) / (z_out + z_in))
         reflectance = pressure * pressure
         self._write_hits(rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube)

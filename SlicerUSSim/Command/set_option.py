@@ -1,0 +1,135 @@
+"""--set NAME=VALUE: any parameter of probe, display, settings, tissues and membrane, by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.base.declaration import Parameter
+    from SlicerUSSim.Logic.imaging import Preset
+    from SlicerUSSim.Logic.tissue import TissueTable
+
+set_option = click.option(
+    "--set", "changes", multiple=True, metavar="NAME=VALUE",
+    help="Any parameter of probe, display, settings, membrane and tissues, such as settings.max_ray_depth=4, "
+    'probe.depth_mm=70 or "white matter.mu0=0.5"; goes before all other options; may be repeated. docs/parameters.md '
+    "lists them.",
+)  # fmt: skip
+
+_MEMBRANE = "membrane"
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What --set changes. Every value is one that its parameter can have."""
+
+    #: {section of the preset: {parameter: value}}
+    sections: dict[str, dict[str, Any]] = field(default_factory=dict)
+    #: {tissue as it was written: {parameter: value}}
+    tissues: dict[str, dict[str, Any]] = field(default_factory=dict)
+    membrane: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, texts: Iterable[str]) -> Changes:
+        """From texts "section.parameter=value"; of several for one parameter the last one counts.
+
+        Raises SimulationError for a name that is none, with those that are near, and for values that are refused.
+        """
+        changes = cls()
+        for text in texts:
+            name, equals, value = (part.strip() for part in text.partition("="))
+            require(name and equals, f"--set is {text!r}, expected NAME=VALUE, such as display.gain_db=3")
+            section, _, attribute = name.rpartition(".")
+            parameter, place = changes._found(name, section, attribute)
+            place[attribute] = parameter.from_text(f"--set {name}", value)
+        return changes
+
+    def _found(self, name: str, section: str, attribute: str) -> tuple[Parameter, dict[str, Any]]:
+        """The parameter of that name, and where its value belongs."""
+        from SlicerUSSim.Logic.base.declaration import parameters_of
+        from SlicerUSSim.Logic.imaging.preset import preset_parameters
+        from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS, Membrane
+
+        of_preset = preset_parameters()
+        of_membrane = {entry.name: entry for entry in parameters_of(Membrane)}
+        of_tissue = {entry.name: entry for entry in TISSUE_PARAMETERS}
+        sections = list(dict.fromkeys(known.partition(".")[0] for known in of_preset))
+        if name in of_preset:
+            return of_preset[name], self.sections.setdefault(section, {})
+        if section == _MEMBRANE and attribute in of_membrane:
+            return of_membrane[attribute], self.membrane
+        if section and section not in (*sections, _MEMBRANE) and attribute in of_tissue:
+            return of_tissue[attribute], self.tissues.setdefault(section, {})
+        of_preset |= {f"{_MEMBRANE}.{known}": entry for known, entry in of_membrane.items()}
+        raise SimulationError(f"--set: no parameter {name!r}, expected {_hint(name, section, of_preset, of_tissue)}")
+
+    @property
+    def gives_geometry(self) -> bool:
+        """Whether the geometry of the probe was set, and not just its beam."""
+        from SlicerUSSim.Logic.base.declaration import parameters_of
+        from SlicerUSSim.Logic.probe.arrays import Probe
+
+        return not set(self.sections.get("probe", ())) <= {entry.name for entry in parameters_of(Probe)}
+
+    def to_preset(self, preset: Preset) -> Preset:
+        """The preset with probe, display and settings changed; its tissues are as they were."""
+        for section, values in self.sections.items():
+            preset = preset.changed(section, **values)
+        return preset
+
+    def to_tissues(self, tissues: TissueTable) -> TissueTable:
+        """The table with tissues and membrane changed. Raises SimulationError for a tissue that it lacks."""
+        for written, values in self.tissues.items():
+            tissues = tissues.replace(_owner(written, (tissue.name for tissue in tissues.all_tissues())), **values)
+        if self.membrane:
+            require(tissues.membrane is not None, "--set membrane: the tissue table has no membrane")
+            tissues = tissues.with_membrane(replace(tissues.membrane, **self.membrane))  # type: ignore[type-var]
+        return tissues
+
+    def check_tissues(self, known: Iterable[str]) -> None:
+        """Raise SimulationError for a tissue that is not among these names."""
+        known = list(known)
+        for written in self.tissues:
+            _owner(written, known)
+
+
+def _owner(written: str, known: Iterable[str]) -> str:
+    """The tissue that is meant, of those that there are."""
+    from SlicerUSSim.Logic.tissue.names import same_name
+
+    known = list(dict.fromkeys(known))
+    for name in known:
+        if same_name(name, written):
+            return name
+    near = get_close_matches(written, known, n=3)
+    raise SimulationError(f"--set: no tissue {written!r}, expected {_either(near or known)}")
+
+
+def _hint(name: str, section: str, of_preset: dict[str, Parameter], of_tissue: dict[str, Parameter]) -> str:
+    """What may have been meant by a name that is no parameter."""
+    from SlicerUSSim.Logic.tissue.presets import TISSUES
+
+    sections = list(dict.fromkeys(known.partition(".")[0] for known in of_preset))
+    own = [known for known in of_preset if known.partition(".")[0] == section]
+    by_tissue = [f"{tissue}.{attribute}" for tissue in TISSUES for attribute in of_tissue]
+    attribute = name.rpartition(".")[2]
+    if own:
+        attributes = [known.partition(".")[2] for known in own]
+        return _either([f"{section}.{known}" for known in get_close_matches(attribute, attributes, n=3) or attributes])
+    everything = [*of_preset, *by_tissue]
+    same = [known for known in everything if known.rpartition(".")[2] == attribute]
+    near = same[:3] or get_close_matches(name, everything, n=3)
+    if near:
+        return _either(near)
+    return f"{_either([*sections, 'a tissue'])}, a dot and one of its parameters, such as display.gain_db"
+
+
+def _either(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"

@@ -1,0 +1,91 @@
+"""What a NIfTI file says of its geometry, and what ITK made of it: for the log alone."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+
+import numpy as np
+
+_log = logging.getLogger(__name__)
+
+#: Millimetres per unit and name of the lower three bits of xyzt_units (nifti1.h)
+_UNITS = {1: (1000.0, "metres"), 2: (1.0, "millimetres"), 3: (0.001, "micrometres")}
+#: Corners of the volume farther apart than this make two orientations different ones, millimetres.
+_SAME_MM = 0.1
+
+
+def log_nifti_geometry(image, ijk_to_ras: np.ndarray, name: str) -> None:
+    """Log which unit and which of its two orientations a SimpleITK image from NIfTI was read with.
+
+    Warns where there are two different ones, and where there is none. Logs nothing of an image from another format.
+    """
+    if not image.HasMetaDataKey("sform_code"):
+        return
+    try:
+        header = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys()}
+        sform_code, qform_code = int(header["sform_code"]), int(header["qform_code"])
+        unit = int(header.get("xyzt_units", "0")) & 7
+        scale, unit_name = _UNITS.get(unit, (1.0, ""))
+        forms = {}
+        if sform_code:
+            forms["sform"] = _sform(header, scale)
+        if qform_code:
+            # ITK does not pass on which way the third axis goes: of the two, the one that is nearer.
+            both = [_qform(header, scale, way) for way in (1.0, -1.0)]
+            forms["qform"] = min(both, key=lambda matrix: _distance_mm(matrix, ijk_to_ras, image.GetSize()))
+    except (KeyError, ValueError):  # the form of these fields is not documented
+        return
+    if not unit_name:
+        _log.info("%s: NIfTI without a unit of length, taken for millimetres", name)
+    elif scale != 1.0:
+        _log.info("%s: NIfTI in %s, read as millimetres", name, unit_name)
+    if not forms:
+        _log.warning("%s: NIfTI without an orientation (sform and qform have code 0); check left and right", name)
+        return
+    size = image.GetSize()
+    off = {form: _distance_mm(matrix, ijk_to_ras, size) for form, matrix in forms.items()}
+    used = min(off, key=lambda form: off[form])
+    codes = f"sform code {sform_code}, qform code {qform_code}"
+    matrices = list(forms.values())
+    apart = _distance_mm(matrices[0], matrices[-1], size)
+    if apart > _SAME_MM:
+        _log.warning(
+            "%s: its sform and its qform are up to %.1f mm apart (%s); the %s is used, as ITK chooses",
+            name, apart, codes, used,
+        )  # fmt: skip
+    else:
+        _log.info("%s: NIfTI orientation by its %s (%s)", name, " and ".join(forms), codes)
+
+
+def _sform(header: dict[str, str], scale: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3] = [np.array(header[f"srow_{axis}"].split(), float) for axis in "xyz"]
+    matrix[:3] *= scale
+    return matrix
+
+
+def _qform(header: dict[str, str], scale: float, way: float) -> np.ndarray:
+    """Method 2 of nifti1.h: a rotation by a quaternion, voxel sizes, and the `way` of the third axis, 1 or -1."""
+    b, c, d = (float(header[f"quatern_{letter}"]) for letter in "bcd")
+    a = np.sqrt(max(1.0 - b * b - c * c - d * d, 0.0))
+    rotation = np.array(
+        [
+            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
+            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
+            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
+        ]
+    )
+    sizes = np.array([float(header[f"pixdim[{n}]"]) for n in (1, 2, 3)])
+    sizes[2] *= way
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * sizes
+    matrix[:3, 3] = [float(header[f"qoffset_{axis}"]) for axis in "xyz"]
+    matrix[:3] *= scale
+    return matrix
+
+
+def _distance_mm(one: np.ndarray, other: np.ndarray, size) -> float:
+    """How far two (4, 4) maps take a corner of the volume apart, at most."""
+    corners = np.array([[*corner, 1] for corner in itertools.product(*((0, n - 1) for n in size[:3]))], float)
+    return float(np.linalg.norm((corners @ (one - other).T)[:, :3], axis=1).max())

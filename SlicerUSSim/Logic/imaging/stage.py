@@ -1,0 +1,139 @@
+"""What a stage is, and the frame in the making that stages work on.
+
+A new *display* stage, which changes grey levels or pixels but not echoes, is one class and one line: a Stage with
+`run`, `work` and `on_host`, and its place in stages.DISPLAY_STAGES. Simulator, appearance model, benchmark and numpy
+model take it from there. What a user can choose about it is a field of DisplaySettings, read from `frame.display`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.imaging.medium import Medium
+from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree, TreeBuffers
+from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+
+if TYPE_CHECKING:
+    from pyopencl import Buffer
+
+#: Bytes of a complex float32 sample, as Stage.work counts them
+SAMPLE_BYTES = 8
+
+
+@dataclass(frozen=True)
+class Work:
+    """What has to be done: bytes to and from memory, each once; floating-point and integer operations."""
+
+    bytes: float
+    operations: float
+
+
+@dataclass(eq=False)
+class FrameInputs:
+    """What is given to the stages of one frame."""
+
+    probe: Probe
+    settings: SimulationSettings
+    #: layout.ACQUISITION record
+    acquisition: np.ndarray
+    #: Standard deviation of the pulse in depth as the scanner reckons it
+    axial_sigma_mm: float
+    display: DisplaySettings
+    grid: ImageGrid
+    #: Which draw of the amplifier noise (noise.py)
+    noise_seed: int
+
+    @property
+    def line_shape(self) -> tuple[int, int]:
+        """(scan lines, samples) of the signals along lines; samples are whole blocks."""
+        return int(self.acquisition["scan_lines"]), int(self.acquisition["samples"])
+
+
+@dataclass(eq=False)
+class DeviceFrame(FrameInputs):
+    """A frame in the making on the device: its inputs, and what its stages hand on.
+
+    A stage reads what is there and puts buffers of its own in place: it leaves those that it read as they are, since
+    frames of which only the display changed begin again with `iq`.
+    """
+
+    acquisition_buffer: Buffer
+    medium: Medium
+    #: Of the ray tree
+    tree: TreeBuffers = field(init=False)
+    #: Impulses on the left and right edges of every traced line's strip
+    traced: EchoLines = field(init=False)
+    #: Impulses of every scan line
+    scanned: EchoLines = field(init=False)
+    #: Baseband signal: complex64 [scan line][sample]
+    iq: Buffer = field(init=False)
+    #: After noise and time-gain compensation: float32 [scan line][sample]
+    envelope: Buffer = field(init=False)
+    #: Grey levels along the scan lines: uint8 [scan line][sample]
+    grey: Buffer = field(init=False)
+    #: uint8 [row][column]
+    image: Buffer = field(init=False)
+
+    def download(self, signal: str) -> np.ndarray:
+        """A copy on the host of "iq", "envelope", "grey" (scan lines, samples) or "image" (rows, columns)."""
+        shape = (self.grid.rows, self.grid.columns) if signal == "image" else self.line_shape
+        return self.medium.device.download(getattr(self, signal), shape, _SIGNAL_TYPES[signal])
+
+
+_SIGNAL_TYPES = {"iq": np.complex64, "envelope": np.float32, "grey": np.uint8, "image": np.uint8}
+
+
+@dataclass(eq=False)
+class HostFrame(FrameInputs):
+    """The same on the host, in numpy, for Stage.on_host. A stage puts arrays of its own in place here too."""
+
+    #: (scan lines, samples) complex64 baseband signal
+    iq: np.ndarray = field(init=False)
+    #: (scan lines, samples) float32 after noise and time-gain compensation
+    envelope: np.ndarray = field(init=False)
+    #: (scan lines, samples) uint8 grey levels along the scan lines
+    grey: np.ndarray = field(init=False)
+    #: (rows, columns) uint8
+    image: np.ndarray = field(init=False)
+
+
+class Stage(ABC):
+    """One step from a pose to an image. A stage is made once for a device and keeps its buffers between frames."""
+
+    #: The key of its time in Frame.timings_ms
+    name: ClassVar[str]
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+
+    @abstractmethod
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the stage; nothing is waited for."""
+
+    @abstractmethod
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        """The least that any implementation of the stage has to do for a frame with this ray tree.
+
+        Bytes are counted once for everything that it has to read or write, whatever a cache saves. Operations are those
+        of the kernel's source, additions, multiplications and integer operations alike: an estimate to a few tens of
+        percent, enough to tell a stage that is twice off its floor from one that is ten times off.
+        """
+
+    def on_host(self, frame: HostFrame) -> None:
+        """The same in plain numpy, written from the equations and not from `run`: what `run` is checked against.
+
+        The first seven stages leave it out: verification/numpy_model has theirs.
+        """
+        raise NotImplementedError(f"stage {self.name!r} has no twin in numpy")
+
+    @classmethod
+    def has_own_twin(cls) -> bool:
+        """Whether the class has an on_host."""
+        return cls.on_host is not Stage.on_host

@@ -1,0 +1,167 @@
+"""What the stages need to know of one frame, computed from the equations of docs/physics.md and what a user chose.
+
+Of a probe only its fields are read, none of what Probe derives from them. The record has the type of
+layout.ACQUISITION: names and number formats of what the kernels read, not values.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import special
+
+from SlicerUSSim.Logic.base.settings import SimulationSettings
+from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
+from SlicerUSSim.Logic.probe.arrays import ConvexProbe, LinearProbe, PhasedProbe, Probe
+from SlicerUSSim.Logic.verification.numpy_model.elementary import hash_mix
+from SlicerUSSim.Logic.verification.numpy_model.medium import HostMedium
+
+_DESIGN_SPEED_M_S = 1540.0  # which wavelengths and focus widths of an array are for
+_FWHM = np.sqrt(8.0 * np.log(2.0))  # of a Gaussian, in standard deviations
+_GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+
+
+def acquisition_record(
+    probe: Probe, probe_to_ras: np.ndarray, settings: SimulationSettings, medium: HostMedium
+) -> np.ndarray:
+    """() record of layout.ACQUISITION for `probe` at a pose (4, 4)."""
+    record = np.zeros((), ACQUISITION)
+    first, spacing, radius = _geometry(probe)
+    lateral, guard = _traced_lines(probe, settings)
+    samples = int(np.ceil(probe.depth_mm / sample_mm(probe, settings)))
+    transmit = _one_way_sigma(probe, probe.focus_mm / probe.aperture_mm)
+    elevational = _one_way_sigma(probe, probe.elevation_focus_mm / probe.elevation_aperture_mm)
+    values = {
+        "ras_to_voxel": medium.ras_to_voxel.ravel(),
+        "dims": medium.dims,
+        "voxel_mm": medium.voxel_mm,
+        "smooth_groups": medium.smooth_groups,
+        "membrane_reach": medium.membrane_reach,
+        "probe_to_ras": np.asarray(probe_to_ras, float)[:3].ravel(),
+        "linear": isinstance(probe, LinearProbe),
+        "apex_radius_mm": radius,
+        "first_line": first,
+        "line_spacing": spacing,
+        "scan_lines": probe.scan_lines,
+        "depth_mm": probe.depth_mm,
+        "frequency_mhz": probe.frequency_mhz,
+        "reference_speed_m_s": settings.reference_speed_m_s,
+        "cycles_per_mm": _cycles_per_mm(probe, settings),
+        "sample_mm": sample_mm(probe, settings),
+        "samples": int(np.ceil(samples / CONSTANTS["BLOCK"])) * CONSTANTS["BLOCK"],
+        "transmit_sigma": transmit,
+        "transmit_focus": probe.focus_mm,
+        "transmit_rayleigh": _rayleigh_mm(probe, transmit),
+        "receive_sigma_min": _one_way_sigma(probe, probe.receive_f_number),
+        "receive_sigma_slope": _one_way_sigma(probe, 1.0 / probe.aperture_mm),
+        "elevation_sigma": elevational / np.sqrt(2.0),
+        "elevation_focus": probe.elevation_focus_mm,
+        "elevation_rayleigh": _rayleigh_mm(probe, elevational),
+        "max_ray_depth": settings.max_ray_depth if settings.reflections else 0,
+        "intensity_threshold": settings.intensity_threshold,
+        "reflection_threshold": settings.reflection_threshold,
+        "reflection_spreading": settings.reflection_spreading,
+        "elevational_rays": settings.elevational_rays,
+        "lateral_rays": lateral,
+        "guard_lines": guard,
+        "traced_lines": 2 * guard + 1 + lateral * (probe.scan_lines - 1),
+        "interface_gain": np.exp(settings.interface_gain_db * np.log(10.0) / 20.0),
+        "interface_is_energy": settings.interface_reflection == "energy",
+        "specular_exponent": settings.specular_exponent,
+        "cell_mm": np.cbrt(1.0 / settings.scatterers_per_mm3),
+        "seed": hash_mix(np.array([settings.seed], np.uint32))[0] ^ np.uint32(0x2545F491),
+        "beam_cutoff": settings.beam_cutoff,
+        # Scatterers of unit variance give unit mean square: the integral of the squared point spread function of
+        # unit height is the product of its sigmas and pi^1.5.
+        "speckle_scale": 1.0 / np.sqrt(settings.scatterers_per_mm3 * np.pi**1.5 * axial_sigma_mm(probe, settings)),
+    }
+    assert set(values) == set(ACQUISITION.names or ())
+    for name, value in values.items():
+        record[name] = value
+    return record
+
+
+def axial_sigma_mm(probe: Probe, settings: SimulationSettings) -> float:
+    """Standard deviation of the pulse in depth: c / (4 pi sf), sf = bandwidth f0 / 2.355."""
+    sigma_mhz = probe.fractional_bandwidth * probe.frequency_mhz / _FWHM
+    return 1e-3 * settings.reference_speed_m_s / (4.0 * np.pi * sigma_mhz)
+
+
+def sample_mm(probe: Probe, settings: SimulationSettings) -> float:
+    """Depth between samples."""
+    return 1.0 / (settings.samples_per_cycle * _cycles_per_mm(probe, settings))
+
+
+def line_roots(acquisition: np.ndarray) -> np.ndarray:
+    """(traced lines, 4) float32 origin (x, y) and direction (x, y) of every traced line in the probe frame."""
+    n = np.arange(int(acquisition["traced_lines"]))
+    step = float(acquisition["line_spacing"]) / float(acquisition["lateral_rays"])
+    at = float(acquisition["first_line"]) + (n - float(acquisition["guard_lines"])) * step
+    if acquisition["linear"]:
+        return np.column_stack([at, 0 * at, 0 * at, 0 * at + 1.0]).astype(np.float32)
+    towards = np.column_stack([np.sin(at), np.cos(at)])
+    start = float(acquisition["apex_radius_mm"]) * (towards - [0.0, 1.0])  # the apex lies a radius above the face
+    return np.column_stack([start, towards]).astype(np.float32)
+
+
+def elevational_quantiles(traced: int, rays: int) -> np.ndarray:
+    """(traced, rays) float32 places of the rays in the elevational beam, in its standard deviations."""
+    line, ray = np.arange(traced)[:, None], np.arange(rays)
+    place_in_stratum = 0.05 + 0.9 * ((0.5 + line * _GOLDEN) % 1.0)
+    return special.ndtri((ray + place_in_stratum) / rays).astype(np.float32)
+
+
+def pulse_taps(sigma: float) -> np.ndarray:
+    """(2 n + 1,) float32 envelope of the pulse: with the triangle that places impulses it is `sigma` samples wide."""
+    own = np.sqrt(np.maximum(sigma * sigma - 1.0 / 6.0, 0.25))
+    at = np.arange(np.ceil(3.7 * own) + 1.0)
+    half = sigma / own * np.exp(-(at * at) / (2.0 * own * own))
+    return np.concatenate([half[:0:-1], half]).astype(np.float32)
+
+
+def noise_key(acquisition: np.ndarray, noise_seed: int) -> np.uint32:
+    """What the hash of the noise starts from."""
+    seed, draw = np.array([acquisition["seed"]], np.uint32), np.array([noise_seed], np.uint32)
+    return (seed * np.uint32(0x9E3779B1) + np.uint32(0x7F4A7C15) + hash_mix(draw))[0]
+
+
+def _geometry(probe: Probe) -> tuple[float, float, float]:
+    """(first line, step between lines, radius of the face): radians about the apex, or millimetres and 0 if linear."""
+    if isinstance(probe, LinearProbe):
+        whole, radius = probe.width_mm, 0.0
+    else:
+        assert isinstance(probe, ConvexProbe | PhasedProbe)
+        whole = probe.field_of_view_deg * np.pi / 180.0
+        radius = probe.radius_mm if isinstance(probe, ConvexProbe) else 0.0
+    return -0.5 * whole, whole / (probe.scan_lines - 1), radius
+
+
+def _wavelength_mm(probe: Probe) -> float:
+    return 1e-3 * _DESIGN_SPEED_M_S / probe.frequency_mhz
+
+
+def _cycles_per_mm(probe: Probe, settings: SimulationSettings) -> float:
+    return 2.0 * probe.frequency_mhz / (1e-3 * settings.reference_speed_m_s)
+
+
+def _one_way_sigma(probe: Probe, f_number: float) -> float:
+    """At a focus: FWHM = 1.21 wavelength x f-number."""
+    return 1.21 * _wavelength_mm(probe) * f_number / _FWHM
+
+
+def _rayleigh_mm(probe: Probe, sigma_mm: float) -> float:
+    return 2.0 * np.pi * sigma_mm * sigma_mm / _wavelength_mm(probe)
+
+
+def _traced_lines(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
+    """(traced lines per scan line, traced lines beyond either edge of the field)."""
+    depth = np.linspace(0.0, probe.depth_mm, 65)
+    waist = _one_way_sigma(probe, probe.focus_mm / probe.aperture_mm)
+    transmit = waist * np.hypot(1.0, (depth - probe.focus_mm) / _rayleigh_mm(probe, waist))
+    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
+    lateral = (transmit**-2.0 + receive**-2.0) ** -0.5
+    _, spacing, radius = _geometry(probe)
+    apart = spacing * (np.ones_like(depth) if isinstance(probe, LinearProbe) else radius + depth)
+    count = settings.lateral_rays or int(np.clip(np.ceil((apart / lateral).max() / 1.5), 1, 128))
+    below = depth >= 0.1 * probe.depth_mm  # next to the apex of a phased array all lines lie within the beam
+    reach = np.ceil(settings.beam_cutoff * (lateral[below] / apart[below]).max() * count)
+    return count, int(min(reach, 16 * count))

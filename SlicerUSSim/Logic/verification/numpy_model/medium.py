@@ -1,0 +1,94 @@
+"""The acoustic medium on the host, from a label map and a tissue table (docs/physics.md#2-interfaces)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage, special
+
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
+
+WIDE_SIGMA = 3.0  # of the Gaussian that smooths the indicators, voxels
+_FARTHEST = 2.2  # standard deviations, where the fluid distance ends; it takes eight bits
+_SHARES = 4095  # steps of the smoothed indicator that it is computed from
+_MOST_GROUPS, _MOST_VALUES = 6, 100_000_000  # of the smoothed indicators of acoustic groups
+
+
+class HostMedium:
+    """Labels, fluid distance, acoustic groups with their smoothed indicators, and a row of numbers per tissue.
+
+    Parameters
+    ----------
+    labels : Volume of tissue labels.
+    tissues : TissueTable with a tissue for every label.
+    """
+
+    def __init__(self, labels: Volume, tissues: TissueTable) -> None:
+        self.tissues = tissues
+        #: (k, j, i) with a voxel of coupling medium on every side
+        self.label = np.pad(labels.array.astype(np.uint8), 1)
+        self.dims = np.array(self.label.shape[::-1])
+        columns = labels.ijk_to_ras[:3, :3]
+        spacing = np.sqrt((columns**2).sum(axis=0))
+        self.voxel_mm = spacing.min()
+        #: (3, 4) from RAS mm to indices (i, j, k) of the padded volume
+        rotation = np.linalg.inv(columns)
+        self.ras_to_voxel = np.column_stack([rotation, 1.0 - rotation @ labels.ijk_to_ras[:3, 3]])
+        values, counts = np.unique(labels.array, return_counts=True)
+        present = [int(values[n]) for n in np.argsort(-counts, kind="stable")]
+        #: (MAX_TISSUES,) layout.TISSUE
+        self.rows = _tissue_rows(tissues, present)
+        #: (k, j, i) uint8
+        self.group = self.rows["group"].astype(np.uint8)[self.label]
+        groups = np.unique(self.group)
+        self.smooth_groups = int(min(groups.max() + 1, _MOST_GROUPS, max(_MOST_VALUES // self.label.size, 2)))
+        #: (groups, k, j, i) uint16, 65535 for 1
+        self.smooth = np.zeros((self.smooth_groups, *self.label.shape), np.uint16)
+        if len(groups) > 1:
+            for number in groups[groups < self.smooth_groups]:
+                share = ndimage.gaussian_filter(
+                    (self.group == number).astype(np.float32), WIDE_SIGMA, mode="nearest", truncate=2.5
+                )
+                self.smooth[number] = np.rint(65535.0 * np.clip(share, 0.0, 1.0))
+        #: (k, j, i) uint8 about 127.5, and half the membrane in its unit; None and -1 without a membrane
+        self.distance, self.membrane_reach = self._fluid_distance(spacing)
+
+    def _fluid_distance(self, spacing_mm: np.ndarray) -> tuple[np.ndarray | None, float]:
+        """A plane at distance d from a voxel has the share Phi(d / sigma) of a Gaussian on its far side."""
+        membrane = self.tissues.membrane
+        if membrane is None or membrane.thickness_mm == 0:
+            return None, -1.0
+        fluids = [label for label, tissue in self.tissues.items() if tissue.name in membrane.fluids]
+        fluid = np.isin(self.label, fluids)
+        if fluid.all() or not fluid.any():
+            return None, -1.0
+        sigma_mm = 0.75 * np.prod(spacing_mm) ** (1.0 / 3.0)
+        share = ndimage.gaussian_filter(
+            fluid.astype(np.float32), sigma_mm / spacing_mm[::-1], mode="nearest", truncate=3.0
+        )
+        per_sigma = 127.5 / _FARTHEST
+        steps = np.rint(np.clip(share, 0.0, 1.0) * _SHARES) / _SHARES
+        sigmas = np.clip(special.ndtri(steps), -_FARTHEST, _FARTHEST)
+        return np.rint(127.5 + per_sigma * sigmas).astype(np.uint8), 0.5 * membrane.thickness_mm / sigma_mm * per_sigma
+
+
+def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
+    """Tissues of one speed and impedance form a group; groups are numbered from the commonest label on."""
+    members = {label: tissues[label] for label in present}
+    members.update((label, tissue) for label, tissue in tissues.items() if label not in members)
+    if tissues.membrane is not None:
+        members[CONSTANTS["MEMBRANE_LABEL"]] = tissues.membrane.tissue
+    rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
+    known: list[tuple[float, float]] = []
+    for label, tissue in members.items():
+        acoustics = tissue.speed_of_sound_m_s, tissue.impedance_mrayl
+        if acoustics not in known:
+            known.append(acoustics)
+        row = rows[label]
+        for parameter in TISSUE_PARAMETERS:
+            if parameter.name in (TISSUE.names or ()):
+                row[parameter.name] = getattr(tissue, parameter.name)
+        row["scatterer_share"], row["group"] = special.ndtr(-tissue.mu1), known.index(acoustics)
+    return rows

@@ -1,0 +1,152 @@
+"""Every stage's twin: the same in numpy, on a TwinFrame, by the name of the stage.
+
+Those of the first seven stages are here. A stage that came later brings its own, Stage.on_host.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB
+from SlicerUSSim.Logic.imaging.stage import HostFrame, Stage
+from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
+    elevational_quantiles,
+    line_roots,
+    noise_key,
+    pulse_taps,
+)
+from SlicerUSSim.Logic.verification.numpy_model.echoes import add_interfaces, lateral_beam, scatterer_lines
+from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, gaussian, hash_mix
+from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
+from SlicerUSSim.Logic.verification.numpy_model.tracing import Tracer
+
+
+@dataclass(eq=False)
+class TwinFrame(HostFrame):
+    """A HostFrame with what the stages before the baseband signal need and hand on."""
+
+    labels: Labels
+    #: layout.TISSUE per label
+    tissues: np.ndarray
+    #: layout.SEGMENT and layout.HIT with their traced lines
+    segments: np.ndarray = field(init=False)
+    segment_lines: np.ndarray = field(init=False)
+    hits: np.ndarray = field(init=False)
+    hit_lines: np.ndarray = field(init=False)
+    #: (2 traced lines, samples) and (scan lines, samples) complex64 impulses
+    traced: np.ndarray = field(init=False)
+    scanned: np.ndarray = field(init=False)
+
+
+def ray_tree(frame: TwinFrame) -> None:
+    """Segments along the axes, hits of the elevational rays."""
+    record = frame.acquisition
+    tracer = Tracer(record, frame.labels, frame.tissues)
+    quantiles = elevational_quantiles(int(record["traced_lines"]), int(record["elevational_rays"]))
+    frame.segments, frame.segment_lines, frame.hits, frame.hit_lines = tracer.run(line_roots(record), quantiles)
+
+
+def scatterers(frame: TwinFrame) -> None:
+    """Impulses of speckle on the edges of the traced lines' strips."""
+    record = frame.acquisition
+    if frame.settings.scattering:
+        frame.traced = scatterer_lines(record, frame.labels, frame.tissues, frame.segments, frame.segment_lines)
+    else:
+        frame.traced = np.zeros((2 * int(record["traced_lines"]), int(record["samples"])), np.complex64)
+
+
+def interfaces(frame: TwinFrame) -> None:
+    """Impulses of the interfaces, added to those of speckle."""
+    if frame.settings.interfaces:
+        add_interfaces(frame.acquisition, frame.hits, frame.hit_lines, frame.traced)
+
+
+def beam(frame: TwinFrame) -> None:
+    """Impulses of the scan lines."""
+    frame.scanned = lateral_beam(frame.acquisition, frame.traced)
+
+
+def pulse(frame: TwinFrame) -> None:
+    """The baseband signal."""
+    taps = pulse_taps(frame.axial_sigma_mm / float(frame.acquisition["sample_mm"]))
+    lines, reach = frame.scanned, len(taps) // 2
+    padded = np.pad(lines, ((0, 0), (reach, reach)))
+    frame.iq = sum((tap * padded[:, k : k + lines.shape[1]] for k, tap in enumerate(taps)), np.zeros_like(lines))
+
+
+def b_mode(frame: TwinFrame) -> None:
+    """Amplifier noise, time-gain compensation, envelope, log compression to eight bits."""
+    record, display, iq = frame.acquisition, frame.display, frame.iq
+    index = np.arange(iq.shape[1])
+    if display.noise_db is not None:
+        noise = f32(10.0 ** (display.noise_db / 20.0) / np.sqrt(2.0))
+        line = np.arange(len(iq), dtype=np.uint32)[:, None]
+        key = hash_mix(
+            index.astype(np.uint32) * np.uint32(0x9E3779B1)
+            + (noise_key(record, frame.noise_seed) + line * np.uint32(0x85EBCA77))
+        )
+        iq = iq + noise * (gaussian(key) + 1j * gaussian(hash_mix(key + np.uint32(0x9E3779B9))))
+    power = np.real(iq) ** 2 + np.imag(iq) ** 2 + f32(1e-30)
+    # Twice the depth, in cm
+    tgc_db = index * (2.0 * display.tgc_db_cm_mhz * float(record["frequency_mhz"]) * float(record["sample_mm"]) * 0.1)
+    frame.envelope = (np.sqrt(power) * 10.0 ** (tgc_db / 20.0)).astype(np.float32)
+    level_db = 10.0 * np.log10(power) + tgc_db
+    value = 255.0 * (1.0 + (level_db - (FULL_SCALE_DB - display.gain_db)) / display.dynamic_range_db)
+    frame.grey = (np.clip(value, 0.0, 255.0) + 0.5).astype(np.uint8)
+
+
+def scan_conversion(frame: TwinFrame) -> None:
+    """Pixels: linear along the lines, cubic (Catmull-Rom) across them, 0 outside the field."""
+    record, grid, grey = frame.acquisition, frame.grid, frame.grey
+    width = max(round(grid.pixel_spacing_mm[1] / float(record["sample_mm"])), 1)
+    lines, samples = grey.shape
+    around = np.clip(np.arange(samples)[:, None] + np.arange(width) - width // 2, 0, samples - 1)
+    grey = (grey[:, around].mean(axis=2) + 0.5).astype(np.uint8).astype(np.float32)
+    x = grid.left_mm + (np.arange(grid.columns) + 0.5) * grid.pixel_spacing_mm[0]
+    y = grid.top_mm + (np.arange(grid.rows)[:, None] + 0.5) * grid.pixel_spacing_mm[1]
+    if record["linear"]:
+        lateral, depth = x + 0 * y, y + 0 * x
+    else:
+        from_apex = y + float(record["apex_radius_mm"])
+        depth = np.hypot(x, from_apex) - float(record["apex_radius_mm"])
+        lateral = np.where(from_apex > 0, np.arctan2(x, from_apex), 1e9)
+    place = (lateral - float(record["first_line"])) / float(record["line_spacing"])
+    inside = (place >= -0.5) & (place <= lines - 0.5) & (depth >= 0) & (depth < float(record["depth_mm"]))
+    image = np.zeros((grid.rows, grid.columns), np.uint8)
+    sample = depth[inside] / float(record["sample_mm"])
+    bins = np.minimum(sample.astype(int), samples - 2)
+    part = np.minimum(sample - bins, 1.0)
+    place = np.clip(place[inside], 0.0, lines - 1.0)
+    line = place.astype(int)
+    t = place - line
+    a, b, c, d = (
+        grey[at, bins] * (1 - part) + grey[at, bins + 1] * part
+        for at in (np.clip(line + n, 0, lines - 1) for n in (-1, 0, 1, 2))
+    )
+    value = b + 0.5 * t * (c - a + t * (2.0 * a - 5.0 * b + 4.0 * c - d + t * (3.0 * (b - c) + d - a)))
+    image[inside] = (np.clip(value, 0.0, 255.0) + 0.5).astype(np.uint8)
+    frame.image = image
+
+
+TWINS: dict[str, Callable[[TwinFrame], None]] = {
+    "ray tree": ray_tree,
+    "scatterers": scatterers,
+    "interfaces": interfaces,
+    "beam": beam,
+    "pulse": pulse,
+    "B-mode": b_mode,
+    "scan conversion": scan_conversion,
+}
+
+
+def twin_of(stage: Stage) -> Callable[[TwinFrame], None]:
+    """The twin of a stage: its own on_host, or one of TWINS. Raises SimulationError if it has none."""
+    if stage.has_own_twin():
+        return stage.on_host
+    if stage.name not in TWINS:
+        raise SimulationError(f"stage {stage.name!r} has no twin in numpy, expected on_host in {type(stage).__name__}")
+    return TWINS[stage.name]

@@ -1,0 +1,208 @@
+"""What fits equally well, without a simulation: draws along lines of equal Var, spreads, and the combinations."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from SlicerUSSim.Logic import DisplaySettings, TissueTable
+from SlicerUSSim.Logic.fitting.identifiability import (
+    Identifiability,
+    Spread,
+    equal_variance_draws,
+    quantities_of,
+    variance_db,
+)
+from SlicerUSSim.Logic.fitting.parameters import FreeParameters
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+
+DISPLAY = DisplaySettings(gain_db=3.0, dynamic_range_db=60.0, tgc_db_cm_mhz=0.4)
+TISSUES_OF_BRAIN = TissueTable({1: TISSUES["csf"], 2: TISSUES["grey matter"], 3: TISSUES["white matter"]})
+
+
+def drawn(free, count=12, best=None, seed=0):
+    """(tissue of the best, tissues of the draws, parameters, draws)"""
+    parameters = FreeParameters.of(free, TISSUES_OF_BRAIN, DISPLAY)
+    best = parameters.units(TISSUES_OF_BRAIN, DISPLAY) if best is None else np.array(best)
+    draws = equal_variance_draws(parameters, best, TISSUES_OF_BRAIN, DISPLAY, np.random.default_rng(seed), count)
+
+    def white(units):
+        return parameters.apply(units, TISSUES_OF_BRAIN, DISPLAY)[0].tissue("white matter")
+
+    return white(best), [white(units) for units in draws], parameters, draws
+
+
+# ---- solutions of equal variance -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_draws_have_the_variance_of_the_best_and_otherwise_differ(seed):
+    best, tissues, parameters, draws = drawn(["white matter", "gain_db"], seed=seed)
+    assert len(draws) == 12
+    assert [variance_db(tissue) for tissue in tissues] == pytest.approx([variance_db(best)] * 12, abs=0.06)
+    assert np.std([tissue.mu1 for tissue in tissues]) > 0.2
+    assert np.std([tissue.mu0 / tissue.sigma0 for tissue in tissues]) > 0.2
+    # What does not scatter stays as it was.
+    for name in ("gain_db", "white matter.attenuation_db_cm_mhz"):
+        place = parameters.names.index(name)
+        assert len({units[place] for units in draws}) == 1
+
+
+def test_draws_keep_within_bounds_that_no_other_mixture_reaches():
+    """With mu0 and sigma0 held to a few percent, most values of mu1 would change Var: those are not drawn."""
+    free = {"white matter.mu0": (0.32, 0.34), "white matter.sigma0": (0.14, 0.16), "white matter.mu1": (-1.0, 1.5)}
+    best, tissues, _, draws = drawn(free)
+    assert 0 < len(draws) <= 12
+    for tissue, units in zip(tissues, draws, strict=True):
+        assert variance_db(tissue) == pytest.approx(variance_db(best), abs=0.06)
+        assert ((units >= 0) & (units <= 1)).all()
+        assert 0.32 <= tissue.mu0 <= 0.34 and 0.14 <= tissue.sigma0 <= 0.16
+
+
+def test_a_single_free_amplitude_leaves_nothing_to_draw():
+    assert drawn(["white matter.mu0", "gain_db"])[3] == []
+    assert len(drawn(["white matter.mu0", "white matter.mu1"])[3]) == 12
+
+
+# ---- spreads ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "was_tested", "answer"),
+    [
+        (-0.1, 0.1, True, True),
+        (-0.1, 0.1, False, None),
+        (-0.1, 0.11, True, False),
+        (-0.1, 0.11, False, False),
+        (0.05, 0.05, True, True),
+    ],
+)
+def test_a_quantity_is_determined_if_all_solutions_agree_and_a_restart_was_among_them(low, high, was_tested, answer):
+    spread = Spread("mu0", "", 0.05, low, high, 0.0, 0.0, 0.1, was_tested)
+    assert spread.is_determined is answer
+
+
+def spreads_of(as_good, again, free=("white matter", "display")):
+    parameters = FreeParameters.of(free, TISSUES_OF_BRAIN, DISPLAY)
+    best = parameters.units(TISSUES_OF_BRAIN, DISPLAY)
+    quantities = quantities_of(parameters, 5.0, TISSUES_OF_BRAIN)
+
+    def state_of(units):
+        return parameters.apply(np.asarray(units), TISSUES_OF_BRAIN, DISPLAY)
+
+    def moved(**changes):
+        units = best.copy()
+        for name, value in changes.items():
+            place = next(n for n, p in enumerate(parameters) if p.attribute == name)
+            units[place] = parameters[place].unit(value)
+        return units
+
+    found = Identifiability.of(
+        quantities, state_of, best, [moved(**c) for c in as_good], [moved(**c) for c in again], 3, 0.01
+    )
+    return found, {p.name: v for p, v in zip(parameters, parameters.values(best), strict=True)}
+
+
+def test_a_spread_holds_the_best_what_was_met_and_what_restarts_found():
+    found, _ = spreads_of([{"gain_db": 1.0}, {"gain_db": 4.0}], [{"gain_db": 6.0}, {"gain_db": 3.0}])
+    gain = found["gain_db"]
+    assert (gain.value, gain.low, gain.high) == pytest.approx((3.0, 1.0, 6.0))
+    assert gain.mean == pytest.approx(4.0) and gain.standard_deviation == pytest.approx(np.sqrt(3.0))
+    assert gain.was_tested and found.solutions == 4 and (found.restarts_as_good, found.restarts) == (2, 3)
+    assert gain.is_determined is False and found["dynamic_range_db"].is_determined is True
+
+
+def test_without_a_restart_as_good_there_is_no_mean_and_json_says_null():
+    found, _ = spreads_of([{"gain_db": 3.5}], [])
+    assert np.isnan(found["gain_db"].mean) and found["gain_db"].is_determined is None
+    written = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    (row,) = [row for row in written["spreads"] if row["name"] == "gain_db"]
+    assert row["mean"] is None and row["standard_deviation"] is None and row["high"] == pytest.approx(3.5)
+    assert (written["solutions"], written["restarts_as_good"], written["restarts"]) == (1, 0, 3)
+
+
+# ---- combinations ----------------------------------------------------------------------------------------------------
+
+
+def test_combinations_are_what_the_documentation_says_of_them():
+    found, _ = spreads_of([], [{}])
+    white, grey = TISSUES["white matter"], TISSUES["grey matter"]
+    var = variance_db(white)
+    share = white.scatterer_share
+    assert var == pytest.approx(10 * np.log10(share * (1 - share) * white.mu0**2 + share * white.sigma0**2), abs=1e-6)
+    for name, value in (
+        ("net fall with depth in white matter", 2 * 5.0 * (white.attenuation_db_cm_mhz - 0.4)),
+        ("Var of white matter", var),
+        ("Var of white matter re grey matter", var - variance_db(grey)),
+        ("Var of white matter with gain", var + 3.0),
+    ):
+        assert found[name].value == pytest.approx(value), name
+
+
+def test_combinations_stay_where_their_parts_trade_off():
+    """More attenuation with more TGC, half the amplitude with 6 dB of gain: each moves, the combination does not."""
+    white = TISSUES["white matter"]
+    faded = {
+        "attenuation_db_cm_mhz": white.attenuation_db_cm_mhz + 0.3, "tgc_db_cm_mhz": 0.7, "mu0": 0.5 * white.mu0,
+        "sigma0": 0.5 * white.sigma0, "gain_db": 3.0 + 20 * np.log10(2.0),
+    }  # fmt: skip
+    found, _ = spreads_of([], [faded])
+    still = ("net fall with depth in white matter", "Var of white matter with gain")
+    for name in (*still, "grey level of white matter at the face"):
+        spread = found[name]
+        assert spread.high - spread.low == pytest.approx(0.0, abs=1e-6) and spread.is_determined, name
+    for name in ("gain_db", "tgc_db_cm_mhz", "white matter.attenuation_db_cm_mhz", "Var of white matter"):
+        assert found[name].is_determined is False, name
+
+
+def test_tolerances_are_those_of_the_documentation():
+    """docs/optimization.md: attenuation 0.1 dB/(cm MHz), Var and gain 1.5 dB, dynamic range 3 dB."""
+    found, _ = spreads_of([], [{}])
+    frequency_mhz = 5.0
+    for name, tolerance in (
+        ("white matter.attenuation_db_cm_mhz", 0.1),
+        ("tgc_db_cm_mhz", 0.1),
+        ("net fall with depth in white matter", 2 * 0.1 * frequency_mhz),
+        ("Var of white matter", 1.5),
+        ("Var of white matter re grey matter", 1.5),
+        ("Var of white matter with gain", 1.5),
+        ("gain_db", 1.5),
+        ("dynamic_range_db", 3.0),
+    ):
+        assert found[name].tolerance == pytest.approx(tolerance), name
+
+
+def test_grey_level_at_the_face_is_that_of_the_display():
+    """10 dB more are 10 / 60 of the grey levels of a display of 60 dB."""
+    loud, plain = (
+        quantities_of(FreeParameters.of(["gain_db"], TISSUES_OF_BRAIN, DISPLAY), 5.0, TISSUES_OF_BRAIN)[-1].of(
+            TISSUES_OF_BRAIN, replace(DISPLAY, gain_db=gain)
+        )
+        for gain in (13.0, 3.0)
+    )
+    assert loud - plain == pytest.approx(255.0 * 10.0 / 60.0)
+
+
+def test_what_does_not_scatter_has_no_combination():
+    """CSF is silent: nothing is compared with it, and a tissue without scatterers has a level that can be printed."""
+    names = [q.name for q in quantities_of(FreeParameters.of(["white matter"], TISSUES_OF_BRAIN, DISPLAY), 5.0,
+                                           TISSUES_OF_BRAIN)]  # fmt: skip
+    assert "Var of white matter re grey matter" in names and not [name for name in names if "csf" in name]
+    silent = replace(TISSUES["csf"], mu0=0.0, sigma0=0.0)
+    assert variance_db(silent) == -200.0
+
+
+def test_two_tissues_are_compared_once():
+    parameters = FreeParameters.of(["white matter.mu0", "grey matter.mu0"], TISSUES_OF_BRAIN, DISPLAY)
+    names = [q.name for q in quantities_of(parameters, 5.0, TISSUES_OF_BRAIN)]
+    assert [name for name in names if " re " in name] == ["Var of white matter re grey matter"]
+    assert not [name for name in names if "with gain" in name or "net fall" in name]
+
+
+def test_the_net_fall_follows_every_tissue_that_is_looked_at_where_tgc_is_free():
+    parameters = FreeParameters.of(["white matter.mu0", "tgc_db_cm_mhz"], TISSUES_OF_BRAIN, DISPLAY)
+    names = [q.name for q in quantities_of(parameters, 5.0, TISSUES_OF_BRAIN)]
+    assert [name for name in names if "net fall" in name] == ["net fall with depth in white matter"]
