@@ -146,10 +146,29 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         """Called when the user opens the module for the first time."""
         ScriptedLoadableModuleWidget.setup(self)
         try:
-            from SlicerUSSim.Widget.panel import Panel
-        except ImportError:  # a Slicer that has not been asked for the packages yet
+            self.showPanel()
+        except ImportError:  # a Slicer that lacks packages of which the panel itself is made
+            self.installButton = qt.QPushButton(_("Install the Python packages that this module needs"))
+            self.installButton.clicked.connect(self.onInstall)
+            self.layout.addWidget(self.installButton)
+            self.onInstall()
+
+    def onInstall(self, *_unused) -> None:
+        """Ask for the packages, and show the panel if they are there then."""
+        from SlicerUSSim.Logic.base.errors import SimulationError
+
+        try:
             ensurePackages()
-            from SlicerUSSim.Widget.panel import Panel
+        except SimulationError as error:
+            slicer.util.errorDisplay(str(error))
+            return
+        self.installButton.setVisible(False)
+        self.showPanel()
+
+    def showPanel(self) -> None:
+        """Make the panel. Raises ImportError where a package is missing."""
+        from SlicerUSSim.Widget.panel import Panel
+
         self.logic = USSimLogic()
         self.initializeParameterNode()
         widget = qt.QWidget()

@@ -14,7 +14,6 @@ import unittest
 from pathlib import Path
 
 import slicer
-import vtk
 from PySide6 import QtCore, QtGui, QtWidgets
 
 # ---- CTK and MRML widgets --------------------------------------------------------------------------------------------

@@ -779,7 +779,7 @@ def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
     for text in ("many", "3.5", "nan", "7"):  # a scene made by hand
         node.SetParameter("classes", text)
         for name in ("classes", "segmentation"):
-            with pytest.raises(SimulationError, match="classes is .*, expected a whole number between 3 and 4"):
+            with pytest.raises(SimulationError, match=r"classes is .*, expected a whole number between 3 and 4"):
                 getattr(parameters, name)
     node.SetParameter("bias_correction", "maybe")
     with pytest.raises(SimulationError, match="bias_correction is 'maybe', expected true or false"):
@@ -801,7 +801,8 @@ def test_every_declared_setting_is_remembered_one_by_one_and_together(bench):
     parameters.fit_evaluations = 70
     assert parameters.fit == FitSettings("0,5", "gain_db", False, True, 70, 0)
     assert set(VALUE_PARAMETERS) == {
-        *(entry.name for entry in fields(SegmentationSettings)), *(f"fit_{entry.name}" for entry in fields(FitSettings)),
+        *(entry.name for entry in fields(SegmentationSettings)),
+        *(f"fit_{entry.name}" for entry in fields(FitSettings)),
         "show_in_slice", "preset",
     }  # fmt: skip
 

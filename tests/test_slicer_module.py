@@ -190,6 +190,29 @@ def test_start_up_imports_nothing_that_takes_time_or_may_be_missing():
     assert done.returncode == 0 and done.stdout.strip().endswith("fine"), done.stderr[-2000:]
 
 
+def test_a_slicer_without_packages_of_the_panel_asks_for_them_and_shows_it_then(module, simulation_error, monkeypatch):
+    def declined() -> None:
+        raise simulation_error()("the installation was declined")
+
+    module.app.errors.clear()
+    monkeypatch.setitem(sys.modules, "SlicerUSSim.Widget.panel", None)  # importing it fails
+    monkeypatch.setattr(module, "ensurePackages", declined)
+    slicer.mrmlScene = slicer.vtkMRMLScene()
+    parent = stand_in.QtWidgets.QWidget()
+    stand_in.QtWidgets.QVBoxLayout(parent)
+    parent.isEntered = True
+    widget = module.USSimWidget(parent)
+    widget.setup()
+    widget.enter()
+    widget.onSceneEndChange(None, None)
+    assert widget.panel is None and module.app.errors == ["the installation was declined"]
+    monkeypatch.delitem(sys.modules, "SlicerUSSim.Widget.panel")
+    monkeypatch.setattr(module, "ensurePackages", lambda: None)
+    widget.installButton.click()
+    assert widget.panel is not None and widget.ui.segmentButton and not widget.installButton.isVisibleTo(parent)
+    widget.cleanup()
+
+
 def test_requirements_are_those_of_the_package_without_what_slicer_brings():
     tomllib = pytest.importorskip("tomllib")
     package = {
@@ -353,7 +376,7 @@ def test_every_value_of_the_panel_accepts_both_ends_of_its_range(session):
     presenter = session.panel.presenter
     for probe in session.logic_module("probe.arrays").PROBES.values():
         session.logic.preset = preset_module.Preset(probe)
-        for name, (control, widget) in controls_of(session).items():
+        for name, (control, _) in controls_of(session).items():
             shown = presenter.value(name)
             if shown is None:
                 continue

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
 
 from SlicerUSSim.Logic.base.declaration import Parameter, Shown
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
@@ -45,11 +45,12 @@ class Control:
     new_node: str = ""
     #: What a choice offers, if that is always the same
     choices: tuple[str, ...] = ()
-    #: What tells the value or the words
+    #: What gives the value or the words
     shows: str = ""
     #: What is called, with the value if there is one
     action: str = ""
-    #: What tells whether it can be used: true or false, or (true or false, why not)
+    #: What says whether it can be used: true or false, or (true or false, why not). Without it, it can always be used,
+    #: and needs no packages.
     enabled: str = ""
 
     @property
@@ -82,18 +83,27 @@ class Control:
         return max(self.range.decimals, 0 if is_whole or self.kind == "slider" else 1)
 
     @property
+    def hint(self) -> str:
+        """What an empty text stands for, if the tool tip says "empty for ..."."""
+        return self.tip.partition("empty for ")[2]
+
+    @property
     def node_classes(self) -> tuple[str, ...]:
         """Classes of the nodes that can be chosen."""
         return NODE_PARAMETERS[self.node]
 
 
+#: A line of the panel: one control, or some side by side.
+Row: TypeAlias = Control | tuple[Control, ...]
+
+
 @dataclass(frozen=True)
 class Section:
-    """A part of the panel that opens and closes. Controls in a tuple stand side by side."""
+    """A part of the panel that opens and closes."""
 
     title: str
     is_open: bool
-    rows: tuple[Control | tuple[Control, ...], ...]
+    rows: tuple[Row, ...]
 
     @property
     def controls(self) -> Iterator[Control]:
@@ -115,18 +125,11 @@ def value(name: str) -> Control:
         kind = "choice"
     elif declared.type is bool:
         kind = "tick"
-    result = Control(
-        _camel_case(_without_unit(declared)),
-        kind,
-        declared.label,
-        declared.tip,
-        name,
-        declared,
-        choices=declared.choices,
-    )
+    widget = _camel_case(_without_unit(declared))
+    result = Control(widget, kind, declared.label, declared.tip, name, declared, choices=declared.choices)
     if isinstance(declared.shown, Shown):
         span = f"{declared.shown.low:.10g} to {declared.shown.high:.10g}{result.suffix}"
-        return Control(**{**vars(result), "tip": f"{declared.tip} ({span})"})
+        result = replace(result, tip=f"{declared.tip} ({span})")
     return result
 
 

@@ -184,7 +184,7 @@ class PanelPresenter:
         self.view.refresh()
 
     def placeProbe(self) -> None:
-        """Put the probe on the surface in the view's slice, or where a craniotomy might be; make one if there is none."""
+        """Put the probe on the surface in the slice view, or where a craniotomy might be; make one if there is none."""
         with self.shown():
             require(self.logic.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
             self._put_probe(self.view.sliceNode())

@@ -16,7 +16,7 @@ import slicer
 from SlicerUSSim.Widget.controls import Control, Section, by_widget
 
 _PAGE_STEPS = 10
-_TABLE_HEIGHT, _LIST_HEIGHT = 220, 150
+_TABLE_HEIGHT, _LIST_HEIGHT = 220, 140
 
 
 def build(sections: tuple[Section, ...], column: Any) -> SimpleNamespace:
@@ -106,6 +106,12 @@ def _node(control: Control) -> Any:
     return result
 
 
+def _text(control: Control) -> Any:
+    result = qt.QLineEdit()
+    result.setProperty("placeholderText", control.hint)
+    return result
+
+
 def _words(control: Control) -> Any:
     result = qt.QLabel("")
     result.setProperty("wordWrap", True)
@@ -121,6 +127,7 @@ def _table(control: Control) -> Any:
 
 def _list(control: Control) -> Any:
     result = qt.QListWidget()
+    result.setMinimumHeight(_LIST_HEIGHT)
     result.setMaximumHeight(_LIST_HEIGHT)
     return result
 
@@ -130,7 +137,7 @@ _MAKERS = {
     "number": _number,
     "tick": lambda control: qt.QCheckBox(control.label),
     "choice": _choice,
-    "text": lambda control: qt.QLineEdit(),
+    "text": _text,
     "node": _node,
     "button": lambda control: qt.QPushButton(control.label),
     "words": _words,

@@ -155,7 +155,8 @@ def _control(control: Control) -> None:
         unit = f" [{control.unit}]" if control.unit else ""
         value = "Number($event.target.value)" if kind == "number" else "$event.target.value"
         shown = f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})" if kind == "number" else key
-        limits = f'min="{low:.10g}" max="{high:.10g}" step="{control.range.step:g}"' if kind == "number" else ""
+        limits = f'min="{low:.10g}" max="{high:.10g}" step="{control.range.step:g}"'
+        limits = limits if kind == "number" else f'placeholder="{escape(control.hint)}"'
         html.Div(
             f"""<label for="{name}">{escape(control.label)}{unit}</label>
             <input type="{kind}" id="{name}" {limits}
