@@ -12,6 +12,7 @@ import sys
 import threading
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -294,11 +295,8 @@ def test_a_section_with_a_value_and_a_button_works_on_the_page_without_further_c
     messages = Messages(shared)
     logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     panel = BrowserPanel(shared, messages, logic, tasks, sections, lambda: None)
-
-    class Loading:
-        segment = place_probe = None
-
-    buttons = Buttons(shared, tasks, panel.presenter, sections, Loading())
+    loading = SimpleNamespace(segment=None, place_probe=None)
+    buttons = Buttons(shared, tasks, panel.presenter, sections, loading)
     panel.refresh()
     assert shared.now.panel.values["marginSpinBox"] == 2.0 and shared.now.panel.can["extractButton"]
     panel.set("marginSpinBox", 4.5)
@@ -318,6 +316,14 @@ def test_a_section_with_a_value_and_a_button_works_on_the_page_without_further_c
     text = page.html
     assert '<label for="marginSpinBox">Margin [mm]</label>' in text and 'min="0" max="20" step="0.5"' in text
     assert "trigger('press', ['extractButton'])" in text and 'id="section-brain"' in text
+
+
+def test_what_the_page_does_otherwise_is_there_to_be_done_otherwise():
+    names = set(controls.by_widget(panel_sections()))
+    assert page_of.NOT_SHOWN < names and set(page_of._IN_PAGE) < names
+    assert (
+        set(Buttons(None, None, None, panel_sections(), SimpleNamespace(segment=1, place_probe=2))._own_actions) < names
+    )
 
 
 def test_only_what_assembles_everything_knows_the_page():

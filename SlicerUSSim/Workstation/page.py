@@ -169,15 +169,15 @@ def _control(control: Control) -> None:
             update_modelValue=f"trigger('set', ['{name}', $event])", id=name, disabled=(disabled,),
         )  # fmt: skip
     elif kind in ("choice", "node"):
-        if kind == "node":
+        if kind == "node":  # none has no ID, and a choice of HTML no null
             items = f"{NAMES.panel.nodes}.{name} ?? []"
-            options = f"""<option v-for="item in ({items})" :value="item.value">{{{{ item.title }}}}
+            options = f"""<option v-for="item in ({items})" :value="item.value ?? ''">{{{{ item.title }}}}
             </option>"""
         else:
             options = f"""<option v-for="item in {NAMES.panel.choices}.{name}">{{{{ item }}}}</option>"""
         html.Div(
             f"""<label for="{name}">{escape(control.label)}</label>
-            <select id="{name}" :value="{key}"
+            <select id="{name}" :value="{key} ?? ''"
             @change="trigger('set', ['{name}', $event.target.value])">{options}</select>""",
             classes="ussim-line", title=control.tip,
         )  # fmt: skip
