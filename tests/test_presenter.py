@@ -6,14 +6,17 @@ import inspect
 import subprocess
 import sys
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import pytest
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
+from SlicerUSSim.Logic.base.declaration import Shown, parameter  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
+from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, LinearProbe  # noqa: E402
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS  # noqa: E402
 from SlicerUSSim.Widget.controls import by_widget, part_of, shown_by, usable  # noqa: E402
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter  # noqa: E402
@@ -107,6 +110,22 @@ def test_the_tissue_table_has_a_column_for_every_number_of_a_tissue(presenter):
     for (_, heading, tip), entry in zip(TISSUE_COLUMNS, TISSUE_PARAMETERS, strict=True):
         assert heading == entry.symbol and entry.tip in tip and entry.unit in tip
     assert all(len(row.values) == len(TISSUE_COLUMNS) for row in presenter.tissues())
+
+
+def test_a_parameter_of_a_new_kind_of_probe_is_in_the_panel_by_its_declaration_alone(presenter):
+    @dataclass(frozen=True)
+    class RingProbe(LinearProbe):
+        kind = "ring"
+        turn_deg: float = parameter(
+            0.0, "Turn", "About its axis", unit="°", bounds=(-180, 180), shown=Shown(-90, 90, 0.5)
+        )
+
+    try:
+        control = by_widget(panel_sections())["turnSpinBox"]
+        assert control.tip == "About its axis (-90 to 90°)" and control.suffix == "°" and control.decimals == 1
+        assert presenter.value("probe.turn_deg") is None  # the probe in use has none
+    finally:
+        del PROBE_KINDS["ring"]
 
 
 def test_widgets_are_called_after_what_they_show_without_its_unit():

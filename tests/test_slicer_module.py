@@ -211,6 +211,8 @@ def test_a_slicer_without_packages_of_the_panel_asks_for_them_and_shows_it_then(
     widget.installButton.click()
     assert widget.panel is not None and widget.ui.segmentButton and not widget.installButton.isVisibleTo(parent)
     widget.cleanup()
+    parent.deleteLater()
+    module.app.processEvents()
 
 
 def test_requirements_are_those_of_the_package_without_what_slicer_brings():
@@ -813,6 +815,17 @@ def test_closing_the_scene_and_leaving_the_module_is_survived(session):
     session.widget.enter()
     session.ui.segmentButton.click()
     assert session.parameters.labels is not None and not session.app.errors
+
+
+def test_widgets_leave_the_scene_alone_while_another_module_is_open(session):
+    session.parameters.mri = session.head()
+    session.widget.exit()
+    session.ui.mriSelector.setCurrentNode(None)  # as selectors do while a scene is closed
+    session.ui.gainSlider.setValue(3.0)
+    assert session.parameters.mri is not None and session.logic.preset.display.gain_db == 0.0
+    session.widget.enter()
+    assert session.ui.mriSelector.currentNode() is session.parameters.mri
+    assert session.ui.gainSlider.property("value") == 0.0
 
 
 def test_reloading_the_module_brings_new_code(module):

@@ -43,7 +43,7 @@ class Panel:
         self.ui = build(sections, column)
         self.logic = logic
         self.presenter = PanelPresenter(logic, self)
-        #: Whether what the widgets hold goes to the scene: not while a scene is closed or loaded
+        #: Whether what the widgets hold goes to the scene: not while it is closed or loaded, nor in other modules
         self.isConnected = True
         self._ensure_packages = ensure_packages
         self._cancelled = False
@@ -147,7 +147,7 @@ class Panel:
         """What a signal calls, which carries what the widget holds in a form that differs between bindings of Qt."""
 
         def called(*_) -> None:
-            if self.isConnected:
+            if self.isConnected or control.kind == "button":
                 method(control, widget)
 
         return called

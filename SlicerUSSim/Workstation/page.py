@@ -164,10 +164,11 @@ def _control(control: Control) -> None:
             classes="ussim-line", title=control.tip,
         )  # fmt: skip
     elif kind == "tick":
-        v3.VCheckbox(
-            label=control.label, model_value=(key,), density="compact", hide_details=True, title=control.tip,
-            update_modelValue=f"trigger('set', ['{name}', $event])", id=name, disabled=(disabled,),
-        )  # fmt: skip
+        with html.Div(title=control.tip):  # a title of the check box would not be its label's
+            v3.VCheckbox(
+                label=control.label, model_value=(key,), density="compact", hide_details=True, id=name,
+                update_modelValue=f"trigger('set', ['{name}', $event])", disabled=(disabled,),
+            )  # fmt: skip
     elif kind in ("choice", "node"):
         if kind == "node":  # none has no ID, and a choice of HTML no null
             items = f"{NAMES.panel.nodes}.{name} ?? []"
