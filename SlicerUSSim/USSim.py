@@ -4,6 +4,7 @@ What the module does is in the package SlicerUSSim, in Logic and Widget; this fi
 Slicer.
 """
 
+import functools
 import importlib.machinery
 import importlib.util
 import logging
@@ -12,14 +13,9 @@ import unittest
 from pathlib import Path
 from typing import Annotated
 
+import qt
 import slicer
 import vtk
-from slicer import (
-    vtkMRMLLinearTransformNode,
-    vtkMRMLModelNode,
-    vtkMRMLNode,
-    vtkMRMLScalarVolumeNode,
-)
 from slicer.i18n import tr as _, translate
 from slicer.parameterNodeWrapper import Choice, WithinRange, parameterNodeWrapper
 from slicer.ScriptedLoadableModule import (
@@ -111,31 +107,34 @@ def ensurePackages() -> None:
     offer_opencl_runtime()
 
 
-@parameterNodeWrapper
-class USSimParameterNode:
-    """What a scene remembers of the module; the names are those of Logic/mrml/parameter_node.py.
+@functools.cache
+def makeParameterNodeClass() -> type:
+    """USSimParameterNode: what a scene remembers of the module, typed, as Logic/mrml/parameter_node.py declares it.
 
-    mask and labels may be label maps or segmentations, real a sequence or a volume, which the panel sees to.
+    Roles that nodes of several classes can play are vtkMRMLNode here. Values that may be None are left out: Slicer
+    keeps those in another form. Made at first use, since the declarations need packages that Slicer may yet lack.
     """
+    from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, VALUE_PARAMETERS
 
-    mri: vtkMRMLScalarVolumeNode
-    mask: vtkMRMLNode
-    labels: vtkMRMLNode
-    probe_transform: vtkMRMLLinearTransformNode
-    output: vtkMRMLScalarVolumeNode
-    outline: vtkMRMLModelNode
-    real: vtkMRMLNode
-    contrast: Annotated[str, Choice(["t1", "t1gd", "t2", "flair"])] = "t1"
-    classes: Annotated[int, WithinRange(3, 4)] = 3
-    thin_sulci: bool = True
-    bias_correction: bool = False
-    show_in_slice: bool = True
-    preset: str = ""
-    fit_frames: str = ""
-    fit_free: str = "display, white matter"
-    fit_estimate: bool = False
-    fit_register: bool = False
-    fit_evaluations: int = 500
+    types, defaults = {}, {}
+    for role, classes in NODE_PARAMETERS.items():
+        types[role] = getattr(slicer, classes[0] if len(classes) == 1 else "vtkMRMLNode")
+    for name, entry in VALUE_PARAMETERS.items():
+        if entry.can_be_none:
+            continue
+        types[name], defaults[name] = entry.type, entry.default
+        if entry.choices:
+            types[name] = Annotated[entry.type, Choice(list(entry.choices))]
+        elif entry.bounds is not None:
+            types[name] = Annotated[entry.type, WithinRange(*entry.bounds)]
+    body = {"__module__": __name__, "__doc__": "Parameters of USSim.", "__annotations__": types, **defaults}
+    return parameterNodeWrapper(type("USSimParameterNode", (), body))
+
+
+def __getattr__(name: str):
+    if name == "USSimParameterNode":
+        return makeParameterNodeClass()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
@@ -147,23 +146,40 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         self.logic = None
         self.panel = None
         self._parameterNode = None
-        self._parameterNodeGuiTag = None
 
     def setup(self) -> None:
         """Called when the user opens the module for the first time."""
         ScriptedLoadableModuleWidget.setup(self)
         try:
-            from SlicerUSSim.Widget.panel import Panel
-        except ImportError:  # a Slicer without scipy
+            self.showPanel()
+        except ImportError:  # a Slicer that lacks packages of which the panel itself is made
+            self.installButton = qt.QPushButton(_("Install the Python packages that this module needs"))
+            self.installButton.clicked.connect(self.onInstall)
+            self.layout.addWidget(self.installButton)
+            self.onInstall()
+
+    def onInstall(self, *_unused) -> None:
+        """Ask for the packages, and show the panel if they are there then."""
+        from SlicerUSSim.Logic.base.errors import SimulationError
+
+        try:
             ensurePackages()
-            from SlicerUSSim.Widget.panel import Panel
-        widget = slicer.util.loadUI(str(_RESOURCES / "UI" / "USSim.ui"))
-        self.layout.addWidget(widget)
-        self.ui = slicer.util.childWidgetVariables(widget)
-        widget.setMRMLScene(slicer.mrmlScene)
+        except SimulationError as error:
+            slicer.util.errorDisplay(str(error))
+            return
+        self.installButton.setVisible(False)
+        self.showPanel()
+
+    def showPanel(self) -> None:
+        """Make the panel. Raises ImportError where a package is missing."""
+        from SlicerUSSim.Widget.panel import Panel
+
         self.logic = USSimLogic()
         self.initializeParameterNode()
-        self.panel = Panel(self.ui, self.logic.ultrasound, ensurePackages)
+        widget = qt.QWidget()
+        self.layout.addWidget(widget)
+        self.panel = Panel(qt.QVBoxLayout(widget), self.logic.ultrasound, ensurePackages)
+        self.ui = self.panel.ui
         self.panel.presenter.chooseDefaultNodes()
         scene = slicer.mrmlScene
         for event in (scene.StartCloseEvent, scene.StartImportEvent):
@@ -206,11 +222,11 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
     def setParameterNode(self, parameterNode) -> None:  # noqa: N803, as in Slicer's template
         """Show and observe another parameter node, or none."""
         if self._parameterNode is not None:
-            self._parameterNode.disconnectGui(self._parameterNodeGuiTag)
             self.removeObserver(self._parameterNode, vtk.vtkCommand.ModifiedEvent, self.onParametersModified)
         self._parameterNode = parameterNode
+        if self.panel is not None:
+            self.panel.isConnected = parameterNode is not None
         if self._parameterNode is not None:
-            self._parameterNodeGuiTag = self._parameterNode.connectGui(self.ui)
             self.addObserver(self._parameterNode, vtk.vtkCommand.ModifiedEvent, self.onParametersModified)
             self.onParametersModified()
 
@@ -234,7 +250,7 @@ class USSimLogic(ScriptedLoadableModuleLogic):
 
     def getParameterNode(self):
         """The parameters of the scene, typed."""
-        return USSimParameterNode(super().getParameterNode())
+        return makeParameterNodeClass()(super().getParameterNode())
 
 
 class USSimTest(ScriptedLoadableModuleTest):

@@ -14,8 +14,7 @@ import unittest
 from pathlib import Path
 
 import slicer
-import vtk
-from PySide6 import QtCore, QtGui, QtUiTools, QtWidgets
+from PySide6 import QtCore, QtGui, QtWidgets
 
 # ---- CTK and MRML widgets --------------------------------------------------------------------------------------------
 
@@ -156,51 +155,6 @@ class NodeComboBox(QtWidgets.QComboBox):
     )
 
 
-class MRMLWidget(QtWidgets.QWidget):
-    """qMRMLWidget: hands the scene to the selectors in it, as the .ui file's connections do in Slicer."""
-
-    def setMRMLScene(self, scene) -> None:
-        for selector in self.findChildren(NodeComboBox):
-            selector.setMRMLScene(scene)
-
-
-WIDGETS = {
-    "ctkCollapsibleButton": CollapsibleButton,
-    "ctkSliderWidget": SliderWidget,
-    "qMRMLNodeComboBox": NodeComboBox,
-    "qMRMLWidget": MRMLWidget,
-}
-
-
-class UiLoader(QtUiTools.QUiLoader):
-    """Qt's own loader of .ui files, for those four classes too."""
-
-    def createWidget(self, class_name, parent=None, name=""):
-        if class_name in WIDGETS:
-            widget = WIDGETS[class_name](parent)
-            widget.setObjectName(name)
-            return widget
-        return super().createWidget(class_name, parent, name)
-
-
-def load_ui(path) -> QtWidgets.QWidget:
-    file = QtCore.QFile(str(path))
-    if not file.open(QtCore.QFile.ReadOnly):
-        raise RuntimeError(f"Could not load UI file: {path}")
-    widget = UiLoader().load(file)
-    if widget is None:
-        raise RuntimeError(f"Could not load UI file: {path}")
-    return widget
-
-
-def child_widget_variables(widget):
-    ui = types.SimpleNamespace()
-    for child in widget.findChildren(QtWidgets.QWidget):
-        if child.objectName() and not child.objectName().startswith("qt_"):
-            setattr(ui, child.objectName(), child)
-    return ui
-
-
 # ---- slicer.parameterNodeWrapper -------------------------------------------------------------------------------------
 
 
@@ -215,7 +169,7 @@ class WithinRange:
 
 
 def parameter_node_wrapper(cls):
-    """Typed attributes kept in a vtkMRMLScriptedModuleNode, and their widgets (SlicerParameterName)."""
+    """Typed attributes kept in a vtkMRMLScriptedModuleNode."""
     hints = typing.get_type_hints(cls, include_extras=True)
     types_ = {name: typing.get_args(hint)[0] if typing.get_args(hint) else hint for name, hint in hints.items()}
     notes = {name: typing.get_args(hint)[1:] for name, hint in hints.items()}
@@ -250,79 +204,17 @@ def parameter_node_wrapper(cls):
 
     def init(self, parameter_node) -> None:
         self.parameterNode = parameter_node
-        self._connected = {}
         for name, default in defaults.items():
             if not parameter_node.HasParameter(name):
                 setattr(self, name, default)
 
-    def connect_gui(self, ui) -> int:
-        for widget in vars(ui).values():
-            name = widget.property("SlicerParameterName")
-            if name:
-                assert name in hints, f"{widget.objectName()} is connected to {name!r}, which is no parameter"
-                self._connected[name] = widget
-                _prepare(widget, types_[name], notes[name])
-        _show(self)
-        self._slots = {}
-        for name, widget in self._connected.items():
-            self._slots[name] = lambda *_, n=name, w=widget: setattr(self, n, _read(w))
-            _signal(widget).connect(self._slots[name])
-        self._tag = self.AddObserver(vtk.vtkCommand.ModifiedEvent, lambda *_: _show(self))
-        return 0
-
-    def disconnect_gui(self, tag) -> None:
-        for name, widget in self._connected.items():
-            _signal(widget).disconnect(self._slots[name])
-        self._connected = {}
-        self.RemoveObserver(self._tag)
-
     for name in hints:
         setattr(cls, name, make(name))
-    cls.__init__, cls.connectGui, cls.disconnectGui = init, connect_gui, disconnect_gui
+    cls.__init__ = init
     cls.AddObserver = lambda self, *arguments: self.parameterNode.AddObserver(*arguments)
     cls.RemoveObserver = lambda self, tag: self.parameterNode.RemoveObserver(tag)
     cls.names = tuple(hints)
     return cls
-
-
-def _prepare(widget, kind, notes) -> None:
-    if isinstance(widget, NodeComboBox):
-        widget._types = [kind().GetClassName()]
-    for note in notes:
-        if isinstance(note, Choice):
-            widget.clear()
-            widget.addItems(note.choices)
-        if isinstance(note, WithinRange):
-            widget.setRange(note.minimum, note.maximum)
-
-
-def _signal(widget):
-    if isinstance(widget, NodeComboBox):
-        return widget.currentNodeChanged
-    if isinstance(widget, QtWidgets.QCheckBox):
-        return widget.stateChanged
-    return widget.currentIndexChanged if isinstance(widget, QtWidgets.QComboBox) else widget.valueChanged
-
-
-def _read(widget):
-    if isinstance(widget, NodeComboBox):
-        return widget.currentNode()
-    for name in ("checked", "currentText", "value"):
-        if widget.property(name) is not None:
-            return widget.property(name)
-
-
-def _show(wrapper) -> None:
-    for name, widget in wrapper._connected.items():
-        value = getattr(wrapper, name)
-        if isinstance(widget, NodeComboBox):
-            widget.setCurrentNode(value)
-        elif isinstance(widget, QtWidgets.QCheckBox):
-            widget.setChecked(value)
-        elif isinstance(widget, QtWidgets.QComboBox):
-            widget.setCurrentText(value)
-        else:
-            widget.setValue(value)
 
 
 # ---- slicer.ScriptedLoadableModule -----------------------------------------------------------------------------------
@@ -411,13 +303,12 @@ def _qt_name(name: str):
 
 def start() -> Application:
     """Install the stand-ins where the module imports them; pytest's monkeypatch of sys.modules removes them again."""
-    # The scene's pointer type is PythonQt's: MRMLWidget hands the scene on instead of the .ui file's connections.
-    QtCore.QLoggingCategory.setFilterRules("qt.core.qobject.connect=false")
     qt = types.ModuleType("qt")
     qt.__getattr__ = _qt_name
     app = Application()
     modules = {
         "qt": qt,
+        "ctk": types.SimpleNamespace(ctkCollapsibleButton=CollapsibleButton, ctkSliderWidget=SliderWidget),
         "slicer.i18n": types.SimpleNamespace(tr=lambda text: text, translate=lambda context, text: text),
         "slicer.parameterNodeWrapper": types.SimpleNamespace(
             parameterNodeWrapper=parameter_node_wrapper, Choice=Choice, WithinRange=WithinRange
@@ -431,8 +322,7 @@ def start() -> Application:
     }
     sys.modules.update(modules)
     slicer.app = app
-    slicer.util.loadUI = load_ui
-    slicer.util.childWidgetVariables = child_widget_variables
+    slicer.qMRMLNodeComboBox = NodeComboBox
     slicer.util.errorDisplay = app.errors.append
     slicer.util.pip_install = app.pip_install
     slicer.util.confirmOkCancelDisplay = app.confirm

@@ -12,6 +12,7 @@ import sys
 import threading
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -46,17 +47,28 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 pytest.importorskip("greenlet", reason="the workstation comes with: pip install '.[serve]'")
 pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
 
+from trame.app import get_server  # noqa: E402
+from trame.ui.vuetify3 import VAppLayout  # noqa: E402
 from trame_server.state import State  # noqa: E402
 from trame_server.utils.typed_state import TypedState  # noqa: E402
 
+from SlicerUSSim.Logic.base.declaration import Parameter, Shown  # noqa: E402
+from SlicerUSSim.Logic.mrml import parameter_node  # noqa: E402
 from SlicerUSSim.Logic.mrml.fit_nodes import tracked_images  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, SequenceIndex, add_sequence  # noqa: E402
 from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
+from SlicerUSSim.Widget import controls  # noqa: E402
+from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
+from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
+from SlicerUSSim.Workstation import page as page_of  # noqa: E402
+from SlicerUSSim.Workstation.buttons import Buttons  # noqa: E402
 from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
 from SlicerUSSim.Workstation.export import Cine  # noqa: E402
+from SlicerUSSim.Workstation.messages import Messages  # noqa: E402
+from SlicerUSSim.Workstation.panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.state import (  # noqa: E402
     NAMES,
     ComparisonMode,
@@ -250,6 +262,67 @@ def test_every_value_that_is_shared_has_a_name_of_its_own_and_begins_as_it_is_de
     assert len({name for name, _ in declared}) == len(declared) > 25
     assert TypedState.as_dataclass(shared.now) == PageState()
     assert {name for name, _ in declared} == set(state.to_dict())
+
+
+class AtOnceTasks:
+    """Tasks that are done when they are started."""
+
+    def start(self, task) -> None:
+        task()
+
+
+def brain_section(monkeypatch):
+    """A section with a value and a button, as they would be declared: parameter_node.py, presenter.py, sections.py."""
+    entry = Parameter(
+        name="margin_mm", type=float, default=2.0, label="Margin", tip="What is left around the brain", unit="mm",
+        bounds=(0, 50), shown=Shown(0, 20, 0.5),
+    )  # fmt: skip
+    monkeypatch.setitem(parameter_node.VALUE_PARAMETERS, "margin_mm", entry)
+    value = parameter_node.ValueParameter(entry)
+    monkeypatch.setattr(parameter_node.SceneParameters, "margin_mm", value, raising=False)
+    pressed: list[float] = []
+    extract = lambda self: pressed.append(self.logic.parameters.margin_mm)  # noqa: E731
+    monkeypatch.setattr(PanelPresenter, "extract", extract, raising=False)
+    monkeypatch.setattr(PanelPresenter, "canExtract", lambda self: (not pressed, "It is done"), raising=False)
+    button = controls.button("extract", "Extract", "Find the brain in the MRI", enabled="canExtract")
+    return controls.Section("Brain", True, (controls.value("scene.margin_mm"), button)), pressed
+
+
+def test_a_section_with_a_value_and_a_button_works_on_the_page_without_further_code(monkeypatch):
+    section, pressed = brain_section(monkeypatch)
+    sections = (*panel_sections(), section)
+    shared, tasks = SharedState(State(ready=True)), AtOnceTasks()
+    messages = Messages(shared)
+    logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
+    panel = BrowserPanel(shared, messages, logic, tasks, sections, lambda: None)
+    loading = SimpleNamespace(segment=None, place_probe=None)
+    buttons = Buttons(shared, tasks, panel.presenter, sections, loading)
+    panel.refresh()
+    assert shared.now.panel.values["marginSpinBox"] == 2.0 and shared.now.panel.can["extractButton"]
+    panel.set("marginSpinBox", 4.5)
+    assert logic.parameters.margin_mm == 4.5 and shared.now.panel.values["marginSpinBox"] == 4.5
+    buttons.press("extractButton")
+    panel.refresh()
+    assert pressed == [4.5] and not shared.now.messages.errors
+    assert shared.now.panel.can["extractButton"] is False and shared.now.panel.tips["extractButton"] == "It is done"
+    for value in (77, "wide", None):
+        panel.set("marginSpinBox", value)
+        assert "margin_mm is" in shared.now.messages.errors[-1] and logic.parameters.margin_mm == 4.5
+    assert len(shared.now.messages.errors) == 3
+
+    server = get_server("a page with another section", client_type="vue3")
+    with VAppLayout(server) as page:
+        page_of._drawer(sections)
+    text = page.html
+    assert '<label for="marginSpinBox">Margin [mm]</label>' in text and 'min="0" max="20" step="0.5"' in text
+    assert "trigger('press', ['extractButton'])" in text and 'id="section-brain"' in text
+
+
+def test_what_the_page_does_otherwise_is_there_to_be_done_otherwise():
+    names = set(controls.by_widget(panel_sections()))
+    assert names.issuperset(page_of.NOT_SHOWN | set(page_of._IN_PAGE))
+    loading = SimpleNamespace(segment=None, place_probe=None)
+    assert names.issuperset(Buttons(None, None, None, panel_sections(), loading)._own_actions)
 
 
 def test_only_what_assembles_everything_knows_the_page():

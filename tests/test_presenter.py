@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import pytest
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
 
+from SlicerUSSim.Logic.base.declaration import Shown, parameter  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
-from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
+from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, LinearProbe  # noqa: E402
+from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS  # noqa: E402
+from SlicerUSSim.Widget.controls import by_widget, part_of, shown_by, usable  # noqa: E402
+from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter  # noqa: E402
+from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
 
 
 class PlainView:
@@ -77,6 +84,77 @@ def test_from_mri_to_live_image(presenter):
     assert after.astype(float).mean() > before.astype(float).mean() + 10
     presenter.setLive(False)
     assert not presenter.isLive()
+
+
+def test_every_name_in_the_list_of_sections_is_one_of_the_presenter(presenter):
+    controls = by_widget(panel_sections())
+    own = {"loadPreset", "savePreset", "assignTissue"}  # with what the view has chosen
+    for control in controls.values():
+        if control.shows:
+            shown_by(presenter, control.shows)
+        if control.action:
+            assert callable(part_of(presenter, control.action)), control.name
+            needs = [
+                parameter
+                for parameter in inspect.signature(part_of(presenter, control.action)).parameters.values()
+                if parameter.default is parameter.empty
+            ]
+            assert control.name in own or len(needs) == (control.kind != "button"), control.name
+        can, tip = usable(presenter, control)
+        assert isinstance(can, bool) and tip
+    assert len(controls) > 60
+
+
+def test_the_tissue_table_has_a_column_for_every_number_of_a_tissue(presenter):
+    assert [name for name, _, _ in TISSUE_COLUMNS] == [entry.name for entry in TISSUE_PARAMETERS]
+    for (_, heading, tip), entry in zip(TISSUE_COLUMNS, TISSUE_PARAMETERS, strict=True):
+        assert heading == entry.symbol and entry.tip in tip and entry.unit in tip
+    assert all(len(row.values) == len(TISSUE_COLUMNS) for row in presenter.tissues())
+
+
+def test_a_parameter_of_a_new_kind_of_probe_is_in_the_panel_by_its_declaration_alone(presenter):
+    @dataclass(frozen=True)
+    class RingProbe(LinearProbe):
+        kind = "ring"
+        turn_deg: float = parameter(
+            0.0, "Turn", "About its axis", unit="°", bounds=(-180, 180), shown=Shown(-90, 90, 0.5)
+        )
+
+    try:
+        control = by_widget(panel_sections())["turnSpinBox"]
+        assert control.tip == "About its axis (-90 to 90°)" and control.suffix == "°" and control.decimals == 1
+        assert presenter.value("probe.turn_deg") is None  # the probe in use has none
+    finally:
+        del PROBE_KINDS["ring"]
+
+
+def test_widgets_are_called_after_what_they_show_without_its_unit():
+    names = {control.value: control.widget for control in by_widget(panel_sections()).values() if control.value}
+    assert names["display.tgc_db_cm_mhz"] == "tgcSlider" and names["probe.field_of_view_deg"] == "fieldOfViewSpinBox"
+    assert names["settings.reference_speed_m_s"] == "referenceSpeedSpinBox" and names["probe.kind"] == "kindComboBox"
+    assert names["scene.fit_frames"] == "fitFramesLineEdit" and names["scene.thin_sulci"] == "thinSulciCheckBox"
+    section = panel_sections()[0]
+    with pytest.raises(ValueError, match="two controls of one name"):
+        by_widget((section, section))
+
+
+def test_values_are_shown_in_the_unit_of_the_panel_and_meant_in_their_own(presenter):
+    presenter.setValue("settings.intensity_threshold", -100.0)
+    assert presenter.logic.preset.settings.intensity_threshold == pytest.approx(1e-5)
+    assert presenter.value("settings.intensity_threshold") == pytest.approx(-100.0)
+    presenter.setValue("display.noise_db", -150.0)
+    assert presenter.logic.preset.display.noise_db is None and presenter.value("display.noise_db") == -150.0
+    presenter.setValue("probe.focus_mm", 0.0)
+    assert presenter.value("probe.focus_mm") == 54.0  # where it is by default
+    presenter.setValue("probe.scan_lines", 64.0)
+    assert type(presenter.logic.preset.probe.scan_lines) is int
+    assert presenter.value("probe.width_mm") is None
+    presenter.setValue("scene.fit_evaluations", 70.0)
+    assert presenter.logic.parameters.fit.evaluations == 70 and not presenter.view.errors
+    for wrong in (float("nan"), "many", True, None):
+        presenter.setValue("scene.fit_evaluations", wrong)
+        assert "fit_evaluations is" in presenter.view.errors[-1] and presenter.value("scene.fit_evaluations") == 70
+    assert len(presenter.view.errors) == 4
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import weakref
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -30,10 +30,13 @@ from SlicerUSSim.Logic import (  # noqa: E402
 )
 from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.fitting.settings import FitSettings  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, pose_in_labels, set_node_to_world, write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import pose_in_slice  # noqa: E402
 from tests.conftest import FLUID, SPECKLE, block, example, rigid  # noqa: E402
 
@@ -766,16 +769,42 @@ def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
         parameters.label = bench.labels
     with pytest.raises(SimulationError, match="no 'label'"):
         parameters.label  # noqa: B018
-    for value in ("four", True, 4.0):
-        with pytest.raises(SimulationError, match=f"classes is {value!r}, expected int"):
+    for value in ("four", True, 4.5, 5):
+        with pytest.raises(
+            SimulationError, match=f"scene: classes is {value!r}, expected a whole number between 3 and 4"
+        ):
             parameters.classes = value
     with pytest.raises(SimulationError, match="mri is a str, expected vtkMRMLScalarVolumeNode"):
         parameters.mri = "Head"
-    node.SetParameter("classes", "many")  # a scene made by hand
-    with pytest.raises(SimulationError, match="classes is 'many', expected int"):
-        parameters.classes  # noqa: B018
+    for text in ("many", "3.5", "nan", "7"):  # a scene made by hand
+        node.SetParameter("classes", text)
+        for name in ("classes", "segmentation"):
+            with pytest.raises(SimulationError, match=r"classes is .*, expected a whole number between 3 and 4"):
+                getattr(parameters, name)
+    node.SetParameter("bias_correction", "maybe")
+    with pytest.raises(SimulationError, match="bias_correction is 'maybe', expected true or false"):
+        parameters.bias_correction  # noqa: B018
     with pytest.raises(SimulationError, match=r"mri is a .*LinearTransformNode, expected vtkMRMLScalarVolumeNode"):
         parameters.mri = bench.probe
+
+
+def test_every_declared_setting_is_remembered_one_by_one_and_together(bench):
+    parameters, node = bench.logic.parameters, bench.logic.parameters.node
+    assert parameters.segmentation == SegmentationSettings() and parameters.fit == FitSettings()
+    settings = SegmentationSettings("flair", 4, False, True, 2, 0.25)
+    parameters.segmentation = settings
+    assert parameters.segmentation == settings and (parameters.contrast, parameters.filter_epsilon) == ("flair", 0.25)
+    assert node.GetParameter("filter_epsilon") == "0.25" and node.GetParameter("thin_sulci") == "False"
+    parameters.filter_epsilon = None
+    assert parameters.segmentation == replace(settings, filter_epsilon=None)
+    parameters.fit = FitSettings(frames="0,5", free="gain_db", register=True, restarts=0)
+    parameters.fit_evaluations = 70
+    assert parameters.fit == FitSettings("0,5", "gain_db", False, True, 70, 0)
+    assert set(VALUE_PARAMETERS) == {
+        *(entry.name for entry in fields(SegmentationSettings)),
+        *(f"fit_{entry.name}" for entry in fields(FitSettings)),
+        "show_in_slice", "preset",
+    }  # fmt: skip
 
 
 def test_a_preset_in_the_scene_that_is_none_is_refused(bench):

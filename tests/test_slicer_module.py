@@ -15,7 +15,6 @@ import textwrap
 import time
 import types
 import typing
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +31,6 @@ from tests.slicer_factory import load_source_as_module  # noqa: E402
 ROOT = Path(__file__).parents[1]
 MODULE_FILE = ROOT / "SlicerUSSim" / "USSim.py"
 RESOURCES = ROOT / "SlicerUSSim" / "Resources"
-UI_FILE = RESOURCES / "UI" / "USSim.ui"
 #: What Slicer gets of the package
 PACKAGES = ("Logic", "Widget")
 
@@ -50,7 +48,7 @@ def module():
     yield loaded
     logging.getLogger("SlicerUSSim").setLevel(logging.NOTSET)
     for name in set(sys.modules) - set(before):
-        if name.split(".")[0] in ("USSim", "SlicerUSSim", "qt") or name.startswith("slicer."):
+        if name.split(".")[0] in ("USSim", "SlicerUSSim", "qt", "ctk") or name.startswith("slicer."):
             del sys.modules[name]
     sys.modules.update(before)
     for target, values in zip((slicer, slicer.util), own, strict=True):
@@ -199,6 +197,31 @@ def test_start_up_imports_nothing_that_takes_time_or_may_be_missing():
     assert done.returncode == 0 and done.stdout.strip().endswith("fine"), done.stderr[-2000:]
 
 
+def test_a_slicer_without_packages_of_the_panel_asks_for_them_and_shows_it_then(module, simulation_error, monkeypatch):
+    def declined() -> None:
+        raise simulation_error()("the installation was declined")
+
+    module.app.errors.clear()
+    monkeypatch.setitem(sys.modules, "SlicerUSSim.Widget.panel", None)  # importing it fails
+    monkeypatch.setattr(module, "ensurePackages", declined)
+    slicer.mrmlScene = slicer.vtkMRMLScene()
+    parent = stand_in.QtWidgets.QWidget()
+    stand_in.QtWidgets.QVBoxLayout(parent)
+    parent.isEntered = True
+    widget = module.USSimWidget(parent)
+    widget.setup()
+    widget.enter()
+    widget.onSceneEndChange(None, None)
+    assert widget.panel is None and module.app.errors == ["the installation was declined"]
+    monkeypatch.delitem(sys.modules, "SlicerUSSim.Widget.panel")
+    monkeypatch.setattr(module, "ensurePackages", lambda: None)
+    widget.installButton.click()
+    assert widget.panel is not None and widget.ui.segmentButton and not widget.installButton.isVisibleTo(parent)
+    widget.cleanup()
+    parent.deleteLater()
+    module.app.processEvents()
+
+
 def test_requirements_are_those_of_the_package_without_what_slicer_brings():
     tomllib = pytest.importorskip("tomllib")
     package = {
@@ -251,14 +274,34 @@ def test_sample_data_is_registered_with_a_checksum_and_a_thumbnail(module, monke
 
 
 def test_the_parameter_node_is_the_scenes(module):
-    hints = typing.get_type_hints(module.USSimParameterNode)
+    wrapper = module.USSimParameterNode
+    hints = typing.get_type_hints(wrapper, include_extras=True)
     parameters = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node")
-    assert set(hints) == {*parameters.NODE_PARAMETERS, *parameters.VALUE_PARAMETERS}
-    for name, default in parameters.VALUE_PARAMETERS.items():
-        assert hints[name] is type(default), name
+    values = {name: entry for name, entry in parameters.VALUE_PARAMETERS.items() if not entry.can_be_none}
+    assert set(hints) == set(wrapper.names) == {*parameters.NODE_PARAMETERS, *values} and len(values) > 10
+    for name, entry in values.items():
+        kind, *notes = typing.get_args(hints[name]) or (hints[name],)
+        assert kind is entry.type, name
+        if entry.choices:
+            assert notes[0].choices == list(entry.choices)
+        elif entry.bounds:
+            assert (notes[0].minimum, notes[0].maximum) == entry.bounds
     for name, classes in parameters.NODE_PARAMETERS.items():
         for kind in classes:
             assert issubclass(getattr(slicer, kind), hints[name]), name
+
+
+def test_the_parameter_node_has_the_declared_defaults_and_both_sides_read_what_the_other_wrote(session):
+    parameters, typed = session.parameters, session.widget.logic.getParameterNode()
+    declared = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node").VALUE_PARAMETERS
+    for name in typed.names:
+        if name in declared:
+            assert getattr(typed, name) == getattr(parameters, name) == declared[name].default, name
+    typed.contrast, typed.fit_evaluations, typed.show_in_slice = "flair", 70, False
+    assert (parameters.contrast, parameters.fit.evaluations, parameters.show_in_slice) == ("flair", 70, False)
+    assert session.ui.contrastComboBox.currentText() == "flair" and not session.ui.showInSliceCheckBox.isChecked()
+    parameters.classes, parameters.real = 4, session.head()
+    assert typed.classes == 4 and typed.real is parameters.real
 
 
 def test_the_modules_own_test_passes(module):
@@ -271,73 +314,178 @@ def test_the_modules_own_test_passes(module):
     assert module.app.shown[-1] == "Test passed"
 
 
-# ---- the .ui file ----------------------------------------------------------------------------------------------------
+# ---- the widgets -----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def ui(module):
-    widget = stand_in.load_ui(UI_FILE)
-    variables = stand_in.child_widget_variables(widget)
-    variables.root = widget
-    return variables
+def shown_parameters() -> dict[str, object]:
+    """{name: declaration} of what panels show of preset and scene."""
+    presets = importlib.import_module("SlicerUSSim.Logic.imaging.preset").preset_parameters()
+    scene = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node").VALUE_PARAMETERS
+    known = {**presets, **{f"scene.{name}": entry for name, entry in scene.items()}}
+    return {name: entry for name, entry in known.items() if entry.shown}
 
 
-def test_every_widget_the_code_names_is_in_the_ui_file(ui):
-    for file in (ROOT / "SlicerUSSim" / "Widget" / "panel.py", MODULE_FILE):
-        names = set(re.findall(r"\bui\.(\w+)", file.read_text()))
-        missing = {name for name in names if not hasattr(ui, name)} - {"__dict__"}
-        assert not missing, file.name
-    used = set(re.findall(r"\bui\.(\w+)", (ROOT / "SlicerUSSim" / "Widget" / "panel.py").read_text()))
-    assert len(used) > 15
+def controls_of(session) -> dict[str, tuple]:
+    """{name of a value: (its control, its widget)}"""
+    return {control.value: (control, widget) for control, widget in session.panel._controls if control.value}
 
 
-def test_every_control_has_a_tool_tip_and_numbers_their_unit(ui):
-    kinds = (stand_in.QtWidgets.QAbstractSpinBox, stand_in.QtWidgets.QComboBox, stand_in.QtWidgets.QAbstractButton,
-             stand_in.SliderWidget, stand_in.QtWidgets.QTableWidget)  # fmt: skip
-    controls = [
-        w for w in ui.root.findChildren(stand_in.QtWidgets.QWidget)
-        if isinstance(w, kinds) and w.objectName() in vars(ui) and not isinstance(w, stand_in.CollapsibleButton)
-    ]  # fmt: skip
-    assert len(controls) > 45
-    for widget in controls:
-        assert len(widget.toolTip()) > 10, widget.objectName()
-        suffix = widget.property("suffix")
-        if suffix and suffix.strip() not in ("°",):
-            assert f"{suffix.strip()}" in widget.toolTip(), widget.objectName()
+def test_every_widget_the_panel_names_is_there(session):
+    names = set(re.findall(r"\bui\.(\w+)", (ROOT / "SlicerUSSim" / "Widget" / "panel.py").read_text()))
+    assert len(names) > 10 and not {name for name in names if not hasattr(session.ui, name)}
+    for name, widget in vars(session.ui).items():
+        assert widget.objectName() == name and session.parent.isAncestorOf(widget)
 
 
-def test_every_node_selector_gets_the_scene():
-    tree = ElementTree.parse(UI_FILE)
-    selectors = {w.get("name") for w in tree.iter("widget") if w.get("class") == "qMRMLNodeComboBox"}
-    connected = {c.findtext("receiver") for c in tree.iter("connection")}
-    assert selectors and selectors == connected
-    declared = {c.findtext("class") for c in tree.iter("customwidget")}
-    assert declared == set(stand_in.WIDGETS)
+def test_every_declared_parameter_that_is_shown_is_in_the_panel_with_tip_unit_and_range(session):
+    controls, shown = controls_of(session), shown_parameters()
+    assert set(controls) == set(shown) and len(shown) > 30
+    for name, entry in shown.items():
+        widget = controls[name][1]
+        assert entry.tip in widget.toolTip(), name
+        if entry.type is bool:
+            assert widget.text() == entry.label
+        elif entry.shown is not True:
+            assert (widget.property("minimum"), widget.property("maximum")) == (entry.shown.low, entry.shown.high), name
+            assert widget.property("singleStep") == pytest.approx(entry.shown.step)
+            assert widget.property("suffix").strip() == ("dB" if entry.shown.as_db else entry.unit)
+            assert f"{entry.shown.low:g} to {entry.shown.high:g}{widget.property('suffix')}" in widget.toolTip()
+        elif entry.choices:
+            assert [widget.itemText(n) for n in range(widget.count())] == list(entry.choices)
 
 
-def test_every_field_of_the_panel_is_one_of_the_preset_and_accepts_both_ends_of_its_range(ui):
-    fields = importlib.import_module("SlicerUSSim.Widget.fields")
-    preset_module = importlib.import_module("SlicerUSSim.Logic.imaging.preset")
-    probes = importlib.import_module("SlicerUSSim.Logic.probe.arrays").PROBES
-    seen = set()
-    for widget in vars(ui).values():
-        name = widget.property("presetField")
-        if not name:
+def test_labels_stand_beside_their_widgets(session):
+    """Every value that is no tick, every node and every list has a label in its line."""
+    for control, widget in session.panel._controls:
+        form = widget.parentWidget().layout()
+        if not isinstance(form, stand_in.QtWidgets.QFormLayout) or control.kind in ("button", "table", "words"):
             continue
-        seen.add(name)
-        for probe in probes.values():
-            preset = preset_module.Preset(probe)
-            shown = fields.field_value(preset, name)
+        label = form.labelForField(widget)
+        assert label.text() == ("" if control.kind == "tick" else f"{control.label}:"), control.name
+        assert label.toolTip() == control.tip
+
+
+def test_every_control_has_a_tool_tip(session):
+    for control, widget in session.panel._controls:
+        assert len(widget.toolTip()) > 10, control.name
+    assert len(session.panel._controls) > 60
+
+
+def test_every_node_selector_has_the_scene_and_the_classes_of_its_role(session):
+    selectors = [(control, widget) for control, widget in session.panel._controls if control.kind == "node"]
+    roles = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node").NODE_PARAMETERS
+    assert {control.node for control, _ in selectors} == set(roles)
+    for control, widget in selectors:
+        assert widget.property("nodeTypes") == list(roles[control.node]) and widget._scene is session.scene
+        assert widget.property("addEnabled") == bool(control.new_node)
+
+
+def test_every_value_of_the_panel_accepts_both_ends_of_its_range(session):
+    preset_module = session.logic_module("imaging.preset")
+    presenter = session.panel.presenter
+    for probe in session.logic_module("probe.arrays").PROBES.values():
+        session.logic.preset = preset_module.Preset(probe)
+        for name, (control, _) in controls_of(session).items():
+            shown = presenter.value(name)
             if shown is None:
                 continue
-            if widget.property("minimum") is not None:
-                low, high = widget.property("minimum"), widget.property("maximum")
-                assert low <= shown <= high, (name, probe)
-                for end in (low, high):
-                    fields.with_field(preset, name, end)
-            again = fields.field_value(fields.with_field(preset, name, shown), name)
-            assert again == pytest.approx(shown) if isinstance(shown, float) else again == shown
-    assert seen == set(fields.FIELDS)
+            if control.kind in ("slider", "number"):
+                assert control.range.low <= shown <= control.range.high, (name, probe)
+                for end in (control.range.low, control.range.high, shown):
+                    presenter.setValue(name, float(end))  # as widgets hold whole numbers
+                    assert presenter.value(name) == pytest.approx(end) or control.range.none_at == end, name
+            else:
+                presenter.setValue(name, shown)
+                assert presenter.value(name) == shown
+            session.logic.preset = preset_module.Preset(probe)
+    assert not session.app.errors
+
+
+def test_whole_numbers_and_ticks_of_widgets_reach_the_declared_types(session):
+    session.ui.scanLinesSpinBox.setValue(64)
+    session.ui.seedSpinBox.setValue(4_000_000_000.0)
+    session.ui.classesSpinBox.setValue(4)
+    session.ui.reflectionsCheckBox.click()
+    session.ui.noiseSlider.setValue(-150.0)
+    preset = session.logic.preset
+    assert preset.probe.scan_lines == 64 and type(preset.probe.scan_lines) is int
+    assert preset.settings.seed == 999_999  # the most that the panel offers
+    assert session.parameters.classes == 4 and preset.settings.reflections is False and preset.display.noise_db is None
+    session.logic.preset = preset.changed("settings", seed=4_000_000_000)
+    session.panel.refresh()
+    assert session.ui.seedSpinBox.property("value") == 4_000_000_000 and not session.app.errors
+
+
+def test_a_scene_made_by_hand_with_a_wrong_value_is_shown_and_can_be_mended(session):
+    session.parameters.mri = session.head()
+    session.parameters.node.SetParameter("contrast", "T3")
+    assert session.ui.contrastComboBox.currentText() == "t1"
+    session.ui.segmentButton.click()
+    assert session.app.errors == ["scene: contrast is 'T3', expected one of t1, t1gd, t2, flair"]
+    session.ui.contrastComboBox.setCurrentText("t2")
+    assert session.parameters.segmentation.contrast == "t2"
+
+
+def test_a_section_with_a_value_and_a_button_is_a_declaration_a_line_and_a_method(module, monkeypatch):
+    declaration = importlib.import_module("SlicerUSSim.Logic.base.declaration")
+    parameter_node = importlib.import_module("SlicerUSSim.Logic.mrml.parameter_node")
+    controls = importlib.import_module("SlicerUSSim.Widget.controls")
+    panel = importlib.import_module("SlicerUSSim.Widget.panel")
+    presenter = importlib.import_module("SlicerUSSim.Widget.presenter").PanelPresenter
+    pressed = []
+
+    # 1. the declaration of the value
+    entry = declaration.Parameter(
+        name="margin_mm", type=float, default=2.0, label="Margin", tip="What is left around the brain", unit="mm",
+        bounds=(0, 50), shown=declaration.Shown(0, 20, 0.5),
+    )  # fmt: skip
+    monkeypatch.setitem(parameter_node.VALUE_PARAMETERS, "margin_mm", entry)
+    value = parameter_node.ValueParameter(entry)
+    monkeypatch.setattr(parameter_node.SceneParameters, "margin_mm", value, raising=False)
+    # 2. the method of the presenter
+    monkeypatch.setattr(
+        presenter, "extract", lambda self: pressed.append(self.logic.parameters.margin_mm), raising=False
+    )
+    monkeypatch.setattr(presenter, "canExtract", lambda self: (not pressed, "It is done"), raising=False)
+    # 3. the section
+    button = controls.button("extract", "Extract", "Find the brain in the MRI", enabled="canExtract")
+    section = controls.Section("Brain", True, (controls.value("scene.margin_mm"), button))
+    sections = panel.panel_sections()
+    monkeypatch.setattr(panel, "panel_sections", lambda: (*sections, section))
+
+    session = Session(module)
+    try:
+        assert session.ui.marginSpinBox.property("value") == 2.0 and session.ui.marginSpinBox.suffix() == " mm"
+        session.ui.marginSpinBox.setValue(4.5)
+        assert session.parameters.node.GetParameter("margin_mm") == "4.5"
+        session.ui.extractButton.click()
+        assert pressed == [4.5]
+        session.panel.refresh()
+        assert not session.ui.extractButton.isEnabled() and session.ui.extractButton.toolTip() == "It is done"
+    finally:
+        session.close()
+
+
+def test_a_new_display_parameter_is_in_the_panel_by_its_declaration_alone(module, monkeypatch):
+    import dataclasses
+
+    declaration = importlib.import_module("SlicerUSSim.Logic.base.declaration")
+    settings = importlib.import_module("SlicerUSSim.Logic.base.settings")
+    preset = importlib.import_module("SlicerUSSim.Logic.imaging.preset")
+    sharpness = declaration.parameter(
+        1.0, "Sharpness", "How sharp edges are", bounds=(0, 9), shown=declaration.Shown(0, 5, 0.1, is_slider=True)
+    )
+    new = dataclasses.make_dataclass(
+        "DisplaySettings", [("sharpness", float, sharpness)], bases=(settings.DisplaySettings,), frozen=True
+    )
+    monkeypatch.setitem(preset.SECTIONS, "display", new)
+    session = Session(module)
+    try:
+        session.logic.preset = dataclasses.replace(preset.Preset(), display=new())
+        session.ui.sharpnessSlider.setValue(3.5)
+        assert session.logic.preset.display.sharpness == 3.5 and not session.app.errors
+    finally:
+        session.close()
 
 
 # ---- working with it -------------------------------------------------------------------------------------------------
@@ -369,7 +517,7 @@ def test_the_image_follows_the_probe_and_the_controls_from_the_event_loop(sessio
         "probe": lambda: [session.move(0.1) for _ in range(50)],
         "gain": lambda: session.ui.gainSlider.setValue(12.0),
         "depth": lambda: session.ui.depthSlider.setValue(60.0),
-        "kind": lambda: session.ui.probeKindComboBox.setCurrentText("convex"),
+        "kind": lambda: session.ui.kindComboBox.setCurrentText("convex"),
         "tissue": lambda: session.ui.tissueTable.item(3, 4).setText("0.9"),
     }.items():
         change()
@@ -400,7 +548,7 @@ def test_the_slice_view_stands_in_the_plane_of_the_probe(session):
     composites = [session.scene.GetNthNodeByClass(n, "vtkMRMLSliceCompositeNode") for n in range(2)]
     ids = {c.GetLayoutName(): c.GetForegroundVolumeID() for c in composites}
     assert ids["Yellow"] == session.parameters.output.GetID() and ids["Red"] is None
-    session.ui.followCheckBox.setChecked(False)
+    session.ui.showInSliceCheckBox.setChecked(False)
     assert session.panel.sliceNode() is None and session.parameters.show_in_slice is False
 
 
@@ -676,6 +824,17 @@ def test_closing_the_scene_and_leaving_the_module_is_survived(session):
     assert session.parameters.labels is not None and not session.app.errors
 
 
+def test_widgets_leave_the_scene_alone_while_another_module_is_open(session):
+    session.parameters.mri = session.head()
+    session.widget.exit()
+    session.ui.mriSelector.setCurrentNode(None)  # as selectors do while a scene is closed
+    session.ui.gainSlider.setValue(3.0)
+    assert session.parameters.mri is not None and session.logic.preset.display.gain_db == 0.0
+    session.widget.enter()
+    assert session.ui.mriSelector.currentNode() is session.parameters.mri
+    assert session.ui.gainSlider.property("value") == 0.0
+
+
 def test_reloading_the_module_brings_new_code(module):
     scene_before = sys.modules.get("SlicerUSSim.Logic.mrml.logic") or importlib.import_module(
         "SlicerUSSim.Logic.mrml.logic"
@@ -852,7 +1011,7 @@ def test_a_scene_loaded_while_the_panel_is_open_is_shown(session, tmp_path):
     session.scene.SetSceneXMLString(saved)
     session.scene.Import()
     session.process()
-    shown = [ui.mriSelector, ui.labelsSelector, ui.transformSelector]
+    shown = [ui.mriSelector, ui.labelsSelector, ui.probeTransformSelector]
     assert [s.currentNode() and s.currentNode().GetName() for s in shown] == ["Head", "Head tissues", "Probe"]
     assert ui.gainSlider.property("value") == 9.0 and ui.contrastComboBox.currentText() == "t2"
     assert session.parameters.labels is ui.labelsSelector.currentNode() and not session.app.errors

@@ -357,20 +357,36 @@ def test_slice_views_show_the_field_outlined_and_the_image_blended_in(page):
     assert np.abs(np.diff(textures[1])).mean() > 2 * np.abs(np.diff(textures[0])).mean()  # speckle, not MRI
 
 
-def test_every_field_of_the_panel_is_on_the_page(page):
-    from SlicerUSSim.Widget.fields import FIELDS
-    from SlicerUSSim.Workstation.sections import read_sections
+def test_every_declared_parameter_that_is_shown_is_on_the_page_with_label_tip_unit_and_range(page):
+    from SlicerUSSim.Logic.imaging.preset import preset_parameters
+    from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS
+    from SlicerUSSim.Widget.sections import panel_sections
+    from SlicerUSSim.Workstation.page import NOT_SHOWN
 
-    sections = read_sections()
-    fields = {control.field for section in sections for control in section.controls if control.field}
-    assert fields == set(FIELDS)
-    for section in sections:
-        for control in section.controls:
-            if control.field:
-                selector = f"#slider-{control.name}" if control.kind == "slider" else f"#{control.name}"
-                assert page.locator(selector).count() == 1, control.name
-        if section.title:
-            assert page.get_by_role("button", name=section.title, exact=True).count() == 1
+    known = {**preset_parameters(), **{f"scene.{name}": entry for name, entry in VALUE_PARAMETERS.items()}}
+    expected = {name for name, entry in known.items() if entry.shown}
+    controls = {control.value: control for section in panel_sections() for control in section.controls if control.value}
+    assert set(controls) == expected and len(expected) > 30
+    for section in panel_sections():
+        assert page.get_by_role("button", name=section.title, exact=True).count() == 1
+    for name, control in controls.items():
+        if control.widget in NOT_SHOWN:
+            continue
+        entry = known[name]
+        found = page.locator(f"#slider-{control.widget}" if control.kind == "slider" else f"#{control.widget}")
+        assert found.count() == 1, name
+        line = found.locator("xpath=ancestor-or-self::*[@title][1]")
+        assert line.get_attribute("title") == control.tip and entry.tip in control.tip, name
+        assert entry.label in line.text_content(), name
+        if control.kind == "number":
+            assert f"{entry.label} [{control.unit}]" in line.text_content() or not control.unit
+            limits = [float(found.get_attribute(limit)) for limit in ("min", "max")]
+            assert limits == [entry.shown.low, entry.shown.high], name
+        elif control.kind == "slider":
+            assert control.unit in line.text_content()
+            thumb = line.locator("[role=slider]")
+            limits = [float(thumb.get_attribute(f"aria-value{limit}")) for limit in ("min", "max")]
+            assert limits == [entry.shown.low, entry.shown.high], name
 
 
 # ---- moving the probe ------------------------------------------------------------------------------------------------
@@ -519,7 +535,7 @@ def test_gain_probe_and_depth_change_the_image(page):
     probe, gain = shown(page, "probePresetComboBox"), shown(page, "gainSlider")
     with new_image(page):
         page.locator("#probePresetComboBox").select_option("linear")
-    assert shown(page, "probeKindComboBox") == "linear" and shown(page, "radiusSpinBox") is None
+    assert shown(page, "kindComboBox") == "linear" and shown(page, "radiusSpinBox") is None
     assert page.locator("#radiusSpinBox").is_disabled() and probe == "custom" and gain > 5
     page.locator("#widthSpinBox").fill("-5")
     page.locator("#widthSpinBox").blur()
@@ -528,7 +544,7 @@ def test_gain_probe_and_depth_change_the_image(page):
     preset = {"name": "a.json", "mimeType": "application/json", "buffer": _preset(page)}
     with new_image(page):
         page.set_input_files("#open-file", preset)
-    assert shown(page, "probeKindComboBox") == "phased" and shown(page, "gainSlider") == 0
+    assert shown(page, "kindComboBox") == "phased" and shown(page, "gainSlider") == 0
 
 
 def _preset(page: Page) -> bytes:
@@ -612,7 +628,7 @@ def test_a_fit_shows_its_costs_and_is_applied_and_reverted(page):
     before = cost(page)
     fit(page, 40)
     page.locator("#cost-curve svg").wait_for()
-    eventually(page, lambda: state(page, NAMES.fit.summary).startswith("cost"))
+    eventually(page, lambda: shown(page, "fitLabel").startswith("cost"))
     settled(page)
     curve = state(page, NAMES.fit.curve)
     assert len(curve) > 10 and min(curve) < curve[0] and curve == sorted(curve, reverse=True)
@@ -626,24 +642,24 @@ def test_a_fit_shows_its_costs_and_is_applied_and_reverted(page):
 
 
 def test_a_fit_is_cancelled_and_nothing_changes(page):
-    summary, gain = state(page, NAMES.fit.summary), shown(page, "gainSlider")
+    summary, gain = shown(page, "fitLabel"), shown(page, "gainSlider")
     fit(page, 100_000)
     page.locator("#cancel").wait_for()
     eventually(page, lambda: len(state(page, NAMES.fit.curve)) > 1)
     click(page, "#cancel")
     eventually(page, lambda: not state(page, NAMES.messages.progress_title))
-    assert state(page, NAMES.fit.summary) == summary and shown(page, "gainSlider") == gain
+    assert shown(page, "fitLabel") == summary and shown(page, "gainSlider") == gain
     assert not errors(page)
 
 
 def test_a_fit_goes_on_when_the_browser_is_closed_and_its_result_is_there_after(page, browser, url):
     other = opened(browser, url)
-    set_state(other, NAMES.fit.summary, "")
+    set_state(other, NAMES.panel.values, {**state(other, NAMES.panel.values), "fitLabel": ""})
     fit(other, 60)
     eventually(other, lambda: len(state(other, NAMES.fit.curve)) > 1)
     other.close()
     again = opened(browser, url)
-    eventually(again, lambda: state(again, NAMES.fit.summary).startswith("cost"))
+    eventually(again, lambda: shown(again, "fitLabel").startswith("cost"))
     again.close()
 
 
@@ -771,12 +787,12 @@ def test_a_reloaded_page_shows_what_there_was(page):
     ],
 )
 def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page, name, content, message):
-    before = state(page, NAMES.title), shown(page, "probeKindComboBox"), shown(page, "mriSelector")
+    before = state(page, NAMES.title), shown(page, "kindComboBox"), shown(page, "mriSelector")
     page.set_input_files("#open-file", {"name": name, "mimeType": "application/octet-stream", "buffer": content})
     text = shown_errors(page)
     assert message in text and "/tmp" not in text and "Traceback" not in text
     settled(page)
-    assert (state(page, NAMES.title), shown(page, "probeKindComboBox"), shown(page, "mriSelector")) == before
+    assert (state(page, NAMES.title), shown(page, "kindComboBox"), shown(page, "mriSelector")) == before
     page.locator(".ussim-error button").first.click()
     eventually(page, lambda: not errors(page))
 

@@ -1,1 +1,4 @@
-"""The panel: what it does (presenter.py, no Qt), wired to Slicer (panel.py), and what it needs (packages.py)."""
+"""The panel: what it shows (sections.py), what it does (presenter.py), both without Qt, for Slicer and the browser.
+
+In Slicer: its widgets (widgets.py), wired to the presenter (panel.py), and the packages it needs (packages.py).
+"""

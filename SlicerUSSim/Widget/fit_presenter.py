@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import Protocol
+from typing import Any, Protocol
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings
@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.sequence import frame_numbers
 from SlicerUSSim.Widget.interface import PanelView
 
+_FREE = "scene.fit_free"
 _REGISTRATION = "Ultrasound registration"
 
 
@@ -31,6 +32,14 @@ class FitHost(Protocol):
 
     @property
     def view(self) -> PanelView: ...
+
+    def value(self, name: str) -> Any:
+        """What is shown for a value."""
+        ...
+
+    def setValue(self, name: str, shown: Any) -> None:
+        """Give a value another one."""
+        ...
 
     def tissueTable(self) -> TissueTable:
         """The tissues in use."""
@@ -69,10 +78,10 @@ class FitPresenter:
     def setFree(self, name: str, on: bool) -> None:
         """The user ticked a parameter, or took the tick away."""
         names = [known for known, is_free in self.freeParameters() if (on if known == name else is_free)]
-        self._parameters.fit_free = ", ".join(names) or "none"  # an empty text would be the default
+        self._panel.setValue(_FREE, ", ".join(names) or "none")  # an empty text would be the default
 
     def _free(self) -> list[str]:
-        names = [name.strip() for name in self._parameters.fit_free.split(",") if name.strip()]
+        names = [name.strip() for name in self._panel.value(_FREE).split(",") if name.strip()]
         tissues = self._panel.tissueTable()
         known: list[str] = []
         for name in names:
@@ -85,13 +94,11 @@ class FitPresenter:
     # ---- fit ---------------------------------------------------------------------------------------------------
 
     def canFit(self) -> tuple[bool, str]:
-        """(whether Fit can be pressed, its tool tip)"""
-        can, tip = self._panel.canSimulate()
-        if not can:
-            return False, tip
-        if self._parameters.real is None:
+        """(whether Fit can be pressed, why not)"""
+        can, why_not = self._panel.canSimulate()
+        if can and self._parameters.real is None:
             return False, "Choose real images first"
-        return True, "Change the free parameters until simulated and real images agree"
+        return can, why_not
 
     def fit(self) -> None:
         """Fit to the chosen real images; Apply takes the result over."""
@@ -107,11 +114,11 @@ class FitPresenter:
                 panel.view.showStatus(f"{step.stage}: cost {step.best_cost:.4f}")
                 progress(step.share)
 
-            labels = parameters.labels
+            labels, settings = parameters.labels, parameters.fit
             found = panel.logic.optimize(
                 labels, parameters.real, probe_transform_node=parameters.probe_transform, frames=self._frames(),
-                free=free, register=parameters.fit_register, estimate_geometry=parameters.fit_estimate,
-                max_evaluations=parameters.fit_evaluations, plot=plot, progress=told,
+                free=free, register=settings.register, estimate_geometry=settings.estimate,
+                max_evaluations=settings.evaluations, restarts=settings.restarts, plot=plot, progress=told,
             )  # fmt: skip
             self._fit, self._before = (found, labels), None
             self.summary = _in_words(found)
@@ -120,7 +127,7 @@ class FitPresenter:
         panel.view.refresh()
 
     def _frames(self) -> list[int] | None:
-        text, real = self._parameters.fit_frames.strip(), self._parameters.real
+        text, real = self._parameters.fit.frames.strip(), self._parameters.real
         if not text or not real.IsA("vtkMRMLSequenceNode"):
             return None
         return frame_numbers(text, real.GetNumberOfDataNodes())
@@ -159,6 +166,10 @@ class FitPresenter:
     def comparedNumbers(self) -> list[int]:
         """Numbers of the fitted images."""
         return [] if self._fit is None else list(self._fit[0].tracked.numbers)
+
+    @property
+    def canCompare(self) -> bool:
+        return self._fit is not None
 
     def compare(self, kind: str, number: int) -> None:
         """Show one image of the fit in the slice view: one of scene_fit.COMPARED."""

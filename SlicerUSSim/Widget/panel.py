@@ -1,4 +1,4 @@
-"""Panel: the widgets of Resources/UI/USSim.ui, wired to a PanelPresenter. All it decides is how things look.
+"""Panel: the widgets of sections.py in Slicer, wired to a PanelPresenter. All it decides is how things look.
 
 Widgets are read and written by property() and setProperty(), which PythonQt and other bindings of Qt share.
 """
@@ -7,20 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import contextmanager
+from typing import Any
 
 import qt
 import slicer
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
-from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Logic.probe.arrays import PROBES
-from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Widget.controls import Control, by_widget, part_of, shown_by, usable
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter, TissueRow
+from SlicerUSSim.Widget.sections import panel_sections
+from SlicerUSSim.Widget.widgets import build
 
-_CUSTOM = "custom"
-#: Property that holds a value, and signal that tells of another one, by what a widget has.
+#: Property that holds a value, and signal that says that it changed, by what a widget has.
 _VALUES = (
     ("value", "valueChanged"), ("checked", "toggled"), ("currentText", "currentTextChanged"),
     ("text", "editingFinished"),
@@ -33,31 +33,29 @@ class Panel:
 
     Parameters
     ----------
-    ui : the named widgets, as slicer.util.childWidgetVariables gives them.
+    column : QVBoxLayout that the widgets go into; `ui` has them as attributes, by their names.
     logic : UltrasoundSceneLogic of the scene.
     ensure_packages : called before work that needs them; raises SimulationError if they are not there then.
     """
 
-    def __init__(self, ui, logic: UltrasoundSceneLogic, ensure_packages: Callable[[], None]) -> None:
-        self.ui = ui
+    def __init__(self, column: Any, logic: UltrasoundSceneLogic, ensure_packages: Callable[[], None]) -> None:
+        sections = panel_sections()
+        self.ui = build(sections, column)
         self.logic = logic
         self.presenter = PanelPresenter(logic, self)
+        #: Whether what the widgets hold goes to the scene: not while it is closed or loaded, nor in other modules
+        self.isConnected = True
         self._ensure_packages = ensure_packages
         self._cancelled = False
         self._rows: list[TissueRow] = []
-        self._fields = {w.property("presetField"): w for w in vars(ui).values() if w.property("presetField")}
-        self._node_selectors = {w.property("sceneNode"): w for w in vars(ui).values() if w.property("sceneNode")}
-        self._values = {w.property("sceneValue"): w for w in vars(ui).values() if w.property("sceneValue")}
-
-        ui.progressWidget.setVisible(False)
-        for name in (_CUSTOM, *PROBES):
-            ui.probePresetComboBox.addItem(name)
-        for name in TISSUES:
-            ui.tissuePresetComboBox.addItem(name)
-        for name in COMPARED:
-            ui.compareComboBox.addItem(name)
-        self._show(ui.compareComboBox, "after")
         self._blinking = False
+        #: The controls with their widgets
+        self._controls = [(control, getattr(self.ui, name)) for name, control in by_widget(sections).items()]
+        #: What buttons do that need something of the panel
+        self._own_actions = {
+            "assignTissue": self._assign_tissue, "loadPreset": self._load_preset, "savePreset": self._save_preset,
+        }  # fmt: skip
+        self._show(self.ui.compareComboBox, "after")
         self._prepare_table()
         self._connect()
         self.refresh()
@@ -75,7 +73,7 @@ class Panel:
 
     def sliceNode(self):
         wanted = self.ui.sliceViewComboBox.property("currentText")
-        if not self.logic.parameters.show_in_slice:
+        if not self.presenter.value("scene.show_in_slice"):
             return None
         return next((node for node in self._slice_nodes() if node.GetLayoutName() == wanted), None)
 
@@ -104,113 +102,88 @@ class Panel:
             self.ui.progressWidget.setVisible(False)
 
     def refresh(self) -> None:
-        presenter, ui = self.presenter, self.ui
-        for field, widget in self._fields.items():
-            value = presenter.value(field)
-            widget.setEnabled(value is not None)
-            if value is not None:
-                self._show(widget, value)
-        for role, widget in self._node_selectors.items():
-            with _silent(widget):
-                widget.setCurrentNode(getattr(self.logic.parameters, role))
-        for name, widget in self._values.items():
-            self._show(widget, getattr(self.logic.parameters, name))
-        self._show(ui.probePresetComboBox, presenter.probeName() or _CUSTOM)
-        self._show(ui.liveCheckBox, presenter.isLive())
+        presenter = self.presenter
         self._show_slice_names()
         self._show_tissues()
-        can, tip = presenter.canSegment()
-        self._enable(can, tip, ui.segmentButton)
-        can, tip = presenter.canSimulate()
-        self._enable(can, tip, ui.simulateButton)
-        for widget in (ui.liveCheckBox, ui.placeButton, ui.simulateSequenceButton):
-            widget.setEnabled(can)
         self._show_fit()
+        for control, widget in self._controls:
+            if control.enabled:
+                can, tip = usable(presenter, control)
+                widget.setEnabled(can)
+                widget.setToolTip(tip)
+            if control.node:
+                with _silent(widget):
+                    widget.setCurrentNode(getattr(self.logic.parameters, control.node))
+            elif control.value:
+                value = presenter.value(control.value)
+                widget.setEnabled(value is not None)
+                if value is not None:
+                    self._show(widget, value)
+            elif control.shows:
+                self._show(widget, shown_by(presenter, control.shows))
 
     # ---- wiring ------------------------------------------------------------------------------------------------
 
     def _connect(self) -> None:
         ui, presenter = self.ui, self.presenter
-        for field, widget in self._fields.items():
-            prop, signal = _value_of(widget)
-
-            def changed(*_, field=field, widget=widget, prop=prop) -> None:
-                presenter.setValue(field, widget.property(prop))
-
-            getattr(widget, signal).connect(changed)
-        for role, widget in self._node_selectors.items():
-
-            def chosen(*_, role=role, widget=widget) -> None:
-                setattr(self.logic.parameters, role, widget.currentNode())
-
-            widget.currentNodeChanged.connect(chosen)
-        for name, widget in self._values.items():
-            prop, signal = _value_of(widget)
-
-            def written(*_, name=name, widget=widget, prop=prop) -> None:
-                setattr(self.logic.parameters, name, widget.property(prop))
-
-            getattr(widget, signal).connect(written)
-        ui.probePresetComboBox.currentTextChanged.connect(self._probe_chosen)
+        for control, widget in self._controls:
+            if control.node:
+                widget.currentNodeChanged.connect(self._changed(self._choose_node, control, widget))
+            elif control.value:
+                _signal_of(widget).connect(self._changed(self._set_value, control, widget))
+            elif control.kind == "button":
+                widget.clicked.connect(self._changed(self._press, control, widget))
+            elif control.action:
+                _signal_of(widget).connect(self._changed(self._act, control, widget))
+        ui.cancelButton.clicked.connect(self._cancel)
         ui.sliceViewComboBox.currentTextChanged.connect(lambda *_: presenter.parametersChanged())
         ui.tissueTable.cellChanged.connect(self._tissue_changed)
-
-        for button, action in (
-            (ui.segmentButton, presenter.segment),
-            (ui.simulateButton, presenter.simulate),
-            (ui.placeButton, self._place),
-            (ui.simulateSequenceButton, self._simulate_sequence),
-            (ui.fitButton, presenter.fits.fit),
-        ):
-            button.clicked.connect(lambda *_, action=action: self._with_packages(action))
-        ui.liveCheckBox.toggled.connect(self._live_toggled)
-        ui.cancelButton.clicked.connect(self._cancel)
-        ui.assignTissueButton.clicked.connect(self._assign_tissue)
-        ui.resetTissuesButton.clicked.connect(lambda *_: presenter.resetTissues())
-        ui.loadPresetButton.clicked.connect(self._load_preset)
-        ui.savePresetButton.clicked.connect(self._save_preset)
-        ui.applyFitButton.clicked.connect(lambda *_: presenter.fits.apply())
-        ui.revertFitButton.clicked.connect(lambda *_: presenter.fits.revert())
         ui.freeList.itemChanged.connect(self._free_changed)
         ui.compareComboBox.currentTextChanged.connect(self._compare)
         ui.compareNumberComboBox.currentTextChanged.connect(self._compare)
         ui.blinkCheckBox.toggled.connect(self._blink)
 
-    def _with_packages(self, action: Callable[[], None]) -> None:
+    def _changed(self, method: Callable[[Control, Any], None], control: Control, widget: Any) -> Callable[..., None]:
+        """What a signal calls, which carries what the widget holds in a form that differs between bindings of Qt."""
+
+        def called(*_) -> None:
+            if self.isConnected or control.kind == "button":
+                method(control, widget)
+
+        return called
+
+    def _choose_node(self, control: Control, widget: Any) -> None:
+        with self.presenter.shown():
+            setattr(self.logic.parameters, control.node, widget.currentNode())
+
+    def _set_value(self, control: Control, widget: Any) -> None:
+        self.presenter.setValue(control.value, widget.property(_property_of(widget)))
+
+    def _act(self, control: Control, widget: Any) -> None:
+        value, action = widget.property(_property_of(widget)), part_of(self.presenter, control.action)
+        self._do(control, lambda: action(value))
+
+    def _press(self, control: Control, widget: Any) -> None:
+        self._do(control, self._own_actions.get(control.name) or part_of(self.presenter, control.action))
+
+    def _do(self, control: Control, action: Callable[[], None]) -> None:
+        """Do what a control is for, with the packages that work needs: what always can be done is none."""
         try:
-            self._ensure_packages()
+            if control.enabled:
+                self._ensure_packages()
         except SimulationError as error:
             self.showError(str(error))
             self.refresh()
             return
         action()
 
-    def _live_toggled(self, *_) -> None:
-        on = bool(self.ui.liveCheckBox.property("checked"))
-        self._with_packages(lambda: self.presenter.setLive(on))
-
-    def _probe_chosen(self, *_) -> None:
-        name = self.ui.probePresetComboBox.property("currentText")
-        if name == _CUSTOM:
-            self.refresh()  # one does not choose it, one makes it
-        else:
-            self.presenter.chooseProbe(name)
-
-    def _place(self) -> None:
-        self.presenter.placeProbe(self.sliceNode())
-
-    def _simulate_sequence(self) -> None:
-        self.presenter.simulateSequence(
-            self.ui.transformSequenceSelector.currentNode(), self.ui.imageSequenceSelector.currentNode()
-        )
-
     def _cancel(self, *_) -> None:
         self._cancelled = True
 
-    def _load_preset(self, *_) -> None:
+    def _load_preset(self) -> None:
         self._with_file(qt.QFileDialog.getOpenFileName, "Load preset", "", self.presenter.loadPreset)
 
-    def _save_preset(self, *_) -> None:
+    def _save_preset(self) -> None:
         self._with_file(qt.QFileDialog.getSaveFileName, "Save preset", "preset.json", self.presenter.savePreset)
 
     @staticmethod
@@ -225,7 +198,7 @@ class Panel:
     def _prepare_table(self) -> None:
         table = self.ui.tissueTable
         table.setColumnCount(1 + len(TISSUE_COLUMNS))
-        for column, (_, heading, tip) in enumerate((("", "Tissue", "name of the tissue"), *TISSUE_COLUMNS)):
+        for column, (_, heading, tip) in enumerate((("", "Tissue", "Name of the tissue"), *TISSUE_COLUMNS)):
             item = qt.QTableWidgetItem(heading)
             item.setToolTip(tip)
             table.setHorizontalHeaderItem(column, item)
@@ -249,13 +222,13 @@ class Panel:
             table.resizeColumnsToContents()
 
     def _tissue_changed(self, line: int, column: int) -> None:
-        row, parameter = self._rows[line], TISSUE_COLUMNS[column - 1][0]
+        row, name = self._rows[line], TISSUE_COLUMNS[column - 1][0]
         text = self.ui.tissueTable.item(line, column).text()
         self._rows = []  # show it anew, whatever becomes of the change
-        self.presenter.setTissue(row.name, parameter, text)
+        self.presenter.setTissue(row.name, name, text)
         self._show_tissues()
 
-    def _assign_tissue(self, *_) -> None:
+    def _assign_tissue(self) -> None:
         line = self.ui.tissueTable.currentRow
         line = line if isinstance(line, int) else line()  # a property in PythonQt
         if 0 <= line < len(self._rows):
@@ -265,15 +238,7 @@ class Panel:
 
     def _show_fit(self) -> None:
         ui, fits = self.ui, self.presenter.fits
-        can, tip = fits.canFit()
-        self._enable(can, tip, ui.fitButton)
-        ui.applyFitButton.setEnabled(fits.canApply)
-        ui.revertFitButton.setEnabled(fits.canRevert)
-        ui.fitLabel.setText(fits.summary)
-        numbers = [str(number) for number in fits.comparedNumbers()]
-        self._fill(ui.compareNumberComboBox, numbers)
-        for widget in (ui.compareComboBox, ui.compareNumberComboBox, ui.blinkCheckBox):
-            widget.setEnabled(bool(numbers))
+        self._fill(ui.compareNumberComboBox, [str(number) for number in fits.comparedNumbers()])
         free = fits.freeParameters()
         with _silent(ui.freeList):
             if [ui.freeList.item(n).text() for n in range(ui.freeList.property("count"))] != [name for name, _ in free]:
@@ -321,13 +286,8 @@ class Panel:
                     combo.addItem(name)
 
     @staticmethod
-    def _enable(can: bool, tip: str, widget) -> None:
-        widget.setEnabled(can)
-        widget.setToolTip(tip)
-
-    @staticmethod
     def _show(widget, value) -> None:
-        prop, _ = _value_of(widget)
+        prop = _property_of(widget)
         with _silent(widget):
             if prop == "value":
                 # A preset from elsewhere may go beyond what a slider offers.
@@ -341,8 +301,14 @@ class Panel:
                 widget.setProperty(prop, value)
 
 
-def _value_of(widget) -> tuple[str, str]:
-    return next((prop, signal) for prop, signal in _VALUES if widget.property(prop) is not None)
+def _property_of(widget) -> str:
+    """Name of the property that holds a widget's value."""
+    return next(name for name, _ in _VALUES if widget.property(name) is not None)
+
+
+def _signal_of(widget):
+    """The signal that says that this property changed."""
+    return getattr(widget, dict(_VALUES)[_property_of(widget)])
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
@@ -21,19 +21,17 @@ from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tissue.names import same_name
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import TissueTable
-from SlicerUSSim.Logic.tissue.tissue import Tissue
-from SlicerUSSim.Widget.fields import field_value, with_field
+from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS, Tissue
+from SlicerUSSim.Widget.controls import SCENE, from_shown, to_shown, value_parameter
 from SlicerUSSim.Widget.fit_presenter import FitPresenter
 from SlicerUSSim.Widget.interface import PanelView
+from SlicerUSSim.Widget.sections import CUSTOM_PROBE
 
-#: Columns of the tissue table: parameter, heading, unit.
-TISSUE_COLUMNS = (
-    ("speed_of_sound_m_s", "c", "speed of sound [m/s]"),
-    ("impedance_mrayl", "Z", "acoustic impedance [MRayl]"),
-    ("attenuation_db_cm_mhz", "α", "attenuation [dB/(cm MHz)]"),
-    ("mu0", "μ₀", "mean amplitude of scatterers"),
-    ("mu1", "μ₁", "threshold of scatterers: the share 1 - Φ(μ₁) of sites holds one"),
-    ("sigma0", "σ₀", "standard deviation of the scatterers' amplitude"),
+_BUSY = "Wait until the work under way is done"
+#: Columns of the tissue table: parameter, heading, tool tip.
+TISSUE_COLUMNS = tuple(
+    (entry.name, entry.symbol or entry.label, f"{entry.tip} [{entry.unit}]" if entry.unit else entry.tip)
+    for entry in TISSUE_PARAMETERS
 )
 
 
@@ -64,30 +62,45 @@ class PanelPresenter:
         #: The part that fits simulated to real ultrasound
         self.fits = FitPresenter(self)
 
-    # ---- fields of the preset ----------------------------------------------------------------------------------
+    # ---- values of preset and scene ----------------------------------------------------------------------------
 
-    def value(self, field: str):
-        """What to show for a field (see fields.FIELDS), or None where the probe has no such value."""
-        return field_value(self._preset(), field)
+    def value(self, name: str):
+        """What to show for a value, named as in controls.py; None where the probe has no such value."""
+        declared = value_parameter(name)
+        section, attribute = name.split(".")
+        if section == SCENE:
+            try:
+                return to_shown(declared, getattr(self.logic.parameters, attribute))
+            except SimulationError:  # a scene made by hand: what needs the value says what is wrong with it
+                return to_shown(declared, declared.default)
+        owner = getattr(self._preset(), section)
+        return to_shown(declared, getattr(owner, attribute)) if hasattr(owner, attribute) else None
 
-    def setValue(self, field: str, value) -> None:
-        """The user gave a field another value."""
+    def setValue(self, name: str, shown) -> None:
+        """The user gave a value, as it is shown, another one."""
+        declared = value_parameter(name)
+        section, attribute = name.split(".")
         with self.shown():
-            preset = with_field(self._preset(), field, value)
+            value = from_shown(declared, shown)
+            if section == SCENE:
+                setattr(self.logic.parameters, attribute, value)
+                return
+            preset = self._preset().changed(section, **{attribute: value})
             if preset != self._preset():
                 self.logic.preset = preset
 
     def chooseProbe(self, name: str) -> None:
-        """Take a probe of probe.PROBES."""
+        """Take a probe of probe.PROBES; a custom one is not chosen but made."""
         with self.shown():
-            require(name in PROBES, f"no probe is called {name!r}, expected one of {', '.join(PROBES)}")
-            self.logic.preset = replace(self._preset(), probe=PROBES[name])
+            if name != CUSTOM_PROBE:
+                require(name in PROBES, f"no probe is called {name!r}, expected one of {', '.join(PROBES)}")
+                self.logic.preset = replace(self._preset(), probe=PROBES[name])
         self.view.refresh()
 
     def probeName(self) -> str:
-        """Which of probe.PROBES is in use; "" for one of the user's own."""
+        """Which of probe.PROBES is in use, or sections.CUSTOM_PROBE."""
         probe = self._preset().probe
-        return next((name for name, known in PROBES.items() if known == probe), "")
+        return next((name for name, known in PROBES.items() if known == probe), CUSTOM_PROBE)
 
     def loadPreset(self, path: str | os.PathLike) -> None:
         """Take everything from a JSON file, one of the `ussim` command too."""
@@ -139,20 +152,20 @@ class PanelPresenter:
     # ---- what the buttons do -----------------------------------------------------------------------------------
 
     def canSegment(self) -> tuple[bool, str]:
-        """(whether Segment can be pressed, its tool tip)"""
+        """(whether Segment can be pressed, why not)"""
         if self._busy:
-            return False, "Wait until the work under way is done"
+            return False, _BUSY
         if self.logic.parameters.mri is None:
             return False, "Choose an MRI first"
-        return True, "Label the tissues of the MRI; takes one or two seconds"
+        return True, ""
 
     def canSimulate(self) -> tuple[bool, str]:
-        """(whether Simulate and Live can be pressed, their tool tip)"""
+        """(whether there is something to simulate, why not)"""
         if self._busy:
-            return False, "Wait until the work under way is done"
+            return False, _BUSY
         if self.logic.parameters.labels is None:
             return False, "Segment the MRI, or choose a label map or segmentation"
-        return True, "Simulate the image under the probe"
+        return True, ""
 
     def segment(self) -> None:
         """Label the tissues of the MRI into the chosen label map or segmentation, or a new segmentation."""
@@ -164,20 +177,17 @@ class PanelPresenter:
                     parameters.mri,
                     labels,
                     mask_node=parameters.mask,
-                    classes=parameters.classes,
-                    contrast=parameters.contrast,
-                    thin_sulci=parameters.thin_sulci,
-                    bias_correction=parameters.bias_correction,
                     progress=progress,
+                    **asdict(parameters.segmentation),
                 )
             parameters.labels = labels
         self.view.refresh()
 
-    def placeProbe(self, slice_node=None) -> None:
-        """Put the probe on the surface in a slice view, or where a craniotomy might be; make one if there is none."""
+    def placeProbe(self) -> None:
+        """Put the probe on the surface in the slice view, or where a craniotomy might be; make one if there is none."""
         with self.shown():
             require(self.logic.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
-            self._put_probe(slice_node)
+            self._put_probe(self.view.sliceNode())
         self.view.refresh()
 
     def simulate(self) -> None:
@@ -215,13 +225,15 @@ class PanelPresenter:
             )
         self.view.refresh()
 
-    def simulateSequence(self, transforms_node, images_node) -> None:
-        """Images for a recorded sequence of transforms, which the browser of that sequence then plays."""
+    def simulateSequence(self) -> None:
+        """Images for the chosen sequence of transforms, which the browser of that sequence then plays."""
+        parameters = self.logic.parameters
+        transforms_node, images_node = parameters.transform_sequence, parameters.image_sequence
         with self.shown(), self.working("Simulate sequence") as progress:
             require(transforms_node is not None, "no sequence of transforms chosen, expected a Sequence node")
             with self._made(images_node, "Sequence", f"{transforms_node.GetName()} ultrasound") as images:
                 count = self.logic.simulateSequence(
-                    self.logic.parameters.labels,
+                    parameters.labels,
                     transforms_node,
                     images,
                     browser_node=self._browser_of(transforms_node),

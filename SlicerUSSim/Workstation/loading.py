@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from trame_slicer.core import SlicerApp
@@ -45,7 +45,7 @@ class Loading:
         with self._presenter.shown():
             if files.preset is not None:
                 self._logic.preset = files.preset
-            parameters.contrast = files.contrast
+            parameters.segmentation = replace(parameters.segmentation, contrast=files.contrast)
             if files.mri is not None or files.labels is None:
                 self._take_mri(files.mri)
             if files.mask is not None:
@@ -78,7 +78,7 @@ class Loading:
             name = self._scene.GenerateUniqueName(f"{parameters.mri.GetName()} tissues")
             parameters.labels = self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
         labels, mri, mask = parameters.labels, parameters.mri, parameters.mask
-        options = {name: getattr(parameters, name) for name in ("contrast", "classes", "thin_sulci", "bias_correction")}
+        options = asdict(parameters.segmentation)
         before = None if labels is None else labels_version(labels)
         self._presenter.segment()
         if labels is None or labels_version(labels) == before:

@@ -16,8 +16,8 @@ from trame_server import Server
 from trame_slicer.core import LayoutManager
 from trame_slicer.views import AbstractView
 
+from SlicerUSSim.Widget.controls import Control, Section
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS
-from SlicerUSSim.Workstation.sections import Control, Section
 from SlicerUSSim.Workstation.state import NAMES, PLANES, SLICE_VIEWS, ComparisonMode
 
 _STATIC = Path(__file__).parent / "static"
@@ -30,7 +30,7 @@ MODULE = {
 #: Controls of the panel that the page has no use for: its slice views follow the probe by themselves, and the fit is
 #: compared in the ultrasound view; the probe is put back to where it began by a button of the page.
 NOT_SHOWN = {
-    "sliceViewComboBox", "followCheckBox", "compareComboBox", "compareNumberComboBox", "blinkCheckBox", "cancelButton",
+    "sliceViewComboBox", "showInSliceCheckBox", "compareComboBox", "compareNumberComboBox", "blinkCheckBox",
     "statusLabel", "placeButton",
 }  # fmt: skip
 #: What buttons do in the page itself.
@@ -120,15 +120,13 @@ def _drawer(sections: tuple[Section, ...]) -> None:
     html.Div(f"{{{{ {NAMES.title} }}}}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
     with v3.VExpansionPanels(multiple=True, v_model=(NAMES.open_sections,), variant="accordion"):
         for section in sections:
-            if not section.title:
-                continue
             with v3.VExpansionPanel(value=section.title):
                 v3.VExpansionPanelTitle(section.title, style="min-height: 36px; font-size: 13px")
                 with v3.VExpansionPanelText(eager=True, id=f"section-{section.title.replace(' ', '-').lower()}"):
                     if section.title == "Inputs":
                         _open_file()
                     for control in section.controls:
-                        if control.name not in NOT_SHOWN:
+                        if control.widget not in NOT_SHOWN:
                             _control(control)
                     if section.title == "Probe":
                         _pose_sliders()
@@ -144,64 +142,64 @@ def _open_file() -> None:
 
 
 def _control(control: Control) -> None:
-    key = f"{NAMES.panel.values}.{control.name}"
-    disabled = f"{NAMES.panel.can}.{control.name} === false"
-    if control.kind == "slider":
+    name, kind, low, high = control.widget, control.kind, control.range.low, control.range.high
+    key = f"{NAMES.panel.values}.{name}"
+    disabled = f"{NAMES.panel.can}.{name} === false"
+    if kind == "slider":
         # A preset from elsewhere may go beyond what the slider offers.
         _slider(
-            key, control.name, control.label, control.tip, f"Math.min({control.minimum}, {key} ?? 0)",
-            f"Math.max({control.maximum}, {key} ?? 0)", control.step, control.unit, control.decimals,
-            f"trigger('set', ['{control.name}', $event])",
+            key, name, control.label, control.tip, f"Math.min({low}, {key} ?? 0)", f"Math.max({high}, {key} ?? 0)",
+            control.range.step, control.unit, control.decimals, f"trigger('set', ['{name}', $event])",
         )  # fmt: skip
-    elif control.kind in ("number", "text"):
+    elif kind in ("number", "text"):
         unit = f" [{control.unit}]" if control.unit else ""
-        value = "Number($event.target.value)" if control.kind == "number" else "$event.target.value"
-        shown = f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})" if control.kind == "number" else key
-        limits = f'min="{control.minimum:g}" max="{control.maximum:g}" step="{control.step:g}"'
+        value = "Number($event.target.value)" if kind == "number" else "$event.target.value"
+        shown = f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})" if kind == "number" else key
+        limits = f'min="{low:.10g}" max="{high:.10g}" step="{control.range.step:g}"'
+        limits = limits if kind == "number" else f'placeholder="{escape(control.hint)}"'
         html.Div(
-            f"""<label for="{control.name}">{control.label}{unit}</label>
-            <input type="{control.kind}" id="{control.name}" {limits if control.kind == "number" else ""}
-            :value="{shown}" :disabled="{key} === null" @change="trigger('set', ['{control.name}', {value}])">""",
+            f"""<label for="{name}">{escape(control.label)}{unit}</label>
+            <input type="{kind}" id="{name}" {limits}
+            :value="{shown}" :disabled="{key} === null" @change="trigger('set', ['{name}', {value}])">""",
             classes="ussim-line", title=control.tip,
         )  # fmt: skip
-    elif control.kind == "tick":
-        v3.VCheckbox(
-            label=control.text, model_value=(key,), density="compact", hide_details=True, title=control.tip,
-            update_modelValue=f"trigger('set', ['{control.name}', $event])", id=control.name,
-            disabled=(disabled,),
-        )  # fmt: skip
-    elif control.kind in ("choice", "node"):
-        if control.kind == "node":
-            items = f"{NAMES.panel.nodes}.{control.name} ?? []"
-            options = f"""<option v-for="item in ({items})" :value="item.value">{{{{ item.title }}}}
+    elif kind == "tick":
+        with html.Div(title=control.tip):  # a title of the check box would not be its label's
+            v3.VCheckbox(
+                label=control.label, model_value=(key,), density="compact", hide_details=True, id=name,
+                update_modelValue=f"trigger('set', ['{name}', $event])", disabled=(disabled,),
+            )  # fmt: skip
+    elif kind in ("choice", "node"):
+        if kind == "node":  # none has no ID, and a choice of HTML no null
+            items = f"{NAMES.panel.nodes}.{name} ?? []"
+            options = f"""<option v-for="item in ({items})" :value="item.value ?? ''">{{{{ item.title }}}}
             </option>"""
         else:
-            options = f"""<option v-for="item in {NAMES.panel.choices}.{control.name}">{{{{ item }}}}</option>"""
+            options = f"""<option v-for="item in {NAMES.panel.choices}.{name}">{{{{ item }}}}</option>"""
         html.Div(
-            f"""<label for="{control.name}">{control.label}</label>
-            <select id="{control.name}" :value="{key}"
-            @change="trigger('set', ['{control.name}', $event.target.value])">{options}</select>""",
+            f"""<label for="{name}">{escape(control.label)}</label>
+            <select id="{name}" :value="{key} ?? ''"
+            @change="trigger('set', ['{name}', $event.target.value])">{options}</select>""",
             classes="ussim-line", title=control.tip,
         )  # fmt: skip
-    elif control.kind == "button":
-        with v3.VBtn(
-            control.text, size="small", classes="ma-1", id=control.name,
-            click=_IN_PAGE.get(control.name, f"trigger('press', ['{control.name}'])"),
-            disabled=(disabled,), title=(f"{NAMES.panel.tips}.{control.name} ?? `{control.tip}`",),
-        ):  # fmt: skip
-            pass
-    elif control.name == "tissueTable":
+    elif kind == "button":
+        v3.VBtn(
+            control.label, size="small", classes="ma-1", id=name,
+            click=_IN_PAGE.get(name, f"trigger('press', ['{name}'])"), disabled=(disabled,),
+            title=(f"{NAMES.panel.tips}.{name} ?? `{control.tip}`",),
+        )  # fmt: skip
+    elif kind == "words":
+        html.Div(f"{{{{ {key} }}}}", id=name, style="white-space: pre-line; font-size: 12px", title=control.tip)
+    elif kind == "table":
         _tissue_table(control)
-    elif control.name == "freeList":
+    else:
         html.Div(
-            f"""<div style="font-size: 12px">{control.label}</div><div class="ussim-free" id="{control.name}">
+            f"""<div style="font-size: 12px">{control.label}</div><div class="ussim-free" id="{name}">
             <label v-for="entry in {NAMES.fit.free}" style="display: block"><input type="checkbox" :checked="entry.on"
             :aria-label="entry.name" @change="trigger('set_free', [entry.name, $event.target.checked])">
             {{{{ entry.name }}}}</label></div>""",
             title=control.tip,
         )
-    elif control.name == "fitLabel":
-        html.Div(f"{{{{ {NAMES.fit.summary} }}}}", id=control.name, style="white-space: pre-line; font-size: 12px")
 
 
 def _slider(
@@ -223,7 +221,7 @@ def _tissue_table(control: Control) -> None:
     heads = "".join(f'<th title="{tip}">{head}</th>' for _, head, tip in TISSUE_COLUMNS)
     names = ", ".join(f"'{parameter}'" for parameter, _, _ in TISSUE_COLUMNS)
     html.Div(
-        f"""<table class="ussim-table" id="{control.name}"><tr><th>Tissue</th>{heads}</tr>
+        f"""<table class="ussim-table" id="{control.widget}"><tr><th>Tissue</th>{heads}</tr>
         <tr v-for="row in {NAMES.panel.tissues}" :class="{{chosen: row.name === {NAMES.panel.chosen_tissue}}}"
         @click="{NAMES.panel.chosen_tissue} = row.name">
         <td>{{{{ row.name }}}}</td>

@@ -13,13 +13,11 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Logic.probe.arrays import PROBES
-from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Widget.controls import Control, Section, by_widget, part_of, shown_by, usable
 from SlicerUSSim.Widget.presenter import PanelPresenter, TissueRow
 from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.observed import Observed
-from SlicerUSSim.Workstation.sections import Control, Section
-from SlicerUSSim.Workstation.state import CUSTOM_PROBE, FreeParameter, NodeItem, SharedState, TissueLine
+from SlicerUSSim.Workstation.state import FreeParameter, NodeItem, SharedState, TissueLine
 from SlicerUSSim.Workstation.tasks import Tasks
 
 #: How the presenter says how fast images come, and seconds for which a page shows it.
@@ -49,7 +47,7 @@ class BrowserPanel:
     ) -> None:
         self._shared, self._messages, self._logic, self._tasks = shared, messages, logic, tasks
         self._about_to_compute = about_to_compute
-        self._controls = {control.name: control for section in sections for control in section.controls}
+        self._controls = by_widget(sections)
         self._thread = threading.get_ident()
         self._cancelled = False
         self._status, self._status_until = "", 0.0
@@ -57,18 +55,9 @@ class BrowserPanel:
         self._costs = Observed("ModifiedEvent", self._show_costs)
         self.presenter = PanelPresenter(logic, self, handles=False)
         with shared.changing() as now:
-            now.open_sections = [section.title for section in sections if section.is_open and section.title]
-            now.panel.choices = {
-                **{name: list(control.choices) for name, control in self._controls.items()},
-                "probePresetComboBox": [CUSTOM_PROBE, *PROBES],
-                "tissuePresetComboBox": list(TISSUES),
-            }
-            now.panel.values = {
-                **dict.fromkeys(self._controls),
-                "probePresetComboBox": CUSTOM_PROBE,
-                "tissuePresetComboBox": next(iter(TISSUES)),
-                "liveCheckBox": False,
-            }
+            now.open_sections = [section.title for section in sections if section.is_open]
+            now.panel.choices = {name: list(control.choices) for name, control in self._controls.items()}
+            now.panel.values = {name: next(iter(control.choices), None) for name, control in self._controls.items()}
 
     # ---- PanelView ---------------------------------------------------------------------------------------------
 
@@ -102,9 +91,7 @@ class BrowserPanel:
 
     def refresh(self) -> None:
         presenter = self.presenter
-        can_segment, segment_tip = presenter.canSegment()
-        can_simulate, simulate_tip = presenter.canSimulate()
-        can_fit, fit_tip = presenter.fits.canFit()
+        can = {name: usable(presenter, control) for name, control in self._controls.items() if control.enabled}
         with self._shared.changing() as now:
             panel = now.panel
             panel.values = {**panel.values, **self._shown_values()}
@@ -112,14 +99,9 @@ class BrowserPanel:
                 name: self._nodes_for(control) for name, control in self._controls.items() if control.kind == "node"
             }
             panel.tissues = [_line(row) for row in presenter.tissues()]
-            panel.can = {
-                "segmentButton": can_segment, "simulateButton": can_simulate, "placeButton": can_simulate,
-                "liveCheckBox": can_simulate, "simulateSequenceButton": can_simulate, "fitButton": can_fit,
-                "applyFitButton": presenter.fits.canApply, "revertFitButton": presenter.fits.canRevert,
-            }  # fmt: skip
-            panel.tips = {"segmentButton": segment_tip, "simulateButton": simulate_tip, "fitButton": fit_tip}
+            panel.can = {name: is_usable for name, (is_usable, _) in can.items()}
+            panel.tips = {name: tip for name, (_, tip) in can.items()}
             now.fit.free = [FreeParameter(name, on) for name, on in presenter.fits.freeParameters()]
-            now.fit.summary = presenter.fits.summary
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:
@@ -152,57 +134,48 @@ class BrowserPanel:
     def set(self, name: str, value: Any) -> None:
         """The user gave a control another value."""
         control = self._controls[name]
-        if name == "tissuePresetComboBox" or (control.kind == "node" and not control.node):
+        if control.value or control.node or control.action:
+            self._tasks.start(lambda: self._changed(control, value))
+        else:
             with self._shared.changing() as now:  # what a button will take
                 now.panel.values = {**now.panel.values, name: value}
-        else:
-            self._tasks.start(lambda: self._changed(control, value))
 
     def _changed(self, control: Control, value: Any) -> None:
         presenter, parameters = self.presenter, self._logic.parameters
-        if control.field:
-            if value != presenter.value(control.field):
-                presenter.setValue(control.field, value)
-                self.refresh()
-        elif control.value:
-            old = getattr(parameters, control.value)
-            if value != old:
-                with presenter.shown():
-                    setattr(parameters, control.value, type(old)(value))
+        if value == self._shown_value(control):
+            return
+        if control.value:
+            presenter.setValue(control.value, value)
         elif control.node:
-            node = parameters.node.GetScene().GetNodeByID(value) if value else None
-            if node is not getattr(parameters, control.node):
-                setattr(parameters, control.node, node)
-        elif control.name == "probePresetComboBox":
-            if value in PROBES and value != presenter.probeName():
-                presenter.chooseProbe(value)
-        elif control.name == "liveCheckBox":
-            presenter.setLive(bool(value))
+            with presenter.shown():
+                setattr(parameters, control.node, self._logic.scene.GetNodeByID(value) if value else None)
+        else:
+            part_of(presenter, control.action)(value)
+        self.refresh()
 
     # ---- inside ------------------------------------------------------------------------------------------------
 
     def _shown_values(self) -> dict[str, object]:
-        parameters = self._logic.parameters
-        shown: dict[str, object] = {}
-        for name, control in self._controls.items():
-            if control.field:
-                shown[name] = self.presenter.value(control.field)
-            elif control.value:
-                shown[name] = getattr(parameters, control.value)
-            elif control.node:
-                node = getattr(parameters, control.node)
-                shown[name] = None if node is None else node.GetID()
-        shown["probePresetComboBox"] = self.presenter.probeName() or CUSTOM_PROBE
-        shown["liveCheckBox"] = self.presenter.isLive()
-        return shown
+        return {
+            name: self._shown_value(control)
+            for name, control in self._controls.items()
+            if control.value or control.node or control.shows
+        }
+
+    def _shown_value(self, control: Control) -> object:
+        if control.value:
+            return self.presenter.value(control.value)
+        if control.node:
+            node = getattr(self._logic.parameters, control.node)
+            return None if node is None else node.GetID()
+        return shown_by(self.presenter, control.shows)
 
     def _nodes_for(self, control: Control) -> list[NodeItem]:
         scene = self._logic.scene
         found = [
             node for name in control.node_classes for node in nodes_of_class(scene, name) if node.GetClassName() == name
         ]
-        none = [NodeItem("None", None)] if control.none_allowed else []
-        return [*none, *(NodeItem(node.GetName(), node.GetID()) for node in found)]
+        return [NodeItem("None", None), *(NodeItem(node.GetName(), node.GetID()) for node in found)]
 
     def _show_costs(self) -> None:
         rows = self._table.GetTable()

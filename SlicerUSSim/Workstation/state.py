@@ -17,8 +17,6 @@ from trame_server.utils.typed_state import TypedState
 
 from SlicerUSSim.Logic.probe.surface import SurfacePose
 
-#: What the choice of probes shows for one of the user's own.
-CUSTOM_PROBE = "custom"
 #: Planes that a slice view follows the probe in: of the image, across it, and the patient's own.
 IN_PLANE, ACROSS = "In plane", "Across"
 PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
@@ -97,7 +95,7 @@ class ImageGeometry:
 
 @dataclass
 class PanelState:
-    """The controls of Resources/UI, whose names are that file's: the mappings are by sections.Control.name."""
+    """The controls of Widget/sections.py: the mappings are by Control.widget."""
 
     #: What each shows; None where the preset has no such value
     values: dict[str, object] = field(default_factory=dict)
@@ -107,7 +105,7 @@ class PanelState:
     nodes: dict[str, list[NodeItem]] = field(default_factory=dict)
     #: Whether it can be used; those that are missing can
     can: dict[str, bool] = field(default_factory=dict)
-    #: Tool tips that say why not
+    #: Their tool tips, which say why not
     tips: dict[str, str] = field(default_factory=dict)
     #: The tissue table, and the name in its chosen line
     tissues: list[TissueLine] = field(default_factory=list)
@@ -163,8 +161,6 @@ class FitState:
     """The fit to real ultrasound."""
 
     free: list[FreeParameter] = field(default_factory=list)
-    #: What the last one found, in lines
-    summary: str = ""
     #: The best costs so far, and the same in words
     curve: list[float] = field(default_factory=list)
     costs: str = ""

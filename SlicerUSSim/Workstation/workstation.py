@@ -14,6 +14,7 @@ from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Widget.sections import panel_sections
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.buttons import Buttons
 from SlicerUSSim.Workstation.comparison import Comparison
@@ -28,7 +29,6 @@ from SlicerUSSim.Workstation.opener import Files, Opener
 from SlicerUSSim.Workstation.page import build_page, view_tools
 from SlicerUSSim.Workstation.panel import BrowserPanel
 from SlicerUSSim.Workstation.probe_control import ProbeControl
-from SlicerUSSim.Workstation.sections import read_sections
 from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
@@ -53,7 +53,7 @@ class Workstation:
         app = SlicerApp()
         # Registers the classes of sequence nodes; pyright does not see names that slicer imports from its libraries.
         app.register_module_logic(cast(Any, slicer).vtkSlicerSequencesLogic())
-        sections = read_sections()
+        sections = panel_sections()
         stamps, cine = LatencyStamps(), Cine()
 
         self._messages = Messages(shared)
@@ -77,7 +77,7 @@ class Workstation:
         self._image_node = Observed("ImageDataModifiedEvent", self._images.image_changed)
         self._parameter_node = Observed("ModifiedEvent", self._parameters_changed)
         self._parameter_node.watch(logic.parameters.node)
-        self._answer_pages(Buttons(shared, app, tasks, presenter, self._loading), stamps)
+        self._answer_pages(Buttons(shared, tasks, presenter, sections, self._loading), stamps)
         self._follow_pages()
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)

@@ -130,6 +130,7 @@ class UltrasoundSceneLogic:
         classes: int = SegmentationSettings.classes,
         contrast: str = SegmentationSettings.contrast,
         filter_radius: int = SegmentationSettings.filter_radius,
+        filter_epsilon: float | None = SegmentationSettings.filter_epsilon,
         bias_correction: bool = SegmentationSettings.bias_correction,
         thin_sulci: bool = SegmentationSettings.thin_sulci,
         progress: Callable[[float], None] | None = None,
@@ -147,7 +148,8 @@ class UltrasoundSceneLogic:
         result = self._work.do(
             lambda: segment_mri(
                 mri, classes=classes, contrast=contrast, mask=mask, filter_radius=filter_radius,
-                bias_correction=bias_correction, thin_sulci=thin_sulci, device=self.device, progress=progress,
+                filter_epsilon=filter_epsilon, bias_correction=bias_correction, thin_sulci=thin_sulci,
+                device=self.device, progress=progress,
             )
         )  # fmt: skip
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")

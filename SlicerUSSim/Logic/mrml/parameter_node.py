@@ -1,17 +1,37 @@
 """What the Slicer module remembers in the scene, so that a saved scene opens as it was left.
 
 The parameters live in the module's vtkMRMLScriptedModuleNode in the same form as Slicer's parameterNodeWrapper keeps
-them there. So a scene made by a script opens in the module, and the other way round.
+them there. So a scene made by a script opens in the module, and the other way round. Values are those of declared
+dataclasses (base/declaration.py): a parameter that is declared there is remembered.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
+from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.fitting.settings import FitSettings
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 MODULE_NAME = "USSim"
-T = TypeVar("T", str, bool, int)
+_OWNER = "scene"
+S = TypeVar("S", bound=Declared)
+
+
+@dataclass(frozen=True)
+class PanelSettings(Declared):
+    """What else the panel remembers."""
+
+    show_in_slice: bool = parameter(
+        True, "Show the image in this slice view",
+        "Turn the slice view into the plane of the probe and lay the image over it, with every image", shown=True,
+    )  # fmt: skip
+    preset: str = parameter("", "Preset", "The JSON text of a Preset; empty: the default")
+
+    def _owner(self) -> str:
+        return "panel"
 
 
 class NodeParameter:
@@ -38,60 +58,76 @@ class NodeParameter:
         node.EndModify(was_modifying)
 
 
-class ValueParameter(Generic[T]):
-    """A value with its default, which also says its type."""
+class ValueParameter:
+    """A declared value; an empty text in the node is its default."""
 
-    def __init__(self, default: T) -> None:
-        self.default: T = default
+    def __init__(self, declared: Parameter) -> None:
+        self.declared = declared
+
+    def __get__(self, parameters: SceneParameters, owner: type | None = None) -> Any:
+        if parameters is None:
+            return self
+        text = parameters.node.GetParameter(self.declared.name)
+        return self.declared.default if text == "" else self.declared.from_text(_OWNER, text)
+
+    def __set__(self, parameters: SceneParameters, value) -> None:
+        parameters.node.SetParameter(self.declared.name, str(self.declared.checked(_OWNER, value)))
+
+
+class SettingsParameter(Generic[S]):
+    """The values of a declared dataclass; the owner gets each of them under its own name too, with a prefix."""
+
+    def __init__(self, kind: type[S], prefix: str = "") -> None:
+        self._kind, self._prefix = kind, prefix
+        #: {name in the scene: declaration, under that name}
+        self.values = {
+            f"{prefix}{entry.name}": replace(entry, name=f"{prefix}{entry.name}") for entry in parameters_of(kind)
+        }
 
     def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
+        for value_name, declared in self.values.items():
+            setattr(owner, value_name, ValueParameter(declared))
 
-    def __get__(self, parameters: SceneParameters, owner: type | None = None) -> T:
+    @overload
+    def __get__(self, parameters: None, owner: type) -> SettingsParameter[S]: ...
+
+    @overload
+    def __get__(self, parameters: SceneParameters, owner: type | None = None) -> S: ...
+
+    def __get__(self, parameters: SceneParameters | None, owner: type | None = None) -> SettingsParameter[S] | S:
         if parameters is None:
-            return self  # type: ignore[return-value], of the class: the parameter itself
-        text = parameters.node.GetParameter(self.name)
-        if text == "":
-            return self.default
-        kind: Any = type(self.default)
-        try:
-            return text == "True" if kind is bool else kind(text)
-        except ValueError:
-            raise SimulationError(f"scene parameter {self.name} is {text!r}, expected {kind.__name__}") from None
+            return self
+        return self._kind(**{name.removeprefix(self._prefix): getattr(parameters, name) for name in self.values})
 
-    def __set__(self, parameters: SceneParameters, value: T) -> None:
-        kind = type(self.default)
-        require(type(value) is kind, f"scene parameter {self.name} is {value!r}, expected {kind.__name__}")
-        parameters.node.SetParameter(self.name, str(value))
+    def __set__(self, parameters: SceneParameters, settings: S) -> None:
+        node = parameters.node
+        was_modifying = node.StartModify()
+        for name in self.values:
+            setattr(parameters, name, getattr(settings, name.removeprefix(self._prefix)))
+        node.EndModify(was_modifying)
 
 
 class SceneParameters:
-    """The parameters of one scene as attributes: parameters.mri, parameters.contrast = "t2".
+    """The parameters of one scene as attributes: parameters.mri, parameters.contrast = "t2", parameters.fit.register.
 
-    Raises SimulationError for a name that is none and for a value or node of the wrong type.
+    Values can be had one by one, under the names of VALUE_PARAMETERS, or together as the dataclass that declares them.
+    Raises SimulationError for a name that is none, for a value or node of the wrong type, and for a value out of range.
     """
 
     mri = NodeParameter("vtkMRMLScalarVolumeNode")
-    mask = NodeParameter("vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode")
-    labels = NodeParameter("vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode")
+    mask = NodeParameter("vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
+    labels = NodeParameter("vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     probe_transform = NodeParameter("vtkMRMLLinearTransformNode")
     output = NodeParameter("vtkMRMLScalarVolumeNode")
     outline = NodeParameter("vtkMRMLModelNode")
     real = NodeParameter("vtkMRMLSequenceNode", "vtkMRMLScalarVolumeNode")
-    contrast = ValueParameter("t1")
-    classes = ValueParameter(3)
-    thin_sulci = ValueParameter(True)
-    bias_correction = ValueParameter(False)
-    show_in_slice = ValueParameter(True)
-    #: The JSON text of a Preset, empty for the default
-    preset = ValueParameter("")
-    #: Numbers of images as sequence.frame_numbers reads them, empty for all
-    fit_frames = ValueParameter("")
-    #: Names of fitting/parameters.py, with commas between
-    fit_free = ValueParameter("display, white matter")
-    fit_estimate = ValueParameter(False)
-    fit_register = ValueParameter(False)
-    fit_evaluations = ValueParameter(500)
+    #: Recorded transforms, and the images simulated at them
+    transform_sequence = NodeParameter("vtkMRMLSequenceNode")
+    image_sequence = NodeParameter("vtkMRMLSequenceNode")
+
+    segmentation = SettingsParameter(SegmentationSettings)
+    fit = SettingsParameter(FitSettings, "fit_")
+    panel = SettingsParameter(PanelSettings)
 
     def __init__(self, scene) -> None:
         object.__setattr__(self, "scene", scene)
@@ -110,13 +146,15 @@ class SceneParameters:
         node.SetAttribute("ModuleName", MODULE_NAME)  # which closing a scene may remove
         return node
 
-    if not TYPE_CHECKING:  # a type checker knows the names
+    if TYPE_CHECKING:  # a type checker knows the names that are written above
+        preset: str
+    else:
 
         def __getattr__(self, name: str):
             raise SimulationError(f"scene parameters have no {name!r}")
 
         def __setattr__(self, name: str, value) -> None:
-            if name not in NODE_PARAMETERS and name not in VALUE_PARAMETERS:
+            if not isinstance(vars(type(self)).get(name), NodeParameter | ValueParameter | SettingsParameter):
                 raise SimulationError(f"scene parameters have no {name!r}")
             object.__setattr__(self, name, value)
 
@@ -125,7 +163,7 @@ class SceneParameters:
 NODE_PARAMETERS = {
     name: entry.classes for name, entry in vars(SceneParameters).items() if isinstance(entry, NodeParameter)
 }
-#: {name: default}
-VALUE_PARAMETERS: dict[str, str | bool | int] = {
-    name: entry.default for name, entry in vars(SceneParameters).items() if isinstance(entry, ValueParameter)
+#: {name: declaration}
+VALUE_PARAMETERS: dict[str, Parameter] = {
+    name: entry.declared for name, entry in vars(SceneParameters).items() if isinstance(entry, ValueParameter)
 }

@@ -1,0 +1,161 @@
+"""The widgets of a panel, in Qt: one for each control of its sections.
+
+Properties are set by setProperty(), which PythonQt and other bindings of Qt share. A widget is called what its control
+says, and is an attribute of that name of what build() returns.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import ctk
+import qt
+import slicer
+
+from SlicerUSSim.Widget.controls import Control, Section, by_widget
+
+_PAGE_STEPS = 10
+_TABLE_HEIGHT, _LIST_HEIGHT = 220, 140
+
+
+def build(sections: tuple[Section, ...], column: Any) -> SimpleNamespace:
+    """The widgets of all controls, laid out in a QVBoxLayout, with those that show progress below them."""
+    ui = SimpleNamespace(**{name: _widget(control) for name, control in by_widget(sections).items()})
+    for name, widget in vars(ui).items():
+        widget.setObjectName(name)
+    for section in sections:
+        column.addWidget(_section(section, ui))
+    _add_progress(column, ui)
+    column.addStretch(1)
+    return ui
+
+
+def _section(section: Section, ui: SimpleNamespace) -> Any:
+    result = ctk.ctkCollapsibleButton()
+    result.setProperty("text", section.title)
+    form = qt.QFormLayout(result)
+    for row in section.rows:
+        if isinstance(row, Control):
+            _add_row(form, row, getattr(ui, row.widget))
+            continue
+        beside = qt.QWidget()
+        line = qt.QHBoxLayout(beside)
+        line.setContentsMargins(0, 0, 0, 0)
+        for control in row:
+            line.addWidget(getattr(ui, control.widget))
+        form.addRow(beside)
+    result.setProperty("collapsed", not section.is_open)
+    return result
+
+
+def _add_row(form: Any, control: Control, widget: Any) -> None:
+    if control.kind in ("button", "table", "words"):
+        form.addRow(widget)
+        return
+    label = qt.QLabel("" if control.kind == "tick" else f"{control.label}:")
+    label.setToolTip(control.tip)
+    form.addRow(label, widget)
+
+
+def _widget(control: Control) -> Any:
+    result = _MAKERS[control.kind](control)
+    result.setToolTip(control.tip)
+    return result
+
+
+def _slider(control: Control) -> Any:
+    result = _with_range(ctk.ctkSliderWidget(), control)
+    result.setProperty("pageStep", _PAGE_STEPS * control.range.step)
+    return result
+
+
+def _number(control: Control) -> Any:
+    # Whole numbers too: a seed can be larger than a QSpinBox holds.
+    result = _with_range(qt.QDoubleSpinBox(), control)
+    result.setProperty("keyboardTracking", False)
+    return result
+
+
+def _with_range(widget: Any, control: Control) -> Any:
+    widget.setProperty("decimals", control.decimals)  # before what they would round
+    widget.setProperty("minimum", control.range.low)
+    widget.setProperty("maximum", control.range.high)
+    widget.setProperty("singleStep", control.range.step)
+    widget.setProperty("suffix", control.suffix)
+    return widget
+
+
+def _choice(control: Control) -> Any:
+    result = qt.QComboBox()
+    for name in control.choices:
+        result.addItem(name)
+    return result
+
+
+def _node(control: Control) -> Any:
+    result = slicer.qMRMLNodeComboBox()
+    result.nodeTypes = list(control.node_classes)
+    result.setProperty("showChildNodeTypes", False)
+    result.setProperty("noneEnabled", True)
+    for name in ("addEnabled", "removeEnabled", "renameEnabled", "selectNodeUponCreation"):
+        result.setProperty(name, bool(control.new_node))
+    if control.new_node:
+        result.setProperty("baseName", control.new_node)
+    result.setMRMLScene(slicer.mrmlScene)
+    return result
+
+
+def _text(control: Control) -> Any:
+    result = qt.QLineEdit()
+    result.setProperty("placeholderText", control.hint)
+    return result
+
+
+def _words(control: Control) -> Any:
+    result = qt.QLabel("")
+    result.setProperty("wordWrap", True)
+    return result
+
+
+def _table(control: Control) -> Any:
+    result = qt.QTableWidget()
+    result.setMinimumHeight(_TABLE_HEIGHT)
+    result.setAlternatingRowColors(True)
+    return result
+
+
+def _list(control: Control) -> Any:
+    result = qt.QListWidget()
+    result.setMinimumHeight(_LIST_HEIGHT)
+    result.setMaximumHeight(_LIST_HEIGHT)
+    return result
+
+
+_MAKERS = {
+    "slider": _slider,
+    "number": _number,
+    "tick": lambda control: qt.QCheckBox(control.label),
+    "choice": _choice,
+    "text": _text,
+    "node": _node,
+    "button": lambda control: qt.QPushButton(control.label),
+    "words": _words,
+    "table": _table,
+    "list": _list,
+}
+
+
+def _add_progress(column: Any, ui: SimpleNamespace) -> None:
+    ui.progressWidget = qt.QWidget()
+    ui.progressBar, ui.cancelButton = qt.QProgressBar(), qt.QPushButton("Cancel")
+    ui.progressBar.setToolTip("Share of the work done [%]")
+    ui.cancelButton.setToolTip("Stop the work; nothing is changed")
+    line = qt.QHBoxLayout(ui.progressWidget)
+    line.setContentsMargins(0, 0, 0, 0)
+    for name in ("progressBar", "cancelButton"):
+        getattr(ui, name).setObjectName(name)
+        line.addWidget(getattr(ui, name))
+    ui.progressWidget.setObjectName("progressWidget")
+    ui.progressWidget.setVisible(False)
+    column.addWidget(ui.progressWidget)
