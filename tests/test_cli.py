@@ -206,7 +206,7 @@ def bad_inputs(folder):
         (["simulate", folder / "nine.nrrd", "--pose", "auto", "-o", out], "label 9 has no tissue"),
         (["simulate", mri, "--pose", "auto", "-o", folder / "out.xyz"], "unknown image format"),
         (["simulate", mri, "--pose", "auto", "-o", folder / "nowhere" / "o.png"], "does not exist"),
-        (["demo", "--mri", mri, "--out", folder / "probe.json" / "x"], "cannot be made"),
+        (["demo", "--mri", mri, "--out", folder / "probe.json" / "x"], "cannot be created"),
         (["simulate", mri, "--pose", "auto", "-o", "/proc/o.png"], "/proc/o.png: cannot be written"),
     ]
 

@@ -161,7 +161,7 @@ def test_the_command_exits_with_zero_when_all_is_well_and_two_for_a_wrong_name(t
 
 def test_a_report_that_cannot_be_written_is_one_clear_error(tmp_path):
     (tmp_path / "taken").write_text("a file")
-    with pytest.raises(SimulationError, match="taken: cannot be made"):
+    with pytest.raises(SimulationError, match="taken: cannot be created"):
         validate(tmp_path / "taken", only=["thin"])
 
 
