@@ -80,8 +80,8 @@ def twins(labels: Volume, tissues: TissueTable, patients: int, device) -> dict:
         results[title] = rows
         print(f"\n### {title}\n")
         columns = ["cost before", "cost after", "histograms per tissue before", "after", "alpha true", "alpha found",
-                   "mu0", "sigma0", "mu1", "error alpha", "error Var dB", "error Var re grey dB", "error net fall",
-                   "seconds"]  # fmt: skip
+                   "mu0", "sigma0", "mu1", "error alpha", "error Var dB", "error Var re grey dB",
+                   "error net attenuation", "seconds"]  # fmt: skip
         table(["patient", *columns], [[n, *(row[name] for name in columns)] for n, row in enumerate(rows)])
         print(f"\nspread (sd over restarts, mean of all patients): {mean_spread(rows)}")
     return results
@@ -120,7 +120,7 @@ def fitted(twin: Twin, display_is_known: bool, settings: SimilaritySettings | No
         "error Var dB": variance_db(found) - variance_db(true),
         # The same value, since grey matter is not free here; it can be determined even if the gain is unknown.
         "error Var re grey dB": variance_db(found) - variance_db(true),
-        "error net fall": alpha - tgc,
+        "error net attenuation": alpha - tgc,
         "error gain dB": result.display.gain_db - twin.true_display.gain_db,
         "error dynamic range dB": result.display.dynamic_range_db - twin.true_display.dynamic_range_db,
         "seconds": result.seconds,
@@ -161,7 +161,7 @@ def ablation(labels: Volume, tissues: TissueTable, patients: int, device) -> dic
     for name, settings in MEASURES.items():
         results[name] = [fitted(make_twin(labels, tissues, n, device=device), False, settings) for n in range(patients)]
     print("\nRoot mean square (largest) errors over the patients, display and white matter free\n")
-    names = ["error alpha", "error net fall", "error Var dB", "error gain dB", "error dynamic range dB", "after"]
+    names = ["error alpha", "error net attenuation", "error Var dB", "error gain dB", "error dynamic range dB", "after"]
     rows = []
     for measure, found in results.items():
         values = {name: np.abs([row[name] for row in found]) for name in names}

@@ -77,7 +77,7 @@ def test_optimize_writes_result_report_preset_and_state(folder):
     assert report.count("data:image/png;base64,") >= 3 * 4 + 3
     assert not re.search(r"(src|href)=\"(?!data:)", report)  # nothing outside the file
     for words in (
-        "simulated, before", "real", "Blink", "white matter.mu0", "net fall", "Var of white matter",
+        "simulated, before", "real", "Blink", "white matter.mu0", "net attenuation", "Var of white matter",
         "<td>Mean amplitude μ₀</td>", 'title="Mean amplitude of scatterers.', "<td>dB/(cm MHz)</td>",
     ):  # fmt: skip
         assert words in report
@@ -237,7 +237,7 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
         (["--register", "--save-transform", "there.tfm"], "there.tfm, expected a name ending in .json"),
         (["--state", "result.json"], "is given for 2 outputs, expected a file for each"),
         (["--report", "/nowhere/report.html"], "the folder /nowhere does not exist"),
-        (["--state", "probe.json"], "is not one of an optimisation"),
+        (["--state", "probe.json"], "the state to resume is invalid"),
     ],
 )
 def test_mistakes_are_one_line_and_write_nothing(folder, options, message, monkeypatch):

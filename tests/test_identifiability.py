@@ -134,7 +134,7 @@ def test_combinations_are_what_the_documentation_says_of_them():
     share = white.scatterer_share
     assert var == pytest.approx(10 * np.log10(share * (1 - share) * white.mu0**2 + share * white.sigma0**2), abs=1e-6)
     for name, value in (
-        ("net fall with depth in white matter", 2 * 5.0 * (white.attenuation_db_cm_mhz - 0.4)),
+        ("net attenuation in white matter", 2 * 5.0 * (white.attenuation_db_cm_mhz - 0.4)),
         ("Var of white matter", var),
         ("Var of white matter re grey matter", var - variance_db(grey)),
         ("Var of white matter with gain", var + 3.0),
@@ -150,7 +150,7 @@ def test_combinations_stay_where_their_parts_trade_off():
         "sigma0": 0.5 * white.sigma0, "gain_db": 3.0 + 20 * np.log10(2.0),
     }  # fmt: skip
     found, _ = spreads_of([], [faded])
-    still = ("net fall with depth in white matter", "Var of white matter with gain")
+    still = ("net attenuation in white matter", "Var of white matter with gain")
     for name in (*still, "grey level of white matter at the face"):
         spread = found[name]
         assert spread.high - spread.low == pytest.approx(0.0, abs=1e-6) and spread.is_determined, name
@@ -165,7 +165,7 @@ def test_tolerances_are_those_of_the_documentation():
     for name, tolerance in (
         ("white matter.attenuation_db_cm_mhz", 0.1),
         ("tgc_db_cm_mhz", 0.1),
-        ("net fall with depth in white matter", 2 * 0.1 * frequency_mhz),
+        ("net attenuation in white matter", 2 * 0.1 * frequency_mhz),
         ("Var of white matter", 1.5),
         ("Var of white matter re grey matter", 1.5),
         ("Var of white matter with gain", 1.5),
@@ -199,10 +199,10 @@ def test_two_tissues_are_compared_once():
     parameters = FreeParameters.of(["white matter.mu0", "grey matter.mu0"], TISSUES_OF_BRAIN, DISPLAY)
     names = [q.name for q in quantities_of(parameters, 5.0, TISSUES_OF_BRAIN)]
     assert [name for name in names if " re " in name] == ["Var of white matter re grey matter"]
-    assert not [name for name in names if "with gain" in name or "net fall" in name]
+    assert not [name for name in names if "with gain" in name or "net attenuation" in name]
 
 
 def test_the_net_fall_follows_every_tissue_that_is_looked_at_where_tgc_is_free():
     parameters = FreeParameters.of(["white matter.mu0", "tgc_db_cm_mhz"], TISSUES_OF_BRAIN, DISPLAY)
     names = [q.name for q in quantities_of(parameters, 5.0, TISSUES_OF_BRAIN)]
-    assert [name for name in names if "net fall" in name] == ["net fall with depth in white matter"]
+    assert [name for name in names if "net attenuation" in name] == ["net attenuation in white matter"]

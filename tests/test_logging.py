@@ -169,7 +169,7 @@ def test_orientation_and_unit_of_nifti_are_logged(log, tmp_path, mirrored):
 def test_a_size_that_no_patient_has_is_a_warning(log, tmp_path):
     Volume(np.zeros((20, 20, 20), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1])).write(tmp_path / "small.nrrd")
     Volume.read(tmp_path / "small.nrrd")
-    assert "is 0.02x0.02x0.02 mm large" in messages(log, logging.WARNING)[0]
+    assert "its size is 0.02x0.02x0.02 mm" in messages(log, logging.WARNING)[0]
 
 
 def test_what_a_sequence_is_taken_for_is_logged(log, files):

@@ -107,7 +107,7 @@ def test_attenuation_and_echogenicity_are_recovered_when_the_display_is_known(br
 def test_it_says_what_cannot_be_known(result):
     found = result.identifiability
     assert not found["white matter.mu1"].is_determined  # only Var shows
-    assert found["net fall with depth in white matter"].is_determined
+    assert found["net attenuation in white matter"].is_determined
     for spread in found.spreads:
         assert spread.low <= spread.value <= spread.high
     mu1, var = found["white matter.mu1"], found["Var of white matter re grey matter"]
@@ -218,7 +218,7 @@ def test_an_interrupted_run_is_resumed_without_computing_again(twin):
     assert optimise(twin, ["display"], max_evaluations=80, resume=resumed.state).evaluations == 0
     with pytest.raises(SimulationError, match="another problem"):
         optimise(twin, ["gain_db"], resume=state)
-    with pytest.raises(SimulationError, match="not one of an optimisation"):
+    with pytest.raises(SimulationError, match="state to resume is invalid"):
         optimise(twin, ["gain_db"], resume={"hello": 1})
 
 

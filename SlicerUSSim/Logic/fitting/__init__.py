@@ -1,6 +1,6 @@
-"""Simulated images fitted to real ones: their likeness, what may vary, the search, registration, the report.
+"""Fit of simulated to real images: image similarity, free parameters, search, registration, report.
 
-`fit` does all of it for tracked images; `optimize_appearance` is the optimisation alone.
+`fit` is the complete fit to tracked images; `optimize_appearance` is the optimisation without registration.
 """
 
 from typing import TYPE_CHECKING

@@ -1,19 +1,18 @@
-"""AppearanceModel: images of fixed poses as a function of the parameters that an optimiser varies.
+"""AppearanceModel: images at fixed poses as a function of the parameters that an optimiser varies.
 
 Constant parts are computed once (docs/optimization.md#efficient-evaluation). The ray tree depends on none of these
-parameters. The echoes of a tissue are linear in mu0 and sigma0, so a few baseband images, its *bases*, hold them for
-all values:
+parameters. The echoes of a tissue are linear in mu0 and sigma0, so a few baseband images, its *bases*, represent them
+for all values:
 
     iq = [ base + sum over varied tissues (mu0 M + sigma0 S) ] exp(-sum over tissues (alpha - alpha_0) path)
 
-- M and S for another mu1 are sums over bands of T1, by which a tissue's scatterers come to exist one after the other. A
-  band that exists in part is weighted so that the variance p (1 - p) mu0^2 + p sigma0^2, which alone is seen in
-  developed speckle, is kept exactly.
-- Another attenuation changes the amplitude by what the direct path to each sample loses, an approximation where the
-  beam straddles the edge of a shadow, and for echoes of reflected rays. At the anchor alpha_0 nothing is approximated,
-  and `anchor` moves it.
+- M and S for another mu1 are sums over bands of T1, since scatterers exist where T1 >= mu1. A band that mu1 divides is
+  weighted so that the variance p (1 - p) mu0^2 + p sigma0^2, the only quantity visible in developed speckle, is exact.
+- Another attenuation changes the amplitude of each sample by the loss along the direct path. This is an approximation
+  where the beam covers the edge of a shadow, and for echoes of reflected rays. At the anchor alpha_0 the model is
+  exact; `anchor` changes it.
 
-So one image costs a weighted sum and the display stages (stages.py).
+An image is therefore computed from a weighted sum and the display stages (stages.py).
 """
 
 from __future__ import annotations
@@ -48,25 +47,25 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _BANDS = CONSTANTS["BANDS"]
-#: Memory that bases and paths of all images may take; more is asked for by mistake.
+#: Limit for the memory of bases and paths of all images.
 _MOST_BYTES = 4 * 2**30
-#: Attenuation over the whole depth with which path lengths are measured: large against the tracer's tolerance, small
-#: against its threshold.
+#: Attenuation over the image depth for measuring path lengths: large compared to the tracer's tolerance, small compared
+#: to its threshold.
 _PROBING_DB = 100.0
 
 
 class AppearanceModel:
-    """The images of one patient at some poses, for any display and for any value of the varied tissue parameters.
+    """The images of one patient at given poses, for any display and any values of the varied tissue parameters.
 
     Parameters
     ----------
     simulator : its labels, tissues and settings; the tissues are the first anchor.
     probe, poses : the probe and its (4, 4) probe_to_ras, one per image.
     varied : {tissue name: parameter names among parameters.TISSUE_BOUNDS}.
-    grid : the pixels of the images (default: what just holds the imaged field, as many as display.image_size says).
+    grid : the pixels of the images (default: the bounding box of the imaged field, with display.image_size pixels).
 
-    Raises SimulationError for a tissue the simulator does not have, a pose that is not rigid, and for more images and
-    parameters than fit into memory.
+    Raises SimulationError for a tissue that the simulator does not have, a pose that is not rigid, and if the images
+    and parameters need too much memory.
     """
 
     def __init__(
@@ -83,7 +82,7 @@ class AppearanceModel:
         self.varied = {name: frozenset(parameters) for name, parameters in varied.items()}
         for name in self.varied:
             simulator.medium.tissues.tissue(name)
-        #: Tissues whose scatterers vary, and whose attenuation does, in the order of the bases and of the paths
+        #: Tissues with varied scatterers, in the order of the bases, and with varied attenuation, in that of the paths
         self.scattering = [n for n, p in self.varied.items() if p & SCATTERING]
         self.attenuating = [n for n, p in self.varied.items() if "attenuation_db_cm_mhz" in p]
         self._check_memory()
@@ -101,13 +100,13 @@ class AppearanceModel:
         self.anchor(simulator.medium.tissues)
 
     def anchor(self, tissues: TissueTable) -> None:
-        """Compute the bases anew for these tissues, for which the model is then exact."""
+        """Recompute the bases for these tissues, for which the model is then exact."""
         started = perf_counter()
         simulator = self.simulator
         self.tissues = tissues
-        self._weighted: TissueTable | None = None  # the weights on the device are for these tissues
+        self._weighted: TissueTable | None = None  # tissues of the weights on the device
         self._frames = [simulator.device_frame(self.probe, pose) for pose in self.poses]
-        simulator.forget_echoes()  # its stages make the bases
+        simulator.forget_echoes()  # the bases use its stages
         with simulator.with_tissues(tissues):
             for number in range(len(self.poses)):
                 self._measure_paths(number)
@@ -132,7 +131,7 @@ class AppearanceModel:
     def _rendered(self, number: int, tissues: TissueTable, display: DisplaySettings) -> DeviceFrame:
         frame = replace(self._frames[number], display=display, grid=self.grid(display))
         lines, samples = frame.line_shape
-        if tissues is not self._weighted:  # a write waits for the images before it
+        if tissues is not self._weighted:  # the write waits for earlier images
             self.device.write(self._weights, self._base_weights(tissues))
             self.device.write(self._decays, self._path_weights(tissues))
             self._weighted = tissues
@@ -181,7 +180,7 @@ class AppearanceModel:
         return self._workspace.get(f"{kind} {number}", 4 * count * lines * samples)
 
     def _compute_bases(self, number: int) -> None:
-        """Trace, scatter tissue by tissue, and bring what is to be mixed later through beam and pulse."""
+        """Trace, compute the scatterers tissue by tissue, and apply beam and pulse to the parts of the bases."""
         device, frame = self.device, self._frames[number]
         self.simulator.tracer.run(frame)
         lines, (_, samples) = 2 * int(frame.acquisition["traced_lines"]), frame.line_shape
@@ -204,7 +203,7 @@ class AppearanceModel:
                     done += 1
 
     def _keep(self, number: int, base: int, weights: np.ndarray, with_interfaces: bool = False) -> None:
-        """One base from the parts: a weighted sum, and the linear stages, beam and pulse."""
+        """One base: a weighted sum of the parts, then the linear stages beam and pulse."""
         device, frame = self.device, self._frames[number]
         values = self._mixed.stride * 2 * int(frame.acquisition["traced_lines"])
         device.write(self._part_weights_buffer, weights)
@@ -223,8 +222,8 @@ class AppearanceModel:
         device.copy(frame.iq, self._buffer("bases", number), nbytes, base * nbytes)
 
     def _roles(self, place: int) -> np.ndarray:
-        """(MAX_TISSUES,) int32: what scatters in which part while tissue `place` is computed."""
-        # What is fixed is computed once, with the first tissue.
+        """(MAX_TISSUES,) int32: role of each tissue's scatterers while tissue `place` is computed."""
+        # Fixed tissues are computed once, with the first varied tissue.
         fixed = CONSTANTS["ROLE_FIXED" if place == 0 else "ROLE_SILENT"]
         roles = np.full(CONSTANTS["MAX_TISSUES"], fixed, np.int32)
         members = dict(self.tissues)
@@ -237,7 +236,7 @@ class AppearanceModel:
         return roles
 
     def _band_tops(self, name: str | None) -> np.ndarray:
-        """(BANDS,) float32; the share at the anchor is one of them, so that no band exists in part there."""
+        """(BANDS,) float32 tops of the bands; one is the anchor's, so that its mu1 does not divide a band."""
         tops = np.ones(_BANDS, np.float32)
         if name is not None:
             share = self.tissues.tissue(name).scatterer_share
@@ -247,7 +246,7 @@ class AppearanceModel:
         return tops
 
     def _part_weights(self, name: str) -> list[np.ndarray]:
-        """Which sums of parts are the bases of a tissue: all its parts if mu1 varies, else M and S for its mu1."""
+        """Weights of the parts in the bases of a tissue: single parts if mu1 varies, else M and S for its mu1."""
         parts = CONSTANTS["PARTS"]
         if "mu1" in self.varied[name]:
             return [_only(part) for part in range(1, parts)]
@@ -283,7 +282,7 @@ class AppearanceModel:
         return _PROBING_DB / (2.0 * self.probe.frequency_mhz * 0.1 * self.probe.depth_mm)
 
     def _measure_paths(self, number: int) -> None:
-        """Nepers lost in each attenuating tissue on the way to every sample, had it the probing attenuation."""
+        """Loss in nepers in each varied tissue along the path to every sample, at the probing attenuation."""
         simulator, device = self.simulator, self.device
         frame, paths = self._frames[number], self._buffer("paths", number)
         lines, samples = frame.line_shape
@@ -318,7 +317,7 @@ def _only(part: int) -> np.ndarray:
 
 
 def _only_attenuating(tissues: TissueTable, name: str, attenuation_db_cm_mhz: float) -> TissueTable:
-    """The same tissues, of which only one attenuates."""
+    """The same tissues, with attenuation in only one of them."""
     for tissue in tissues.all_tissues():
         value = attenuation_db_cm_mhz if tissue.name == name else 0.0
         tissues = tissues.with_tissue(replace(tissue, attenuation_db_cm_mhz=value))

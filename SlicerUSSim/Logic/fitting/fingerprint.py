@@ -1,4 +1,4 @@
-"""fingerprint: a short name for a value, equal for equal values alone."""
+"""fingerprint: a hash that is equal only for equal values."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 
 
 def fingerprint(value: object) -> str:
-    """SHA-256 of plain values, arrays, dataclasses (what they compare by), and sequences and mappings of those.
+    """SHA-256 of plain values, arrays, dataclasses (fields that are compared), and sequences and mappings of these.
 
-    Arrays count with type and shape, sequences with their lengths, so that nothing passes for something else that
-    happens to have the same bytes. Raises TypeError for anything else.
+    Types and shapes of arrays and lengths of sequences are included, so that different values with the same bytes have
+    different hashes. Raises TypeError for other values.
     """
     digest = hashlib.sha256()
     _feed(digest, value)
@@ -24,7 +24,7 @@ def _feed(digest, value: object) -> None:
     if value is None or isinstance(value, str):
         _feed_bytes(digest, type(value).__name__, repr(value).encode())
     elif isinstance(value, bool | int | float | np.generic):
-        whole = float(value).is_integer()  # 1 and 1.0 are equal, and 2**53 and 2**53 + 1 are not
+        whole = float(value).is_integer()  # 1 equals 1.0, but 2**53 does not equal 2**53 + 1
         _feed_bytes(digest, "number", repr(int(value) if whole else float(value)).encode())
     elif isinstance(value, np.ndarray) and not value.dtype.hasobject:
         _feed_bytes(digest, f"array {value.dtype.str} {value.shape}", np.ascontiguousarray(value).data)

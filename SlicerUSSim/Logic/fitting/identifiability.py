@@ -1,8 +1,9 @@
-"""What an image can tell about its parameters, and what it cannot (docs/optimization.md#identifiability).
+"""Identifiability of parameters from images (docs/optimization.md#identifiability).
 
-Developed speckle shows a tissue's Var = p (1 - p) mu0^2 + p sigma0^2 and not mu0, sigma0 and mu1; its level shows Var
-times gain; its fall with depth shows attenuation less time-gain compensation; grey levels show all of it over the
-dynamic range. So beside the parameters themselves their identifiable combinations are looked at.
+Developed speckle determines a tissue's Var = p (1 - p) mu0^2 + p sigma0^2, but not mu0, sigma0 and mu1 separately. Its
+level determines the product of Var and gain, its decrease with depth the difference of attenuation and time-gain
+compensation (net attenuation), and grey levels all of these relative to the dynamic range. Identifiable combinations
+are therefore analysed in addition to the parameters themselves.
 """
 
 from __future__ import annotations
@@ -26,36 +27,36 @@ Units: TypeAlias = "Sequence[float] | np.ndarray"
 
 @dataclass(frozen=True)
 class Quantity:
-    """A parameter or a combination of some, as a function of tissues and display."""
+    """A parameter or a combination of parameters, as a function of tissues and display."""
 
     name: str
     unit: str
-    #: Half the spread within which it counts as determined
+    #: It counts as determined if the values spread by at most twice this
     tolerance: float
     of: Callable[[TissueTable, DisplaySettings], float]
 
 
 @dataclass(frozen=True)
 class Spread:
-    """One quantity over all solutions that fit equally well."""
+    """The values of one quantity over all solutions that fit equally well."""
 
     name: str
     unit: str
     #: Of the best solution
     value: float
-    #: Smallest and largest of the equally good
+    #: Smallest and largest of the equally good solutions
     low: float
     high: float
-    #: Over the restarts that fit as well, the best included; NaN if there are none
+    #: Over the best solution and the restarts that fit equally well; NaN if there are none
     mean: float
     standard_deviation: float
     tolerance: float
-    #: Whether a search from elsewhere found the same cost, without which agreement means nothing
+    #: Whether a search from another starting point reached the same cost; otherwise agreement has no meaning
     was_tested: bool
 
     @property
     def is_determined(self) -> bool | None:
-        """Whether the equally good solutions agree within the tolerance; None if nothing else was found to compare."""
+        """Whether the equally good solutions agree within the tolerance; None if there is no other solution."""
         if self.high - self.low > 2.0 * self.tolerance:
             return False
         return True if self.was_tested else None
@@ -66,11 +67,11 @@ class Identifiability:
     """The spread of every free parameter and of every combination."""
 
     spreads: tuple[Spread, ...]
-    #: Solutions called equally good, and restarts among them, of how many
+    #: Number of equally good solutions, of restarts among them, and of all restarts
     solutions: int
     restarts_as_good: int
     restarts: int
-    #: Costs closer than this are called equal: as much changes with the draw of the speckle
+    #: Costs that differ by less are considered equal: other speckle changes the cost by as much
     cost_tolerance: float
 
     @classmethod
@@ -84,7 +85,7 @@ class Identifiability:
         restarts: int,
         cost_tolerance: float,
     ) -> Identifiability:
-        """From the best solution, equally good ones met or drawn, and those that restarts found."""
+        """From the best solution, equally good ones evaluated or sampled, and the results of restarts."""
         at_best = state_of(best)
         met, found = [state_of(units) for units in as_good], [state_of(units) for units in again]
         spreads = []
@@ -128,7 +129,7 @@ class Identifiability:
 def equal_variance_draws(
     parameters: FreeParameters, best: np.ndarray, tissues: TissueTable, display: DisplaySettings, random, count: int
 ) -> list[np.ndarray]:
-    """Positions with the Var of every tissue as at `best` and its mu0, sigma0 and mu1 drawn anew within the bounds."""
+    """Random mu0, sigma0 and mu1 within the bounds for every tissue, as positions, with Var as at `best`."""
     groups: dict[str, dict[str, int]] = {}
     for place, parameter in enumerate(parameters):
         if parameter.tissue is not None and parameter.attribute in SCATTERING:
@@ -142,7 +143,7 @@ def equal_variance_draws(
             units = np.array(best)
             units[list(places.values())] = random.random(len(places))
             amplitudes = [place for attribute, place in places.items() if attribute != "mu1"]
-            for _ in range(3):  # amplitudes are logarithmic: a shift of all of them is a factor
+            for _ in range(3):  # amplitudes are logarithmic: a common shift is a factor
                 tissue = parameters.apply(units, tissues, display)[0].tissue(name)
                 factor = 10.0 ** ((wanted - variance_db(tissue)) / 20.0)
                 for place in amplitudes:
@@ -162,7 +163,7 @@ def variance_db(tissue: Tissue) -> float:
 
 
 def quantities_of(parameters: FreeParameters, frequency_mhz: float, tissues: TissueTable) -> list[Quantity]:
-    """The free parameters, and combinations of them that images can tell (docs/optimization.md#identifiability)."""
+    """The free parameters and their identifiable combinations (docs/optimization.md#identifiability)."""
     quantities = [
         Quantity(p.name, p.declaration.unit, p.fit.tolerance, _reader(p.tissue, p.attribute)) for p in parameters
     ]
@@ -174,7 +175,7 @@ def quantities_of(parameters: FreeParameters, frequency_mhz: float, tissues: Tis
         dampened += [name for name in _scattering(tissues) if name not in dampened and name in varied]
     for name in dampened:
         quantities.append(
-            Quantity(f"net fall with depth in {name}", "dB/cm", 0.2 * frequency_mhz, _fall(name, frequency_mhz))
+            Quantity(f"net attenuation in {name}", "dB/cm", 0.2 * frequency_mhz, _fall(name, frequency_mhz))
         )
     for name in brightened:
         quantities.append(Quantity(f"Var of {name}", "dB", 1.5, _echogenicity(name)))
@@ -192,7 +193,7 @@ def quantities_of(parameters: FreeParameters, frequency_mhz: float, tissues: Tis
 
 
 def _scattering(tissues: TissueTable) -> list[str]:
-    """Tissues of the labels that echo by themselves."""
+    """Tissues of the labels with scatterers."""
     return list(dict.fromkeys(tissue.name for tissue in tissues.values() if tissue.scatterer_variance > 1e-8))
 
 

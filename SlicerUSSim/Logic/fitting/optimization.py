@@ -1,9 +1,9 @@
-"""optimize_appearance: display and tissue parameters fitted until simulated and real images agree.
+"""optimize_appearance: fit of display and tissue parameters to real images.
 
-A global search finds the basin, a local one its bottom, then the bases are computed anew there (appearance.py) and the
-local search goes on until the anchor no longer moves the cost (docs/optimization.md#search). One seed draws
-scatterers and noise of every evaluation (common random numbers), so the cost is a function: the same problem gives the
-same answer, and an interrupted run is resumed by replaying what it had evaluated.
+A global search is followed by a local one. Then the bases are recomputed there (appearance.py) and the local search
+continues, until a new anchor no longer changes the cost (docs/optimization.md#search). All evaluations use the same
+seed for scatterers and noise (common random numbers), so the cost is a deterministic function: the same problem gives
+the same result, and an interrupted run is resumed by replaying its evaluations.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 
 _log = logging.getLogger(__name__)
 
-#: The search for the best, stage by stage; afterwards come "redraw n", "restart n" and "draw".
+#: Stages of the search; they are followed by "redraw n", "restart n" and "draw".
 STAGES = ("global", "local", "polish")
-#: Shares of the evaluations of the first two; the rest is for the search after the anchor has moved.
+#: Fractions of the evaluations for the first two; the rest is for the search after the anchor has changed.
 _SHARES = (0.6, 0.25)
-#: Standard deviation of the starts of restarts around the best, between 0 and 1 across the bounds.
+#: Standard deviation of the starting points of restarts around the best, with bounds scaled to 0 and 1.
 _RESTART_SPREAD = 0.15
-#: Solutions drawn with the same variance of the scatterers, which should fit as well.
+#: Number of sampled solutions with equal variance of the scatterers, expected to fit equally well.
 _DRAWS = 12
 
 
 @dataclass(frozen=True, eq=False)
 class AppearanceResult:
-    """What an optimisation found."""
+    """Result of an optimisation."""
 
     tissues: TissueTable
     display: DisplaySettings
@@ -67,7 +67,7 @@ class AppearanceResult:
     #: {parameter name: value} at the start and at the end
     before: dict[str, float]
     after: dict[str, float]
-    #: Mean over the images, of full simulations
+    #: Mean over the images, from full simulations
     cost_before: float
     cost_after: float
     #: Of each image
@@ -78,12 +78,12 @@ class AppearanceResult:
     evaluations: int
     seconds: float
     identifiability: Identifiability = field(repr=False)
-    #: What a later run needs to go on: pass it as `resume`
+    #: State for continuing in a later run, as its `resume`
     state: dict = field(repr=False)
 
     @property
     def at_bounds(self) -> list[str]:
-        """Names of parameters that ended at one of their bounds, beyond which the images might fit better."""
+        """Names of parameters that ended at one of their bounds; wider bounds might give a better fit."""
         return [p.name for p in self.parameters if not 0.005 < p.unit(self.after[p.name]) < 0.995]
 
     def to_dict(self) -> dict:
@@ -116,7 +116,7 @@ class AppearanceCost:
     ----------
     model : AppearanceModel with one pose per reference.
     references : (rows, columns) uint8 each, on the model's grid.
-    masks : (rows, columns) bool each, where the reference shows its field; None is everywhere.
+    masks : (rows, columns) bool each, the imaged field of the reference; None: all pixels.
 
     Raises SimulationError where shapes or counts differ, fields do not overlap, or a reference is black.
     """
@@ -144,7 +144,7 @@ class AppearanceCost:
         return [comparison.result() for comparison in self.comparisons]
 
     def __call__(self, units: np.ndarray) -> float:
-        """The mean cost at (parameters,) positions between the bounds."""
+        """The mean cost at (parameters,) positions, 0 to 1 between the bounds."""
         tissues, display = self.parameters.apply(units, self.tissues, self.display)
         return mean_cost(self.of_each(tissues, display))
 
@@ -172,26 +172,25 @@ def optimize_appearance(
 
     Parameters
     ----------
-    simulator : of the patient; its tissues and settings are where the search starts, and it is left as it is.
-    probe, poses : what saw the references, and its (4, 4) probe_to_ras for each.
+    simulator : of the patient; the search starts from its tissues. It is not changed.
+    probe, poses : the probe of the references, and the (4, 4) probe_to_ras of each.
     references : (rows, columns) uint8 images.
     free : names of free parameters, or names with (low, high); see parameters.py.
-    display : where the search starts.
+    display : starting values of the search.
     grid : the pixels of the references in the probe frame (default: those of simulated images).
-    masks : (rows, columns) bool each, the field that a reference shows; only pixels inside both fields count.
-    max_evaluations : of the cost of all images, in the search for the best.
-    restarts : searches from other starts with other scatterers, for the spread of what fits equally well.
-    seed : of the search; that of scatterers and noise is the simulator's.
+    masks : (rows, columns) bool each, the imaged field of a reference; only pixels inside both fields count.
+    max_evaluations : largest number of evaluations of the cost of all images, without restarts.
+    restarts : searches from other starting points with other scatterers, for the spread of equally good fits.
+    seed : of the search; the seed of scatterers and noise is the simulator's.
     algorithms : nlopt's names of the global algorithm (None for none) and the local one.
-    progress : told after every evaluation; may raise errors.Cancelled.
-    resume : the state of an earlier run on the same problem, shorter or broken off: what was the same is not computed
-        again.
-    checkpoint : told the state at the end, and when something ends the run before (Cancelled, an interrupt).
+    progress : called after every evaluation; may raise errors.Cancelled.
+    resume : the state of an earlier run on the same problem, shorter or interrupted: its evaluations are not repeated.
+    checkpoint : called with the state at the end, and if the run ends early (Cancelled, an interrupt).
 
-    Raises SimulationError for what FreeParameters, AppearanceModel and AppearanceCost refuse, and for the state of
-    another problem, which it says what is different about.
+    Raises SimulationError as FreeParameters, AppearanceModel and AppearanceCost do, and for the state of another
+    problem, with the differences.
 
-    The gain of one image, found again:
+    Example: recovering the gain of one image:
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic import LinearProbe, TissueTable, UltrasoundSimulator, Volume
@@ -229,7 +228,7 @@ def optimize_appearance(
         "fit of %d images, %d free parameters: %s", len(references), len(parameters.names), ", ".join(parameters.names)
     )
     if history:
-        _log.info("%d evaluations of an earlier run are used again", len(history))
+        _log.info("%d evaluations of an earlier run are reused", len(history))
     search = Search(cost, describe, limit, seed, progress, history)
 
     start = parameters.units(tissues, display)
@@ -267,13 +266,13 @@ def optimize_appearance(
 def _searched(
     search: Search, cost: AppearanceCost, start: np.ndarray, algorithms: tuple[str | None, str], evaluations: int
 ) -> np.ndarray:
-    """The best positions: globally, locally, and locally with the bases computed anew there."""
+    """The best positions: global, local, and local with the bases recomputed there."""
     global_name, local_name = algorithms
     best = start
     if global_name is not None:
         best = search.minimise(global_name, STAGES[0], best, int(_SHARES[0] * evaluations))
     best = search.minimise(local_name, STAGES[1], best, int(_SHARES[1] * evaluations))
-    # What the model approximates away from its anchor is exact again once the anchor is here.
+    # With the anchor here, the model is exact again.
     cost.model.anchor(cost.parameters.apply(best, cost.tissues, cost.display)[0])
     return search.minimise(local_name, STAGES[2], best, evaluations - len(search.history))
 
@@ -287,7 +286,7 @@ def _identifiability(
     budget: int,
     algorithm: str,
 ) -> Identifiability:
-    """What fits as well: searches with other scatterers from starts around the best, and what was met on the way."""
+    """Equally good fits: searches with other scatterers from starting points around the best, and evaluations."""
     parameters = cost.parameters
     random = np.random.default_rng(search.seed)
     best_cost = search.best_cost(STAGES[2])
@@ -305,7 +304,7 @@ def _identifiability(
             found.append((units, search.best_cost(stage) - costs_of_best[-1]))
     finally:
         simulator.settings = settings
-    # How much the cost changes from one draw of the speckle to the next: less cannot tell two fits apart.
+    # The change of the cost between realisations of the speckle: a smaller difference of two fits is not significant.
     tolerance = max(float(np.std(costs_of_best)), 0.01 * best_cost)
     cost.model.anchor(parameters.apply(best, cost.tissues, cost.display)[0])
     for units in equal_variance_draws(parameters, best, cost.tissues, cost.display, random, _DRAWS):
@@ -322,7 +321,7 @@ def _identifiability(
 
 
 def _with_source(tissues: TissueTable, parameters: FreeParameters) -> TissueTable:
-    """The table with the origin of what was fitted."""
+    """The table with the source of fitted values."""
     for tissue in tissues.all_tissues():
         fitted = [p.attribute for p in parameters if p.tissue == tissue.name]
         if fitted:
@@ -340,10 +339,10 @@ def _problem(
     algorithms: tuple[str | None, str],
     seed: int,
 ) -> dict[str, str]:
-    """{what: its fingerprint} of everything that an evaluation's place and cost follow from.
+    """{name: fingerprint} of all inputs that determine the positions and costs of evaluations.
 
-    Not the number of evaluations and restarts: a longer run begins as a shorter one does, and is compared with it step
-    by step. Nor the device: all draw the same images.
+    Numbers of evaluations and restarts are not included, since a longer run begins with the same evaluations as a
+    shorter one. Nor is the device, since all compute the same images.
     """
     model, tissues = cost.model, cost.tissues
     simulator, medium = model.simulator, model.simulator.medium

@@ -1,7 +1,7 @@
-"""Free parameters of an optimisation: their names, physical bounds, and the way from numbers to tissues and display.
+"""Free parameters of an optimisation: names, physical bounds, conversion from numbers to tissues and display.
 
-A name is one of DISPLAY_BOUNDS ("gain_db") or a tissue and one of TISSUE_BOUNDS ("white matter.mu0"). "display" stands
-for all of the first, a tissue's name for all of its own.
+A name is one of DISPLAY_BOUNDS ("gain_db") or a tissue and one of TISSUE_BOUNDS ("white matter.mu0"). "display" means
+all of DISPLAY_BOUNDS, a tissue's name all of its parameters in TISSUE_BOUNDS.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 Bounds = tuple[float, float]
 
-#: Declarations of what can be fitted, by name: of the display and of a tissue.
+#: Declarations of parameters that can be fitted, by name: of the display and of a tissue.
 DISPLAY_PARAMETERS = {entry.name: entry for entry in parameters_of(DisplaySettings) if entry.fit is not None}
 TISSUE_PARAMETERS = {entry.name: entry for entry in parameters_of(Tissue) if entry.fit is not None}
-#: Default bounds of those.
+#: Their default bounds.
 DISPLAY_BOUNDS: dict[str, Bounds] = {name: (e.fit.low, e.fit.high) for name, e in DISPLAY_PARAMETERS.items() if e.fit}
 TISSUE_BOUNDS: dict[str, Bounds] = {name: (e.fit.low, e.fit.high) for name, e in TISSUE_PARAMETERS.items() if e.fit}
-#: Those of them that make a tissue's scatterers.
+#: The parameters of a tissue's scatterers.
 SCATTERING = frozenset(("mu0", "mu1", "sigma0"))
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One free parameter. Raises SimulationError for bounds that are not finite or the wrong way round."""
+    """One free parameter. Raises SimulationError for bounds that are not finite or in the wrong order."""
 
     name: str
     low: float
@@ -49,7 +49,7 @@ class Parameter:
 
     @property
     def tissue(self) -> str | None:
-        """The tissue it belongs to, or None for the display."""
+        """Name of its tissue, or None for the display."""
         return self.name.rpartition(".")[0] or None
 
     @property
@@ -59,12 +59,12 @@ class Parameter:
 
     @property
     def declaration(self) -> Declaration:
-        """What is known of it, whatever its bounds are here."""
+        """Its declaration, with the default bounds."""
         return (TISSUE_PARAMETERS if self.tissue else DISPLAY_PARAMETERS)[self.attribute]
 
     @property
     def fit(self) -> Fit:
-        """How it is searched, and when it counts as determined."""
+        """Its declared search range and tolerance."""
         return cast(Fit, self.declaration.fit)
 
     @property
@@ -79,7 +79,7 @@ class Parameter:
         return self.low + unit * (self.high - self.low)
 
     def unit(self, value: float) -> float:
-        """The inverse of `value`; what lies outside the bounds is moved to the nearest."""
+        """The inverse of `value`; values outside the bounds are clamped."""
         value = min(max(float(value), self.low), self.high)
         if self._is_logarithmic:
             return log(value / self.low) / log(self.high / self.low)
@@ -93,10 +93,10 @@ class FreeParameters(tuple):
     def of(
         cls, free: Iterable[str] | Mapping[str, Bounds | None], tissues: TissueTable, display: DisplaySettings
     ) -> FreeParameters:
-        """From names, or from names with their (low, high); None stands for the default bounds.
+        """From names, or from names with (low, high); None means the default bounds.
 
-        Raises SimulationError for a name that is none, for bounds the wrong way round, for values that a Tissue or
-        DisplaySettings would refuse, and if nothing is free.
+        Raises SimulationError for an unknown name, for bounds in the wrong order or beyond the range of a Tissue or
+        DisplaySettings, and if there is no parameter.
         """
         entries = dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
         parameters: dict[str, Parameter] = {}
@@ -107,7 +107,7 @@ class FreeParameters(tuple):
         require(bool(parameters), "no free parameter, expected at least one, such as gain_db or white matter.mu0")
         result = cls(parameters.values())
         for corner in (np.zeros(len(result)), np.ones(len(result))):
-            result.apply(corner, tissues, display)  # which refuses what is out of range
+            result.apply(corner, tissues, display)  # raises SimulationError for values out of range
         return result
 
     @property
@@ -127,14 +127,14 @@ class FreeParameters(tuple):
         return np.array([parameter.value(unit) for parameter, unit in zip(self, units, strict=True)])
 
     def units(self, tissues: TissueTable, display: DisplaySettings) -> np.ndarray:
-        """(parameters,) positions of what tissues and display are now; outside the bounds, the nearest."""
+        """(parameters,) positions of the values in tissues and display, clamped to the bounds."""
         return np.array([p.unit(v) for p, v in zip(self, self.current(tissues, display), strict=True)])
 
     def current(self, tissues: TissueTable, display: DisplaySettings) -> np.ndarray:
-        """(parameters,) values that tissues and display have now."""
+        """(parameters,) values in tissues and display."""
         known = {tissue.name: tissue for tissue in tissues.all_tissues()}
         values = [getattr(known[p.tissue] if p.tissue else display, p.attribute) for p in self]
-        # No value at all, as no noise, is the lowest.
+        # None, as for no noise, is the lowest value.
         return np.array([p.fit.low if value is None else value for p, value in zip(self, values, strict=True)], float)
 
     def apply(
@@ -152,13 +152,13 @@ class FreeParameters(tuple):
 
 
 def all_names(tissues: TissueTable) -> list[str]:
-    """Everything that can be free: the display's, then those of every tissue that scatters."""
+    """All possible free parameters: of the display, then of every tissue with scatterers."""
     scattering = dict.fromkeys(t.name for t in tissues.all_tissues() if t.scatterer_variance > 0.0)
     return [*DISPLAY_BOUNDS, *(f"{tissue}.{attribute}" for tissue in scattering for attribute in TISSUE_BOUNDS)]
 
 
 def _meant_by(name: str, tissues: TissueTable) -> list[tuple[str, Bounds]]:
-    """(full name, default bounds) of every parameter that `name` stands for."""
+    """(full name, default bounds) of every parameter that `name` includes."""
     known = list(dict.fromkeys(tissue.name for tissue in tissues.all_tissues()))
     if name == "display":
         return list(DISPLAY_BOUNDS.items())

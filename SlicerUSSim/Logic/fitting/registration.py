@@ -1,9 +1,9 @@
-"""register_poses: where the ultrasound lies in the MRI, refined with the cost of the appearance optimisation.
+"""register_poses: refines the position of the ultrasound in the MRI, with the cost of the appearance optimisation.
 
-A rigid correction of all poses together, six parameters: millimetres along and degrees about the axes of the middle
-image, about the middle of what the images see, where translations and rotations disturb each other least. Every
-evaluation traces and scatters anew, so the search first runs on a coarse simulation (fewer scan lines, pixels,
-scatterers and rays), then on the full one.
+All poses get the same rigid correction with six parameters: millimetres along and degrees about the axes of the middle
+image. The centre of rotation is the middle of all imaged fields, where translations and rotations are least coupled.
+Every evaluation repeats ray tracing and scattering, so the search first uses a coarse simulation (fewer scan lines,
+pixels, scatterers and rays), then the full one.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
 NAMES = ("x_mm", "y_mm", "z_mm", "about_x_deg", "about_y_deg", "about_z_deg")
-#: nlopt's name. A simplex steps over the ripple that speckle gives the cost; quadratic models fall into it.
+#: Name in nlopt. A simplex is robust against the ripple of the cost due to speckle; quadratic models are not.
 _ALGORITHM = "LN_NELDERMEAD"
-#: Of the evaluations, how many are coarse; first steps of the simplices, in units of the range.
+#: Fraction of coarse evaluations; initial steps of the simplices, in units of the range.
 _COARSE_SHARE = 0.75
 _STEPS, _FINE_STEP = (0.12, 0.25, 0.12, 0.2, 0.12, 0.06), 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A rigid correction and what it brought."""
+    """A rigid correction with costs."""
 
     #: (4, 4) rigid; corrected poses are correction @ pose
     correction: np.ndarray
     poses: list[np.ndarray] = field(repr=False)
-    #: (3,) the middle of what the images saw before, and how far it was moved
+    #: (3,) the middle of the imaged fields before the correction, and its displacement
     centre: np.ndarray = field(repr=False)
     shift_mm: float
     cost_before: float
@@ -47,16 +47,16 @@ class Registration:
 
     @property
     def turn_deg(self) -> float:
-        """By how much the images were turned."""
+        """Angle by which the images were rotated."""
         return rotation_deg(self.correction)
 
     @classmethod
     def none(cls, poses: Sequence[np.ndarray]) -> Registration:
-        """Poses that stay where they are."""
+        """The identity, for poses that are not moved."""
         return cls(np.eye(4), list(poses), np.mean([pose[:3, 3] for pose in poses], axis=0), 0.0, 0.0, 0.0, [])
 
     def after(self, earlier: Registration) -> Registration:
-        """Both, one after the other."""
+        """The composition of two corrections."""
         correction = self.correction @ earlier.correction
         start = (np.linalg.inv(earlier.correction) @ [*self.centre, 1.0])[:3]
         moved = (correction @ [*start, 1.0])[:3] - start
@@ -92,10 +92,10 @@ def register_poses(
     settings: SimilaritySettings | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Registration:
-    """Move all poses together until simulated and real images agree.
+    """Move all poses together so that simulated and real images agree best.
 
-    Parameters are those of optimization.optimize_appearance; tissues and display are taken as they are, so fit them
-    first. `range_mm` and `range_deg` are the bounds of each parameter.
+    Parameters are those of optimization.optimize_appearance. Tissues and display are not changed, so fit them first.
+    `range_mm` and `range_deg` are the bounds of each parameter.
 
     Raises SimulationError for poses that are not rigid and references that do not fit.
     """
@@ -130,7 +130,7 @@ def register_poses(
     random = np.random.default_rng(0)
     best, coarse_budget = here, int(_COARSE_SHARE * max_evaluations)
     for step in _STEPS:
-        # A simplex that has shrunk in a dip of the speckle's making is spread out again.
+        # A simplex that has contracted in a local minimum due to speckle is restarted with larger steps.
         start = best if step == _STEPS[0] else best + random.normal(0.0, 0.3 * step, 6)
         search.minimise(_ALGORITHM, "coarse", start, coarse_budget - len(search.history), step=step)
         best = np.array(search.best("coarse").units)
@@ -139,7 +139,7 @@ def register_poses(
     search.cost = full
     best = search.minimise(_ALGORITHM, "fine", best, max_evaluations - len(search.history), step=_FINE_STEP)
     after = search.best_cost("fine")
-    if after > before:  # the start was the best after all
+    if after > before:  # no improvement on the start
         best, after = here, before
     matrix = correction(best)
     centre = frame[:3, 3]
@@ -163,7 +163,7 @@ def rotation_deg(matrix: np.ndarray) -> float:
 
 
 class _PoseCost:
-    """The mean cost at corrected poses, as a function of the correction's positions between 0 and 1."""
+    """The mean cost at corrected poses, as a function of the correction's parameters scaled to 0 to 1."""
 
     def __init__(
         self, simulator, probe, poses, comparisons: list[PatchComparison], grid, display, correction,
@@ -185,7 +185,7 @@ class _PoseCost:
 
 
 def _middle_frame(probe: Probe, poses: list[np.ndarray]) -> np.ndarray:
-    """(4, 4) the axes of the middle image, at the middle of what all images see."""
+    """(4, 4) the axes of the middle image, with the origin in the middle of all imaged fields."""
     centres = [(pose @ [0.0, 0.5 * probe.depth_mm, 0.0, 1.0])[:3] for pose in poses]
     frame = np.array(poses[len(poses) // 2])
     frame[:3, 3] = np.mean(centres, axis=0)

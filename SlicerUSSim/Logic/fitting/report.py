@@ -1,4 +1,4 @@
-"""A report of an optimisation as one self-contained HTML file: images, cost, parameters, and what they can tell."""
+"""A report of an optimisation as one self-contained HTML file: images, cost, parameters, identifiability."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def write_report(
     subtitle: str = "",
     provenance: str = "",
 ) -> None:
-    """Write the report, whole or not at all.
+    """Write the report; on failure an existing file is kept.
 
-    `before` and `after` are the simulated images (rows, columns) beside those of `tracked`.
-    Raises SimulationError without matplotlib and for an unwritable path.
+    `before` and `after` are the simulated images (rows, columns) for those of `tracked`.
+    Raises SimulationError without matplotlib and if the file cannot be written.
     """
     require_matplotlib()
     images = [np.where(tracked.mask, image, 0).astype(np.uint8) for image in tracked.images]
@@ -82,7 +82,7 @@ def write_report(
 def grey_levels_per_tissue(
     tracked: TrackedImages, images: list[np.ndarray], simulator: UltrasoundSimulator
 ) -> dict[str, np.ndarray]:
-    """{tissue name: (pixels,) grey levels of these images where the labels have that tissue}, the coupling left out."""
+    """{tissue name: (pixels,) grey levels of these images where the labels have that tissue}, without the coupling."""
     medium = simulator.medium
     found: dict[str, list[np.ndarray]] = {}
     for pose, image in zip(tracked.poses, images, strict=True):
@@ -110,7 +110,7 @@ def _trio(number: int, real: np.ndarray, before: np.ndarray, after: np.ndarray, 
 <span class="name l">after</span><span class="name r">real</span></div>
 <div class="controls"><input type="range" min="0" max="100" value="50" aria-label="divide simulated and real">
 <select aria-label="simulated image"><option>after</option><option>before</option></select><button>Blink</button></div>
-<details><summary class="dim">difference, after less real</summary>
+<details><summary class="dim">difference, after minus real</summary>
 <img class="plot" alt="difference" src="{difference}"></details>
 </figure>"""
 
@@ -148,16 +148,16 @@ def _spread_cells(spread: Spread) -> str:
 def _in_words(result: AppearanceResult) -> str:
     found = result.identifiability
     text = (
-        f"Speckle is random: another draw of it changes the cost by about {found.cost_tolerance:.4f}, so costs closer "
-        f"than that cannot be told apart. {found.solutions} solutions are equally good by this measure; "
+        f"Speckle is random: another realisation changes the cost by about {found.cost_tolerance:.4f}, so smaller "
+        f"differences are not significant. {found.solutions} solutions are equally good by this measure; "
     )
     if found.restarts:
         text += (
-            f"{found.restarts_as_good} of {found.restarts} searches with other speckle from other starts fit as well. "
+            f"{found.restarts_as_good} of {found.restarts} searches with other speckle and starts fit equally well. "
         )
     return text + (
-        "mu0, sigma0 and mu1 act through the variance of developed speckle (Var), Var and gain through the level, "
-        "attenuation and TGC through the fall with depth: combinations can be known where each alone is not."
+        "mu0, sigma0 and mu1 determine the variance of developed speckle (Var), Var and gain the level, attenuation "
+        "and TGC the net attenuation: such a combination can be determined although its parts are not."
     )
 
 

@@ -1,4 +1,4 @@
-"""Search: nlopt on a cost that is a function, stage by stage; told, cancelled and resumed evaluation by evaluation."""
+"""Search: nlopt on a deterministic cost, in stages, with progress, cancellation and resumption at every evaluation."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
-#: nlopt's names. The choice is justified in docs/optimization.md by benchmarks/fitting.py.
+#: Names in nlopt. docs/optimization.md justifies the choice with results of benchmarks/fitting.py.
 GLOBAL_ALGORITHM, LOCAL_ALGORITHM = "G_MLSL_LDS", "LN_BOBYQA"
 #: BOBYQA needs two parameters or more.
 _ALGORITHM_FOR_ONE = "LN_SBPLX"
-#: Between 0 and 1 across the bounds: how exactly the best is wanted, and the first step of local searches.
+#: Tolerance of the best position and first step of local searches, with bounds scaled to 0 and 1.
 _TOLERANCE, _FIRST_STEP = 1e-3, 0.1
 
 
@@ -30,11 +30,11 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Progress:
-    """What a progress function is told after every evaluation."""
+    """The argument of a progress function, after every evaluation."""
 
     stage: str
     evaluations: int
-    #: How many there will be at most
+    #: Largest number of evaluations
     limit: int
     cost: float
     best_cost: float
@@ -43,22 +43,22 @@ class Progress:
 
     @property
     def share(self) -> float:
-        """Share done, 0 to 1."""
+        """Fraction done, 0 to 1."""
         return min(self.evaluations / self.limit, 1.0)
 
 
 class Search:
-    """Minimises a cost over positions between 0 and 1.
+    """Minimises a cost over positions from 0 to 1.
 
     Parameters
     ----------
-    cost : of (parameters,) positions; the same for the same, which is what makes a run repeatable.
+    cost : function of (parameters,) positions; must be deterministic, so that a run is repeatable.
     describe : {parameter name: value} of a position, for progress.
-    limit : how many evaluations there will be at most, for progress.
+    limit : largest number of evaluations, for progress.
     seed : of algorithms that draw random numbers.
-    progress : told after every evaluation; may raise errors.Cancelled.
-    replayed : the history of an earlier run: as long as stage and position are those, in its order, they are not
-        computed again.
+    progress : called after every evaluation; may raise errors.Cancelled.
+    replayed : the history of an earlier run. Evaluations are taken from it as long as stage and position agree, in its
+        order.
     """
 
     def __init__(
@@ -73,16 +73,16 @@ class Search:
         self.cost, self.describe, self.limit, self.seed = cost, describe, limit, seed
         self.progress, self.replayed = progress, replayed or []
         self.history: list[Evaluation] = []
-        #: How many were computed in this run
+        #: Number of evaluations computed in this run
         self.computed = 0
         self._best: Evaluation | None = None
 
     def minimise(
         self, algorithm: str, stage: str, start: np.ndarray, budget: int, step: float = _FIRST_STEP
     ) -> np.ndarray:
-        """The best of at most `budget` evaluations from `start` on, (parameters,) between 0 and 1.
+        """The best position, (parameters,) from 0 to 1, of at most `budget` evaluations that begin at `start`.
 
-        Raises SimulationError for a name that is no algorithm of nlopt or one that cannot be used here.
+        Raises SimulationError for an algorithm that nlopt does not have or that cannot be used here.
         """
         import nlopt
 
@@ -90,18 +90,18 @@ class Search:
         failure: list[BaseException] = []
 
         def evaluate(units: np.ndarray, _gradient) -> float:
-            if len(self.history) - first >= budget:  # some algorithms take a few more than they are allowed
+            if len(self.history) - first >= budget:  # some algorithms exceed the limit by a few
                 itself.force_stop()
                 return float("inf")
             try:
                 return self.evaluate(stage, units)
-            except BaseException as error:  # through nlopt's C++, which would lose what kind it was
+            except BaseException as error:  # nlopt's C++ would lose the type of the exception
                 failure.append(error)
                 itself.force_stop()
                 return float("inf")
 
         search = self._optimiser(algorithm, len(start), step)
-        itself = weakref.proxy(search)  # which holds `evaluate` where Python's garbage collector does not see it
+        itself = weakref.proxy(search)  # nlopt refers to `evaluate` invisibly to Python's garbage collector
         self.evaluate(stage, start)
         if budget > 1:
             nlopt.srand(self.seed + 1)
@@ -124,8 +124,8 @@ class Search:
         key = tuple(np.clip(units, 0.0, 1.0).tolist())
         known = self.replayed[place] if place < len(self.replayed) else None
         if known is not None and (known.stage, known.units) != (stage, key):
-            # From here on it is another run, in which even an equal position may have another cost: what a stage
-            # compares with comes from the stages before it.
+            # From here on the run differs, and even an equal position may have another cost, since a stage may depend
+            # on earlier stages.
             self.replayed, known = self.replayed[:place], None
         if known is not None:
             cost = known.cost
@@ -134,7 +134,7 @@ class Search:
             self.computed += 1
         entry = Evaluation(stage, key, cost)
         self.history.append(entry)
-        # A new stage may have another cost, with which earlier ones cannot be compared.
+        # A new stage may have another cost function, so earlier values are not comparable.
         if self._best is None or self._best.stage != stage or cost < self._best.cost:
             self._best = entry
         if self.progress is not None:
@@ -152,7 +152,7 @@ class Search:
         return self.best(stage).cost
 
     def state(self) -> list:
-        """The history as plain values; `history_from` reads it back. A replay that was broken off keeps its rest."""
+        """The history as plain values for `history_from`. It includes the rest of an interrupted replay."""
         known = self.history + self.replayed[len(self.history) :]
         return [[entry.stage, list(entry.units), entry.cost] for entry in known]
 
@@ -182,7 +182,7 @@ class Search:
 def history_from(state: dict | None, problem: dict[str, str]) -> list[Evaluation]:
     """The evaluations of an earlier run from {"problem": {what: fingerprint}, "history": ...}.
 
-    Raises SimulationError if it was on another problem, naming what differs, or is no such thing.
+    Raises SimulationError if it is invalid or from another problem; the message names the differences.
     """
     if state is None:
         return []
@@ -190,11 +190,13 @@ def history_from(state: dict | None, problem: dict[str, str]) -> list[Evaluation
         known = dict(state["problem"])
         history = [Evaluation(str(stage), tuple(map(float, units)), float(c)) for stage, units, c in state["history"]]
     except (KeyError, TypeError, ValueError):
-        raise SimulationError("the state to resume is not one of an optimisation (problem and history)") from None
+        raise SimulationError(
+            "the state to resume is invalid, expected problem and history of an optimisation"
+        ) from None
     other = [what for what in problem if known.get(what) != problem[what]]
     require(
         not other,
-        f"the state to resume is of another problem: other {', '.join(other)}; begin without it, or resume with what "
-        "it was made of",
+        f"the state to resume is of another problem: other {', '.join(other)}; start without it, or with the same "
+        "inputs",
     )
     return history

@@ -1,4 +1,4 @@
-"""Real images that simulated ones are compared with: checked once, kept on the device."""
+"""Reference images for comparison with simulated ones: checked once, kept on the device."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ def target_comparisons(
     require(len(references) > 0, "no reference image, expected at least one")
     require(
         len(references) == poses,
-        f"{len(references)} reference images and {poses} poses, expected as many",
+        f"{len(references)} reference images and {poses} poses, expected equal numbers",
     )
     require(
         masks is None or len(masks) == len(references),
-        f"{len(masks or ())} masks and {len(references)} reference images, expected as many",
+        f"{len(masks or ())} masks and {len(references)} reference images, expected equal numbers",
     )
     comparisons = []
     for number, reference in enumerate(references):
         reference = np.asarray(reference)
         require(
             reference.shape == (grid.rows, grid.columns),
-            f"reference image {number} has shape {reference.shape}, expected that of the simulated ones, "
+            f"reference image {number} has shape {reference.shape}, expected that of the simulated images, "
             f"{(grid.rows, grid.columns)}",
         )
         inside = seen if masks is None else seen & np.asarray(masks[number], bool)
@@ -55,5 +55,5 @@ def target_comparisons(
 
 
 def mean_cost(similarities: Iterable[Similarity]) -> float:
-    """The cost of several images: the mean of theirs."""
+    """The mean cost of several images."""
     return float(np.mean([one.total for one in similarities]))

@@ -1,4 +1,4 @@
-"""fit: simulated to tracked images, with or without registration, and the images before and after."""
+"""fit: fit of simulated to tracked images, with or without registration, with the images before and after."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from SlicerUSSim.Logic.tracked.images import TrackedImages
 
 _log = logging.getLogger(__name__)
 
-#: Of the evaluations, how many a fit takes before registration.
+#: Fraction of the evaluations for a fit before registration.
 _FIRST_SHARE = 0.4
-#: Registrations one after the other: bounds (mm and degrees) and evaluations. A fit at wrong poses is biased, and so is
-#: the registration after it; the next ones start closer.
+#: Successive registrations: bounds (mm and degrees) and evaluations. A fit at wrong poses is biased, and so is the
+#: registration after it; later ones start closer.
 _ROUNDS = ((8.0, 500), (4.0, 300), (2.0, 250))
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What was fitted, and how it looks."""
+    """Fitted parameters and poses, and the images."""
 
     appearance: AppearanceResult
-    #: None where none was asked for
+    #: None without registration
     registration: Registration | None
     #: At the registered poses
     tracked: TrackedImages
-    #: (rows, columns) uint8, simulated with what was and with what was found, at the poses that were and are
+    #: (rows, columns) uint8, simulated before and after the fit, with the parameters and poses of each
     before: list[np.ndarray] = field(repr=False)
     after: list[np.ndarray] = field(repr=False)
 
@@ -65,8 +65,8 @@ def fit(
 ) -> Fit:
     """Fit display and tissue parameters (optimization.optimize_appearance) and, with `register`, the poses.
 
-    Registration needs images that look alike and the fit needs poses: so short fits and registrations alternate, and
-    the whole fit comes at the poses found. `resume` and `checkpoint` are those of the whole fit.
+    Registration requires similar images and the fit requires poses. Short fits and registrations therefore alternate,
+    followed by the complete fit at the resulting poses. `resume` and `checkpoint` are those of the complete fit.
     Raises SimulationError as those do.
     """
     display = display or DisplaySettings()
@@ -98,9 +98,9 @@ def _registered(
     appearance_at: Callable[..., AppearanceResult],
     step_from: Callable[..., Registration],
 ) -> tuple[TrackedImages, Registration]:
-    """The images at the poses where a short fit comes closest, and how they were moved there; its costs are theirs.
+    """The images at the poses where a short fit has the lowest cost, and their registration with its costs.
 
-    `appearance_at` poses is a short fit, `step_from` poses a registration, which is yet to be told display and bounds.
+    `appearance_at` poses is a short fit, `step_from` poses a registration as a function of display and bounds.
     """
     candidates: list[tuple[float, TrackedImages, Registration]] = []
     moved = Registration.none(tracked.poses)
@@ -118,7 +118,7 @@ def _registered(
             )
         moved = step.after(moved)
         _log.info(
-            "registration within %g mm and degrees: moved by %.2f mm and %.2f degrees in all", bound, moved.shift_mm,
+            "registration within %g mm and degrees: moved by %.2f mm and %.2f degrees in total", bound, moved.shift_mm,
             moved.turn_deg,
         )  # fmt: skip
         tracked = replace(tracked, poses=step.poses)
