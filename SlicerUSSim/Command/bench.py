@@ -17,17 +17,19 @@ from SlicerUSSim.Logic.base.version import __version__
     "--json",
     "json_file",
     type=click.Path(path_type=Path),
-    help="Keep the numbers in this file; -: print them instead of the table.",
+    help="Write the results to this JSON file; -: print them instead of the table.",
 )
-@click.option("--repeat", default=30, show_default=True, help="Calls per measurement; best and median are shown.")
-@click.option("--brief", is_flag=True, help="Frame A and the segmentation only, a few calls each.")
+@click.option(
+    "--repeat", default=30, show_default=True, help="Calls per measurement; the best and the median are reported."
+)
+@click.option("--brief", is_flag=True, help="Only frame A and the segmentation, with few calls.")
 @device_option
 @click.pass_context
 def bench(ctx: click.Context, json_file: Path | None, repeat: int, brief: bool, device: str | None) -> None:
-    """Time per stage and per frame on every OpenCL device found, against what memory and arithmetic allow.
+    """Time per stage and per frame on every OpenCL device, compared with lower bounds for memory and arithmetic.
 
-    The image is checked too, against the same model in numpy and between the devices: exit status 1 if it is wrong.
-    Never because of a time.
+    The images are also compared with the numpy model and between devices; exit status 1 if they differ. Times do not
+    affect the exit status.
     """
     from SlicerUSSim.Logic.base.files import require_place, write_json
     from SlicerUSSim.Logic.opencl.devices import devices_to_measure

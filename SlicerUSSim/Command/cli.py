@@ -1,6 +1,6 @@
-"""The `ussim` command: its subcommands, one file each, and what it makes of errors and warnings.
+"""The `ussim` command: its subcommands, one file each, and its error and warning messages.
 
-Heavy imports happen inside the subcommands, so that --help answers at once.
+Slow imports are inside the subcommands, so that --help is immediate.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from SlicerUSSim.Logic.base.version import __version__
 
 
 class _Commands(click.Group):
-    """Turns what the user caused into one line on stderr and exit status 2."""
+    """Reports errors caused by the user as one line on stderr, with exit status 2."""
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    """Our own warnings are one line; those of the libraries are not for the user of a command."""
+    """Show warnings of this package as one line, and none of other libraries."""
     if is_our_warning(category):
         note(f"ussim: warning: {message}")
 

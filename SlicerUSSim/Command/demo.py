@@ -18,14 +18,12 @@ PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # prob
 @click.option(
     "--out", type=click.Path(path_type=Path), default="ussim-demo", show_default=True, help="Folder for the results."
 )
-@click.option(
-    "--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain that nilearn carries)."
-)
+@click.option("--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain of nilearn).")
 @click.option("--probe", "kind", type=click.Choice(PROBE_NAMES), default="phased", show_default=True)
 @parameter_option(SimulationSettings, "seed")
 @device_option
 def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -> None:
-    """The whole line on a real brain MRI: segmentation, a craniotomy view, pictures."""
+    """Segment a brain MRI, simulate a view through a craniotomy, and write figures."""
     from SlicerUSSim.Command.whole_line import run_whole_line
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.samples import demo_mri
@@ -39,5 +37,5 @@ def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -
     times = summary["milliseconds"]
     note(f"device: {summary['device']}")
     note(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")
-    note(f"wrote {out / 'figure.png'} and nine more files beside it")
+    note(f"wrote {out / 'figure.png'} and nine more files in this folder")
     click.echo(out / "figure.png")

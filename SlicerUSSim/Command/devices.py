@@ -10,7 +10,7 @@ from SlicerUSSim.Command.options import device_option
 @click.command()
 @device_option
 def devices(device: str | None) -> None:
-    """Which OpenCL devices exist, which one is used and why, and how to get a faster one."""
+    """List the OpenCL devices, the one that is used with the reason, and how to install a faster one."""
     from SlicerUSSim.Logic.opencl.devices import choose_device, faster_hint, list_devices
 
     chosen, reason = choose_device(device)

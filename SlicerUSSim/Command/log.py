@@ -1,4 +1,4 @@
-"""show_log: the package's log on stderr for as long as a command runs, one line `ussim: LEVEL: MESSAGE` each."""
+"""show_log: the package's log on stderr while a command runs, in lines of the form `ussim: LEVEL: MESSAGE`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import click
 
 from SlicerUSSim.Command.progress import note
 
-#: By how often --verbose was given
+#: Level by the number of --verbose options
 _LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
 
 
 class _Handler(logging.Handler):
-    """Writes to what stderr is at that moment, above a progress bar."""
+    """Writes to the current stderr, above a progress bar."""
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
@@ -23,16 +23,16 @@ class _Handler(logging.Handler):
 
 
 def show_log(ctx: click.Context, verbosity: int) -> None:
-    """Show the package's warnings, with `verbosity` 1 what is chosen too, with 2 times and caches, until `ctx` ends.
+    """Show the package's warnings until `ctx` ends; with `verbosity` 1 also INFO, with 2 also DEBUG.
 
-    Loggers of other packages are not shown, but for errors that nobody else handles.
+    Of other packages, only errors without another handler are shown.
     """
     ours, last = logging.getLogger("SlicerUSSim"), logging.lastResort
     handler = _Handler()
     before = ours.level, ours.propagate, None if last is None else last.level
     ours.addHandler(handler)
     ours.setLevel(_LEVELS[min(verbosity, len(_LEVELS) - 1)])
-    ours.propagate = False  # a library that gives the root logger a handler would show each line twice
+    ours.propagate = False  # a library that adds a handler to the root logger would duplicate each line
     if last is not None:
         last.setLevel(logging.ERROR)
 

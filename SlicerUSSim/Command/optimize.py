@@ -18,9 +18,9 @@ from SlicerUSSim.Logic.fitting.settings import FitSettings
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.fitting import Fit
 
-#: Images that are fitted if none are chosen.
+#: Default number of images to fit.
 _MOST_IMAGES = 6
-#: A state holds every evaluation of the cost.
+#: Size limit of a state, which contains every evaluation of the cost.
 _STATE_BYTES = 2**30
 
 
@@ -31,17 +31,17 @@ _STATE_BYTES = 2**30
     "--free",
     multiple=True,
     metavar="NAME[=LOW:HIGH]",
-    help='Free parameters: "display", a tissue, one of either ("gain_db", "white matter.mu0"), with bounds if wanted; '
-    'may be repeated (default: display and "white matter").',
+    help='Free parameters: "display", a tissue, or a parameter of either ("gain_db", "white matter.mu0"), optionally '
+    'with bounds; may be repeated (default: display and "white matter").',
 )
 @gathered(settings=FitSettings)
-@click.option("--report", type=click.Path(path_type=Path), help="Self-contained report: .html")
-@click.option("--save-preset", type=click.Path(path_type=Path), help="Preset with what was found: .json")
+@click.option("--report", type=click.Path(path_type=Path), help="Self-contained HTML report: .html")
+@click.option("--save-preset", type=click.Path(path_type=Path), help="Preset with the fitted values: .json")
 @click.option(
     "--state",
     type=click.Path(path_type=Path),
-    help="Keep what was evaluated here, and go on from there when run again, with --register only where that finds "
-    "the same poses again: .json",
+    help="Save all evaluations in this file and resume from it in the next run (with --register only if registration "
+    "gives the same poses): .json",
 )
 @click.option(
     "--save-transform",
@@ -60,7 +60,7 @@ def optimize(
     state: Path | None,
     save_transform: Path | None,
 ) -> None:
-    """Fit display and tissue parameters until simulated and tracked real ultrasound agree."""
+    """Fit display and tissue parameters to tracked real ultrasound."""
     from SlicerUSSim.Logic.base.files import read_json, require_place, write_json
     from SlicerUSSim.Logic.fitting.tracked_fit import fit
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
@@ -71,7 +71,7 @@ def optimize(
     for place in places:
         require_place(place)
         same = [other for other in places if other.resolve() == place.resolve()]
-        require(len(same) == 1, f"{place}: is given for {len(same)} outputs, expected a file for each")
+        require(len(same) == 1, f"{place}: given for {len(same)} outputs, expected a separate file for each")
     if save_transform:
         is_json = save_transform.suffix.lower() == ".json"
         require(is_json, f"--save-transform is {save_transform}, expected a name ending in .json")
@@ -109,14 +109,16 @@ def _free_parameter(text: str) -> tuple[str, tuple[float, float] | None]:
     try:
         low, high = (float(end) for end in bounds.split(":"))
     except ValueError:
-        raise SimulationError(f"--free is {text!r}, expected such as white matter.mu0=0.1:0.8") from None
+        raise SimulationError(
+            f"--free is {text!r}, expected NAME or NAME=LOW:HIGH, as in white matter.mu0=0.1:0.8"
+        ) from None
     return name.strip(), (low, high)
 
 
 def _write_report(
     path: Path, found: Fit, tracked: TrackedExamination, patient: PatientOptions, recording: SequenceOptions
 ) -> None:
-    """--report, with all that it takes to do the same again."""
+    """Write --report, with all inputs that are needed to repeat the fit."""
     from SlicerUSSim.Logic.fitting.report import write_report
 
     simulator = tracked.examination.simulator
@@ -132,7 +134,7 @@ def _write_report(
 
 
 def _tell(found: Fit) -> None:
-    """What was found, one line for the cost and one for each parameter."""
+    """Print the result, one line for the cost and one for each parameter."""
     if found.registration:
         moved = found.registration
         click.echo(f"moved by {moved.shift_mm:.2f} mm and {moved.turn_deg:.2f} degrees")

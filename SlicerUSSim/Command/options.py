@@ -1,7 +1,6 @@
-"""Options that several commands share, those of declared parameters, and how options become one parameter of a command.
+"""Shared options, options of declared parameters, and dataclasses of options as one parameter of a command.
 
-What is known of a parameter stands at its declaration (base/declaration.py): name, help, default and checks of its
-option come from there.
+Name, help, default and checks of a parameter's option are derived from its declaration (base/declaration.py).
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter_of
 Command = Callable[..., None]
 Decorator = Callable[[Command], Command]
 
-#: In place of an option that was not given, where None could be what was meant.
+#: Value of an option that was not given, where None is a valid value.
 _NOT_GIVEN = object()
 
-#: Under which a click.Context keeps how often --verbose was given, before the subcommand and after it
+#: Key in click.Context for the number of --verbose options, before and after the subcommand
 _VERBOSITY = "SlicerUSSim.verbosity"
 
 device_option = click.option(
@@ -33,11 +32,11 @@ mask_option = click.option("--mask", type=click.Path(), help="Foreground on the 
 
 
 def verbose_option(command: click.Command) -> click.Command:
-    """The command with --verbose, which may stand before the subcommand, after it, or at both places."""
+    """The command with --verbose, which may be before the subcommand, after it, or both."""
     command.params.append(
         click.Option(
             ["-v", "--verbose"], count=True, expose_value=False, callback=_set_verbosity,
-            help="Say on stderr what is chosen and what inputs are taken for; -vv: times and caches too.",
+            help="Write choices and the interpretation of inputs to stderr; -vv: also times and caches.",
         )
     )  # fmt: skip
     return command
@@ -46,8 +45,8 @@ def verbose_option(command: click.Command) -> click.Command:
 def _set_verbosity(ctx: click.Context, _: click.Parameter, count: int) -> None:
     ctx.meta[_VERBOSITY] = ctx.meta.get(_VERBOSITY, 0) + count
     if isinstance(ctx.command, click.Group):
-        return  # the subcommand, which has the same option, adds its own and shows the log
-    from SlicerUSSim.Command.log import show_log  # which --help does not wait for
+        return  # the subcommand has the same option, adds its count and shows the log
+    from SlicerUSSim.Command.log import show_log  # imported here to keep --help fast
 
     show_log(ctx, ctx.meta[_VERBOSITY])
 
@@ -56,7 +55,7 @@ def _set_verbosity(ctx: click.Context, _: click.Parameter, count: int) -> None:
 
 
 class ParameterType(click.ParamType):
-    """The values of a declared parameter. What is refused is a SimulationError that names option and parameter."""
+    """The values of a declared parameter. Raises SimulationError that names option and parameter for invalid ones."""
 
     def __init__(self, entry: Parameter) -> None:
         self.entry = entry
@@ -71,12 +70,12 @@ class ParameterType(click.ParamType):
 
 
 def parameter_option(kind: type, name: str) -> Decorator:
-    """The option of one parameter of `kind`, called as the parameter in the command; without it the default."""
+    """The option of one parameter of `kind`, with the parameter's name in the command and its default."""
     return _option(parameter_of(kind, name))
 
 
 def _option(entry: Parameter, of_preset: bool = False) -> Decorator:
-    """With `of_preset`, None for a flag and _NOT_GIVEN for others stand for an option that was not given."""
+    """With `of_preset`, an option that was not given is None for a flag and _NOT_GIVEN otherwise."""
     assert entry.option is not None, f"{entry.name} has no option"
     names = "/".join(f"--{name}" for name in entry.option.split("/"))
     if entry.type is bool:
@@ -91,7 +90,7 @@ def _option(entry: Parameter, of_preset: bool = False) -> Decorator:
 
 
 def help_text(entry: Parameter, of_preset: bool = False) -> str:
-    """What --help says of a parameter: "Gain [dB]: brightness of all echoes (default: the preset's, 0)."."""
+    """Help text of a parameter, such as "Gain [dB]: brightness of all echoes (default: the preset's, 0)."."""
     if entry.type is bool:
         text, default = entry.tip, f"--{(entry.option or '').split('/')[not entry.default]}"
     else:
@@ -104,25 +103,25 @@ def help_text(entry: Parameter, of_preset: bool = False) -> str:
 
 
 def written(value: Any) -> str:
-    """A value as an option takes it."""
+    """A value in the format of options."""
     if isinstance(value, bool) or value is None:
         return str(value).lower()
     return f"{value:.10g}" if isinstance(value, int | float) else str(value)
 
 
-# ---- options that become one parameter of a command ------------------------------------------------------------------
+# ---- dataclasses of options as one parameter of a command ------------------------------------------------------------
 
 
 def declared(option: Decorator) -> Any:
-    """A field of a dataclass of options, which a click.option or click.argument of the same name fills."""
+    """A field of a dataclass of options, with its click.option or click.argument of the same name."""
     return field(metadata={"options": (option,)})
 
 
 def declared_parameters(kind: type, names: Iterable[str] | None = None, *, of_preset: bool = False) -> Any:
     """A field of a dataclass of options: {name: value} of the parameters of `kind` that have an option.
 
-    `names` chooses among them. With `of_preset` it holds only what was given, and
-    --help says that the preset goes before the default.
+    `names` selects some of them. With `of_preset` it contains only options that were given, and --help refers to the
+    preset for the default.
     """
     entries = [entry for entry in parameters_of(kind) if entry.option and (names is None or entry.name in names)]
     return field(
@@ -135,7 +134,7 @@ def declared_parameters(kind: type, names: Iterable[str] | None = None, *, of_pr
 
 
 def gathered(**kinds: type) -> Callable[[Command], Command]:
-    """Decorator: the command takes the options declared in these dataclasses, and gets one parameter for each.
+    """Decorator: adds the options of these dataclasses to a command, which gets one parameter for each dataclass.
 
     With gathered(patient=PatientOptions) the command's parameter `patient` is a PatientOptions; with
     gathered(settings=FitSettings) `settings` is a FitSettings, whose parameters without an option have their defaults.
@@ -149,7 +148,7 @@ def gathered(**kinds: type) -> Callable[[Command], Command]:
 
         decorated: Command = with_options
         for option in reversed([option for kind in kinds.values() for option in _options_of(kind)]):
-            decorated = option(decorated)  # the last one applied is the first one of --help
+            decorated = option(decorated)  # --help lists the last one applied first
         return decorated
 
     return decorate
@@ -162,7 +161,7 @@ def _options_of(kind: type) -> list[Decorator]:
 
 
 def _filled(kind: type, given: dict[str, Any]) -> Any:
-    """A `kind` of what click was given, which is taken out of it."""
+    """A `kind` from click's values, which are removed from them."""
     if issubclass(kind, Declared):
         return kind(**{entry.name: given.pop(entry.name) for entry in parameters_of(kind) if entry.option})
     return kind(**{entry.name: _value(entry, given) for entry in fields(kind)})  # type: ignore[arg-type]
@@ -178,7 +177,7 @@ def _value(entry: Field, given: dict[str, Any]) -> Any:
 
 
 def check_output(out: Path, png: bool = False) -> None:
-    """Refuse an output that cannot be written now rather than after the work."""
+    """Raise SimulationError before the computation if an output cannot be written."""
     from SlicerUSSim.Logic.base.files import require_place
     from SlicerUSSim.Logic.base.volume import require_image_name
 

@@ -1,4 +1,4 @@
-"""PatientOptions, what every command that simulates is told of a patient and a probe; and the Examination they make."""
+"""PatientOptions: options for patient and probe of every command that simulates; Examination: the resulting inputs."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ pose_option = click.option(
 
 @dataclass(frozen=True)
 class PatientOptions:
-    """Whom to simulate, with which probe, and how the images are shown. Files are named by their paths."""
+    """Patient, probe and display. Files are given by their paths."""
 
     mri_or_labels: str = declared(click.argument("mri_or_labels", type=click.Path()))
-    #: None where the input has to tell
+    #: None: determined from the input
     is_labels: bool | None = declared(
         click.option(
             "--labels/--mri", "is_labels", default=None,
-            help="What the input is (default: few whole numbers are labels).",
+            help="Type of the input (default: labels if it has few different whole numbers).",
         )
     )  # fmt: skip
     preset: str | None = declared(
         click.option(
             "--preset", type=click.Path(),
             help="Probe, display, settings and tissues as JSON, from `ussim demo` or the Slicer module; the options "
-            "below go before it.",
+            "below override it.",
         )
     )  # fmt: skip
     probe: str | None = declared(
@@ -62,7 +62,7 @@ class PatientOptions:
     #: {parameter: value}
     segmentation: Mapping[str, Any] = declared_parameters(SegmentationSettings, ("contrast", "thin_sulci"))
     mask: str | None = declared(mask_option)
-    #: {parameter: value} of those that were given
+    #: {parameter: value} of the options that were given
     display: Mapping[str, Any] = declared_parameters(DisplaySettings, of_preset=True)
     settings: Mapping[str, Any] = declared_parameters(SimulationSettings, of_preset=True)
     #: NAME=VALUE
@@ -71,7 +71,7 @@ class PatientOptions:
 
     @property
     def gives_probe(self) -> bool:
-        """Whether the probe was chosen, and is not just the one there is by default."""
+        """Whether the probe was given, and is not the default."""
         return bool(self.probe or self.preset) or Changes.of(self.changes).gives_geometry
 
     @property
@@ -80,7 +80,7 @@ class PatientOptions:
         return os.path.abspath(self.mri_or_labels)
 
     def changed_preset(self) -> Preset:
-        """--preset, or the default one, with what the options for probe, display and settings change of it.
+        """--preset, or the default one, with the changes of the options for probe, display and settings.
 
         Raises SimulationError for files that cannot be read and values out of range.
         """
@@ -98,21 +98,21 @@ class PatientOptions:
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """A simulator for one patient, the probe, and how its images are shown."""
+    """A simulator for one patient, the probe, and the display settings."""
 
     simulator: UltrasoundSimulator
     probe: Probe
     display: DisplaySettings
-    #: Whether the patient came as a label map, and not as an MRI
+    #: Whether the input was a label map, and not an MRI
     is_labels: bool
 
 
 def open_examination(patient: PatientOptions) -> Examination:
     """The Examination of a command's options. An MRI is segmented, with a progress bar.
 
-    What is cheap to check comes before what takes time. Raises SimulationError for everything that does not fit.
+    Fast checks come before slow computations. Raises SimulationError for inconsistent options.
     """
-    import logging  # not at the top: --help does not wait for it
+    import logging  # imported here to keep --help fast
 
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -124,22 +124,22 @@ def open_examination(patient: PatientOptions) -> Examination:
     is_labels = volume.looks_like_labels() if patient.is_labels is None else patient.is_labels
     if patient.is_labels is None:
         kinds = ("a label map", "--mri") if is_labels else ("an MRI, to be segmented", "--labels")
-        log.info("%s is taken for %s; %s says otherwise", patient.mri_or_labels, *kinds)
+        log.info("%s is read as %s; use %s if it is not", patient.mri_or_labels, *kinds)
     if is_labels and preset.settings.needs_texture:
         raise SimulationError(
-            f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need the MRI it came from"
+            f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need an MRI"
         )
     changes = Changes.of(patient.changes)
     table = _tissues_from_file(patient, is_labels)
     if table is None:
         log.info("tissues: %s", "the preset's" if patient.preset else "presets of the brain")
     else:
-        log.info("tissues: %s", patient.tissues or "the table beside the label map")
+        log.info("tissues: %s", patient.tissues or "the table next to the label map")
     tissues = preset.tissues if table is None else table
     is_known = is_labels or table is not None
     if is_known:
         tissues = changes.to_tissues(tissues)
-    else:  # what the tissues are is known when the MRI is segmented
+    else:  # the tissues are not known before the segmentation
         changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
     labels, texture = volume, None
     if not is_labels:
@@ -153,7 +153,7 @@ def open_examination(patient: PatientOptions) -> Examination:
 
 
 def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination, np.ndarray]:
-    """(Examination, (4, 4) probe_to_ras) of a command's options; a pose of "auto" is a view through a craniotomy."""
+    """(Examination, (4, 4) probe_to_ras) of a command's options; the pose "auto" is a view through a craniotomy."""
     from SlicerUSSim.Logic.probe.placement import craniotomy_pose
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
@@ -165,7 +165,7 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
 
 
 def _tissues_from_file(patient: PatientOptions, is_labels: bool) -> TissueTable | None:
-    """The table of --tissues, or of the file beside a label map; None if there is none or a preset goes before it."""
+    """The table of --tissues, or of the file next to a label map; None if there is none or a preset overrides it."""
     from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 
     if patient.tissues:

@@ -1,4 +1,4 @@
-"""Progress bars and remarks on stderr for commands: stdout has the answer alone."""
+"""Progress bars and messages of commands on stderr; stdout has only the result."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def note(text: str) -> None:
-    """A line on stderr, above a progress bar that is being drawn."""
+    """Write a line to stderr, above a progress bar."""
     if "tqdm" in sys.modules:
         from tqdm import tqdm
 
@@ -25,7 +25,7 @@ def note(text: str) -> None:
 
 
 class _Bar:
-    """A bar that is drawn while its `with` block runs, and only where stderr is a terminal."""
+    """A progress bar that is shown during its `with` block if stderr is a terminal."""
 
     def __init__(self, total: int, name: str = "") -> None:
         from tqdm import tqdm
@@ -42,12 +42,12 @@ class _Bar:
         self.bar.close()
 
     def _reach(self, share: float) -> None:
-        """Draw a share done, between 0 and 1."""
+        """Show the fraction done, 0 to 1."""
         self.bar.update(int((self.bar.total or 0) * share) - self.bar.n)
 
 
 class Steps(_Bar):
-    """A progress bar that is told the name of each step as it begins."""
+    """A progress bar that is called with the name of each step at its start."""
 
     def __init__(self, count: int) -> None:
         super().__init__(count)
@@ -61,7 +61,7 @@ class Steps(_Bar):
 
 
 class Share(_Bar):
-    """A progress bar that is told a share done, between 0 and 1."""
+    """A progress bar that is called with the fraction done, 0 to 1."""
 
     def __init__(self, name: str) -> None:
         super().__init__(100, name)
@@ -71,7 +71,7 @@ class Share(_Bar):
 
 
 class Curve(_Bar):
-    """A progress bar of an optimisation: its stage and the best cost so far."""
+    """A progress bar of an optimisation, with its stage and the best cost so far."""
 
     def __init__(self, name: str) -> None:
         super().__init__(100, name)

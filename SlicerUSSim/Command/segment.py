@@ -19,13 +19,13 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
     "--out",
     type=click.Path(path_type=Path),
     required=True,
-    help="Label map; its tissues go to a .json beside it.",
+    help="Label map; the tissue table is written to a .json file of the same name.",
 )
 @gathered(settings=SegmentationSettings)
 @mask_option
 @device_option
 def segment(mri: str, out: Path, settings: SegmentationSettings, mask: str | None, device: str | None) -> None:
-    """Label the tissues of a skull-stripped brain MRI."""
+    """Segment a skull-stripped brain MRI into tissues."""
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
     from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside

@@ -1,4 +1,4 @@
-"""SequenceOptions, what every command that reads tracked ultrasound is told of it; and what is read by them."""
+"""SequenceOptions: options of every command that reads tracked ultrasound, and the data read from them."""
 
 from __future__ import annotations
 
@@ -22,32 +22,33 @@ if TYPE_CHECKING:
 
 transform_option = click.option(
     "--transform", default="ImageToReference", show_default=True,
-    help="From pixels to where the patient lies; composed of what the sequence has.",
+    help="Transform from pixels to the patient's frame; composed of the transforms in the sequence.",
 )  # fmt: skip
 calibration_option = click.option(
     "--calibration", type=click.Path(),
-    help="What the sequence lacks: a Plus configuration (XML), or a file with the 4x4 ImageToProbe.",
+    help="ImageToProbe, if the sequence lacks it: a Plus configuration (XML), or a file with the 4x4 matrix.",
 )  # fmt: skip
 to_mri_option = click.option(
     "--to-mri", type=click.Path(),
-    help="From there to the MRI: a pose file, .xfm, or .tag with landmarks in MRI and ultrasound.",
+    help="Transform from the patient's frame to the MRI: a pose file, .xfm, or .tag with landmarks in both.",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class SequenceOptions:
-    """Which tracked images, and where they lie in the MRI. Files are named by their paths."""
+    """Tracked images and their position in the MRI. Files are given by their paths."""
 
     sequence: str = declared(
         click.option(
             "--sequence", type=click.Path(), required=True,
             help="Tracked images: .igs.mha .seq.mha .mhd .nrrd (Plus, 3D Slicer), a folder of MINC slices, or with "
-            "--cut a 3D ultrasound volume. Without --probe or --preset, the probe's geometry is found in the images.",
+            "--cut a 3D ultrasound volume. Without --probe or --preset, the geometry is estimated from the images.",
         )
     )  # fmt: skip
     frames: str | None = declared(
         click.option(
-            "--frames", help="Which images: 0,5,10 or 0:20:5 (default: all that were tracked; to fit, six of them)."
+            "--frames",
+            help="Images to use, such as 0,5,10 or 0:20:5 (default: all tracked images; for a fit, six of them).",
         )
     )
     transform: str = declared(transform_option)
@@ -55,39 +56,41 @@ class SequenceOptions:
     to_mri: str | None = declared(to_mri_option)
     cut: str | None = declared(
         click.option(
-            "--cut", type=click.Path(), help="Cut a volume where a probe at this pose would look, and beside it:"
+            "--cut",
+            type=click.Path(),
+            help="For a volume: extract the image plane of a probe at this pose, and neighbouring planes:",
         )
     )
     cut_tilt: float | None = declared(
-        click.option("--cut-tilt", type=float, help="tilted by this many degrees in all,")
+        click.option("--cut-tilt", type=float, help="tilted over this total angle in degrees,")
     )
     cut_slide: float | None = declared(
-        click.option("--cut-slide", type=float, help="or slid by this many millimetres in all,")
+        click.option("--cut-slide", type=float, help="or slid over this total distance in millimetres,")
     )
     cuts: int = declared(
-        click.option("--cuts", type=click.IntRange(1), default=3, show_default=True, help="in as many images.")
+        click.option("--cuts", type=click.IntRange(1), default=3, show_default=True, help="in this number of images.")
     )
     field: Path | None = declared(  # noqa: RUF009, a dataclasses.field like the others
-        click.option("--field", type=click.Path(path_type=Path), help="Picture of the imaged field, to check it: .png")
+        click.option("--field", type=click.Path(path_type=Path), help="Figure of the imaged field, for checking: .png")
     )
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedExamination:
-    """An examination, and the real images to which it is compared."""
+    """An examination, and the real images for comparison."""
 
     examination: Examination
     sequence: TrackedSequence
-    #: Those of its images that were chosen, at their poses in the MRI
+    #: The selected images, at their poses in the MRI
     images: TrackedImages
     #: (4, 4) rigid, from the reference frame of the ultrasound to the MRI; the identity without --to-mri
     reference_to_ras: np.ndarray
 
 
 def open_tracked(patient: PatientOptions, recording: SequenceOptions, most: int | None = None) -> TrackedExamination:
-    """The TrackedExamination of a command's options; `most` is how many images are taken if none are chosen.
+    """The TrackedExamination of a command's options; `most` is the default number of images.
 
-    What is cheap to check comes before what takes time. Raises SimulationError for everything that does not fit.
+    Fast checks come before slow computations. Raises SimulationError for inconsistent options.
     """
     import numpy as np
 
@@ -122,7 +125,7 @@ def open_tracked(patient: PatientOptions, recording: SequenceOptions, most: int 
 
 
 def read_sequence(path: str, calibration: str | None) -> TrackedSequence:
-    """The TrackedSequence of --sequence, with what --calibration adds."""
+    """The TrackedSequence of --sequence, with the transform of --calibration."""
     from SlicerUSSim.Logic.tracked.pose_files import read_matrix
     from SlicerUSSim.Logic.tracked.sequence import TrackedSequence, read_coordinate_definitions
 
@@ -155,27 +158,27 @@ def read_to_mri(path: str) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Cuts:
-    """A volume of ultrasound, and where a probe is to have looked in it."""
+    """An ultrasound volume, and poses of a probe in it."""
 
     volume: Volume
     #: (4, 4) each, from the probe to the frame of the volume
     poses: list[np.ndarray]
 
     def seen_by(self, probe: Probe) -> TrackedSequence:
-        """The images that `probe` would have taken there."""
+        """The images in the planes of `probe` at these poses."""
         from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
         return TrackedSequence.from_volume(self.volume, probe, self.poses)
 
 
 def _read_cuts(pose_file: str, recording: SequenceOptions) -> _Cuts:
-    """The volume of --sequence, to be cut at the pose of --cut and beside it."""
+    """The volume of --sequence, with the pose of --cut and neighbouring poses."""
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
     if recording.cut_tilt is not None and recording.cut_slide is not None:
-        raise SimulationError("expected either --cut-tilt DEGREES or --cut-slide MILLIMETRES, for cuts of one kind")
+        raise SimulationError("--cut-tilt and --cut-slide are both given, expected only one")
     pose = read_pose(pose_file)
     poses = [pose]
     if recording.cut_tilt is not None:

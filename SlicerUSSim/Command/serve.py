@@ -29,8 +29,8 @@ _PORT = 8080
 
 @click.command()
 @click.argument("mri", type=click.Path(), required=False)
-@click.option("--labels", type=click.Path(), help="Label map to simulate from, instead of segmenting the MRI.")
-@click.option("--sequence", type=click.Path(), help="Tracked ultrasound to play and to compare with.")
+@click.option("--labels", type=click.Path(), help="Label map, used instead of a segmentation of the MRI.")
+@click.option("--sequence", type=click.Path(), help="Tracked ultrasound for replay and comparison.")
 @transform_option
 @calibration_option
 @to_mri_option
@@ -42,15 +42,15 @@ _PORT = 8080
     "--host",
     default="127.0.0.1",
     show_default=True,
-    help="Address to listen at. Anything but this computer's own loopback needs the token in the URL that is printed.",
+    help="Address to listen at. Except on the loopback interface, access requires the token in the printed URL.",
 )
 @click.option(
     "--igtl",
-    help="HOST:PORT of a tracker that sends TRANSFORM messages over OpenIGTLink, and gets the images. :PORT waits for "
-    "one on this computer to connect, listen:HOST:PORT for one elsewhere (listen:0.0.0.0:18944). OpenIGTLink knows no "
-    "passwords: whoever reaches that port can move the probe and gets the images.",
+    help="HOST:PORT of a tracker that sends TRANSFORM messages over OpenIGTLink and receives the images. :PORT waits "
+    "for a client on this computer, listen:HOST:PORT for one on another computer (listen:0.0.0.0:18944). OpenIGTLink "
+    "has no authentication: anyone who can reach the port can move the probe and receive the images.",
 )
-@click.option("--igtl-device", help="Name of the transform to follow (default: the first that comes).")
+@click.option("--igtl-device", help="Name of the transform to follow (default: the first one received).")
 @device_option
 def serve(
     mri: str | None,
@@ -68,10 +68,10 @@ def serve(
     igtl_device: str | None,
     device: str | None,
 ) -> None:
-    """The workstation in the browser: MRI, probe, image, live. Without a file, the demo brain."""
+    """The workstation in the browser, with live images. Without a file it shows the demo brain."""
     _require_workstation()
     files = [file for file in (mri, labels, mask) if file is not None]
-    # What a page could only show is said here, where it was caused.
+    # Checked here, so that the error is reported in the terminal and not on the page.
     for file in files:
         if not Path(file).exists():
             raise SimulationError(f"{file}: no such file")
@@ -120,7 +120,7 @@ def _run(server: Server | None, host: str, port: int) -> None:
 
     from SlicerUSSim.Workstation.access import guard, is_loopback
 
-    assert server is not None  # trame's get_server is declared to give one or None
+    assert server is not None  # the declared result of trame's get_server includes None
     token = "" if is_loopback(host) else secrets.token_urlsafe(24)
     server.controller.on_server_bind.add(lambda wslink: guard(wslink.app, token))
 
@@ -134,7 +134,7 @@ def _run(server: Server | None, host: str, port: int) -> None:
 
 
 def _usable_port(host: str, port: int | None) -> int:
-    """`port`, or one that is free. Raises SimulationError for a host that is not ours and a port that is taken."""
+    """`port`, or a free one. Raises SimulationError for a host of another computer and for a port in use."""
     import socket
 
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -149,10 +149,10 @@ def _usable_port(host: str, port: int | None) -> int:
 
 
 def _prepare_libraries() -> None:
-    """What trame and VTK would print is not for the user of a command; nor are this command's options for trame."""
+    """Suppress messages of trame and VTK, and hide this command's options from trame."""
     os.environ.setdefault("WSLINK_READY_MSG", "")
-    os.environ.setdefault("WSLINK_WS_COMPRESS", "0")  # nearly all that goes over the socket is JPEG
-    # Where the processor draws the views too (Mesa's llvmpipe), it leaves half of it to the ultrasound image.
+    os.environ.setdefault("WSLINK_WS_COMPRESS", "0")  # nearly all data on the socket are JPEG
+    # If the processor also renders the views (Mesa's llvmpipe), half of it is reserved for the ultrasound image.
     os.environ.setdefault("LP_NUM_THREADS", str(max((os.cpu_count() or 2) // 2, 1)))
     sys.argv = sys.argv[:1]
     import vtkmodules.vtkCommonCore as core

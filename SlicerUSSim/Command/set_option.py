@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 set_option = click.option(
     "--set", "changes", multiple=True, metavar="NAME=VALUE",
     help="Any parameter of probe, display, settings, membrane and tissues, such as settings.max_ray_depth=4, "
-    'probe.depth_mm=70 or "white matter.mu0=0.5"; goes before all other options; may be repeated. docs/parameters.md '
+    'probe.depth_mm=70 or "white matter.mu0=0.5"; overrides other options; may be repeated. docs/parameters.md '
     "lists them.",
 )  # fmt: skip
 
@@ -28,19 +28,19 @@ _MEMBRANE = "membrane"
 
 @dataclass(frozen=True)
 class Changes:
-    """What --set changes. Every value is one that its parameter can have."""
+    """The changes of --set, with checked values."""
 
     #: {section of the preset: {parameter: value}}
     sections: dict[str, dict[str, Any]] = field(default_factory=dict)
-    #: {tissue as it was written: {parameter: value}}
+    #: {tissue as written by the user: {parameter: value}}
     tissues: dict[str, dict[str, Any]] = field(default_factory=dict)
     membrane: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, texts: Iterable[str]) -> Changes:
-        """From texts "section.parameter=value"; of several for one parameter the last one counts.
+        """From texts "section.parameter=value"; of several for one parameter the last one is used.
 
-        Raises SimulationError for a name that is none, with those that are near, and for values that are refused.
+        Raises SimulationError for an unknown name, with similar names, and for invalid values.
         """
         changes = cls()
         for text in texts:
@@ -52,7 +52,7 @@ class Changes:
         return changes
 
     def _found(self, name: str, section: str, attribute: str) -> tuple[Parameter, dict[str, Any]]:
-        """The parameter of that name, and where its value belongs."""
+        """The parameter with a name, and the mapping for its value."""
         from SlicerUSSim.Logic.base.declaration import parameters_of
         from SlicerUSSim.Logic.imaging.preset import preset_parameters
         from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS, Membrane
@@ -72,20 +72,20 @@ class Changes:
 
     @property
     def gives_geometry(self) -> bool:
-        """Whether the geometry of the probe was set, and not just its beam."""
+        """Whether the geometry of the probe was set, and not only its beam."""
         from SlicerUSSim.Logic.base.declaration import parameters_of
         from SlicerUSSim.Logic.probe.arrays import Probe
 
         return not set(self.sections.get("probe", ())) <= {entry.name for entry in parameters_of(Probe)}
 
     def to_preset(self, preset: Preset) -> Preset:
-        """The preset with probe, display and settings changed; its tissues are as they were."""
+        """The preset with probe, display and settings changed; its tissues are unchanged."""
         for section, values in self.sections.items():
             preset = preset.changed(section, **values)
         return preset
 
     def to_tissues(self, tissues: TissueTable) -> TissueTable:
-        """The table with tissues and membrane changed. Raises SimulationError for a tissue that it lacks."""
+        """The table with tissues and membrane changed. Raises SimulationError for an unknown tissue."""
         for written, values in self.tissues.items():
             tissues = tissues.replace(_owner(written, (tissue.name for tissue in tissues.all_tissues())), **values)
         if self.membrane:
@@ -101,7 +101,7 @@ class Changes:
 
 
 def _owner(written: str, known: Iterable[str]) -> str:
-    """The tissue that is meant, of those that there are."""
+    """The known tissue with this name, in other spelling if necessary."""
     from SlicerUSSim.Logic.tissue.names import same_name
 
     known = list(dict.fromkeys(known))
@@ -113,7 +113,7 @@ def _owner(written: str, known: Iterable[str]) -> str:
 
 
 def _hint(name: str, section: str, of_preset: dict[str, Parameter], of_tissue: dict[str, Parameter]) -> str:
-    """What may have been meant by a name that is no parameter."""
+    """Similar names for an unknown parameter."""
     from SlicerUSSim.Logic.tissue.presets import TISSUES
 
     sections = list(dict.fromkeys(known.partition(".")[0] for known in of_preset))

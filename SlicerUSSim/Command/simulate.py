@@ -18,7 +18,7 @@ from SlicerUSSim.Command.progress import note
     "-o", "--out", type=click.Path(path_type=Path), required=True, help="Image: .png .mha .nrrd .nii.gz or .vti"
 )
 def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
-    """One B-mode image from an MRI or a label map at a given pose."""
+    """Simulate one B-mode image from an MRI or a label map at a given pose."""
     from SlicerUSSim.Logic.imaging.figures import write_png
 
     check_output(out, png=True)

@@ -18,7 +18,7 @@ from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
     "-o", "--out", type=click.Path(path_type=Path), required=True, help="Sequence: .igs.mha .seq.mha .mhd or .nrrd"
 )
 def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> None:
-    """Simulate the images of a tracked sequence: what its probe saw, on the same pixels."""
+    """Simulate the images of a tracked sequence, at its poses and on its pixels."""
     import numpy as np
 
     from SlicerUSSim.Logic.base.files import require_place

@@ -19,12 +19,12 @@ from SlicerUSSim.Command.progress import Steps, note
     help="Folder for the report.",
 )
 @click.option(
-    "--only", multiple=True, metavar="TEXT", help="Only checks with this text in their name; may be repeated."
+    "--only", multiple=True, metavar="TEXT", help="Run only checks with this text in their names; may be repeated."
 )
 @device_option
 @click.pass_context
 def validate(ctx: click.Context, out: Path, only: tuple[str, ...], device: str | None) -> None:
-    """Measure the simulator against theory on phantoms: tables and pictures; exit status 1 if any number is off."""
+    """Compare the simulator with theory on phantoms, in tables and figures; exit status 1 for values out of limits."""
     from SlicerUSSim.Logic.verification.validation import chosen_checks, validate as run
 
     with Steps(sum(len(check.orientations) for check in chosen_checks(only))) as step:
@@ -32,7 +32,7 @@ def validate(ctx: click.Context, out: Path, only: tuple[str, ...], device: str |
     for finding in report.failed:
         row = finding.row
         click.echo(
-            f"off: {finding.check}, {row.quantity}, {finding.orientation}: {row.measured:.4g} {row.unit}, "
+            f"out of limits: {finding.check}, {row.quantity}, {finding.orientation}: {row.measured:.4g} {row.unit}, "
             f"predicted {row.predicted:.4g} ({row.limits})"
         )
     click.echo(report.summary())

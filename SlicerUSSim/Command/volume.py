@@ -16,16 +16,18 @@ from SlicerUSSim.Logic.base.errors import SimulationError
 @gathered(patient=PatientOptions)
 @pose_option
 @click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Volume: .nrrd .nii.gz .mha or .vti")
-@click.option("--tilt", type=float, help="Tilt the image plane about the probe's face by this many degrees in all.")
-@click.option("--slide", type=float, help="Slide the probe across its image plane by this many millimetres in all.")
-@click.option("--frames", type=click.IntRange(1), default=61, show_default=True, help="Images of the sweep.")
+@click.option("--tilt", type=float, help="Tilt the image plane about the probe face over this total angle in degrees.")
+@click.option(
+    "--slide", type=float, help="Slide the probe across its image plane over this total distance in millimetres."
+)
+@click.option("--frames", type=click.IntRange(1), default=61, show_default=True, help="Number of images in the sweep.")
 @click.option("--spacing", type=float, default=0.5, show_default=True, help="Voxel size [mm].")
-@click.option("--like", type=click.Path(), help="Take the voxel grid of this volume instead (the MRI, say).")
+@click.option("--like", type=click.Path(), help="Use the voxel grid of this volume, such as the MRI.")
 def volume(
     patient: PatientOptions, pose: str, out: Path, tilt: float | None, slide: float | None, frames: int,
     spacing: float, like: str | None,
 ) -> None:  # fmt: skip
-    """A 3D ultrasound volume: a sweep of images around a pose, compounded in patient space."""
+    """Simulate a 3D ultrasound volume: a sweep of images around a pose, compounded in patient space."""
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
 
@@ -35,7 +37,7 @@ def volume(
     elif slide is not None and tilt is None:
         sweep, extent = slide_sweep, slide
     else:
-        raise SimulationError("expected either --tilt DEGREES or --slide MILLIMETRES, for a sweep of one kind")
+        raise SimulationError("expected exactly one of --tilt DEGREES and --slide MILLIMETRES")
     grid = Volume.read(like) if like else None
     examination, middle = open_examination_at(patient, pose)
     with Share("sweep") as progress:

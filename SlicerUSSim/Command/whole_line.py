@@ -1,4 +1,4 @@
-"""The whole line on one brain, with pictures: what `ussim demo` runs."""
+"""All steps from a brain MRI to figures, for `ussim demo`."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def run_whole_line(
     device: str | None = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> dict:
-    """Segment, place the probe, simulate, and write pictures, volumes and a summary to the folder `out`.
+    """Segment, place the probe, simulate, and write figures, volumes and a summary to the folder `out`.
 
-    `progress` is told the name of every step as it begins. Returns what demo.json holds.
-    Raises SimulationError for anything the caller can mend.
+    `progress` is called with the name of every step at its start. Returns the content of demo.json.
+    Raises SimulationError for errors that the caller can correct.
     """
-    require_matplotlib()  # now rather than after the work
+    require_matplotlib()  # before the computation, not after it
     make_folder(out)
     timings: dict[str, float] = {}
 
