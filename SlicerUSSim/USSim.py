@@ -1,7 +1,6 @@
 """What 3D Slicer loads: module, widget, logic and test of the scripted module USSim.
 
-What the module does is in the package SlicerUSSim, in Logic and Widget; this file is the part that only exists inside
-Slicer.
+The module's code is in the package SlicerUSSim, in Logic and Widget; this file is the part that requires Slicer.
 """
 
 import functools
@@ -27,7 +26,7 @@ from slicer.ScriptedLoadableModule import (
 from slicer.util import VTKObservationMixin
 
 if sys.version_info < (3, 10):  # noqa: UP036, Slicer runs this file whatever its Python is
-    raise RuntimeError(f"USSim needs Slicer 5.10 or newer: Python 3.10, and this is {sys.version.split()[0]}")
+    raise RuntimeError(f"USSim needs Slicer 5.10 or newer: Python is {sys.version.split()[0]}, expected 3.10 or newer")
 
 _HERE = Path(__file__).absolute().parent
 _RESOURCES = _HERE / "Resources"
@@ -35,11 +34,11 @@ _HOME = "https://github.com/SlicerUSSim/SlicerUSSim"
 
 
 def bindPackage() -> None:
-    """Let `import SlicerUSSim` mean the package that this file belongs to, wherever Python would look for it.
+    """Make `import SlicerUSSim` import the package of this file, independent of Python's search path.
 
-    Slicer puts no more than the folder of this file on sys.path. The package is beside the file where CMake laid it,
-    around it in a checkout and after pip, whatever that folder is called. Python may already have imported another
-    copy, installed with pip, or before "Reload" an older state of this one: none of that stays.
+    Slicer adds only the folder of this file to sys.path. After a build with CMake the package is a subfolder of it; in
+    a checkout or a pip installation it is the folder itself, with any name. Modules that Python has already imported
+    from another copy, or before "Reload" from this one, are removed.
     """
     beside = _HERE / "SlicerUSSim"
     spec = importlib.machinery.ModuleSpec("SlicerUSSim", loader=None, is_package=True)
@@ -51,15 +50,15 @@ def bindPackage() -> None:
 
 bindPackage()
 
-# Slicer's own loggers take everything from the level of debugging on, which would be several lines for each live image.
+# Slicer logs everything from DEBUG on, which would be several lines for each live image.
 if logging.getLogger("SlicerUSSim").level == logging.NOTSET:
     logging.getLogger("SlicerUSSim").setLevel(logging.INFO)
 
-# Slicer runs this file at start-up; what takes time to import is imported when the module is first used.
+# Slicer executes this file at start-up; slow imports follow when the module is first used.
 
 
 class USSim(ScriptedLoadableModule):
-    """The module as Slicer lists it."""
+    """The module's entry in Slicer."""
 
     def __init__(self, parent) -> None:
         ScriptedLoadableModule.__init__(self, parent)
@@ -68,14 +67,14 @@ class USSim(ScriptedLoadableModule):
         self.parent.dependencies = []
         self.parent.contributors = ["The SlicerUSSim developers"]
         self.parent.helpText = _(
-            "Simulates the B-mode image that an ultrasound probe would see in a patient, from the patient's MRI: "
+            "Simulates B-mode ultrasound images of a patient from the patient's MRI: "
             "choose a skull-stripped MRI, press Segment, tick Live, and move the probe. See the "
             '<a href="{home}/blob/main/docs/slicer.md">documentation</a>.'
         ).format(home=_HOME)
         self.parent.acknowledgementText = _(
             "Implements Salehi et al., Patient-specific 3D Ultrasound Simulation Based on Convolutional Ray-tracing "
             "and Appearance Optimization, MICCAI 2015. The sample MRI is the ICBM 152 2009a template (© 1993-2009 "
-            "Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute), as nilearn carries it."
+            "Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute), from nilearn."
         )
         slicer.app.connect("startupCompleted()", registerSampleData)
 
@@ -97,9 +96,9 @@ def registerSampleData() -> None:
 
 
 def ensurePackages() -> None:
-    """Install what Slicer's Python lacks, after asking; on first use, not at start-up.
+    """Install missing packages in Slicer's Python, after confirmation; on first use, not at start-up.
 
-    Raises SimulationError if something is missing then, and after installing what takes effect when Slicer starts anew.
+    Raises SimulationError if packages are still missing, and if Slicer must be restarted after the installation.
     """
     from SlicerUSSim.Widget.packages import ensure_packages, offer_opencl_runtime
 
@@ -203,18 +202,18 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         self.setParameterNode(None)
 
     def onSceneStartChange(self, caller, event) -> None:
-        """Called just before the scene is closed, or another is loaded into it: the panel keeps its hands off."""
+        """Called before the scene is closed or another one is loaded: disconnects the panel."""
         self.setParameterNode(None)
 
     def onSceneEndChange(self, caller, event) -> None:
-        """Called just after that: the panel shows the parameters that the scene now has."""
+        """Called afterwards: the panel shows the parameters of the new scene."""
         if self.parent.isEntered:
             self.initializeParameterNode()
 
     def initializeParameterNode(self) -> None:
-        """Make sure that the scene has a parameter node and that the panel shows it."""
+        """Create the scene's parameter node if necessary, and show it in the panel."""
         if self.logic is None:
-            return  # entered, and not set up
+            return  # entered before the setup
         self.setParameterNode(self.logic.getParameterNode())
         if self.panel is not None:
             self.panel.presenter.chooseDefaultNodes()
@@ -237,7 +236,7 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
 
 
 class USSimLogic(ScriptedLoadableModuleLogic):
-    """`ultrasound` does everything (see Logic/mrml/logic.py); this class gives it to Slicer.
+    """`ultrasound` is the logic (see Logic/mrml/logic.py); this class provides it in Slicer.
 
     In scripts: logic = slicer.util.getModuleLogic("USSim").ultrasound
     """
@@ -254,13 +253,13 @@ class USSimLogic(ScriptedLoadableModuleLogic):
 
 
 class USSimTest(ScriptedLoadableModuleTest):
-    """The whole way in Slicer: phantom head, Segment, place, Live."""
+    """All steps in Slicer: phantom head, Segment, placement, Live."""
 
     def setUp(self) -> None:
         slicer.mrmlScene.Clear()
 
     def runTest(self) -> None:
-        """What the SelfTests module and the panel's Test button run; CTest runs the test_ methods by itself."""
+        """Called by the SelfTests module and the panel's Test button; CTest calls the test_ methods directly."""
         self.setUp()
         try:
             self.test_image_follows_probe()
@@ -275,11 +274,11 @@ class USSimTest(ScriptedLoadableModuleTest):
         try:
             ensurePackages()
             choose_device()
-        except SimulationError as error:  # in testing mode Slicer installs nothing
+        except SimulationError as error:  # in testing mode nothing is installed
             self.skipTest(str(error))
         from SlicerUSSim.Logic.mri.samples import head_mri
 
-        self.delayDisplay("Make a head")
+        self.delayDisplay("Create a head phantom")
         mri = head_mri(2.0)
         node = slicer.util.addVolumeFromArray(mri.array, mri.ijk_to_ras, "Head")
         logic = USSimLogic().ultrasound

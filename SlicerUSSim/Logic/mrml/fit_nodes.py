@@ -1,4 +1,4 @@
-"""Fitting on the nodes of a scene: real images out of nodes, the cost as a plot, images to compare back into nodes."""
+"""Fits on the nodes of a scene: reads real images, plots the cost, writes images for comparison."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 _log = logging.getLogger(__name__)
 
-#: Images that a fit leaves to be compared, by what they show.
+#: Names of the images that a fit provides for comparison.
 COMPARED = ("real", "before", "after", "difference")
-#: How many images of a sequence are taken if none are chosen, evenly spread.
+#: Default number of images of a sequence, evenly spaced.
 MOST_IMAGES = 6
-#: Seconds between two drawings of the plot.
+#: Seconds between two updates of the plot.
 _PLOT_EVERY = 0.25
 
 
@@ -52,9 +52,9 @@ def tracked_images(
 ) -> TrackedImages:
     """Real images from a sequence of volumes, from a volume of one slice, or a slice of a 3D volume under the probe.
 
-    A sequence's poses are those that its browser's transforms have at the same time. With `estimate_geometry` the
-    probe's geometry is found in the images, and `probe` says the rest.
-    Raises SimulationError for nodes that hold no such images and as TrackedImages does.
+    The poses of a sequence are those of its browser's transforms at the same times. With `estimate_geometry` the
+    geometry of the probe is estimated from the images; its other parameters are those of `probe`.
+    Raises SimulationError for nodes without such images and as TrackedImages does.
     """
     require_node(images_node, "vtkMRMLSequenceNode", "vtkMRMLScalarVolumeNode", use="real images")
     if images_node.IsA("vtkMRMLSequenceNode"):
@@ -64,9 +64,9 @@ def tracked_images(
         if volume.array.shape[0] > 1:
             if probe_to_world is None:
                 raise SimulationError(
-                    f"{named(images_node)} is a 3D volume; choose a probe transform, which says where to cut it"
+                    f"{named(images_node)} is a 3D volume, expected a probe transform to select its image plane"
                 )
-            _log.info("%s is a 3D volume, cut where the probe is", named(images_node))
+            _log.info("%s is a 3D volume, resampled in the plane of the probe", named(images_node))
             placed = Volume(volume.array, node_to_world(images_node) @ volume.ijk_to_ras)
             sequence = TrackedSequence.from_volume(placed, probe, [probe_to_world])
             return TrackedImages.of(sequence, numbers, probe=probe)
@@ -88,7 +88,7 @@ def _sequence(sequence_node) -> TrackedSequence:
     )
     shown = None if browser is None else browser.GetProxyNode(sequence_node)
     if shown is None:
-        _log.info("%s: no browser shows it, so its images are where their own geometry says", named(sequence_node))
+        _log.info("%s: is in no browser, so the geometry of its images is used", named(sequence_node))
     parent = None if shown is None else shown.GetParentTransformNode()
     slices, times = [], []
     for number in range(count):
@@ -105,7 +105,7 @@ def _sequence(sequence_node) -> TrackedSequence:
 
 
 def _to_world_at(browser, transform_node, number: int, index: str) -> np.ndarray:
-    """(4, 4) of a chain of transforms, each as its sequence in the browser has it for the item of this index value."""
+    """(4, 4) of a chain of transforms, each taken from its sequence in the browser at this index value."""
     matrix, to_parent = np.eye(4), vtkMatrix4x4()
     while transform_node is not None:
         recorded = browser.GetSequenceNode(transform_node)
@@ -119,10 +119,10 @@ def _to_world_at(browser, transform_node, number: int, index: str) -> np.ndarray
 
 
 def _recorded_at(sequence_node, number: int, index: str):
-    """The item that goes with item `number` of another sequence, whose index value is `index`; None if there is none.
+    """The item that corresponds to item `number` of another sequence, with index value `index`; None if there is none.
 
-    By its value, unless both sequences have that in the same place: of several values that a sequence node takes for
-    one, it would give the first.
+    It is found by its place if both sequences have the index value there, otherwise by the value: among values within
+    its tolerance, a sequence node would return the first.
     """
     if number < sequence_node.GetNumberOfDataNodes() and sequence_node.GetNthIndexValue(number) == index:
         return sequence_node.GetNthDataNode(number)
@@ -131,14 +131,14 @@ def _recorded_at(sequence_node, number: int, index: str):
 
 def _of_slices(slices: list[tuple[np.ndarray, np.ndarray]], times: list[float]) -> TrackedSequence:
     shapes = {image.shape for image, _ in slices}
-    require(len(shapes) == 1, f"the images have the sizes {sorted(shapes)}, expected one")
+    require(len(shapes) == 1, f"the images have the sizes {sorted(shapes)}, expected equal sizes")
     return TrackedSequence(
         np.stack([image for image, _ in slices]), tuple({"ImageToReference": m} for _, m in slices), np.array(times)
     )
 
 
 class CostPlot:
-    """The cost of an optimisation as a table, two series and a chart in the scene, drawn as it runs."""
+    """The cost of an optimisation as a table, two series and a chart in the scene, updated while it runs."""
 
     def __init__(self, scene, name: str = "Fit to real ultrasound") -> None:
         self.chart = node_called(scene, "PlotChart", name)
@@ -169,7 +169,7 @@ class CostPlot:
         self._drawn = 0.0
 
     def add(self, progress: Progress) -> None:
-        """One more evaluation; the views are told a few times a second."""
+        """Add an evaluation; the views are updated a few times a second."""
         if self.table.GetScene() is None:
             return  # the user closed the scene
         for column, value in zip(self._columns, (progress.evaluations, progress.cost, progress.best_cost), strict=True):
@@ -178,7 +178,7 @@ class CostPlot:
             self.draw()
 
     def draw(self) -> None:
-        """Tell the views."""
+        """Update the views."""
         for column in self._columns:
             column.Modified()
         self.table.GetTable().Modified()
@@ -187,9 +187,9 @@ class CostPlot:
 
 
 def write_compared(nodes: dict, fit: Fit, number: int, to_world: np.ndarray) -> None:
-    """Put one image of a fit into volume nodes, {name among COMPARED: node}, where it lies in the world.
+    """Write one image of a fit into volume nodes, {name among COMPARED: node}, at its position in the world.
 
-    `to_world` (4, 4) takes the frame of the fit's poses there. Raises SimulationError for an image that was not fitted.
+    `to_world` (4, 4) is from the frame of the fit's poses. Raises SimulationError for an image that was not fitted.
     """
     tracked = fit.tracked
     if number not in tracked.numbers:

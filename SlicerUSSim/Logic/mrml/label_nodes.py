@@ -1,4 +1,4 @@
-"""Label maps and segmentations of a scene: their voxels, and the tissues that their names stand for."""
+"""Label maps and segmentations of a scene: their voxels, and the tissues of their names."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 
 _log = logging.getLogger(__name__)
 
-#: Nodes that can hold labels.
+#: Classes of nodes with labels.
 LABEL_CLASSES = ("vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode")
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledTissues:
-    """A label map or segmentation as the simulator takes it: one label per tissue."""
+    """A label map or segmentation in the form for the simulator: one label per tissue."""
 
     #: uint8 labels in the node's own frame, before its parent transform
     volume: Volume
@@ -46,18 +46,18 @@ class LabelledTissues:
 
 @dataclass(frozen=True, eq=False)
 class Patient:
-    """All that the simulator needs of a label node, read at one moment: from here on nobody asks the node again."""
+    """A copy of all data of a label node for the simulator; the node is not accessed again."""
 
-    #: How a message calls the node
+    #: Description of the node in messages
     name: str
-    #: uint8 labels, one per tissue, in a frame that the world reaches rigidly
+    #: uint8 labels, one per tissue, in a frame with a rigid transform to the world
     labels: Volume
     #: Name of the tissue of label 1, 2, ...
     names: tuple[str, ...]
     #: (4, 4) rigid, from the world (RAS) to the frame of `labels`
     world_to_patient: np.ndarray
-    #: Of the node's voxels and names, see labels_version; and of what simulators are built for, which knows the names'
-    #: tissues and a scaling transform too
+    #: Version of the node's voxels and names, see labels_version; and of the inputs of simulators, which also include
+    #: the tissues of the names and a scaling transform
     node_version: Hashable
     version: Hashable
 
@@ -67,16 +67,16 @@ class Patient:
 
 
 class PatientReader:
-    """Reads label nodes, and keeps the labels it read last for as long as node and tissues stay what they are."""
+    """Reads label nodes, and caches the last labels as long as node and tissues do not change."""
 
     def __init__(self) -> None:
         self._read: tuple[Hashable, LabelledTissues] | None = None
 
     def read(self, labels_node, tissues: TissueTable) -> Patient:
-        """What a label map or segmentation holds and where it is; see read_labels for `tissues` and errors."""
+        """The content and position of a label map or segmentation; see read_labels for `tissues` and errors."""
         require_node(labels_node, *LABEL_CLASSES, use="label map")
         node_version = labels_version(labels_node)
-        # Names alone would not do: a label map without names of its own takes those that `tissues` has by label.
+        # Names are not sufficient: a label map without names takes those of `tissues` by label.
         version = (node_version, tuple((label, tissue.name) for label, tissue in tissues.items()))
         if self._read is None or self._read[0] != version:
             self._read = (version, read_labels(labels_node, tissues))
@@ -90,7 +90,7 @@ class PatientReader:
 
 
 def read_mask(mask_node, mri_node) -> Volume:
-    """A mask on the grid of an MRI: a label map or scalar volume that has it, or a segmentation.
+    """A mask on the grid of an MRI: a label map or scalar volume on this grid, or a segmentation.
 
     Raises SimulationError for another node, and for an empty segmentation.
     """
@@ -109,7 +109,7 @@ def read_mask(mask_node, mri_node) -> Volume:
 
 
 def labels_version(labels_node) -> Hashable:
-    """Changes when voxels, segments, their names or their place in the node's own frame change."""
+    """A value that changes with voxels, segments, their names or their position in the node's own frame."""
     if labels_node.IsA("vtkMRMLSegmentationNode"):
         segmentation = labels_node.GetSegmentation()
         parts = [labels_node.GetID()]
@@ -128,12 +128,12 @@ def labels_version(labels_node) -> Hashable:
 
 
 def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
-    """What a label map or a segmentation holds, one label for every tissue that its names stand for.
+    """The content of a label map or segmentation, with one label for every tissue of its names.
 
-    The names are those of segments, or of a label map's colours; `tissues` are known by name before the presets are.
-    A label whose colour has no tissue's name, or only the one of Slicer's default table, is the tissue with that label
-    in `tissues`.
-    Raises SimulationError for a node without voxels or segments, and lists names that nobody knows.
+    The names are those of segments, or of a label map's colours. They are looked up in `tissues`, then in the presets.
+    A label whose colour has no tissue's name, or only the name in Slicer's default table, is the tissue with that
+    label in `tissues`.
+    Raises SimulationError for a node without voxels or segments, and for unknown names, which it lists.
     """
     require_node(labels_node, *LABEL_CLASSES, use="label map")
     if labels_node.IsA("vtkMRMLSegmentationNode"):
@@ -151,7 +151,7 @@ def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
     )
     taken = [f"{label} {names[label]!r} for {tissue}" for label, tissue in known.items() if names[label] != tissue]
     if taken:
-        _log.info("%s: labels are taken by their names: %s", named(labels_node), ", ".join(taken))
+        _log.info("%s: labels are identified by their names: %s", named(labels_node), ", ".join(taken))
     order = tuple(dict.fromkeys(known.values()))
     table = np.zeros(max(names, default=0) + 1, np.uint8)
     for label, tissue in known.items():
@@ -186,7 +186,7 @@ def _read_segmentation(segmentation_node) -> tuple[Volume, dict[int, str]]:
         names[number] = segmentation.GetSegment(segment_id).GetName()
     require(
         segmentation_node.CreateBinaryLabelmapRepresentation(),
-        f"label map {named(segmentation_node)} has no binary label map and none can be made of it",
+        f"label map {named(segmentation_node)} has no binary label map and cannot be converted to one",
     )
     merged = slicer.vtkOrientedImageData()
     segmentation_node.GenerateMergedLabelmapForAllSegments(
@@ -215,10 +215,10 @@ def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int
         "numbers from 0 to 99999",
     )
     colours, names = _colour_node(labels_node), {}
-    # Slicer gives every label map this table, in which 2 is bone and 3 is skin, whatever they are.
+    # Slicer assigns this table to every label map; its names (2 is bone, 3 is skin) are therefore ignored.
     is_default = colours is not None and colours.GetName() == "GenericAnatomyColors"
     if is_default:
-        _log.info("%s: has Slicer's default colours, so labels are tissues by their number", named(labels_node))
+        _log.info("%s: has Slicer's default colours, so labels are identified by their numbers", named(labels_node))
     for label in map(int, np.flatnonzero(np.bincount(values.ravel()))):
         if label == 0:
             continue
@@ -228,7 +228,7 @@ def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int
         if label in tissues and (is_default or _tissue_name(name, tissues) is None):
             if not is_default:
                 _log.info(
-                    "%s: label %d, %r, is taken by its number for %s", named(labels_node), label, name,
+                    "%s: label %d, %r, is identified by its number as %s", named(labels_node), label, name,
                     tissues[label].name,
                 )  # fmt: skip
             name = tissues[label].name
@@ -238,11 +238,11 @@ def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int
 
 
 def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -> None:
-    """Put a label map with named, coloured tissues into a label map or segmentation node, where a volume node is."""
+    """Write labels with named, coloured tissues into a label map or segmentation node, aligned with a volume node."""
     parent = like_node.GetParentTransformNode()
     labels_node.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
     if labels_node.IsA("vtkMRMLSegmentationNode"):
-        # After the transform: the node translates the reference geometry into its own frame.
+        # After the transform, since the node converts the reference geometry to its own frame.
         labels_node.SetReferenceImageGeometryParameterFromVolumeNode(like_node)
         _write_segmentation(labels_node, labels, tuple(names))
     else:
@@ -262,7 +262,7 @@ def _write_label_map(labels_node, labels: Volume, names: tuple[str, ...]) -> Non
     for label, name in enumerate(names, 1):
         colours.SetColor(label, name, *colour_of(name), 1.0)
     display = labels_node.GetDisplayNode()
-    if display is None:  # not the default one, which looks for colours that only Slicer's own scene has
+    if display is None:  # the default display node requires colours that exist only in Slicer's own scene
         display = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeDisplayNode")
         labels_node.SetAndObserveDisplayNodeID(display.GetID())
     display.SetAndObserveColorNodeID(colours.GetID())

@@ -1,4 +1,4 @@
-"""LiveUpdate: one image per burst of changes, and nothing left behind when it ends."""
+"""LiveUpdate: one image per burst of changes; all observers are removed at the end."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.errors import user_message
 
 _log = logging.getLogger(__name__)
 
-#: Event of an output volume: another live update now writes to it.
+#: Event of an output volume: another live update writes to it from now on.
 _CLAIMED = vtkCommand.UserEvent + 7301
 
 
@@ -41,7 +41,7 @@ class LiveUpdate:
         report: Callable[[str], None] | None,
         stopped: Callable[[], None] | None,
     ) -> None:
-        self._logic = weakref.ref(logic)  # which owns us
+        self._logic = weakref.ref(logic)  # the logic owns this object
         self._nodes: LiveNodes | None = nodes
         labels_node, transform_node, output_node = nodes.labels, nodes.probe_transform, nodes.output
         self._schedule, self._report, self._stopped = schedule, report, stopped
@@ -52,7 +52,7 @@ class LiveUpdate:
         self.running = True
 
         scene = logic.scene
-        output_node.InvokeEvent(_CLAIMED)  # whoever wrote to it before stops
+        output_node.InvokeEvent(_CLAIMED)  # stops a live update that wrote to it before
         self._observe(output_node, _CLAIMED, self.stop)
         self._observe(scene, scene.StartCloseEvent, self.stop)
         self._observe(scene, scene.NodeAboutToBeRemovedEvent, self._node_goes, call_data=VTK_OBJECT)
@@ -74,7 +74,7 @@ class LiveUpdate:
         self._observe(logic.parameters.node, vtkCommand.ModifiedEvent, self._request)
 
     def stop(self) -> None:
-        """Observe nothing any more, hold no node, and say so once."""
+        """Remove all observers and node references, and report the end once."""
         if not self.running:
             return
         self.running = False
@@ -91,7 +91,7 @@ class LiveUpdate:
         self.stop()
 
     def _observe(self, subject, event, method, call_data=None) -> None:
-        weak = weakref.WeakMethod(method)  # an observer that held us would keep us for as long as the scene lives
+        weak = weakref.WeakMethod(method)  # a strong reference would keep this object alive as long as the scene
 
         def callback(_subject, _event, *data):
             alive = weak()
@@ -112,22 +112,22 @@ class LiveUpdate:
             self._request()
 
     def _request(self) -> None:
-        """Something changed: make sure that one image comes after it, and no more than one."""
+        """After a change: schedule exactly one image."""
         if self._pending or self._nodes is None:
             return
         self._pending = True
         if self._nodes.output.GetScene().IsBatchProcessing():
-            return  # the scene is half loaded or half closed; the end of the batch comes back here
+            return  # the scene is being loaded or closed; the end of the batch calls this again
         if self._schedule is not None:
             self._schedule(self._run)
         elif not self._busy:
-            while self._pending and self.running:  # an image can cause the next change, within this loop
+            while self._pending and self.running:  # an image can cause the next change within this loop
                 self._run()
 
     def _run(self) -> None:
         logic, nodes = self._logic(), self._nodes
         if self._busy or not self._pending or logic is None or nodes is None:
-            return  # where work is done elsewhere, changes come while it is
+            return  # changes can occur while the work is done in another thread
         self._pending = False
         self._busy = True
         try:

@@ -56,29 +56,29 @@ T = TypeVar("T")
 
 
 class AtOnce:
-    """How a program with one thread works: at once. Where there is an event loop, another class of this form may do it
-    in a thread of its own, and serve events and other calls of the logic's methods until it is done."""
+    """Runs work immediately. In a program with an event loop, a class with the same methods can run it in a thread, and
+    process events and other calls of the logic's methods until it is done."""
 
     def do(self, function: Callable[[], T]) -> T:
-        """What `function` gives. It takes time and touches no node; one is called after the other."""
+        """The result of `function`, which is slow and does not access nodes. Calls are sequential."""
         return function()
 
     def tell(self, function: Callable[[], None]) -> None:
-        """From within do(): call `function`, which touches nodes, soon."""
+        """From within do(): call `function`, which accesses nodes, as soon as possible."""
         function()
 
 
 class UltrasoundSceneLogic:
     """Simulates on the nodes of one scene.
 
-    What is set (`preset`, and the nodes the module works with) is kept in the scene, see parameter_node. Every method
-    raises SimulationError for a node that is missing, empty, of the wrong kind or under a transform that is not linear.
+    The choices (`preset`, and the nodes of the module) are saved in the scene, see parameter_node. All methods raise
+    SimulationError for a node that is missing, empty, of the wrong kind or under a transform that is not linear.
 
     Parameters
     ----------
     scene : vtkMRMLScene.
     device : see opencl.devices.choose_device.
-    work : who does what takes time and touches no node.
+    work : runs slow functions that do not access nodes.
     """
 
     def __init__(self, scene, device: str | None = None, work: AtOnce | None = None) -> None:
@@ -88,18 +88,18 @@ class UltrasoundSceneLogic:
         self.parameters = SceneParameters(scene)
         self._simulators = ReusedSimulator()
         self._patients = PatientReader()
-        self._segmented: tuple[Hashable, Segmentation] | None = None  # labels of that version came from it
-        self._texture: tuple[Hashable, Texture] | None = None  # of labels of that version
+        self._segmented: tuple[Hashable, Segmentation] | None = None  # with the version of its labels
+        self._texture: tuple[Hashable, Texture] | None = None  # with the version of its labels
         self._preset: tuple[str, Preset] = ("", Preset())
         self._live: LiveUpdate | None = None
-        self._last: tuple[Frame, np.ndarray] | None = None  # and where the probe was
+        self._last: tuple[Frame, np.ndarray] | None = None  # with the pose of the probe
 
-    # ---- what is set -------------------------------------------------------------------------------------------
+    # ---- choices -------------------------------------------------------------------------------------------
 
     @property
     def preset(self) -> Preset:
-        """Probe, display, settings and tissues; kept in the scene. Raises SimulationError if the scene holds another
-        thing in its place."""
+        """Probe, display, settings and tissues; saved in the scene. Raises SimulationError if the scene's preset is
+        invalid."""
         text = self.parameters.preset
         if text != self._preset[0]:
             try:
@@ -116,10 +116,10 @@ class UltrasoundSceneLogic:
         self.parameters.preset = text
 
     def tissues(self, labels_node) -> TissueTable:
-        """The tissues of a label map or segmentation: what the preset says about those names, else the presets."""
+        """The tissues of a label map or segmentation by name, from the preset's table or else the tissue presets."""
         return self.preset.tissues.for_names(self._patient(labels_node).names)
 
-    # ---- once --------------------------------------------------------------------------------------------------
+    # ---- single steps ------------------------------------------------------------------------------------------------
 
     def segment(
         self,
@@ -141,10 +141,12 @@ class UltrasoundSceneLogic:
         raise errors.Cancelled; the nodes are then as they were.
         """
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
-        require(labels_node is not mri_node, f"input and output are both {named(mri_node)}, expected two nodes")
+        require(labels_node is not mri_node, f"input and output are both {named(mri_node)}, expected different nodes")
         mri = read_volume(mri_node, "MRI")
         mask = None if mask_node is None else read_mask(mask_node, mri_node)
-        require(mask_node is not labels_node, f"mask and output are both {named(labels_node)}, expected two nodes")
+        require(
+            mask_node is not labels_node, f"mask and output are both {named(labels_node)}, expected different nodes"
+        )
         result = self._work.do(
             lambda: segment_mri(
                 mri, classes=classes, contrast=contrast, mask=mask, filter_radius=filter_radius,
@@ -160,16 +162,16 @@ class UltrasoundSceneLogic:
     def simulate(
         self, labels_node, probe_transform_node, output_node, *, warned: Callable[[Warning], None] = warn_again
     ) -> Frame:
-        """The image under the probe, into a scalar volume node that is put under the probe's transform.
+        """Write the image at the probe's pose into a scalar volume node, and put it under the probe's transform.
 
-        `labels_node` is a label map or a segmentation; its names choose the tissues, see label_nodes.read_labels. Every
-        pose in the labels' frame has amplifier noise of its own (noise.seed_of_pose). `warned` is told what there is to
-        warn of.
+        `labels_node` is a label map or a segmentation; its names determine the tissues, see label_nodes.read_labels.
+        Amplifier noise differs between poses in the labels' frame (noise.seed_of_pose). `warned` is called with each
+        warning.
         """
         self._check_output(labels_node, output_node)
         probe_to_world = probe_pose(probe_transform_node)
         frame = self._frame(self._patient(labels_node), probe_to_world, warned)
-        self._check_output(labels_node, output_node)  # much may have happened meanwhile
+        self._check_output(labels_node, output_node)  # nodes may have changed in the meantime
         require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         self._last = (frame, probe_to_world)
         write_image(output_node, frame, probe_transform_node)
@@ -177,11 +179,11 @@ class UltrasoundSceneLogic:
 
     @property
     def lastFrame(self) -> Frame | None:
-        """What simulate() computed last."""
+        """The last result of simulate()."""
         return None if self._last is None else self._last[0]
 
     def lastImage(self) -> Volume:
-        """The image of lastFrame as one slice where the probe was then (RAS), wherever its transform is now.
+        """The image of lastFrame as one slice at the probe's pose of that time (RAS), not its present pose.
 
         Raises SimulationError if there is none.
         """
@@ -199,14 +201,18 @@ class UltrasoundSceneLogic:
     ) -> int:
         """A sequence of simulated images from a vtkMRMLSequenceNode of linear transforms; returns how many.
 
-        Images are in the probe frame with the transforms' index values (SequenceIndex says what becomes of values that
-        a sequence node cannot tell apart; no image is lost), and their numbers say which noise they have. With the
-        browser of the transforms, its current transform's parents count, and the images are added to it, under that
-        transform. `progress` is told the share done and may raise errors.Cancelled; `images_node` is then as it was.
+        Images are in the probe frame with the transforms' index values; SequenceIndex changes values that a sequence
+        node cannot distinguish, so that no image is lost. Their numbers are the seeds of their noise. With the browser
+        of the transforms, the parents of its current transform are applied, and the images are added to it, under that
+        transform. `progress` is called with the fraction done and may raise errors.Cancelled; `images_node` is then
+        unchanged.
         """
         require_node(transforms_node, "vtkMRMLSequenceNode", use="sequence of transforms")
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
-        require(images_node is not transforms_node, f"input and output are both {named(images_node)}, expected two")
+        require(
+            images_node is not transforms_node,
+            f"input and output are both {named(images_node)}, expected different nodes",
+        )
         count = transforms_node.GetNumberOfDataNodes()
         require(count > 0, f"sequence {named(transforms_node)} is empty, expected transforms")
         proxy = None if browser_node is None else browser_node.GetProxyNode(transforms_node)
@@ -237,10 +243,11 @@ class UltrasoundSceneLogic:
         return count
 
     def placeProbe(self, labels_node, probe_transform_node, slice_node=None, target_ras=None) -> None:
-        """Put the probe on the surface of what is labelled, looking inwards.
+        """Put the probe on the surface of the labelled tissue, with its axis inwards.
 
-        With a slice node the image lies in that slice, its depth running down the view, aimed at `target_ras` (the
-        middle of the view by default). Without one it is a coronal view through a parasagittal craniotomy.
+        With a slice node the image is in that slice, with its depth towards the bottom of the view, aimed at
+        `target_ras` (default: the middle of the view). Without one it is a coronal view through a parasagittal
+        craniotomy.
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
         patient = self._patient(labels_node)
@@ -259,7 +266,7 @@ class UltrasoundSceneLogic:
         write_outline(model_node, self.preset.probe, probe_transform_node)
 
     def showInSlice(self, slice_node, output_node, probe_transform_node, fit: bool = True) -> None:
-        """Turn a slice view into the plane of the probe and lay the image over what it shows."""
+        """Move a slice view to the image plane and overlay the image."""
         require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
         show_in_slice(slice_node, output_node, probe_pose(probe_transform_node), self.preset.probe, fit)
@@ -284,8 +291,9 @@ class UltrasoundSceneLogic:
         """Fit display and tissue parameters, and with `register` the poses, to real images; see fitting.fit.
 
         `images_node` is a sequence of images with its browser's transforms, a volume of one slice, or a 3D ultrasound
-        volume, cut where the probe is. `frames` are numbers of images (default: six, spread). `plot` draws the cost,
-        live. Nothing else in the scene changes: applyFit takes the result over. `progress` may raise errors.Cancelled.
+        volume, resampled in the image plane. `frames` are numbers of images (default: six, evenly spaced). `plot` shows
+        the cost during the fit. Nothing else in the scene changes; applyFit adopts the result. `progress` may raise
+        errors.Cancelled.
         """
         patient, preset = self._patient(labels_node), self.preset
         pose = None if probe_transform_node is None else probe_pose(probe_transform_node)
@@ -320,7 +328,7 @@ class UltrasoundSceneLogic:
                 plot.draw()
 
     def applyFit(self, found: Fit) -> Preset:
-        """Take probe, display and tissues of a fit into the preset; returns the preset that was, to revert to."""
+        """Adopt probe, display and tissues of a fit in the preset; returns the previous preset, for reverting."""
         before = self.preset
         tissues = before.tissues
         for name in found.appearance.parameters.varied():
@@ -329,26 +337,26 @@ class UltrasoundSceneLogic:
         return before
 
     def writeRegistration(self, found: Fit, labels_node, transform_node) -> None:
-        """Put what registration moved the ultrasound by into a linear transform: the last parent of its tracking."""
+        """Write the registration's correction into a linear transform: the last parent of the tracking."""
         require_node(transform_node, "vtkMRMLLinearTransformNode", use="registration")
         registration = required(found.registration, "the fit was made without registration")
         to_world = self._fit_to_world(labels_node)
         set_node_to_world(transform_node, to_world @ registration.correction @ np.linalg.inv(to_world))
 
     def showFit(self, found: Fit, labels_node, nodes: Mapping[str, object], number: int | None = None) -> None:
-        """Put one image of a fit, the first by default, into volume nodes: {"real": ..., "before": ..., "after": ...,
-        "difference": ...}, any of them."""
+        """Write one image of a fit, by default the first, into volume nodes: any of {"real": ..., "before": ...,
+        "after": ..., "difference": ...}."""
         number = found.tracked.numbers[0] if number is None else number
         write_compared(dict(nodes), found, number, self._fit_to_world(labels_node))
 
     def showFitInSlice(self, slice_node, found: Fit, labels_node, shown_node, real_node, number: int) -> None:
-        """Turn a slice view into the plane of an image of a fit: `shown_node` before `real_node`, to fade between."""
+        """Move a slice view to the plane of an image of a fit: `shown_node` in front of `real_node`, for fading."""
         require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
         pose = self._fit_to_world(labels_node) @ found.tracked.poses[found.tracked.numbers.index(number)]
         show_in_slice(slice_node, shown_node, pose, found.tracked.probe, fit=True, behind=real_node)
 
     def _fit_to_world(self, labels_node) -> np.ndarray:
-        """(4, 4) from the frame that poses of a fit are in, that of the labels unless they scale."""
+        """(4, 4) from the frame of a fit's poses, which is the labels' frame unless its transform scales."""
         in_labels, _ = pose_in_labels(labels_node, np.eye(4))
         return np.linalg.inv(in_labels)
 
@@ -356,7 +364,7 @@ class UltrasoundSceneLogic:
 
     @property
     def isLive(self) -> bool:
-        """Whether images follow the probe."""
+        """Whether a live update is running."""
         return self._live is not None and self._live.running
 
     def startLiveUpdate(
@@ -373,17 +381,17 @@ class UltrasoundSceneLogic:
     ) -> None:
         """Simulate now, and again whenever the transform or its parents, the labels or the preset change.
 
-        `outline_node` is a model that shows the imaged field, `slice_node` a slice view that stays in its plane.
-        `schedule(function)` has to call `function` once, soon, from the event loop (in Slicer: qt.QTimer.singleShot(0,
-        function)). However many changes come before that, one image is computed, of the last. Without an event loop
-        the image is computed within the change itself.
-        `report` is told "" after an image, and otherwise one line about what is wrong; the update goes on, since what
-        is wrong may be mended. `stopped` is called when it ends: by stopLiveUpdate, when one of its nodes or the scene
-        goes away, or when another live update takes over the output.
+        `outline_node` is a model for the outline of the imaged field, `slice_node` a slice view that follows its plane.
+        `schedule(function)` must call `function` once, soon, from the event loop (in Slicer: qt.QTimer.singleShot(0,
+        function)). One image is then computed for all changes before the call. Without `schedule` an image is computed
+        synchronously with each change.
+        `report` is called with "" after an image, and otherwise with one line that describes the error; the update
+        continues, since the error may be corrected. `stopped` is called when it ends: by stopLiveUpdate, when one of
+        its nodes or the scene is removed, or when another live update uses the output.
         """
         self.stopLiveUpdate()
         caught: list[Warning] = []
-        self.simulate(labels_node, probe_transform_node, output_node, warned=caught.append)  # raises what is wrong now
+        self.simulate(labels_node, probe_transform_node, output_node, warned=caught.append)  # raises errors immediately
         if outline_node is not None:
             self.showOutline(outline_node, probe_transform_node)
         if slice_node is not None:
@@ -394,16 +402,18 @@ class UltrasoundSceneLogic:
             report("; ".join(map(str, caught)))
 
     def stopLiveUpdate(self) -> None:
-        """Let the image rest; nothing is observed any more."""
+        """End the live update and remove its observers."""
         if self._live is not None:
             self._live.stop()
             self._live = None
 
-    # ---- inside ------------------------------------------------------------------------------------------------
+    # ---- internal ------------------------------------------------------------------------------------------------
 
     def _check_output(self, labels_node, output_node) -> None:
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
-        require(labels_node is not output_node, f"input and output are both {named(output_node)}, expected two nodes")
+        require(
+            labels_node is not output_node, f"input and output are both {named(output_node)}, expected different nodes"
+        )
         require(
             not output_node.IsA("vtkMRMLLabelMapVolumeNode"),
             f"output is {named(output_node)}, expected a ScalarVolume node",
@@ -422,13 +432,13 @@ class UltrasoundSceneLogic:
         warned: Callable[[Warning], None],
         noise_seed: int | None = None,
     ) -> Frame:
-        """The image at a pose; its draw of the noise is the pose's own unless another is given."""
+        """The image at a pose; the default seed of its noise depends on the pose."""
         preset, texture = self.preset, self._texture_of(patient)
         pose = patient.pose(probe_to_world)
         seed = seed_of_pose(pose) if noise_seed is None else noise_seed
 
         def compute() -> tuple[Frame, list[Warning]]:
-            # Collected within the work: Python can do that for one thing at a time only.
+            # Collected within the work, since Python collects warnings for all threads together.
             with collected_warnings() as caught:
                 simulator = self._simulator(patient, preset, texture)
                 return simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed), caught
@@ -439,22 +449,22 @@ class UltrasoundSceneLogic:
         return frame
 
     def _simulator(self, patient: Patient, preset: Preset, texture: Texture | None) -> UltrasoundSimulator:
-        """Touches no node, but the device: to be called in the work itself."""
+        """Uses the device and no node; called within the work."""
         tissues = preset.tissues.for_names(patient.names)
         return self._simulators.get(patient.version, patient.labels, tissues, preset.settings, self.device, texture)
 
     def _texture_of(self, patient: Patient) -> Texture | None:
-        """What the MRI knows of a patient beyond labels, if the settings ask for it."""
+        """The texture from the MRI, if the settings require it."""
         if not self.preset.settings.needs_texture:
             return None
         segmented = self._segmented
         if segmented is None or segmented[0] != patient.node_version:
             raise SimulationError(
-                f"the settings want more of the MRI than {patient.name} holds; segment the MRI again, or set "
+                f"the settings need a texture from the MRI, which {patient.name} lacks; segment the MRI again, or set "
                 "partial_volume to false and mri_modulation_db to 0"
             )
         if self._texture is None or self._texture[0] != patient.version:
-            # A segmentation node gives its labels cropped to what it holds.
+            # A segmentation node returns its labels cropped to their content.
             texture = segmented[1].texture().on_grid_of(patient.labels, segmented[1].labels)
             self._texture = (patient.version, texture)
         return self._texture[1]

@@ -1,6 +1,6 @@
-"""Between MRML nodes and this package's values: volumes, labels and their names, poses, images, outlines.
+"""Conversion between MRML nodes and values of this package: volumes, labels and names, poses, images, outlines.
 
-Works on nodes alone and needs nothing of the `slicer` namespace.
+Uses only nodes, and nothing of the `slicer` namespace.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.probe.shape import outline_polydata
 
 
 def named(node) -> str:
-    """How a message calls a node: its kind and name."""
+    """Description of a node in messages: its kind and name."""
     if node is None:
         return "no node"
     kind = node.GetNodeTagName() if hasattr(node, "GetNodeTagName") else type(node).__name__
@@ -33,34 +33,34 @@ def require_node(node, *classes: str, use: str) -> None:
         hasattr(node, "IsA") and any(node.IsA(name) for name in classes),
         f"{use} is {named(node)}, expected a {words} node",
     )
-    require(node.GetScene() is not None, f"{use} {named(node)} is not in a scene any more; choose another")
+    require(node.GetScene() is not None, f"{use} {named(node)} has been removed from the scene; choose another")
 
 
 def nodes_of_class(scene, name: str) -> list:
-    """All nodes of a class, subclasses too, in the order of the scene."""
+    """All nodes of a class and its subclasses, in the order of the scene."""
     return [scene.GetNthNodeByClass(number, name) for number in range(scene.GetNumberOfNodesByClass(name))]
 
 
 def node_called(scene, kind: str, name: str):
-    """The first vtkMRML`kind`Node of that name, or a new one."""
+    """The first vtkMRML`kind`Node with this name, or a new one."""
     known = (node for node in nodes_of_class(scene, f"vtkMRML{kind}Node") if node.GetName() == name)
     return next(known, None) or scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
 
 
 def display_of(node):
-    """A node's display node, the default one if it has none; None where even that cannot be."""
+    """A node's display node, created by default; None if none can be created."""
     if node.GetDisplayNode() is None:
         node.CreateDefaultDisplayNodes()
     return node.GetDisplayNode()
 
 
-# ---- where nodes are -------------------------------------------------------------------------------------------------
+# ---- positions of nodes ----------------------------------------------------------------------------------------------
 
 
 def node_to_world(node) -> np.ndarray:
-    """(4, 4) from a node's own frame to the world (RAS): its parent transforms; for a transform node, itself too.
+    """(4, 4) from a node's own frame to the world (RAS), by its parent transforms and, for a transform node, itself.
 
-    Raises SimulationError where a transform on the way is not linear.
+    Raises SimulationError if one of the transforms is not linear.
     """
     transform = node if node.IsA("vtkMRMLTransformNode") else node.GetParentTransformNode()
     if transform is None:
@@ -87,10 +87,10 @@ def probe_pose(transform_node) -> np.ndarray:
 
 
 def pose_in_labels(labels_node, probe_to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(probe pose, what the volume has to be moved by), both (4, 4), in one rigid frame.
+    """(probe pose, transform of the volume), both (4, 4), in one rigid frame.
 
-    A rigid transform of the labels is taken out of the pose, so that moving them costs nothing; one that scales has to
-    be put into the volume.
+    The inverse of a rigid transform of the labels is applied to the pose, so that the volume does not change; a
+    transform that scales is applied to the volume.
     """
     labels_to_world = node_to_world(labels_node)
     try:
@@ -125,7 +125,7 @@ def read_volume(volume_node, use: str = "volume") -> Volume:
 
 
 def write_volume(volume_node, volume: Volume) -> None:
-    """Put a volume into a volume node, as loading a file does; the node has its own copy of the voxels."""
+    """Write a copy of a volume into a volume node, as when loading a file."""
     volume_node.SetIJKToRASMatrix(vtk_matrix(volume.ijk_to_ras))
     volume_node.SetAndObserveImageData(Volume(volume.array, np.eye(4)).to_vtk())
 
@@ -133,19 +133,19 @@ def write_volume(volume_node, volume: Volume) -> None:
 # ---- labels ----------------------------------------------------------------------------------------------------------
 
 
-# ---- what is simulated -----------------------------------------------------------------------------------------------
+# ---- simulated images -----------------------------------------------------------------------------------------------
 
 
 def write_image(volume_node, frame: Frame, transform_node=None) -> None:
-    """Put a frame into a volume node: fixed geometry in the probe frame, under the probe's transform node.
+    """Write a frame into a volume node: fixed geometry in the probe frame, under the probe's transform node.
 
-    So the slice moves with the transform at once, and the pixels follow.
+    The slice therefore moves with the transform immediately, before its pixels are updated.
     """
     write_slice(volume_node, Volume(frame.image[None], frame.grid.slice_to_probe), transform_node)
 
 
 def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:
-    """Put a uint8 volume of one slice into a volume node, which keeps its memory where the size is the same."""
+    """Write a uint8 volume of one slice into a volume node; memory is reused if the size is the same."""
     was_modifying = volume_node.StartModify()
     if transform_node is not None and volume_node.GetTransformNodeID() != transform_node.GetID():
         volume_node.SetAndObserveTransformNodeID(transform_node.GetID())
@@ -165,7 +165,7 @@ def write_slice(volume_node, in_probe: Volume, transform_node=None) -> None:
 
 
 def _show_all_greys(volume_node) -> None:
-    """Black at 0 and white at 255, as on a scanner: an automatic window would change brightness from frame to frame."""
+    """Black at 0 and white at 255, as on a scanner; an automatic window would change the brightness between frames."""
     if volume_node.GetScene() is None:  # an item of a sequence
         return
     display = display_of(volume_node)
@@ -175,7 +175,7 @@ def _show_all_greys(volume_node) -> None:
 
 
 def write_outline(model_node, probe: Probe, transform_node) -> None:
-    """Put the outline of the imaged field into a model node, under the probe's transform node."""
+    """Write the outline of the imaged field into a model node, under the probe's transform node."""
     model_node.SetAndObservePolyData(outline_polydata(probe))
     if model_node.GetTransformNodeID() != transform_node.GetID():
         model_node.SetAndObserveTransformNodeID(transform_node.GetID())
@@ -190,12 +190,12 @@ def write_outline(model_node, probe: Probe, transform_node) -> None:
 
 
 def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Probe, fit: bool, behind=None) -> None:
-    """Turn a slice view into the plane of the probe, standing as on a scanner, and lay the image over its background.
+    """Move a slice view to the image plane, oriented as on a scanner, and overlay the image on its background.
 
-    `fit` also makes the imaged field fill the view; `behind` is another volume to put into the background.
+    `fit` also zooms to the imaged field; `behind` is another volume for the background.
     """
     left, right, top, bottom = probe.image_bounds_mm()
-    view = probe_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])  # a view's second axis goes up, the probe's goes down
+    view = probe_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])  # a view's second axis points up, the probe's down
     view[:3, 3] = (probe_to_world @ [0.5 * (left + right), 0.5 * (top + bottom), 0.0, 1.0])[:3]
     slice_node.GetSliceToRAS().DeepCopy(vtk_matrix(view))
     if fit:
@@ -214,6 +214,6 @@ def show_in_slice(slice_node, volume_node, probe_to_world: np.ndarray, probe: Pr
 
 
 def composite_of(slice_node):
-    """The vtkMRMLSliceCompositeNode that says what a slice view shows, or None."""
+    """The vtkMRMLSliceCompositeNode of a slice view, or None."""
     composites = nodes_of_class(slice_node.GetScene(), "vtkMRMLSliceCompositeNode")
     return next((node for node in composites if node.GetLayoutName() == slice_node.GetLayoutName()), None)

@@ -1,4 +1,4 @@
-"""Sequences as nodes: what their items are found by, and tracked images with a browser that plays them."""
+"""Sequence nodes: index values of their items, and tracked images with a browser."""
 
 from __future__ import annotations
 
@@ -15,21 +15,20 @@ from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.mrml.nodes import write_volume
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
-#: Attribute of an image in a sequence: when it was taken, in seconds, whatever its index value is.
+#: Attribute of an image in a sequence: its time in seconds, independent of its index value.
 TIME = "SlicerUSSim.time"
-#: Numbers closer than the first are one index value to a sequence node, unless it is told otherwise; by the second a
-#: made-up value follows the one before.
+#: Default tolerance within which a sequence node considers numbers equal; step between generated values.
 _TOLERANCE, _STEP = 1e-3, 1e-6
 
 
 @dataclass(frozen=True)
 class SequenceIndex:
-    """What the items of sequences are found by: the same for all that a browser shall play together.
+    """Index values of the items of sequences, common to all sequences of one browser.
 
-    A sequence node keeps one item for each index value, in the order of the numbers, and takes numbers within its
-    tolerance of each other (a millisecond) for one. So that every item stays, and where it was, a number that is not
-    larger than the one before it, or is none, becomes the one before and a millionth, and the tolerance less than the
-    smallest step. Recorded times thus stay what they are but for images that have equal ones.
+    A sequence node has one item for each index value, in the order of the numbers, and considers numbers equal that
+    differ by less than its tolerance (a millisecond). To keep all items and their order, an index value that is not a
+    number, or not larger than the previous one, is replaced by the previous one plus a millionth, and the tolerance is
+    set to less than the smallest step. Recorded times therefore change only for images with equal times.
     """
 
     values: tuple[str, ...]
@@ -47,12 +46,12 @@ class SequenceIndex:
 
     @classmethod
     def of_times(cls, seconds: Iterable[float]) -> SequenceIndex:
-        """Of items recorded at these times, to a microsecond."""
+        """Index of items recorded at these times, to a microsecond."""
         return cls(tuple(f"{time:.6f}" for time in seconds))
 
     @classmethod
     def of_node(cls, sequence_node) -> SequenceIndex:
-        """That of a vtkMRMLSequenceNode."""
+        """Index of a vtkMRMLSequenceNode."""
         count = sequence_node.GetNumberOfDataNodes()
         return cls(
             tuple(sequence_node.GetNthIndexValue(number) for number in range(count)),
@@ -63,7 +62,7 @@ class SequenceIndex:
         )
 
     def fill(self, sequence_node, items: Iterable) -> None:
-        """Put `items`, a data node for each value, into a vtkMRMLSequenceNode in place of what it held."""
+        """Replace the content of a vtkMRMLSequenceNode by `items`, a data node for each value."""
         sequence_node.RemoveAllDataNodes()
         sequence_node.SetIndexName(self.name)
         sequence_node.SetIndexUnit(self.unit)
@@ -74,7 +73,7 @@ class SequenceIndex:
 
 
 def _distinct(texts: Sequence[str]) -> tuple[str, ...]:
-    """The same, but one that was there before has a number behind it that makes it another."""
+    """The same texts, with a number appended to duplicates."""
     found: list[str] = []
     for place, text in enumerate(texts):
         others = {*texts, *found}
@@ -85,7 +84,7 @@ def _distinct(texts: Sequence[str]) -> tuple[str, ...]:
 
 
 def _rising(texts: Sequence[str]) -> tuple[str, ...]:
-    """The same numbers as long as they rise."""
+    """The same numbers, as long as they increase."""
     risen, last = [], -inf
     for text in texts:
         value = number_in(text)
@@ -97,7 +96,7 @@ def _rising(texts: Sequence[str]) -> tuple[str, ...]:
 
 
 def number_in(text: str) -> float:
-    """The number that an index value is; NaN for text."""
+    """The number of an index value; NaN for text."""
     try:
         return float(text)
     except ValueError:
@@ -115,11 +114,10 @@ def add_sequence(
 ):
     """(browser, images): a vtkMRMLSequenceBrowserNode and the vtkMRMLSequenceNode of the images in `scene`.
 
-    The images are in pixels under recorded transforms, which take them to the world (RAS); `path` and `to_ras` (4, 4)
-    are those of TrackedImages.of. Images that were not tracked are left out. `poses`, one probe_to_ras (4, 4) for each
-    image that is kept, become a sequence too, which `probe_transform_node` follows when the browser plays. All three
-    are found by the images' times (SequenceIndex says what becomes of equal ones); an image's own is its attribute
-    TIME.
+    The images are in pixels, under the recorded transforms to the world (RAS); `path` and `to_ras` (4, 4) are those of
+    TrackedImages.of. Images that were not tracked are omitted. `poses`, one probe_to_ras (4, 4) for each remaining
+    image, become a sequence for `probe_transform_node`, which follows the browser. The index of all three sequences is
+    the images' times (with unique values, see SequenceIndex); the original time of an image is its attribute TIME.
     Raises SimulationError if no image was tracked.
     """
     numbers = [number for number in range(len(sequence)) if sequence.has_pose(number, path)] or [0]
