@@ -86,7 +86,7 @@ class Volume:
         else:
             values = np.unique(array)
             found, is_labels = f"{len(values)} whole numbers from {values[0]} to {values[-1]}", len(values) <= 32
-        _log.info("the volume contains %s, as does %s", found, "a label map" if is_labels else "an MRI")
+        _log.info("the volume contains %s, as %s does", found, "a label map" if is_labels else "an MRI")
         return is_labels
 
     # ---- files -------------------------------------------------------------------------------------------------
@@ -231,7 +231,7 @@ def _log_size(volume: Volume, path: Path) -> None:
     )  # fmt: skip
     if not _SMALLEST_MM <= size.max() <= _LARGEST_MM:
         _log.warning(
-            "%s: its size is %s if the unit is mm, as assumed; check its voxel size", path,
+            "%s: its size is %s mm if lengths are in millimetres, as assumed; check its voxel size", path,
             "x".join(f"{round(mm, 3):g}" for mm in size),
         )  # fmt: skip
 

@@ -1,6 +1,6 @@
-"""From a label map and a pose to an image, stage by stage: medium, ray tree, echoes, B-mode, scan conversion.
+"""From a label map and a pose to an image, in stages: medium, ray tree, echoes, B-mode, scan conversion.
 
-`simulator` runs the stages; each has its host side here and its kernels in kernels/. A Preset is all that a user sets.
+`simulator` runs the stages; each has its host code here and its kernels in kernels/. A Preset has all user settings.
 """
 
 from typing import TYPE_CHECKING

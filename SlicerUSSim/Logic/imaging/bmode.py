@@ -29,7 +29,7 @@ class PulseFilter(Stage):
         self.kernel = device.kernels("bmode.cl", device.lanes)["convolve_pulse"]
         self.workspace = Workspace(device)
         self._sigma: float | None = None
-        # Of the pulse with that sigma
+        # Taps of the pulse with this sigma
         self._pulse: Buffer
         self._reach: int
 
@@ -74,7 +74,7 @@ class Compressor(Stage):
         display, acquisition, (lines, samples) = frame.display, frame.acquisition, frame.line_shape
         frame.envelope = self.workspace.get("envelope", lines * samples * 4)
         frame.grey = self.workspace.get("grey", lines * samples)
-        # Two ways through `sample_mm` of depth each sample, in cm.
+        # Two-way path per sample, in cm.
         tgc = 2.0 * display.tgc_db_cm_mhz * float(acquisition["frequency_mhz"]) * float(acquisition["sample_mm"]) * 0.1
         # Noise power is shared between the two quadrature components.
         noise = 0.0 if display.noise_db is None else 10.0 ** (display.noise_db / 20.0) / np.sqrt(2.0)
@@ -101,7 +101,7 @@ def pulse_taps(sigma: float) -> np.ndarray:
     """(2 reach + 1,) float32 Gaussian of standard deviation `sigma` samples and height 1.
 
     Impulses are placed between samples by linear interpolation, which convolves them with a triangle of variance 1/6 on
-    average; the taps are narrower by that much so that the whole has the width asked for.
+    average. The variance of the taps is reduced by this value, so that the result has the specified width.
     """
     narrowed = np.sqrt(max(sigma**2 - 1.0 / 6.0, 0.25))
     reach = int(np.ceil(3.7 * narrowed))

@@ -12,14 +12,14 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
-_SLAB = 48  # planes at a time: what is between the passes stays small whatever the volume
+_SLAB = 48  # planes at a time, to limit the memory between the passes
 
 
 def smoothed_indicators(device: Device, group_buffer: Buffer, dims, present: set[int], fields: int) -> Buffer:
-    """Device buffer ushort [field][k][j][i]: where each of the first `fields` groups is, smoothed by a Gaussian.
+    """Device buffer ushort [field][k][j][i]: indicators of the first `fields` groups, smoothed by a Gaussian.
 
-    `group_buffer` holds uint8 groups with flags, `dims` (i, j, k) voxels, `present` the groups that occur. Fields of
-    groups that do not occur are 0, and all are where there is one group only: it has no border. 65535 stands for 1.
+    `group_buffer` has uint8 groups with flags, `dims` (i, j, k) voxels, `present` the groups that occur. Fields of
+    groups that do not occur are 0, and all fields if there is only one group, which has no border. 65535 means 1.
     """
     columns, rows, planes = (int(n) for n in dims)
     voxels = columns * rows * planes

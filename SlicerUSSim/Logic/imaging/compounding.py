@@ -1,4 +1,4 @@
-"""Compounding: the images of a sweep, wherever they lie, become one volume in patient space."""
+"""Compounding of the images of a sweep, at any poses, into one volume in patient space."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _MOST_VOXELS = 400_000_000
-_WIDEST_GAP_MM = 10.0  # farther apart, neighbouring images are two sweeps rather than one with a hole
+_WIDEST_GAP_MM = 10.0  # neighbouring images at a larger distance belong to different sweeps
 
 
 def sweep_grid(probe: Probe, poses: Iterable[np.ndarray], spacing_mm: float = 0.5) -> Volume:
-    """An empty uint8 volume along the patient's axes (RAS) that holds the field of `probe` at all `poses` (4, 4).
+    """An empty uint8 volume along the patient's axes (RAS) that contains the field of `probe` at all `poses` (4, 4).
 
-    Raises SimulationError without poses, for one that is not rigid, and for more voxels than a computer likes.
+    Raises SimulationError without poses, for a pose that is not rigid, and for too many voxels.
     """
     require_between("sweep_grid", "spacing_mm", spacing_mm, 0.02, 20)
     points = [_outline(probe, check_rigid("pose", pose)) for pose in poses]
@@ -48,16 +48,16 @@ def sweep_grid(probe: Probe, poses: Iterable[np.ndarray], spacing_mm: float = 0.
 
 
 class Compounder:
-    """Collects images in a volume: every voxel near an image plane takes its grey level there.
+    """Collects images in a volume: voxels near an image plane get its grey levels.
 
-    A voxel counts with a weight that falls linearly to zero at one voxel from the plane, so that neighbouring images
-    blend into each other; where images overlap, it is their weighted mean. An image's own thickness, the elevational
-    beam, is in its grey levels already.
+    The weight of an image decreases linearly to zero at one voxel from its plane, and a voxel is the weighted mean of
+    all images, so that neighbouring images blend. The slice thickness, due to the elevational beam, is already in the
+    grey levels.
 
     Parameters
     ----------
-    grid : the volume to fill; its array is not looked at.
-    probe : which took the images.
+    grid : the grid of the volume; its array is not used.
+    probe : the probe of the images.
     device : see opencl.devices.choose_device.
     """
 
@@ -71,17 +71,17 @@ class Compounder:
         self._sum, self._weight = (self.device.zeros(4 * grid.array.size) for _ in range(2))
         self._to_image = self.device.empty(12 * 4)
         self._pixels: ImageGrid | None = None
-        # Of images with these pixels: uint8, which are in the field, and room for means
+        # For images with these pixels: uint8 mask of the field, and memory for means
         self._field: Buffer
         self._mean: Buffer
         self._poses: list[np.ndarray] = []
 
     def add(self, frame: Frame) -> None:
-        """Put one image into the volume."""
+        """Add one image to the volume."""
         self.add_buffer(self.device.upload(frame.image), frame.grid, frame.probe_to_ras)
 
     def add_buffer(self, image: Buffer, pixels: ImageGrid, probe_to_ras: np.ndarray) -> None:
-        """The same for an image that is on the device already (UltrasoundSimulator.render)."""
+        """The same for an image on the device (UltrasoundSimulator.render)."""
         self._prepare(pixels)
         shape = pixels.columns, pixels.rows
         window = [max(round(float(self.grid.spacing_mm.min()) / s), 1) for s in pixels.pixel_spacing_mm]
@@ -111,10 +111,10 @@ class Compounder:
         )
 
     def volume(self, hole_mm: float | None = None) -> Volume:
-        """The compounded uint8 volume; voxels that no image came near are 0, but for holes.
+        """The compounded uint8 volume; voxels without an image nearby are 0, except in filled holes.
 
-        `hole_mm` is how wide a gap between images is filled, smoothly from its borders; default: the widest gap between
-        neighbouring images of the sweep, 10 mm at most. 0 fills none. Raises SimulationError for a negative one.
+        Gaps between images are filled smoothly from their borders up to a width of `hole_mm`; default: the widest gap
+        between neighbouring images of the sweep, at most 10 mm; 0: none. Raises SimulationError for a negative value.
         """
         if hole_mm is None:
             hole_mm = min(self._widest_gap_mm(), _WIDEST_GAP_MM)
@@ -130,20 +130,20 @@ class Compounder:
         return self.grid.with_array(np.clip(np.rint(values), 0, 255).astype(np.uint8))
 
     def _prepare(self, pixels: ImageGrid) -> None:
-        """The imaged field of images with these pixels, and room for their means."""
+        """The imaged field of images with these pixels, and memory for their means."""
         if pixels != self._pixels:
             self._field = self.device.upload(pixels.field(self.probe).astype(np.uint8))
             self._mean = self.device.empty(4 * pixels.rows * pixels.columns)
             self._pixels = pixels
 
     def _reach(self, probe_to_ras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """First and one past the last voxel of the box around the imaged field, within the grid."""
+        """First and one past the last voxel of the bounding box of the imaged field, within the grid."""
         index = _outline(self.probe, self.grid.ras_to_ijk @ probe_to_ras)
         low = np.clip(np.floor(index.min(axis=0)).astype(int) - 1, 0, self._size)
         return low, np.maximum(np.clip(np.ceil(index.max(axis=0)).astype(int) + 2, 0, self._size), low)
 
     def _widest_gap_mm(self) -> float:
-        """How far any point of the field moves between neighbouring images at most."""
+        """Largest displacement of a point of the field between neighbouring images."""
         places = [_outline(self.probe, pose) for pose in self._poses]
         return max((float(np.linalg.norm(b - a, axis=1).max()) for a, b in itertools.pairwise(places)), default=0.0)
 
@@ -159,17 +159,17 @@ def _int4(values) -> np.ndarray:
 
 
 def _outline(probe: Probe, matrix: np.ndarray) -> np.ndarray:
-    """(points, 3) outline of the imaged field, taken from the probe frame by a (4, 4) matrix."""
+    """(points, 3) outline of the imaged field, transformed from the probe frame by a (4, 4) matrix."""
     return probe.outline_mm() @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _filled(values: np.ndarray, known: np.ndarray, hole_voxels: np.ndarray) -> np.ndarray:
     """`values` with gaps up to `hole_voxels` (k, j, i) wide filled by normalised convolution from their borders.
 
-    What is a gap is found by closing the known region with an ellipsoid of that size; beyond its outline stays empty.
+    Gaps are found by closing the known region with an ellipsoid of this size; the outside stays empty.
     """
     pad = [int(np.ceil(h / 2)) + 1 for h in hole_voxels]
-    sampling = 2.0 / np.maximum(hole_voxels, 1e-3)  # distances in half holes
+    sampling = 2.0 / np.maximum(hole_voxels, 1e-3)  # distances in units of half a hole
     around = np.pad(known, [(p, p) for p in pad])
     around = _distance_to(around, sampling) <= 1.0 + 1e-4
     around = _distance_to(~around, sampling) > 1.0 + 1e-4
@@ -188,7 +188,7 @@ def _filled(values: np.ndarray, known: np.ndarray, hole_voxels: np.ndarray) -> n
 
 
 def _distance_to(places: np.ndarray, sampling: np.ndarray) -> np.ndarray:
-    """Distance of every voxel (k, j, i) to the nearest of `places`, 0 there; voxels are `sampling` apart."""
+    """Distance of every voxel (k, j, i) to the nearest of `places`; the voxel spacing is `sampling`."""
     import SimpleITK as sitk  # on all cores: four times as fast as scipy's
 
     image = sitk.GetImageFromArray(places.astype(np.uint8))

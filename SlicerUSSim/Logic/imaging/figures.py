@@ -1,4 +1,4 @@
-"""Pictures of what a probe sees: MRI, labels and B-mode in the probe's plane, with a millimetre scale."""
+"""Figures of MRI, labels and B-mode in the image plane, with a millimetre scale."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ def draw_views(
     bounds_mm: tuple[float, float, float, float],
     tissue_names: tuple[str, ...] = (),
 ) -> None:
-    """Write a PNG with the given views side by side; whole or not at all.
+    """Write a PNG with the given views side by side; on failure an existing file is kept.
 
     Parameters
     ----------
     views : (title, image (rows, columns), kind) with kind "mri", "labels" or "bmode".
     bounds_mm : (left, right, top, bottom) of all of them in the probe frame.
-    tissue_names : of labels 1, 2, ...; their colours, and the legend beside labels.
+    tissue_names : of labels 1, 2, ...; for their colours and the legend.
 
-    Raises SimulationError without matplotlib and for an unwritable path.
+    Raises SimulationError without matplotlib and if the file cannot be written.
     """
     require_matplotlib()
     from matplotlib import patches
@@ -75,7 +75,7 @@ def draw_views(
 
 
 def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
-    """Write a (rows, columns) uint8 image as it is; whole or not at all."""
+    """Write a (rows, columns) uint8 image unchanged; on failure an existing file is kept."""
     from PIL import Image
 
     with written_whole(path) as partial:
@@ -86,12 +86,12 @@ def _scale_bar(axis, right: float, bottom: float) -> None:
     from matplotlib.patheffects import withStroke
 
     y = 0.96 * bottom
-    outline = [withStroke(linewidth=4.5, foreground="black")]  # readable on bright tissue too
+    outline = [withStroke(linewidth=4.5, foreground="black")]  # for readability on bright tissue
     axis.plot([right - 13.0, right - 3.0], [y, y], color="white", linewidth=2.5, path_effects=outline)
     axis.text(right - 8.0, y - 1.0, "10 mm", color="white", fontsize=7, ha="center", va="bottom", path_effects=outline)
 
 
 def require_matplotlib() -> None:
-    """Raise SimulationError, saying what to install, if there is no matplotlib."""
+    """Raise SimulationError with the package to install if matplotlib is missing."""
     if importlib.util.find_spec("matplotlib") is None:
         raise SimulationError('figures need matplotlib; install it with: pip install "SlicerUSSim[demo]"')

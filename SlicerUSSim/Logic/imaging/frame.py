@@ -1,4 +1,4 @@
-"""Frame: one simulated image with its geometry and the signals it was made from."""
+"""Frame: one simulated image with its geometry and signals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One simulated image with its geometry and the signals it was made from."""
+    """One simulated image with its geometry and the signals from which it was computed."""
 
     #: (scan_lines, samples) complex64 baseband (I/Q) signal before noise and TGC
     iq: np.ndarray = field(repr=False)
@@ -35,7 +35,7 @@ class Frame:
 
     @cached_property
     def rf(self) -> np.ndarray:
-        """(scan_lines, samples) complex64 analytic RF signal; its real part is what an A/D converter would see."""
+        """(scan_lines, samples) complex64 analytic RF signal; its real part is the sampled echo signal."""
         depth = np.arange(self.iq.shape[1]) * self.sample_interval_mm
         return self.iq * np.exp(2j * np.pi * self.cycles_per_mm * depth).astype(np.complex64)
 
@@ -50,7 +50,7 @@ class Frame:
         return self.grid.image_to_probe
 
     def to_volume(self) -> Volume:
-        """The image as a Volume of one slice in patient space; the slice is as thick as a pixel is high."""
+        """The image as a Volume of one slice in patient space; the slice thickness is the pixel height."""
         return Volume(self.image[None], self.probe_to_ras @ self.grid.slice_to_probe)
 
     def to_vtk(self):

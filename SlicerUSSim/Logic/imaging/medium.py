@@ -1,10 +1,10 @@
-"""The acoustic medium as the device sees it: labels, membrane, smoothed borders and tissue numbers in buffers.
+"""The acoustic medium on the device: buffers with labels, membrane, smoothed borders and tissue parameters.
 
-A voxel takes two bytes. The low byte holds the label and flags for cells (the cube between eight voxel centres) whose
-corners agree, so that most look-ups need one load. The high byte holds the *fluid distance*: how far inside the
-membrane's fluids the voxel lies. It comes from their indicator, smoothed by a Gaussian: a planar border at distance d
-smooths to Phi(d / sigma), so d = sigma Phi^-1 of it. Linear between voxels, it places a layer thinner than a voxel
-without stairs.
+A voxel has two bytes. The low byte has the label and flags for cells (the cube between eight voxel centres) whose
+corners agree, so that most look-ups need one load. The high byte has the *fluid distance* of the voxel from the border
+of the membrane's fluids, positive inside. It is computed from their indicator, smoothed by a Gaussian: for a planar
+border at distance d this is Phi(d / sigma), so d = sigma Phi^-1 of it. With linear interpolation between voxels, a
+layer thinner than a voxel is located without steps.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_FARTHEST_SIGMAS = 2.2  # where the stored distance ends
-# Smoothed indicators take two bytes a voxel and group: so many groups, so many voxels in all; but always two groups.
+_FARTHEST_SIGMAS = 2.2  # limit of the stored distance
+# Smoothed indicators need two bytes per voxel and group. Limits of groups and of all values; at least two groups.
 _MOST_SMOOTHED_GROUPS = 6
 _SMOOTHED_VOXELS = 100_000_000
 _TISSUE_ATTRIBUTES = tuple(name for name in TISSUE.names or () if name != "group")
-_PAD = 1  # one voxel of coupling medium around the volume, so that a clamped look-up outside finds it
+_PAD = 1  # one voxel of coupling medium around the volume, for clamped look-ups outside
 
 
 class Medium:
@@ -44,7 +44,7 @@ class Medium:
     ----------
     labels : Volume of whole numbers; 0 is the coupling medium.
     tissues : a Tissue for every label that occurs.
-    texture : (k, j, i) uint32 of Texture.packed, if scatterers shall know more than labels.
+    texture : (k, j, i) uint32 of Texture.packed, if scatterers depend on more than labels.
 
     Raises SimulationError for labels that are not whole numbers or have no tissue.
     """
@@ -64,11 +64,11 @@ class Medium:
         self.voxel_buffer: Buffer
         self.group_buffer: Buffer
         self.smooth_buffer: Buffer
-        #: How many groups have a smoothed indicator
+        #: Number of groups with a smoothed indicator
         self.smooth_groups: int
         #: Half the membrane in the unit of the fluid distance; negative: none
         self.membrane_reach: float
-        #: layout.TISSUE per label, as the device has it
+        #: layout.TISSUE per label, as on the device
         self.rows = self._tissue_rows(tissues)
         self._upload(padded, tissues)
         self._upload_groups(padded)
@@ -96,21 +96,21 @@ class Medium:
         return matrix
 
     def packed_texture(self) -> np.ndarray | None:
-        """(k, j, i) uint32 with a margin, the texture as the device has it; None without one."""
+        """(k, j, i) uint32 with a margin, the texture as on the device; None without one."""
         if not self.has_texture:
             return None
         return self.device.download(self.texture_buffer, tuple(self.dims[::-1]), np.uint32)
 
     def set_tissues(self, tissues: TissueTable) -> None:
-        """Change tissue parameters; voxels are touched only if the membrane's place or the acoustic groups change."""
+        """Change tissue parameters; voxels are uploaded only for a new membrane position or new acoustic groups."""
         self._check(tissues)
         if _membrane_shape(tissues) != _membrane_shape(self.tissues):
-            _log.debug("the membrane is another one: voxels are uploaded again")
+            _log.debug("the membrane has changed: voxels are uploaded again")
             self._upload(np.pad(as_labels(self.labels.array), _PAD), tissues)
         groups_before = self.rows["group"]
         self.rows = self._tissue_rows(tissues)
         if not np.array_equal(self.rows["group"], groups_before):
-            _log.debug("the acoustic groups are others: voxels are uploaded again")
+            _log.debug("the acoustic groups have changed: voxels are uploaded again")
             self._upload_groups(np.pad(as_labels(self.labels.array), _PAD))
         self.device.write(self.tissue_buffer, self.rows)
         self.version += 1
@@ -124,7 +124,7 @@ class Medium:
         )
 
     def _tissue_rows(self, tissues: TissueTable) -> np.ndarray:
-        """layout.TISSUE per label. Acoustic groups are numbered from the most frequent tissue on: those get a smoothed
+        """layout.TISSUE per label. Acoustic groups are numbered by decreasing frequency; the first ones have a smoothed
         indicator."""
         rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
         members = {int(label): tissues[label] for label in self.present} | dict(tissues)
@@ -151,15 +151,15 @@ class Medium:
         self.voxel_buffer = self.device.upload(words)
 
     def _upload_groups(self, padded: np.ndarray) -> None:
-        """The acoustic group of every voxel, and smoothed indicators of the first groups: on flat interfaces they know
-        normals best."""
+        """The acoustic group of every voxel, and smoothed indicators of the first groups, which give the most accurate
+        normals on flat interfaces."""
         group_of = self.rows["group"].astype(np.uint8)
         group = group_of[padded]
         lowest, highest = _cell_extremes(group)
         words = group | np.uint8(CONSTANTS["SAME_GROUP"]) * (lowest == highest)
-        # Rows are read eight voxels at a time, the last one too.
+        # Rows are read eight voxels at a time, including the last one.
         self.group_buffer = self.device.upload(np.pad(words.ravel(), (0, 8)))
-        # The coupling medium lies around the volume even where its label does not occur.
+        # The coupling medium surrounds the volume even if its label does not occur.
         groups = {int(group_of[label]) for label in (0, *self.present)}
         room = max(_SMOOTHED_VOXELS // padded.size, 2)
         self.smooth_groups = min(max(groups) + 1, _MOST_SMOOTHED_GROUPS, room)
@@ -175,7 +175,7 @@ class Medium:
         if is_fluid.all() or not is_fluid.any():
             return None, -1.0
         spacing = self.labels.spacing_mm[::-1]
-        # Wide enough to hide the voxels' stairs, narrow enough to keep a sulcus of two voxels open.
+        # Wide enough to smooth the steps between voxels, narrow enough to keep a sulcus of two voxels open.
         sigma_mm = 0.75 * float(np.cbrt(spacing.prod()))
         thickest = 2.0 * _FARTHEST_SIGMAS * sigma_mm
         require(
@@ -184,7 +184,7 @@ class Medium:
             "size; label thicker layers in the label map",
         )
         smooth = ndimage.gaussian_filter(is_fluid.astype(np.float32), sigma_mm / spacing, mode="nearest", truncate=3.0)
-        # Phi^-1 by a table: the argument has no more than this many different values worth telling apart.
+        # Phi^-1 by a table, whose size is sufficient for the resolution of the argument.
         share = np.linspace(0.0, 1.0, 4096)
         sigmas = np.clip(special.ndtri(share), -_FARTHEST_SIGMAS, _FARTHEST_SIGMAS)
         unit = 127.5 / _FARTHEST_SIGMAS
@@ -203,12 +203,12 @@ def as_labels(array: np.ndarray) -> np.ndarray:
         low, high = (array.min(), array.max()) if array.size else (0, 0)
         require(
             bool(np.isfinite(low) and np.isfinite(high)) and low >= 0 and high <= MAX_LABEL,
-            f"label map holds values from {low} to {high}, expected whole numbers from 0 to {MAX_LABEL}",
+            f"label map has values from {low} to {high}, expected whole numbers from 0 to {MAX_LABEL}",
         )
         labels = array.astype(np.uint8)
         if not np.array_equal(labels, array):
-            raise SimulationError("label map holds fractions, expected whole numbers; segment the MRI first")
-    require(int(labels.max()) <= MAX_LABEL, f"label map holds label {labels.max()}, expected 0 to {MAX_LABEL}")
+            raise SimulationError("label map has fractions, expected whole numbers; segment the MRI first")
+    require(int(labels.max()) <= MAX_LABEL, f"label map has label {labels.max()}, expected 0 to {MAX_LABEL}")
     return labels
 
 
@@ -220,7 +220,7 @@ def _cell_extremes(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         there = [slice(None)] * 3
         here[axis], there[axis] = slice(0, -1), slice(1, None)
         here, there = tuple(here), tuple(there)
-        # In-place with ascending memory order: `there` still holds its old value when `here` is written.
+        # In place, in ascending memory order: `there` still has its old value when `here` is written.
         lowest[here] = np.minimum(lowest[here], lowest[there])
         highest[here] = np.maximum(highest[here], highest[there])
     return lowest, highest

@@ -1,8 +1,8 @@
-"""Amplifier noise: which draw of it an image has.
+"""Seeds of the amplifier noise of images.
 
-A scanner's noise is another in every image. Here it follows from the settings' seed and a number, `noise_seed`, so that
-an image can be had again: the images of a sweep are numbered, what follows a probe takes the number from its pose
-(seed_of_pose), and a fit keeps to 0 throughout, so that its cost is a function.
+A scanner's noise differs between images. Here it is a function of the settings' seed and a number, `noise_seed`, so
+that images are reproducible: it is the image's number in a sweep, a function of the pose for a live probe
+(seed_of_pose), and 0 throughout a fit, so that the cost is deterministic.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.transforms import check_affine
 
-#: What counts as the same pose: steps of the axes' coordinates and of the origin [mm]. They begin off the numbers that
-#: people and programs like, or the last digit of such a pose would decide between two steps.
+#: Steps for rounding the axes' coordinates and the origin [mm]. They are offset from round numbers, so that rounding
+#: errors of poses with round numbers do not change the step.
 _AXES_STEP, _ORIGIN_STEP_MM, _BEGINNING = 1e-4, 1e-2, 0.381966
 
 
 def seed_of_pose(probe_to_ras: np.ndarray) -> int:
-    """The `noise_seed` of the image at a pose (4, 4): the same at the same pose, and another at another.
+    """The `noise_seed` of the image at a pose (4, 4), different for different poses.
 
-    Poses are the same to a hundredth of a millimetre and 0.1 mrad, far more than the rounding of a product of parent
-    transforms. Raises SimulationError for a matrix that is not affine.
+    Poses that agree within 0.01 mm and 0.1 mrad are considered equal, which is much more than the rounding errors of
+    products of parent transforms. Raises SimulationError for a matrix that is not affine.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic import seed_of_pose
@@ -40,7 +40,7 @@ def seed_of_pose(probe_to_ras: np.ndarray) -> int:
 
 
 def noise_key(acquisition: np.ndarray, noise_seed: int) -> int:
-    """What starts the hash of the noise: it has nothing in common with that of the scatterers, nor with other draws'.
+    """Initial value of the noise's hash, independent of that of the scatterers and of other noise seeds.
 
     Raises SimulationError for a noise_seed that is not a whole number of 32 bits.
     """
@@ -52,7 +52,7 @@ def noise_key(acquisition: np.ndarray, noise_seed: int) -> int:
 
 
 def stirred(number: int) -> int:
-    """32 bits of which each depends on all of the number's (the kernels' hash_mix); 0 stays 0."""
+    """A hash of 32 bits, each of which depends on all bits of the number (the kernels' hash_mix); 0 stays 0."""
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
         number = ((number ^ (number >> shift)) * factor) % 2**32
     return number ^ (number >> 16)

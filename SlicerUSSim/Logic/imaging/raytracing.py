@@ -1,4 +1,4 @@
-"""Host side of kernels/raytracing.cl: the ray tree of every scan line."""
+"""Host code of kernels/raytracing.cl: the ray tree of every scan line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 # Operations counted in the kernel
-_PER_STEP = 35  # a look-up on the way: position, beam offset, clamp, index
+_PER_STEP = 35  # a look-up along the ray: position, beam offset, clamp, index
 _PER_BORDER = 5 * 60 + 12 * 15 + 49 * 8 * 10  # bisection; stencil of 12 rows; 7 x 7 rows of eight voxels
 _BORDER_BYTES = 12 * 4 * 2 * 2 + 49 * 8  # the stencil's rows of two smoothed indicators; the voxels' groups
 
@@ -38,7 +38,7 @@ class RayTracer(Stage):
         # What these keys stand for
         self._quantiles: Buffer
         self._roots: Buffer
-        #: (traced lines, elevational rays) of the frame traced last, its record and its tree
+        #: (traced lines, elevational rays) of the last traced frame, its record and its tree
         self.shape: tuple[int, int]
         self._acquisition: np.ndarray
         self._tree: TreeBuffers
@@ -92,7 +92,7 @@ class RayTracer(Stage):
         )
 
     def download(self) -> RayTree:
-        """The tree of the frame traced last."""
+        """The tree of the last traced frame."""
         (traced, rays), tree, download = self.shape, self._tree, self.device.download
         segments = download(tree.segments, (traced, CONSTANTS["MAX_SEGMENTS"]), SEGMENT)
         kept = np.arange(CONSTANTS["MAX_SEGMENTS"]) < download(tree.segment_counts, traced, np.int32)[:, None]
@@ -109,18 +109,18 @@ class RayTracer(Stage):
         )
 
     def _place(self, line: np.ndarray) -> np.ndarray:
-        """Where traced lines lie among the scan lines."""
+        """Positions of traced lines among the scan lines."""
         return (line - float(self._acquisition["guard_lines"])) / float(self._acquisition["lateral_rays"])
 
     def overflown_lines(self) -> int:
-        """How many traced lines since the last call had more segments than there is room for."""
+        """Number of traced lines since the last call with more segments than the buffer can hold."""
         lines = int(self.device.download(self._overflown, 1, np.int32)[0])
         if lines:
             self.device.write(self._overflown, np.zeros(1, np.int32))
         return lines
 
 
-#: What places the traced lines in the probe frame
+#: Fields that determine the traced lines in the probe frame
 _ARRAY_FIELDS = (
     "linear", "apex_radius_mm", "first_line", "line_spacing", "lateral_rays", "guard_lines", "traced_lines"
 )  # fmt: skip
@@ -129,7 +129,7 @@ _ARRAY_FIELDS = (
 def line_roots(acquisition: np.ndarray) -> np.ndarray:
     """(traced lines, 4) float32: origin (x, y) and direction (x, y) of every traced line in the probe frame.
 
-    The guard lines go on beyond the edges of the array, so they are not lines that the probe knows.
+    They include the guard lines beyond the edges of the array, which are not lines of the probe.
     """
     line = np.arange(int(acquisition["traced_lines"])) - int(acquisition["guard_lines"])
     position = float(acquisition["first_line"]) + float(acquisition["line_spacing"]) * line / int(
@@ -148,8 +148,8 @@ def line_roots(acquisition: np.ndarray) -> np.ndarray:
 def beam_quantiles(traced: int, rays: int) -> np.ndarray:
     """(traced, rays) float32 offsets in elevational sigmas: stratified quantiles of the beam profile.
 
-    Equal weights then reproduce the profile. Each line shifts the strata by a golden-ratio sequence, so that an
-    interface tilted in elevation does not show as `rays` separate lines but as the band its time differences make.
+    Equal weights then reproduce the profile. Each line shifts the quantiles by a golden-ratio sequence, so that an
+    interface tilted in elevation appears as a band and not as `rays` separate lines.
     """
     shift = np.mod(0.5 + np.arange(traced) * 0.6180339887498949, 1.0)
     share = (np.arange(rays)[None, :] + 0.05 + 0.9 * shift[:, None]) / rays

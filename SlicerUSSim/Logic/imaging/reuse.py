@@ -1,4 +1,4 @@
-"""A simulator for inputs that change one at a time, as those of a pipeline and of a scene do."""
+"""A simulator for inputs that change one at a time, as in a pipeline or a scene."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 
 class ReusedSimulator:
-    """Keeps an UltrasoundSimulator and builds it anew only where the voxels on the device have to change."""
+    """Keeps an UltrasoundSimulator and rebuilds it only if the voxels on the device must change."""
 
     def __init__(self) -> None:
         self._simulator: UltrasoundSimulator | None = None
@@ -31,11 +31,11 @@ class ReusedSimulator:
         device: DeviceChoice = None,
         texture: Texture | None = None,
     ) -> UltrasoundSimulator:
-        """A simulator for these inputs; voxels count as the same for as long as `labels_version` is the same.
+        """A simulator for these inputs; voxels are considered equal as long as `labels_version` is equal.
 
-        Raises SimulationError as UltrasoundSimulator does; the next call then starts from nothing.
+        Raises SimulationError as UltrasoundSimulator does; the next call then builds a new simulator.
         """
-        # Only how scatterers use the texture concerns what is on the device; other settings count per frame.
+        # Of the settings, only the use of the texture affects data on the device; others apply per frame.
         wanted = (labels_version, texture, device, settings.partial_volume, settings.mri_modulation_db)
         if self._simulator is None or self._built_for != wanted:
             _log.debug("a simulator is built: %s", "the first" if self._built_for is None else self._changed(wanted))
@@ -53,5 +53,5 @@ class ReusedSimulator:
         return ", ".join(name for name, new, old in values if new != old) + " changed"
 
     def forget(self) -> None:
-        """Give the device's memory back."""
+        """Release the device's memory."""
         self._simulator = self._built_for = None

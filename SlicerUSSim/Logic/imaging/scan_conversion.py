@@ -1,4 +1,4 @@
-"""Host side of kernels/scan_conversion.cl: from scan lines to an image in the probe plane."""
+"""Host code of kernels/scan_conversion.cl: from scan lines to pixels in the image plane."""
 
 from __future__ import annotations
 

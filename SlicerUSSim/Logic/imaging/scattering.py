@@ -1,4 +1,4 @@
-"""Host side of kernels/scattering.cl, interfaces.cl and beam.cl: echoes as baseband impulses along every line."""
+"""Host code of kernels/scattering.cl, interfaces.cl and beam.cl: echoes as baseband impulses along every line."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from pyopencl import Buffer
 
 # Operations counted in the kernels
-_PER_CELL = 180  # a lattice cell that is looked at: three hashes, place, pulse phase, amplitude
-_PER_SCATTERER = 40  # one that counts: label, strength, four impulses
+_PER_CELL = 180  # per examined lattice cell: three hashes, position, pulse phase, amplitude
+_PER_SCATTERER = 40  # per contributing scatterer: label, amplitude, four impulses
 _PER_HIT = 40
-_PER_EDGE_PAIR = 16  # of the lateral beam, per sample
+_PER_EDGE_PAIR = 16  # for the lateral beam, per sample
 
 
 class Scatterers(Stage):
-    """Adds speckle: every scatterer beside every ray segment."""
+    """Adds speckle: the scatterers near every ray segment."""
 
     name = "scatterers"
 
@@ -32,7 +32,7 @@ class Scatterers(Stage):
         self.lines = EchoLines(device)
 
     def run(self, frame: DeviceFrame) -> None:
-        """Enqueue the speckle of one frame: its `traced` impulses, none if the settings want no scattering."""
+        """Enqueue the speckle of one frame: its `traced` impulses, zero if scattering is off."""
         frame.traced = self.lines
         self.lines.prepare(2 * int(frame.acquisition["traced_lines"]), frame.line_shape[1])  # two edges of each strip
         if frame.settings.scattering:
@@ -44,7 +44,7 @@ class Scatterers(Stage):
         """Enqueue the speckle of one frame; it overwrites `lines`.
 
         With `varied`, the device buffers of roles (MAX_TISSUES,) int32 and band tops (BANDS,) float32, it comes in
-        CONSTANTS["PARTS"] parts one after the other: see kernels/scattering.cl and appearance.py.
+        CONSTANTS["PARTS"] consecutive parts: see kernels/scattering.cl and appearance.py.
         """
         medium = frame.medium
         variant = (["TEXTURE"] if medium.has_texture else []) + (["VARIED"] if varied else [])
@@ -72,7 +72,7 @@ class Scatterers(Stage):
 
 
 class InterfaceEchoes(Stage):
-    """Adds the echoes of the interfaces that the elevational rays hit."""
+    """Adds the echoes of interfaces at the hits of the elevational rays."""
 
     name = "interfaces"
 
@@ -81,7 +81,7 @@ class InterfaceEchoes(Stage):
         self.kernel = device.kernels("interfaces.cl")["interface_echoes"]
 
     def run(self, frame: DeviceFrame) -> None:
-        """Enqueue the interface echoes of one frame, if the settings want them; they are added to `traced`."""
+        """Enqueue the interface echoes of one frame, unless they are off; they are added to `traced`."""
         if not frame.settings.interfaces:
             return
         self.device.run(
@@ -100,7 +100,7 @@ class InterfaceEchoes(Stage):
 
 
 class LateralBeam(Stage):
-    """Spreads the impulses of the traced lines over the scan lines, as the lateral beam profile says."""
+    """Distributes the impulses of the traced lines to the scan lines by the lateral beam profile."""
 
     name = "beam"
 
@@ -138,9 +138,9 @@ class LateralBeam(Stage):
 
 
 def scatterer_counts(frame: FrameInputs, segments: np.ndarray, chunk: int) -> tuple[float, float]:
-    """(scatterers inside the strips of all ray segments, lattice cells that have to be looked at for them).
+    """(number of scatterers inside the strips of all ray segments, number of lattice cells to examine for them).
 
-    `segments` are records of layout.SEGMENT, `chunk` the samples that one work-item fills.
+    `segments` are records of layout.SEGMENT, `chunk` the number of samples of a work-item.
     """
     acquisition, probe, settings = frame.acquisition, frame.probe, frame.settings
     ends = segments["path_mm"], segments["path_mm"] + segments["length_mm"]

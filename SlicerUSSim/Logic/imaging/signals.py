@@ -1,4 +1,4 @@
-"""What stages hand on: the ray tree, the impulses along every line."""
+"""Data passed between stages: the ray tree and the impulses along every line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TreeBuffers:
-    """The ray tree of one frame on the device: layout.SEGMENT and layout.HIT, and how many of each there are.
+    """The ray tree of one frame on the device: layout.SEGMENT and layout.HIT, with their counts.
 
     segments [traced line][MAX_SEGMENTS], segment_counts int32 [traced line], hits [traced line][ray][MAX_HITS],
     hit_counts int32 [traced line][ray], cut float32 [traced line][1 + elevational rays].
@@ -33,11 +33,11 @@ class TreeBuffers:
 class RayTree:
     """The tree of one frame, on the host.
 
-    segments : structured array (layout.SEGMENT) of every straight piece along the beam axes; `segment_line` (same
-        length) is its place among the scan lines: a fraction for a line traced between them, and outside
-        0..scan_lines - 1 for one beyond the edge of the field.
-    hits : structured array (layout.HIT) of every interface crossing of the elevational rays; `hit_line` is its place
-        among the scan lines and `hit_ray` its elevational ray.
+    segments : structured array (layout.SEGMENT) of all straight segments along the beam axes; `segment_line` (same
+        length) is the position among the scan lines: fractional for lines between them, and outside
+        0..scan_lines - 1 for lines beyond the edge of the field.
+    hits : structured array (layout.HIT) of all interface crossings of the elevational rays; `hit_line` is the position
+        among the scan lines and `hit_ray` the elevational ray.
     cut_weight : (traced lines, 1 + elevational rays) weight of the branches that were not followed.
     """
 
@@ -56,15 +56,15 @@ class EchoLines:
         self.device = device
         self.workspace = Workspace(device)
         self._shape: tuple[int, int] | None = None
-        # Of the frame that there is room for: see prepare
+        # Size of the allocated frame, see prepare
         self.re: Buffer
         self.im: Buffer
-        #: Samples from one line to the next, pads included
+        #: Samples from one line to the next, including pads
         self.stride: int
 
     def prepare(self, lines: int, samples: int) -> None:
-        """Make room for a frame. Kernels write every sample between the pads, so only a new shape is cleared."""
-        # An odd number of cache lines: the same sample of many lines then does not fall into the same few sets.
+        """Allocate a frame. Kernels write every sample between the pads, so only a new shape is cleared."""
+        # An odd number of cache lines avoids that the same sample of many lines maps to the same cache sets.
         self.stride = (samples + 2 * CONSTANTS["LINE_PAD"]) // 16 * 16 + 16
         self.stride += self.stride % 32 == 0 and 16
         nbytes = lines * self.stride * 4

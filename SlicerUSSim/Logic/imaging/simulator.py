@@ -1,4 +1,4 @@
-"""UltrasoundSimulator: the line from a label map and a pose to a B-mode image, one stage after the other."""
+"""UltrasoundSimulator: runs the stages from a label map and a pose to a B-mode image."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ StageKind = TypeVar("StageKind", bound=Stage)
 
 
 class EmptyViewWarning(UserWarning):
-    """The imaged field lies wholly outside the volume; the image is black."""
+    """The imaged field is completely outside the volume; the image is black."""
 
 
 class TreeOverflowWarning(UserWarning):
-    """Scan lines with more ray segments than there is room for lack the speckle of the last ones."""
+    """Scan lines have more ray segments than the buffer can hold; the speckle of the last ones is missing."""
 
 
 class UltrasoundSimulator:
@@ -54,14 +54,14 @@ class UltrasoundSimulator:
     ----------
     labels : Volume of tissue labels; 0 is the coupling medium around the patient.
     tissues : TissueTable with a tissue for every label.
-    settings : SimulationSettings. The attribute may be replaced between frames, by another seed say; only what concerns
-        the texture counts at construction.
+    settings : SimulationSettings. The attribute may be replaced between frames, for example by another seed; the
+        settings of the texture only apply at construction.
     device : see opencl.devices.choose_device.
-    texture : what the MRI knows beyond labels (Segmentation.texture, Texture.from_mri); looked at only if the settings'
-        partial_volume or mri_modulation_db ask for it.
+    texture : data from the MRI in addition to labels (Segmentation.texture, Texture.from_mri); used only with the
+        settings partial_volume or mri_modulation_db.
 
-    Raises SimulationError for labels without a tissue, settings that need a texture where there is none or it does not
-    fit, and where no device can be used.
+    Raises SimulationError for labels without a tissue, if a required texture is missing or has another shape, and if no
+    device can be used.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic import LinearProbe, TissueTable, UltrasoundSimulator, Volume
@@ -85,16 +85,16 @@ class UltrasoundSimulator:
         self.settings = settings or SimulationSettings()
         self.device = Device.get(device)
         self.medium = Medium(labels, tissues, self.device, _packed_texture(texture, labels, self.settings))
-        #: The stages of stages.py, from which the appearance model and those that verify take theirs
+        #: The stages of stages.py, also for the appearance model and verification
         self.impulse_stages = [stage(self.device) for stage in stages.IMPULSE_STAGES]
         self.linear_stages = [stage(self.device) for stage in stages.LINEAR_STAGES]
         self.display_stages = [stage(self.device) for stage in stages.DISPLAY_STAGES]
         self.tracer = self.stage(RayTracer)
         self._acquisition_buffer = self.device.empty(ACQUISITION.itemsize)
-        # The baseband signal of the last frame, and what it was made for
+        # The baseband signal of the last frame, and its inputs
         self._iq: Buffer
         self._iq_made_for: tuple | None = None
-        #: Measure every stage (Frame.timings_ms); each stage is then computed and waited for.
+        #: Measure every stage (Frame.timings_ms); the host then waits for each stage.
         self.profiling = False
 
     def simulate(
@@ -106,12 +106,12 @@ class UltrasoundSimulator:
         *,
         noise_seed: int = 0,
     ) -> Frame:
-        """The image that `probe` sees at the pose `probe_to_ras` (4, 4).
+        """The image of `probe` at the pose `probe_to_ras` (4, 4).
 
-        `grid` are its pixels, those of a real image to compare with, say; by default they just hold the imaged field,
-        as many as display.image_size says. `noise_seed` says which draw of the amplifier noise it has (noise.py): 0 is
-        that of the settings' seed alone, seed_of_pose(probe_to_ras) one for this pose.
-        Warns with EmptyViewWarning (and gives a black image) if the field misses the volume.
+        `grid` gives the pixels, for example those of a real image; by default they cover the bounding box of the imaged
+        field, with display.image_size pixels. `noise_seed` selects the amplifier noise (noise.py): 0 depends only on
+        the settings' seed, seed_of_pose(probe_to_ras) also on the pose.
+        Warns with EmptyViewWarning and returns a black image if the field is outside the volume.
         Raises SimulationError for a pose that is not rigid and a noise_seed that is not a whole number of 32 bits.
         """
         display = display or DisplaySettings()
@@ -150,14 +150,14 @@ class UltrasoundSimulator:
     ) -> Buffer:
         """Enqueue all stages of one frame; returns the device buffer of its image, which the next frame overwrites.
 
-        Where only the display, the noise or the pixels have changed since the last frame, its echoes are used again.
+        If only the display, the noise or the pixels have changed since the last frame, its echoes are reused.
         """
         return self._rendered(probe, pose, display, grid, {} if timings is None else timings, noise_seed).image
 
     def forget_echoes(self) -> None:
-        """Have the next frame computed from its rays on, though nothing may have changed.
+        """Recompute the rays and echoes of the next frame, even if nothing has changed.
 
-        For measurements, and after the stages were run from outside: their buffers then hold another frame.
+        For measurements, and after the stages were run from outside, since their buffers then have another frame.
         """
         self._iq_made_for = None
 
@@ -172,7 +172,7 @@ class UltrasoundSimulator:
     ) -> DeviceFrame:
         with self._timed("upload", timings):
             frame = self.device_frame(probe, pose, display, grid, noise_seed, self._acquisition_buffer)
-        # Up to the baseband signal nothing depends on display, noise or pixels.
+        # The baseband signal does not depend on display, noise or pixels.
         inputs = (frame.acquisition.tobytes(), self.settings, self.medium.version)
         if self.profiling or self._iq_made_for != inputs:
             _log.debug("frame: rays and echoes computed")
@@ -180,7 +180,7 @@ class UltrasoundSimulator:
             self._run([*self.impulse_stages, *self.linear_stages], frame, timings)
             self._iq, self._iq_made_for = frame.iq, inputs
         else:
-            _log.debug("frame: the echoes of the last one used again")
+            _log.debug("frame: the echoes of the last frame are reused")
         frame.iq = self._iq
         self._run(self.display_stages, frame, timings)
         return frame
@@ -192,16 +192,16 @@ class UltrasoundSimulator:
 
     @property
     def stages(self) -> list[Stage]:
-        """All stages in their order."""
+        """All stages, in order."""
         return [*self.impulse_stages, *self.linear_stages, *self.display_stages]
 
     def stage(self, kind: type[StageKind]) -> StageKind:
-        """The stage of one class, such as scattering.Scatterers. Raises SimulationError if the lists lack it."""
+        """The stage of a class, such as scattering.Scatterers. Raises SimulationError if no list has it."""
         found = next((stage for stage in self.stages if isinstance(stage, kind)), None)
         return required(found, f"no stage is a {kind.__name__}, see imaging/stages.py")
 
     def trace(self, probe: Probe, probe_to_ras: np.ndarray) -> RayTree:
-        """The ray tree alone, on the host: segments along the beam axes and interface hits."""
+        """The ray tree, on the host: segments along the beam axes and interface hits."""
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self.tracer.run(self.device_frame(probe, pose, buffer=self._acquisition_buffer))
         return self.tracer.download()
@@ -213,9 +213,9 @@ class UltrasoundSimulator:
         display: DisplaySettings | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> Iterator[Frame]:
-        """One Frame per pose, as they are computed; `progress` is told how many are done.
+        """Yields one Frame per pose; `progress` is called with the number done.
 
-        Each has noise of its own: its number, from 0, is its noise_seed.
+        Their noise differs: the noise_seed is the frame's number, from 0.
         """
         for number, pose in enumerate(poses):
             yield self.simulate(probe, pose, display, noise_seed=number)
@@ -235,9 +235,9 @@ class UltrasoundSimulator:
     ) -> Volume:
         """A 3D image: the sweep over `poses` (regular or freehand), compounded in patient space, holes filled.
 
-        `like` gives the grid (the MRI, say); without it the grid lies along the patient's axes with `spacing_mm`.
-        `hole_mm` is how wide a gap between images is filled (default: as wide as the sweep's widest, 10 mm at most).
-        The grey levels are uint8; where no image came near, 0. The images have the noise that sweep() gives them.
+        `like` gives the grid, for example the MRI; without it the grid is along the patient's axes with `spacing_mm`.
+        Gaps between images are filled up to a width of `hole_mm` (default: the widest gap of the sweep, at most 10 mm).
+        The grey levels are uint8, and 0 without an image nearby. The noise of the images is as in sweep().
         Raises SimulationError as sweep_grid and Compounder do.
 
         >>> import numpy as np
@@ -266,7 +266,7 @@ class UltrasoundSimulator:
             self._warn_if_empty(probe, pose)
             image = self.render(probe, pose, display, pixels, noise_seed=number)
             compounder.add_buffer(image, pixels, pose)
-            # One image is prepared while the device computes the one before, and no more than one.
+            # One image is prepared while the device computes the previous one, and no more than one.
             done = self.device.mark()
             if before is not None:
                 before.wait()
@@ -277,12 +277,12 @@ class UltrasoundSimulator:
         return compounder.volume(hole_mm)
 
     def set_tissues(self, tissues: TissueTable) -> None:
-        """Change tissue parameters without building the medium anew."""
+        """Change tissue parameters without rebuilding the medium."""
         self.medium.set_tissues(tissues)
 
     @contextmanager
     def with_tissues(self, tissues: TissueTable) -> Iterator[None]:
-        """Simulate with other tissues for as long as the block lasts."""
+        """Simulate with other tissues within the block."""
         before = self.medium.tissues
         try:
             self.set_tissues(tissues)
@@ -301,7 +301,7 @@ class UltrasoundSimulator:
         noise_seed: int = 0,
         buffer: Buffer | None = None,
     ) -> DeviceFrame:
-        """What the stages of one frame start from; its record goes to `buffer`, by default a new one."""
+        """The inputs of the stages of one frame; its record is written to `buffer`, by default a new one."""
         display = display or DisplaySettings()
         frame = DeviceFrame(
             probe=probe,
@@ -318,7 +318,7 @@ class UltrasoundSimulator:
         return frame
 
     def acquisition(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
-        """The record (layout.ACQUISITION) of what the stages need to know of one frame."""
+        """The record (layout.ACQUISITION) of the constants of one frame."""
         settings, medium = self.settings, self.medium
         block = CONSTANTS["BLOCK"]
         transmit, elevation = probe.transmit_waist(), probe.elevation_waist()
@@ -361,7 +361,7 @@ class UltrasoundSimulator:
         return probe.cycles_per_mm * NOMINAL_SPEED_M_S / self.settings.reference_speed_m_s
 
     def axial_sigma_mm(self, probe: Probe) -> float:
-        """Standard deviation of the pulse in depth as the scanner reckons it, millimetres."""
+        """Standard deviation of the pulse in depth, millimetres, with the scanner's speed of sound."""
         return probe.axial_sigma_mm * self.settings.reference_speed_m_s / NOMINAL_SPEED_M_S
 
     def _sample_mm(self, probe: Probe) -> float:
@@ -371,7 +371,7 @@ class UltrasoundSimulator:
         return int(np.ceil(probe.depth_mm / self._sample_mm(probe)))
 
     def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
-        """The box around the imaged field, in voxels, has to meet the volume."""
+        """Warn if the bounding box of the imaged field, in voxels, does not intersect the volume."""
         left, right, top, bottom = probe.image_bounds_mm()
         corners = np.array([[x, y, 0.0, 1.0] for x in (left, right) for y in (top, bottom)])
         voxels = (self.medium.labels.ras_to_ijk @ pose @ corners.T)[:3]
@@ -381,10 +381,10 @@ class UltrasoundSimulator:
 
     def _warn_if_overflown(self, frames: int = 1) -> None:
         lines, traced = self.tracer.overflown_lines(), frames * self.tracer.shape[0]
-        if lines > 0.01 * traced:  # a single chaotic line is lost among its neighbours
+        if lines > 0.01 * traced:  # a single chaotic line is not noticeable
             warnings.warn(
                 f"{lines} of {traced} traced lines have more than {CONSTANTS['MAX_SEGMENTS']} ray segments, "
-                "the last are left out; raise reflection_threshold or lower max_ray_depth",
+                "the last are ignored; raise reflection_threshold or lower max_ray_depth",
                 TreeOverflowWarning,
                 stacklevel=3,
             )
@@ -401,13 +401,13 @@ class UltrasoundSimulator:
 
 
 def _packed_texture(texture: Texture | None, labels: Volume, settings: SimulationSettings) -> np.ndarray | None:
-    """The texture as the device reads it, or None if the settings ask for none."""
+    """The texture in the device's format, or None if the settings do not require it."""
     if not settings.needs_texture:
         return None
     texture = required(
         texture,
         f"partial_volume {settings.partial_volume}, mri_modulation_db {settings.mri_modulation_db:g} need a texture; "
-        "pass segmentation.texture(), or Texture.from_mri(mri, labels) for a label map of your own",
+        "pass segmentation.texture(), or Texture.from_mri(mri, labels) for your own label map",
     )
     require(
         texture.deviation.shape == labels.array.shape,
@@ -417,16 +417,16 @@ def _packed_texture(texture: Texture | None, labels: Volume, settings: Simulatio
 
 
 def _mixed(seed: int) -> int:
-    """The seed with all its bits stirred, so that neighbouring seeds have nothing in common."""
+    """A hash of the seed, so that neighbouring seeds are independent."""
     return stirred(seed) ^ 0x2545F491
 
 
 def _traced_lines_for(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
     """(traced lines per scan line, traced lines beyond either edge of the field).
 
-    Traced lines are at most 1.5 lateral beam sigmas apart at any depth, so that sums over them are integrals; those
-    beyond the edge give the outermost scan lines the other half of their beam (where it is no wider than 16 lines,
-    that is everywhere but next to the apex of a phased array).
+    Traced lines are at most 1.5 lateral beam sigmas apart at any depth, so that sums over them approximate integrals.
+    Those beyond the edge provide the other half of the beam for the outermost scan lines (if it is at most 16 lines
+    wide, which is not the case only near the apex of a phased array).
     """
     depth = np.linspace(0.0, probe.depth_mm, 65)
     sigmas = probe.line_distance_mm(depth) / probe.beam_sigma_mm(depth)[0]

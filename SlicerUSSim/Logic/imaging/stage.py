@@ -1,8 +1,8 @@
-"""What a stage is, and the frame in the making that stages work on.
+"""Stage, and the frames under computation on which stages work.
 
 A new *display* stage, which changes grey levels or pixels but not echoes, is one class and one line: a Stage with
 `run`, `work` and `on_host`, and its place in stages.DISPLAY_STAGES. Simulator, appearance model, benchmark and numpy
-model take it from there. What a user can choose about it is a field of DisplaySettings, read from `frame.display`.
+model use this list. Its user settings are fields of DisplaySettings, read from `frame.display`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
-#: Bytes of a complex float32 sample, as Stage.work counts them
+#: Bytes of a complex float32 sample, for Stage.work
 SAMPLE_BYTES = 8
 
 
 @dataclass(frozen=True)
 class Work:
-    """What has to be done: bytes to and from memory, each once; floating-point and integer operations."""
+    """The minimum work: bytes to and from memory, each once; floating-point and integer operations."""
 
     bytes: float
     operations: float
@@ -37,17 +37,17 @@ class Work:
 
 @dataclass(eq=False)
 class FrameInputs:
-    """What is given to the stages of one frame."""
+    """Inputs of the stages of one frame."""
 
     probe: Probe
     settings: SimulationSettings
     #: layout.ACQUISITION record
     acquisition: np.ndarray
-    #: Standard deviation of the pulse in depth as the scanner reckons it
+    #: Standard deviation of the pulse in depth, with the scanner's speed of sound
     axial_sigma_mm: float
     display: DisplaySettings
     grid: ImageGrid
-    #: Which draw of the amplifier noise (noise.py)
+    #: Seed of the amplifier noise (noise.py)
     noise_seed: int
 
     @property
@@ -58,10 +58,10 @@ class FrameInputs:
 
 @dataclass(eq=False)
 class DeviceFrame(FrameInputs):
-    """A frame in the making on the device: its inputs, and what its stages hand on.
+    """A frame under computation on the device: its inputs, and the signals passed between stages.
 
-    A stage reads what is there and puts buffers of its own in place: it leaves those that it read as they are, since
-    frames of which only the display changed begin again with `iq`.
+    A stage replaces signals by its own buffers and does not change those that it reads, since frames of which only the
+    display has changed start again from `iq`.
     """
 
     acquisition_buffer: Buffer
@@ -92,7 +92,7 @@ _SIGNAL_TYPES = {"iq": np.complex64, "envelope": np.float32, "grey": np.uint8, "
 
 @dataclass(eq=False)
 class HostFrame(FrameInputs):
-    """The same on the host, in numpy, for Stage.on_host. A stage puts arrays of its own in place here too."""
+    """The same on the host, in numpy, for Stage.on_host. Here, too, a stage replaces arrays by its own."""
 
     #: (scan lines, samples) complex64 baseband signal
     iq: np.ndarray = field(init=False)
@@ -105,9 +105,9 @@ class HostFrame(FrameInputs):
 
 
 class Stage(ABC):
-    """One step from a pose to an image. A stage is made once for a device and keeps its buffers between frames."""
+    """One step from a pose to an image. A stage is created once per device and keeps its buffers between frames."""
 
-    #: The key of its time in Frame.timings_ms
+    #: Key of its time in Frame.timings_ms
     name: ClassVar[str]
 
     def __init__(self, device: Device) -> None:
@@ -115,21 +115,21 @@ class Stage(ABC):
 
     @abstractmethod
     def run(self, frame: DeviceFrame) -> None:
-        """Enqueue the stage; nothing is waited for."""
+        """Enqueue the stage without waiting."""
 
     @abstractmethod
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
-        """The least that any implementation of the stage has to do for a frame with this ray tree.
+        """The minimum work of any implementation of the stage for a frame with this ray tree.
 
-        Bytes are counted once for everything that it has to read or write, whatever a cache saves. Operations are those
-        of the kernel's source, additions, multiplications and integer operations alike: an estimate to a few tens of
-        percent, enough to tell a stage that is twice off its floor from one that is ten times off.
+        Bytes of all data read or written are counted once. Operations are counted in the kernel's source; additions,
+        multiplications and integer operations count equally. The estimate is accurate to a few tens of percent, enough
+        to distinguish twice the lower bound from ten times the lower bound.
         """
 
     def on_host(self, frame: HostFrame) -> None:
-        """The same in plain numpy, written from the equations and not from `run`: what `run` is checked against.
+        """The same in plain numpy, written from the equations and not from `run`, as a reference for tests of `run`.
 
-        The first seven stages leave it out: verification/numpy_model has theirs.
+        Not defined for the first seven stages: theirs are in verification/numpy_model.
         """
         raise NotImplementedError(f"stage {self.name!r} has no twin in numpy")
 

@@ -1,4 +1,4 @@
-"""The stages of an image in their order: shared by simulator, appearance model, benchmark and numpy model.
+"""The stages of an image, in order: shared by simulator, appearance model, benchmark and numpy model.
 
 How to add one is in docs/architecture.md#adding-a-stage.
 """
@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.imaging.stage import Stage
 
 #: From the acquisition to impulses along the traced lines
 IMPULSE_STAGES: tuple[type[Stage], ...] = (RayTracer, Scatterers, InterfaceEchoes)
-#: From there to the baseband signal. They are linear: the appearance model brings its bases through them one by one
+#: From there to the baseband signal. They are linear, so the appearance model applies them to each of its bases
 LINEAR_STAGES: tuple[type[Stage], ...] = (LateralBeam, PulseFilter)
 #: From the baseband signal to pixels
 DISPLAY_STAGES: tuple[type[Stage], ...] = (Compressor, ScanConverter)
