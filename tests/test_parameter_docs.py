@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mrml.parameter_node import PanelSettings
 from SlicerUSSim.Logic.probe.arrays import PROBE_KIND, PROBE_KINDS, Probe
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 
@@ -55,6 +56,7 @@ SECTIONS: list[tuple[str, type[Declared], str]] = [
      "`ussim optimize` has `--frames` and `--free` for the first two."),
     ("Similarity", SimilaritySettings, "How alike two images are ([optimization.md](optimization.md#the-cost)), in "
      "Python alone."),
+    ("Panel", PanelSettings, "What else a scene remembers of the panel ([slicer.md](slicer.md))."),
 ]  # fmt: skip
 
 
