@@ -1,4 +1,4 @@
-"""The first frame of a fresh process with empty kernel caches, from interpreter start to image, and its peak memory.
+"""Time from interpreter start to the first image in a new process with empty kernel caches, and peak memory.
 
     python benchmarks/cold_start.py [--json FILE]
 
@@ -29,7 +29,7 @@ NAMES = ("csf", "grey matter", "white matter")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("--json", type=output_file, help="keep the numbers in this file")
+    parser.add_argument("--json", type=output_file, help="write the results to this file")
     parser.add_argument("--first-frame", metavar="DEVICE", help=argparse.SUPPRESS)
     parser.add_argument("--labels", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def run_first_frame(device: str, extra: list[str]) -> dict[str, float]:
-    """Seconds to the first image and peak memory, in a process of its own with empty caches."""
+    """Seconds to the first image and peak memory, in a separate process with empty caches."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "XDG_CACHE_HOME": folder, "POCL_CACHE_DIR": folder, "HOME": folder}
         environment.pop("OCL_ICD_VENDORS", None)
@@ -72,12 +72,12 @@ def first_frame(device: str, label_file: Path | None) -> None:
 
 
 def peak_memory_mb() -> float:
-    """Peak resident memory of this process since it was started."""
+    """Peak resident memory of this process since its start."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
         return next(float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
     except OSError:
-        # Counts what the parent held when it started us, too.
+        # Includes the memory of the parent process at the start.
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 

@@ -1,8 +1,8 @@
-"""Two files of `ussim bench --json` side by side: best times, and how many times faster the second is.
+"""Comparison of two files of `ussim bench --json`: best times, and the speed-up of the second.
 
     python benchmarks/compare.py before.json after.json
 
-Times of two runs are as comparable as the machine was idle; compare stages by their share of a frame, too.
+Times of two runs are comparable only if the machine was equally idle; compare the stages' fractions of a frame too.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The workstation in the browser: how soon it is usable, images per second and latency while dragging, memory.
+"""Performance of the browser workstation: start-up time, images per second and latency while dragging, memory.
 
     python benchmarks/dragging.py [--device intel --device pocl] [--seconds 10] [--frames 2000] [--json FILE]
 
 Starts `ussim serve` with the demo brain, opens it in headless Chromium, drags the probe with the mouse in a slice view
-and in the 3D view. Server, browser and whoever moves the mouse share the processor. Needs playwright and Chromium.
+and in the 3D view. Server, browser and playwright share the processor. Needs playwright and Chromium.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ FLAGS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-#: Where the probe's body is in a view, as shares of its width and height: the craniotomy of the demo brain.
+#: Position of the probe's body in a view, as fractions of its width and height, at the craniotomy of the demo brain.
 GRIPS = {"slice view": (1, 0.5, 0.2), "3D view": (0, 0.12, 0.08)}
-#: Frames before the first measurement of memory: what is allocated once is there by then.
+#: Frames before the first measurement of memory, after which one-time allocations are complete.
 WARM_UP_FRAMES = 300
 
 
@@ -41,8 +41,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--device", action="append", help="as of `ussim devices`; may be repeated (default: each once)")
     parser.add_argument("--seconds", type=float, default=10.0, help="of dragging, in each view")
-    parser.add_argument("--frames", type=int, default=2000, help="over which memory is watched; 0: not at all")
-    parser.add_argument("--json", type=output_file, help="keep the numbers in this file")
+    parser.add_argument("--frames", type=int, default=2000, help="over which memory is measured; 0: not measured")
+    parser.add_argument("--json", type=output_file, help="write the results to this file")
     arguments = parser.parse_args()
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if chromium is None:
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def measured(browser, device: str, seconds: float, frames: int) -> dict:
-    """All numbers of one device."""
+    """All results of one device."""
     start = perf_counter()
     with serving(device) as (url, process):
         page = browser.new_page(viewport={"width": 1500, "height": 900})
@@ -89,14 +89,14 @@ def measured(browser, device: str, seconds: float, frames: int) -> dict:
 
 
 def dragged(page: Page, x: float, y: float, seconds: float) -> dict[str, float]:
-    """Images per second, and then milliseconds from mouse to image, while the mouse goes to and fro."""
+    """Images per second, then milliseconds from mouse to image, while the mouse moves back and forth."""
     page.mouse.move(x, y)
     page.mouse.down()
     images = _move(page, x, y, seconds)
     _set(page, NAMES.show_latency, True)
     page.wait_for_function("window.ussim.measuring")
     _rest(page)
-    page.evaluate("window.ussim.measured.length = 0")  # of images that still bore the stamp of an earlier drag
+    page.evaluate("window.ussim.measured.length = 0")  # discard images with the stamp of an earlier drag
     _move(page, x, y, seconds)
     times = page.evaluate("window.ussim.measured")
     page.mouse.up()
@@ -117,7 +117,7 @@ def _set(page: Page, name: object, value: object) -> None:
 
 
 def _rest(page: Page) -> None:
-    """Wait until the server has done what it was asked for, and give the views a moment to be drawn."""
+    """Wait until the server has completed all requests, and for the views to be drawn."""
     page.evaluate("window.trame.trigger('at_rest')")
     page.wait_for_timeout(1500)
 
@@ -133,7 +133,7 @@ def _move(page: Page, x: float, y: float, seconds: float) -> float:
 
 
 def watched(page: Page, process: subprocess.Popen, frames: int) -> dict:
-    """Memory before and after so many images, of server and page."""
+    """Memory of server and page before and after this number of images."""
     session = page.context.new_cdp_session(page)
 
     def page_mb() -> float:

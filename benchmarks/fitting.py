@@ -1,4 +1,4 @@
-"""What the appearance optimisation finds on twins: patients whose parameters are known (twins.py).
+"""Accuracy of the appearance optimisation on twins: simulated patients with known parameters (twins.py).
 
     python benchmarks/fitting.py twins         # 14 patients: cost, parameters, errors; the paper's Table 1
     python benchmarks/fitting.py algorithms    # nlopt's global and local algorithms
@@ -34,7 +34,7 @@ from SlicerUSSim.Logic.verification.benchmark.files import output_file
 from SlicerUSSim.Logic.verification.benchmark.timing import measured
 from SlicerUSSim.Logic.verification.twins import TISSUE, Twin, make_twin
 
-#: Where the search starts when its start is to be a bad one.
+#: Poor starting points of the search.
 FAR = {
     "too bright": DisplaySettings(gain_db=18, dynamic_range_db=75, tgc_db_cm_mhz=0.9),
     "too dark": DisplaySettings(gain_db=-20, dynamic_range_db=40, tgc_db_cm_mhz=0.1),
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 def twins(labels: Volume, tissues: TissueTable, patients: int, device) -> dict:
-    """Both experiments: with the display known, and with everything free."""
+    """Two experiments: with the display known, and with everything free."""
     results = {}
     for title, known in (("Display known, white matter free", True), ("Display and white matter free", False)):
         rows = [fitted(make_twin(labels, tissues, n, display_is_known=known, device=device), known)
@@ -118,7 +118,7 @@ def fitted(twin: Twin, display_is_known: bool, settings: SimilaritySettings | No
         "mu1": found.mu1,
         "error alpha": alpha,
         "error Var dB": variance_db(found) - variance_db(true),
-        # Grey matter is not free here, so this is the same; it is what can be known with an unknown gain.
+        # The same value, since grey matter is not free here; it can be determined even if the gain is unknown.
         "error Var re grey dB": variance_db(found) - variance_db(true),
         "error net fall": alpha - tgc,
         "error gain dB": result.display.gain_db - twin.true_display.gain_db,
@@ -129,7 +129,7 @@ def fitted(twin: Twin, display_is_known: bool, settings: SimilaritySettings | No
 
 
 def algorithms(labels: Volume, tissues: TissueTable, patients: int, device) -> dict:
-    """Cost reached within 500 evaluations, from the presets and from far off."""
+    """Cost reached within 500 evaluations, from the presets and from poor starting points."""
     starts = {"preset": None, **FAR}
     results = {f"{g} then {local}" if g else local: {name: [] for name in starts} for g, local in ALGORITHMS}
     for number in range(patients):
@@ -156,7 +156,7 @@ def algorithms(labels: Volume, tissues: TissueTable, patients: int, device) -> d
 
 
 def ablation(labels: Volume, tissues: TissueTable, patients: int, device) -> dict:
-    """What other measures of similarity find."""
+    """Accuracy with other similarity measures."""
     results = {}
     for name, settings in MEASURES.items():
         results[name] = [fitted(make_twin(labels, tissues, n, device=device), False, settings) for n in range(patients)]
@@ -171,7 +171,7 @@ def ablation(labels: Volume, tissues: TissueTable, patients: int, device) -> dic
 
 
 def registration(labels: Volume, tissues: TissueTable, patients: int, device) -> dict:
-    """An offset of 4 mm and 4 degrees, in a direction of each patient's own, recovered from two crossing sweeps.
+    """An offset of 4 mm and 4 degrees, in another direction for each patient, recovered from two crossing sweeps.
 
     Planes that are nearly parallel leave a rotation open.
     """
@@ -206,7 +206,7 @@ def registration(labels: Volume, tissues: TissueTable, patients: int, device) ->
 
 
 def evaluation(labels: Volume, tissues: TissueTable, patients: int, device) -> dict:
-    """One image's evaluation against one frame, in one run."""
+    """Time of one evaluation per image, compared with one frame, in one run."""
     twin = make_twin(labels, tissues, 0, frames=1, device=device)
     simulator, cases = twin.simulator, {"display": ["display"], "display, mu0, sigma0": ["display", "white matter.mu0",
         "white matter.sigma0"], "display, mu0, sigma0, mu1, alpha": ["display", TISSUE]}  # fmt: skip
@@ -224,7 +224,7 @@ def evaluation(labels: Volume, tissues: TissueTable, patients: int, device) -> d
         )  # fmt: skip
         random = np.random.default_rng(0)
         results[name] = best_ms(lambda c=cost, p=parameters, r=random: c(r.random(len(p))))
-        results[f"bases anew: {name}"] = best_ms(lambda m=model: (m.anchor(tissues), m.device.queue.finish()), 5)
+        results[f"bases: {name}"] = best_ms(lambda m=model: (m.anchor(tissues), m.device.queue.finish()), 5)
     print(f"\n{simulator.device.info}\n")
     table(["", "best ms", "median ms"], [[name, *values] for name, values in results.items()])
     return results
@@ -236,12 +236,12 @@ def best_ms(function, repeat: int = 40) -> tuple[float, ...]:
 
 
 def white(tissues: TissueTable):
-    """The tissue that was fitted."""
+    """The fitted tissue."""
     return tissues[tissues.label_of(TISSUE)]
 
 
 def as_tracked(twin: Twin) -> TrackedImages:
-    """The twin's images as a sequence would give them."""
+    """The twin's images as from a tracked sequence."""
     found = TrackedImages.of(twin.sequence(), probe=twin.probe)
     grid = ImageGrid.for_probe(twin.probe, None)
     mask = grid.field(twin.probe)

@@ -1,15 +1,15 @@
-"""Frame A against what a user would pick instead, in one run: PyMUST's simus, zea's simulators, this model in numpy.
+"""Frame A compared with other simulators in one run: PyMUST's simus, zea's simulators, this model in numpy.
 
     python benchmarks/peers.py [--device NAME] [--json FILE]
 
-Needs pip install "SlicerUSSim[demo]" PyMUST zea jax; a peer that is not installed is left out.
+Needs pip install "SlicerUSSim[demo]" PyMUST zea jax; a simulator that is not installed is skipped.
 
 Frame A has 196 scan lines of a 64-element phased array. PyMUST and zea compute the channel data of one transmission
 from point scatterers, so an image of 196 focused lines takes 196 of them, each with the scatterers inside its beam
-(2.25 standard deviations to either side, as many per cubic millimetre as this simulator has). One transmission is timed
-with growing numbers of scatterers; a straight line through the times gives what those of one beam take. Beamforming,
-which they leave to their user, is not counted, nor that they know neither interfaces nor refraction; they compute the
-wave field, which this simulator does not.
+(2.25 standard deviations to either side, at this simulator's density). One transmission is timed with increasing
+numbers of scatterers, and the time for those of one beam is extrapolated linearly. Beamforming, which is left to the
+user of PyMUST and zea, is not included. They do not model interfaces or refraction, but they compute the wave field,
+which this simulator does not.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def scatterers_in_beam(settings: SimulationSettings) -> float:
 
 
 def scaled(transmission: Callable[[int], Callable[[], object]], in_beam: float) -> dict:
-    """Time 196 transmissions with `in_beam` scatterers each, from a straight line through the times of fewer."""
+    """Time of 196 transmissions with `in_beam` scatterers each, extrapolated linearly from fewer scatterers."""
     times = [measured(transmission(count), 3)["best_ms"] for count in COUNTS]
     slope, offset = np.polyfit(COUNTS, times, 1)
     line = max(offset, 0.0) + slope * in_beam
@@ -122,7 +122,7 @@ def pymust_transmission(count: int) -> Callable[[], object]:
 def zea_transmission(count: int, domain: str) -> Callable[[], object]:
     """One focused transmission by zea, compiled beforehand."""
     os.environ.setdefault("KERAS_BACKEND", "jax")
-    # By name: they are in none of our extras, and so unknown to whoever checks the types.
+    # Imported by name: they are not among this package's extras, so the type checker does not find them.
     jax = importlib.import_module("jax")
     if domain == "time":
         simulate = importlib.import_module("zea.simulator_time_domain").simulate_rf_td

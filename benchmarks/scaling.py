@@ -1,10 +1,10 @@
-"""How the time of a frame grows: with scan lines, depth, tree depth, scatterers, size of the label map, tissues.
+"""Scaling of the time of a frame with scan lines, depth, tree depth, scatterers, size of the label map, tissues.
 
     python benchmarks/scaling.py [--device NAME] [--out docs/images/scaling.png] [--json FILE]
 
-Best of many frames in brain-like tissue: a head of layered ellipsoids with cysts, voxels of 0.25 to 2 mm. One thing
-varies at a time, about a convex array with 128 scan lines 80 mm deep. Each curve's slope between its ends (in
-logarithms, 1 is linear) is printed beside it.
+Best of many frames in brain-like tissue: a head of layered ellipsoids with cysts, voxels of 0.25 to 2 mm. One quantity
+varies at a time, for a convex array with 128 scan lines 80 mm deep. The slope of each curve between its ends (in
+logarithms, 1 is linear) is printed next to it.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ def main() -> None:
         (x0, t0), (x1, t1) = points[0], points[-1]
         print(f"| {name} | {x0:g} | {x1:g} | {t0:.1f} ms | {t1:.1f} ms | {slope(points):.2f} |")
     for side in SIDES:
-        print(f"a label map of {side}³ is made ready in {readiness(side, arguments.device):.2f} s")
+        print(f"a label map of {side}³ voxels is prepared in {readiness(side, arguments.device):.2f} s")
     draw(curves, arguments.out)
     if arguments.json:
         write_json(arguments.json, curves)
 
 
 def measure(device: str | None) -> dict[str, list[tuple[float, float]]]:
-    """{what grows: [(its value, milliseconds of a frame)]}"""
+    """{varied quantity: [(its value, milliseconds of a frame)]}"""
     usual = simulator(128, 4, device)
     settings = SimulationSettings()
     mirrors = simulator(128, 4, device, hard=True)
-    bushy = replace(settings, reflection_threshold=1e-4)  # so that the tree grows as deep as it may
+    bushy = replace(settings, reflection_threshold=1e-4)  # so that the tree reaches its maximum depth
     return {
         "scan lines": [(n, frame(usual, replace(PROBE, scan_lines=n), settings)) for n in (32, 64, 128, 256, 512)],
         "depth, mm": [(d, frame(usual, replace(PROBE, depth_mm=d), settings)) for d in (20.0, 40.0, 80.0, 110.0)],
@@ -85,20 +85,20 @@ def frame(simulator: UltrasoundSimulator, probe, settings) -> float:
 
 
 def simulator(side: int, tissues: int, device: str | None, hard: bool = False) -> UltrasoundSimulator:
-    """A head of `side` voxels each way: brain with balls of the other tissues in it; with `hard`, some are stones."""
+    """A head of `side`³ voxels: brain with spheres of the other tissues; with `hard`, some of them are stones."""
     spacing = 2.0 * HALF_MM / side
     axis = ((np.arange(side) + 0.5) * spacing - HALF_MM).astype(np.float32)
     z, y, x = axis[:, None, None], axis[None, :, None], axis[None, None, :]
     labels = (x * x + y * y + z * z < 58.0**2).astype(np.uint8)
     random = np.random.default_rng(1)
-    for n in range(120):  # as many balls whatever the number of tissues
+    for n in range(120):  # the same number of spheres for every number of tissues
         centre, radius = random.uniform(-40, 40, 3), random.uniform(3, 7)
         box = tuple(slice(*np.searchsorted(axis, [c - radius, c + radius])) for c in centre[::-1])
         part = (z[box[0]] - centre[2]) ** 2 + (y[:, box[1]] - centre[1]) ** 2 + (x[:, :, box[2]] - centre[0]) ** 2
         labels[box][part < radius**2] = 2 + n % (tissues - 1) if tissues > 1 else 1
     table = {0: Tissue("fluid", 1540, 1.54, 0.0, 0.0, 0.0, 0.0)}
     for n in range(1, tissues + 1):
-        # Brain-like; every fourth has a border of its own, as tumours and vessels do.
+        # Brain-like; every fourth tissue forms an interface, as tumours and vessels do.
         speed = 1546.0 + 10.0 * (n // 4 if n % 4 == 0 else 0)
         table[n] = Tissue(f"tissue {n}", speed, speed * 1.04e-3, 0.5, 0.3, 0.0, 0.1 + 0.01 * n)
     if hard:
@@ -109,7 +109,7 @@ def simulator(side: int, tissues: int, device: str | None, hard: bool = False) -
 
 
 def readiness(side: int, device: str | None) -> float:
-    """Seconds from a label map in memory to a simulator that has it on the device; the better of two."""
+    """Seconds from a label map in memory to a simulator with it on the device; the better of two."""
     medium = simulator(side, 4, device).medium
 
     def build() -> None:
@@ -119,13 +119,13 @@ def readiness(side: int, device: str | None) -> float:
 
 
 def slope(points: list[tuple[float, float]]) -> float:
-    """Exponent of growth between the first and the last point."""
+    """Exponent of the power law between the first and the last point."""
     (x0, t0), (x1, t1) = points[0], points[-1]
     return float(np.log(t1 / t0) / np.log(x1 / x0))
 
 
 def draw(curves: dict, out: Path) -> None:
-    """One logarithmic plot per curve, with a line of slope 1 to compare."""
+    """One logarithmic plot per curve, with a line of slope 1 for comparison."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -2,11 +2,11 @@
 
     python examples/fit_real_speckle.py FOLDER [--out PICTURES]
 
-FOLDER holds SpinePhantomFreehand.igs.mha and UltrasonixLinearRfData.igs.mha of the Plus toolkit's test data
-(PlusLibData, TestImages; BSD-3-Clause). What the phantom looks like inside is not known, so its geometry is simplified
-to one uniform tissue, and only a region of one image counts in which nothing but speckle is seen. The RF frame was
-recorded in air: below the reverberations of the probe it holds amplifier noise alone, which grows with depth as the
-time-gain compensation does; so noise and TGC are what can be fitted to it.
+FOLDER contains SpinePhantomFreehand.igs.mha and UltrasonixLinearRfData.igs.mha of the Plus toolkit's test data
+(PlusLibData, TestImages; BSD-3-Clause). The interior of the phantom is not known, so it is modelled as one uniform
+tissue, and only a region of one image is compared that shows speckle alone. The RF frame was recorded in air: below the
+reverberations of the probe it contains only amplifier noise, which rises with depth with the time gain compensation
+(TGC). Noise level and TGC can therefore be fitted to it.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def main() -> None:
 
 def fit_speckle(sequence: TrackedSequence):
     """Display and one tissue to the left part of image 20, where the phantom is homogeneous."""
-    # The scanner's settings were not recorded; with these speckle is about as large as in the image.
+    # The scanner's settings were not recorded; with these the speckle size is similar to that of the image.
     field = estimate_field(
         sequence.images, width_mm=WIDTH_MM, scan_lines=256, frequency_mhz=6.6, fractional_bandwidth=0.35,
         aperture_mm=9.0,
@@ -74,7 +74,7 @@ def fit_speckle(sequence: TrackedSequence):
 
 
 def fit_noise(sequence: TrackedSequence):
-    """Noise and TGC to what lies below the reverberations; the envelope is compressed as DisplaySettings would."""
+    """Noise and TGC to the region below the reverberations; the envelope is compressed as by DisplaySettings."""
     depth = sequence.images.shape[2] * 1.54 / (2.0 * SAMPLING_MHZ)
     probe = LinearProbe(WIDTH_MM, depth, scan_lines=256, frequency_mhz=6.6)
     envelope = np.abs(hilbert(sequence.images[0].astype(float), axis=1))
@@ -119,7 +119,7 @@ def cells(image: np.ndarray, region: np.ndarray, grid: ImageGrid) -> str:
     """Width of the autocovariance at half its height, along and across the lines."""
     rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
     part = image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].astype(float)
-    part = part - gaussian_filter(part, 15.0)  # the fall with depth is no speckle
+    part = part - gaussian_filter(part, 15.0)  # the fall with depth is not speckle
     if part.std() < 1e-6:
         return "none"
     widths = []
@@ -134,7 +134,7 @@ def cells(image: np.ndarray, region: np.ndarray, grid: ImageGrid) -> str:
 
 
 def draw(path: Path, title: str, real, before, after, region, result) -> None:
-    """Before, after and real side by side, the region outlined, with the histograms in it."""
+    """Images before and after the fit and real, with the region outlined, and histograms of the region."""
     figure = Figure(figsize=(14, 4.6), facecolor="#111111", dpi=110, layout="constrained")
     axes = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.2))
     rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))

@@ -1,9 +1,9 @@
-"""What the MRI adds to scatterers, side by side: labels alone (the paper), partial volume, intensity, both.
+"""Hybrid scatterers compared: labels alone (the paper), partial volume, MRI intensity, both.
 
     python examples/hybrid_scatterers.py [-o hybrid.png]
 
-Above, one image each of the MNI152 brain (nilearn); below, the mean of 24 patients who differ in their scatterers
-alone: what the speckle is drawn from.
+Top: one image each of the MNI152 brain (nilearn). Bottom: the mean of 24 patients that differ only in their scatterers,
+which shows the expected echo level.
 """
 
 from __future__ import annotations

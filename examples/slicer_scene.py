@@ -1,8 +1,8 @@
 """A MRML scene without Slicer's window: python examples/slicer_scene.py [OUT.mrb]
 
-Loads the demo brain, segments it, puts the probe on the cortex, lets the image follow the probe while it slides,
-records the sweep as sequences with a browser, and saves a .mrb. Opened in 3D Slicer, the module USSim shows
-everything as it was left: tick Live, and move the probe. The file is read back here to show that it is whole.
+Loads the demo brain, segments it, places the probe on the cortex, updates the image while the probe slides, records the
+sweep as sequences with a browser, and saves a .mrb. When it is opened in 3D Slicer, the module USSim restores its
+state: tick Live, and move the probe. The file is read back here to show that it is complete.
 
 Needs pip install "SlicerUSSim[slicer,demo]"; in Slicer's own Python console `slicer.mrmlScene` takes the scene's place.
 """
@@ -28,7 +28,7 @@ from SlicerUSSim.Logic.probe import slide_sweep
 
 
 def new_scene() -> tuple[slicer.vtkMRMLScene, slicer.vtkSlicerSequencesLogic]:
-    """A scene that knows sequence browsers too; Slicer's own does."""
+    """A scene with the classes of sequence browsers, which Slicer's own scene has already."""
     scene = slicer.vtkMRMLScene()
     sequences = slicer.vtkSlicerSequencesLogic()
     sequences.SetMRMLScene(scene)
@@ -36,14 +36,14 @@ def new_scene() -> tuple[slicer.vtkMRMLScene, slicer.vtkSlicerSequencesLogic]:
 
 
 def add_volume(scene, volume: Volume, name: str):
-    """What loading a file does in Slicer."""
+    """Add a volume node as Slicer does when it loads a file."""
     node = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
     write_volume(node, volume)
     return node
 
 
 def build(mri: Volume):
-    """(scene, its logic, the sequences' logic): everything in its place and one image simulated."""
+    """(scene, its logic, the sequences' logic) with all nodes and one simulated image."""
     scene, sequences = new_scene()
     logic = UltrasoundSceneLogic(scene)
     nodes = logic.parameters

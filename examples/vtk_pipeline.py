@@ -1,8 +1,8 @@
 """One VTK pipeline from MRI to ultrasound, rendered off-screen: python examples/vtk_pipeline.py [OUT.png]
 
-Left, the plane of the probe: the MRI cut by vtkImageReslice, the simulated image on it, the outline of the field.
-Right, the same in the patient, in the far half of the brain's surface. Whoever moves `transform` and renders again
-has a live picture.
+Left: the image plane with the MRI resampled by vtkImageReslice, the simulated image on it, and the outline of the
+imaged field. Right: the same in the patient, with the far half of the brain's surface. To update the image, change
+`transform` and render again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from SlicerUSSim.Logic.vtk import SegmentationFilter, UltrasoundSimulationFilter
 
 @dataclass
 class Scene:
-    """What a program goes on working with."""
+    """The objects that an application needs afterwards."""
 
     window: vtkRenderWindow
     transform: vtkTransform
@@ -82,11 +82,11 @@ def build(mri: Volume, probe=PROBES["convex"]) -> Scene:
 
 
 def mri_in_plane(image, transform: vtkTransform) -> vtkImageSlice:
-    """The MRI in the plane of the probe: resliced in the probe frame, and put at the probe's place."""
+    """The MRI in the image plane: resampled in the probe frame, and placed at the probe's pose."""
     reslice = vtkImageReslice()
     reslice.SetInputData(image)
     reslice.SetResliceTransform(transform)
-    reslice.SetOutputOrigin(-100.0, -60.0, 0.3)  # a little behind the ultrasound, or the two would fight for pixels
+    reslice.SetOutputOrigin(-100.0, -60.0, 0.3)  # slightly behind the ultrasound image, to avoid z-fighting
     reslice.SetOutputSpacing(0.5, 0.5, 0.5)
     reslice.SetOutputExtent(0, 400, 0, 500, 0, 0)
     reslice.SetInterpolationModeToCubic()
@@ -116,7 +116,7 @@ def line_actor(port) -> vtkActor:
 
 
 def surface_actor(segmentation: SegmentationFilter) -> vtkActor:
-    """The surface of everything labelled."""
+    """The surface of all labelled voxels."""
     inside = vtkImageThreshold()
     inside.SetInputConnection(segmentation.GetOutputPort())
     inside.ThresholdByUpper(1.0)
@@ -147,12 +147,12 @@ def coloured(port, colour, opacity: float) -> vtkActor:
 
 
 def look_at(renderer: vtkRenderer, transform: vtkTransform, direction) -> None:
-    """Look at the middle of the field against a direction of the probe frame, with depth downwards."""
+    """Point the camera at the middle of the field, against a direction of the probe frame, with depth downwards."""
     camera = renderer.GetActiveCamera()
     camera.ParallelProjectionOn()
     middle = (0.0, 50.0, 0.0)
     camera.SetFocalPoint(transform.TransformPoint(middle))
-    # Seen against +z, the probe's x axis points left; the image would be mirrored.
+    # Viewed against +z, the probe's x axis points left; the image would be mirrored.
     camera.SetPosition(transform.TransformPoint([m - 400.0 * d for m, d in zip(middle, direction, strict=True)]))
     camera.SetViewUp(transform.TransformVector((0.0, -1.0, 0.0)))
     camera.SetParallelScale(75.0)
@@ -160,7 +160,7 @@ def look_at(renderer: vtkRenderer, transform: vtkTransform, direction) -> None:
 
 
 def write_png(window: vtkRenderWindow, path: str) -> None:
-    """What the window shows."""
+    """The content of the window."""
     grab = vtkWindowToImageFilter()
     grab.SetInput(window)
     grab.ReadFrontBufferOff()

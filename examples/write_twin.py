@@ -1,11 +1,11 @@
-"""A patient with known parameters on disk: labels, and tracked ultrasound to fit, as `ussim optimize` reads them.
+"""Write a simulated patient with known parameters: labels and tracked ultrasound, as `ussim optimize` reads them.
 
     python examples/write_twin.py [FOLDER] [--seed N]
     ussim optimize FOLDER/labels.nii.gz --sequence FOLDER/tracked.igs.mha --probe FOLDER/probe.json \
         -o FOLDER/result.json --report FOLDER/report.html
 
 The "real" images in tracked.igs.mha are simulated with the parameters in truth.json, other speckle and noise;
-labels.nii.gz is the same brain, segmented slightly wrongly (SlicerUSSim/Logic/verification/twins.py).
+labels.nii.gz is the same brain with a slightly wrong segmentation (SlicerUSSim/Logic/verification/twins.py).
 """
 
 from __future__ import annotations

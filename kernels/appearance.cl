@@ -1,12 +1,13 @@
-// Images of one pose as a function of what may be varied in them (docs/optimization.md#how-it-is-fast): parts of the
-// echoes are mixed before the beam and the pulse, which are linear too, and again for every image (appearance.py).
+// Images of one pose as a function of the free parameters (docs/optimization.md#efficient-evaluation). Parts of the
+// echoes are combined before beam and pulse, which are linear too, and the results again for every image
+// (appearance.py).
 //
 // Buffers: parts float [part][values]; lengths, path float [scan line][sample]; bases and iq float2 [scan
 // line][sample].
 
 #include "common.clh"
 
-// One linear combination of the parts that scattering.cl wrote. Global size (values / LANES).
+// One linear combination of the parts written by scattering.cl. Global size (values / LANES).
 __kernel void mix_parts(__global const float *parts, __global const float *weights, int count, int values,
                         __global float *mixed) {
   const int here = get_global_id(0) * LANES;
@@ -16,8 +17,8 @@ __kernel void mix_parts(__global const float *parts, __global const float *weigh
   STORE_LANES(sum, mixed + here);
 }
 
-// Nepers of two-way attenuation along the direct path to every sample of a scan line: one work-item does one line.
-// Reflected branches, which overlap it in time, are taken to have spent as much.
+// Two-way attenuation in nepers along the direct path to every sample of a scan line. One work-item computes one line.
+// Reflected branches, which overlap the direct path in time, are assumed to have the same attenuation.
 __kernel void direct_path(__constant const Acquisition *acquisition, __global const Segment *segments,
                           __global const int *segment_counts, __global float *path) {
   const int scan_line = get_global_id(0);

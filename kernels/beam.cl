@@ -3,10 +3,10 @@
 //
 // One work-item computes LANES samples of one scan line; global size (samples / LANES, scan lines). In the unfolded
 // geometry of the array two lines are y = (R + s) dtheta apart at path length s (or a fixed distance for a linear
-// array), wherever refraction and reflection have sent them; so each part of the beam has gone its own way, and the
-// edge of a shadow is as soft as the beam is wide. The weights are a Gaussian of unit sum. Scatterers come shared
-// between the edges of a strip (scattering.cl), which has the mean variance step^2 / 6; this Gaussian is narrower by
-// that.
+// array), independent of refraction and reflection. Each part of the beam therefore follows its own path, and the edge
+// of a shadow is as blurred as the beam is wide. The weights are a Gaussian of unit sum. scattering.cl has distributed
+// scatterers between the two edges of a strip, with a mean variance of step^2 / 6; the variance of this Gaussian is
+// reduced by that.
 //
 // Buffers: from_re, from_im float [2 traced line + side][stride]; to_re, to_im float [scan line][stride].
 
@@ -16,7 +16,7 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
                            __global const float *from_im, __global float *to_re, __global float *to_im, int stride) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int centre = acquisition->guard_lines + line * acquisition->lateral_rays;
-  // Lane by lane: near a tight focus the width changes from sample to sample.
+  // One width per lane: near a tight focus the width changes from sample to sample.
   const floatn s = (TO_FLOATN(LANE_INDEX) + sample) * acquisition->sample_mm;
   const floatn apart = line_distance_lanes(acquisition, s), sigma = lateral_sigma_lanes(acquisition, s);
   floatn step = apart / sigma;  // between traced lines, in sigmas
@@ -28,8 +28,8 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   float longest = 0.0f;
   for (int n = 0; n < LANES; n++) longest = fmax(longest, reach_[n]);
   const int last = min((int)longest, max(centre, acquisition->traced_lines - 1 - centre));
-  // Edge `edge` lies half a step before traced line `edge`; the strips on both its sides contribute. Edges come in
-  // pairs n + 1/2 lines to either side, whose weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
+  // Edge `edge` is half a step before traced line `edge`; the strips on both sides of it contribute. Edges come in
+  // pairs, n + 1/2 lines to either side. Their weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
   const floatn fall = exp2_fast(max(2.0f * exponent, -60.0f));
   floatn weight = exp2_fast(max(0.25f * exponent, -60.0f)), ratio = fall;
   int here = LINE_PAD + sample;

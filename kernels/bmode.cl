@@ -6,8 +6,8 @@
 
 #include "display.clh"
 
-// The axial part of the point spread function. The pulse is exp(-x^2 / 2 sx^2) cos(2 pi f x); on baseband impulses,
-// which carry the carrier's phase, only its Gaussian envelope is left, and the magnitude needs no Hilbert transform.
+// The axial part of the point spread function. The pulse is exp(-x^2 / 2 sx^2) cos(2 pi f x). Baseband impulses contain
+// the phase of the carrier, so only the Gaussian envelope remains, and the magnitude needs no Hilbert transform.
 __kernel void convolve_pulse(__global const float *re, __global const float *im, int stride,
                              __constant const float *pulse, int reach, __global float *iq, int samples) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
@@ -21,7 +21,7 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
   STORE_PAIRS(sum_re, sum_im, iq + 2 * (line * samples + sample));
 }
 
-// Amplifier noise, time-gain compensation, envelope, log compression, eight bits.
+// Amplifier noise, time gain compensation, envelope, log compression, eight bits.
 __kernel void compress(__global const float *iq, int samples, float noise, uint noise_seed, float tgc_per_sample,
                        float level_of_white_db, float dynamic_range_db, __global float *envelope,
                        __global uchar *grey) {
@@ -42,8 +42,8 @@ __kernel void compress(__global const float *iq, int samples, float noise, uint 
   STORE_GREY(grey_level(level_db, level_of_white_db, dynamic_range_db), grey + here);
 }
 
-// Mean grey level over `width` samples about each sample: what one pixel of the image covers in depth. Picking single
-// samples instead would alias the speckle into black dashes. Beyond its ends a line repeats its first and last sample.
+// Mean grey level over `width` samples about each sample, the depth range of one pixel of the image. Single samples
+// would alias the speckle into black dashes. Beyond its ends a line repeats its first and last sample.
 __kernel void average_depth(__global const uchar *grey, __global uchar *smooth, int samples, int width) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   __global const uchar *row = grey + line * samples;

@@ -1,11 +1,11 @@
-// Images of a sweep become one volume (compounding.py). Positions are in voxels (i, j, k) and pixels (column,
-// row).
+// Compounding of the images of a sweep into a volume (compounding.py). Positions are in voxels (i, j, k) and pixels
+// (column, row).
 
 #include "common.clh"
 
 // The mean grey level over the window of `size` (columns, rows) about each pixel, within the imaged field: single
-// pixels would alias speckle. One work-item computes one pixel; global size (columns, rows). Where the field has no
-// share in the window it is 0. Buffers: image, field uchar [row][column] (field: 0 or 1); mean float [row][column].
+// pixels would alias speckle. It is 0 if the window is entirely outside the field. One work-item computes one pixel;
+// global size (columns, rows). Buffers: image, field uchar [row][column] (field: 0 or 1); mean float [row][column].
 __kernel void mean_in_field(__global const uchar *image, __global const uchar *field, int2 size, __global float *mean) {
   const int2 pixel = (int2)(get_global_id(0), get_global_id(1)), count = (int2)(get_global_size(0), get_global_size(1));
   const int2 low = max(pixel - size / 2, (int2)(0)), high = min(pixel - size / 2 + size, count);
@@ -19,12 +19,14 @@ __kernel void mean_in_field(__global const uchar *image, __global const uchar *f
   mean[pixel.y * count.x + pixel.x] = inside > 0 ? (float)sum / inside : 0.0f;
 }
 
-// Puts one image into the volume. The image's plane is taken column by column of voxels along the axis that it crosses
-// most steeply; one work-item follows one column and adds to the voxels within `reach` millimetres of the plane, with a
-// weight that falls linearly. Global size: voxels along the two other axes of the box that starts at voxel `low`.
+// Adds one image to the volume. The volume is processed in columns of voxels along the axis that crosses the image
+// plane most steeply. One work-item processes one column and adds to the voxels within `reach` millimetres of the
+// plane, with a weight that falls linearly. Global size: voxels along the two other axes of the box that starts at
+// voxel `low`.
 //
-// `to_image` is the affine map from voxels to (column, row, millimetres off the plane), three rows of four. `axes` are
-// (first other axis, second other axis, axis crossed), `dims` the voxels along i, j, k, `pixels` the (columns, rows).
+// `to_image` is the affine map from voxels to (column, row, distance from the plane in millimetres), three rows of
+// four. `axes` are (first other axis, second other axis, axis of the columns), `dims` the voxels along i, j, k,
+// `pixels` the (columns, rows) of the image.
 // Buffers: mean, field as above; sum, weight float [k][j][i].
 __kernel void add_image(__global const float *mean, __global const uchar *field, int2 pixels,
                         __constant const float *to_image, int4 axes, int4 low, int4 dims, float reach,

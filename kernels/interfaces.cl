@@ -1,8 +1,9 @@
 // interface_echoes: adds the echoes of tissue interfaces to the traced lines (docs/physics.md#3-rays; eq. 2 of
 // the paper).
 //
-// One work-item computes one traced line: every hit of its elevational rays is an impulse at its own time. The rays run
-// at quantiles of the elevational profile, so their sum has the beam's elevational width; beam.cl adds the lateral one.
+// One work-item computes one traced line: every hit of its elevational rays is an impulse at its travel time. The rays
+// sample quantiles of the elevational profile, so their sum has the beam's elevational width; beam.cl applies the
+// lateral profile.
 //
 // Buffers: hits, hit_counts (raytracing.cl); re, im float [2 traced line + side][stride]: complex baseband impulses,
 // half on either side of the line (scattering.cl).

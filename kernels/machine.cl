@@ -1,4 +1,4 @@
-// What the machine can do at most (machine.py): the floors that stages are measured against.
+// Memory bandwidth and arithmetic throughput of the device (machine.py), for the lower bounds of stage times.
 
 #include "common.clh"
 
@@ -13,7 +13,7 @@ __kernel void move_memory(__global const float *from, __global float *to) {
 __kernel void multiply_add(__global float *to, float factor, float term, int rounds) {
   floatn chain[CHAINS];
   for (int n = 0; n < CHAINS; n++)
-    chain[n] = TO_FLOATN(LANE_INDEX) + (float)(n + get_global_id(0));  // nothing in common
+    chain[n] = TO_FLOATN(LANE_INDEX) + (float)(n + get_global_id(0));  // different in every chain
   for (int round = 0; round < rounds; round++)
     for (int n = 0; n < CHAINS; n++) chain[n] = mad(chain[n], (floatn)(factor), (floatn)(term));
   floatn sum = 0.0f;

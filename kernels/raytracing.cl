@@ -4,14 +4,14 @@
 //   ray 0 of a line runs along the beam axis and writes the segments along which the scatter kernel works;
 //   rays 1.. run at fixed quantiles of the elevational beam profile and write the interface hits, so that an interface
 //   echo has the beam's elevational width. The lateral width comes from the neighbouring lines (beam.cl).
-// Lines are traced at least as finely as they are scanned (lateral_rays per scan line), and a few beyond the edges.
+// Traced lines are at least as dense as scan lines (lateral_rays per scan line), with a few beyond the edges.
 //
 // Buffers: voxels ushort [k][j][i], groups uchar [k][j][i] and smooth ushort [group][k][j][i] (medium.py); tissues
 // Tissue [label]; roots float4 [traced line], origin and direction (x, y) in the probe frame; quantiles float [traced
 // line][elevational ray], offsets in units of the elevational sigma; segments Segment [traced line][MAX_SEGMENTS] with
 // segment_counts; hits Hit [traced line][elevational ray][MAX_HITS] with hit_counts; cut float [traced line][1 +
-// elevational ray], the weight of the branches that were not followed; overflown int [1], to which traced lines with
-// more segments than there is room for are added.
+// elevational ray], the weight of the branches that were not followed; overflown int [1], the number of traced lines
+// with more than MAX_SEGMENTS segments.
 
 #include "borders.clh"
 
@@ -25,14 +25,14 @@ typedef struct {
   float log_attenuation;  // natural logarithm, two-way amplitude
   float weight;
   float4 tube;        // widths and growths per mm at `path`: lateral, its growth, elevational, its growth
-  float blind_until;  // path length before which no crossing counts: a reflected ray has to get off its interface
+  float blind_until;  // path length before which crossings are ignored: a reflected ray must leave its interface
   int reflections;
   int label;
 } Ray;
 
 // The label at fraction f of the cell of voxels at index `here`: the acoustic group with the largest trilinear weight,
-// so that borders are sub-voxel and without stairs, and within it the label of the nearest corner. Voting by group
-// keeps the border of fluid against brain smooth wherever grey, white and other brain labels change along it.
+// so that borders are smooth at the sub-voxel scale, and within the group the label of the nearest corner. Voting by
+// group keeps the border between fluid and brain smooth where grey, white and other brain labels change along it.
 inline int label_in_cell(__global const ushort *voxels, __global const uchar *groups,
                          __constant const Acquisition *acquisition, int here, float3 f) {
   const int word = voxels[here];
@@ -47,7 +47,7 @@ inline int label_in_cell(__global const ushort *voxels, __global const uchar *gr
   const float3 g = 1.0f - f;
   const float4 plane = (float4)(g.x * g.y, f.x * g.y, g.x * f.y, f.x * f.y);
   const float8 weights = (float8)(plane * g.z, plane * f.z);
-  // Nearly every border cell holds two groups: the first corner's and another one.
+  // Nearly every border cell contains two groups: that of the first corner and another one.
   const int first = group.s0, second = max_int8(select(group, (int8)(-1), group == first));
   const float first_weight = sum8(where8(group == first, weights));
   const float second_weight = sum8(where8(group == second, weights));
@@ -92,7 +92,7 @@ inline float3 course_at(__constant const Acquisition *acquisition, const Course 
   return course->start + l * course->step + elevation_sigma(acquisition, course->path + l) * course->aside;
 }
 
-// Lengths along the course at which it can be inside the volume: (enter, leave). `margin` is in voxels.
+// Lengths along the course at which it enters and leaves the volume: (enter, leave). `margin` is in voxels.
 inline float2 volume_span(__constant const Acquisition *acquisition, const Course *course, float margin,
                           float longest) {
   float start[3] = {course->start.x, course->start.y, course->start.z};
@@ -107,7 +107,7 @@ inline float2 volume_span(__constant const Acquisition *acquisition, const Cours
   return (float2)(fmin(enter, longest), leave);
 }
 
-// Halve the stretch from `inside`, in `label`, to `beyond`, in `other`.
+// Bisect the interval from `inside`, in `label`, to `beyond`, in `other`.
 inline void bisect(__global const ushort *voxels, __global const uchar *groups,
                    __constant const Acquisition *acquisition, const Course *course, int label, int times, float *inside,
                    float *beyond, int *other) {
@@ -123,9 +123,9 @@ inline void bisect(__global const ushort *voxels, __global const uchar *groups,
   }
 }
 
-// March from `*inside` until the label is no longer `label`, then bisect. Returns the first length found to be in
-// another tissue, whose label goes to `other`, and the last one before it in `inside`; or -1 if there is none up to
-// `last`. Nothing before `blind_until` counts. Eight steps of half a voxel are looked up at once.
+// March from `*inside` until the label is no longer `label`, then bisect. Returns the first length found in another
+// tissue, writes its label to `other` and the last length before it to `inside`; returns -1 if there is none up to
+// `last`. Crossings before `blind_until` are ignored. Eight steps of half a voxel are looked up at once.
 inline float next_border(__global const ushort *voxels, __global const uchar *groups,
                          __constant const Acquisition *acquisition, __constant const Tissue *tissues,
                          const Course *course, int label, float *inside, float last, float blind_until, int *other) {
@@ -166,8 +166,8 @@ inline float next_border(__global const ushort *voxels, __global const uchar *gr
     }
   }
   if (beyond < 0.0f) return beyond;
-  // Where only attenuation changes, a sixteenth of a voxel is enough, and where a smoothed border tells the rest, half
-  // of that.
+  // Where only attenuation changes, a sixteenth of a voxel is enough. At an interface the position is bisected to 1/64
+  // of a voxel, from which the smoothed border refines it.
   bisect(voxels, groups, acquisition, course, label, 3, inside, &beyond, other);
   if (tissues[*other].group != tissues[label].group)
     bisect(voxels, groups, acquisition, course, label, 2, inside, &beyond, other);
@@ -179,18 +179,18 @@ inline float decay_in(__constant const Acquisition *acquisition, Tissue tissue) 
   return tissue.attenuation_db_cm_mhz * acquisition->frequency_mhz * 0.2f * LN10_OVER_20;
 }
 
-// The tube (tube_after) behind a mirror of curvature k, met under the angle of incidence i in the plane of the offset:
-// a ray beside this one meets a normal turned by k / cos i per mm of offset, and is turned by twice that.
+// The tube (tube_after) behind a mirror of curvature k at angle of incidence i in the plane of the offset: a ray beside
+// this one meets a normal turned by k / cos i per mm of offset, and is itself turned by twice that angle.
 inline float4 tube_reflected(__global const uchar *groups, __global const ushort *smooth,
                              __constant const Acquisition *acquisition, float4 tube, Ray ray, float3 point,
                              float3 normal, int before, int behind) {
   for (int axis = 0; axis < 2; axis++) {
     const float3 offset = axis == 0 ? ray.lateral : ray.elevational;
-    // Along the ray onto the surface, so longer by 1 / cos i.
+    // Projected along the ray onto the surface, which lengthens the offset by 1 / cos i.
     const float3 along = offset - dot3(normal, offset) / fmin(dot3(normal, ray.direction), -0.2f) * ray.direction;
     const float longer = fmax(length3(along), 1e-3f);
     const float curvature = border_curvature(groups, smooth, acquisition, point, along / longer, before, behind);
-    // Concave mirrors focus; taken from voxels that would make random bright spots, so they count as flat.
+    // Concave mirrors focus. With curvatures from voxels this would cause random bright spots, so they count as flat.
     const float growth = 2.0f * fmax(curvature, 0.0f) * longer;
     if (axis == 0)
       tube.y += growth * tube.x;
@@ -220,8 +220,8 @@ inline Segment segment_of(Ray ray, float from, float to, float spent_from, float
   return segment;
 }
 
-// What a fluid interface does to a wave (docs/physics.md#3-rays): Snell, and the pressure reflection coefficient r.
-// R = r^2 is the two-way factor of the reflected branch, 1 - R that of the refracted one.
+// Refraction and reflection at a fluid interface (docs/physics.md#3-rays): Snell's law and the pressure reflection
+// coefficient r. R = r^2 is the two-way factor of the reflected branch, 1 - R that of the refracted branch.
 typedef struct {
   float cos_in, cos_out, speed_ratio, pressure;
   int is_total;
@@ -239,7 +239,7 @@ inline Interface interface_between(Tissue here, Tissue behind, float3 direction,
   return result;
 }
 
-// The root of a traced line: the beam frame at the probe face, taken from the probe frame to RAS.
+// The root of a traced line: the beam frame at the probe face, transformed from the probe frame to RAS.
 // `origin_and_direction` are (x, y) each.
 inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_direction) {
   const float2 origin = origin_and_direction.lo, direction = origin_and_direction.hi;
@@ -259,9 +259,9 @@ inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_
   return root;
 }
 
-// How much of an echo is left when a surface is tilted in elevation: a ray stands for a stratum of the beam, over which
-// the range changes by slope x width, and an integral over that many turns of the carrier is short of the sum of its
-// parts. Without it, walls seen aslant show as one thin line per ray.
+// Loss of coherence of an echo from a surface that is tilted in the elevation direction. A ray represents a stratum of
+// the beam, over which the range changes by slope x width, and the integral over these cycles of the carrier is smaller
+// than the sum of magnitudes. Without this factor, oblique walls would appear as one thin line per ray.
 inline float stratum_coherence(__constant const Acquisition *acquisition, Ray ray, float3 normal, float quantile,
                                float path, float depth_per_mm) {
   const float density = 0.39894228f * exp_fast(-0.5f * quantile * quantile);  // of N(0, 1)
@@ -286,7 +286,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
   __global Segment *my_segments = segments + line * MAX_SEGMENTS;
   __global Hit *my_hits = hits + max(slot, 0) * MAX_HITS;
   const int room = on_axis ? MAX_SEGMENTS : MAX_HITS;
-  int count = 0;  // of segments or hits; more than `room` says that some are missing
+  int count = 0;  // of segments or hits; a value above `room` means that some are missing
   float cut_weight = 0.0f;
 
   Ray stack[MAX_STACK];
@@ -294,11 +294,11 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
   int waiting = 1;
   while (waiting > 0) {
     Ray ray = stack[--waiting];
-    if (count > room) {  // nothing more can be written, and a tree can have more branches than a lifetime has seconds
+    if (count > room) {  // nothing more can be written, and the number of branches can grow exponentially
       cut_weight += ray.weight;
       continue;
     }
-    while (1) {  // one turn per tree node: march to the next interface, branch, go on with the refracted child
+    while (1) {  // one iteration per tree node: march to the next interface, branch, continue with the refracted child
       Course course;
       course.start = affine_point(acquisition->ras_to_voxel, ray.axis);
       course.step = affine_vector(acquisition->ras_to_voxel, ray.direction);
@@ -311,9 +311,9 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       const float2 span =
           volume_span(acquisition, &course, 3.0f + fabs(quantile) * 4.0f / acquisition->voxel_mm, to_depth);
 
-      // Tissues of one group have no interface between them: only attenuation changes there and the node goes on.
-      // `since` is where the present tissue began, `spent` the attenuation exponent up to there; a segment is open from
-      // `open`, with `spent_open`.
+      // Tissues of one group have no interface between them: only attenuation changes there and the node continues.
+      // `since` is the start of the current tissue, `spent` the attenuation exponent up to there; a segment is open
+      // from `open`, with `spent_open`.
       float since = 0.0f, spent = 0.0f, open = 0.0f, spent_open = 0.0f, inside = span.x, border;
       int other = ray.label, is_silenced;
       while (1) {
@@ -329,8 +329,8 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         if (border >= 0.0f) behind = tissues[other];
         const int node_ends = border < 0.0f || behind.group != here.group;
         if (on_axis) {
-          // A segment has one decay, its mean. Where that would be off by more than 0.02 neper (0.17 dB) inside, the
-          // segment is closed at the last change of tissue.
+          // A segment has one decay, its mean. If the error inside would exceed 0.02 neper (0.17 dB), the segment is
+          // closed at the last change of tissue.
           const float earlier = since - open, mean_decay = earlier > 0.0f ? (spent - spent_open) / earlier : decay;
           if (fabs(decay - mean_decay) * fmin(earlier, until - since) > 0.02f) {
             if (count < room) my_segments[count] = segment_of(ray, open, since, spent_open, spent, depth_per_mm);
@@ -360,7 +360,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
                                              here.group, behind.group, ray.direction, course.step, &overshoot);
       overshoot = fmin(overshoot, border - since);
       float back = overshoot;
-      if (overshoot == 0.0f) {  // the labels alone have to tell
+      if (overshoot == 0.0f) {  // only the labels give the position
         float beyond = border;
         bisect(voxels, groups, acquisition, &course, ray.label, 3, &inside, &beyond, &other);
         back = border - beyond;
@@ -370,8 +370,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       spent -= back * decay_in(acquisition, here);
       if (on_axis && count > 0 && count <= room) my_segments[count - 1].length_mm -= back;
       const float path = ray.path + border, depth = ray.depth + border * depth_per_mm;
-      if (depth >= acquisition->depth_mm)
-        break;  // with the overshoot taken back, the border lies beyond the field: a leaf
+      if (depth >= acquisition->depth_mm) break;  // without the overshoot, the border lies beyond the field: a leaf
       const float log_attenuation = ray.log_attenuation - spent, attenuation = exp_fast(log_attenuation);
       const float3 aside = quantile * elevation_sigma(acquisition, path) * ray.elevational;
       const float3 hit_point = ray.axis + border * ray.direction + aside;
@@ -403,7 +402,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         count++;
       }
 
-      // The reflected child waits on the stack; weak ones and those beyond the tree's depth are cut.
+      // The reflected child is pushed onto the stack; weak ones and those beyond the tree's depth are cut.
       const float reflected_weight = ray.weight * reflectance, refracted_weight = ray.weight * (1.0f - reflectance);
       if (ray.reflections < acquisition->max_ray_depth && reflected_weight >= acquisition->reflection_threshold &&
           reflected_weight * attenuation >= acquisition->intensity_threshold && waiting < MAX_STACK) {
@@ -426,7 +425,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         cut_weight += reflected_weight;
       }
 
-      // The refracted child is this ray, bent.
+      // The refracted child continues this ray in a new direction.
       if (surface.is_total) break;
       if (refracted_weight * attenuation < acquisition->intensity_threshold || count > room) {
         cut_weight += refracted_weight;
@@ -444,7 +443,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       ray.log_attenuation = log_attenuation;
       ray.weight = refracted_weight;
       ray.label = other;
-      // Until the trilinear border is behind, too: at grazing incidence the ray would go on crossing the same border.
+      // Up to a point beyond the trilinear border too: at grazing incidence the ray would cross the same border again.
       ray.blind_until = overshoot > 0.0f ? path + overshoot + 0.5f * acquisition->voxel_mm : path;
     }
   }

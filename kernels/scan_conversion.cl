@@ -1,9 +1,9 @@
 // scan_convert: scan lines to pixels of the probe plane (docs/physics.md#6-from-rf-to-image). One work-item computes
 // LANES pixels of a row; global size (columns / LANES rounded up, rows).
 //
-// Along the line interpolation is linear (samples lie an eighth of a wavelength apart by default, four per cycle of the
-// carrier); across lines it is cubic (Catmull-Rom), since lines are little denser than the beam is wide and linear
-// interpolation shows as spokes in the far field.
+// Interpolation along a line is linear (by default the sample spacing is an eighth of a wavelength, four samples per
+// cycle of the carrier). Across lines it is cubic (Catmull-Rom): the line spacing is only slightly smaller than the
+// beam width, and linear interpolation would be visible as spokes in the far field.
 // Buffers: grey uchar [scan line][samples]; image uchar [row][column], 0 outside the field.
 
 #include "common.clh"

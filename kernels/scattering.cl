@@ -1,29 +1,30 @@
-// scatter: every scatterer beside every ray segment, as complex baseband impulses (docs/physics.md#5-scatterers).
+// scatter: the echoes of all scatterers along all ray segments, as complex baseband impulses
+// (docs/physics.md#5-scatterers).
 //
-// One work-item owns CHUNK samples of one traced line: it visits the segments of the line's ray tree whose times meet
-// those samples and, for each, the cells of the patient-fixed scatterer lattice beside it: half-way to the next traced
-// line laterally, as far as the beam reaches elevationally. A scatterer counts with the elevational profile and is
-// shared linearly between the two edges of its strip (buffer line 2 line: left, 2 line + 1: right); beam.cl then
-// spreads it over all scan lines whose beam covers it. So each scatterer is computed once per image, not once per beam.
-// Work-items write disjoint samples in a fixed order: a pose always gives the same bits. Global size (chunks, traced
-// lines).
+// One work-item computes CHUNK samples of one traced line. It processes the segments of the line's ray tree that
+// overlap these samples in time and, for each, the cells of the patient-fixed scatterer lattice beside it: laterally
+// half-way to the next traced line, and as far as the beam reaches in the elevation direction. A scatterer is weighted
+// by the elevational profile and distributed linearly between the two edges of its strip (buffer line 2 line: left,
+// 2 line + 1: right); beam.cl then distributes it over all scan lines whose beam covers it. So each scatterer is
+// computed once per image, not once per beam. Work-items write disjoint samples in a fixed order: a pose always gives
+// the same bits. Global size (chunks, traced lines).
 //
-// A cell's scatterer has its place, T0 and T1 from a hash of the cell's index and the seed. Its amplitude is
+// Position, T0 and T1 of a cell's scatterer come from a hash of the cell's index and the seed. Its amplitude is
 //   mu0 (E - p) + sigma0 T0 E,  E = [T1 >= mu1],  p = P(E):
-// zero mean, variance p (1 - p) mu0^2 + p sigma0^2, linear in mu0 and sigma0. The mean p mu0 of the field is taken out
-// because a uniform medium does not echo; on a fine lattice the pulse would cancel it, a jittered one would not.
+// zero mean, variance p (1 - p) mu0^2 + p sigma0^2, linear in mu0 and sigma0. The mean p mu0 of the field is subtracted
+// because a uniform medium returns no echo; on a fine regular lattice the pulse would cancel it, on a jittered one not.
 //
-// With TEXTURE defined, scatterers know more of the MRI than labels (texture.py): a scatterer takes the second tissue
-// of its voxel with that one's probability, and its amplitude follows the intensity.
+// With TEXTURE defined, scatterers depend on the MRI in addition to labels (texture.py): a scatterer takes the second
+// tissue of its voxel with that tissue's probability, and its amplitude follows the intensity.
 //
-// With VARIED defined, the echoes are written in PARTS parts, of which every image of this pose is a linear combination
-// whatever mu0, sigma0 and mu1 of one tissue are (appearance.py). Part 0 is everything else. The tissue's scatterers
-// come to exist in bands of T1, one after the other: band b has part 1 + 2 b, its scatterers with amplitude 1, and part
-// 2 + 2 b, with amplitude T0.
+// With VARIED defined, the echoes are written in PARTS parts. For all mu0, sigma0 and mu1 of one tissue, the image of
+// this pose is a linear combination of the parts (appearance.py). Part 0 has the echoes of all other tissues. The
+// scatterers of the varied tissue are divided into bands of T1: part 1 + 2 b has the scatterers of band b with
+// amplitude 1, part 2 + 2 b with amplitude T0.
 //
 // Buffers: voxels, tissues, segments as in raytracing.cl; texture uint [k][j][i] (one element without TEXTURE); re, im
 // float [2 traced line + side][stride]; with VARIED also [part] before these, role int [label] (ROLE_...) and
-// band_top float [BANDS], the share of sites up to and with each band.
+// band_top float [BANDS], the cumulative fraction of sites up to each band.
 
 #include "common.clh"
 
@@ -39,11 +40,11 @@
 #ifndef CHUNK
 #define CHUNK BLOCK
 #endif
-#define PART (CHUNK + 2)  // one more sample at either end: echoes lie between samples
+#define PART (CHUNK + 2)  // one extra sample at either end: echoes lie between samples
 
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
-// What is the same for all scatterers beside one piece of a segment. Vectors are in the order u, v, w of lattice axes.
+// Quantities common to all scatterers beside one piece of a segment. Vectors are in the order u, v, w of lattice axes.
 typedef struct {
   float3 direction, lateral, elevational;
   float3 at_start, row_i, row_j, row_k;  // voxel index = at_start + rows * (offset from the segment's start)
@@ -57,20 +58,20 @@ typedef struct {
   int u, v, w, first;
 } Piece;
 
-// The hash counts cells by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
+// The hash uses cell indices by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
-// Adds an echo of this strength to one part.
+// Adds an echo of this amplitude to one part.
 inline void add_echo(float4 *sum, int bin, float between, float right, float strength, float re, float im) {
   const float to_right = right * strength, to_left = strength - to_right;
   const float4 echo = (float4)(to_left, to_left, to_right, to_right) * (float4)(re, im, re, im);
-  // Bins count from -1, so that the first and last sample of the chunk get their share from scatterers beyond.
+  // Bins start at -1, so that the first and last sample of the chunk receive contributions from scatterers beyond them.
   sum[bin + 1] += echo * (1.0f - between);
   sum[bin + 2] += echo * between;
 }
 
-// The label of a scatterer at fraction (fx, fy, fz) of the cell of voxels at `corner`, which has a border or the
-// membrane in it; `random` are bits of the scatterer's own. With TEXTURE, also its gain.
+// The label of a scatterer at fraction (fx, fy, fz) of the cell of voxels at `corner`, which contains a border or the
+// membrane; `random` are random bits of the scatterer. With TEXTURE, also its gain.
 inline int drawn_label(__constant const Acquisition *acquisition, __global const ushort *corner,
                        __global const uint *texture, float fx, float fy, float fz, uint random, float *gain) {
   const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
@@ -96,8 +97,8 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
   return MEMBRANE_LABEL;
 }
 
-// Three passes over a batch, each without a branch to guess wrong: vectors of all cells; labels of those that count;
-// their echoes, one after the other.
+// Three passes over a batch, each without unpredictable branches: vectors of all cells; labels of the scatterers that
+// contribute; their echoes, one after the other.
 inline void scatter_batch(__constant const Acquisition *acquisition, __global const ushort *voxels,
                           __global const uint *texture, __global const Tissue *tissues, const Piece *piece,
                           const int *cell_u, const uint *row_key, const float *row_v, const float *row_w, int count,
@@ -120,8 +121,8 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const intn cells = LOAD_LANES(cell_u + begin);
     const uintn key = hash_mixn((LOAD_LANES(row_key + begin) + TO_UINTN(cells) * step_u) ^ acquisition->seed);
     const uintn key1 = hash_mixn(key + 0x9E3779B9u), key2 = hash_mixn(key + 0x3C6EF372u);
-    // (The seed is not added: one added to another would be the same patient, shifted by a cell.)
-    // Jitter belongs to the lattice axes: u, v, w take the bits of the axis they stand for.
+    // (The seed is not added to the index: seeds would then give the same scatterers, shifted by cells.)
+    // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
                 bits_w = (key >> (10 * w)) & 0x3ffu;
     const floatn pu = (TO_FLOATN(cells) * cell - piece->start_u) + (TO_FLOATN(bits_u) + 0.5f) * grain;
@@ -175,7 +176,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     label_[i] = word & LABEL_MASK;
     mixed[several] = i;
 #ifdef TEXTURE
-    several++;  // texture varies inside tissues too
+    several++;  // texture also varies within tissues
 #else
     several += (word & PLAIN_CELL) != PLAIN_CELL;
 #endif
@@ -237,7 +238,7 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
   const float3 box_high = (fmax(near_end, far_end) + reach) * inverse_cell;
   const int v_low = (int)floor(box_low.y), v_high = (int)floor(box_high.y);
   const int w_low = (int)floor(box_low.z), w_high = (int)floor(box_high.z);
-  // A scatterer is at most half a cell from its cell's centre along each axis.
+  // A scatterer is at most half a cell from the centre of its cell along each axis.
   const float slack_d = 0.5f * cell * (fabs(d.x) + fabs(d.y) + fabs(d.z));
   const float limit_l = radius_l + 0.5f * cell * (fabs(l.x) + fabs(l.y) + fabs(l.z));
   const float limit_e = radius_e + 0.5f * cell * (fabs(e.x) + fabs(e.y) + fabs(e.z));
@@ -315,8 +316,8 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
   float4 sum[PARTS * PART];  // left re, im, right re, im
   for (int i = 0; i < PARTS * PART; i++) sum[i] = (float4)(0.0f);
   const float depth_low = (first - 1) * acquisition->sample_mm, depth_high = (first + CHUNK) * acquisition->sample_mm;
-  // Widths and gains are taken as linear over BLOCK samples, of which CHUNK is a part, so that the image does not
-  // depend on how the work is split.
+  // Widths and gains are assumed linear over BLOCK samples, of which CHUNK is a part, so that the image does not depend
+  // on the split of the work.
   const int block = first / BLOCK * BLOCK;
   const float block_low = (block - 1) * acquisition->sample_mm, block_high = (block + BLOCK) * acquisition->sample_mm;
 
@@ -333,8 +334,8 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
     const float chunk_high = (depth_high - piece.depth0) / piece.slope;
     if (fmax(segment_low, chunk_low) >= fmin(segment_high, chunk_high)) continue;
 
-    // Lattice axes in an order that puts the beam's elevational width, the longest, along u, whose cells lie side by
-    // side in the lanes, and depth along v, whose rows do.
+    // Lattice axes are ordered so that u is closest to the elevation direction, in which the beam is widest and whose
+    // cells fill the lanes, and v is closest to depth.
     float wide[3];
     for (int a = 0; a < 3; a++) wide[a] = fabs(segment->elevational[a]);
     const int u = wide[0] >= wide[1] ? (wide[0] >= wide[2] ? 0 : 2) : (wide[1] >= wide[2] ? 1 : 2);
@@ -354,7 +355,7 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
     piece.row_j = (float3)(m[4 + u], m[4 + v], m[4 + w]);
     piece.row_k = (float3)(m[8 + u], m[8 + v], m[8 + w]);
 
-    // Widths and gains are taken as linear between the two ends of a piece, so it must not be long for the beam's
+    // Widths and gains are assumed linear between the two ends of a piece, so it must be short compared with the beam's
     // waist.
     const float waist = fmin(acquisition->transmit_rayleigh, acquisition->elevation_rayleigh);
     const int pieces = max(1, (int)ceil((segment_high - segment_low) / (0.4f * waist)));
@@ -373,11 +374,11 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       piece.line1 = 1.0f / apart_high - piece.line0;
       piece.narrow0 = 0.5f * LOG2_E / (sigma_low.y * sigma_low.y);
       piece.narrow1 = 0.5f * LOG2_E / (sigma_high.y * sigma_high.y) - piece.narrow0;
-      // Unit energy of the point spread function, whatever its widths: sqrt(1 / (sigma_l sigma_e)) times the scale; and
-      // beam.cl weighs with unit sum, that is with apart / (sqrt(2 pi) sigma_l) at the peak.
+      // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
+      // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak.
       const float gain = log2(segment->weight * segment->attenuation * acquisition->speckle_scale * 2.50662827f);
       const float decay = LOG2_E * segment->decay_per_mm;
-      // Behind a curved mirror the same power has a wider tube to fill.
+      // Behind a curved mirror the same power is spread over a wider tube.
       const float4 tube_low = tube_after(vload4(0, segment->tube), low);
       const float4 tube_high = tube_after(vload4(0, segment->tube), high);
       piece.gain0 =
@@ -385,7 +386,7 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       piece.gain1 = gain - decay * high + 0.5f * log2(sigma_high.x / (sigma_high.y * tube_high.x * tube_high.z)) -
                     log2(apart_high) - piece.gain0;
 
-      // Beside the axis of a curved array the same range is reached a little earlier.
+      // Off the axis of a curved array the same range is reached slightly earlier.
       const float radius_l = 0.5f * fmax(apart_low, apart_high), early = piece.bend * radius_l * radius_l;
       const float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
       if (begin >= end) continue;

@@ -1,7 +1,7 @@
 // 3D guided filter (He et al., ECCV 2010), self-guided, inside a mask (docs/physics.md#1-from-mri-to-tissues).
 //
 // Box windows are running sums along one axis at a time, so the cost does not depend on the radius. Volumes are float
-// [k][j][i] with i padded to whole lanes; the mask (1 inside) keeps air out of every mean.
+// [k][j][i] with i padded to whole lanes; the mask (1 inside) excludes air from every mean.
 
 #include "common.clh"
 
@@ -40,8 +40,8 @@ __kernel void squares(__global const float *image, __global float *square) {
 }
 
 // The local linear model a I + b of every window (He, eq. 5 and 6 with the image as its own guide), from the sums of
-// mask, image and image^2 over the window. A voxel lies in many windows; He averages their models, here those of calm
-// windows weigh more (by 1 / variance), so that a border window does not blur what a flat one beside it knows better.
+// mask, image and image^2 over the window. A voxel lies in many windows, and He averages their models. Here they are
+// weighted by 1 / variance, so that windows across an edge do not blur the estimate of homogeneous windows.
 // Overwrites sum_of_mask with the weight, sum with weight a, sum_of_squares with weight b.
 __kernel void linear_model(__global float *sum_of_mask, __global const float *mask, __global float *sum,
                            __global float *sum_of_squares, float epsilon, float least_variance) {

@@ -1,10 +1,10 @@
 // compare_patches: the local histograms of two images and their absolute difference
-// (docs/optimization.md#the-cost, equations 4 and 5 of the paper). One work-item compares one square patch; global size
-// (patch columns, patch rows).
+// (docs/optimization.md#cost-function, equations 4 and 5 of the paper). One work-item compares one square patch; global
+// size (patch columns, patch rows).
 //
-// Buffers: image, reference uchar [row][column]; inside uchar likewise, 0 where a pixel does not count; result float
-// [patch row][patch column][3]: 1 - sum_j sqrt(P_j Q_j), sum of absolute differences in grey levels, pixels that count.
-// The first is computed as half of sum_j (sqrt P_j - sqrt Q_j)^2, which is the same and exact where P = Q.
+// Buffers: image, reference uchar [row][column]; inside uchar [row][column], 0 for pixels to ignore; result float
+// [patch row][patch column][3]: 1 - sum_j sqrt(P_j Q_j), sum of absolute differences in grey levels, number of pixels
+// used. The first is computed as half of sum_j (sqrt P_j - sqrt Q_j)^2, which is equal, and exact where P = Q.
 
 #include "common.clh"
 

@@ -1,5 +1,6 @@
-// The indicators of acoustic groups, smoothed (borders.py): a separable Gaussian whose ends repeat the border
-// voxels. One work-item computes LANES voxels of a row; global size (columns / LANES rounded up, rows, planes).
+// Smoothing of the indicators of acoustic groups (borders.py): a separable Gaussian. Beyond the volume its outermost
+// voxels are repeated. One work-item computes LANES voxels of a row; global size (columns / LANES rounded up, rows,
+// planes).
 //
 // Buffers: groups uchar [k][j][i] with flags; taps float [2 reach + 1] of unit sum; partial float [plane][j][i]; smooth
 // ushort [k][j][i], 65535 for 1. `columns` and `rows` are the voxels along i and j.
@@ -15,17 +16,17 @@
   JOIN(vstore, LANES)(JOIN(JOIN(convert_ushort, LANES), _sat)((value) * 65535.0f + 0.5f), 0, pointer)
 #endif
 
-// Along i, from groups: planes from `first` on, each clamped into the volume.
+// Along i, from groups: planes starting at `first`, each clamped to the volume.
 __kernel void smooth_rows(__global const uchar *groups, int group, __constant const float *taps, int reach, int columns,
                           int rows, int planes, int first, __global float *partial) {
-  // The last vector of a row begins earlier: what it shares with the one before is computed twice.
+  // The last vector of a row starts earlier: voxels shared with the previous vector are computed twice.
   const int column = min((int)get_global_id(0) * LANES, columns - LANES), row = get_global_id(1);
   const int plane = clamp((int)get_global_id(2) + first, 0, planes - 1);
   __global const uchar *from = groups + ((size_t)plane * rows + row) * columns;
   const int is_inside = column >= reach && column + LANES + reach <= columns;
   floatn sum = 0.0f;
   for (int k = -reach; k <= reach; k++) {
-    floatn words;  // the flag counts 128
+    floatn words;  // the flag is worth 128
     if (is_inside) {
       words = LOAD_BYTES(from + column + k);
     } else {
@@ -50,7 +51,7 @@ __kernel void smooth_columns(__global const float *from, __constant const float 
   STORE_LANES(sum, to + (plane + row) * columns + column);
 }
 
-// Along k: `from` begins `reach` planes before the plane `first` of the volume.
+// Along k: `from` starts `reach` planes before the plane `first` of the volume.
 __kernel void smooth_planes(__global const float *from, __constant const float *taps, int reach, int columns, int rows,
                             int first, ulong offset, __global ushort *smooth) {
   const int column = min((int)get_global_id(0) * LANES, columns - LANES), row = get_global_id(1);
@@ -60,7 +61,7 @@ __kernel void smooth_planes(__global const float *from, __constant const float *
   STORE_SMOOTH(min(sum, (floatn)(1.0f)), smooth + offset + (plane + first) * size + here);
 }
 
-// Indicators sum to one, which saves the last group's Gaussian. One work-item computes one voxel.
+// Indicators sum to one, so the last group needs no Gaussian. One work-item computes one voxel.
 __kernel void smooth_rest(__global ushort *smooth, int group, int groups) {
   const size_t voxel = get_global_id(0), voxels = get_global_size(0);
   int rest = 65535;

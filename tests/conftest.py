@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.tissue.presets import TISSUES
 hypothesis.settings.register_profile("ussim", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("ussim")
 
-#: Real sequences, where a checkout has them beside it.
+#: Real sequences, if the checkout has them next to it.
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="the real sequences of ../shared/data are not here")
 

@@ -1,4 +1,4 @@
-"""How 3D Slicer finds and loads scripted modules, rule for rule, without Slicer.
+"""The rules by which 3D Slicer finds and loads scripted modules, without Slicer.
 
 Sources, in Slicer/Slicer: Base/QTGUI/qSlicerScriptedLoadableModuleFactory.cxx (which files),
 Base/QTCore/qSlicerUtils.cxx (which are command-line modules), Base/QTGUI/qSlicerScriptedLoadableModule.cxx and
@@ -55,7 +55,7 @@ class Factory:
 
 
 def is_scripted_module(file: Path) -> bool:
-    """Whether the factory takes a file for a module: .py, or .pyc without its .py; none that begins with #!."""
+    """Whether the factory treats a file as a module: .py, or .pyc without its .py, but no file that begins with #!."""
     if not file.is_file() or is_command_line_module(file):
         return False
     suffix = file.suffix.lower()
@@ -63,7 +63,7 @@ def is_scripted_module(file: Path) -> bool:
 
 
 def is_command_line_module(file: Path) -> bool:
-    """Whether another factory would run a file to ask it what it can do: a script with #!, a name without a dot."""
+    """Whether another factory would run a file to query its interface: a script with #!, a name without a dot."""
     if file.suffix.lower() == ".py":
         return file.read_bytes().removeprefix(b"\xef\xbb\xbf").startswith(b"#!")
     return "." not in file.name
@@ -79,7 +79,7 @@ def load_source_as_module(name: str, file: Path):
 
 
 def found_by_wizard(path: Path, depth: int = 1) -> list[Path]:
-    """What the Extension Wizard lists for a folder, and what is found when a folder or a file is dropped on Slicer.
+    """The modules that the Extension Wizard lists for a folder, or that Slicer finds in a dropped folder or file.
 
     A folder with an __init__.py is a library, and nothing in it is a module. Elsewhere a module is a file with a class
     of its name, derived from ScriptedLoadableModule by that very name.

@@ -1,4 +1,4 @@
-"""As much of the Slicer application as the scripted module touches, on PySide6 and slicer-core's MRML libraries.
+"""A substitute for the parts of the Slicer application that the scripted module uses, on PySide6 and slicer-core.
 
 Slicer's scripted-module base classes, PythonQt and CTK cannot be installed; these stand in for them, so that the panel
 runs, is clicked and is looked at. What they promise is what Slicer's sources do: the loader, the lifecycle, signals and
@@ -258,7 +258,7 @@ class ScriptedLoadableModuleTest(unittest.TestCase):
 
 
 class Application:
-    """slicer.app, and what message boxes said."""
+    """slicer.app, with the texts of message boxes."""
 
     def __init__(self) -> None:
         self.qt = QtWidgets.QApplication.instance() or QtWidgets.QApplication([])
@@ -267,7 +267,7 @@ class Application:
         self.answer = True
         self.started: list = []
         self.shown: list[str] = []
-        #: What pip was told: packages, and what the file of constraints said
+        #: Arguments of pip: packages, and the content of the file of constraints
         self.installed: list[str] = []
         self.constraints = ""
         #: --testing, in which message boxes answer themselves
@@ -302,7 +302,7 @@ def _qt_name(name: str):
 
 
 def start() -> Application:
-    """Put the stand-ins where the module looks for them; pytest's monkeypatch of sys.modules takes them away again."""
+    """Install the stand-ins where the module imports them; pytest's monkeypatch of sys.modules removes them again."""
     qt = types.ModuleType("qt")
     qt.__getattr__ = _qt_name
     app = Application()

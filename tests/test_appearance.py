@@ -1,4 +1,4 @@
-"""What an optimiser varies, computed from bases: the same images as whole simulations give."""
+"""Images computed from bases for the free parameters of an optimiser equal those of complete simulations."""
 
 from __future__ import annotations
 

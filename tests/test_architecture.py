@@ -1,4 +1,4 @@
-"""Who imports whom: the rooms of DESIGN's line, read from the sources.
+"""Dependencies between rooms, from the imports in the sources.
 
     python -m tests.test_architecture [ROOT]
 
@@ -24,8 +24,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "SlicerUSSim"
-#: The rooms as the table in docs/architecture.md has them, each of which knows those before it. The module's file is
-#: none of them, and knows all but the workstation and the command.
+#: The rooms in the order of the table in docs/architecture.md, each of which may import those before it. The module's
+#: file is not one of them, and may import all but the workstation and the command.
 _TABLE = re.findall(r"^\| \[(\w+)\]", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"), re.MULTILINE)
 ORDER = [room for entry in _TABLE for room in (["module", entry] if entry == "Workstation" else [entry])]
 #: Libraries that take long to import, and the rooms whose files may do so at their top. Elsewhere it is left to the
@@ -171,7 +171,7 @@ def _in_type_checking(source: ast.Module) -> Iterator[ast.AST]:
 
 
 def _executed(node: ast.AST) -> Iterator[ast.AST]:
-    """What runs when the file is imported: everything outside functions."""
+    """The statements that run when the file is imported: all outside functions."""
     for child in ast.iter_child_nodes(node):
         if not isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
             yield child
@@ -268,7 +268,7 @@ def test_only_the_command_knows_the_workstation_and_what_verifies(tree):
 
 
 def test_examples_and_benchmarks_know_no_workstation_and_no_panel(tree):
-    """But for the benchmark of the workstation itself."""
+    """Except for the benchmark of the workstation itself."""
     for path in [*(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]:
         if path.stem == "dragging":
             continue
@@ -305,7 +305,7 @@ print(json.dumps(sorted({name.split(".")[0] for name in sys.modules})))
 
 
 def test_what_reads_the_imports_finds_them_all(tmp_path):
-    """The reader itself: relative and lazy imports, names from faces, those for types alone, circles and levels."""
+    """The reader of imports: relative and lazy imports, names from faces, imports for types only, cycles and levels."""
     files = {
         "Logic/low/__init__.py": "from x import lazy_exports\nif TYPE_CHECKING:\n    from .a import A as A\n"
         "lazy_exports(globals())\n",
@@ -334,7 +334,7 @@ def test_what_reads_the_imports_finds_them_all(tmp_path):
 
 
 def main(root: Path) -> None:
-    """Print what there is to compare."""
+    """Print rooms, levels and imports."""
     tree = Tree(root)
     edges = tree.room_edges()
     floor = levels(edges)

@@ -1,4 +1,4 @@
-"""`ussim bench`: floors, tables, comparison, and that a wrong image is told. No test looks at a time."""
+"""`ussim bench`: lower bounds, tables, comparison, and the report of a wrong image. No test depends on a time."""
 
 from __future__ import annotations
 

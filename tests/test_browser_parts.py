@@ -1,4 +1,4 @@
-"""What the workstation is made of, without a browser: tasks, cines, scripts, sequences as nodes, the probe's shape."""
+"""Parts of the workstation without a browser: tasks, cine loops, scripts, sequences as nodes, the probe's shape."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def head():
 
 
 def run_in_loop(coroutine_function):
-    """What an async function gives in a loop of its own; what it waits for and does not come fails."""
+    """The result of an async function in a separate event loop; fails if it waits too long."""
     return run_in(asyncio.new_event_loop(), coroutine_function)
 
 
@@ -379,7 +379,7 @@ def test_of_images_that_come_fast_the_last_is_compared(head):
 
 def test_a_cine_keeps_time_and_begins_anew_with_another_size():
     cine = Cine()
-    with pytest.raises(SimulationError, match="holds 0 images"):
+    with pytest.raises(SimulationError, match="has 0 images"):
         cine.gif()
     cine.add(np.zeros((10, 10), np.uint8), 0.0)
     for number in range(4):
@@ -396,7 +396,7 @@ NASTY = ["it's", 'a "b"', "back\\slash\\", "two\nlines", "'''", '"""', "\\N{x} {
 
 
 def run_again(script: str, folder) -> np.ndarray:
-    """The (rows, columns) image that a script writes."""
+    """The (rows, columns) image written by a script."""
     (folder / "again.py").write_text(script, encoding="utf-8")
     done = subprocess.run([sys.executable, "again.py"], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

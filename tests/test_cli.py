@@ -1,4 +1,4 @@
-"""The ussim command: what it writes, and that a mistake is one line on stderr, exit 2, and nothing half-written."""
+"""The ussim command: its output; errors give one line on stderr, exit status 2, and no incomplete files."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_the_demo_without_nilearn_says_that_it_uses_a_phantom(monkeypatch):
         importlib.util, "find_spec", lambda name, *rest: None if name == "nilearn" else find(name, *rest)
     )
     volume, source = demo_mri()
-    assert "phantom made by code" in source and volume.array.max() > 0
+    assert "synthetic head phantom" in source and volume.array.max() > 0
 
 
 def test_segment_writes_labels_and_their_tissues(labels, head):
@@ -166,7 +166,7 @@ def test_devices_says_which_is_used():
 
 
 def bad_inputs(folder):
-    """(arguments, part of the message) for every mistake a user can make."""
+    """(arguments, part of the message) for user errors."""
     np.savetxt(folder / "three.txt", np.eye(3))
     np.savetxt(folder / "scaled.txt", np.eye(4) * 2)
     np.savetxt(folder / "singular.txt", np.zeros((4, 4)))
@@ -206,7 +206,7 @@ def bad_inputs(folder):
         (["simulate", folder / "nine.nrrd", "--pose", "auto", "-o", out], "label 9 has no tissue"),
         (["simulate", mri, "--pose", "auto", "-o", folder / "out.xyz"], "unknown image format"),
         (["simulate", mri, "--pose", "auto", "-o", folder / "nowhere" / "o.png"], "does not exist"),
-        (["demo", "--mri", mri, "--out", folder / "probe.json" / "x"], "cannot be made"),
+        (["demo", "--mri", mri, "--out", folder / "probe.json" / "x"], "cannot be created"),
         (["simulate", mri, "--pose", "auto", "-o", "/proc/o.png"], "/proc/o.png: cannot be written"),
     ]
 

@@ -1,4 +1,4 @@
-"""ussim sweep and ussim optimize: what they write, and that a mistake is one line, exit 2, and nothing half-written."""
+"""ussim sweep and ussim optimize: their output; errors give one line, exit status 2, and no incomplete files."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def test_the_saved_transform_puts_the_images_where_the_fit_found_them(folder, tm
 
 
 def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path):
-    """As RESECT has it: ultrasound as NIfTI in its own frame, landmarks in MRI and ultrasound as .tag."""
+    """Data as in RESECT: ultrasound as NIfTI in its own frame, landmarks in MRI and ultrasound as .tag."""
     sequence = TrackedSequence.read(folder / "tracked.igs.mha")
     probe = PhasedProbe(70.0, 50.0, scan_lines=80)
     labels, tissues = Volume.read(folder / "labels.nii.gz"), TissueTable.read(folder / "labels.json")
@@ -224,8 +224,8 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
     "options, message",
     [
         (["--frames", "9"], "image 9 does not exist, expected 0 to 2"),
-        (["--frames", "one"], "frames are 'one', expected such as 0,5,10 or 0:20:5"),
-        (["--frames", "5:9"], "choose none of the 3 images"),
+        (["--frames", "one"], "frames are 'one', expected numbers such as 0,5,10 or 0:20:5"),
+        (["--frames", "5:9"], "frames are '5:9', expected at least one of the 3 images"),
         (["--transform", "ImageToPatient"], "no path from Image to Patient"),
         (["--free", "brightness"], "no free parameter 'brightness'"),
         (["--free", "gain_db=5:1"], "bounds of gain_db are 5.0 to 1.0, expected two numbers, the smaller one first"),
@@ -265,7 +265,7 @@ def test_black_images_and_a_sequence_that_is_none_are_refused(folder, tmp_path):
 
 @needs_shared
 def test_a_real_sequence_is_fitted_with_a_plus_calibration(folder, tmp_path):
-    """Image geometry found in real images, tracking from Plus: a block of muscle stands in for the unknown phantom."""
+    """Geometry estimated from real images, tracking from Plus: a block of muscle replaces the unknown phantom."""
     (tmp_path / "plus.xml").write_text(
         '<PlusConfiguration><CoordinateDefinitions><Transform From="Image" To="Probe" '
         'Matrix="0.0854 0 0 -35 0 0.0854 0 -1.2 0 0 0.0854 0 0 0 0 1"/></CoordinateDefinitions></PlusConfiguration>'

@@ -1,4 +1,4 @@
-"""The extension: built and installed with a stand-in for Slicer, loaded from there, fit for the Extensions Index.
+"""The extension: built and installed with a substitute for Slicer, loaded from there, valid for the Extensions Index.
 
 tests/slicer_cmake/SlicerConfig.cmake lays files out as Slicer's build does. The Index's rules are those of
 scripts/check_description_files.py and schemas/slicer-extension-catalog-entry-schema-v1.0.2.json in
@@ -26,7 +26,7 @@ ENTRY_FILE = ROOT / "USSim.json"
 
 
 def tool(name: str) -> str | None:
-    """The program of a pip package, beside this Python, or of the system."""
+    """The program of a pip package, next to this Python, or of the system."""
     return shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
 
 
@@ -97,7 +97,7 @@ def test_the_module_its_resources_and_one_folder_are_installed_and_nothing_else(
 
 @needs_cmake
 def test_every_installed_resource_bears_the_modules_name(installed):
-    """Other extensions' resources lie in the same folders: Resources/UI/Settings.ui would be anybody's."""
+    """Resources of other extensions are in the same folders: a name such as Resources/UI/Settings.ui could conflict."""
     mine = files(ROOT / "SlicerUSSim" / "Resources")
     assert mine and all("USSim" in Path(path).parts or Path(path).stem == "USSim" for path in mine)
 
@@ -132,7 +132,7 @@ def test_the_built_module_loads_from_its_own_folder(build):
 @needs_cmake
 @needs_slicer
 def test_the_installed_module_simulates_beside_other_extensions_with_its_own_kernels(installed):
-    """Another extension's Logic lies on sys.path there, and is left alone."""
+    """Another extension's Logic on sys.path is not affected."""
     package = installed / "SlicerUSSim"
     result = load(installed, self_test=True)
     assert_loaded_from(result, installed / "USSim.py", package, package / "kernels")

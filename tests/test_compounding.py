@@ -1,4 +1,4 @@
-"""Volumes from sweeps: every grey level in its place, whatever poses and grid; holes filled, nothing invented."""
+"""Volumes from sweeps: grey levels at their positions for all poses and grids; gaps filled, nothing added elsewhere."""
 
 from __future__ import annotations
 

@@ -260,8 +260,8 @@ BAD = [
     (" " * (4 * 2**20 + 1), "has 4194305 bytes, expected at most 4194304"),
     ('{"display": {"gain_db": 1, "gain_db": 2}}', "is not JSON ('gain_db' is given twice)"),
     ('{"tissues": {"1": {}, "1": {}}}', "is not JSON ('1' is given twice)"),
-    ('{"display": {"gain_db": NaN}}', "is not JSON (NaN is no number)"),
-    ('{"display": {"gain_db": -Infinity}}', "is not JSON (-Infinity is no number)"),
+    ('{"display": {"gain_db": NaN}}', "is not JSON (NaN is not a number)"),
+    ('{"display": {"gain_db": -Infinity}}', "is not JSON (-Infinity is not a number)"),
     ('{"display": {"gain_db": 1e999}}', "display: gain_db is inf, expected a number between -200 and 200"),
     ('{"settings": {"seed": ' + "9" * 5000 + "}}", "is not JSON (Exceeds the limit"),
     ({"probes": {}}, "has 'probes', expected probe, display, settings, tissues, membrane"),
@@ -423,7 +423,8 @@ def test_help_says_label_unit_what_it_does_and_the_default():
     for text in (
         "Gain [dB]: brightness of all echoes (default: the preset's, 0).",
         "(default: the preset's, --hard-labels).",
-        "--contrast [t1|t1gd|t2|flair] Contrast of the MRI; it orders the tissues by intensity (default: t1).",
+        "--contrast [t1|t1gd|t2|flair] Contrast of the MRI, which gives the order of the tissues by intensity "
+        "(default: t1).",
     ):
         assert text in said
     said = " ".join(ussim("optimize", "--help").output.split())

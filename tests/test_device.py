@@ -83,7 +83,7 @@ def test_an_unknown_choice_lists_what_there_is(three_devices, monkeypatch):
     ],
 )  # fmt: skip
 def test_what_to_install_is_what_there_is_for_the_computer(monkeypatch, system, machine, advice, hint):
-    """Packages that pip finds, and no extra of this package, which is not published."""
+    """Packages that pip finds, but not extras of this package, which is not published."""
     monkeypatch.setattr("SlicerUSSim.Logic.opencl.devices.list_devices", lambda: [])
     monkeypatch.setattr(sys, "platform", system)
     monkeypatch.setattr("platform.machine", lambda: machine)
@@ -96,7 +96,7 @@ def test_what_to_install_is_what_there_is_for_the_computer(monkeypatch, system, 
 
 @pytest.fixture
 def intels_wheel(tmp_path, monkeypatch):
-    """Intel's wheel as pip installs it on Windows: the library in the prefix, its path from site-packages on record."""
+    """Intel's wheel as installed by pip on Windows: the library in the prefix, its path in RECORD."""
     library = tmp_path / "Library" / "bin" / "intelocl64.dll"
     record = tmp_path / "Lib" / "site-packages" / "intel_opencl_rt-2026.2.0.dist-info"
     for folder in (library.parent, record):
@@ -112,7 +112,7 @@ def intels_wheel(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("before", "after"), [("", "{0}"), ("C:\\own.dll", "C:\\own.dll;{0}"), ("{0}", "{0}")])
 def test_on_windows_intels_wheel_is_named_to_the_loader(intels_wheel, monkeypatch, before, after):
-    """OCL_ICD_FILENAMES, paths with ; between them. Untested on Windows itself."""
+    """OCL_ICD_FILENAMES, paths separated by ;. Untested on Windows itself."""
     monkeypatch.setenv("OCL_ICD_FILENAMES", before.format(intels_wheel))
     register_pip_runtimes()
     assert os.environ["OCL_ICD_FILENAMES"] == after.format(intels_wheel)
@@ -194,7 +194,7 @@ def test_importing_the_interface_imports_nothing_heavy():
 
 @pytest.mark.parametrize("missing", [("ld",), ("gcc", "cc")])
 def test_pocl_without_a_linker_is_an_error_and_not_the_end_of_the_process(monkeypatch, missing):
-    """PoCL 3 aborts where it cannot link, as on a minimal Debian."""
+    """PoCL 3 aborts if it cannot link, as on a minimal Debian."""
     monkeypatch.setattr("shutil.which", lambda name, path=None: None if name in missing else f"/usr/bin/{name}")
     monkeypatch.setattr("pathlib.Path.glob", lambda self, pattern: iter(()))
     with pytest.raises(SimulationError, match=r"which are not installed; .* apt-get install gcc libc6-dev"):

@@ -1,4 +1,4 @@
-"""What README, docs and comments refer to exists: headings, links, files, options of the command, imports."""
+"""References in README, docs and comments exist: headings, links, files, options of the command, imports."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_no_source_refers_to_a_section_by_its_number():
 
 
 def test_files_that_comments_name_exist():
-    """Whatever source or page a docstring or comment speaks of by its name."""
+    """Every source or page that a docstring or comment names."""
     missing = {
         f"{source.relative_to(ROOT)}: {name}"
         for source in SOURCES
@@ -168,7 +168,7 @@ def test_options_named_in_the_text_exist(page):
 
 
 def require_imports(code: str) -> None:
-    """Every module that is imported exists, and ours have the names that are taken from them."""
+    """Every imported module exists, and those of this package have the imported names."""
     if "Logic.mrml" in code:
         pytest.importorskip("slicer", reason="MRML needs slicer-core: pip install '.[slicer]'")
     for node in ast.walk(ast.parse(code)):

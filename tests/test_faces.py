@@ -1,4 +1,4 @@
-"""The faces of Logic: what a package promises to editors is there at run time, and costs nothing before it is used."""
+"""The faces of Logic: names exported for type checkers exist at run time, and are imported only when used."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def declared(package: str) -> dict[str, str]:
 
 
 def fresh(code: str) -> str:
-    """What a new interpreter prints."""
+    """The output of a new interpreter."""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()

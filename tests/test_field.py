@@ -1,4 +1,4 @@
-"""The imaged field, found in images: simulated ones whose geometry is known, and real ones."""
+"""The imaged field estimated from images: simulated images with known geometry, and real images."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ phased = st.builds(PhasedProbe, st.floats(50, 100), st.floats(50, 180))
 
 @given(st.one_of(convex, linear, phased))
 def test_geometry_is_found_from_the_image(probe):
-    if isinstance(probe, ConvexProbe):  # with less of a radius it is taken for a phased array
+    if isinstance(probe, ConvexProbe):  # with a smaller radius it is classified as a phased array
         assume(probe.radius_mm > 0.08 * (probe.radius_mm + probe.depth_mm))
     image, grid = screen(probe)
     field = estimate_field(image, grid.pixel_spacing_mm)
@@ -85,10 +85,10 @@ def test_size_of_a_pixel_follows_from_what_is_known():
     assert by_width.image_to_probe[0, 0] == pytest.approx(grid.pixel_spacing_mm[0], rel=0.01)
     assert estimate_field(image, depth_mm=50.0).probe.to_dict()["width_mm"] == pytest.approx(38.0, abs=0.3)
     for options in ({}, {"width_mm": 38.0, "depth_mm": 50.0}):
-        with pytest.raises(SimulationError, match="how large a pixel is"):
+        with pytest.raises(SimulationError, match="pixel size is not known"):
             estimate_field(image, **options)
     sector, _ = screen(ConvexProbe(20, 70, 80))
-    with pytest.raises(SimulationError, match="width_mm is known of linear probes only"):
+    with pytest.raises(SimulationError, match="width_mm is for linear probes only"):
         estimate_field(sector, width_mm=38.0)
 
 
@@ -97,7 +97,7 @@ def test_size_of_a_pixel_follows_from_what_is_known():
     [
         (np.zeros((50, 60), np.uint8), "black"),
         (np.full((3, 0, 4), 9, np.uint8), "expected (n, rows, columns)"),
-        (np.tri(200, 200, dtype=np.uint8) * 99, "no probe's field"),
+        (np.tri(200, 200, dtype=np.uint8) * 99, "not a probe's field"),
     ],
 )
 def test_images_without_a_fan_are_refused(image, message):
@@ -156,9 +156,9 @@ def test_a_given_probe_keeps_its_beam_and_gets_the_place_of_the_field():
     found = TrackedImages.of(sequence, [1], probe=probe)
     assert found.probe is probe and found.numbers == [1]
     assert np.allclose(found.poses[0], TrackedImages.of(sequence).poses[1], atol=0.4)
-    with pytest.raises(SimulationError, match="field of a convex probe, but the probe given is linear"):
+    with pytest.raises(SimulationError, match="the probe is linear, expected convex as in the images"):
         TrackedImages.of(sequence, probe=LinearProbe(40, 80))
-    with pytest.raises(SimulationError, match="mm deep, but the probe given sees 120 mm"):
+    with pytest.raises(SimulationError, match="the probe's depth is 120 mm, expected"):
         TrackedImages.of(sequence, probe=ConvexProbe(40, 60, 120))
 
 

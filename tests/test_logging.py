@@ -191,7 +191,7 @@ def test_images_that_were_not_tracked_are_a_warning(log, files):
 
 def test_names_taken_for_tissues_are_logged(log):
     TissueTable.named(["csf", "Left-Cerebral-White-Matter"])
-    assert messages(log, logging.INFO) == ["label 2, 'Left-Cerebral-White-Matter', is taken for white matter"]
+    assert messages(log, logging.INFO) == ["label 2, 'Left-Cerebral-White-Matter', is interpreted as white matter"]
 
 
 def test_a_refused_pose_is_a_warning_with_its_reason_and_comes_once(log):

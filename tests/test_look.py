@@ -1,4 +1,4 @@
-"""Does a brain look like ultrasound? On the template, and on one person where Debian's Colin27 is installed."""
+"""Plausibility of the image of a brain, for the template, and for one person if Debian's Colin27 is installed."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_ventricles_are_black_and_white_matter_is_above_grey(view):
     ventricle = eroded((labels == 1) & near_axis, 6)
     assert ventricle.sum() > 200
     assert np.median(mean[ventricle]) < 12
-    near = in_field(PhasedProbe(80, 50, scan_lines=196), frame)  # before enhancement and shadow have had their say
+    near = in_field(PhasedProbe(80, 50, scan_lines=196), frame)  # before enhancement and shadow have an effect
     grey, white = (np.median(mean[eroded(labels == label, 3) & field & near]) for label in (2, 3))
     assert white > grey + 8
 

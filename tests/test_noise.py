@@ -1,4 +1,4 @@
-"""Amplifier noise: another in every image, the same again for the same one, and one throughout a fit."""
+"""Amplifier noise: different in every image, the same when an image is repeated, and the same throughout a fit."""
 
 from __future__ import annotations
 

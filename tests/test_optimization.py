@@ -1,4 +1,4 @@
-"""The optimisation on twins, whose parameters are known: what it recovers, what it says of the rest, and mistakes."""
+"""The optimisation on twins with known parameters: accuracy, identifiability, and errors for invalid input."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def white(tissues):
 
 @pytest.fixture(scope="module")
 def result(twin):
-    # As many as users take: with half of them a restart does not come as far, and nothing could be said.
+    # The default number: with half of it restarts reach a higher cost, and identifiability cannot be determined.
     return optimise(twin, ["display", "white matter"], max_evaluations=600, restarts=2)
 
 

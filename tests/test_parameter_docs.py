@@ -1,8 +1,8 @@
-"""docs/parameters.md says what the declarations say.
+"""docs/parameters.md agrees with the declarations.
 
     python -m tests.test_parameter_docs
 
-writes it again from them.
+generates it from them.
 """
 
 from __future__ import annotations
@@ -24,44 +24,44 @@ from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 PAGE = Path(__file__).parents[1] / "docs" / "parameters.md"
 INTRODUCTION = """# Parameters
 
-All that can be set, as the sources declare it: `python -m tests.test_parameter_docs` writes this page from there. One
-declaration per parameter makes its checks, its place in a preset, its option, its field in the panel and on the page,
-and the bounds of its fit.
+All parameters, generated from their declarations in the code by `python -m tests.test_parameter_docs`. The declaration
+of a parameter also defines its checks, its name in a preset, its option, its field in the panel and on the page, and
+the bounds of its fit.
 
 A preset is a JSON file with the objects `probe`, `display`, `settings`, `tissues` (by label, `"1"` to `"62"`, and `"0"`
-for the coupling medium) and `membrane`; `ussim demo` and the panels write one, `--preset` and the panels read it. Types
-are strict: `true` is no number, `"5"` is no 5, 3.0 is no whole number, and names that are not in these tables are
-refused. *None* is `null` in JSON.
+for the coupling medium) and `membrane`. `ussim demo` and the panels write presets; `--preset` and the panels read them.
+Types are strict: `true` and `"5"` are not accepted as numbers, nor 3.0 as a whole number, and names that are not in
+these tables are refused. *None* is `null` in JSON.
 
-In the command, `--set` changes any parameter of probe, display, settings, membrane and tissues, by the name of the
-section or tissue, a dot and the name of the parameter: `--set settings.max_ray_depth=4`, `--set probe.depth_mm=70`,
-`--set "white matter.mu0=0.5"`. Those with an option of their own have it in the last column. `--set` goes before
-options, options before `--preset`.
+In the command, `--set` changes any parameter of probe, display, settings, membrane and tissues. Its value is the name
+of the section or tissue, a dot, the name of the parameter, and the new value: `--set settings.max_ray_depth=4`,
+`--set probe.depth_mm=70`, `--set "white matter.mu0=0.5"`. The last column lists the parameters that also have an
+option. `--set` overrides these options, and they override `--preset`.
 """
-#: (heading, declared classes, what to know of them)
+#: (heading, declared class, description)
 SECTIONS: list[tuple[str, type[Declared], str]] = [
-    ("Probe", Probe, "What all kinds share; `probe` in a preset."),
+    ("Probe", Probe, "Parameters of all kinds of probe; `probe` in a preset."),
     *((f"{name.capitalize()} probe", kind, f"{(kind.__doc__ or '').splitlines()[0]}") for name, kind in
       PROBE_KINDS.items()),
-    ("Display", DisplaySettings, "`display` in a preset: what a scanner's console does to the echoes."),
-    ("Settings", SimulationSettings, "`settings` in a preset: what the physics needs beside tissues, probe and pose."),
-    ("Tissues", Tissue, "`tissues` in a preset, one object for each label. [physics.md](physics.md#5-scatterers) has "
-     "the model; the presets and the source of every number are in "
-     "[presets.py](../SlicerUSSim/Logic/tissue/presets.py)."),
-    ("Membrane", Membrane, "`membrane` in a preset: a thin scattering layer along the border between fluid and brain. "
+    ("Display", DisplaySettings, "Settings of a scanner's console; `display` in a preset."),
+    ("Settings", SimulationSettings, "Settings of the acoustic model; `settings` in a preset."),
+    ("Tissues", Tissue, "`tissues` in a preset, one object for each label. [physics.md](physics.md#5-scatterers) "
+     "describes the model; [presets.py](../SlicerUSSim/Logic/tissue/presets.py) has the presets and the source of "
+     "every value."),
+    ("Membrane", Membrane, "A thin scattering layer along the border between fluid and brain; `membrane` in a preset. "
      "Its `tissue` is an object as in [Tissues](#tissues)."),
-    ("Segmentation", SegmentationSettings, "How an MRI becomes tissues: `ussim segment`, `segment_mri` and the VTK "
-     "filter."),
-    ("Fit", FitSettings, "How simulated images are fitted to real ones ([optimization.md](optimization.md)); "
-     "`ussim optimize` has `--frames` and `--free` for the first two."),
-    ("Similarity", SimilaritySettings, "How alike two images are ([optimization.md](optimization.md#the-cost)), in "
-     "Python alone."),
-    ("Panel", PanelSettings, "What else a scene remembers of the panel ([slicer.md](slicer.md))."),
+    ("Segmentation", SegmentationSettings, "Segmentation of an MRI into tissues, by `ussim segment`, `segment_mri` "
+     "and the VTK filter."),
+    ("Fit", FitSettings, "Fit of simulated to real images ([optimization.md](optimization.md)). For `frames` and "
+     "`free`, `ussim optimize` has options of the same names."),
+    ("Similarity", SimilaritySettings, "The cost of a fit ([optimization.md](optimization.md#cost-function)); set in "
+     "Python only."),
+    ("Panel", PanelSettings, "Further values of the panel that are saved with a scene ([slicer.md](slicer.md))."),
 ]  # fmt: skip
 
 
 def page() -> str:
-    """The page as the declarations have it."""
+    """The page, generated from the declarations."""
     parts = [INTRODUCTION]
     for heading, kind, text in SECTIONS:
         entries = list(parameters_of(kind))
@@ -75,10 +75,10 @@ def page() -> str:
 
 
 def table(entries: list[Parameter]) -> str:
-    """One row for each; columns that would be empty are left out."""
+    """One row for each parameter, without empty columns."""
     columns: dict[str, Callable[[Parameter], str]] = {
         "Name": lambda entry: f"`{entry.name}`",
-        "What it is": what_it_is,
+        "Description": description,
         "Unit": lambda entry: entry.unit,
         "Values": values,
         "Default": default,
@@ -92,7 +92,7 @@ def table(entries: list[Parameter]) -> str:
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
-def what_it_is(entry: Parameter) -> str:
+def description(entry: Parameter) -> str:
     symbol = f" {entry.symbol}" if entry.symbol else ""
     more = " ".join(f"{text}." for text in (entry.note, entry.source) if text)
     return f"**{entry.label}{symbol}**: {entry.tip}." + (f" {more}" if more else "")
@@ -114,7 +114,7 @@ def values(entry: Parameter) -> str:
 
 def default(entry: Parameter) -> str:
     if entry.is_required:
-        return "has to be given"
+        return "required"
     value = entry.default
     if isinstance(value, bool):
         return str(value).lower()
@@ -131,8 +131,8 @@ def fit_bounds(entry: Parameter) -> str:
     return f"{entry.fit.low:g} to {entry.fit.high:g}{', logarithmic' if entry.fit.is_logarithmic else ''}"
 
 
-def test_the_page_says_what_is_declared():
-    assert PAGE.read_text(encoding="utf-8") == page(), "python -m tests.test_parameter_docs writes it again"
+def test_the_page_agrees_with_the_declarations():
+    assert PAGE.read_text(encoding="utf-8") == page(), "run python -m tests.test_parameter_docs to generate it"
 
 
 def test_every_declared_class_is_on_the_page():

@@ -1,4 +1,4 @@
-"""Free parameters: names, bounds, and the way from positions to tissues and display and back."""
+"""Free parameters: names, bounds, and the conversion between search positions, tissues and display."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The panel's presenter without any Qt: another view, as a browser's would be."""
+"""The panel's presenter without Qt, with another view, as in the browser."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
 
 
 class PlainView:
-    """Remembers what it was told; its event loop is a list."""
+    """Records all calls; its event loop is a list."""
 
     def __init__(self) -> None:
         self.errors, self.status, self.waiting, self.shares, self.refreshed = [], [], [], [], 0

@@ -1,4 +1,4 @@
-"""Presets: one value, one file, checked as its parts are."""
+"""Presets: one value, one file, validated like its parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Probes: scan lines lie where the geometry says, the beam is as wide as diffraction says, parameters are checked."""
+"""Probes: scan lines follow the geometry, the beam has the width of diffraction theory, parameters are checked."""
 
 from __future__ import annotations
 

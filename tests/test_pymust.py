@@ -1,4 +1,4 @@
-"""Against PyMUST (Garcia; Bernardino), an independent simulator of the wave field: no code is shared with it.
+"""Comparison with PyMUST (Garcia; Bernardino), an independent simulator of the wave field without shared code.
 
 PyMUST computes every element's pressure by far-field diffraction in the frequency domain and leaves beamforming to its
 user; here its channels are beamformed by its own delay-and-sum matrix. Differences that remain, and why:
@@ -152,7 +152,7 @@ def focused_probe() -> LinearProbe:
 
 @pytest.mark.parametrize("depth", [10.0, 15.0, 30.0, 35.0, 40.0])
 def test_a_focused_transmit_beam_is_as_wide_at_and_away_from_its_focus(depth):
-    """Not just before the focus (20 to 25 mm): there a real aperture's near field has ripples of 20 % about ours."""
+    """Not just before the focus (20 to 25 mm): there the near field of a real aperture has ripples of 20 %."""
     lines = np.arange(-2.0, 2.01, 0.1)
     image = focused_lines(np.zeros(1), np.full(1, depth), np.ones(1), lines, depth + np.arange(-0.4, 0.41, 0.02))
     width = float(focused_probe().beam_sigma_mm(depth)[0]) * FWHM_PER_SIGMA  # which `ussim validate` finds in the image
@@ -161,7 +161,7 @@ def test_a_focused_transmit_beam_is_as_wide_at_and_away_from_its_focus(depth):
 
 @pytest.mark.parametrize(("depth", "tolerance"), [(15.0, 0.1), (30.0, 0.1), (45.0, 0.2)])
 def test_the_elevational_beam_is_as_wide_as_the_diffraction_integral(depth, tolerance):
-    """A lens of 7 mm focused at 30 mm, both ways. Beyond the focus the Gaussian beam opens faster than the real one."""
+    """A lens of 7 mm focused at 30 mm, two-way. Beyond the focus the Gaussian beam widens faster than the real one."""
     height, focus, wave_number = 7.0, 30.0, 2 * np.pi / (SPEED / FREQUENCY * 1e3)
     source, across = np.linspace(-height / 2, height / 2, 701), np.linspace(-4, 4, 401)
     lens = np.hypot(focus, source) - focus
@@ -203,7 +203,7 @@ def correlation_length(pairs, spacing: float) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize(("depth", "lateral_tolerance"), [(12.0, 0.3), (30.0, 0.15), (39.0, 0.3)])
 def test_focused_speckle_has_the_same_correlation_lengths(scatterers, depth, lateral_tolerance):
-    """Within 15 %, axially everywhere, laterally in the focus (the module's docstring says why)."""
+    """Within 15 %, axially at all depths, laterally in the focus (for the reason see the module's docstring)."""
     array = focused_probe()
     along = depth + np.arange(-3, 3, 0.04)
     near = [values[abs(scatterers[1] - depth) < 5.0] for values in scatterers]

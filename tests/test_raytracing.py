@@ -1,4 +1,4 @@
-"""The ray tree in odd places: tilted planes, narrow gaps, equal tissues, overfull trees, rays that leave the volume."""
+"""Special cases of the ray tree: tilted planes, narrow gaps, equal tissues, full trees, rays that leave the volume."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def first_hits(tree):
 
 @pytest.mark.parametrize("tilt_deg", [5, 10, 20, 35, 50])
 def test_a_tilted_plane_has_no_terraces(tilt_deg):
-    """Voxels cut a plane that is nearly aligned with them into long steps; its normals must not show them."""
+    """A plane nearly aligned with the voxels has long steps, which must not affect its normals."""
     normal = np.array([np.sin(np.radians(tilt_deg)), np.cos(np.radians(tilt_deg)), 0.0])
     plane = block(lambda x, y, z: x * normal[0] + y * normal[1] > 0, half_mm=(30, 40, 20), spacing_mm=0.5)
     sim = simulator(plane, FAST, coupling=replace(FAST, name="before", impedance_mrayl=1.6), reflections=False)
@@ -36,7 +36,7 @@ def test_a_tilted_plane_has_no_terraces(tilt_deg):
 
 
 def test_a_gap_of_a_few_voxels_keeps_its_width():
-    """Smoothing that sees both sides of a gap must not move them."""
+    """Smoothing across a gap must not displace its sides."""
     for voxels in (3, 5, 7, 9):
         gap = block(lambda x, y, z, half=0.5 * voxels: np.abs(y) < half, spacing_mm=1.0)
         tree = simulator(gap, replace(FAST, speed_of_sound_m_s=1540.0)).trace(
@@ -73,7 +73,7 @@ def test_max_ray_depth_counts_reflections_and_zero_switches_them_off():
 
 
 def test_more_segments_than_there_is_room_for_are_a_warning():
-    """Plates that reflect nearly everything, and a threshold that follows every bounce."""
+    """Plates that reflect nearly all energy, and a threshold at which every reflection is followed."""
     plates = block(lambda x, y, z: np.floor(y / 1.0).astype(int) % 2, half_mm=(6, 30, 6))
     hard = Tissue("hard", 1540.0, 6.0, 0.0)
     sim = simulator(plates, hard, reflection_threshold=1e-9, intensity_threshold=1e-9, max_ray_depth=16)

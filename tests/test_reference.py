@@ -48,7 +48,7 @@ def test_every_room_and_every_name_of_the_package_is_on_the_first_page():
 
 
 def test_a_constant_is_described_by_the_comment_above_it():
-    assert ".. py:data:: PROBES\n\n   Probes to start from, by name" in reference.room_page("probe")
+    assert ".. py:data:: PROBES\n\n   Preset probes by name" in reference.room_page("probe")
     for room in reference.rooms():
         assert not re.findall(r"py:data:: (\w+)\n\n *\n", reference.room_page(room)), (
             "needs a comment that begins with #:"

@@ -1,4 +1,4 @@
-"""Poses refined with the cost of the appearance: a known offset is found back."""
+"""Registration of poses with the cost of the appearance: a known offset is recovered."""
 
 from __future__ import annotations
 

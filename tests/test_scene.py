@@ -1,4 +1,4 @@
-"""The scene logic on real MRML nodes: what goes in, where the image lies, what live update does and when it ends."""
+"""The scene logic on real MRML nodes: inputs, position of the image, live update and its end."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_any_chain_of_rigid_parents_gives_the_same_image_as_their_product(bench)
 
 
 def noisy(bench) -> None:
-    """Nothing but noise, of which the image is full."""
+    """Noise only, which fills the image."""
     fluid = TissueTable({0: FLUID, 1: Tissue("speckle", 1540.0, 1.54, 0.0), 2: FLUID})
     display = DisplaySettings(noise_db=-5.0, tgc_db_cm_mhz=0.0, image_size=(96, 64))
     bench.logic.preset = Preset(PRESET.probe, display, PRESET.settings, fluid)
@@ -376,7 +376,7 @@ def test_slicers_default_colours_do_not_make_bone_of_grey_matter(bench):
     labels.SetAndObserveDisplayNodeID(display.GetID())
     display.SetAndObserveColorNodeID(colours.GetID())
     assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["speckle", "fluid"]
-    colours.SetName("mine")  # a table somebody chose means what it says
+    colours.SetName("mine")  # a table chosen by the user is used by its names
     with pytest.raises(SimulationError, match="no tissue is called"):
         bench.logic.preset = Preset(tissues=TissueTable({}))
         bench.logic.tissues(labels)
@@ -385,7 +385,7 @@ def test_slicers_default_colours_do_not_make_bone_of_grey_matter(bench):
 
 
 def test_labels_without_names_follow_the_tissues_that_have_their_numbers(bench):
-    """They are read again when the same names stand for other labels: once the old ones stayed, without an error."""
+    """They are read again when the same names belong to other labels; formerly the old ones remained."""
     labels = add(bench.scene, "LabelMapVolume", "labels.nii")
     write_volume(labels, cyst())
     assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["speckle", "fluid"]
@@ -841,7 +841,7 @@ def test_hybrid_scatterers_take_the_texture_of_the_last_segmentation(kind):
 
 
 def test_slicers_own_slice_view_shows_the_image_upright_and_not_mirrored(bench):
-    """Through vtkMRMLSliceLogic, which is what draws Slicer's slice views."""
+    """Through vtkMRMLSliceLogic, which renders Slicer's slice views."""
     application = slicer.vtkSlicerApplicationLogic()
     application.SetMRMLScene(bench.scene)
     application.GetColorLogic().SetMRMLScene(bench.scene)

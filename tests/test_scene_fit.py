@@ -209,7 +209,7 @@ def test_geometry_can_be_estimated(scene):
     scene_preset = scene.logic.preset
     try:
         scene.logic.preset = replace(scene_preset, probe=replace(PROBE, depth_mm=90.0, frequency_mhz=4.0))
-        with pytest.raises(SimulationError, match="mm deep, but the probe given sees 90 mm"):
+        with pytest.raises(SimulationError, match="the probe's depth is 90 mm, expected"):
             scene.optimize()
         found = scene.optimize(estimate_geometry=True, max_evaluations=20)
         assert found.tracked.probe.depth_mm == pytest.approx(50.0, abs=1.0)

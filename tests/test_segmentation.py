@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.mri.segmentation import estimate_noise
 
 
 def with_rician_noise(volume: Volume, share: float, seed: int = 0) -> Volume:
-    """Magnitude of a complex signal with noise of `share` x 255 in both channels, as an MRI has it."""
+    """Magnitude of a complex signal with noise of `share` x 255 in both channels, as in MRI."""
     rng = np.random.default_rng(seed)
     real, imaginary = (rng.normal(0, share * 255, volume.array.shape).astype(np.float32) for _ in range(2))
     return volume.with_array(np.hypot(volume.array + real, imaginary))
@@ -114,7 +114,7 @@ def test_bright_voxels_beyond_white_matter_are_white_matter():
 
 @pytest.mark.parametrize("radius", [1, 2, 5])
 def test_the_guided_filter_is_what_its_definition_says(radius):
-    """He et al., eq. 5, 6, 8, with models weighed by the inverse of their window's variance."""
+    """He et al., eq. 5, 6, 8, with models weighted by the inverse of their window's variance."""
     rng = np.random.default_rng(2)
     image = rng.normal(100, 20, (13, 17, 21)).astype(np.float32)
     mask = rng.random(image.shape) < 0.8

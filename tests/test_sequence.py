@@ -32,7 +32,7 @@ def rigid(seed: int) -> np.ndarray:
 
 
 def chain(count: int = 3) -> TrackedSequence:
-    """Images that can be told apart and turned, tracked along ImageToProbe, ProbeToTracker, ReferenceToTracker."""
+    """Asymmetric, distinguishable images, tracked along ImageToProbe, ProbeToTracker, ReferenceToTracker."""
     images = np.random.default_rng(0).integers(0, 256, (count, 20, 30), dtype=np.uint8)
     transforms = tuple(
         {"ProbeToTracker": rigid(10 + n), "ReferenceToTracker": rigid(20 + n), "ImageToProbe": rigid(30)}
@@ -145,7 +145,7 @@ def test_a_sequence_is_written_whole_or_not_at_all(tmp_path):
 
 
 def plus_file(path: Path, orientation: str, pixels: np.ndarray, image_type: str = "BRIGHTNESS") -> None:
-    """A file as Plus writes it, byte by byte, so that our own writer does not check itself."""
+    """A file as Plus writes it, byte by byte, independent of this package's writer."""
     count, rows, columns = pixels.shape
     lines = [
         "ObjectType = Image", "NDims = 3", "AnatomicalOrientation = RAI", "BinaryData = True",
@@ -227,11 +227,11 @@ def test_slicer_reads_the_transforms_that_are_written(tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (("UltrasoundImageOrientation = MF", "UltrasoundImageOrientation = QX"), "'QX', expected such as MF"),
-        (("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "1 0 0"), "holds 3 numbers, expected 16"),
+        (("UltrasoundImageOrientation = MF", "UltrasoundImageOrientation = QX"), "'QX', expected a code such as MF"),
+        (("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "1 0 0"), "has 3 numbers, expected 16"),
         (("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "one"), "expected 16 numbers"),
         (("Timestamp = 10.5", "Timestamp = noon"), "'noon', expected seconds"),
-        (("Seq_Frame0001_Timestamp", "Seq_Frame0007_Timestamp"), "has Seq_Frame0007_Timestamp, but 2 images"),
+        (("Seq_Frame0001_Timestamp", "Seq_Frame0007_Timestamp"), "has the field Seq_Frame0007_Timestamp"),
         (("Seq_Frame0000_ProbeToTrackerTransform =", "Seq_Frame0000_ProbeTransform ="), "ProbeTo"),
     ],
 )

@@ -14,7 +14,7 @@ images = arrays(np.uint8, st.tuples(st.integers(4, 40), st.integers(4, 40)))
 
 
 def by_the_equations(a, b, patch, bins, weight):
-    """Equations 4 and 5 word by word, patch by patch, for patches of whole images of whole patches."""
+    """Equations 4 and 5 implemented literally, patch by patch, for images that consist of complete patches."""
     distances = []
     for y in range(0, a.shape[0], patch):
         for x in range(0, a.shape[1], patch):

@@ -47,7 +47,7 @@ def solid():
 @pytest.mark.parametrize("kind", PROBES)
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 def test_a_small_target_appears_where_it_is_in_the_patient(kind, orientation):
-    """The brightest pixel, taken to RAS by the frame's own matrices, is the target's front."""
+    """The brightest pixel, transformed to RAS by the frame's matrices, is the front of the target."""
     probe, rotation = PROBES[kind], ORIENTATIONS[orientation]
     target = np.array([6.0, 3.0, -2.0])
     ball = block(lambda x, y, z: (x - 6) ** 2 + (y - 3) ** 2 + (z + 2) ** 2 < 2.0**2, spacing_mm=0.5)
@@ -148,7 +148,7 @@ def test_rf_is_the_carrier_times_the_baseband(solid):
 
 @pytest.mark.parametrize("bandwidth, samples_per_cycle", [(0.5, 4), (0.05, 4), (0.1, 8), (0.5, 16), (0.05, 16)])
 def test_the_pulse_is_whole_at_every_bandwidth_and_sampling_rate(bandwidth, samples_per_cycle):
-    """A point-like echo is the Gaussian envelope of axial_sigma_mm, not a piece of it."""
+    """The echo of a point has the complete Gaussian envelope of axial_sigma_mm."""
     wall = block(lambda x, y, z: y > 0)
     probe = LinearProbe(4, 45, scan_lines=9, fractional_bandwidth=bandwidth)
     sim = simulator(wall, Tissue("wall", 1540.0, 1.8, 0.0), scattering=False, samples_per_cycle=samples_per_cycle)
@@ -178,7 +178,7 @@ def test_frames_go_to_vtk_with_their_place_in_the_patient(solid):
 )
 @settings(max_examples=15)
 def test_the_grid_of_the_labels_does_not_matter_only_their_place(angles, shift, flips):
-    """The same tissue stored on a rotated or mirrored grid gives the same speckle: scatterers live in the patient."""
+    """The same tissue on a rotated or mirrored grid gives the same speckle: scatterers are fixed in the patient."""
     rotation = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     matrix = np.eye(4)
     matrix[:3, :3] = rotation @ np.diag(flips) * 1.5
@@ -213,7 +213,7 @@ def test_changed_tissues_give_what_a_new_simulator_would(solid):
 
 @pytest.mark.parametrize("thickness", [0.6, 1.0, 1.6])
 def test_the_membrane_is_as_thick_as_it_is_set(thickness):
-    """Thinner and thicker than a voxel: the share of scatterers it takes is its thickness (within 15 %)."""
+    """Thinner and thicker than a voxel: the fraction of scatterers in it is its thickness (within 15 %)."""
     half = block(lambda x, y, z: np.where(y > 0, 2, 1), half_mm=(25, 25, 25))
     bright = Tissue("bright", 1540.0, 1.54, 0.0, mu0=1.0, sigma0=0.5)
     silent, csf = Tissue("silent", 1540.0, 1.54, 0.0), Tissue("csf", 1540.0, 1.54, 0.0)
@@ -299,7 +299,7 @@ def test_a_sweep_is_the_frames_of_its_poses(solid):
 
 
 def kernels_of(sim, *arguments) -> set[str]:
-    """Names of the kernels that an image takes."""
+    """Names of the kernels that run for an image."""
     sim.device.profiling = True
     try:
         sim.simulate(*arguments)

@@ -1,4 +1,4 @@
-"""3D Slicer finds and loads the module wherever it lies: from the sources, a renamed folder, a wheel, both at once.
+"""3D Slicer finds and loads the module from all locations: the sources, a renamed folder, a wheel, both at once.
 
 Each time in a Python of its own, where sys.path has nothing of this package but what Slicer puts there
 (slicer_factory.py says which sources of Slicer are imitated). test_cmake.py does the same with the build and the
@@ -70,7 +70,7 @@ print(json.dumps(result))
 
 
 def load(*module_paths: Path, site: Path | None = None, first: str = "", self_test: bool = False) -> dict:
-    """What happens when Slicer starts with these module paths and the panel is opened, or the self test run.
+    """The result of starting Slicer with these module paths and opening the panel, or running the self test.
 
     `site` is an installed wheel's folder, before all others; the statement `first` is executed before Slicer's factory
     is at work.
@@ -90,7 +90,7 @@ def load(*module_paths: Path, site: Path | None = None, first: str = "", self_te
 
 
 def assert_loaded_from(result: dict, module_file: Path, package: Path, kernels: Path) -> None:
-    """The module is USSim, without a word in the log, and everything of the package comes from `package`."""
+    """The module is USSim, the log is empty, and all modules of the package come from `package`."""
     assert result["errors"] == [] and result["modules"] == ["USSim"]
     assert result["files"] == [str(module_file)] and result["icon"] and result["html"]
     assert result["early"] == [], "imported at start-up"
@@ -115,7 +115,7 @@ def wheel(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def stale_wheel(wheel, tmp_path) -> Path:
-    """An older version in site-packages, a package with an __init__.py as it once was."""
+    """An older version in site-packages, a package with an __init__.py."""
     site = tmp_path / "stale"
     shutil.copytree(wheel, site)
     (site / "SlicerUSSim" / "__init__.py").write_text("")
@@ -199,7 +199,7 @@ def test_the_extension_wizard_and_drag_and_drop_find_the_module(dropped):
 
 
 def test_the_rules_imitated_refuse_what_slicer_refuses(tmp_path):
-    """The package as it was: an __init__.py hides the module from the Wizard, and makes a traceback at each start."""
+    """The former package: an __init__.py hides the module from the Wizard and causes a traceback at each start."""
     shutil.copy(ROOT / "SlicerUSSim" / "USSim.py", tmp_path)
     (tmp_path / "__init__.py").write_text("")
     (tmp_path / "tool.py").write_text("#!/usr/bin/env python3\n")

@@ -1,4 +1,4 @@
-"""The scripted module as Slicer loads and runs it, on stand-ins for what only the Slicer application has."""
+"""The scripted module as loaded and run by Slicer, with stand-ins for parts of the Slicer application."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class Session:
 
 @pytest.fixture
 def simulation_error(module):
-    """The class as the module imported it, whatever else is imported under that name."""
+    """The class as imported by the module, independent of other imports of that name."""
     return lambda: importlib.import_module("SlicerUSSim.Logic.base.errors").SimulationError
 
 
@@ -495,7 +495,7 @@ def test_the_first_image_takes_a_volume_and_two_clicks(session):
     session.parameters.mri = None
     assert not session.ui.segmentButton.isEnabled() and not session.ui.liveCheckBox.isEnabled()
     session.head()
-    session.widget.enter()  # the only volume is taken for the MRI
+    session.widget.enter()  # the only volume is used as the MRI
     assert session.parameters.mri.GetName() == "Head" and session.ui.segmentButton.isEnabled()
     session.ui.segmentButton.click()
     labels = session.parameters.labels
@@ -800,7 +800,7 @@ def test_errors_of_a_fit_are_one_line(session):
     session.ui.fitFramesLineEdit.setText("first")
     session.ui.fitFramesLineEdit.editingFinished.emit()
     session.ui.fitButton.click()
-    assert "frames are 'first', expected such as 0,5,10" in session.app.errors[2]
+    assert "frames are 'first', expected numbers such as 0,5,10" in session.app.errors[2]
     session.panel.presenter.fits.apply()
     session.panel.presenter.fits.revert()
     session.panel.presenter.fits.compare("after", 0)
@@ -848,7 +848,7 @@ def test_reloading_the_module_brings_new_code(module):
 
 
 def test_the_panel_looks_as_it_should(session, tmp_path):
-    """A picture of the panel, with every section open, in which every control is visible and none is cut off."""
+    """A figure of the panel with all sections open, in which every control is completely visible."""
     session.segmented()
     session.ui.simulateButton.click()
     for button in session.parent.findChildren(stand_in.CollapsibleButton):
@@ -962,7 +962,7 @@ def test_a_slicer_that_has_pip_ensure_is_left_to_it(bare_slicer, simulation_erro
 
 
 def test_on_windows_without_a_device_intels_runtime_is_offered(bare_slicer, simulation_error, monkeypatch):
-    """Untested on Windows: what is held here is what the module asks and does."""
+    """Untested on Windows: this tests only the questions and actions of the module."""
     app = bare_slicer.app
     app.installed = ["pyopencl"]
     devices = importlib.import_module("SlicerUSSim.Logic.opencl.devices")

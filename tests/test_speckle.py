@@ -1,4 +1,4 @@
-"""Speckle of one patient, whatever looks at it: sparse lines, small motions, other sides; linear in mu0 and sigma0."""
+"""Speckle is fixed in the patient: with sparse lines, small motions, other directions; linear in mu0 and sigma0."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_the_same_pose_gives_the_same_bits_and_another_seed_another_patient(simu
 
 
 def test_the_signal_is_linear_in_mu0_and_sigma0():
-    """What docs/optimization.md#how-it-is-fast builds on: RF(mu0, sigma0) = mu0 RF(1, 0) + sigma0 RF(0, 1)."""
+    """The basis of docs/optimization.md#efficient-evaluation: RF(mu0, sigma0) = mu0 RF(1, 0) + sigma0 RF(0, 1)."""
     pose = rigid(ORIENTATIONS["oblique"], [0, -25, 0])
     rf = {
         (mu0, sigma0): simulator(SOLID, replace(SPECKLE, mu0=mu0, sigma0=sigma0)).simulate(LINEAR, pose).iq
@@ -70,7 +70,7 @@ def test_the_signal_is_linear_in_mu0_and_sigma0():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_scatterer_is_in_the_same_place_seen_from_the_front_and_from_the_side(seed):
-    """Sparse scatterers, two probes at right angles: the lattice is enumerated along other axes, the patient stays."""
+    """Sparse scatterers, two probes at right angles: the order of lattice axes differs, the scatterers do not."""
     tissue = replace(SPECKLE, mu0=0.0, sigma0=1.0)
     sim = simulator(SOLID, tissue, seed=seed, scatterers_per_mm3=0.1)
     probe = LinearProbe(20, 40, scan_lines=101, focus_mm=20, elevation_focus_mm=20)

@@ -1,4 +1,4 @@
-"""Where a probe lies on a patient, and how it is slid, rocked, tilted and rotated there."""
+"""Position of a probe on the patient's surface, and sliding, rocking, tilting and rotating it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_carried_probe_turns_by_the_angle_between_the_directions_and_no_more(p
 
 
 def test_a_direction_of_no_length_is_refused():
-    with pytest.raises(SimulationError, match="expected two of some length"):
+    with pytest.raises(SimulationError, match="expected two of non-zero length"):
         carried(np.eye(4), [0, 0, 0], [0, 0, 0], [0, 0, 1])
 
 

@@ -54,7 +54,7 @@ def inner(found) -> np.ndarray:
 def test_off_is_the_paper_bit_for_bit():
     (plain,), (with_texture,) = frames(seeds=[0]), frames(texture(0.5), seeds=[0])
     np.testing.assert_array_equal(plain.iq, with_texture.iq)
-    # And a texture that knows nothing more than the labels changes nothing either.
+    # A texture without information beyond the labels does not change the image either.
     (ignorant,) = frames(texture(0.0), seeds=[0], partial_volume=True, mri_modulation_db=3.0)
     np.testing.assert_array_equal(plain.iq, ignorant.iq)
 

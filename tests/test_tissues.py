@@ -1,4 +1,4 @@
-"""Tissues and tables: sources beside the numbers, JSON both ways, errors that name tissue and value."""
+"""Tissues and tables: sources of parameters, reading and writing JSON, errors that name tissue and value."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_replace_changes_one_tissue_and_the_membrane_by_name():
 
 
 def test_replace_changes_every_label_of_a_name_and_the_membrane_with_them():
-    """Left and right hemisphere have labels of their own; sulci can be labelled and be the membrane besides."""
+    """Left and right hemisphere have separate labels; sulci can be labelled and also be the membrane."""
     louder = replace(TISSUES["white matter"], speed_of_sound_m_s=1550.0)
     members = {1: TISSUES["white matter"], 2: TISSUES["leptomeninges"], 3: louder}
     table = TissueTable(members, Membrane(TISSUES["leptomeninges"], 0.7))
@@ -86,7 +86,7 @@ def test_replace_changes_every_label_of_a_name_and_the_membrane_with_them():
     assert changed[1] == replace(members[1], mu0=0.5) and changed[3] == replace(louder, mu0=0.5)
     assert changed[2] == replace(members[2], sigma0=0.9) == changed.membrane.tissue
     assert changed.membrane.thickness_mm == 0.7 and changed[0] == table[0]
-    assert changed == table.with_tissue(changed[2]).replace("white matter", mu0=0.5)  # the other way to say it
+    assert changed == table.with_tissue(changed[2]).replace("white matter", mu0=0.5)  # the equivalent call
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_a_name_means_the_same_tissue_to_labels_membrane_and_label_maps():
     tuned = TissueTable.brain().replace("leptomeninges", mu0=1.3).for_names(["csf", "leptomeninges"])
     assert tuned[2].mu0 == tuned.membrane.tissue.mu0 == 1.3
     both = TissueTable({1: quiet, 2: replace(loud, name="White Matter")}).for_names(["White Matter", "WHITE_MATTER"])
-    assert (both[1].mu0, both[2].mu0) == (0.9, 0.1)  # a name as it is written goes before one that is like it
+    assert (both[1].mu0, both[2].mu0) == (0.9, 0.1)  # an exact name has precedence over a similar one
 
 
 def test_a_full_table_refuses_another_tissue():

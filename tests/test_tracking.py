@@ -1,4 +1,4 @@
-"""Poses in and images out over OpenIGTLink, with pyigtl at the other end, on loopback."""
+"""Receiving poses and sending images over OpenIGTLink, with pyigtl as the peer, on loopback."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def free_port() -> int:
 
 
 def until(condition, seconds: float = 120.0):
-    """What `condition` comes to give, once it is true; on a busy machine that may take long."""
+    """Wait until `condition` returns a true value, and return it; this may take long on a busy machine."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         result = condition()
@@ -95,7 +95,7 @@ def test_a_client_that_connects_to_us_can_go_and_come_back(link):
 def test_a_server_that_goes_is_found_again_when_it_comes_back(link):
     port = free_port()
     ours, poses = link("127.0.0.1", port)  # before there is anyone
-    until(lambda: "trying again" in ours.status)
+    until(lambda: "reconnecting" in ours.status)
     for n in range(1, 4):
         with socket.create_server(("127.0.0.1", port)) as listener:
             peer, _ = listener.accept()
@@ -106,7 +106,7 @@ def test_a_server_that_goes_is_found_again_when_it_comes_back(link):
                 peer.sendall(message[30:])
                 until(lambda n=n: len(poses) == 2 * n)
                 peer.sendall(message[:70])  # and gone in the middle of a message
-        until(lambda: "trying again" in ours.status)
+        until(lambda: "reconnecting" in ours.status)
     ours.send(IMAGE)  # to nobody: not an error
 
 
@@ -207,7 +207,7 @@ def test_it_listens_where_it_is_told_and_connects_there(link, ours, theirs):
     here, poses = link(host, port, listen=listen)
     host, _, listen = parse_address(f"{theirs}:{port}")
     there, _ = link(host, port, listen=listen)
-    until(lambda: there.status == f"connected to {theirs}:{port}" and here.status == "connected to the other end")
+    until(lambda: there.status == f"connected to {theirs}:{port}" and here.status == "connected to the client")
     with socket.create_connection((host, port)) as late:  # one at a time: heard when the first has gone
         late.sendall(transform().pack())
         there.stop()

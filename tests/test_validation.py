@@ -1,4 +1,4 @@
-"""Every row of the validation, the phantoms it measures, and that it would notice if the physics were wrong."""
+"""Every row of the validation, its phantoms, and its sensitivity to wrong physics."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_an_echo_that_was_not_there_is_farther_from_its_limit_than_any_other(kin
     ],
 )
 def test_wrong_physics_fails_the_check_of_its_phenomenon(monkeypatch, check, wrong):
-    """The same measurement on a simulator that ignores or distorts what the check is about."""
+    """The same measurement on a simulator in which the phenomenon of the check is missing or wrong."""
 
     class Distorted(UltrasoundSimulator):
         def __init__(self, labels, tissues, settings=None, device=None):
@@ -148,7 +148,7 @@ def test_the_command_says_what_is_off_and_exits_with_one(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "all_checks", lambda: (replace(good, measure=off),))
     result = CliRunner().invoke(main, ["validate", "--out", str(tmp_path)])
     assert result.exit_code == 1
-    assert "off: thin sheet, share of rays that see it, linear, oblique: 1" in result.output
+    assert "off: thin sheet, fraction of rays that hit it, linear, oblique: 1" in result.output
     assert json.loads((tmp_path / "report.json").read_text())["passed"] is False
     assert "**FAIL**" in (tmp_path / "report.md").read_text()
 
@@ -156,12 +156,12 @@ def test_the_command_says_what_is_off_and_exits_with_one(tmp_path, monkeypatch):
 def test_the_command_exits_with_zero_when_all_is_well_and_two_for_a_wrong_name(tmp_path):
     assert CliRunner().invoke(main, ["validate", "--out", str(tmp_path), "--only", "thin"]).exit_code == 0
     result = CliRunner().invoke(main, ["validate", "--out", str(tmp_path), "--only", "gravity"])
-    assert result.exit_code == 2 and "no check has 'gravity' in its name" in result.stderr
+    assert result.exit_code == 2 and "check is 'gravity', expected part of" in result.stderr
 
 
 def test_a_report_that_cannot_be_written_is_one_clear_error(tmp_path):
     (tmp_path / "taken").write_text("a file")
-    with pytest.raises(SimulationError, match="taken: cannot be made"):
+    with pytest.raises(SimulationError, match="taken: cannot be created"):
         validate(tmp_path / "taken", only=["thin"])
 
 
@@ -207,7 +207,7 @@ def test_phantoms_echo_from_where_they_say(make, orientation):
     for probe in PROBES.values():
         frame = simulator.simulate(probe, phantom.probe_to_ras)
         (echo,) = phantom.expected(probe)
-        # A sheet's faces are only as good as its one voxel; a bar's brightest grain lies anywhere in its 1.2 mm.
+        # The faces of a sheet have errors of up to a voxel; the brightest grain of a bar can be anywhere in its 1.2 mm.
         tolerance = {"voxel sheet": 0.5, "thin rod": 0.9}.get(phantom.name, 0.3)
         assert echo_near(frame, probe, echo.shown_mm, 1.5)[1] == pytest.approx(echo.shown_mm[1], abs=tolerance)
 

@@ -1,4 +1,4 @@
-"""Volume: geometry survives every way in and out, and bad files are refused in one line."""
+"""Volume: geometry is preserved by all conversions, and invalid files give an error of one line."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
     (tmp_path / "bad.nii").write_text("not an image")
     with pytest.raises(SimulationError, match=r"bad\.nii: cannot be read"):
         Volume.read(tmp_path / "bad.nii")
-    with pytest.raises(SimulationError, match="holds no DICOM series"):
+    with pytest.raises(SimulationError, match="has no DICOM series"):
         Volume.read(tmp_path)
 
 

@@ -1,4 +1,4 @@
-"""The VTK filters: they execute when they must and only then, and their images are where the probe is."""
+"""The VTK filters: they execute only when necessary, and their images have the position of the probe."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def test_the_information_pass_knows_the_geometry_before_anything_is_computed(ang
     np.testing.assert_allclose(promised["SPACING"], output.GetSpacing(), rtol=1e-9)
     np.testing.assert_allclose(promised["ORIGIN"], output.GetOrigin(), atol=1e-9)
     np.testing.assert_allclose(promised["DIRECTION"], output.GetDirectionMatrix().GetData(), atol=1e-6)
-    # The cyst is seen where it is: black in the middle of the image, whatever the pose.
+    # The cyst appears at its position, black in the middle of the image, for every pose.
     picture = Volume.from_vtk(output).array[0].astype(float)
     assert picture[58:68, 28:36].mean() < 0.3 * picture[8:24, 10:54].mean()
 
@@ -406,7 +406,7 @@ def test_an_image_actor_shows_it_where_it_is():
 
 
 def seen_along_z(actor, pose: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """(rows, columns) of a window that just holds the image plane of PROBE, 20 mm wide and 30 mm deep."""
+    """(rows, columns) of a window that shows exactly the image plane of PROBE, 20 mm wide and 30 mm deep."""
     renderer, window = vtkRenderer(), vtkRenderWindow()
     renderer.AddViewProp(actor)
     camera = renderer.GetActiveCamera()

@@ -1,4 +1,4 @@
-"""The workstation in the browser: `ussim serve` as a process, and Chromium in front of it, as a user has them."""
+"""The workstation in the browser: `ussim serve` as a process, and Chromium as its client."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ POSE = ("right_deg", "front_deg", "rotate_deg", "rock_deg", "tilt_deg", "lift_mm
 
 @contextlib.contextmanager
 def serving(*arguments: str):
-    """The URL that `ussim serve` prints, while it runs."""
+    """The URL printed by `ussim serve`, while it runs."""
     server = subprocess.Popen(
         [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", "0", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
@@ -71,7 +71,7 @@ def serving(*arguments: str):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> Path:
-    """A head, its labels, and a sequence that a scanner with more gain saw in it."""
+    """A head, its labels, and a sequence of images of it with more gain."""
     folder = tmp_path_factory.mktemp("patient")
     mri = head_mri(2.0)
     mri.write(folder / "head.nii.gz")
@@ -92,7 +92,7 @@ def files(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def tracker():
-    """What a tracker's server would be, at the other end of the workstation's --igtl."""
+    """A tracker's server, the peer of the workstation's --igtl."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     server = pyigtl.OpenIGTLinkServer(port=port, local_server=True)
@@ -135,7 +135,7 @@ def _sent(page: Page, frame: bytes | str) -> None:
 
 
 def loaded(page: Page) -> None:
-    """Wait until the page shows an image, and let it count what comes of Slicer's views."""
+    """Wait until the page shows an image, and make it count the images of Slicer's views."""
     page.wait_for_function("window.ussim?.images > 0")
     page.evaluate(
         """() => {
@@ -166,7 +166,7 @@ def page(first_page):
 
 
 def state(page: Page, name):
-    """What one of NAMES is on the page."""
+    """The value of one of NAMES on the page."""
     return page.evaluate("name => window.trame.state.get(name)", name)
 
 
@@ -175,7 +175,7 @@ def set_state(page: Page, name, value) -> None:
 
 
 def shown(page: Page, control: str):
-    """What a control of the panel shows."""
+    """The value of a control of the panel."""
     return state(page, NAMES.panel.values)[control]
 
 
@@ -189,7 +189,7 @@ def pose(page: Page) -> dict[str, float]:
 
 
 def cost(page: Page) -> float:
-    """Between simulated and real image, as the page says it."""
+    """The cost of simulated and real image as shown on the page."""
     return float(re.match(r"cost ([0-9.]+)", state(page, NAMES.sequence.similarity))[1])
 
 
@@ -197,7 +197,7 @@ def click(page: Page, selector: str) -> None:
     page.locator(selector).first.click()
 
 
-#: Until the server has nothing more to do; the second answer comes after all that it told the page before the first.
+#: Waits until the server is idle; the second answer arrives after all messages sent to the page before the first.
 _AT_REST = """async (patience) => {
   const late = new Promise((_, failed) => setTimeout(() => failed(new Error('it never came to rest')), patience));
   for (let before = null; ; ) {
@@ -210,12 +210,12 @@ _DRAWN = """(numbers) => Object.entries(numbers).every(([name, number]) =>
 
 
 def settled(page: Page) -> None:
-    """Wait until all that the page asked for is done, and it shows the last images."""
+    """Wait until all requests of the page are done and it shows the last images."""
     page.wait_for_function(_DRAWN, arg=page.evaluate(_AT_REST, 1000 * PATIENCE_S))
 
 
 def drawn(page: Page) -> None:
-    """Wait until Slicer's views, too, show what there is: for two new images of each, one may be on its way already."""
+    """Wait until Slicer's views are up to date too: for two new images of each, since one may already be on its way."""
     settled(page)
     for _ in range(2):
         counts = page.evaluate("() => { window.trame.trigger('page_opened'); return { ...window.viewImages }; }")
@@ -228,7 +228,7 @@ def drawn(page: Page) -> None:
 
 @contextlib.contextmanager
 def new_image(page: Page):
-    """What is done in it has to bring a new image."""
+    """Asserts that the actions in it produce a new image."""
     count = page.evaluate("window.ussim.images")
     yield
     page.wait_for_function("n => window.ussim.images > n", arg=count)
@@ -236,7 +236,7 @@ def new_image(page: Page):
 
 
 def eventually(page: Page, condition) -> None:
-    """Wait until something is so."""
+    """Wait until a condition is true."""
     end = monotonic() + PATIENCE_S
     while not condition():
         assert monotonic() < end, "it never became so"
@@ -268,7 +268,7 @@ def picture(page: Page, box: dict) -> np.ndarray:
 
 @contextlib.contextmanager
 def heard(page: Page, releases: int = 1):
-    """Wait until the page has told what the mouse does in Slicer's views, which it does piece by piece."""
+    """Wait until the page has sent all mouse events in Slicer's views, which it sends one at a time."""
     before = _RELEASES[page]
     yield
     eventually(page, lambda: _RELEASES[page] >= before + releases)
@@ -280,7 +280,7 @@ def drag(page: Page, start: tuple[float, float], by: tuple[float, float], key: s
         page.mouse.down()
         for share in np.linspace(0, 1, 9)[1:]:
             page.mouse.move(start[0] + share * by[0], start[1] + share * by[1])
-            page.evaluate("() => new Promise(requestAnimationFrame)")  # as often as a browser tells of a mouse
+            page.evaluate("() => new Promise(requestAnimationFrame)")  # the rate of a browser's mouse events
         page.mouse.up()
     settled(page)
 
@@ -588,7 +588,7 @@ def test_a_sequence_plays_beside_the_simulation_and_the_cost_follows(page):
     for _ in range(4):
         page.keyboard.press("Shift+ArrowRight")
     settled(page)
-    assert cost(page) > at_the_pose  # elsewhere the images are less alike
+    assert cost(page) > at_the_pose  # away from the recorded pose the cost is higher
 
 
 def test_real_and_simulated_blink_or_are_subtracted(page):

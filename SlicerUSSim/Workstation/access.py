@@ -1,4 +1,4 @@
-"""Who may use the workstation: pages of this server only, and from other computers only who has the token."""
+"""Access to the workstation: only from pages of this server, and from other computers only with the token."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ def is_loopback(host: str) -> bool:
 
 
 def guard(app: web.Application, token: str) -> None:
-    """Refuse requests of other sites' pages and, where there is a `token`, of whoever does not have it.
+    """Refuse requests from pages of other sites and, if there is a `token`, requests without it.
 
-    The token comes with the URL, and then as a cookie, so that the page's files and its web socket have it too. Without
-    a token the server is on loopback: a name that another site made point here is refused as well.
+    The token is first part of the URL and then a cookie, so that requests for the page's files and its web socket carry
+    it too. Without a token the server is on loopback; requests by another host name are then refused as well, since
+    another site can make a name of its own resolve to this computer (DNS rebinding).
     """
     app.middlewares.append(_checker(token))
 
@@ -42,7 +43,7 @@ def _checker(token: str):
 
 
 def _cookie(request: web.Request) -> str:
-    """Browsers share cookies between the ports of a computer; two workstations on it have two tokens."""
+    """Name of the cookie, by port: browsers share cookies between ports, but each workstation has its own token."""
     return f"ussim_token_{request.url.port}"
 
 
@@ -50,10 +51,10 @@ def _objection(request: web.Request, token: str) -> str:
     host = urlsplit(f"//{request.host}")
     origin = request.headers.get("Origin")
     if origin is not None and urlsplit(origin).netloc != host.netloc:
-        return "The request comes from a page of another site."
+        return "The request came from a page of another site."
     if not token:
         if not is_loopback(host.hostname or ""):
-            return f"This server answers to 127.0.0.1, not to {request.host!r}."
+            return f"The host is {request.host!r}, expected 127.0.0.1."
         return ""
     given = request.query.get("token", request.cookies.get(_cookie(request), ""))
     if not hmac.compare_digest(given.encode(), token.encode()):

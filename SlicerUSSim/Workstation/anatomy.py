@@ -1,4 +1,4 @@
-"""AnatomyViews: Slicer's 3D view and three slice views around the probe: where it is, and what lies under it."""
+"""AnatomyViews: Slicer's 3D view and three slice views, which show the probe and the anatomy under it."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ from SlicerUSSim.Logic.probe.surface import PatientSurface
 from SlicerUSSim.Workstation.state import ACROSS, IN_PLANE, SLICE_VIEWS
 
 THREED_VIEW = "ThreeD"
-#: Images per second of the view under the mouse, and of the others: on few cores the ultrasound image goes before them.
+#: Images per second of the view under the mouse, and of the others: on few cores the ultrasound image has priority.
 _CORES = os.cpu_count() or 2
 _FAST, _SLOW = min(2.0 * _CORES, 20.0), min(0.75 * _CORES, 8.0)
-#: More mouse events than images would only keep the images waiting.
+#: Seconds between mouse events; more events than images would only delay the images.
 _EVENTS_EVERY_S = 0.025
-#: Seconds after which a view itself knows its new size.
+#: Seconds after a resize event until a view has its new size.
 _RESIZED_S = 0.05
 _LAYOUT = "Anatomy"
-#: Model nodes that show things, by what they show; they are not saved with the scene.
+#: Names of the nodes for display; they are not saved with the scene.
 _PATIENT, _BODY, _FIELD, _SEEN = "Patient surface", "Probe body", "Ultrasound field", "Ultrasound as shown"
 _SKIN_COLOR, _BODY_COLOR, _RIDGE_COLOR = (0.92, 0.8, 0.72), (0.82, 0.86, 0.9), (1.0, 0.62, 0.18)
 
 
 class AnatomyViews:
-    """Keeps the views on the probe.
+    """Slice views and 3D view that follow the probe.
 
     Parameters
     ----------
     app : SlicerApp, with its scene.
-    server : trame server that shows the views.
-    view_ui : (server, view_id, view) adds what lies over a view.
+    server : trame server of the views.
+    view_ui : (server, view_id, view) adds the controls on top of a view.
     """
 
     def __init__(self, app: SlicerApp, server: Server, view_ui: Callable[[Server, str, AbstractView], None]) -> None:
@@ -65,7 +65,7 @@ class AnatomyViews:
         self._fitted: set[str] = set()
         self._blend = 1.0
         self._image = vtkTrivialProducer()
-        self._image.SetOutput(Volume(np.zeros((1, 2, 2), np.uint8), np.eye(4)).to_vtk())  # until there is one
+        self._image.SetOutput(Volume(np.zeros((1, 2, 2), np.uint8), np.eye(4)).to_vtk())  # until the first image
         for kind, make in ((ViewType.SLICE_VIEW, SliceView), (ViewType.THREE_D_VIEW, ThreeDView)):
             app.view_manager.register_factory(
                 RemoteViewFactory(
@@ -82,7 +82,7 @@ class AnatomyViews:
         self.layout = LayoutManager(app.scene, app.view_manager, server)
         self.layout.register_layout(_LAYOUT, Layout(LayoutDirection.Vertical, [above, below]))
         self.layout.set_layout(_LAYOUT)
-        # Without a GPU these cost more than all the rest, and depth peeling hides what is translucent.
+        # Without a GPU these cost more than all other rendering, and depth peeling hides translucent objects.
         for view in (self.threed, *self.slices):
             view.render_window().SetMultiSamples(0)
         for view in self.slices:
@@ -102,7 +102,7 @@ class AnatomyViews:
         if self._followed is not None:
             self.follow(*self._followed)
 
-    # ---- what there is -----------------------------------------------------------------------------------------
+    # ---- content -----------------------------------------------------------------------------------------------
 
     @property
     def slices(self) -> list[SliceView]:
@@ -113,7 +113,7 @@ class AnatomyViews:
         return self._app.view_manager.get_threed_views()[0]
 
     def show_volume(self, volume_node) -> None:
-        """Show an MRI in the slice views, all of it."""
+        """Show an MRI in the slice views, at full extent."""
         for view in self.slices:
             view.set_background_volume_id(None if volume_node is None else volume_node.GetID())
             view.fit_view_to_content()
@@ -130,7 +130,7 @@ class AnatomyViews:
         display.SetBackfaceCulling(True)
 
     def show_probe(self, probe: Probe, transform_node) -> None:
-        """Show the probe's body, and its field for the image to lie on, under its transform."""
+        """Show the probe's body, and its imaged field with the image as texture, under the probe's transform."""
         body, field = self._model(_BODY), self._model(_FIELD)
         body.SetAndObservePolyData(probe_polydata(probe))
         field.SetAndObservePolyData(field_polydata(probe))
@@ -159,12 +159,12 @@ class AnatomyViews:
         self._fitted.clear()
 
     def show_image(self, volume_node, field: np.ndarray) -> None:
-        """Show the image that a volume node has now, in 3D and blended into the slice views.
+        """Show the current image of a volume node, in 3D and blended into the slice views.
 
-        `field` (rows, columns) is where it shows anything; around it the MRI stays as it is.
+        `field` (rows, columns) bool is the imaged field; outside it the MRI is unchanged.
         """
         volume = read_volume(volume_node)
-        # A copy, in which nothing inside of the field is 0, so that the threshold takes what is outside.
+        # A copy without zeros inside the field, so that the threshold removes only the pixels outside.
         seen = volume.with_array(np.where(field, np.maximum(volume.array, 1), 0).astype(np.uint8))
         shown = self._seen
         write_slice(shown, seen, volume_node.GetParentTransformNode())
@@ -182,13 +182,13 @@ class AnatomyViews:
         self.threed.schedule_render()
 
     def set_blend(self, share: float) -> None:
-        """How much of the image, against the MRI, the slice views show: 0 to 1."""
+        """Set the opacity of the image over the MRI in the slice views: 0 to 1."""
         self._blend = share
         for view in self.slices:
             view.set_foreground_opacity(share)
 
     def show_labels(self, labels_node: Any, on: bool) -> None:
-        """Colour the tissues in the slice views; a label map only."""
+        """Colour the tissues in the slice views, or not; only possible with a label map."""
         shown = labels_node if on and _is_label_map(labels_node) else None
         for view in self.slices:
             composite: Any = composite_of(_node(view))
@@ -196,14 +196,14 @@ class AnatomyViews:
             composite.SetLabelOpacity(0.35)
             view.schedule_render()
 
-    # ---- staying with the probe --------------------------------------------------------------------------------
+    # ---- following the probe -----------------------------------------------------------------------------------
 
     def hold(self, view: SliceView | None) -> None:
-        """Let a slice view rest, while the probe is dragged in it; None: none."""
+        """Stop a slice view from following while the probe is dragged in it; None releases it."""
         self._held = view
 
     def set_follow(self, on: bool) -> None:
-        """Let the slice views follow the probe, or rest."""
+        """Make the slice views follow the probe, or not."""
         self._follows = on
 
     def set_plane(self, name: str, plane: str) -> None:
@@ -212,7 +212,7 @@ class AnatomyViews:
         self._fitted.discard(name)
 
     def follow(self, probe_to_world: np.ndarray, probe: Probe) -> None:
-        """Turn the slice views to where the probe now is."""
+        """Move the slice views to the current pose of the probe, (4, 4) probe_to_world."""
         self._followed = (probe_to_world, probe)
         left, right, top, bottom = probe.image_bounds_mm()
         middle = (probe_to_world @ [0.5 * (left + right), 0.5 * (top + bottom), 0.0, 1.0])[:3]
@@ -226,7 +226,7 @@ class AnatomyViews:
             if plane == IN_PLANE:
                 show_in_slice(node, self._seen, probe_to_world, probe, fit=False)
             elif plane == ACROSS:
-                across = np.eye(4)  # right, up and normal of the view: elevation, against depth, lateral
+                across = np.eye(4)  # right, up and normal of the view: elevation, negative depth, lateral
                 across[:3, :3] = probe_to_world[:3, [2, 1, 0]] * [1.0, -1.0, 1.0]
                 across[:3, 3] = middle
                 node.GetSliceToRAS().DeepCopy(vtk_matrix(across))
@@ -245,13 +245,13 @@ class AnatomyViews:
             self._fitted.add(name)
 
     def look_at_probe(self, probe_to_world: np.ndarray, surface: PatientSurface) -> None:
-        """Turn the 3D view so that the probe is on the side that one sees, its image seen obliquely."""
+        """Turn the 3D view so that the probe is on the visible side and its image is seen obliquely."""
         camera = self.threed.get_camera_node()
         if camera is None:
             return
         outward = probe_to_world[:3, 3] - surface.centre
         away = outward / np.linalg.norm(outward) + 1.3 * probe_to_world[:3, 2] + 0.35 * probe_to_world[:3, 0]
-        if away @ [0, 1, 0] < 0:  # rather from the face's side than from behind
+        if away @ [0, 1, 0] < 0:  # prefer a view from the patient's front
             away = away - 2.6 * probe_to_world[:3, 2]
         away = away / np.linalg.norm(away)
         self.threed.reset_focal_point()
@@ -278,7 +278,7 @@ class AnatomyViews:
 
 
 def _silent(make):
-    """Makes views that do not draw themselves anew with every step of their making, some two hundred times."""
+    """Create views that do not render during their construction, which would be some two hundred times."""
     return lambda **options: make(**options, scheduled_render_strategy=NoScheduleRendering())
 
 

@@ -1,4 +1,4 @@
-"""Comparison: a tracked sequence beside the simulation: played, in the same pixels, and how much they look alike."""
+"""Comparison: a tracked sequence next to the simulation: playback, resampling to the same pixels, similarity."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Workstation.state import ComparisonMode, SharedState
 from SlicerUSSim.Workstation.streams import ImageStream
 
-#: Seconds between two images of a sequence that is played.
+#: Seconds between two images during playback of a sequence.
 _PLAY_EVERY_S = 0.1
 
 
 class RealImages:
-    """The images of a sequence on whatever grid the simulated image has."""
+    """The images of a sequence, resampled to the grid of the simulated image."""
 
     def __init__(self, tracked: TrackedImages) -> None:
         self.tracked = tracked
@@ -33,7 +33,7 @@ class RealImages:
         return len(self.tracked.images)
 
     def on_grid(self, place: int, grid: ImageGrid) -> tuple[np.ndarray, np.ndarray]:
-        """((rows, columns) uint8, (rows, columns) bool where it shows the field) of the image at this place."""
+        """(image (rows, columns) uint8, mask (rows, columns) bool of the imaged field) of the image with this index."""
         key = (place, grid)
         if self._on_grid is None or self._on_grid[0] != key:
             tracked = self.tracked
@@ -46,17 +46,17 @@ class RealImages:
         return self._on_grid[1], self._on_grid[2]
 
     def compared(self, place: int, simulated: np.ndarray, grid: ImageGrid) -> Similarity:
-        """The paper's cost between a simulated image and the real one at this place."""
+        """The paper's cost between a simulated image and the real image with this index."""
         real, mask = self.on_grid(place, grid)
         return similarity(simulated, real, grid.pixel_spacing_mm, mask=mask)
 
 
 class Comparison:
-    """Shows real images to the page, and tells it how alike the simulated one is.
+    """Shows real images on the page, with their similarity to the simulated image.
 
     Parameters
     ----------
-    move : takes the pose (4, 4) that a real image was taken at.
+    move : called with the pose (4, 4) of a real image.
     """
 
     def __init__(self, shared: SharedState, move: Callable[[np.ndarray], None]) -> None:
@@ -67,23 +67,23 @@ class Comparison:
         self._playing: asyncio.Task | None = None
         self._waiting: tuple[RealImages, int, np.ndarray, ImageGrid] | None = None  # to be compared
         self._comparing: asyncio.Task | None = None
-        #: Beside the simulated image, and over it
+        #: For display next to the simulated image, and over it
         self.streams = (ImageStream("real"), ImageStream("real-over"))
 
     @property
     def is_comparing(self) -> bool:
-        """Whether the page has yet to be told how alike the last images are."""
+        """Whether the similarity of the latest images is still to be shown."""
         return self._comparing is not None
 
     def take(self, tracked: TrackedImages, browser_node: Any) -> None:
-        """Compare with these from now on."""
+        """Use these images for comparison from now on."""
         self._real, self._browser = RealImages(tracked), browser_node
         with self._shared.changing() as now:
             now.sequence.length = len(self._real)
         self.show(0)
 
     def show(self, number: int) -> None:
-        """Put the probe where the real image at this place was taken, and show that image."""
+        """Move the probe to the pose of the real image with this index, and show that image."""
         if self._real is None:
             return
         number = int(np.clip(number, 0, len(self._real) - 1))
@@ -95,7 +95,7 @@ class Comparison:
         self.send()
 
     def send(self) -> None:
-        """Send the real image to the pages, if they show it."""
+        """Send the real image to the pages if they show it."""
         sequence = self._shared.now.sequence
         if self._real is None or self._grid is None or sequence.comparison is ComparisonMode.SIMULATED:
             return
@@ -104,7 +104,7 @@ class Comparison:
             stream.send(image)
 
     def compare(self, simulated: np.ndarray, grid: ImageGrid) -> None:
-        """Tell how alike a simulated image and the real one are; of images that come too fast, some and the last."""
+        """Show the similarity of a simulated image to the real one; if images arrive too fast, some are skipped."""
         if grid != self._grid:
             self._grid = grid
             self.send()
@@ -129,7 +129,7 @@ class Comparison:
             self._comparing = None
 
     def play(self) -> None:
-        """Play the sequence round and round, or stop."""
+        """Start playing the sequence in a loop, or stop."""
         if self._playing is not None:
             self._playing.cancel()
             self._playing = None

@@ -1,4 +1,4 @@
-"""What a user takes along: pictures, frames with their geometry, cines, the scene."""
+"""Export of images, frames with their geometry, cine loops, the scene and scripts."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose
 from SlicerUSSim.Workstation.opener import Opener
 from SlicerUSSim.Workstation.script import python_script
 
-#: Files of an image with its geometry.
+#: File formats of an image with its geometry.
 FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
-#: Images that a cine keeps, and how long one may be shown, in milliseconds.
+#: Number of images in a cine loop, and limits of the display time of each, in milliseconds.
 _MOST_IMAGES = 200
 _SHORTEST_MS, _LONGEST_MS = 40, 500
 
 
 def png(image: np.ndarray) -> bytes:
-    """A (rows, columns) uint8 image as it is."""
+    """A (rows, columns) uint8 image as a PNG file, without scaling."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG")
     return buffer.getvalue()
 
 
 def frame_file(image: Volume, suffix: str) -> bytes:
-    """An image with its place in the patient, as a file of one of FRAME_SUFFIXES."""
-    require(suffix in FRAME_SUFFIXES, f"frames are not written as {suffix!r}, expected {', '.join(FRAME_SUFFIXES)}")
+    """An image with its position in the patient as a file. Raises SimulationError if not one of FRAME_SUFFIXES."""
+    require(suffix in FRAME_SUFFIXES, f"the file type is {suffix!r}, expected {', '.join(FRAME_SUFFIXES)}")
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"frame{suffix}"
         image.write(path)
@@ -48,7 +48,7 @@ def frame_file(image: Volume, suffix: str) -> bytes:
 
 
 class Cine:
-    """The last images, as a scanner keeps them."""
+    """A cine loop: the last images, as in a scanner."""
 
     def __init__(self) -> None:
         self._images: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_IMAGES)
@@ -57,14 +57,14 @@ class Cine:
         return len(self._images)
 
     def add(self, image: np.ndarray, seconds: float) -> None:
-        """Keep a (rows, columns) uint8 image of this time; another size begins anew."""
+        """Append a (rows, columns) uint8 image with its time; an image of another size starts a new loop."""
         if self._images and self._images[-1][1].shape != image.shape:
             self._images.clear()
         self._images.append((seconds, image))
 
     def gif(self) -> bytes:
-        """An animated GIF, as fast as it was seen. Raises SimulationError without images."""
-        require(len(self._images) > 1, f"the cine holds {len(self._images)} images, expected two or more")
+        """An animated GIF with the original timing. Raises SimulationError for fewer than two images."""
+        require(len(self._images) > 1, f"the cine loop has {len(self._images)} images, expected two or more")
         times = np.array([seconds for seconds, _ in self._images])
         waits = np.clip(np.diff(times, append=times[-1] + 0.2) * 1e3, _SHORTEST_MS, _LONGEST_MS)
         first, *others = [Image.fromarray(image) for _, image in self._images]
@@ -76,16 +76,16 @@ class Cine:
 
 
 class Exports:
-    """What the menu Export offers, by kind: png, .nrrd, .mha, .vti, gif, mrb, json; and the script.
+    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, gif, mrb, json; and the script.
 
-    Each is (file name, content, MIME type). Raises SimulationError where there is nothing to export.
+    Each is (file name, content, MIME type). Raises SimulationError if there is nothing to export.
     """
 
     def __init__(self, app: SlicerApp, logic: UltrasoundSceneLogic, opener: Opener, cine: Cine) -> None:
         self._app, self._logic, self._opener, self._cine = app, logic, opener, cine
 
     async def export(self, kind: str) -> tuple[str, bytes, str]:
-        """One kind; what takes long leaves the event loop free."""
+        """Export one kind; slow encoding runs outside the event loop."""
         if kind == "json":
             return "preset.json", json.dumps(self._logic.preset.to_dict(), indent=2).encode(), "application/json"
         if kind == "mrb":
@@ -99,15 +99,15 @@ class Exports:
         return f"ultrasound{kind}", frame_file(image, kind), "application/octet-stream"
 
     def script(self) -> str:
-        """A script that gives the image on the screen again."""
+        """A Python script that reproduces the image on the screen."""
         preset = self._logic.preset
         labels: Any = self._logic.parameters.labels
         transform: Any = self._logic.parameters.probe_transform
         if labels is None or transform is None:
-            raise SimulationError("there is no image yet, expected labels and a probe")
+            raise SimulationError("there is no image, expected labels and a probe")
         source = self._opener.source_of(labels)
         in_labels, moved = pose_in_labels(labels, probe_pose(transform))
-        require(np.allclose(moved, np.eye(4)), f"{labels.GetName()!r} is scaled by a transform, expected a rigid one")
+        require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
         names = read_labels(labels, preset.tissues).names
         return python_script(source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels)
 
@@ -117,7 +117,7 @@ def scene_file(app: SlicerApp) -> bytes:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "ultrasound.mrb"
         window = vtkOutputWindow.GetInstance()
-        window.SetDisplayModeToNever()  # of every file in it
+        window.SetDisplayModeToNever()  # VTK would report every file of the scene
         try:
             written = app.io_manager.write_scene(path)
         finally:

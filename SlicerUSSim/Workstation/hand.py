@@ -1,4 +1,4 @@
-"""ProbeHand: the probe moved by mouse and keys: slid over the patient, rocked, tilted, rotated, aimed."""
+"""ProbeHand: moving the probe by mouse and keys: slide over the patient, rock, tilt, rotate, aim."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from SlicerUSSim.Logic.probe.placement import aimed_at, carried, turned
 from SlicerUSSim.Logic.probe.shape import probe_polydata
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 
-#: What keys do: turn by (rock, tilt, rotate) degrees, slide by (lateral, elevational) mm, lift by mm. With Shift: five
-#: times as much.
+#: Actions of the keys: turn by (rock, tilt, rotate) degrees, slide by (lateral, elevational) mm, lift by mm. With Shift
+#: five times as much.
 KEYS: dict[str, tuple[str, tuple[float, ...]]] = {
     "ArrowLeft": ("slide", (-2.0, 0.0)),
     "ArrowRight": ("slide", (2.0, 0.0)),
@@ -37,11 +37,11 @@ KEYS: dict[str, tuple[str, tuple[float, ...]]] = {
     "Home": ("upright", ()),
 }
 _DOUBLE_CLICK_S, _DOUBLE_CLICK_PX = 0.4, 5
-#: A drag in a slice view begins at the probe, and slides it, down to here below its face, mm; beyond, it aims.
+#: A drag in a slice view slides the probe if it starts less than this far below the probe face, mm; else it swings it.
 _AT_THE_PROBE_MM = 8.0
-#: Degrees that the probe is rotated by per pixel of the mouse.
+#: Rotation of the probe per pixel of mouse movement, degrees.
 _DEG_PER_PIXEL = 0.5
-#: Before VTK's own observers, which then do not see what was meant for the probe.
+#: Priority above VTK's own observers, which then do not receive events for the probe.
 _FIRST = 1000.0
 
 
@@ -49,21 +49,21 @@ _FIRST = 1000.0
 class _Drag:
     kind: str
     pose: np.ndarray
-    point: np.ndarray  # that was grabbed, in the world
+    point: np.ndarray  # grabbed point, in the world frame
     pixel: np.ndarray
-    normal: np.ndarray  # of the plane that the mouse moves in
+    normal: np.ndarray  # of the plane in which the mouse moves
 
 
 class ProbeHand:
-    """Turns what a user does with mouse and keys into poses.
+    """Converts mouse and key events into probe poses.
 
     Parameters
     ----------
-    pose : gives (4, 4) probe_to_world, or None without a probe.
-    move : takes the new one.
-    surface : gives what the probe slides over, or None.
-    upright : whether sliding makes the probe stand along the normal of the surface, or keeps its angles to it.
-    hold : told the slice view that a drag goes on in, and None at its end.
+    pose : returns (4, 4) probe_to_world, or None without a probe.
+    move : called with the new pose.
+    surface : returns the surface that the probe slides over, or None.
+    upright : whether sliding aligns the probe with the surface normal; otherwise it keeps its angles to the normal.
+    hold : called with the slice view in which a drag starts, and with None at its end.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class ProbeHand:
         self._probe: Probe | None = None
 
     def set_probe(self, probe: Probe) -> None:
-        """Another probe has another body to grab."""
+        """Use the body of another probe for picking."""
         self._probe = probe
         self._body.SetDataSet(probe_polydata(probe))
         self._body.BuildLocator()
@@ -89,7 +89,7 @@ class ProbeHand:
     # ---- keys and buttons --------------------------------------------------------------------------------------
 
     def key(self, name: str, fast: bool = False) -> bool:
-        """Do what a key does; whether it does anything."""
+        """Apply the action of a key. Returns False if the key has none or there is no probe."""
         pose, surface = self._pose(), self._surface()
         if name not in KEYS or pose is None:
             return False
@@ -111,19 +111,19 @@ class ProbeHand:
         return True
 
     def aim(self, point_world: np.ndarray) -> None:
-        """Turn the probe where it is so that its axis goes through a point."""
+        """Turn the probe about its position so that its axis passes through a point."""
         pose = self._pose()
         if pose is None:
             return
         try:
             self._move(aimed_at(pose, point_world))
-        except SimulationError:  # the point is on the face: nothing to aim at
+        except SimulationError:  # the point is on the probe face and gives no direction
             return
 
     # ---- mouse -------------------------------------------------------------------------------------------------
 
     def attach(self, view: AbstractView) -> None:
-        """Listen to the mouse in a view, before the view's own interaction does."""
+        """Observe the mouse in a view, with priority over the view's own interaction."""
         interactor = view.interactor()
 
         def observe(event: int, method) -> None:
@@ -169,7 +169,7 @@ class ProbeHand:
         hit, kind = self._on_body(start, end), _kind(view)
         if hit is not None:
             grabbed = hit
-        elif kind and (start[2] > 0) != (end[2] > 0):  # with a key also the field can be taken
+        elif kind and (start[2] > 0) != (end[2] > 0):  # with a modifier key the imaged field can be grabbed too
             grabbed = start + start[2] / (start[2] - end[2]) * (end - start)
             if self._probe is None or not self._probe.holds(grabbed[0], grabbed[1]):
                 return None
@@ -179,7 +179,7 @@ class ProbeHand:
         return _Drag(kind or "slide", pose, (pose @ [*grabbed, 1.0])[:3], pixel, direction)
 
     def _on_body(self, start: np.ndarray, end: np.ndarray) -> np.ndarray | None:
-        """(3,) where a line meets the probe's body first, all in the probe's frame, or None."""
+        """(3,) first intersection of a line with the probe's body in the probe frame, or None."""
         point, local, by_reference = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], cast(Any, mutable)  # the stubs want numbers
         hit = self._body.IntersectWithLine(
             start.tolist(), end.tolist(), 1e-6, by_reference(0.0), point, local, by_reference(0), by_reference(0)
@@ -220,7 +220,7 @@ class ProbeHand:
 
 
 def _kind(view: AbstractView) -> str:
-    """What the keys held say: "rotate", "swing" or nothing."""
+    """Kind of drag for the modifier keys held: "rotate", "swing" or ""."""
     interactor = view.interactor()
     if interactor.GetControlKey():
         return "rotate"
@@ -228,7 +228,7 @@ def _kind(view: AbstractView) -> str:
 
 
 def _in_slice(view: SliceView, pixel: np.ndarray) -> np.ndarray:
-    """(3,) in the world, of a pixel."""
+    """(3,) position of a pixel in the world frame."""
     node: Any = view.get_view_node()
     return (matrix_array(node.GetXYToRAS()) @ [*pixel, 0.0, 1.0])[:3]
 
@@ -239,7 +239,7 @@ def _slice_normal(view: SliceView) -> np.ndarray:
 
 
 def _ray(view: AbstractView, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((3,), (3,)) ends of what lies behind a pixel, in the world."""
+    """((3,), (3,)) near and far end of the viewing ray through a pixel, in the world frame."""
     ends = []
     x, y = pixel.tolist()
     for depth in (0.0, 1.0):
@@ -251,7 +251,7 @@ def _ray(view: AbstractView, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _on_plane(view: AbstractView, pixel: np.ndarray, drag: _Drag) -> np.ndarray:
-    """(3,) where the ray behind a pixel meets the plane through what was grabbed, which faces the viewer."""
+    """(3,) intersection of the viewing ray through a pixel with the drag plane, which faces the viewer."""
     near, far = _ray(view, pixel)
     along = far - near
     return near + ((drag.point - near) @ drag.normal) / (along @ drag.normal) * along

@@ -1,4 +1,4 @@
-"""ImageFlow: what becomes of every simulated image: on the page, in the views, compared, kept, and sent on."""
+"""ImageFlow: distribution of every simulated image: page, views, comparison, cine loop, tracker."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from SlicerUSSim.Workstation.tracker import Tracker
 
 
 class ImageFlow:
-    """Takes the images of the logic to whoever wants them."""
+    """Distributes the images of the logic to page, views, comparison, cine loop and tracker."""
 
     def __init__(
         self,
@@ -38,11 +38,11 @@ class ImageFlow:
 
     @property
     def streams(self) -> tuple[ImageStream, ...]:
-        """All that pages can show, simulated and real."""
+        """All image streams of the pages, simulated and real."""
         return self._simulated, *self._comparison.streams
 
     def image_changed(self) -> None:
-        """There is another image."""
+        """Distribute the new image."""
         frame = self._logic.lastFrame
         if frame is None:
             return
@@ -54,7 +54,7 @@ class ImageFlow:
         self._comparison.compare(frame.image, frame.grid)
 
     def tell_geometry(self) -> None:
-        """Probe or display may be others: tell the page what it draws around the image."""
+        """Update the geometry that the page draws around the image, after a change of probe or display."""
         preset = self._logic.preset
         grid = ImageGrid.for_probe(preset.probe, preset.display.image_size)
         width, height = grid.columns * grid.pixel_spacing_mm[0], grid.rows * grid.pixel_spacing_mm[1]
@@ -76,14 +76,14 @@ class ImageFlow:
             )
 
     def show_again(self) -> None:
-        """Another page came: it has to be shown what there is."""
+        """Send the current images again, for a page that has just opened."""
         for stream in self.streams:
             stream.send_again()
         for view in (self._views.threed, *self._views.slices):
             view.schedule_render()
 
     def _field_of(self, grid: ImageGrid) -> np.ndarray:
-        """(rows, columns) bool: where an image shows anything."""
+        """(rows, columns) bool: the imaged field."""
         key = grid, self._logic.preset.probe
         if self._field is None or self._field[0] != key:
             self._field = key, grid.field(key[1])

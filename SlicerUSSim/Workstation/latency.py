@@ -1,13 +1,13 @@
-"""LatencyStamps: which mouse event an image shows the effect of, so that the page can measure how long it took."""
+"""LatencyStamps: assigns mouse events to the images that show their effect, so that the page can measure latency."""
 
 from __future__ import annotations
 
-#: A page, and the time of an event on it, by that page's clock, ms.
+#: A page, and the time of an event on it by that page's clock, ms.
 Stamp = tuple[str, float]
 
 
 class LatencyStamps:
-    """Follows a stamp from the page that told it, through the probe that was moved, to the image of that pose."""
+    """Passes a stamp from the page that sent it, through the movement of the probe, to the image of that pose."""
 
     def __init__(self) -> None:
         self._told: Stamp | None = None
@@ -16,13 +16,13 @@ class LatencyStamps:
         self.computed: Stamp | None = None
 
     def told(self, page: str, milliseconds: float) -> None:
-        """A page says when the mouse moved, just before it says that it did."""
+        """Store the time of a mouse event, which the page sends just before the event itself."""
         self._told = (page, milliseconds)
 
     def probe_moved(self) -> None:
-        """A hand is about to move the probe."""
+        """Called before the user moves the probe."""
         self._applied = self._told
 
     def image_begun(self) -> None:
-        """An image is about to be computed, of where the probe is now."""
+        """Called before an image of the current pose is computed."""
         self.computed = self._applied

@@ -1,4 +1,4 @@
-"""Loading: MRI, labels and sequence that the workstation is about: taken from files, segmented, put under the probe."""
+"""Loading: reads MRI, labels and sequences from files, segments the MRI and places the probe."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from SlicerUSSim.Workstation.tasks import Tasks
 
 
 class Loading:
-    """Lets another patient, or more of the same one, take the place of what there was. All methods run in a task."""
+    """Replaces the patient, or adds data of the same patient. All methods run in a task."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class Loading:
         self._views, self._probe, self._comparison = views, probe, comparison
 
     def begin(self, files: Files) -> None:
-        """Load what the workstation was started with, and show the first image."""
+        """Load the files with which the workstation was started, and show the first image."""
         parameters = self._logic.parameters
         with self._presenter.shown():
             if files.preset is not None:
@@ -58,7 +58,7 @@ class Loading:
                 self._take_sequence(files.sequence, files.sequence_name)
 
     def open(self, name: str, content: bytes) -> None:
-        """Whatever file a page sent: an MRI, a label map, a tracked sequence, or settings."""
+        """Open a file sent by a page: an MRI, a label map, a tracked sequence or a preset."""
         with self._presenter.shown(), self._opener.uploaded(name, content) as (path, kind):
             if kind == "preset":
                 self._logic.preset = Preset.read(path)
@@ -71,10 +71,10 @@ class Loading:
                 self.segment()
 
     def segment(self) -> None:
-        """Label the MRI's tissues, and put a probe on the patient if there is none."""
+        """Segment the MRI into tissues, and place a probe on the patient if there is none."""
         parameters: Any = self._logic.parameters
         if parameters.mri is not None and parameters.labels is None:
-            # A label map: ten times as fast to fill as a segmentation, and its tissues colour the slice views.
+            # A label map: filled ten times as fast as a segmentation, and usable as an overlay of the slice views.
             name = self._scene.GenerateUniqueName(f"{parameters.mri.GetName()} tissues")
             parameters.labels = self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
         labels, mri, mask = parameters.labels, parameters.mri, parameters.mask
@@ -83,17 +83,17 @@ class Loading:
         self._presenter.segment()
         if labels is None or labels_version(labels) == before:
             if labels is not None and labels.IsA("vtkMRMLVolumeNode") and labels.GetImageData() is None:
-                self._scene.RemoveNode(labels)  # made for this, and nothing came of it
+                self._scene.RemoveNode(labels)  # created above, but the segmentation failed
             return
         self._opener.segmented(labels, mri, mask, options)
         self._labels_ready()
 
     def place_probe(self) -> None:
-        """Put the probe where a craniotomy might be."""
+        """Place the probe at a typical craniotomy."""
         self._presenter.placeProbe()
         self._probe.look()
 
-    # ---- inside ------------------------------------------------------------------------------------------------
+    # ---- implementation ----------------------------------------------------------------------------------------
 
     def _take_labels(self, path: str) -> None:
         node = self._opener.labels(path)
@@ -105,7 +105,7 @@ class Loading:
     def _take_mri(self, path: str | None) -> None:
         parameters = self._logic.parameters
         node = self._opener.mri(path)
-        self._logic.stopLiveUpdate()  # until there are labels of it
+        self._logic.stopLiveUpdate()  # until the new MRI is segmented
         parameters.mri, parameters.labels, parameters.mask = node, None, None
         self._take_volume(node)
 
@@ -115,7 +115,7 @@ class Loading:
         self._views.show_volume(node)
 
     def _take_sequence(self, sequence: TrackedSequence, name: str) -> None:
-        """The probe goes where the images were taken, and is the one that took them."""
+        """Use the probe and the poses of a tracked sequence."""
         tracked, browser, images = self._opener.sequence(sequence, name)
         self._logic.preset = replace(self._logic.preset, probe=tracked.probe)
         self._logic.parameters.real = images
@@ -126,5 +126,5 @@ class Loading:
             self._presenter.placeProbe()
         if not self._logic.isLive:
             self._presenter.setLive(True)
-        self._probe.update_surface()  # which the first image does not need
+        self._probe.update_surface()  # after the start of live images, which do not need it
         self._probe.look()

@@ -1,4 +1,4 @@
-"""Messages: what went wrong, one line each, on every page until the user closes it."""
+"""Messages: errors, one line each, shown on every page until the user closes them."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from SlicerUSSim.Workstation.state import SharedState
 
 _log = logging.getLogger(__name__)
 
-#: More would cover the page.
+#: Number of messages; more would cover the page.
 _MOST = 5
 
 
 class Messages:
-    """Shows errors."""
+    """Shows errors on the pages."""
 
     def __init__(self, shared: SharedState) -> None:
         self._shared = shared
 
     def show(self, message: str) -> None:
-        """One line more."""
+        """Add a line."""
         _log.warning("%s", message)
         with self._shared.changing() as now:
             now.messages.errors = [*now.messages.errors, message][-_MOST:]
 
     def dismiss(self, number: int) -> None:
-        """The user closed a line."""
+        """Remove a line that the user has closed."""
         with self._shared.changing() as now:
             now.messages.errors = [message for n, message in enumerate(now.messages.errors) if n != number]
 
     def failed(self, error: Exception) -> None:
-        """Show what nobody caught; a bug of ours is logged with its traceback."""
+        """Show an uncaught exception; an internal error is also logged with its traceback."""
         message = user_message(error)
         if message is None:
             _log.error("a mistake of the program", exc_info=error)

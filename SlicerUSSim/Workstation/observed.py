@@ -1,4 +1,4 @@
-"""Observed: one node at a time of those that play a role, whose changes are told."""
+"""Observed: observes one MRML node at a time, the one that currently has a given role."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 
 
 class Observed:
-    """Observes whichever node plays a role now.
+    """Observes the node that currently has a role.
 
     Parameters
     ----------
     event : name of an event of that node, such as "TransformModifiedEvent".
-    method : called when it happens.
+    method : called on this event.
     """
 
     def __init__(self, event: str, method: Callable[[], None]) -> None:
@@ -21,12 +21,12 @@ class Observed:
         self._tag = 0
 
     def watch(self, node: Any) -> None:
-        """Observe this one from now on, or none."""
+        """Observe this node from now on, or none."""
         if node is self._node:
             return
         if self._node is not None:
             self._node.RemoveObserver(self._tag)
         self._node = node
         if node is not None:
-            event = getattr(node, self._event, self._event)  # VTK knows its own events by name, MRML's by number
+            event = getattr(node, self._event, self._event)  # VTK takes its own events by name, MRML's by number
             self._tag = node.AddObserver(event, lambda *_: self._method())

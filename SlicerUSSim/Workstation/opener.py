@@ -1,4 +1,4 @@
-"""Opener: files that become nodes of the scene: MRI, label maps, masks, tracked sequences."""
+"""Opener: reads files into nodes of the scene: MRI, label maps, masks, tracked sequences."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from SlicerUSSim.Workstation.tasks import Tasks
 
 _log = logging.getLogger(__name__)
 
-#: Attribute of a node: the file it came from; "" for the demo brain.
+#: Attribute of a node: the file from which it was read; "" for the demo brain.
 FILE = "SlicerUSSim.file"
 
 
 @dataclass(frozen=True)
 class Files:
-    """What to begin with; the demo brain without an MRI and without labels."""
+    """Files and options at the start; without an MRI and labels it is the demo brain."""
 
     mri: str | None = None
     labels: str | None = None
@@ -43,33 +43,33 @@ class Files:
     preset: Preset | None = None
     sequence: TrackedSequence | None = None
     sequence_name: str = "sequence"
-    #: From pixels to where the patient lies, and from there to the MRI; see TrackedImages.of
+    #: Transform from pixels to the reference frame, and from there to the MRI; see TrackedImages.of
     transform: str = "ImageToReference"
     to_ras: np.ndarray | None = None
     #: OpenIGTLink, as openigtlink.parse_address reads it, and the transform to follow
     tracker: str | None = None
     tracker_device: str | None = None
-    #: What has been read of these files already
+    #: Volumes that have already been read, by file
     volumes: Mapping[str, Volume] = field(default_factory=dict)
 
 
 class Opener:
-    """Reads files in the thread for work, and puts what they hold into the scene. Raises SimulationError for others."""
+    """Reads files in the worker thread and adds them to the scene. Raises SimulationError for invalid files."""
 
     def __init__(self, scene, logic: UltrasoundSceneLogic, tasks: Tasks, files: Files) -> None:
         self._scene, self._logic, self._tasks, self._files = scene, logic, tasks, files
         self._sources: dict[tuple, LabelSource] = {}
-        self._volumes = dict(files.volumes)  # read, but not asked for yet
+        self._volumes = dict(files.volumes)  # read, but not yet used
 
     def mri(self, path: str | None):
-        """A node with the MRI of a file, or the demo brain."""
+        """A volume node with the MRI of a file, or with the demo brain."""
         volume = self._tasks.do(lambda: demo_mri()[0]) if path is None else self._volume(path)
         name = "MNI152 brain" if path is None else Path(path).name
         node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
         write_volume(node, volume)
         node.SetAttribute(FILE, "" if path is None else os.path.abspath(path))
         display = display_of(node)
-        display.SetAutoWindowLevel(False)  # its own takes bright tissue for white
+        display.SetAutoWindowLevel(False)  # the automatic window saturates bright tissue
         inside = volume.array[volume.array > 0]
         display.SetWindowLevelMinMax(0.0, 1.1 * float(np.percentile(inside, 99.8)) if inside.size else 1.0)
         return node
@@ -79,7 +79,7 @@ class Opener:
         return self._label_map(self._volume(path), path, ["inside"])
 
     def labels(self, path: str):
-        """A label map node; its tissues are in the .json beside the file, or the preset's."""
+        """A label map node; its tissues come from the .json file next to it, or from the preset."""
         volume = self._volume(path)
         beside, preset = tissues_beside(Path(path)), self._logic.preset
         _log.info("%s: tissues of %s", path, beside if beside.exists() else "the preset")
@@ -87,7 +87,7 @@ class Opener:
         _require_labels(volume, path)
         values = [int(label) for label in np.unique(volume.array) if label]
         unknown = [label for label in values if label not in tissues]
-        require(not unknown, f"{path}: has the labels {unknown}, which no tissue has; put a tissue table at {beside}")
+        require(not unknown, f"{path}: labels {unknown} have no tissue, expected a tissue table with them at {beside}")
         if beside.exists():
             mine = preset.tissues
             for tissue in tissues.values():
@@ -101,18 +101,18 @@ class Opener:
         return node
 
     def segmented(self, labels_node, mri_node, mask_node, options: dict) -> None:
-        """Remember what labels were made of."""
+        """Record the source of labels."""
         file, mask = mri_node.GetAttribute(FILE), None if mask_node is None else mask_node.GetAttribute(FILE)
         self._sources = {}
         if file is not None and (mask_node is None or mask is not None):
             self._sources[_voxels_of(labels_node)] = LabelSource(file, mask=mask, options=options)
 
     def source_of(self, labels_node) -> LabelSource:
-        """What labels were made of. Raises SimulationError where it were not files."""
+        """The source of labels. Raises SimulationError if they were not made from files."""
         source = self._sources.get(_voxels_of(labels_node))
         if source is None:
             name = labels_node.GetName()
-            raise SimulationError(f"{name!r} was not made from files here; save it, and open it with --labels")
+            raise SimulationError(f"{name!r} has no source file, expected labels of a file (save, open with --labels)")
         return source
 
     def sequence(self, sequence: TrackedSequence, name: str):
@@ -132,7 +132,7 @@ class Opener:
 
     @contextmanager
     def uploaded(self, name: str, content: bytes) -> Iterator[tuple[str, str]]:
-        """(path, kind) of a file whose content came from a page: "preset", "sequence", "labels" or "mri"."""
+        """(path, kind) of a file uploaded from a page; kind is "preset", "sequence", "labels" or "mri"."""
         with TemporaryDirectory() as folder:
             path = Path(folder) / name
             path.write_bytes(content)
@@ -146,7 +146,7 @@ class Opener:
                     kind = "labels" if volume.looks_like_labels() else "mri"
                     _log.info("%s: opened as %s", name, "a label map" if kind == "labels" else "an MRI")
                 yield str(path), kind
-            except SimulationError as error:  # the user knows the file by its name alone
+            except SimulationError as error:  # the user knows only the file name, not the temporary folder
                 raise SimulationError(str(error).replace(folder + os.sep, "")) from None
 
     def _volume(self, path: str) -> Volume:
@@ -170,6 +170,6 @@ def _require_labels(volume: Volume, path: str) -> None:
 
 
 def _voxels_of(labels_node) -> tuple:
-    """Changes with the voxels of a label map."""
+    """A key that changes with the voxels of a label map."""
     image = labels_node.GetImageData() if labels_node.IsA("vtkMRMLVolumeNode") else None
     return labels_node.GetID(), None if image is None else image.GetMTime()

@@ -1,4 +1,4 @@
-"""ProbeControl: where the probe is on the patient: moved by hand, sliders and trackers, followed by the views."""
+"""ProbeControl: pose of the probe on the patient, set by mouse, keys, sliders and tracker, followed by the views."""
 
 from __future__ import annotations
 
@@ -22,18 +22,17 @@ from SlicerUSSim.Workstation.tasks import AtMost, Tasks
 
 _log = logging.getLogger(__name__)
 
-#: Seconds between two times that the slice views turn to the probe, and that the sliders are told where it is: both
-#: take time that the image then has to wait for.
+#: Seconds between two updates of the slice views, and of the sliders: both delay the image.
 _TURN_EVERY_S, _TELL_EVERY_S = 0.12, 0.4
 _POSE_FIELDS = tuple(entry.name for entry in fields(SurfacePose))
 
 
 class ProbeControl:
-    """Moves the probe's transform node, and tells views and sliders where it went.
+    """Moves the probe's transform node, and updates views and sliders.
 
     Parameters
     ----------
-    about_to_move : called when a hand is about to move the probe.
+    about_to_move : called before the user moves the probe with mouse or keys.
     """
 
     def __init__(
@@ -63,7 +62,7 @@ class ProbeControl:
             self.hand.attach(view)
 
     def pose(self) -> np.ndarray | None:
-        """(4, 4) probe_to_world, or None without a probe, or with one that is scaled: simulating says so."""
+        """(4, 4) probe_to_world; None without a probe, or if its transform scales, which the simulation reports."""
         transform = self._logic.parameters.probe_transform
         try:
             return None if transform is None else probe_pose(transform)
@@ -71,7 +70,7 @@ class ProbeControl:
             return None
 
     def move(self, probe_to_world: np.ndarray) -> None:
-        """Put the probe somewhere; the image follows."""
+        """Set the pose of the probe; the image follows."""
         transform = self._logic.parameters.probe_transform
         if transform is not None:
             set_node_to_world(transform, probe_to_world)
@@ -81,25 +80,25 @@ class ProbeControl:
             self._refused = True
 
     def moved(self) -> None:
-        """The transform changed, whoever did it."""
+        """Update views and sliders after any change of the transform."""
         self._turn()
         self._tell()
 
     @property
     def is_told(self) -> bool:
-        """Whether views and sliders know where the probe is."""
+        """Whether views and sliders are up to date with the pose."""
         return not (self._turn.is_waiting or self._tell.is_waiting)
 
-    # ---- what the page asks for --------------------------------------------------------------------------------
+    # ---- requests of the page ----------------------------------------------------------------------------------
 
     def set_pose(self, name: str, value: float) -> None:
-        """The slider of a field of SurfacePose was moved."""
+        """Set a field of SurfacePose from its slider."""
         pose = self.pose()
         if pose is not None and self.surface is not None and name in _POSE_FIELDS:
             self.move(self.surface.held(pose, **{name: float(value)}))
 
     def aim_image(self, across: float, down: float) -> None:
-        """Aim at a point of the image, in shares of its width and height."""
+        """Aim at a point of the image, given as fractions of its width and height."""
         pose = self.pose()
         left, right, top, bottom = self._logic.preset.probe.image_bounds_mm()
         if pose is not None:
@@ -113,14 +112,14 @@ class ProbeControl:
             self._views.look_at_probe(pose, self.surface)
 
     def choose_plane(self, name: str, plane: str) -> None:
-        """Let a slice view follow the probe in another plane."""
+        """Choose the plane in which a slice view follows the probe."""
         self._views.set_plane(name, plane)
         with self._shared.changing() as now:
             now.views.planes = dict(self._views.planes)
         self._turn()
 
     def set_follow(self, on: bool) -> None:
-        """Let the slice views follow the probe, or rest."""
+        """Make the slice views follow the probe, or not."""
         self._views.set_follow(on)
         self._turn()
 
@@ -131,7 +130,7 @@ class ProbeControl:
     # ---- patient and probe in the views ------------------------------------------------------------------------
 
     def update_surface(self) -> None:
-        """Make the surface anew if the labels are others; called in a task."""
+        """Recompute the surface if the labels have changed; called in a task."""
         labels: Any = self._logic.parameters.labels
         if labels is None or (labels.IsA("vtkMRMLVolumeNode") and labels.GetImageData() is None):
             return
@@ -147,7 +146,7 @@ class ProbeControl:
         self._tell()
 
     def draw(self) -> None:
-        """Draw another probe, or the same under another transform."""
+        """Draw the probe if it or its transform node has changed."""
         transform, probe = self._logic.parameters.probe_transform, self._logic.preset.probe
         if transform is not None and (probe, transform) != self._drawn:
             self._drawn = (probe, transform)
@@ -155,7 +154,7 @@ class ProbeControl:
             self._views.show_probe(probe, transform)
             self.moved()
 
-    # ---- inside ------------------------------------------------------------------------------------------------
+    # ---- implementation ----------------------------------------------------------------------------------------
 
     def _move_by_hand(self, probe_to_world: np.ndarray) -> None:
         self._about_to_move()

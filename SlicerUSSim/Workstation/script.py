@@ -1,4 +1,4 @@
-"""python_script: what is on the screen as a script, which gives the same image again, pixel by pixel."""
+"""python_script: a Python script that reproduces the image on the screen, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.imaging.preset import Preset
 
-_TEMPLATE = '''"""The image of a SlicerUSSim workstation, again."""
+_TEMPLATE = '''"""Reproduces an image of a SlicerUSSim workstation."""
 
 import numpy as np
 
@@ -33,7 +33,7 @@ print(frame.image.shape, "pixels, mean", frame.image.mean())
 
 @dataclass(frozen=True)
 class LabelSource:
-    """Where labels come from: a file of labels, or the segmentation of an MRI."""
+    """Source of labels: a label file, or the segmentation of an MRI."""
 
     #: File of the MRI or of the labels; "" is the demo brain
     path: str
@@ -42,12 +42,12 @@ class LabelSource:
     mask: str | None = None
     #: Other arguments of segment_mri
     options: dict = field(default_factory=dict)
-    #: What the simulator calls the labels 0, 1, 2, ... of the file
+    #: The simulator's numbers of the file's labels 0, 1, 2, ...
     relabelled: tuple[int, ...] = ()
 
 
 def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray) -> str:
-    """A script that simulates what `preset`, whose tissues are by label, shows at a pose (4, 4) in these labels."""
+    """A script that simulates an image of these labels with `preset`, whose tissues are by label, at a pose (4, 4)."""
     imports, more, lines = ["UltrasoundSimulator", "seed_of_pose"], "", []
     is_demo = not source.path
     if is_demo:
@@ -78,5 +78,5 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
 
 
 def _plain(preset: Preset) -> dict:
-    """The preset as its JSON file has it: of values that Python writes as literals, whatever names are made of."""
+    """The preset as in its JSON file, which has only values that Python can write as literals."""
     return json.loads(json.dumps(preset.to_dict()))

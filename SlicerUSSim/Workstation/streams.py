@@ -1,4 +1,4 @@
-"""ImageStream: the newest of images that come faster or slower than a browser takes them."""
+"""ImageStream: sends the newest of a series of images, at the rate at which it can encode them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from PIL import Image
 from trame_server.utils.asynchronous import get_event_loop
 
-#: Visually without loss on speckle, a fifth of the size of PNG, and encoded in a millisecond.
+#: Visually lossless on speckle, a fifth of the size of PNG, and encoded in a millisecond.
 _QUALITY = 92
 
 
 class ImageStream:
     """Sends grey images to all pages under one name; static/workstation.js draws them.
 
-    Has the form that trame-rca wants of an area that it serves.
+    Implements the interface of an area of trame-rca.
     """
 
     def __init__(self, name: str) -> None:
@@ -27,11 +27,11 @@ class ImageStream:
         self._waiting: tuple[np.ndarray, dict] | None = None
         self._last: tuple[bytes, dict] | None = None
         self._encoding = False
-        #: Number of the last image, from 1
+        #: Number of the last image, starting at 1
         self.count = 0
 
     def send(self, image: np.ndarray, **about) -> None:
-        """Send a (rows, columns) uint8 image; one that still waits is replaced. `about` goes with it."""
+        """Send a (rows, columns) uint8 image with the metadata `about`; an image that is still waiting is replaced."""
         self._waiting = (image, about)
         if not self._encoding:
             self._encoding = True
@@ -39,7 +39,7 @@ class ImageStream:
 
     @property
     def is_sending(self) -> bool:
-        """Whether an image is on its way to the pages."""
+        """Whether an image is being sent to the pages."""
         return self._encoding
 
     def send_again(self) -> None:
@@ -63,16 +63,16 @@ class ImageStream:
         if self._streamer is not None:
             self._streamer.push_content(self.area_name, {**about, "st": int(time.time() * 1e3)}, content)
 
-    # ---- what trame-rca calls ----------------------------------------------------------------------------------
+    # ---- interface of trame-rca --------------------------------------------------------------------------------
 
     def set_streamer(self, streamer) -> None:
         self._streamer = streamer
 
     def update_size(self, origin, size) -> None:
-        """Pages scale the image themselves."""
+        """Ignored: pages scale the image themselves."""
 
     def on_interaction(self, origin, event) -> None:
-        """Pages tell what happens on the image by name, see page.py."""
+        """Ignored: pages send events on the image as named triggers, see page.py."""
 
 
 def _jpeg(image: np.ndarray) -> bytes:

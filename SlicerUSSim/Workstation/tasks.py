@@ -1,7 +1,7 @@
-"""Tasks: work in a thread of its own, while the event loop's thread serves the browser and alone touches the nodes.
+"""Tasks: a worker thread for computations; the event loop's thread serves the browser and alone accesses the nodes.
 
-The presenter and the logic are written as if everything happened at once. Here they run in greenlets: where the logic
-has work to do (UltrasoundSceneLogic, `work`), its greenlet waits, and the event loop runs until the work is done.
+Presenter and logic are written as synchronous code. Here they run in greenlets: during a computation
+(UltrasoundSceneLogic, `work`) the greenlet waits, and the event loop runs until the computation is done.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ T = TypeVar("T")
 
 
 class Tasks(AtOnce):
-    """Runs functions of the event loop that may wait for work; is what UltrasoundSceneLogic takes as `work`.
+    """Runs functions in the event loop that may wait for computations; the `work` of UltrasoundSceneLogic.
 
     Parameters
     ----------
-    failed : told of an exception that no task caught, in the event loop.
+    failed : called in the event loop with an exception that a task did not catch.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         self._failed = failed
         self._loop = get_event_loop()
-        # One: what a device does for one task must not change what it does for another in its midst.
+        # One thread: computations on a device must not be interleaved between tasks.
         self._executor = ThreadPoolExecutor(1, "ultrasound")
         self._unfinished = 0
 
     @property
     def are_done(self) -> bool:
-        """Whether no task is under way, or about to start."""
+        """Whether no task is running or about to start."""
         return not self._unfinished
 
     def start(self, function: Callable[[], object]) -> None:
-        """Call `function` soon, from the event loop, where it may wait for work."""
+        """Call `function` soon, in the event loop, as a task that may wait for computations."""
         self._unfinished += 1
         self._loop.call_soon(self._start, function)
 
     def do(self, function: Callable[[], T]) -> T:
-        """What `function` gives, called in the thread for work. Outside of a task the event loop waits as well."""
+        """The result of `function`, called in the worker thread. Outside a task this blocks the event loop."""
         waiting = getcurrent()
         event_loop = waiting.parent
         if event_loop is None:
@@ -55,11 +55,11 @@ class Tasks(AtOnce):
         return future.result()
 
     def tell(self, function: Callable[[], None]) -> None:
-        """From any thread: call `function` soon, from the event loop."""
+        """Call `function` soon in the event loop; may be used from any thread."""
         self._loop.call_soon_threadsafe(function)
 
     def stop(self) -> None:
-        """Forget the work that has not begun."""
+        """Cancel computations that have not started."""
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def _start(self, function: Callable[[], object]) -> None:
@@ -75,7 +75,7 @@ class Tasks(AtOnce):
 
 
 class AtMost:
-    """Calls a function when called itself, but not more often than every so many seconds; the last call counts."""
+    """Limits how often a function is called: at most once per `seconds`; the last call is always followed by one."""
 
     def __init__(self, seconds: float, function: Callable[[], None]) -> None:
         self._seconds, self._function = seconds, function

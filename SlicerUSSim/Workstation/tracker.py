@@ -1,4 +1,4 @@
-"""Tracker: a TrackerLink that moves the probe and gets the images, and what the page says of it."""
+"""Tracker: a TrackerLink that moves the probe and sends the images, with its state on the page."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from SlicerUSSim.Logic.tracked.openigtlink import TrackerLink, parse_address
 from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 
-#: Seconds between two looks at the connection's state.
+#: Seconds between two checks of the connection's state.
 _LOOK_EVERY_S = 0.3
 
 
 class Tracker:
-    """The connection to a tracker, once there is one.
+    """The connection to a tracker, if any.
 
     Parameters
     ----------
-    move : takes the pose (4, 4) that a tracker says, in the event loop.
+    move : called in the event loop with the pose (4, 4) from the tracker.
     """
 
     def __init__(self, shared: SharedState, tasks: Tasks, move: Callable[[np.ndarray], None]) -> None:
@@ -31,9 +31,9 @@ class Tracker:
         self._telling: asyncio.Task | None = None
 
     def start(self, address: str, device: str | None) -> None:
-        """Connect, or wait for it; `address` is what parse_address reads, `device` the transform to follow.
+        """Connect, or wait for a connection; `address` as in parse_address, `device` is the transform to follow.
 
-        Raises SimulationError for another address, and for one that cannot be waited at.
+        Raises SimulationError for an invalid address, and for one at which it cannot listen.
         """
         host, port, listen = parse_address(address)
         self._link = TrackerLink(host, port, self._moved, device=device, listen=listen)
@@ -41,16 +41,16 @@ class Tracker:
 
     @property
     def is_on(self) -> bool:
-        """Whether anyone wants images."""
+        """Whether a tracker has been started, so that images are sent."""
         return self._link is not None
 
     def send(self, image: Volume) -> None:
-        """Send an image with its place (RAS)."""
+        """Send an image with its position (RAS)."""
         if self._link is not None:
             self._link.send(image)
 
     def stop(self) -> None:
-        """Let go of it."""
+        """Close the connection."""
         link, self._link = self._link, None
         if link is not None:
             link.stop()

@@ -1,4 +1,4 @@
-"""Workstation: one scene, one presenter, one page: what `ussim serve` runs. Here everything is made and connected."""
+"""Workstation: one scene, one presenter, one page, run by `ussim serve`. All parts are created and connected here."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
 
-#: Seconds between two looks whether everything is done.
+#: Seconds between two checks whether all work is done.
 _LOOK_EVERY_S = 0.02
 
 
 class Workstation:
-    """Everything behind the page. All pages show and drive the same workstation.
+    """The server side of the page. All pages show and control the same workstation.
 
     Parameters
     ----------
-    files : what to begin with.
+    files : files and options at the start.
     device : see opencl.devices.choose_device.
     """
 
@@ -51,7 +51,7 @@ class Workstation:
         self._files = files
         self._shared = shared = SharedState(self.server.state)
         app = SlicerApp()
-        # Whose nodes the scene does not know without it; pyright does not see what slicer takes from its libraries.
+        # Registers the classes of sequence nodes; pyright does not see names that slicer imports from its libraries.
         app.register_module_logic(cast(Any, slicer).vtkSlicerSequencesLogic())
         sections = panel_sections()
         stamps, cine = LatencyStamps(), Cine()
@@ -84,7 +84,7 @@ class Workstation:
         build_page(self.server, sections, self._views.layout, tuple(KEYS))
 
     def close(self, **_: object) -> None:
-        """Let go of the tracker and of what waits."""
+        """Close the connection to the tracker and cancel waiting tasks."""
         self._logic.stopLiveUpdate()
         self._tracker.stop()
         self._tasks.stop()
@@ -92,7 +92,7 @@ class Workstation:
     # ---- pages -------------------------------------------------------------------------------------------------
 
     def _answer_pages(self, buttons: Buttons, stamps: LatencyStamps) -> None:
-        """What pages ask for by name."""
+        """Register the triggers by which pages call methods."""
         probe, comparison = self._probe, self._comparison
         triggers: dict[str, Callable[..., object]] = {
             "set": self._panel.set,
@@ -118,7 +118,7 @@ class Workstation:
             self.server.controller.trigger(name)(method)
 
     def _follow_pages(self) -> None:
-        """What pages change in the state they share."""
+        """React to changes that pages make in the shared state."""
         self._shared.on_change(NAMES.views.blend, self._views.set_blend)
         self._shared.on_change(NAMES.views.follow, self._probe.set_follow)
         self._shared.on_change(NAMES.views.show_tissues, self._probe.show_tissues)
@@ -142,7 +142,7 @@ class Workstation:
         self._panel.refresh()
 
     async def _export(self, kind: str) -> list[object] | None:
-        """[file name, content, MIME type], or None after the page was told why not."""
+        """[file name, content, MIME type], or None after an error was shown on the page."""
         try:
             name, content, mime = await self._exports.export(kind)
         except SimulationError as error:
@@ -156,9 +156,9 @@ class Workstation:
             now.script.text, now.script.is_open = self._exports.script(), True
 
     async def _at_rest(self) -> dict[str, int]:
-        """Answers once all that pages and trackers asked for is done: the number of the last image by stream.
+        """Wait until all requests of pages and trackers are done; returns the number of the last image by stream.
 
-        For whoever drives a page by program; a page is up to date once its canvases have drawn those images.
+        For programs that control a page; a page is up to date once its canvases show those images.
         """
         while not self._is_at_rest:
             await asyncio.sleep(_LOOK_EVERY_S)
@@ -190,7 +190,7 @@ class Workstation:
             self._tasks.start(self._follow_parameters)
 
     def _follow_parameters(self) -> None:
-        """The scene's parameters are others: watch, draw and simulate with what they now name."""
+        """Observe, draw and simulate the nodes that the scene's parameters now name."""
         self._following = False
         parameters = self._logic.parameters
         self._probe_node.watch(parameters.probe_transform)

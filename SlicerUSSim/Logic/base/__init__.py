@@ -1,6 +1,6 @@
-"""What every other room stands on: errors, settings, volumes, files, transforms.
+"""Basic types of all other rooms: errors, settings, volumes, files, transforms.
 
-Imports nothing of the other rooms; numpy always, VTK and SimpleITK only where a volume goes there.
+Imports no other room. VTK and SimpleITK are imported only when a volume is converted for them.
 """
 
 from typing import TYPE_CHECKING

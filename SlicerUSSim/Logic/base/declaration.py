@@ -1,8 +1,8 @@
-"""One declaration per parameter: parameter() says at the field of a dataclass all that is known of it.
+"""One declaration per parameter: parameter() describes it completely at the field of its dataclass.
 
-From there come the checks, JSON, the command's options, the fields of panel and page, what a scene remembers, the
-optimiser's bounds, the report and docs/parameters.md. Types are checked strictly (msgspec): true is no number, "5" is
-no 5, 3.0 is no seed, and nan is nothing.
+The checks, JSON, the command's options, the fields of panel and page, the values saved in a scene, the optimiser's
+bounds, the report and docs/parameters.md are derived from it. Types are checked strictly (msgspec): true and "5" are
+not accepted as numbers, nor 3.0 as a whole number, nor NaN.
 
     @dataclass(frozen=True)
     class DisplaySettings(Declared):
@@ -25,37 +25,37 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 _T = TypeVar("_T")
 
-#: More than any parameter can be
+#: Larger than any parameter
 _HUGE = 10**300
 
 
 @dataclass(frozen=True)
 class Shown:
-    """The range that a panel offers for a number, in the unit that it is shown in."""
+    """The range of a number in a panel, in the unit in which it is shown."""
 
     low: float
     high: float
     step: float = 1.0
-    #: A slider beside the number
+    #: Whether there is a slider next to the number
     is_slider: bool = False
-    #: An amplitude that is shown as its level in dB
+    #: Whether an amplitude is shown as its level in dB
     as_db: bool = False
-    #: The number that stands for None, and for all below it
+    #: Numbers up to this one mean None
     none_at: float | None = None
 
     @property
     def decimals(self) -> int:
-        """Decimals that the step needs."""
+        """Number of decimals for the step."""
         return max(0, -int(log10(self.step) // 1))
 
     def number(self, value: float | None) -> float | None:
-        """What is shown for a value."""
+        """The number shown for a value."""
         if value is None:
             return self.none_at
         return 20.0 * log10(value) if self.as_db else value
 
     def value(self, number: float) -> float | None:
-        """What is meant by a number that was entered."""
+        """The value of an entered number."""
         if self.none_at is not None and number <= self.none_at:
             return None
         return 10.0 ** (number / 20.0) if self.as_db else number
@@ -63,48 +63,48 @@ class Shown:
 
 @dataclass(frozen=True)
 class Fit:
-    """How a parameter is fitted to real ultrasound."""
+    """Search range and tolerance of a parameter in fits."""
 
     #: Default bounds of the search
     low: float
     high: float
-    #: Half the spread of equally good fits within which it counts as determined
+    #: The parameter counts as determined if equally good fits spread by at most twice this
     tolerance: float
-    #: Searched by its logarithm: amplitudes are compared by their ratios
+    #: Whether the search uses its logarithm, as for amplitudes
     is_logarithmic: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
-    """Everything that is known of a parameter."""
+    """The declaration of a parameter."""
 
-    #: Of the field, and its type; None where it may be None is left out
+    #: Name of the field, and its type without None
     name: str = ""
     type: Any = None
     default: Any = None
-    #: Whether it has to be given
+    #: Whether a value is required
     is_required: bool = False
-    #: Whether None may be given, by its type or because the owner puts something in its place
+    #: Whether None is allowed, by its type or because the owner replaces it
     can_be_none: bool = False
-    #: As people say it
+    #: Name for users
     label: str
-    #: One sentence without a full stop, which tool tips, --help and the documentation show
+    #: One sentence without a full stop, for tool tips, --help and the documentation
     tip: str
     unit: str = ""
-    #: The formula sign
+    #: Symbol in formulas
     symbol: str = ""
     #: Smallest and largest value; of each element of a tuple
     bounds: tuple[float, float] | None = None
-    #: What a text can be
+    #: Allowed values of a text
     choices: tuple[str, ...] = ()
-    #: What else one should know, and where default or bounds come from
+    #: Further explanation, and the source of the default or bounds
     note: str = ""
     source: str = ""
-    #: None: panels do not show it. Ticks and choices need no range: True
+    #: None: not in panels. True: shown without a range, as tick boxes and choices are
     shown: Shown | bool | None = None
-    #: None: it cannot be fitted
+    #: None: not fitted
     fit: Fit | None = None
-    #: Name of the command's option, such as "gain" or "thin-sulci/no-thin-sulci"; None: it has none of its own
+    #: Name of the command's option, such as "gain" or "thin-sulci/no-thin-sulci"; None: no option
     option: str | None = None
 
     @property
@@ -114,7 +114,7 @@ class Parameter:
 
     @property
     def expected(self) -> str:
-        """What a value has to be, in words."""
+        """Description of the accepted values."""
         kind = get_origin(self.type) or self.type
         if self.choices:
             words = f"one of {', '.join(self.choices)}"
@@ -145,21 +145,21 @@ class Parameter:
         return Annotated[self.type, meta]
 
     def checked(self, owner: str, value: Any) -> Any:
-        """The value in its type; whole numbers will do for a float. Raises SimulationError that says what is expected.
+        """The value in its type; a float may be given as a whole number. Raises SimulationError for other values.
 
-        A numpy scalar counts as the Python number that it is.
+        Numpy scalars are accepted as Python numbers.
         """
         if value is None and self.can_be_none:
             return None
         plain = _plain(value)
-        # msgspec before 0.22 fails at whole numbers that no float can hold.
+        # msgspec before 0.22 fails for whole numbers beyond the range of a float.
         if not (isinstance(plain, int) and abs(plain) > _HUGE):
             with suppress(msgspec.ValidationError):
                 return msgspec.convert(plain, self._accepted, strict=True)
         raise SimulationError(f"{owner}: {self.name} is {short(value)}, expected {self.expected}")
 
     def from_text(self, owner: str, text: str) -> Any:
-        """The value that a text stands for, as the command and a scene write it. Raises SimulationError for others."""
+        """The value of a text, in the format of the command and of scenes. Raises SimulationError for other texts."""
         kind = get_origin(self.type) or self.type
         value: Any = text
         if self.can_be_none and text.lower() == "none":
@@ -182,7 +182,7 @@ def parameter(
     default_factory: Any = MISSING,
     **more: Any,
 ) -> Any:
-    """The field of a dataclass, with what Parameter knows of it."""
+    """A field of a dataclass, with its declaration as a Parameter."""
     metadata = {"parameter": Parameter(label=label, tip=tip, **more)}
     if default_factory is not MISSING:
         return field(default_factory=default_factory, compare=compare, metadata=metadata)
@@ -211,16 +211,16 @@ def parameters_of(kind: type) -> tuple[Parameter, ...]:
 
 
 def parameter_of(kind: type, name: str) -> Parameter:
-    """One of them by name. Raises SimulationError that lists the names if there is none."""
+    """A declared parameter by name. Raises SimulationError that lists the names for an unknown one."""
     known = {entry.name: entry for entry in parameters_of(kind)}
     require(name in known, f"{kind.__name__} has no {name!r}, expected one of {', '.join(known)}")
     return known[name]
 
 
 class Declared:
-    """Base of frozen dataclasses whose fields are declared with parameter(): they are checked on construction.
+    """Base of frozen dataclasses whose fields are declared with parameter() and checked on construction.
 
-    Raises SimulationError that names the value and says what is expected.
+    Raises SimulationError that names the value and what is expected.
     """
 
     def __post_init__(self) -> None:
@@ -229,15 +229,15 @@ class Declared:
             object.__setattr__(self, entry.name, entry.checked(owner, getattr(self, entry.name)))
 
     def _owner(self) -> str:
-        """What the values belong to, for messages."""
+        """Name of the object in messages."""
         return type(self).__name__
 
 
 def built(kind: type[_T], values: Any, source: str) -> _T:
     """A `kind` from plain values, such as those of a JSON file.
 
-    Raises SimulationError that names `source` and the parameter: for what is no object, for a name that is unknown or
-    missing, and for a value that is refused.
+    Raises SimulationError that names `source` and the parameter if `values` is not an object, if a name is unknown or
+    missing, or if a value is invalid.
     """
     require(isinstance(values, Mapping), f"{source}: is {kind_of(values)}, expected an object")
     known = [entry.name for entry in fields(kind)]  # type: ignore[arg-type], of dataclasses
@@ -266,8 +266,8 @@ def _without_none(hint: Any) -> tuple[Any, bool]:
 
 
 def _number(kind: type, text: str) -> Any:
-    """The number that a text stands for; any other text as it is, which is then refused, or meant."""
-    if kind in (int, float) and "_" not in text:  # which Python takes in numbers, and nobody else
+    """The number in a text; other texts are returned unchanged, to be checked later."""
+    if kind in (int, float) and "_" not in text:  # Python accepts underscores in numbers, other programs do not
         with suppress(ValueError):
             return kind(text)
     return text
@@ -287,9 +287,9 @@ def _plain(value: Any) -> Any:
 
 
 def short(value: Any) -> str:
-    """A value as messages show it: one line that is not long."""
+    """A value for messages: one short line."""
     try:
         text = " ".join(repr(_plain(value)).splitlines())
-    except ValueError:  # from 4300 digits on
+    except ValueError:  # 4300 digits or more
         text = "a huge number"
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,4 +1,4 @@
-"""The one exception a user of this package has to know, and what to tell users."""
+"""SimulationError, the exception for users of this package, and messages for users."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _T = TypeVar("_T")
 
 
 class SimulationError(Exception):
-    """A failure the caller caused and can mend.
+    """An error that the caller caused and can correct.
 
-    The message is one line; it names the value, says what was expected and, where that is not obvious, what to do.
+    The message is one line; it names the value, what was expected and, where that is not obvious, what to do.
     The command line prints it and exits with status 2; the Slicer panel shows it in one message box.
 
     >>> import numpy as np
@@ -28,7 +28,7 @@ class SimulationError(Exception):
 
 
 class Cancelled(SimulationError):  # noqa: N818, what the user wanted is no error
-    """Raised by a progress function to stop the work that reports to it; nothing is changed or written."""
+    """Raised by a progress function to cancel the computation; nothing is changed or written."""
 
     def __init__(self) -> None:
         super().__init__("cancelled")
@@ -41,13 +41,13 @@ def require(condition: object, message: str) -> None:
 
 
 def require_package(module: str, distribution: str, purpose: str) -> None:
-    """Raise SimulationError, saying what to install, if `module`, which is in a pip `distribution`, is missing."""
+    """Raise SimulationError if `module` is missing; the message names the pip `distribution` to install."""
     if importlib.util.find_spec(module) is None:
         raise SimulationError(f"{purpose} needs {distribution}; install it with: pip install {distribution}")
 
 
 def required(value: _T | None, message: str) -> _T:
-    """`value`; raises SimulationError(message) where there is none."""
+    """`value`; raises SimulationError(message) if it is None."""
     if value is None:
         raise SimulationError(message)
     return value
@@ -64,7 +64,7 @@ def require_between(owner: str, name: str, value: float, low: float, high: float
 
 
 def user_message(error: Exception) -> str | None:
-    """One line for a user, where the error is one the user or the machine caused; None for a bug of ours."""
+    """One line for the user about an error caused by the user or the computer; None for an internal error."""
     if isinstance(error, SimulationError):
         return str(error)
     if isinstance(error, MemoryError):
@@ -76,13 +76,13 @@ def user_message(error: Exception) -> str | None:
 
 
 def is_our_warning(category: type[Warning]) -> bool:
-    """Whether a warning is one for the user, and not one of a library's for its developers."""
+    """Whether a warning is for the user, and not for developers of a library."""
     return category.__module__.startswith("SlicerUSSim")
 
 
 @contextmanager
 def collected_warnings() -> Iterator[list[Warning]]:
-    """A list that holds, after the block, what this package warned of in it; for those who show it themselves."""
+    """A list that contains, after the block, the warnings of this package in it; for code that displays them itself."""
     ours: list[Warning] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -91,5 +91,5 @@ def collected_warnings() -> Iterator[list[Warning]]:
 
 
 def warn_again(warning: Warning) -> None:
-    """Issue a warning that was collected."""
+    """Issue a collected warning."""
     warnings.warn(warning, stacklevel=3)

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, and JSON in and out."""
+"""Atomic writing of files, and JSON files."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _DEEPEST_NESTING = 16
 
 
 def require_place(path: Path) -> None:
-    """Raise SimulationError unless `path` could be a file in a folder that exists."""
+    """Raise SimulationError unless `path` can be a file in an existing folder."""
     require(path.parent.is_dir(), f"{path}: the folder {path.parent} does not exist")
     require(not path.is_dir(), f"{path}: is a folder, expected a file name")
 
 
 def make_folder(path: str | os.PathLike) -> Path:
-    """The folder, made if it is not there. Raises SimulationError where that cannot be."""
+    """The folder, created if necessary. Raises SimulationError if it cannot be created."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SimulationError(f"{folder}: cannot be made ({error.strerror})") from None
+        raise SimulationError(f"{folder}: cannot be created ({error.strerror})") from None
     return folder
 
 
@@ -45,7 +45,7 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
         raise SimulationError(f"{path}: cannot be written ({error.strerror})") from None
     try:
         yield Path(folder) / path.name
-        for file in sorted(Path(folder).iterdir()):  # .mhd and .nhdr come with a second file
+        for file in sorted(Path(folder).iterdir()):  # .mhd and .nhdr have a second file
             file.replace(path.parent / file.name)
     except (OSError, RuntimeError) as error:
         raise SimulationError(f"{path}: cannot be written ({str(error).strip().splitlines()[-1]})") from None
@@ -58,8 +58,8 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
 def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):
     """The content of a JSON file.
 
-    Raises SimulationError naming the file: where it cannot be read, is larger than `most_bytes` or nested deeper than
-    anything of ours, and where JSON leaves open what is meant: a name given twice, NaN and infinities.
+    Raises SimulationError naming the file if it cannot be read, is larger than `most_bytes`, is nested deeper than any
+    file of this project, or has ambiguous content: duplicate names, NaN and infinities.
     """
     try:
         size = Path(path).stat().st_size
@@ -84,7 +84,7 @@ def _check_nesting(path: str | os.PathLike, text: str) -> None:
 
 
 def _distinct(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    """The object of these pairs, in which every name stands once."""
+    """The object of these pairs. Raises ValueError for a duplicate name."""
     found: dict[str, object] = {}
     for name, value in pairs:
         if name in found:
@@ -94,10 +94,10 @@ def _distinct(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def _refused(constant: str) -> float:
-    raise ValueError(f"{constant} is no number")
+    raise ValueError(f"{constant} is not a number")
 
 
 def write_json(path: str | os.PathLike, values) -> None:
-    """Write plain values as JSON, whole or not at all."""
+    """Write plain values as JSON; on failure an existing file is kept."""
     with written_whole(path) as partial:
         partial.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")

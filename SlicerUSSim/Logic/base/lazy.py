@@ -1,8 +1,8 @@
-"""lazy_exports: the face of a package, whose public names are imported when they are first used.
+"""lazy_exports: imports the public names of a package when they are first used.
 
-So an import of one name does not pay for the others (vtk, scipy), and the command answers --help at once. A face
-declares its names once, in the imports under `if TYPE_CHECKING`, which editors and type checkers read too. No name may
-be that of a module in the package: importing the module would put it in the name's place.
+So the import of one name does not import the dependencies of others (vtk, scipy), and --help is immediate. The names
+are declared once, in the imports under `if TYPE_CHECKING`, which editors and type checkers read too. No name may be
+that of a module in the package, since importing the module would replace it.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from types import CodeType
 
 
 def lazy_exports(namespace: dict) -> None:
-    """Give a package's `namespace` (its globals()) the names that its code imports under `if TYPE_CHECKING`."""
+    """Add to a package's `namespace` (its globals()) the names that its code imports under `if TYPE_CHECKING`."""
     package = namespace["__name__"]
     needed = frozenset(namespace)
 
     @cache
     def homes() -> dict[str, str]:
         declared = _imports(namespace["__spec__"].loader.get_code(package))
-        # What the face itself needs, which is imported at once.
+        # Names that the package itself needs, imported immediately.
         return {name: f"{package}.{module}" for name, module in declared.items() if name not in needed}
 
     def getattr_(name: str):
@@ -37,9 +37,9 @@ def lazy_exports(namespace: dict) -> None:
 def _imports(code: CodeType) -> dict[str, str]:
     """{name: module} of all `from module import name` in the code of a module, whether they are executed or not.
 
-    Read from the code and not from its text, which a build may leave out.
+    Read from the byte code, since a build may omit the source.
     """
-    import dis  # not before it is needed: it takes longer to import than the rest of this package
+    import dis  # imported here, since it takes longer than the rest of this package
 
     found, module = {}, ""
     for instruction in dis.get_instructions(code):

@@ -1,4 +1,4 @@
-"""What a NIfTI file says of its geometry, and what ITK made of it: for the log alone."""
+"""Geometry of a NIfTI file and how ITK interpreted it, for the log."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _log = logging.getLogger(__name__)
 
 #: Millimetres per unit and name of the lower three bits of xyzt_units (nifti1.h)
 _UNITS = {1: (1000.0, "metres"), 2: (1.0, "millimetres"), 3: (0.001, "micrometres")}
-#: Corners of the volume farther apart than this make two orientations different ones, millimetres.
+#: Two orientations are different if they move a corner of the volume by more than this, millimetres.
 _SAME_MM = 0.1
 
 
 def log_nifti_geometry(image, ijk_to_ras: np.ndarray, name: str) -> None:
     """Log which unit and which of its two orientations a SimpleITK image from NIfTI was read with.
 
-    Warns where there are two different ones, and where there is none. Logs nothing of an image from another format.
+    Warns if the two differ and if there is none. Logs nothing for images from other formats.
     """
     if not image.HasMetaDataKey("sform_code"):
         return
@@ -31,13 +31,13 @@ def log_nifti_geometry(image, ijk_to_ras: np.ndarray, name: str) -> None:
         if sform_code:
             forms["sform"] = _sform(header, scale)
         if qform_code:
-            # ITK does not pass on which way the third axis goes: of the two, the one that is nearer.
+            # ITK does not report the direction of the third axis, so the nearer of the two is taken.
             both = [_qform(header, scale, way) for way in (1.0, -1.0)]
             forms["qform"] = min(both, key=lambda matrix: _distance_mm(matrix, ijk_to_ras, image.GetSize()))
     except (KeyError, ValueError):  # the form of these fields is not documented
         return
     if not unit_name:
-        _log.info("%s: NIfTI without a unit of length, taken for millimetres", name)
+        _log.info("%s: NIfTI without a unit of length, read as millimetres", name)
     elif scale != 1.0:
         _log.info("%s: NIfTI in %s, read as millimetres", name, unit_name)
     if not forms:
@@ -51,11 +51,11 @@ def log_nifti_geometry(image, ijk_to_ras: np.ndarray, name: str) -> None:
     apart = _distance_mm(matrices[0], matrices[-1], size)
     if apart > _SAME_MM:
         _log.warning(
-            "%s: its sform and its qform are up to %.1f mm apart (%s); the %s is used, as ITK chooses",
+            "%s: sform and qform differ by up to %.1f mm (%s); ITK uses the %s",
             name, apart, codes, used,
         )  # fmt: skip
     else:
-        _log.info("%s: NIfTI orientation by its %s (%s)", name, " and ".join(forms), codes)
+        _log.info("%s: NIfTI orientation from its %s (%s)", name, " and ".join(forms), codes)
 
 
 def _sform(header: dict[str, str], scale: float) -> np.ndarray:
@@ -86,6 +86,6 @@ def _qform(header: dict[str, str], scale: float, way: float) -> np.ndarray:
 
 
 def _distance_mm(one: np.ndarray, other: np.ndarray, size) -> float:
-    """How far two (4, 4) maps take a corner of the volume apart, at most."""
+    """Largest distance between the positions of a corner of the volume under two (4, 4) maps."""
     corners = np.array([[*corner, 1] for corner in itertools.product(*((0, n - 1) for n in size[:3]))], float)
     return float(np.linalg.norm((corners @ (one - other).T)[:, :3], axis=1).max())

@@ -1,4 +1,4 @@
-"""4x4 matrices checked and compared, and LPS_TO_RAS, which only those need who read and write ITK's files."""
+"""Checks and comparison of 4x4 matrices, and LPS_TO_RAS for reading and writing ITK's files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 
-#: (4, 4) of homogeneous points in millimetres: from LPS, which ITK counts in, to RAS; its own inverse.
+#: (4, 4) for homogeneous points in millimetres: from LPS, the convention of ITK, to RAS; its own inverse.
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
@@ -17,7 +17,7 @@ def check_affine(name: str, matrix, expected: str = "a 4x4 affine matrix") -> np
     except (TypeError, ValueError):
         raise SimulationError(f"{name} is not a matrix of numbers, expected {expected}") from None
     require(array.shape == (4, 4), f"{name} has shape {array.shape}, expected (4, 4)")
-    require(bool(np.isfinite(array).all()), f"{name} holds a value that is not finite, expected {expected}")
+    require(bool(np.isfinite(array).all()), f"{name} has a value that is not finite, expected {expected}")
     require(
         np.allclose(array[3], [0, 0, 0, 1], atol=1e-6), f"{name} has last row {array[3].tolist()}, expected 0 0 0 1"
     )
@@ -35,19 +35,19 @@ def check_rigid(name: str, matrix) -> np.ndarray:
 
 
 def is_singular(matrix: np.ndarray) -> bool:
-    """Whether the axes of a (4, 4) affine matrix lie in a plane, whatever their lengths are."""
+    """Whether the axes of a (4, 4) affine matrix lie in a plane, independent of their lengths."""
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     return bool((lengths == 0).any()) or abs(np.linalg.det(matrix[:3, :3] / np.where(lengths > 0, lengths, 1))) <= 1e-6
 
 
 def nearest_rotation(axes: np.ndarray) -> np.ndarray:
-    """(3, 3) the orthogonal matrix that is nearest to `axes`; rounding in files leaves axes slightly off."""
+    """(3, 3) the orthogonal matrix nearest to `axes`, to remove rounding errors of files."""
     u, _, vt = np.linalg.svd(axes)
     return u @ vt
 
 
 def rigid_between(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, float]:
-    """((4, 4) rigid map that takes points (n, 3) onto others best, root mean square distance left, mm).
+    """((4, 4) rigid map with the least squared distances of points (n, 3) to others, remaining RMS distance in mm).
 
     Arun et al., IEEE PAMI 9(5) 1987. Raises SimulationError for fewer than three points or different numbers of them.
 

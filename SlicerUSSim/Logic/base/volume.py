@@ -1,4 +1,4 @@
-"""Volume: a 3D image with its place in the patient (RAS), and its files."""
+"""Volume: a 3D image with its position in the patient (RAS), and its files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singu
 
 _log = logging.getLogger(__name__)
 
-#: Largest side of a volume that is no mistake in its unit.
+#: A larger side of a volume indicates a wrong unit.
 _SMALLEST_MM, _LARGEST_MM = 5.0, 2500.0
 WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
 
@@ -28,7 +28,7 @@ class Volume:
     Parameters
     ----------
     array : (k, j, i) numbers; i varies fastest in memory, as in ITK and VTK.
-    ijk_to_ras : (4, 4) takes homogeneous voxel indices (i, j, k, 1) of voxel *centres* to RAS millimetres.
+    ijk_to_ras : (4, 4) from homogeneous voxel indices (i, j, k, 1) of voxel *centres* to RAS millimetres.
 
     Raises SimulationError for an array that is not 3D or not numeric, and for a singular or non-affine matrix.
 
@@ -77,7 +77,7 @@ class Volume:
         return Volume(array, self.ijk_to_ras)
 
     def looks_like_labels(self) -> bool:
-        """Whether the image holds few whole numbers, none negative, as a label map does and an MRI does not."""
+        """Whether the image contains few different whole numbers and none is negative, as in a label map."""
         array = self.array
         if not np.issubdtype(array.dtype, np.integer):
             found, is_labels = f"{array.dtype} numbers", False
@@ -86,7 +86,7 @@ class Volume:
         else:
             values = np.unique(array)
             found, is_labels = f"{len(values)} whole numbers from {values[0]} to {values[-1]}", len(values) <= 32
-        _log.info("the volume holds %s, as %s does", found, "a label map" if is_labels else "an MRI")
+        _log.info("the volume contains %s, as does %s", found, "a label map" if is_labels else "an MRI")
         return is_labels
 
     # ---- files -------------------------------------------------------------------------------------------------
@@ -101,7 +101,7 @@ class Volume:
         require(path.exists(), f"{path}: no such file or folder")
         if path.suffix.lower() == ".vti":
             volume = cls._read_vti(path)
-            _log.info("%s: its coordinates are taken for RAS millimetres, since VTI files do not say", path)
+            _log.info("%s: coordinates are read as RAS millimetres, since VTI files do not specify them", path)
         elif path.is_dir():
             volume = cls.from_sitk(_read_dicom_series(path), name=str(path))
         elif not is_minc1(path):
@@ -122,7 +122,7 @@ class Volume:
 
         if image.GetDimension() == 4 and image.GetSize()[3] == 1:
             image = image[..., 0]  # NIfTI files often carry a time axis of length one
-            _log.info("%s: has a time axis of length one, which is left out", name)
+            _log.info("%s: has a time axis of length one, which is ignored", name)
         _require_volume(image.GetSize(), name)
         channels = image.GetNumberOfComponentsPerPixel()
         require(channels == 1, f"{name}: has {channels} components per voxel, expected 1")
@@ -141,9 +141,9 @@ class Volume:
         return image
 
     def write(self, path: str | os.PathLike) -> None:
-        """Write the volume whole or not at all; the format follows from the suffix.
+        """Write the volume in the format of the suffix; on failure an existing file is kept.
 
-        Raises SimulationError for an unknown suffix or an unwritable place.
+        Raises SimulationError for an unknown suffix or if the file cannot be written.
         """
         path = Path(path)
         require_image_name(path)
@@ -159,7 +159,7 @@ class Volume:
 
     @classmethod
     def from_vtk(cls, image_data, ijk_to_ras: np.ndarray | None = None) -> Volume:
-        """From a vtkImageData whose physical coordinates are RAS, or with a matrix of its own as MRML nodes have.
+        """From a vtkImageData whose physical coordinates are RAS, or with a separate matrix as MRML nodes have.
 
         Raises SimulationError for an image without scalars, with several components, or that is not 3D.
         """
@@ -175,13 +175,13 @@ class Volume:
         if ijk_to_ras is None:
             vtk_matrix = image_data.GetIndexToPhysicalMatrix()
             ijk_to_ras = np.array([[vtk_matrix.GetElement(r, c) for c in range(4)] for r in range(4)])
-        # VTK counts indices from the extent's start; this class counts from zero.
+        # VTK indices start at the extent's start; in this class they start at zero.
         first = np.eye(4)
         first[:3, 3] = image_data.GetExtent()[0::2]
         return cls(array, np.asarray(ijk_to_ras, float) @ first)
 
     def to_vtk(self):
-        """A vtkImageData in RAS with a direction matrix; it has its own copy of the voxels."""
+        """A vtkImageData in RAS with a direction matrix and a copy of the voxels."""
         from vtkmodules.vtkCommonDataModel import vtkImageData
 
         from SlicerUSSim.Logic.base.vtk_data import set_scalars
@@ -201,7 +201,7 @@ class Volume:
         direction = matrix[:3, :3] / spacing
         skew = np.abs(direction.T @ direction - np.eye(3)).max()
         require(skew < 1e-4, f"volume axes are not perpendicular (cosine {skew:.3g}); resample it to a regular grid")
-        return nearest_rotation(direction), spacing, matrix[:3, 3]  # ITK and VTK want the axes exact
+        return nearest_rotation(direction), spacing, matrix[:3, 3]  # ITK and VTK require exactly orthogonal axes
 
     @classmethod
     def _read_vti(cls, path: Path) -> Volume:
@@ -223,7 +223,7 @@ class Volume:
 
 
 def _log_size(volume: Volume, path: Path) -> None:
-    """Log what was read, and warn of a size that no patient has: lengths are taken for millimetres."""
+    """Log the volume, and warn if its size in millimetres is implausible."""
     size = volume.spacing_mm * volume.array.shape[::-1]
     _log.info(
         "%s: %s voxels of %s mm, %s, i, j, k towards %s", path, "x".join(map(str, volume.array.shape[::-1])),
@@ -231,20 +231,20 @@ def _log_size(volume: Volume, path: Path) -> None:
     )  # fmt: skip
     if not _SMALLEST_MM <= size.max() <= _LARGEST_MM:
         _log.warning(
-            "%s: is %s mm large if its lengths are millimetres, as they are taken; check its voxel size", path,
+            "%s: its size is %s if the unit is mm, as assumed; check its voxel size", path,
             "x".join(f"{round(mm, 3):g}" for mm in size),
         )  # fmt: skip
 
 
 def axis_letters(ijk_to_ras: np.ndarray) -> str:
-    """Where the axes i, j, k of a (4, 4) ijk_to_ras point, nearly: "RAS", "LPS", ..."""
+    """Approximate directions of the axes i, j, k of a (4, 4) ijk_to_ras: "RAS", "LPS", ..."""
     axes = ijk_to_ras[:3, :3].T
     main = np.abs(axes).argmax(axis=1)
     return "".join("RAS"[n] if axis[n] > 0 else "LPI"[n] for axis, n in zip(axes, main, strict=True))
 
 
 def require_image_name(path: Path) -> None:
-    """Raise SimulationError unless Volume.write knows the format that the name stands for."""
+    """Raise SimulationError unless Volume.write supports the format of this file name."""
     require(
         path.name.lower().endswith(WRITABLE_SUFFIXES),
         f"{path}: unknown image format, expected a name ending in one of {', '.join(WRITABLE_SUFFIXES)}",
@@ -252,9 +252,9 @@ def require_image_name(path: Path) -> None:
 
 
 def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """((k, j, i) voxels, (4, 4) ijk_to_ras) of an image file that may hold one slice only.
+    """((k, j, i) voxels, (4, 4) ijk_to_ras) of an image file, which may have only one slice.
 
-    Raises SimulationError for a missing or unreadable file and for one that has not three dimensions.
+    Raises SimulationError for a missing or unreadable file and for an image that is not 3D.
     """
     path = Path(path)
     require(path.is_file(), f"{path}: no such file")
@@ -268,7 +268,7 @@ def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_itk_image(path: Path):
-    """A SimpleITK image of whatever ITK reads. Raises SimulationError, naming the file, for what it does not."""
+    """A SimpleITK image of any file that ITK can read. Raises SimulationError, naming the file, for others."""
     import SimpleITK as sitk
 
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
@@ -306,16 +306,16 @@ def _read_minc1(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         image = nibabel.Minc1Image.from_filename(path)
         values = np.asarray(image.dataobj)
-    except Exception as error:  # scipy's NetCDF reader and nibabel raise whatever comes up in a damaged file
+    except Exception as error:  # scipy's NetCDF reader and nibabel raise various exceptions for damaged files
         raise SimulationError(
             f"{path}: cannot be read as MINC 1 ({str(error).strip() or type(error).__name__})"
         ) from None
     require(values.ndim == 3, f"{path}: has {values.ndim} dimensions, expected 3")
     whole = values.round()
     if np.issubdtype(image.get_data_dtype(), np.integer) and np.abs(values - whole).max() < 1e-3:
-        values = whole.astype(np.int32)  # nibabel scales to floating point whatever the file holds
-        _log.info("%s: its values are taken for whole numbers, as it stores them", path)
-    # nibabel counts (z, y, x) as the file does, in millimetres of the MNI's world, which is RAS.
+        values = whole.astype(np.int32)  # nibabel always scales to floating point
+        _log.info("%s: values are read as whole numbers, as they are stored", path)
+    # nibabel's indices are (z, y, x) as in the file; its millimetres are in MNI world coordinates, which are RAS.
     return values, np.array(image.affine)[:, [2, 1, 0, 3]]
 
 
@@ -323,14 +323,14 @@ def _read_dicom_series(folder: Path):
     import SimpleITK as sitk
 
     series = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
-    require(bool(series), f"{folder}: holds no DICOM series")
+    require(bool(series), f"{folder}: has no DICOM series")
     require(
         len(series) == 1,
-        f"{folder}: holds {len(series)} DICOM series, expected 1; put the one to use in its own folder",
+        f"{folder}: has {len(series)} DICOM series, expected 1; move the required series to its own folder",
     )
     reader = sitk.ImageSeriesReader()
     files = sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0])
-    _log.info("%s: DICOM series %s of %d files", folder, series[0], len(files))
+    _log.info("%s: DICOM series %s with %d files", folder, series[0], len(files))
     reader.SetFileNames(files)
     try:
         return reader.Execute()

@@ -1,4 +1,4 @@
-"""Small things between numpy and VTK: matrices and voxels."""
+"""Conversion of matrices and voxels between numpy and VTK."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def vtk_matrix(array: np.ndarray) -> vtkMatrix4x4:
 
 
 def set_scalars(image: vtkImageData, array: np.ndarray) -> None:
-    """Give `image` its own copy of (k, j, i) voxels, or of (..., j, i, components)."""
+    """Set the voxels of `image` to a copy of a (k, j, i) or (..., j, i, components) array."""
     components = array.size // image.GetNumberOfPoints()
     scalars = numpy_to_vtk(np.ascontiguousarray(array).reshape(-1, components).squeeze(), deep=True)
     scalars.SetName("ImageScalars")

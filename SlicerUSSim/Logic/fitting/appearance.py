@@ -1,6 +1,6 @@
 """AppearanceModel: images of fixed poses as a function of the parameters that an optimiser varies.
 
-What does not change is not computed again (docs/optimization.md#how-it-is-fast). The ray tree depends on none of these
+Constant parts are computed once (docs/optimization.md#efficient-evaluation). The ray tree depends on none of these
 parameters. The echoes of a tissue are linear in mu0 and sigma0, so a few baseband images, its *bases*, hold them for
 all values:
 

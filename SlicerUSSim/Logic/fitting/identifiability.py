@@ -1,4 +1,4 @@
-"""What an image can tell about its parameters, and what it cannot (docs/optimization.md#what-can-be-known).
+"""What an image can tell about its parameters, and what it cannot (docs/optimization.md#identifiability).
 
 Developed speckle shows a tissue's Var = p (1 - p) mu0^2 + p sigma0^2 and not mu0, sigma0 and mu1; its level shows Var
 times gain; its fall with depth shows attenuation less time-gain compensation; grey levels show all of it over the
@@ -162,7 +162,7 @@ def variance_db(tissue: Tissue) -> float:
 
 
 def quantities_of(parameters: FreeParameters, frequency_mhz: float, tissues: TissueTable) -> list[Quantity]:
-    """The free parameters, and combinations of them that images can tell (docs/optimization.md#what-can-be-known)."""
+    """The free parameters, and combinations of them that images can tell (docs/optimization.md#identifiability)."""
     quantities = [
         Quantity(p.name, p.declaration.unit, p.fit.tolerance, _reader(p.tissue, p.attribute)) for p in parameters
     ]

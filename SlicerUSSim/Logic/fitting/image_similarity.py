@@ -1,10 +1,10 @@
-"""How alike two B-mode images are: equations 4 and 5 of Salehi et al., MICCAI 2015 (docs/optimization.md#the-cost).
+"""Similarity of B-mode images: equations 4 and 5 of Salehi et al., MICCAI 2015 (docs/optimization.md#cost-function).
 
     L(A, B) = rho(A, B) + lambda SAD(A, B),    rho = mean over patches of sqrt(1 - sum_j sqrt(P_j Q_j))
 
 P and Q are the normalised histograms of the two images in one square patch, SAD is the mean absolute difference of
-intensities scaled to [0, 1]. Histograms forget where in a patch a grey level was, so rho does not mind which seed drew
-the speckle; the patches remember where in the image, so anatomy and the fall with depth count.
+intensities scaled to [0, 1]. Histograms do not depend on the positions of grey levels within a patch, so rho does not
+depend on the speckle's seed. It does depend on the position of patches, and therefore on anatomy and attenuation.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 
-#: A patch at the edge of the common field counts if this share of it lies inside.
+#: A patch at the edge of the common field counts if at least this fraction of it lies inside.
 _LEAST_SHARE = 0.25
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """The cost and its two parts; 0 for equal images, larger for less alike ones."""
+    """The cost and its two parts; 0 for equal images, larger for less similar ones."""
 
     #: bhattacharyya + sad_weight x sad
     total: float
@@ -36,19 +36,19 @@ class Similarity:
 
 @dataclass(frozen=True)
 class SimilaritySettings(Declared):
-    """What is compared with what."""
+    """Patches, histograms and weights of the cost."""
 
     patch_mm: float = parameter(
-        5.0, "Patches", "Side of the square patches; larger than the image compares it as a whole", unit="mm",
+        5.0, "Patches", "Side of the square patches; one patch if larger than the image", unit="mm",
         bounds=(0.01, 1e6),
     )  # fmt: skip
-    bins: int = parameter(32, "Bins", "Bins of the histograms", bounds=(2, CONSTANTS["MAX_BINS"]))
+    bins: int = parameter(32, "Bins", "Number of histogram bins", bounds=(2, CONSTANTS["MAX_BINS"]))
     sad_weight: float = parameter(
         1.0, "Weight of the difference", "Weight of the absolute difference", symbol="λ", bounds=(0, 1e3)
     )
     histogram_weight: float = parameter(
-        1.0, "Weight of the histograms", "Weight of the histograms; 0 leaves the absolute difference alone",
-        bounds=(0, 1e3), source="1 is the paper",
+        1.0, "Weight of the histograms", "Weight of the histograms; 0: absolute difference only",
+        bounds=(0, 1e3), source="1 in the paper",
     )  # fmt: skip
 
     def patch_pixels(self, shape: tuple[int, int], pixel_spacing_mm: tuple[float, float]) -> tuple[int, int]:
@@ -60,8 +60,8 @@ class SimilaritySettings(Declared):
         return rows, columns
 
     def combine(self, apart: np.ndarray, difference: np.ndarray, count: np.ndarray, full: int) -> Similarity:
-        """The cost from patches: 1 - Bhattacharyya coefficient, sum of absolute grey differences, and pixels of each;
-        `full` is how many pixels a whole patch has."""
+        """The cost from the patches' 1 - Bhattacharyya coefficient, sum of absolute grey differences and pixel count;
+        `full` is the pixel count of a complete patch."""
         pixels = int(count.sum())
         counts = count >= min(_LEAST_SHARE * full, count.max())
         rho = float(np.sqrt(np.clip(apart[counts], 0.0, 1.0)).mean())
@@ -79,7 +79,7 @@ def similarity(
     sad_weight: float = 1.0,
     mask: np.ndarray | None = None,
 ) -> Similarity:
-    """The cost of two images against each other, in plain numpy.
+    """The cost of two images, in plain numpy.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def similarity(
     """
     settings = SimilaritySettings(patch_mm, bins, sad_weight)
     a, b = _as_image("first image", a), _as_image("second image", b)
-    require(a.shape == b.shape, f"the images have shapes {a.shape} and {b.shape}, expected two of one shape")
+    require(a.shape == b.shape, f"the images have shapes {a.shape} and {b.shape}, expected equal shapes")
     inside = _as_mask(mask, a.shape)
     rows, columns = settings.patch_pixels(a.shape, pixel_spacing_mm)
     down, across = -(-a.shape[0] // rows), -(-a.shape[1] // columns)
@@ -116,7 +116,7 @@ def similarity(
 
 
 class PatchComparison:
-    """Compares images on the device with one reference that stays there."""
+    """Compares images on the device with one reference image that is kept there."""
 
     def __init__(
         self,

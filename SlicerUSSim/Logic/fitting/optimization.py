@@ -1,7 +1,7 @@
 """optimize_appearance: display and tissue parameters fitted until simulated and real images agree.
 
 A global search finds the basin, a local one its bottom, then the bases are computed anew there (appearance.py) and the
-local search goes on until the anchor no longer moves the cost (docs/optimization.md#the-search). One seed draws
+local search goes on until the anchor no longer moves the cost (docs/optimization.md#search). One seed draws
 scatterers and noise of every evaluation (common random numbers), so the cost is a function: the same problem gives the
 same answer, and an interrupted run is resumed by replaying what it had evaluated.
 """

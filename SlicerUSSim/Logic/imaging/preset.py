@@ -1,4 +1,4 @@
-"""Preset: what a user sets, as one value and one JSON file, for the command, the VTK filter and the Slicer module."""
+"""Preset: all settings of a user as one value and one JSON file, for the command, VTK filter and Slicer module."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 
 _log = logging.getLogger(__name__)
 
-#: {name: class} of the sections of a preset that are one dataclass each.
+#: {name: class} of the sections of a preset that consist of one dataclass.
 SECTIONS: dict[str, type[DisplaySettings] | type[SimulationSettings]] = {
     "display": DisplaySettings,
     "settings": SimulationSettings,
 }
-#: What segment_mri labels with thin sulci.
+#: Tissues of segment_mri with thin sulci.
 _BRAIN = ("csf", "grey matter", "white matter", "leptomeninges")
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Probe, console, physics and tissues. The default is a cranial phased array and the brain's tissues.
+    """Probe, display, settings and tissues. The default is a cranial phased array and the brain's tissues.
 
     >>> from SlicerUSSim.Logic import Preset
     >>> preset = Preset().changed("probe", kind="convex", depth_mm=110).changed("display", gain_db=3)
@@ -46,9 +46,9 @@ class Preset:
     def changed(self, section: str, **values) -> Preset:
         """A preset with values of one section changed: changed("display", gain_db=3).
 
-        Sections are "probe", "display" and "settings"; probe values may include its "kind": what the new kind needs
-        and the old one lacks comes from the preset of that kind in PROBES. A focus at its default place moves with
-        the depth.
+        Sections are "probe", "display" and "settings"; probe values may include its "kind". Parameters that only
+        the new kind has are then taken from its preset in PROBES. A focus at its default depth moves with the image
+        depth.
         Raises SimulationError for an unknown section or name and for a value out of range.
         """
         _check_section(section)
@@ -68,9 +68,9 @@ class Preset:
 
     @classmethod
     def from_dict(cls, values: dict, source: str = "preset") -> Preset:
-        """The preset that to_dict describes; a section that is missing is the default's.
+        """The inverse of to_dict; missing sections have their default.
 
-        Raises SimulationError naming `source` and what is wrong in it.
+        Raises SimulationError that names `source` and the error in it.
         """
         known = ("probe", *SECTIONS, "tissues", "membrane")
         require(isinstance(values, dict), f"{source}: is {kind_of(values)}, expected an object")
@@ -86,21 +86,21 @@ class Preset:
             sections["tissues"] = TissueTable.from_dict(values, source)
         missing = [name for name in known[:-1] if name not in values]
         if missing:
-            _log.info("%s: says nothing of %s, for which the default is taken", source, ", ".join(missing))
+            _log.info("%s: has no %s; the defaults are used", source, ", ".join(missing))
         return cls(**sections)
 
     @classmethod
     def read(cls, path: str | os.PathLike) -> Preset:
-        """Read a preset from JSON. Raises SimulationError for a missing, unreadable or wrong file."""
+        """Read a preset from JSON. Raises SimulationError for a missing, unreadable or invalid file."""
         return cls.from_dict(read_json(path), str(path))
 
     def write(self, path: str | os.PathLike) -> None:
-        """Write the preset as JSON, whole or not at all."""
+        """Write the preset as JSON; on failure an existing file is kept."""
         write_json(path, self.to_dict())
 
 
 def preset_parameters() -> dict[str, Parameter]:
-    """{"section.name": Parameter} of all in probe, display and settings; the probe's are those of every kind."""
+    """{"section.name": Parameter} of probe, display and settings; the probe's include those of all kinds."""
     found = {"probe.kind": PROBE_KIND}
     for kind in PROBE_KINDS.values():
         found |= {f"probe.{entry.name}": entry for entry in parameters_of(kind)}

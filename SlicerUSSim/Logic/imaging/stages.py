@@ -1,6 +1,6 @@
 """The stages of an image in their order: shared by simulator, appearance model, benchmark and numpy model.
 
-How to add one is in docs/architecture.md#a-stage-more.
+How to add one is in docs/architecture.md#adding-a-stage.
 """
 
 from __future__ import annotations

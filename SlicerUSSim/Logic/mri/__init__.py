@@ -1,6 +1,6 @@
-"""From an MRI to tissues: guided filter, Gaussian mixture, label map; and MRIs to begin with.
+"""Segmentation of an MRI into tissues: guided filter, Gaussian mixture, label map; and sample MRIs.
 
-Knows nothing of ultrasound beyond the texture that scatterers may take from the MRI.
+Independent of ultrasound except for the texture that scatterers may take from the MRI.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""The guided filter on the device: edges stay, noise goes."""
+"""The guided filter on the device: reduces noise and preserves edges."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ def guided_filter(
 ) -> np.ndarray:
     """(k, j, i) float32 self-guided filter of `image` inside the boolean `mask` (He et al., ECCV 2010).
 
-    `radius` is that of the box window in voxels, `epsilon` the variance below which a window counts as flat. The models
-    of overlapping windows are weighed by the inverse of their variance, not equally.
+    `radius` is that of the box window in voxels, `epsilon` the variance below which a window counts as homogeneous. The
+    models of overlapping windows are weighted by the inverse of their variance, not equally.
     Outside the mask the result is 0. A radius of 0 returns the image.
     """
     if radius == 0:
@@ -30,7 +30,7 @@ def guided_filter(
         result[..., :width] = array
         return result
 
-    # Windows see intensities about the mean: sums of squares of float32 stay exact enough.
+    # Intensities are taken relative to the mean, so that sums of squares are accurate enough in float32.
     centre = float(image[mask].mean())
     values = device.upload(padded(np.where(mask, image - centre, 0)))
     inside_mask = device.upload(padded(mask))

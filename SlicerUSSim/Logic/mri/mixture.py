@@ -9,10 +9,10 @@ _MAX_ITERATIONS = 300
 
 
 def fit_mixture(values: np.ndarray, classes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gaussian mixture of `values` by EM on their histogram.
+    """Gaussian mixture of `values`, fitted by EM to their histogram.
 
     Returns (means, standard deviations, weights), each (classes,) in ascending order of the means, and the mean
-    log-likelihood of every iteration, which never falls.
+    log-likelihood of every iteration, which never decreases.
     """
     counts, edges = np.histogram(values, _HISTOGRAM_BINS)
     levels = 0.5 * (edges[1:] + edges[:-1])
@@ -30,7 +30,7 @@ def fit_mixture(values: np.ndarray, classes: int) -> tuple[np.ndarray, np.ndarra
         population = responsibility.sum(axis=1) + 1e-300
         means = responsibility @ levels / population
         variances = (responsibility * (levels - means[:, None]) ** 2).sum(axis=1) / population
-        # A bin's own width is the least a class can have; a class on one grey level would otherwise collapse.
+        # The width of a bin limits the variance from below; a class on one grey level would otherwise collapse.
         deviations = np.sqrt(np.maximum(variances, step**2 / 12.0))
         weights = population / population.sum()
     order = np.argsort(means)
@@ -38,7 +38,7 @@ def fit_mixture(values: np.ndarray, classes: int) -> tuple[np.ndarray, np.ndarra
 
 
 def _first_guess(levels, counts, classes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means, deviations and weights of the classes that multi-level Otsu thresholds cut; deterministic."""
+    """Means, standard deviations and weights of the classes between multi-level Otsu thresholds; deterministic."""
     from skimage.filters import threshold_multiotsu
 
     coarse = 8  # Otsu's search grows fast with the number of bins

@@ -1,4 +1,4 @@
-"""MRIs to begin with: the MNI152 brain that nilearn carries, and a head made by code."""
+"""Sample MRIs: the MNI152 brain from nilearn, and a synthetic head."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ _log = logging.getLogger(__name__)
 
 
 def demo_mri() -> tuple[Volume, str]:
-    """(MRI, where it comes from): the MNI152 T1 that nilearn carries, or a phantom made by code without nilearn."""
+    """(MRI, source): the MNI152 T1 from nilearn, or a synthetic phantom if nilearn is not installed."""
     package = importlib.util.find_spec("nilearn")
     if package is not None and package.origin is not None:
         path = Path(package.origin).parent / "datasets/data/mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz"
         if path.exists():
             _log.info("demo MRI: the MNI152 brain that nilearn carries")
             return Volume.read(path), "MNI152 2009a T1 (nilearn)"
-    _log.info("demo MRI: a phantom, since nilearn is not installed")
-    return head_mri(), 'head phantom made by code (install "SlicerUSSim[demo]" for the MNI152 brain)'
+    _log.info("demo MRI: the synthetic phantom, since nilearn is not installed")
+    return head_mri(), 'synthetic head phantom (install "SlicerUSSim[demo]" for the MNI152 brain)'
 
 
 def head_mri(spacing_mm: float = 1.0, seed: int = 0) -> Volume:
     """A skull-stripped T1-like brain: folded cortex with sulci, white matter, lateral and third ventricles, midline.
 
-    (k, j, i) float32, air 0, with noise. It is a stand-in for a real MRI, not anatomy.
+    (k, j, i) float32, air 0, with noise. It replaces a real MRI and is not anatomically accurate.
     """
     half = np.array([74.0, 88.0, 68.0])
     counts = (2 * (half + 6) / spacing_mm).astype(int)
@@ -44,7 +44,7 @@ def head_mri(spacing_mm: float = 1.0, seed: int = 0) -> Volume:
         bend = 1.4 * np.sin(3.0 * elevation + 2.0 * azimuth + phase)
         return np.sin(frequency * azimuth * np.cos(elevation) + bend) * np.cos(frequency * elevation + bend)
 
-    # Sulci are the zero lines of a smooth pattern, up to 16 mm deep and narrower below; the cortex follows them.
+    # Sulci are the zero lines of a smooth pattern, up to 16 mm deep and narrower with depth; the cortex follows them.
     pattern = np.abs(folds(9.0, 0.3))
     sulcus = (pattern < 0.07 - 0.003 * depth) & (depth < 16.0)
     cortex = (depth < 3.5) | ((pattern < 0.34 - 0.006 * depth) & (depth < 20.0))

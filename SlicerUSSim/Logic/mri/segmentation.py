@@ -1,4 +1,4 @@
-"""From an MRI to a label map: 3D guided filter, then a Gaussian mixture (docs/physics.md#1-from-mri-to-tissues)."""
+"""Segmentation of an MRI: 3D guided filter, then a Gaussian mixture (docs/physics.md#1-from-mri-to-tissues)."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _CLASS_NAMES = {
     "t2": {3: ("white matter", "grey matter", "csf")},
     "flair": {3: ("csf", "white matter", "grey matter"), 4: ("csf", "white matter", "grey matter", "tumour")},
 }
-#: Filter strength per estimated noise: smooths what is noise, keeps borders; chosen on the MNI152 brain at 0-9 % noise.
+#: Filter strength per estimated noise: removes noise, preserves borders; chosen on the MNI152 brain at 0-9 % noise.
 _EPSILON_PER_NOISE = 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """A label map and the mixture it came from."""
+    """A label map, and the Gaussian mixture from which it was computed."""
 
-    #: uint8; label n + 1 is class n, 0 is background; one label more for thin sulci
+    #: uint8; label n + 1 is class n, 0 is background; one extra label for thin sulci
     labels: Volume
     #: Name of label n + 1
     tissue_names: tuple[str, ...]
@@ -50,9 +50,9 @@ class Segmentation:
     standard_deviations: np.ndarray
     #: (classes,) summing to 1
     weights: np.ndarray
-    #: One per EM iteration, never falling
+    #: One per EM iteration, never decreasing
     log_likelihoods: np.ndarray
-    #: Standard deviation of the noise that was found, and the filter's epsilon
+    #: Standard deviation of the estimated noise, and the filter's epsilon
     noise: float
     filter_epsilon: float
     _filtered: np.ndarray = field(repr=False)
@@ -68,14 +68,14 @@ class Segmentation:
         return result
 
     def texture(self) -> Texture:
-        """What the MRI knows beyond labels: every voxel's second tissue with its probability among the two, and the
-        filtered intensity in standard deviations of its tissue."""
+        """Information of the MRI beyond labels: the second most probable tissue of every voxel with its probability
+        relative to the two, and the filtered intensity in standard deviations of its tissue."""
         labels = self.labels.array
         foreground = labels > 0
         label, values = labels[foreground], self._filtered[foreground]
         posteriors = mixture_posteriors(values, self.means, self.standard_deviations, self.weights)
-        # Labels are in order of intensity; beyond the outermost means a posterior of the widest class means nothing
-        # (see mixture.classify), nor does one where the label does not come from the mixture (thin sulci).
+        # Labels are in order of intensity. Posteriors are not meaningful beyond the outermost means, where the widest
+        # class dominates (see mixture.classify), nor where the label does not come from the mixture (thin sulci).
         sure = (label > len(self.means)) | (values <= self.means[0]) | (values >= self.means[-1])
         own = np.where(sure, 1, label)[None] - 1
         first = np.take_along_axis(posteriors, own, 0)[0]
@@ -108,15 +108,15 @@ def segment_mri(
     classes : number of tissues.
     contrast : "t1", "t1gd", "t2" or "flair"; orders and names the classes.
     mask : foreground on the same grid (non-zero is inside); default: Otsu's threshold and the largest component.
-    filter_radius : of the guided filter in voxels; 0 switches it off.
-    filter_epsilon : of the guided filter, squared intensity; default: from the noise found in the image.
+    filter_radius : of the guided filter in voxels; 0 disables it.
+    filter_epsilon : of the guided filter, squared intensity; default: from the noise estimated in the image.
     bias_correction : run N4 first (slow); for scans with a visible intensity gradient.
-    thin_sulci : also label the middle of sulci too narrow to reach CSF intensity, one voxel thick, as one more tissue
-        named "leptomeninges", taken from the grey matter. Ultrasound shows them, intensity classes lose them.
-    progress : called with the share done, 0 to 1.
+    thin_sulci : also label the middle of sulci that are too narrow to reach CSF intensity, one voxel thick, as an extra
+        tissue "leptomeninges" within the grey matter. Ultrasound shows these sulci, but intensity classes miss them.
+    progress : called with the completed fraction, 0 to 1.
 
-    Raises SimulationError for a contrast or number of classes that is not known, an image that is not finite or
-    constant, and a mask that does not fit or is empty.
+    Raises SimulationError for an unknown contrast or number of classes, an image that is constant or not finite, and a
+    mask that is empty or on another grid.
 
     >>> from SlicerUSSim.Logic import segment_mri
     >>> from SlicerUSSim.Logic.mri import head_mri
@@ -168,7 +168,7 @@ def segment_mri(
     if thin_sulci:
         csf, grey = names.index("csf"), names.index("grey matter")
         middles = _sulcal_middles(filtered, labels, grey + 1, means[csf], means[grey], noise)
-        # CSF less than two voxels thick is such a sulcus too; left as CSF it would be a chain of droplets, each a lens.
+        # CSF less than two voxels thick is such a sulcus too; as CSF it would form isolated droplets, each a lens.
         is_csf = labels == csf + 1
         middles |= is_csf & ~cast(np.ndarray, ndimage.binary_opening(is_csf, np.ones((2, 2, 2))))
         labels[middles] = classes + 1
@@ -210,7 +210,7 @@ def estimate_noise(image: np.ndarray, mask: np.ndarray) -> float:
     """Standard deviation of the noise inside the mask, in the unit of the image.
 
     From the difference of every voxel to its six neighbours (Coupe et al., Medical Image Analysis 14(4) 2010), by the
-    median absolute deviation, so that borders do not count. Every other slice is used.
+    median absolute deviation, which is robust against borders. Every other slice is used.
     """
     inner = cast(np.ndarray, ndimage.binary_erosion(mask[::2], np.ones((1, 3, 3))))
     if inner.sum() < 1000:
@@ -224,14 +224,14 @@ def estimate_noise(image: np.ndarray, mask: np.ndarray) -> float:
 def _sulcal_middles(
     filtered: np.ndarray, labels: np.ndarray, grey_label: int, csf_mean: float, grey_mean: float, noise: float
 ) -> np.ndarray:
-    """(k, j, i) True at grey voxels on the middle of a sheet that is closer to CSF than both of its sides.
+    """(k, j, i) True at grey-matter voxels on the middle of a sheet that is closer to CSF than both of its sides.
 
-    Along any of the 13 directions of the 26-neighbourhood the voxel has to be an extremum against both neighbours and
-    a valley against the better of the first two voxels on either side.
+    Along at least one of the 13 directions of the 26-neighbourhood the voxel must be an extremum compared with both
+    neighbours, and differ sufficiently from the first two voxels on either side.
     """
     towards_csf = np.sign(csf_mean - grey_mean)
-    # Depth below grey matter; what is further from CSF than grey counts as grey, or every cortex would be a valley
-    # between white matter and white matter.
+    # Depth below grey matter. Intensities further from CSF than grey matter count as grey matter; otherwise all cortex
+    # would be a valley between white matter on both sides.
     depth = np.where(labels > 0, np.maximum(towards_csf * (filtered - grey_mean), 0), 0).astype(np.float32)
     depth = np.pad(ndimage.gaussian_filter(depth, 0.6), 2)
     flat, steps = depth.ravel(), np.array([depth.shape[1] * depth.shape[2], depth.shape[2], 1])
@@ -241,7 +241,7 @@ def _sulcal_middles(
     is_middle = np.zeros(grey.size, bool)
     for direction in itertools.product((-1, 0, 1), repeat=3):
         if direction <= (0, 0, 0):
-            continue  # the opposite direction says the same
+            continue  # equivalent to the opposite direction
         step = int(np.dot(direction, steps))
         before, behind = flat[grey - step], flat[grey + step]
         side = np.maximum(np.minimum(before, flat[grey - 2 * step]), np.minimum(behind, flat[grey + 2 * step]))
@@ -265,17 +265,17 @@ def _class_names(contrast: str, classes: int) -> tuple[str, ...]:
 def _finite(mri: Volume) -> np.ndarray:
     intensity = mri.array.astype(np.float32)
     bad = int(intensity.size - np.isfinite(intensity).sum())
-    require(bad == 0, f"MRI holds {bad} voxels that are not finite numbers, expected none")
+    require(bad == 0, f"MRI has {bad} voxels that are not finite numbers, expected none")
     low, high = float(intensity.min()), float(intensity.max())
-    require(high > low, f"MRI is constant ({low:g}), expected an image")
+    require(high > low, f"MRI is constant ({low:g}), expected different intensities")
     return intensity
 
 
 def _foreground(intensity: np.ndarray) -> np.ndarray:
     from skimage.filters import threshold_otsu
 
-    inside = intensity > 0.5 * threshold_otsu(intensity)  # half: Otsu alone cuts CSF off a T1
-    # What scipy returns depends on arguments, and scipy has no types that say how: hence the casts.
+    inside = intensity > 0.5 * threshold_otsu(intensity)  # half: Otsu's threshold itself would exclude CSF in T1
+    # Casts: the return types of scipy's functions depend on their arguments, without type annotations for that.
     components, count = cast(tuple[np.ndarray, int], ndimage.label(inside))
     if count > 1:
         inside = components == np.argmax(np.bincount(components.ravel())[1:]) + 1
@@ -307,7 +307,7 @@ def _without_bias(mri: Volume, foreground: np.ndarray, report: Callable[[float],
         done = sum(iterations[: corrector.GetCurrentLevel()]) + corrector.GetElapsedIterations()
         try:
             report(min(done / sum(iterations), 1.0))
-        except Exception as error:  # through C++ it could not pass
+        except Exception as error:  # it cannot propagate through C++
             raised.append(error)
             corrector.Abort()
 

@@ -1,8 +1,8 @@
-"""What the Slicer module remembers in the scene, so that a saved scene opens as it was left.
+"""The choices of the Slicer module, saved with the scene.
 
-The parameters live in the module's vtkMRMLScriptedModuleNode in the same form as Slicer's parameterNodeWrapper keeps
-them there. So a scene made by a script opens in the module, and the other way round. Values are those of declared
-dataclasses (base/declaration.py): a parameter that is declared there is remembered.
+The parameters are stored in the module's vtkMRMLScriptedModuleNode, in the format of Slicer's parameterNodeWrapper.
+Scenes can therefore be exchanged between scripts and the module. Values are those of declared dataclasses
+(base/declaration.py): all parameters declared there are saved.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ S = TypeVar("S", bound=Declared)
 
 @dataclass(frozen=True)
 class PanelSettings(Declared):
-    """What else the panel remembers."""
+    """Other saved choices of the panel."""
 
     show_in_slice: bool = parameter(
         True, "Show the image in this slice view",
-        "Turn the slice view into the plane of the probe and lay the image over it, with every image", shown=True,
+        "Move the slice view to the image plane and overlay the image, with every new image", shown=True,
     )  # fmt: skip
     preset: str = parameter("", "Preset", "The JSON text of a Preset; empty: the default")
 
@@ -35,7 +35,7 @@ class PanelSettings(Declared):
 
 
 class NodeParameter:
-    """A role that a node plays, and the classes that can play it; None where no node does."""
+    """A node reference by role, with the classes that are allowed; None if there is no node."""
 
     def __init__(self, *classes: str) -> None:
         self.classes = classes
@@ -59,7 +59,7 @@ class NodeParameter:
 
 
 class ValueParameter:
-    """A declared value; an empty text in the node is its default."""
+    """A declared value; an empty text in the node means the default."""
 
     def __init__(self, declared: Parameter) -> None:
         self.declared = declared
@@ -75,7 +75,7 @@ class ValueParameter:
 
 
 class SettingsParameter(Generic[S]):
-    """The values of a declared dataclass; the owner gets each of them under its own name too, with a prefix."""
+    """The values of a declared dataclass; each is also an attribute of the owner, with a prefix."""
 
     def __init__(self, kind: type[S], prefix: str = "") -> None:
         self._kind, self._prefix = kind, prefix
@@ -110,8 +110,8 @@ class SettingsParameter(Generic[S]):
 class SceneParameters:
     """The parameters of one scene as attributes: parameters.mri, parameters.contrast = "t2", parameters.fit.register.
 
-    Values can be had one by one, under the names of VALUE_PARAMETERS, or together as the dataclass that declares them.
-    Raises SimulationError for a name that is none, for a value or node of the wrong type, and for a value out of range.
+    Values are available one by one, under the names of VALUE_PARAMETERS, or together as the dataclass that declares
+    them. Raises SimulationError for an unknown name, a value or node of the wrong type, and a value out of range.
     """
 
     mri = NodeParameter("vtkMRMLScalarVolumeNode")
@@ -134,7 +134,7 @@ class SceneParameters:
 
     @property
     def node(self) -> Any:
-        """The vtkMRMLScriptedModuleNode, made if the scene has none."""
+        """The vtkMRMLScriptedModuleNode, created if the scene has none."""
         scene = self.__dict__["scene"]
         node = scene.GetSingletonNode(MODULE_NAME, "vtkMRMLScriptedModuleNode")
         if node is None:
@@ -143,10 +143,10 @@ class SceneParameters:
             node.SetSingletonTag(MODULE_NAME)
             node.SetName(scene.GenerateUniqueName(MODULE_NAME))
             node = scene.AddNode(node)
-        node.SetAttribute("ModuleName", MODULE_NAME)  # which closing a scene may remove
+        node.SetAttribute("ModuleName", MODULE_NAME)  # closing a scene may remove it
         return node
 
-    if TYPE_CHECKING:  # a type checker knows the names that are written above
+    if TYPE_CHECKING:  # type checkers use the names declared above
         preset: str
     else:
 
@@ -159,7 +159,7 @@ class SceneParameters:
             object.__setattr__(self, name, value)
 
 
-#: {role: classes of nodes that can play it}
+#: {role: allowed node classes}
 NODE_PARAMETERS = {
     name: entry.classes for name, entry in vars(SceneParameters).items() if isinstance(entry, NodeParameter)
 }

@@ -1,6 +1,6 @@
-"""What computes: the OpenCL devices there are, the one chosen, its programs and buffers.
+"""OpenCL: available devices, the choice of one, its programs and buffers.
 
-`layout` declares the structs and constants that the host and the kernels share.
+`layout` declares the structs and constants shared by host and kernels.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""Device: an OpenCL device ready to compute, with the programs built for it; Workspace: its buffers."""
+"""Device: an opened OpenCL device with the programs built for it; Workspace: buffers on it."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-#: What says which device computes; see devices.choose_device
+#: Choice of a device; see devices.choose_device
 DeviceChoice: TypeAlias = "str | DeviceInfo | Device | None"
 
 _ZERO = np.zeros(1, np.float32)
 
 
 class Device:
-    """An OpenCL device ready to compute: its context, its in-order queue and its built programs.
+    """An opened OpenCL device: its context, its in-order queue and its built programs.
 
-    Use `Device.get(choice)`, which makes one per device and process, so that programs are built once.
-    With `profiling = True` every kernel's event is kept until `take_profile()`.
+    Use `Device.get(choice)`, which creates one per device and process, so that programs are built once.
+    With `profiling = True` the events of all kernels are kept until `take_profile()`.
     """
 
     def __init__(self, info: DeviceInfo) -> None:
@@ -51,8 +51,8 @@ class Device:
         except cl.Error as error:
             raise SimulationError(f"OpenCL device {info} cannot be opened: {error}") from None
         self.lanes = _vector_lanes(info)
-        #: Samples of a line that one work-item fills with scatterers: long for a few cores, so that little is looked at
-        #: twice; short for a GPU, which one frame shall fill. A divisor of CONSTANTS["BLOCK"]
+        #: Samples of a line for which one work-item computes scatterers: many on a processor, so that few cells are
+        #: processed twice; few on a GPU, so that one frame occupies it. A divisor of CONSTANTS["BLOCK"]
         self.chunk = 16 if info.kind == "GPU" else CONSTANTS["BLOCK"]
         self.profiling = False
         self._events: list[tuple[str, Event]] = []
@@ -71,9 +71,9 @@ class Device:
         return _opened[info]
 
     def kernels(self, file_name: str, lanes: int = 1, *defines: str) -> dict[str, Kernel]:
-        """The kernels of kernels/`file_name`, built once; each work-item computes `lanes` values side by side.
+        """The kernels of kernels/`file_name`, built once; each work-item computes a vector of `lanes` values.
 
-        `defines` are preprocessor names that choose a variant.
+        `defines` are preprocessor names that select a variant. Raises SimulationError if the build fails.
         """
         key = (file_name, lanes, *defines)
         if key in self._kernels:
@@ -89,7 +89,7 @@ class Device:
                 options.append("-DNO_IMPLICIT_VECTORS")
             try:
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", self.cl.CompilerWarning)  # runtimes report success at length
+                    warnings.simplefilter("ignore", self.cl.CompilerWarning)  # runtimes emit them for successful builds
                     program = self.cl.Program(self.context, source).build(options=options)
             except self.cl.Error as error:
                 lines = [line.strip() for line in str(error).splitlines() if "error:" in line] or [str(error)]
@@ -106,10 +106,10 @@ class Device:
         return self._kernels[key]
 
     def run(self, kernel: Kernel, global_size: tuple[int, ...], *arguments, heavy: bool = False) -> None:
-        """Enqueue a kernel; its profiling event is kept if `profiling` is on.
+        """Enqueue a kernel; its event is kept if `profiling` is on.
 
-        `heavy` is for work-items with large private arrays: on a processor each is then a group of its own, since PoCL
-        keeps the arrays of a whole group on one thread's stack and ends the process when that overflows.
+        `heavy` is for work-items with large private arrays: on a processor each is then a separate group, since PoCL
+        keeps the arrays of a group on the stack of one thread, and a stack overflow would end the process.
         """
         local_size = (1,) * len(global_size) if heavy and self.info.kind != "GPU" else None
         event = kernel(self.queue, global_size, local_size, *arguments)
@@ -134,34 +134,34 @@ class Device:
         return buffer
 
     def clear(self, buffer: Buffer) -> None:
-        """Fill a buffer, whose size is a multiple of four, with zeros in its turn."""
+        """Enqueue filling a buffer, whose size is a multiple of four, with zeros."""
         self.cl.enqueue_fill_buffer(self.queue, buffer, _ZERO, 0, buffer.size)
 
     def copy(self, source: Buffer, target: Buffer, nbytes: int, target_offset: int = 0) -> None:
-        """Copy the first `nbytes` of a buffer to `target_offset` (bytes) of another, in their turn."""
+        """Enqueue copying the first `nbytes` of a buffer to `target_offset` (bytes) of another."""
         self.cl.enqueue_copy(self.queue, target, source, byte_count=nbytes, dst_offset=target_offset)
 
     def write(self, buffer: Buffer, array: np.ndarray) -> None:
-        """Copy `array` into a buffer that is at least as large, in its turn; nothing is waited for."""
-        # An event keeps its array alive, and waits for the copy when it is dropped itself.
+        """Enqueue copying `array` into a buffer that is at least as large, without waiting for completion."""
+        # An event keeps its array alive, and its destructor waits for the copy.
         event = self.cl.enqueue_copy(self.queue, buffer, array.copy(), is_blocking=False)
         self._writes.append(event)
 
     def mark(self) -> Event:
-        """An event that completes when everything enqueued so far has; its wait() waits for that."""
+        """An event that completes when all commands enqueued so far have completed; use its wait()."""
         marker = self.cl.enqueue_marker(self.queue)
         self.queue.flush()
         return marker
 
     def download(self, buffer: Buffer, shape: int | tuple[int, ...], dtype) -> np.ndarray:
-        """A new host array with the buffer's content; waits for everything enqueued before."""
+        """A new host array with the buffer's content; waits for all commands enqueued before."""
         array = np.empty(shape, dtype)
         if array.nbytes:
             self.cl.enqueue_copy(self.queue, array, buffer)
         return array
 
     def take_profile(self) -> dict[str, float]:
-        """Milliseconds per kernel since the last call (profiling has to be on)."""
+        """Milliseconds per kernel since the last call (requires profiling)."""
         self.queue.finish()
         events, self._events = self._events, []
         total: dict[str, float] = {}
@@ -173,7 +173,7 @@ class Device:
         limit = self.info.handle.max_mem_alloc_size
         if nbytes > limit:
             raise SimulationError(
-                f"a buffer of {nbytes / 2**20:.0f} MB is needed but {self.info.name} allows {limit / 2**20:.0f} MB; "
+                f"buffer size is {nbytes / 2**20:.0f} MB, expected at most {limit / 2**20:.0f} on {self.info.name}; "
                 "use a smaller or coarser volume, or another device"
             )
 
@@ -190,9 +190,9 @@ def _was_cached(program: Program) -> bool:
 
 
 def _vector_lanes(info: DeviceInfo) -> int:
-    """How many values one work-item computes side by side.
+    """Number of values that one work-item computes as a vector.
 
-    Processor runtimes vectorise the branching scatter kernel badly or not at all, so it is vectorised by hand there
+    Processor runtimes vectorise the branching scatter kernel poorly or not at all, so it is vectorised by hand there
     (measured: 2.7 times faster with Intel's runtime, 3 times with PoCL). A GPU runs one value per work-item.
     """
     if info.kind == "GPU":
@@ -201,9 +201,9 @@ def _vector_lanes(info: DeviceInfo) -> int:
 
 
 def _with_includes(folder: Path, file_name: str) -> str:
-    """The text of a kernel file with the files it includes in place of the #include lines.
+    """The text of a kernel file with its #include lines replaced by the included files.
 
-    The compiler is not asked to find them: runtimes disagree about include paths that hold spaces.
+    The compiler's include path is not used, since runtimes treat paths with spaces differently.
     """
 
     def included(line: re.Match) -> str:
@@ -214,12 +214,12 @@ def _with_includes(folder: Path, file_name: str) -> str:
 
 @lru_cache(maxsize=1)
 def kernel_folder() -> Path:
-    """The folder of the .cl files: inside an installed package, or beside it in a checkout or Slicer module."""
+    """The folder of the .cl files: inside an installed package, or next to it in a checkout or Slicer module."""
     package = Path(__file__).resolve().parents[2]
     for folder in (package / "kernels", package.parent / "kernels"):
         if (folder / "common.clh").exists():
             return folder
-    raise SimulationError(f"the OpenCL kernels are missing beside {package}; reinstall SlicerUSSim")
+    raise SimulationError(f"the OpenCL kernels are missing next to {package}; reinstall SlicerUSSim")
 
 
 class Workspace:
@@ -230,7 +230,7 @@ class Workspace:
         self._buffers: dict[str, Buffer] = {}
 
     def get(self, name: str, nbytes: int) -> Buffer:
-        """A buffer of at least `nbytes`; its content is whatever the last frame left."""
+        """A buffer of at least `nbytes`, with the content of its last use."""
         buffer = self._buffers.get(name)
         if buffer is None or buffer.size < nbytes:
             buffer = self._buffers[name] = self._device.empty(nbytes)

@@ -1,8 +1,8 @@
-"""Which OpenCL devices there are, and which one computes.
+"""List of OpenCL devices, and the choice of one.
 
-Order of preference: a GPU, Intel's processor runtime, PoCL, anything else. An explicit choice overrides it: the
-`device` argument, then PYOPENCL_CTX (pyopencl's own "platform:device" notation), then USSIM_DEVICE (either that
-notation or part of a device or platform name).
+Order of preference: a GPU, Intel's processor runtime, PoCL, others. An explicit choice overrides it: the `device`
+argument, then PYOPENCL_CTX (pyopencl's "platform:device" notation), then USSIM_DEVICE (that notation, or part of a
+device or platform name).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _EMULATOR_RANK = 9
-#: What pip installs of Intel's runtime for processors, by sys.platform; there are wheels for x86-64 only.
+#: Packages of Intel's runtime for processors, by sys.platform; there are wheels for x86-64 only.
 _INTEL_PACKAGES = {"linux": f"{INTEL_RUNTIME} intel-cmplr-lib-rt", "win32": INTEL_RUNTIME}
 
 
@@ -42,7 +42,7 @@ class DeviceInfo:
 
     @property
     def is_emulator(self) -> bool:
-        """Whether it emulates other hardware, for that hardware's developers."""
+        """Whether it emulates other hardware, for developers."""
         return self.rank == _EMULATOR_RANK
 
     def __str__(self) -> str:
@@ -57,7 +57,7 @@ def list_devices() -> list[DeviceInfo]:
     cl = load_pyopencl()
     try:
         platforms = cl.get_platforms()
-    except cl.LogicError:  # the loader's way of saying "no platform at all"
+    except cl.LogicError:  # raised by the loader if there is no platform
         return []
     devices = []
     for platform_index, cl_platform in enumerate(platforms):
@@ -67,7 +67,7 @@ def list_devices() -> list[DeviceInfo]:
             continue  # a driver without hardware
         for device_index, handle in enumerate(handles):
             device = _describe(cl, f"{platform_index}:{device_index}", cl_platform, handle)
-            # A runtime registered twice (its wheel and a vendors folder) would be listed twice.
+            # A runtime that is registered twice (by its wheel and in a vendors folder) is listed once.
             names = {(known.platform, known.name) for known in devices if known.kind == "CPU"}
             if (device.platform, device.name) not in names:
                 devices.append(device)
@@ -79,7 +79,7 @@ def _describe(cl, index: str, cl_platform: pyopencl.Platform, handle: pyopencl.D
     is_cpu = bool(handle.type & cl.device_type.CPU)
     platform_name = cl_platform.name.strip()
     if "FPGA" in platform_name or "FPGA" in handle.name:
-        rank = _EMULATOR_RANK  # Intel's FPGA emulator also lists itself; it is for FPGA developers
+        rank = _EMULATOR_RANK  # Intel's FPGA emulator, for FPGA developers
     elif is_gpu:
         rank = 0
     elif is_cpu and "Intel" in platform_name:
@@ -101,14 +101,14 @@ def _describe(cl, index: str, cl_platform: pyopencl.Platform, handle: pyopencl.D
 
 
 def choose_device(device: str | DeviceInfo | None = None) -> tuple[DeviceInfo, str]:
-    """The device to use and the reason, one short phrase.
+    """The device to use, and the reason as a short phrase.
 
     Parameters
     ----------
     device : "0:1" (platform:device), part of a name, a DeviceInfo, or None for PYOPENCL_CTX, then USSIM_DEVICE, then
-        the best there is.
+        the best available device.
 
-    Raises SimulationError if there is no device or none fits the choice.
+    Raises SimulationError if there is no device or none matches the choice.
     """
     if isinstance(device, DeviceInfo):
         return device, "chosen by argument"
@@ -138,7 +138,7 @@ def _find(devices: list[DeviceInfo], choice: str, source: str) -> DeviceInfo:
 
 
 def devices_to_measure(device: str | None = None) -> list[DeviceInfo]:
-    """The device chosen by `device`, or without a choice all that are no emulators, best first.
+    """The device chosen by `device`, or without a choice all devices except emulators, best first.
 
     Raises SimulationError as choose_device does.
     """
@@ -147,7 +147,7 @@ def devices_to_measure(device: str | None = None) -> list[DeviceInfo]:
 
 
 def faster_hint(device: DeviceInfo) -> str | None:
-    """The one pip line that would give a faster device than `device` on this computer, or None."""
+    """The pip command that would install a faster device than `device` on this computer, or None."""
     return _intel_hint() if device.kind == "CPU" and "Intel" not in device.platform else None
 
 
@@ -161,7 +161,7 @@ def _is_x86_64() -> bool:
 
 
 def _how_to_get_one() -> str:
-    """What to do on this computer to get an OpenCL device; it names nothing that pip could not find."""
+    """How to get an OpenCL device on this computer; names only packages that pip can find for it."""
     if sys.platform == "linux" and _is_x86_64():
         return f"run: pip install pocl-binary-distribution (or, faster: {_intel_hint()})"
     if sys.platform == "linux":

@@ -1,20 +1,20 @@
-"""The structs and constants that the host and the kernels share: defined here once, as numpy dtypes.
+"""The structs and constants shared by host and kernels, defined once as numpy dtypes.
 
-Every member is four bytes wide, so numpy's packed layout and C's agree on every device.
+Every member is four bytes wide, so the packed layout of numpy and that of C agree on every device.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-#: Constants known to host and kernels by the same name.
+#: Constants with the same name in host and kernels.
 CONSTANTS = {
     "LABEL_MASK": 0x3F,  # low byte of a medium voxel: six bits of label, ...
-    "SAME_LABEL": 0x40,  # ... one that says that all eight voxels of this cell have one label, ...
-    "NO_MEMBRANE": 0x80,  # ... and one that says that no membrane passes between them
+    "SAME_LABEL": 0x40,  # ... one bit that is set if all eight voxels of this cell have one label, ...
+    "NO_MEMBRANE": 0x80,  # ... and one that is set if no membrane passes between them
     "PLAIN_CELL": 0xC0,  # both
     "GROUP_MASK": 0x7F,
-    "SAME_GROUP": 0x80,  # beside the acoustic group of a voxel: all eight of this cell have the same
+    "SAME_GROUP": 0x80,  # added to the acoustic group of a voxel: all eight voxels of this cell have the same group
     "MEMBRANE_LABEL": 63,
     "MAX_TISSUES": 64,
     "WIDE_SIGMA": 3.0,  # of the Gaussian that smooths the indicators of acoustic groups (medium.py), voxels
@@ -22,11 +22,11 @@ CONSTANTS = {
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
     "MAX_STACK": 24,  # reflected rays waiting to be followed
-    "BLOCK": 64,  # samples over which beam widths and gains are taken as linear; lines are whole blocks long
-    "BANDS": 4,  # of T1, by which a tissue's scatterers come to exist as mu1 is varied (appearance.py)
+    "BLOCK": 64,  # samples over which beam widths and gains are assumed linear; lines are whole blocks long
+    "BANDS": 4,  # of T1, into which a tissue's scatterers are divided when mu1 is varied (appearance.py)
     "PARTS": 9,  # 1 + 2 BANDS
     "ROLE_FIXED": 0,  # of a tissue while the parts are computed: in part 0, ...
-    "ROLE_VARIED": 1,  # ... in the parts of its own, ...
+    "ROLE_VARIED": 1,  # ... in separate parts, ...
     "ROLE_SILENT": 2,  # ... or in none
     "MAX_BINS": 256,  # of the histograms in similarity.cl
     "LINE_PAD": 448,  # zeros on either side of a line: the longest pulse filter (bandwidth 0.05, 16 samples per cycle)
@@ -108,7 +108,7 @@ SEGMENT = np.dtype(
         ("tube", _FLOAT, 4),  # spreading at `start`: lateral width, growth per mm, elevational width, growth per mm
         ("path_mm", _FLOAT),  # unfolded path length from the probe face at `start`: sets the beam width
         ("length_mm", _FLOAT),
-        ("depth_mm", _FLOAT),  # t c_ref / 2 at `start`: what the scanner believes
+        ("depth_mm", _FLOAT),  # t c_ref / 2 at `start`: the displayed depth
         ("depth_per_mm", _FLOAT),  # c_ref / c
         ("weight", _FLOAT),  # product of R and 1 - R along the path
         ("attenuation", _FLOAT),  # two-way amplitude factor at `start`
@@ -148,7 +148,7 @@ def _c_struct(name: str, dtype: np.dtype) -> str:
 
 
 def shared_source() -> str:
-    """C text of every constant and struct above; Device.kernels puts it in front of a kernel file."""
+    """C source of all constants and structs above; Device.kernels prepends it to a kernel file."""
     constants = [f"#define {name} {value}{'f' * isinstance(value, float)}" for name, value in CONSTANTS.items()]
     structs = [("Acquisition", ACQUISITION), ("Tissue", TISSUE), ("Segment", SEGMENT), ("Hit", HIT)]
     return "\n".join(constants + [_c_struct(name, dtype) for name, dtype in structs])

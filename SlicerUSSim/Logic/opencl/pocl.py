@@ -1,9 +1,9 @@
-"""What PoCL 3.0 needs beside itself: a processor name that its compiler knows, and a linker.
+"""Workarounds for PoCL 3.0: a processor name that its compiler knows, and a check for a linker.
 
-LLVM 14 calls a processor it does not know "generic" (AMD Zen 4 and 5, for instance), PoCL hands that name to clang,
-and clang refuses it: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open since 2022). PoCL 3.0 has no setting
-for the name, but it keeps it as a C string of its own that is read at every build. This file replaces the string by a
-processor that LLVM 14 knows and that has no instruction this one lacks.
+LLVM 14 calls a processor it does not know "generic" (AMD Zen 4 and 5, for instance). PoCL passes that name to clang,
+which rejects it: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open since 2022). PoCL 3.0 has no setting for
+the name, but stores it as a C string that is read at every build. This module replaces the string by the name of a
+processor that LLVM 14 knows and whose instructions this processor has.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from SlicerUSSim.Logic.base.errors import require
 _log = logging.getLogger(__name__)
 
 # The oldest Intel processor of each of PoCL's x86 kernel libraries, and the /proc/cpuinfo flags it needs.
-# PoCL picks its library by these flags, and the name has to go with the library.
+# PoCL selects its library by these flags, and the name must match the library.
 _KNOWN_PROCESSORS = (
     ("skylake-avx512", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2"}),
     ("haswell", {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"}),
@@ -34,7 +34,7 @@ _NOT_NAMED = "PoCL's compiler does not know this processor, and it cannot be nam
 
 
 def name_unknown_processor(handle) -> str | None:
-    """Give PoCL a processor name its compiler accepts; returns it, or None where nothing had to or could be done.
+    """Give PoCL a processor name that its compiler accepts. Returns the name, or None if nothing was changed.
 
     `handle` is the pyopencl Device. Nothing is written unless a pointer to exactly the string "generic", in a heap
     block large enough for the new name, is found in the device's own structure.
@@ -47,7 +47,7 @@ def name_unknown_processor(handle) -> str | None:
         _log.warning("PoCL's compiler does not know this processor, and no older one is like it: kernels may not build")
         return None
     try:
-        # /proc/self/mem answers with an error where following a wrong pointer would end the process.
+        # Reading a wrong pointer through /proc/self/mem is an error; dereferencing it would end the process.
         memory = os.open("/proc/self/mem", os.O_RDONLY)
     except OSError as error:
         _log.warning(_NOT_NAMED, f"its memory cannot be read ({error.strerror})")
@@ -65,8 +65,9 @@ def name_unknown_processor(handle) -> str | None:
 
 
 def require_linker(version: str) -> None:
-    """Raise SimulationError where PoCL would end the process: up to version 5 it links every kernel with `ld`, against
-    libgcc and libc, and aborts where it cannot, as on a minimal Debian. `version` is that of the OpenCL platform."""
+    """Raise SimulationError if PoCL cannot link kernels, which would end the process: up to version 5 it links every
+    kernel with `ld` against libgcc and libc, and aborts if they are missing, as on a minimal Debian. `version` is that
+    of the OpenCL platform."""
     found = re.search(r"PoCL (\d+)", version, re.IGNORECASE)
     if found is None or int(found.group(1)) > 5 or sys.platform != "linux":
         return

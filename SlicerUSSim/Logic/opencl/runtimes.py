@@ -1,7 +1,7 @@
-"""pyopencl, with every OpenCL runtime that pip installed made known to its loader.
+"""Imports pyopencl after registering the OpenCL runtimes installed by pip with its loader.
 
-A driver registers its runtime with the system; a wheel cannot, so its library is named to the loader here, before
-pyopencl is imported: in a folder of .icd files on Linux, in OCL_ICD_FILENAMES on Windows (untested there).
+A driver registers its runtime with the system; a wheel cannot. Its library is therefore registered here before pyopencl
+is imported: by a folder of .icd files on Linux, by OCL_ICD_FILENAMES on Windows (untested there).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ INTEL_RUNTIME = "intel-opencl-rt"
 
 @lru_cache(maxsize=1)
 def load_pyopencl():
-    """Import pyopencl with every installed runtime visible to its ICD loader, or say what to install."""
+    """Import pyopencl with all installed runtimes visible to its ICD loader. Raises SimulationError without it."""
     if "pyopencl" not in sys.modules:
         register_pip_runtimes()
     try:
@@ -36,7 +36,7 @@ def load_pyopencl():
 
 
 def register_pip_runtimes() -> None:
-    """Name the runtimes that pip installed to the ICD loader, in the environment of this process."""
+    """Register the runtimes installed by pip with the ICD loader, in the environment of this process."""
     if sys.platform == "linux" and "OCL_ICD_VENDORS" not in os.environ:
         _point_at_vendors_folder()
     elif sys.platform == "win32":
@@ -44,11 +44,11 @@ def register_pip_runtimes() -> None:
 
 
 def _add_to_icd_filenames() -> None:
-    """Add Intel's library to the variable that Khronos' loader, the one in pyopencl's wheels, reads on Windows.
+    """Add Intel's library to the variable that Khronos' loader, which is in pyopencl's wheels, reads on Windows.
 
-    The loader takes paths with ; between them, before the registry's drivers, and searches a library's own folder for
-    what that library needs. It ignores the variable in programs that run as administrator. Source: icd.c and windows/*
-    of KhronosGroup/OpenCL-ICD-Loader. Untested on Windows.
+    The loader reads paths separated by ; before the drivers in the registry, and searches a library's own folder for
+    its dependencies. It ignores the variable in programs that run as administrator. Source: icd.c and windows/* of
+    KhronosGroup/OpenCL-ICD-Loader. Untested on Windows.
     """
     library = _library_of(INTEL_RUNTIME, r"intelocl64\.dll")
     if library is None:
@@ -62,8 +62,8 @@ def _add_to_icd_filenames() -> None:
 def _point_at_vendors_folder() -> None:
     """Point the ICD loader at a folder that names every runtime by absolute path.
 
-    Intel's wheel ships an .icd file with a placeholder path, and OCL_ICD_VENDORS *replaces* the loader's own folders,
-    so a folder of our own has to list Intel's library, PoCL's wheel and whatever the system has installed.
+    Intel's wheel has an .icd file with a placeholder path, and OCL_ICD_VENDORS *replaces* the loader's default folders.
+    A separate folder therefore lists Intel's library, PoCL's wheel and the runtimes installed in the system.
     """
     libraries = {}
     for name, distribution, pattern in (
@@ -74,7 +74,7 @@ def _point_at_vendors_folder() -> None:
         if library is not None:
             libraries[f"ussim-{name}.icd"] = str(library)
     if "ussim-intel.icd" not in libraries:
-        return  # without Intel's wheel the loader finds everything by itself
+        return  # without Intel's wheel the loader finds all runtimes
     import platformdirs
 
     folder = Path(platformdirs.user_cache_dir("ussim")) / "vendors" / f"{zlib.crc32(sys.prefix.encode()):08x}"
@@ -90,7 +90,7 @@ def _point_at_vendors_folder() -> None:
                 partial = folder / f"{name}.{os.getpid()}"
                 partial.write_text(library)
                 partial.replace(folder / name)
-    except OSError as error:  # a read-only home: the loader's own folders still work
+    except OSError as error:  # a read-only home directory: the loader's default folders still work
         _log.warning(
             "Intel's OpenCL runtime is installed but not used: %s cannot be written (%s)", folder, error.strerror
         )
@@ -100,7 +100,7 @@ def _point_at_vendors_folder() -> None:
 
 
 def _library_of(distribution: str, pattern: str) -> Path | None:
-    """The first file of an installed distribution whose name is like `pattern`."""
+    """The first file of an installed distribution whose name matches `pattern`, or None."""
     try:
         files = importlib.metadata.files(distribution) or []
     except importlib.metadata.PackageNotFoundError:

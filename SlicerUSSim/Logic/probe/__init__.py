@@ -1,6 +1,6 @@
-"""The probe: its array and beam, its pixels, what it looks like, and where it is held on a patient.
+"""The probe: array and beam, image pixels, shape, and placement on a patient.
 
-Probe frame: x lateral, y depth, z elevational, millimetres, origin in the middle of the face.
+Probe frame: x lateral, y depth, z elevational, millimetres, origin in the middle of the probe face.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""Probes: where the scan lines start, where they go, and how wide the beam is.
+"""Probes: origins and directions of the scan lines, and widths of the beam.
 
 Probe frame (millimetres): origin at the centre of the probe face, +x lateral (left to right in the image), +y depth,
 +z elevational. A scan line is a polar line around the apex of a curved array, or a parallel line of a linear one.
@@ -27,9 +27,9 @@ NOMINAL_SPEED_M_S = 1540.0
 #: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
 MAIN_LOBE = 1.21
 FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
-#: None, until the probe knows its depth: Any, since nobody who has a probe meets it
+#: None until the probe's depth is set. Typed Any, since constructed probes never have None
 _BY_DEPTH: Any = None
-#: {what a preset calls it: class} of every kind of probe
+#: {name in a preset: class} of all kinds of probe
 PROBE_KINDS: dict[str, type[Probe]] = {}
 
 
@@ -55,14 +55,14 @@ class Probe(Declared):
         192, "Scan lines", "Number of scan lines in an image", bounds=(2, 4096), shown=Shown(16, 512)
     )
     frequency_mhz: float = parameter(
-        5.0, "Frequency", "Centre frequency of the pulse; the resolution gets finer with it, the penetration less",
+        5.0, "Frequency", "Centre frequency of the pulse; higher: finer resolution, less penetration",
         unit="MHz", bounds=(0.5, 40), shown=Shown(1, 20, 0.1, is_slider=True),
     )  # fmt: skip
     fractional_bandwidth: float = parameter(
         0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
     )
     focus_mm: float = parameter(
-        _BY_DEPTH, "Focus", "Depth of the transmit focus; none, or 0 in a panel: at 60 % of the depth", unit="mm",
+        _BY_DEPTH, "Focus", "Depth of the transmit focus; none (panels: 0): 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
         note="It then moves with the depth",
     )  # fmt: skip
@@ -71,22 +71,22 @@ class Probe(Declared):
     )
     receive_f_number: float = parameter(
         2.5, "Receive f-number", "Smallest f-number of the receive aperture", bounds=(0.5, 20),
-        note="The receive aperture opens with depth until it reaches the full aperture",
+        note="The receive aperture grows with depth up to the full aperture",
     )  # fmt: skip
     elevation_aperture_mm: float = parameter(
-        7.0, "Elevational aperture", "Height of the elements", unit="mm", bounds=(0.5, 100)
+        7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
     )
     elevation_focus_mm: float = parameter(
-        _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: at 60 % of the depth", unit="mm",
+        _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), can_be_none=True, note="It then moves with the depth",
     )  # fmt: skip
 
-    #: What the kind is called in a preset, and what it is
+    #: Name of the kind in a preset, and a description for tool tips
     kind: ClassVar[str]
     geometry: ClassVar[str]
 
     def __post_init__(self) -> None:
-        # A field of each kind, so that it can be given by position after what is the kind's own.
+        # A field of each kind, so that it can be given by position after the kind's own fields.
         self.depth_mm: float
         super().__post_init__()
         for name in ("focus_mm", "elevation_focus_mm"):
@@ -98,7 +98,7 @@ class Probe(Declared):
 
     @staticmethod
     def default_focus_mm(depth_mm: float) -> float:
-        """Where a focus lies that is not given."""
+        """Default depth of a focus."""
         return 0.6 * depth_mm
 
     # ---- geometry, defined by each kind ------------------------------------------------------------------------
@@ -165,12 +165,12 @@ class Probe(Declared):
         starts = self.origins_mm()
         points = np.concatenate([starts, starts + self.depth_mm * self.directions()])
         if not self.is_linear:
-            points = np.concatenate([points, [[0.0, self.depth_mm, 0.0]]])  # the middle of the arc, if no line is there
+            points = np.concatenate([points, [[0.0, self.depth_mm, 0.0]]])  # the middle of the arc, if there is no line
         x, y = points[:, 0], points[:, 1]
         return float(x.min()), float(x.max()), float(min(y.min(), 0.0)), float(y.max())
 
     def outline_mm(self, points_per_arc: int = 65) -> np.ndarray:
-        """(points, 3) closed outline of the imaged field in the probe frame, for drawing."""
+        """(points, 3) closed outline of the imaged field in the probe frame."""
         ends = np.linspace(self.first_line, -self.first_line, points_per_arc)
         if self.is_linear:
             near = np.stack([ends, 0 * ends, 0 * ends], axis=1)
@@ -190,12 +190,12 @@ class Probe(Declared):
 
     @property
     def wavelength_mm(self) -> float:
-        """Wavelength at the nominal speed of sound, 1540 m/s, which arrays are designed for."""
+        """Wavelength at the nominal speed of sound of 1540 m/s, for which arrays are designed."""
         return NOMINAL_SPEED_M_S / self.frequency_mhz * 1e-3
 
     @property
     def cycles_per_mm(self) -> float:
-        """Cycles of the carrier per millimetre of *depth*: the pulse travels there and back."""
+        """Cycles of the centre frequency per millimetre of *depth* (two-way travel)."""
         return 2.0 / self.wavelength_mm
 
     @property
@@ -248,7 +248,7 @@ class Probe(Declared):
 
 
 def _own(label: str, tip: str, unit: str, bounds: tuple[float, float], shown: Shown) -> Any:
-    """A parameter of one kind of probe, which has to be given."""
+    """A required parameter of one kind of probe."""
     return parameter(label=label, tip=tip, unit=unit, bounds=bounds, shown=shown)
 
 
@@ -280,7 +280,7 @@ class LinearProbe(Probe):
 
 @dataclass(frozen=True)
 class ConvexProbe(Probe):
-    """A curved array of radius `radius_mm`; scan lines leave it at right angles over `field_of_view_deg`.
+    """A curved array of radius `radius_mm` with perpendicular scan lines over `field_of_view_deg`.
 
     >>> from SlicerUSSim.Logic import ConvexProbe
     >>> probe = ConvexProbe(radius_mm=40, field_of_view_deg=60, depth_mm=100)
@@ -307,10 +307,10 @@ class ConvexProbe(Probe):
 
 @dataclass(frozen=True)
 class PhasedProbe(Probe):
-    """A small array that steers: every scan line starts at the centre of the face, over `field_of_view_deg`."""
+    """A small array with steered scan lines from the centre of the face, over `field_of_view_deg`."""
 
     kind = "phased"
-    geometry = "small array that steers"
+    geometry = "small array with beam steering"
     field_of_view_deg: float = _field_of_view_deg()
     depth_mm: float = _depth_mm()
 
@@ -332,7 +332,7 @@ PROBE_KIND = Parameter(
 def probe_from_dict(values: dict, source: str = "probe") -> Probe:
     """The probe described by plain values (see Probe.to_dict).
 
-    Raises SimulationError that names `source`, for an unknown kind or name, a missing value and one that is refused.
+    Raises SimulationError that names `source` for an unknown kind or name and for a missing or invalid value.
 
     >>> from SlicerUSSim.Logic.probe import probe_from_dict
     >>> probe = probe_from_dict({"kind": "linear", "width_mm": 38, "depth_mm": 40, "frequency_mhz": 9})
@@ -353,7 +353,7 @@ def probe_from_dict(values: dict, source: str = "probe") -> Probe:
     return built(PROBE_KINDS[kind], arguments, source)
 
 
-#: Probes to start from, by name: PROBES["phased"].
+#: Preset probes by name, such as PROBES["phased"].
 PROBES: dict[str, Probe] = {
     "phased": PhasedProbe(field_of_view_deg=80.0, depth_mm=90.0, scan_lines=196, frequency_mhz=5.0),
     "convex": ConvexProbe(radius_mm=40.0, field_of_view_deg=60.0, depth_mm=100.0, scan_lines=192, frequency_mhz=5.0),

@@ -33,7 +33,7 @@ class ImageGrid:
 
     @classmethod
     def for_probe(cls, probe: Probe, image_size: tuple[int, int] | None) -> ImageGrid:
-        """The grid that just holds the imaged field; square pixels unless `image_size` (rows, columns) is given."""
+        """The smallest grid around the imaged field; square pixels unless `image_size` (rows, columns) is given."""
         left, right, top, bottom = probe.image_bounds_mm()
         if image_size is None:
             pixel = (bottom - top) / _DEFAULT_ROWS
@@ -45,7 +45,7 @@ class ImageGrid:
 
     @property
     def image_to_probe(self) -> np.ndarray:
-        """(4, 4) from (column, row, 0, 1) of pixel centres to the probe frame in millimetres."""
+        """(4, 4) map from (column, row, 0, 1) of pixel centres to the probe frame in millimetres."""
         matrix = np.eye(4)
         matrix[0, 0], matrix[1, 1] = self.pixel_spacing_mm
         matrix[0, 3] = self.left_mm + 0.5 * self.pixel_spacing_mm[0]
@@ -54,13 +54,13 @@ class ImageGrid:
 
     @property
     def slice_to_probe(self) -> np.ndarray:
-        """(4, 4) the same for the image as a volume of one slice, which is as thick as a pixel is high."""
+        """(4, 4) the same for the image as a volume of one slice, whose thickness is the height of a pixel."""
         matrix = self.image_to_probe
         matrix[2, 2] = self.pixel_spacing_mm[1]
         return matrix
 
     def field(self, probe: Probe) -> np.ndarray:
-        """(rows, columns) bool: which pixels lie in the field that `probe` images."""
+        """(rows, columns) bool: pixels within the field imaged by `probe`."""
         x, y = self.left_mm, self.top_mm
         dx, dy = self.pixel_spacing_mm
         return probe.holds(

@@ -1,4 +1,4 @@
-"""Where to put a probe: poses from a target and a direction, and the plane of an MRI that a probe sees."""
+"""Placement of a probe: poses from a target and a direction, sweeps, and the MRI resampled in the image plane."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _log = logging.getLogger(__name__)
 def pose_looking_at(face_ras, target_ras, lateral_ras=(1.0, 0.0, 0.0)) -> np.ndarray:
     """(4, 4) probe_to_ras of a probe whose face centre is at `face_ras` and whose axis points to `target_ras` (mm).
 
-    `lateral_ras` is the direction the image's left-to-right axis should have as nearly as possible.
-    Raises SimulationError if the points coincide or `lateral_ras` lies along the axis.
+    `lateral_ras` is the preferred direction of the image's left-to-right axis; its component along the probe axis is
+    ignored. Raises SimulationError if the points coincide or `lateral_ras` is parallel to the axis.
 
     >>> from SlicerUSSim.Logic.probe import pose_looking_at
     >>> pose = pose_looking_at(face_ras=(0, 0, 70), target_ras=(0, 0, 0))
@@ -33,7 +33,7 @@ def pose_looking_at(face_ras, target_ras, lateral_ras=(1.0, 0.0, 0.0)) -> np.nda
     y = depth / np.linalg.norm(depth)
     x = lateral - (lateral @ y) * y
     require(
-        np.linalg.norm(x) > 1e-3, f"lateral direction {lateral.tolist()} is along the probe's axis, expected across it"
+        np.linalg.norm(x) > 1e-3, f"lateral direction {lateral.tolist()} is along the probe axis, expected across it"
     )
     x /= np.linalg.norm(x)
     pose = np.eye(4)
@@ -43,9 +43,9 @@ def pose_looking_at(face_ras, target_ras, lateral_ras=(1.0, 0.0, 0.0)) -> np.nda
 
 
 def surface_point(foreground: Volume, target_ras, outward_ras) -> np.ndarray:
-    """(3,) where the line from `target_ras` along `outward_ras` leaves the foreground (non-zero voxels) for good.
+    """(3,) last point of the foreground (non-zero voxels) on the line from `target_ras` along `outward_ras` (RAS, mm).
 
-    Raises SimulationError if the line meets no foreground at all.
+    Raises SimulationError if the line does not meet the foreground.
     """
     target, outward = np.asarray(target_ras, float), np.asarray(outward_ras, float)
     outward = outward / np.linalg.norm(outward)
@@ -84,27 +84,27 @@ def _point(ras: np.ndarray) -> str:
 
 
 def pose_in_slice(foreground: Volume, slice_to_ras: np.ndarray, target_ras=None) -> np.ndarray:
-    """(4, 4) probe_to_ras of a probe on the surface whose image lies in a slice view and stands as the view does.
+    """(4, 4) probe_to_ras of a probe on the surface whose image lies in a slice view, in the orientation of the view.
 
-    `slice_to_ras` (4, 4) has the view's right, up and normal as its columns and its middle as its origin, as Slicer's
-    slice nodes have. The probe comes from the top of the view, and its axis runs down through `target_ras` (default:
-    the middle of the view), moved into the slice.
+    `slice_to_ras` (4, 4) has the view's right, up and normal as its columns and its middle as its origin, as in slice
+    nodes of Slicer. The probe is at the top of the view, and its axis points down through `target_ras` (default: the
+    middle of the view), projected onto the slice.
     Raises SimulationError if no foreground (non-zero voxels) lies above or below the target in the view.
     """
     right, up, normal = (slice_to_ras[:3, n] / np.linalg.norm(slice_to_ras[:3, n]) for n in range(3))
     middle = slice_to_ras[:3, 3]
     target = middle if target_ras is None else np.asarray(target_ras, float)
     target = target - ((target - middle) @ normal) * normal
-    # From below everything, so that a target in the coupling medium beneath the patient still meets the surface above.
+    # Start below the patient, so that a target in the coupling medium beneath it still finds the surface above.
     face = surface_point(foreground, target - 200.0 * up, up)
     return pose_looking_at(face, face - up, lateral_ras=right)
 
 
 def turned(probe_to_ras: np.ndarray, *, rock_deg=0.0, tilt_deg=0.0, rotate_deg=0.0) -> np.ndarray:
-    """(4, 4) probe_to_ras turned about the middle of the probe's face, which stays where it is.
+    """(4, 4) probe_to_ras turned about the middle of the probe face, which does not move.
 
-    Rocking stays in the image plane (about z), tilting leaves it (about the lateral axis x), rotating is about the
-    probe's own axis (y); positive as rotations about these axes. The names are AIUM's.
+    Rocking is in the image plane (about z), tilting out of it (about the lateral axis x), rotating about the probe axis
+    (y); signs as rotations about these axes. The terms are those of the AIUM.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic.probe import turned
@@ -117,21 +117,21 @@ def turned(probe_to_ras: np.ndarray, *, rock_deg=0.0, tilt_deg=0.0, rotate_deg=0
 
 
 def carried(probe_to_ras: np.ndarray, face_ras, outward_from, outward_to) -> np.ndarray:
-    """(4, 4) probe_to_ras with its face at `face_ras` (mm), turned as little as takes one direction onto another.
+    """(4, 4) probe_to_ras with its face at `face_ras` (mm), turned by the smallest rotation between two directions.
 
-    From the outward normal of a surface here to the one there, the probe keeps its angles to the surface; from its own
-    axis, reversed, to the normal, it comes to stand upright.
-    Raises SimulationError for a direction of no length.
+    If the directions are the outward normals of a surface at the old and the new position, the probe keeps its angles
+    to the surface. If they are the reversed probe axis and the new normal, the probe is aligned with the normal.
+    Raises SimulationError for a direction of zero length.
     """
     start, end = (np.asarray(v, float) for v in (outward_from, outward_to))
     require(
         min(np.linalg.norm(start), np.linalg.norm(end)) > 1e-9,
-        f"directions are {start.tolist()} and {end.tolist()}, expected two of some length",
+        f"directions are {start.tolist()} and {end.tolist()}, expected two of non-zero length",
     )
     start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
     axis = np.cross(start, end)
     angle = np.arctan2(np.linalg.norm(axis), start @ end)
-    if np.linalg.norm(axis) < 1e-9:  # the same direction, or the opposite one: then about any axis across it
+    if np.linalg.norm(axis) < 1e-9:  # parallel or antiparallel: any perpendicular axis will do
         axis = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
     axis = axis / np.linalg.norm(axis)
     turn = Rotation.from_rotvec(angle * axis)
@@ -142,7 +142,7 @@ def carried(probe_to_ras: np.ndarray, face_ras, outward_from, outward_to) -> np.
 
 
 def aimed_at(probe_to_ras: np.ndarray, target_ras) -> np.ndarray:
-    """(4, 4) probe_to_ras turned as little as makes the probe's axis point to `target_ras` (mm).
+    """(4, 4) probe_to_ras turned by the smallest rotation that points the probe axis at `target_ras` (mm).
 
     Raises SimulationError if the target is on the face.
     """
@@ -151,7 +151,7 @@ def aimed_at(probe_to_ras: np.ndarray, target_ras) -> np.ndarray:
 
 
 def angles_to_surface(probe_to_ras: np.ndarray, outward_ras) -> tuple[float, float]:
-    """(rock, tilt) in degrees that turned() gives an upright probe, its axis along the normal, to stand as this one."""
+    """(rock, tilt) in degrees by which turned() takes a probe aligned with the surface normal to this orientation."""
     inward = probe_to_ras[:3, :3].T @ (-np.asarray(outward_ras, float))
     inward = inward / np.linalg.norm(inward)
     # (Rz(rock) Rx(tilt))^-1 takes y to (sin rock, cos rock cos tilt, -cos rock sin tilt).
@@ -161,13 +161,13 @@ def angles_to_surface(probe_to_ras: np.ndarray, outward_ras) -> tuple[float, flo
 
 
 def slide_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int) -> list[np.ndarray]:
-    """Poses (4, 4) of a probe that slides across its image plane, `length_mm` in all, its middle at `probe_to_ras`."""
+    """Poses (4, 4) of a probe that slides across its image plane, `length_mm` in total, centred at `probe_to_ras`."""
     return [probe_to_ras @ elevational_motion(offset_mm=share * length_mm) for share in _shares(frames)]
 
 
 def tilt_sweep(probe_to_ras: np.ndarray, angle_deg: float, frames: int) -> list[np.ndarray]:
-    """Poses (4, 4) of a probe that tilts about the lateral axis of its face, `angle_deg` in all, as a matrix array or a
-    wobbling one scans.
+    """Poses (4, 4) of a probe that tilts about the lateral axis of its face, `angle_deg` in total, as in the scan of a
+    matrix array or a mechanically swept array.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic.probe import tilt_sweep
@@ -179,7 +179,7 @@ def tilt_sweep(probe_to_ras: np.ndarray, angle_deg: float, frames: int) -> list[
 
 
 def elevational_motion(offset_mm: float = 0.0, angle_deg: float = 0.0) -> np.ndarray:
-    """(4, 4) in the probe frame: by `offset_mm` along z, and by `angle_deg` about x, so that depth turns towards +z."""
+    """(4, 4) motion in the probe frame: `offset_mm` along z, and `angle_deg` about x, which turns depth towards +z."""
     angle = np.deg2rad(angle_deg)
     motion = np.eye(4)
     motion[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
@@ -188,20 +188,20 @@ def elevational_motion(offset_mm: float = 0.0, angle_deg: float = 0.0) -> np.nda
 
 
 def _shares(frames: int) -> np.ndarray:
-    """(frames,) from -1/2 to 1/2, or 0 for a single frame. Raises SimulationError for a number that is none."""
+    """(frames,) from -1/2 to 1/2, or 0 for a single frame. Raises SimulationError for an invalid number of frames."""
     require(int(frames) == frames and frames >= 1, f"a sweep has {frames!r} frames, expected a whole number above 0")
     return np.linspace(-0.5, 0.5, int(frames)) if frames > 1 else np.zeros(1)
 
 
 def sample(volume: Volume, points_ras: np.ndarray, order: int = 1) -> np.ndarray:
-    """Values of `volume` at (..., 3) RAS points; order 0 is nearest neighbour, 1 linear; 0 outside."""
+    """Values of `volume` at (..., 3) RAS points; order 0 is nearest neighbour, 1 is linear; 0 outside the volume."""
     points = np.asarray(points_ras, float)
     ijk = points @ volume.ras_to_ijk[:3, :3].T + volume.ras_to_ijk[:3, 3]
     return ndimage.map_coordinates(volume.array, np.moveaxis(ijk[..., ::-1], -1, 0), order=order, cval=0)
 
 
 def slice_under_probe(volume: Volume, grid: ImageGrid, probe_to_ras: np.ndarray, order: int = 1) -> np.ndarray:
-    """(rows, columns) of `volume` resampled at the pixels of a probe's image."""
+    """(rows, columns) values of `volume` at the pixels of a probe's image."""
     columns, rows = np.meshgrid(np.arange(grid.columns), np.arange(grid.rows))
     pixels = np.stack([columns, rows, np.zeros_like(rows), np.ones_like(rows)], axis=-1).astype(float)
     points = pixels @ (probe_to_ras @ grid.image_to_probe).T

@@ -1,4 +1,4 @@
-"""What a probe looks like in 3D: the outline of its field, the field itself, the body in the sonographer's hand."""
+"""3D models of a probe: the outline of its imaged field, the field as a surface, and the probe's body."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from vtkmodules.vtkFiltersCore import vtkAppendPolyData, vtkPolyDataNormals
 
 from SlicerUSSim.Logic.probe.arrays import Probe
 
-#: Housing around a face, and the least half width of one that a hand can hold, mm.
+#: Width of the housing around a face, and minimum half width and half thickness of the probe, mm.
 _HOUSING_MM, _LEAST_HALF_WIDTH_MM, _HALF_THICKNESS_MM = 3.0, 9.0, 8.0
-#: Sections of the handle: mm behind the face, half width and half thickness there.
+#: Sections of the handle: distance behind the face, half width, half thickness, mm.
 _HANDLE = ((34.0, 14.0, 11.0), (86.0, 14.0, 11.0), (92.0, 11.0, 8.5))
-#: The housing goes on like the face for so far, mm.
+#: Length over which the housing has the cross-section of the face, mm.
 _STRAIGHT_MM = 16.0
-#: The ridge that tells one side from the other: from and to mm behind the face, half width, half thickness.
+#: The ridge that marks one side: start and end behind the face, half width, half thickness, mm.
 _RIDGE = (5.0, 30.0, 2.6, 1.8)
 _RING_POINTS = 48
 
@@ -35,10 +35,10 @@ def outline_polydata(probe: Probe) -> vtkPolyData:
 
 
 def field_polydata(probe: Probe) -> vtkPolyData:
-    """The imaged field in the probe frame (mm) as triangles; texture coordinates lay its image over it."""
+    """The imaged field in the probe frame (mm) as triangles, with texture coordinates for the image."""
     left, right, top, bottom = probe.image_bounds_mm()
     corners = probe.outline_mm()[:-1]
-    half = len(corners) // 2  # along the face, then back along the far end
+    half = len(corners) // 2  # first half along the face, second half back along the far end
     polydata = vtkPolyData()
     points = vtkPoints()
     points.SetData(numpy_to_vtk(np.ascontiguousarray(corners), deep=True))
@@ -47,7 +47,7 @@ def field_polydata(probe: Probe) -> vtkPolyData:
     order = [corner for n in range(half) for corner in (n, len(corners) - 1 - n)]
     strip.InsertNextCell(len(order), order)
     polydata.SetStrips(strip)
-    # A texture's first row is an image's, the uppermost.
+    # The first row of a texture is the top row of the image.
     across, down = (corners[:, 0] - left) / (right - left), (corners[:, 1] - top) / (bottom - top)
     coordinates = numpy_to_vtk(np.stack([across, down], axis=1).astype(np.float32), deep=True)
     coordinates.SetName("TextureCoordinates")
@@ -58,7 +58,7 @@ def field_polydata(probe: Probe) -> vtkPolyData:
 def probe_polydata(probe: Probe) -> vtkPolyData:
     """A probe's body behind its face, in the probe frame (mm), with a ridge on the side that is left in the image.
 
-    For people to see how the probe is held; nothing is simulated with it. Cell scalars "Part" are 1 on the ridge.
+    For display only; the simulation does not use it. Cell scalars "Part" are 1 on the ridge.
     """
     half_face = max(float(np.abs(probe.origins_mm()[:, 0]).max()) + _HOUSING_MM, _LEAST_HALF_WIDTH_MM)
     face = _ring(half_face, _HALF_THICKNESS_MM)
@@ -81,7 +81,7 @@ def probe_polydata(probe: Probe) -> vtkPolyData:
 
 
 def _ring(half_width: float, half_thickness: float) -> np.ndarray:
-    """(points, 3) of a rounded rectangle across the probe's axis, as housings are."""
+    """(points, 3) of a rounded rectangle perpendicular to the probe axis."""
     turn = np.linspace(0.0, 2 * np.pi, _RING_POINTS, endpoint=False)
     x, z = (np.sign(v) * np.sqrt(np.abs(v)) for v in (np.cos(turn), np.sin(turn)))
     return np.stack([half_width * x, 0.0 * x, half_thickness * z], axis=1)
@@ -96,7 +96,7 @@ def _lofted(rings: list[np.ndarray], part: int) -> vtkPolyData:
     cells = vtkCellArray()
     for quadrilateral in np.stack([numbers[:-1], after[:-1], after[1:], numbers[1:]], axis=-1).reshape(-1, 4):
         cells.InsertNextCell(4, quadrilateral.tolist())
-    opposite = -np.arange(_RING_POINTS // 2 + 1) % _RING_POINTS  # across the thickness: at the same x, where ends curve
+    opposite = -np.arange(_RING_POINTS // 2 + 1) % _RING_POINTS  # the point at the same x across the thickness
     for ring, turned_round in ((numbers[0], True), (numbers[-1], False)):
         near, far = ring[: _RING_POINTS // 2 + 1], ring[opposite]
         for strip in np.stack([near[:-1], near[1:], far[1:], far[:-1]], axis=-1):

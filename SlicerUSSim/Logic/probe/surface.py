@@ -1,4 +1,4 @@
-"""PatientSurface: where a probe can lie on a patient: the outside of what is labelled, closed over sulci."""
+"""PatientSurface: the surface on which a probe can lie: the outside of the labelled voxels, closed over sulci."""
 
 from __future__ import annotations
 
@@ -20,44 +20,44 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
 from SlicerUSSim.Logic.probe.placement import angles_to_surface, carried, turned
 
-#: Voxels of this size are fine enough to lie on, and coarse enough to be made while one waits, mm.
+#: Voxel size of the surface, mm: a compromise between accuracy and the time to compute it.
 _VOXEL_MM = 2.0
-#: Gaps narrower than twice this are bridged, as a probe's face bridges a sulcus.
+#: Gaps narrower than twice this are bridged, as a probe face bridges a sulcus, mm.
 _CLOSING_MM = 8.0
 _SMOOTHING_MM = 2.0
-#: A probe's face rests on a patch of this radius; its normal is the mean over the patch.
+#: Radius of the patch over which normals are averaged, about that of a probe face, mm.
 _PATCH_MM = 10.0
-#: Share of the triangles that a smooth surface looks the same without.
+#: Fraction of the triangles that can be removed without visible change of the smooth surface.
 _DROPPED = 0.85
-#: A probe that slides is held within these of the surface, wherever it came from, mm.
+#: Limits of the distance between a sliding probe and the surface, mm.
 _LIFT_MM = (-5.0, 20.0)
 _UP = np.array([0.0, 0.0, 1.0])
-#: Probe on the vertex of the head that looks down, its lateral axis to the patient's right.
+#: Pose of a probe on the vertex of the head that points down, with its lateral axis to the patient's right.
 _LOOKING_DOWN = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 @dataclass(frozen=True)
 class SurfacePose:
-    """A probe's pose as a sonographer says it: where on the patient, and how it is held there."""
+    """A probe's pose in a sonographer's terms: position on the patient, and orientation to the surface."""
 
-    #: Where on the surface, away from the vertex of the head; see PatientSurface.angles
+    #: Position on the surface as angles from the vertex of the head; see PatientSurface.angles
     right_deg: float
     front_deg: float
-    #: Turned about its own axis: at 0, in front of the vertex, the image's lateral axis points to the patient's right
+    #: Rotation about the probe axis; at 0, in front of the vertex, the lateral axis points to the patient's right
     rotate_deg: float
-    #: Against the normal of the surface; see placement.turned
+    #: Angles to the surface normal; see placement.turned
     rock_deg: float
     tilt_deg: float
-    #: Between surface and face; negative is pressed in
+    #: Distance between surface and probe face; negative if pressed in
     lift_mm: float
 
 
 class PatientSurface:
-    """The surface around the labelled voxels, smooth enough to slide a probe over.
+    """A smooth surface around the labelled voxels, over which a probe can slide.
 
     Parameters
     ----------
-    labels : non-zero is the patient, in whatever frame `labels.ijk_to_ras` leads to; all points here are in it.
+    labels : non-zero voxels are the patient. All points here are in the world frame of `labels.ijk_to_ras`.
 
     Raises SimulationError for labels that are all zero.
 
@@ -71,7 +71,7 @@ class PatientSurface:
     """
 
     def __init__(self, labels: Volume) -> None:
-        require(bool((labels.array > 0).any()), "the label map is empty, expected voxels for a probe to lie on")
+        require(bool((labels.array > 0).any()), "the label map is empty, expected labelled voxels")
         self.polydata: vtkPolyData = _closed_surface(labels)
         points = vtk_to_numpy(self.polydata.GetPoints().GetData()).astype(float)
         self._normals = vtk_to_numpy(self.polydata.GetPointData().GetNormals()).astype(float)
@@ -79,21 +79,21 @@ class PatientSurface:
         self._locator = vtkStaticCellLocator()
         self._locator.SetDataSet(self.polydata)
         self._locator.BuildLocator()
-        #: The same with fewer triangles, for renderers without a GPU
+        #: The same surface with fewer triangles, for rendering without a GPU
         self.coarse_polydata: vtkPolyData = _with_fewer_triangles(self.polydata)
         low, high = points.min(axis=0), points.max(axis=0)
-        #: (3,) the middle of the patient's bounding box, which angles() are seen from
+        #: (3,) the middle of the patient's bounding box, the origin of angles()
         self.centre = 0.5 * (low + high)
         self._radius = float(np.linalg.norm(high - low))
 
     def nearest(self, point) -> np.ndarray:
-        """(3,) the point of the surface that is closest to `point`."""
+        """(3,) the point of the surface closest to `point`."""
         closest, cell, part, distance = [0.0, 0.0, 0.0], _written(0), _written(0), _written(0.0)
         self._locator.FindClosestPoint(list(map(float, point)), closest, cell, part, distance)
         return np.array(closest)
 
     def hit(self, start, end) -> np.ndarray | None:
-        """(3,) where the line from `start` to `end` first meets the surface, or None."""
+        """(3,) the first intersection of the line from `start` to `end` with the surface, or None."""
         t, point, parametric = _written(0.0), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
         part, cell = _written(0), _written(0)
         met = self._locator.IntersectWithLine(
@@ -102,7 +102,7 @@ class PatientSurface:
         return np.array(point) if met else None
 
     def normal(self, point) -> np.ndarray:
-        """(3,) outward normal of the patch around a point of the surface, as a probe's face feels it."""
+        """(3,) outward normal at a point of the surface, averaged over a patch of the size of a probe face."""
         point = np.asarray(point, float)
         near = self._tree.query_ball_point(point, _PATCH_MM) or [self._tree.query(point)[1]]
         away = np.linalg.norm(self._tree.data[near] - point, axis=1) / _PATCH_MM
@@ -111,7 +111,7 @@ class PatientSurface:
         return mean / length if length > 1e-6 else self._normals[near[0]]
 
     def angles(self, point) -> tuple[float, float]:
-        """(to the right, to the front) in degrees: where a point is, seen from the centre, away from straight up.
+        """(to the right, to the front) in degrees: the direction of a point from the centre, relative to straight up.
 
         An azimuthal equidistant map: both zero at the vertex of the head, (90, 0) at the right ear, (0, 90) at the
         forehead; only straight down is singular.
@@ -121,7 +121,7 @@ class PatientSurface:
         return (float(away * x / across), float(away * y / across)) if across > 1e-9 else (0.0, 0.0)
 
     def at(self, right_deg: float, front_deg: float) -> np.ndarray:
-        """(3,) the outermost point of the surface in the direction of these angles; the inverse of angles()."""
+        """(3,) the outermost point of the surface in the direction given by these angles; the inverse of angles()."""
         away, across = np.deg2rad(np.hypot(right_deg, front_deg)), np.arctan2(front_deg, right_deg)
         outward = np.array([np.sin(away) * np.cos(across), np.sin(away) * np.sin(across), np.cos(away)])
         far = self.centre + self._radius * outward
@@ -129,7 +129,7 @@ class PatientSurface:
         return self.nearest(far) if found is None else found
 
     def where(self, probe_to_ras: np.ndarray) -> SurfacePose:
-        """A probe's pose (4, 4), said by the surface that is nearest to its face."""
+        """A probe's pose (4, 4) relative to the point of the surface nearest to its face."""
         face = probe_to_ras[:3, 3]
         point = self.nearest(face)
         normal = self.normal(point)
@@ -140,7 +140,7 @@ class PatientSurface:
         return SurfacePose(*self.angles(point), float(rotate), rock, tilt, float((face - point) @ normal))
 
     def held(self, probe_to_ras: np.ndarray, **changes: float) -> np.ndarray:
-        """(4, 4) probe_to_ras with some values of its SurfacePose changed; a face that is not moved stays exactly."""
+        """(4, 4) probe_to_ras with some values of its SurfacePose changed; angles alone do not move the face."""
         pose = replace(self.where(probe_to_ras), **changes)
         if {"right_deg", "front_deg", "lift_mm"} & set(changes):
             point = self.at(pose.right_deg, pose.front_deg)
@@ -153,9 +153,9 @@ class PatientSurface:
         return turned(upright, rock_deg=pose.rock_deg, tilt_deg=pose.tilt_deg)
 
     def slid(self, probe_to_ras: np.ndarray, point, *, upright: bool = True) -> np.ndarray:
-        """(4, 4) probe_to_ras slid to where the surface is nearest to `point`, as far above it as it was.
+        """(4, 4) probe_to_ras slid to the point of the surface nearest to `point`, at unchanged distance from it.
 
-        An `upright` probe comes to stand along the normal there; another one keeps its angles to the surface.
+        With `upright` the probe is aligned with the normal there, otherwise it keeps its angles to the surface.
         """
         face = probe_to_ras[:3, 3]
         here, there = self.nearest(face), self.nearest(point)
@@ -165,13 +165,13 @@ class PatientSurface:
 
 
 def _written(start: float) -> Any:
-    """A number that a method of VTK writes into. Any: VTK's type stubs ask for a plain number there."""
+    """A number that a method of VTK can write to. Any: VTK's type stubs require a plain number there."""
     return mutable(start)
 
 
 def _distance_mm(outside: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Distance of every voxel (k, j, i) of `outside` to the nearest that is not; voxels are `size` mm."""
-    # What scipy returns depends on arguments, and scipy has no types that say how.
+    """(k, j, i) distance in mm of every voxel of `outside` to the nearest voxel that is not; voxels are `size` mm."""
+    # The return type of scipy's function depends on its arguments, and scipy has no type annotations for that.
     return cast(np.ndarray, ndimage.distance_transform_edt(outside, sampling=size))
 
 
@@ -189,7 +189,7 @@ def _closed_surface(labels: Volume) -> vtkPolyData:
     contour.SetInputData(Volume(soft, np.eye(4)).to_vtk())
     contour.SetValue(0, 0.5)
     contour.ComputeNormalsOff()
-    to_ras = labels.ijk_to_ras.copy()  # of the middles of the coarse voxels
+    to_ras = labels.ijk_to_ras.copy()  # of the centres of the coarse voxels
     to_ras[:3, 3] += to_ras[:3, :3] @ (0.5 * (step[::-1] - 1) - step[::-1] * margin[::-1])
     to_ras[:3, :3] *= step[::-1]
     transform = vtkTransform()
@@ -217,7 +217,7 @@ def _with_normals(source) -> vtkPolyData:
 
 
 def _coarse(inside: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Blocks of step voxels that hold any of the patient."""
+    """Blocks of `step` voxels that contain any voxel of the patient."""
     wanted = -(-np.array(inside.shape) // step) * step
     padded = np.pad(inside, [(0, extra) for extra in wanted - inside.shape])
     k, j, i = wanted // step

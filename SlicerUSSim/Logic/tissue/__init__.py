@@ -1,6 +1,6 @@
-"""Tissues: their acoustic parameters with sources, the labels and names they go by, and their texture.
+"""Tissues: acoustic parameters with sources, labels and names, and texture.
 
-A tissue is six numbers; a TissueTable says which tissue every label of a label map stands for.
+A tissue has six parameters; a TissueTable assigns a tissue to every label of a label map.
 """
 
 from typing import TYPE_CHECKING

@@ -6,7 +6,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
-#: Other names for the same tissue, as label maps and segmentations use them.
+#: Synonyms in label maps and segmentations.
 _ALIASES = {
     "background": "coupling", "cerebrospinal fluid": "csf", "ventricles": "csf", "cyst": "csf",
     "gray matter": "grey matter",
@@ -15,7 +15,7 @@ _ALIASES = {
 }  # fmt: skip
 
 
-#: What a longer name, such as FreeSurfer's or a colleague's, is taken for by a word in it; the first that is found.
+#: Tissue of a longer name, such as one of FreeSurfer's, by a word in it; the first match is used.
 _WORDS = {
     "white matter": "white matter", "corpus callosum": "white matter", "ventricle": "csf", "csf": "csf",
     "choroid plexus": "enhancing", "grey matter": "grey matter", "gray matter": "grey matter", "cortex": "grey matter",
@@ -38,14 +38,14 @@ def same_name(a: str, b: str) -> bool:
 
 
 def tissue_named(name: str) -> Tissue:
-    """The preset for a tissue name: case, usual synonyms, and words in a longer name ("Left-Cerebral-White-Matter").
+    """The preset for a tissue name, with synonyms and by words in a longer name ("Left-Cerebral-White-Matter").
 
-    Raises SimulationError for a name that means none of them.
+    Raises SimulationError for a name that matches no preset.
     """
     key = plain_name(name)
     key = _ALIASES.get(key, key)
     if key not in TISSUES:
-        texts = f" {key} ", f" {key} ".replace("s ", " ")  # as it stands, and without plurals
+        texts = f" {key} ", f" {key} ".replace("s ", " ")  # unchanged, and without plurals
         key = next((tissue for word, tissue in _WORDS.items() if any(f" {word} " in text for text in texts)), key)
     require(key in TISSUES, f"no preset for tissue {name!r}, expected one of: {', '.join(TISSUES)}")
     return TISSUES[key]

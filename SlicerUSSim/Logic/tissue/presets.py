@@ -1,4 +1,4 @@
-"""Preset tissues with the source of every number, and their colours."""
+"""Preset tissues with the source of every parameter, and their colours."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def _tissue(name, c, c_source, z, z_source, alpha, alpha_source, mu0=0.0, mu1=0.
 _DENSITY = f"density ({_ITIS}) x speed of sound"
 
 
-# Grey and white matter share Szabo's speed for brain and one impedance: published differences between them are smaller
-# than between publications, and a difference would bend rays at every voxel of a border that is not a sharp interface.
+# Grey and white matter share Szabo's speed of sound for brain and one impedance: published differences between them are
+# smaller than those between publications, and would refract rays at a border that is not a sharp interface.
 # fmt: off
 #: Tissues by name, each number with its source: TISSUES["white matter"].
 TISSUES: dict[str, Tissue] = {
@@ -68,7 +68,7 @@ TISSUES: dict[str, Tissue] = {
 }
 # fmt: on
 
-#: Colours of tissues in pictures, label maps and segmentations: quiet and distinguishable; red, green, blue, 0 to 1.
+#: Colours of tissues in figures, label maps and segmentations: muted but distinguishable; red, green, blue, 0 to 1.
 _COLOURS = {
     "csf": (0.17, 0.37, 0.54), "grey matter": (0.55, 0.55, 0.55), "white matter": (0.91, 0.89, 0.85),
     "leptomeninges": (0.78, 0.35, 0.33), "enhancing": (0.85, 0.64, 0.25), "tumour": (0.37, 0.62, 0.43),
@@ -80,5 +80,5 @@ _OTHER_COLOUR = (0.3, 0.75, 0.8)
 
 
 def colour_of(tissue_name: str) -> tuple[float, float, float]:
-    """Red, green, blue from 0 to 1 of a tissue in pictures, label maps and segmentations."""
+    """Red, green, blue from 0 to 1 of a tissue in figures, label maps and segmentations."""
     return _COLOURS.get(tissue_name, _OTHER_COLOUR)

@@ -1,4 +1,4 @@
-"""TissueTable: which tissue every label of a label map stands for."""
+"""TissueTable: the tissue of every label of a label map."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_LABEL = 62  # six bits in the device's label volume, and 63 is the membrane
 
 
 class TissueTable(Mapping[int, Tissue]):
-    """Which tissue every label stands for: a read-only mapping {label: Tissue}, and the membrane, if any.
+    """The tissues of a label map: a read-only mapping {label: Tissue}, and the membrane, if any.
 
     Label 0 is the coupling medium around the patient and is added when it is not given.
     Raises SimulationError for labels outside 0..62.
@@ -74,12 +74,12 @@ class TissueTable(Mapping[int, Tissue]):
 
     @classmethod
     def named(cls, tissue_names: Iterable[str], membrane: Membrane | None = None) -> TissueTable:
-        """Presets for labels 1, 2, ... by name, for the body as for the brain. SimulationError for a new one."""
+        """Presets for labels 1, 2, ... by name, for all organs. Raises SimulationError for an unknown name."""
         table = {label: _preset(label, name) for label, name in enumerate(tissue_names, 1)}
         return cls(table, membrane)
 
     def label_of(self, name: str) -> int:
-        """The label of a tissue by name. Raises SimulationError if the table has none of that name."""
+        """The label of a tissue by name. Raises SimulationError if the table has no tissue with that name."""
         for label, tissue in self.items():
             if tissue.name == name:
                 return label
@@ -94,7 +94,7 @@ class TissueTable(Mapping[int, Tissue]):
         return [*self.values(), *([] if self.membrane is None else [self.membrane.tissue])]
 
     def tissue(self, name: str) -> Tissue:
-        """The tissue of that name, the membrane's too. Raises SimulationError that lists the names if there is none."""
+        """Tissue by name, including the membrane's. Raises SimulationError that lists the names for unknown ones."""
         for tissue in self.all_tissues():
             if tissue.name == name:
                 return tissue
@@ -102,17 +102,19 @@ class TissueTable(Mapping[int, Tissue]):
         raise SimulationError(f"no tissue named {name!r}, expected one of: {', '.join(names)}")
 
     def with_tissue(self, tissue: Tissue) -> TissueTable:
-        """A new table in which everything of that name, the membrane too, is `tissue`; added if nothing is."""
+        """A new table in which `tissue` replaces all tissues of its name, including the membrane's, or is added."""
         if any(old.name == tissue.name for old in self.all_tissues()):
             return self._changed(tissue.name, lambda _: tissue)
-        free = next(label for label in range(MAX_LABEL + 2) if label not in self)  # a full table refuses the last
+        free = next(
+            label for label in range(MAX_LABEL + 2) if label not in self
+        )  # refused as out of range if the table is full
         return TissueTable({**self, free: tissue}, self.membrane)
 
     def replace(self, name: str, /, **changes) -> TissueTable:
-        """A new table in which everything called `name`, the membrane too, has the given parameters changed.
+        """A new table with parameters changed in every tissue named `name`, including the membrane's.
 
-        Names stay: membrane, label maps and fits know tissues by them. Raises SimulationError that lists the names or
-        the parameters for one that does not exist.
+        The name itself cannot be changed, since membrane, label maps and fits refer to it. Raises SimulationError that
+        lists the names or parameters for an unknown one.
         """
         known = [field.name for field in parameters_of(Tissue) if field.name != "name"]
         for parameter in changes:
@@ -120,11 +122,11 @@ class TissueTable(Mapping[int, Tissue]):
                 parameter in known,
                 f"{parameter!r} is not a tissue parameter that can be replaced, expected one of: {', '.join(known)}",
             )
-        self.tissue(name)  # which refuses a name that nothing has
+        self.tissue(name)  # raises SimulationError for an unknown name
         return self._changed(name, lambda tissue: replace(tissue, **changes))
 
     def _changed(self, name: str, change: Callable[[Tissue], Tissue]) -> TissueTable:
-        """A new table in which `change` was made to everything called `name`."""
+        """A new table with `change` applied to every tissue named `name`."""
 
         def after(tissue: Tissue) -> Tissue:
             return change(tissue) if tissue.name == name else tissue
@@ -135,11 +137,13 @@ class TissueTable(Mapping[int, Tissue]):
         return TissueTable({label: after(tissue) for label, tissue in self.items()}, membrane)
 
     def for_names(self, names: Iterable[str]) -> TissueTable:
-        """A table for labels 1, 2, ... named `names`: every tissue from this table, the membrane's too, if it has one
-        of that name (or else of that name in other case, hyphens and underscores), else from the presets; coupling
-        medium and membrane stay. Of several with one name it is the first, as in `label_of` and `tissue`.
+        """A table for labels 1, 2, ... named `names`, with the coupling medium and membrane of this table.
 
-        Raises SimulationError that lists the names nobody knows.
+        A tissue is taken from this table, including its membrane, if the name occurs there, or else if it occurs with
+        other case, hyphens or underscores, or else from the presets. Of several tissues with one name, the first is
+        taken, as in `label_of` and `tissue`.
+
+        Raises SimulationError that lists the unknown names.
         """
         last_first = self.all_tissues()[::-1]
         mine = {plain_name(tissue.name): tissue for tissue in last_first}
@@ -163,7 +167,7 @@ class TissueTable(Mapping[int, Tissue]):
     # ---- JSON --------------------------------------------------------------------------------------------------
 
     def to_dict(self) -> dict:
-        """Plain values; from_dict reads them back."""
+        """Plain values, the input of from_dict."""
         values: dict[str, dict] = {"tissues": {str(label): _plain(tissue) for label, tissue in self.items()}}
         if self.membrane is not None:
             values["membrane"] = {
@@ -175,7 +179,7 @@ class TissueTable(Mapping[int, Tissue]):
 
     @classmethod
     def from_dict(cls, values: dict, source: str = "tissues") -> TissueTable:
-        """The table described by to_dict. Raises SimulationError naming `source` and what is wrong in it."""
+        """The inverse of to_dict. Raises SimulationError that names `source` and the error in it."""
         expected = 'expected {"tissues": {"1": {...}}}'
         require(isinstance(values, dict), f"{source}: is {kind_of(values)}, {expected}")
         require("tissues" in values, f"{source}: lacks tissues, {expected}")
@@ -195,16 +199,16 @@ class TissueTable(Mapping[int, Tissue]):
 
     @classmethod
     def read(cls, path: str | os.PathLike) -> TissueTable:
-        """Read a table from JSON. Raises SimulationError for a missing, unreadable or wrong file."""
+        """Read a table from JSON. Raises SimulationError for a missing, unreadable or invalid file."""
         return cls.from_dict(read_json(path), str(path))
 
     def write(self, path: str | os.PathLike) -> None:
-        """Write the table as JSON, whole or not at all."""
+        """Write the table as JSON; on failure an existing file is kept."""
         write_json(path, self.to_dict())
 
 
 def _label(text: str, source: str) -> int:
-    """The label that a JSON file names. Raises SimulationError for a text that is not just its digits."""
+    """The label in a JSON file. Raises SimulationError for a text that does not consist of digits."""
     known = {str(label): label for label in range(MAX_LABEL + 1)}
     require(text in known, f"{source}: tissue label is {short(text)}, expected a whole number from 0 to {MAX_LABEL}")
     return known[text]
@@ -213,7 +217,7 @@ def _label(text: str, source: str) -> int:
 def _preset(label: int, name: str) -> Tissue:
     tissue = tissue_named(name)
     if tissue.name != name:
-        _log.info("label %d, %r, is taken for %s", label, name, tissue.name)
+        _log.info("label %d, %r, is interpreted as %s", label, name, tissue.name)
     return tissue
 
 
@@ -222,7 +226,7 @@ def _plain(tissue: Tissue) -> dict:
 
 
 def tissues_beside(labels: Path) -> Path:
-    """Where the tissue table of a label map lies: beside it, .json."""
+    """The file of a label map's tissue table: the same name with .json."""
     name = labels.name
     for suffix in (".nii.gz", labels.suffix):
         if suffix and name.endswith(suffix):

@@ -1,10 +1,10 @@
-"""What an MRI knows about scatterers beyond hard labels (docs/physics.md#hybrid-scatterers).
+"""Texture: information of an MRI for scatterers beyond hard labels (docs/physics.md#hybrid-scatterers).
 
-Two things, either of which can be used alone:
-- partial volume: the probability that a voxel is of another tissue than its label says. A scatterer takes its tissue
-  by that probability, drawn once and for ever, so that the mean power is that of both in their shares and the signal
-  stays linear in mu0 and sigma0 of every tissue;
-- intensity: how far the MRI deviates from the mean of the tissue. Amplitudes follow it in decibels, normalised so that
+Two kinds of information, which can be used separately:
+- partial volume: the probability that a voxel belongs to another tissue than its label. A scatterer takes the other
+  tissue with this probability, with a random number that is fixed for each scatterer. The mean power is therefore the
+  weighted mean of both tissues, and the signal remains linear in mu0 and sigma0 of every tissue;
+- intensity: the deviation of the MRI from the mean of the tissue. Amplitudes follow it in decibels, normalised so that
   the tissue as a whole keeps its mean power.
 """
 
@@ -23,15 +23,15 @@ _FARTHEST_DEVIATION = 2.5
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """On the grid of a label map.
+    """Texture on the grid of a label map.
 
     Parameters
     ----------
-    second_label : (k, j, i) uint8, the likeliest other tissue of every voxel.
-    second_share : (k, j, i) float32, its probability, 0 to 1; where it is 0 the label is sure.
+    second_label : (k, j, i) uint8, the most probable other tissue of every voxel.
+    second_share : (k, j, i) float32, its probability, 0 to 1; 0 if the label is certain.
     deviation : (k, j, i) float32, MRI intensity in standard deviations from the mean of the voxel's tissue.
 
-    Raises SimulationError if the shapes differ or a probability is none.
+    Raises SimulationError if the shapes differ, or for a probability outside 0 to 1.
     """
 
     second_label: np.ndarray
@@ -43,11 +43,11 @@ class Texture:
         require(len(set(shapes.values())) == 1, f"texture arrays have different shapes: {shapes}")
         low, high = float(np.min(self.second_share)), float(np.max(self.second_share))
         require(low >= 0.0 and high <= 1.0, f"second_share goes from {low:g} to {high:g}, expected 0 to 1")
-        require(bool(np.isfinite(self.deviation).all()), "deviation holds a value that is not finite")
+        require(bool(np.isfinite(self.deviation).all()), "deviation has values that are not finite, expected none")
 
     @classmethod
     def from_mri(cls, mri: Volume, labels: Volume) -> Texture:
-        """From any label map and an image on its grid: intensity alone, no partial volume.
+        """Texture from any label map and an image on its grid: intensity only, no partial volume.
 
         Raises SimulationError if the grids differ or the image is not finite.
         """
@@ -56,14 +56,14 @@ class Texture:
             f"the MRI ({'x'.join(map(str, mri.array.shape[::-1]))}) and the labels "
             f"({'x'.join(map(str, labels.array.shape[::-1]))}) lie on different grids; resample one of them",
         )
-        require(bool(np.isfinite(mri.array).all()), "the MRI holds a value that is not finite")
+        require(bool(np.isfinite(mri.array).all()), "the MRI has values that are not finite, expected none")
         nothing = np.zeros(labels.array.shape, np.uint8)
         return cls(nothing, nothing.astype(np.float32), tissue_deviation(mri.array, labels.array))
 
     def on_grid_of(self, labels: Volume, whole: Volume) -> Texture:
-        """The part of this texture of `whole` that lies on the voxels of `labels`, a label map cropped from it.
+        """The part of this texture of `whole` on the voxels of `labels`, a label map cropped from it.
 
-        Raises SimulationError if those voxels are not among those of `whole`.
+        Raises SimulationError if `labels` is not a part of `whole`.
         """
         offset = (whole.ras_to_ijk @ labels.ijk_to_ras)[:3]
         first = np.rint(offset[:, 3]).astype(int)[::-1]
@@ -72,16 +72,16 @@ class Texture:
             np.allclose(offset[:, :3], np.eye(3), atol=1e-3)
             and np.allclose(offset[::-1, 3], first, atol=1e-2)
             and bool((first >= 0).all() and (last <= whole.array.shape).all()),
-            "the labels lie on another grid than the MRI they came from; segment the MRI again",
+            "the labels are on another grid than their MRI; segment the MRI again",
         )
         part = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
         return Texture(self.second_label[part], self.second_share[part], self.deviation[part])
 
     def packed(self, labels: np.ndarray, partial_volume: bool, modulation_db: float) -> np.ndarray:
-        """(k, j, i) uint32 as kernels/scattering.cl reads it: second label | share in 1/255 << 8 | gain << 16.
+        """(k, j, i) uint32 for kernels/scattering.cl: second label | share in 1/255 << 8 | gain << 16.
 
-        The gain is in TEXTURE_STEP_DB about 128. `modulation_db` per standard deviation; the mean square of the gain
-        over each label is 1.
+        The gain is in steps of TEXTURE_STEP_DB, with 128 for 0 dB. `modulation_db` is per standard deviation; the mean
+        square of the gain over each label is 1.
         """
         level = np.full(labels.shape, 128.0, np.float32)
         if modulation_db != 0.0:
@@ -100,10 +100,10 @@ def tissue_deviation(intensity: np.ndarray, labels: np.ndarray) -> np.ndarray:
     values = intensity.astype(np.float64)
     mean = _means(values, labels)
     spread = np.sqrt(np.maximum(_means(values**2, labels) - mean**2, 0.0))
-    table = np.where(spread > 1e-6 * np.abs(mean).max(), spread, np.inf)  # a constant tissue deviates nowhere
+    table = np.where(spread > 1e-6 * np.abs(mean).max(), spread, np.inf)  # no deviation in a constant tissue
     return ((intensity - mean[labels]) / table[labels]).astype(np.float32)
 
 
 def _means(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """(largest label + 1,) mean of `values` over the voxels of each label; 0 for one that does not occur."""
+    """(largest label + 1,) mean of `values` over the voxels of each label; 0 for labels that do not occur."""
     return np.bincount(labels.ravel(), values.ravel()) / np.maximum(np.bincount(labels.ravel()), 1)

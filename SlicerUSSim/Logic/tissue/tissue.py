@@ -1,6 +1,6 @@
-"""Tissue and Membrane: what a tissue is to ultrasound.
+"""Tissue and Membrane: acoustic parameters.
 
-Six parameters make a tissue (docs/physics.md#5-scatterers): speed of sound, impedance, attenuation, and the
+A tissue has six parameters (docs/physics.md#5-scatterers): speed of sound, impedance, attenuation, and the
 scatterers' mu0, mu1 and sigma0. A scatterer exists where T1 >= mu1 and has amplitude mu0 + sigma0 T0, with T0, T1 ~
 N(0, 1).
 """
@@ -14,11 +14,11 @@ from statistics import NormalDist
 from SlicerUSSim.Logic.base.declaration import Declared, Fit, parameter, parameters_of, short
 from SlicerUSSim.Logic.base.errors import require
 
-_ECHOGENICITY = "Bounds of a fit: echogenicity over some 40 dB"
+_ECHOGENICITY = "Bounds of a fit: some 40 dB of echogenicity"
 
 
 def _is_line(name: object) -> bool:
-    """Whether a name is one that messages and files can show: one line, not empty, without half characters."""
+    """Whether a name can be shown in messages and files: one line, not empty, valid Unicode."""
     if not isinstance(name, str) or not name.strip():
         return False
     return name.splitlines() == [name] and name == name.encode(errors="ignore").decode()
@@ -34,7 +34,7 @@ class Tissue(Declared):
     0.06
     """
 
-    name: str = parameter(label="Tissue", tip="Name of the tissue")
+    name: str = parameter(label="Tissue", tip="Name of the tissue, one line")
     speed_of_sound_m_s: float = parameter(
         label="Speed of sound", tip="Speed of sound", unit="m/s", symbol="c", bounds=(100, 10_000)
     )
@@ -46,11 +46,11 @@ class Tissue(Declared):
         fit=Fit(0.1, 1.2, tolerance=0.1), source="Bounds of a fit: from blood to tendon (Duck 1990)",
     )  # fmt: skip
     mu0: float = parameter(
-        0.0, "Mean amplitude", "Mean amplitude of scatterers", symbol="μ₀", bounds=(-100, 100),
+        0.0, "Mean amplitude", "Mean amplitude of the scatterers", symbol="μ₀", bounds=(-100, 100),
         fit=Fit(0.02, 1.5, tolerance=0.05, is_logarithmic=True), source=_ECHOGENICITY,
     )  # fmt: skip
     mu1: float = parameter(
-        0.0, "Threshold", "Threshold of scatterers: the share 1 - Φ(μ₁) of sites holds one", symbol="μ₁",
+        0.0, "Threshold", "Threshold of scatterers: a fraction 1 - Φ(μ₁) of the sites has one", symbol="μ₁",
         bounds=(-10, 10), fit=Fit(-1.0, 1.5, tolerance=0.1), source=_ECHOGENICITY,
     )  # fmt: skip
     sigma0: float = parameter(
@@ -58,7 +58,7 @@ class Tissue(Declared):
         fit=Fit(0.02, 1.0, tolerance=0.05, is_logarithmic=True), source=_ECHOGENICITY,
     )  # fmt: skip
     sources: Mapping[str, str] = parameter(
-        default_factory=dict, label="Sources", tip="Where the numbers come from, by parameter", compare=False
+        default_factory=dict, label="Sources", tip="Source of each value, by parameter", compare=False
     )
 
     def __post_init__(self) -> None:
@@ -70,7 +70,7 @@ class Tissue(Declared):
 
     @property
     def scatterer_share(self) -> float:
-        """p = 1 - Phi(mu1): the share of lattice sites that hold a scatterer."""
+        """p = 1 - Phi(mu1): the fraction of lattice sites with a scatterer."""
         return 1.0 - NormalDist().cdf(self.mu1)
 
     @property
@@ -84,8 +84,8 @@ class Tissue(Declared):
 class Membrane(Declared):
     """A thin scattering layer along the border between fluid and brain: leptomeninges outside, ependyma inside.
 
-    An MRI shows it as partial volume at best, so the label map cannot hold it; the simulator finds it from the labels,
-    at sub-voxel thickness.
+    It is too thin for the voxels of an MRI and therefore not part of the label map. The simulator derives it from the
+    labels, at sub-voxel thickness.
     """
 
     tissue: Tissue
@@ -93,8 +93,8 @@ class Membrane(Declared):
         1.0, "Thickness", "Thickness of the layer, centred on the border", unit="mm", bounds=(0, 10)
     )
     fluids: tuple[str, ...] = parameter(
-        ("csf", "coupling", "leptomeninges"), "Fluids", "Names of the tissues on its fluid side",
-        note="Thin sulci, whose two sides meet, count as one sheet",
+        ("csf", "coupling", "leptomeninges"), "Fluids", "Names of the tissues on the fluid side",
+        note="A thin sulcus, whose two sides meet, counts as one sheet",
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -105,5 +105,5 @@ class Membrane(Declared):
         return "membrane"
 
 
-#: The parameters that are numbers, in the order of a tissue table.
+#: The numeric parameters, in the order of a tissue table.
 TISSUE_PARAMETERS = tuple(entry for entry in parameters_of(Tissue) if entry.type is float)

@@ -1,6 +1,6 @@
-"""Real ultrasound with its poses: sequences and pose files, the imaged field in images, OpenIGTLink.
+"""Tracked real ultrasound: sequences and pose files, the imaged field in images, OpenIGTLink.
 
-Files are those of Plus, IGSIO, 3D Slicer and the MNI; world frames are RAS millimetres.
+File formats are those of Plus, IGSIO, 3D Slicer and the MNI; world frames are RAS in millimetres.
 """
 
 from typing import TYPE_CHECKING

@@ -1,7 +1,7 @@
-"""estimate_field: what a scanner's images show of its geometry: the imaged field, and the probe that would see it.
+"""estimate_field: the imaged field and the geometry of the probe, estimated from a scanner's images.
 
-Scanners draw the field on black, with rulers, logos and text beside it. The field is the largest connected part of
-what is ever bright; its two straight sides say whether lines are parallel or meet in an apex.
+Scanners show the field on black, with rulers, logos and text beside it. The field is the largest connected region of
+pixels that are bright in any image. Its two straight sides show whether scan lines are parallel or meet at an apex.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from SlicerUSSim.Logic.probe.arrays import Probe, probe_from_dict
 
 _log = logging.getLogger(__name__)
 
-#: Grey levels above this are not the black around the field.
+#: Largest grey level of the black background around the field.
 _DARK = 4
-#: Sides closer to parallel than this belong to a linear array, degrees each.
+#: Sides with a smaller angle to the vertical are those of a linear array, degrees.
 _PARALLEL_DEG = 1.5
-#: Apex radius below this share of the outer one is a phased array.
+#: A phased array has an apex radius below this fraction of the outer radius.
 _POINT_SHARE = 0.06
-#: The estimate has to cover and be covered by what is bright (intersection over union).
+#: Least overlap of the estimated field with the bright region (intersection over union).
 _LEAST_OVERLAP = 0.85
 
 
 @dataclass(frozen=True, eq=False)
 class ImagedField:
-    """The imaged field of an image, as a probe and its place in the image."""
+    """The imaged field of an image, as a probe and its position in the image."""
 
     probe: Probe
-    #: (4, 4) from (column, row, 0, 1) to the probe frame, millimetres
+    #: (4, 4) map from (column, row, 0, 1) to the probe frame in millimetres
     image_to_probe: np.ndarray
-    #: (rows, columns) bool, what lies in the field
+    #: (rows, columns) bool, pixels in the field
     mask: np.ndarray
-    #: How well the field explains what is bright: intersection over union, 1 is perfect; NaN if it was not estimated
+    #: Overlap of the field with the bright region: intersection over union, 1 is perfect; NaN if it was not estimated
     overlap: float = float("nan")
 
     @classmethod
@@ -52,13 +52,13 @@ class ImagedField:
 
     @property
     def window(self) -> tuple[slice, slice]:
-        """Rows and columns that just hold the field. Raises SimulationError if it lies outside the image."""
+        """Smallest range of rows and columns around the field. Raises SimulationError if it is outside the image."""
         rows, columns = (np.flatnonzero(self.mask.any(axis=axis)) for axis in (1, 0))
-        require(rows.size > 0, "the probe's field lies outside the images")
+        require(rows.size > 0, "the probe's field is outside the images, expected an overlap")
         return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
     def outline_pixels(self) -> np.ndarray:
-        """(points, 2) closed outline as (column, row), for drawing."""
+        """(points, 2) closed outline as (column, row)."""
         outline = self.probe.outline_mm()
         points = np.concatenate([outline, np.ones((len(outline), 1))], axis=1) @ np.linalg.inv(self.image_to_probe).T
         return points[:, :2]
@@ -72,18 +72,18 @@ def estimate_field(
     depth_mm: float | None = None,
     **probe_parameters,
 ) -> ImagedField:
-    """The field that images show, and the probe that would see it.
+    """The imaged field in images, and the probe with this field.
 
     Parameters
     ----------
     images : (n, rows, columns) or (rows, columns) uint8, rows away from the probe; more images show more of the field.
-    pixel_spacing_mm : (column, row). Without it, pixels are square and their size follows from the next:
+    pixel_spacing_mm : (column, row). Without it, pixels are square and their size follows from one of these:
     width_mm : of a linear probe's face, or
     depth_mm : of the field along its lines.
-    probe_parameters : of the probe beside its geometry, such as frequency_mhz.
+    probe_parameters : further parameters of the probe, such as frequency_mhz.
 
-    Raises SimulationError where no field is found (black images, or a bright part of another
-    shape), and where nothing says how large a pixel is.
+    Raises SimulationError if no field is found (black images, or a bright region of another shape), or if the pixel
+    size is not known.
     """
     images = np.asarray(images)
     stack = images if images.ndim == 3 else images[None]
@@ -111,8 +111,8 @@ def estimate_field(
     overlap = float((field.mask & bright).sum() / (field.mask | bright).sum())
     require(
         overlap >= _LEAST_OVERLAP,
-        f"the bright part of the images is no probe's field (the best one fits {overlap:.0%}); give the probe and its "
-        "place",
+        f"the bright region of the images is not a probe's field (best overlap {overlap:.0%}); give the probe and its "
+        "position",
     )
     sizes = ", ".join(f"{name} {value:.1f}" for name, value in geometry.items())
     _log.info("field found in the images: %s probe (%s), covers what is bright to %.0f %%", kind, sizes, 100 * overlap)
@@ -122,7 +122,7 @@ def estimate_field(
 
 
 def draw_field(path: str | os.PathLike, image: np.ndarray, field: ImagedField) -> None:
-    """Write a PNG of an image (rows, columns) with the outline of the field drawn in, to check it."""
+    """Write a PNG of an image (rows, columns) with the outline of the field, to check the estimate."""
     from PIL import Image, ImageDraw
 
     picture = Image.fromarray(np.asarray(image, np.uint8)).convert("RGB")
@@ -131,19 +131,19 @@ def draw_field(path: str | os.PathLike, image: np.ndarray, field: ImagedField) -
     x, y = np.linalg.inv(field.image_to_probe)[:2, 3]
     draw.ellipse((x - 4, y - 4, x + 4, y + 4), outline=(255, 90, 60), width=2)  # the centre of the probe's face
     kind = field.probe.to_dict()["kind"]
-    fits = "" if np.isnan(field.overlap) else f", fits {field.overlap:.0%}"
+    fits = "" if np.isnan(field.overlap) else f", overlap {field.overlap:.0%}"
     draw.text((8, picture.height - 16), f"{kind}, {field.probe.depth_mm:.1f} mm deep{fits}", fill=(255, 200, 61))
     with written_whole(path) as partial:
         picture.save(partial)
 
 
 def _field_pixels(brightest: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool: the largest connected bright part, without holes and thin attachments."""
+    """(rows, columns) bool: the largest connected bright region, without holes and thin attachments."""
     bright = ndimage.binary_closing(brightest > _DARK, iterations=3)
     bright = ndimage.binary_opening(bright, structure=np.ones((9, 9)))
-    # What scipy returns depends on arguments, and scipy has no types that say how: hence the casts.
+    # Casts: the return types of scipy's functions depend on their arguments, without type annotations for that.
     labels, count = cast(tuple[np.ndarray, int], ndimage.label(bright))
-    require(count > 0, "the images are black: no field is found")
+    require(count > 0, "the images are black, expected an imaged field")
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     return cast(np.ndarray, ndimage.binary_fill_holes(labels == sizes.argmax()))
@@ -158,21 +158,21 @@ def _sides(bright: np.ndarray, scale: np.ndarray) -> tuple[tuple[float, float], 
     try:
         hull = points[ConvexHull(points).vertices]
     except QhullError:
-        raise SimulationError("the bright part of the images is no probe's field, it has no area") from None
+        raise SimulationError("the bright region of the images is not a probe's field: it has no area") from None
     middle = hull.mean(axis=0)
     found = []
     for is_right in (False, True):
-        # Outer points of each row on this side, between the ends of the side's longest hull edge
+        # Edges of the hull on this side, of which the longest is taken
         ends = [(p, q) for p, q in zip(hull, np.roll(hull, -1, axis=0), strict=True)]
         side = [
             (p, q)
             for p, q in ends
             if (0.5 * (p + q)[0] > middle[0]) == is_right and 3.0 * abs(q[1] - p[1]) > abs(q[0] - p[0])
         ]
-        require(bool(side), "the bright part of the images is no probe's field, it has no sides")
+        require(bool(side), "the bright region of the images is not a probe's field: it has no straight sides")
         p, q = max(side, key=lambda edge: np.hypot(*(edge[1] - edge[0])))
         slope = (q[0] - p[0]) / (q[1] - p[1])
-        # The hull touches only outliers; the line is fitted to all border points near it.
+        # The hull passes through the outermost points only; the line is fitted to all border points near it.
         distance = np.abs(points[:, 0] - p[0] - slope * (points[:, 1] - p[1]))
         low, high = sorted((p[1], q[1]))
         near = (distance < 3.0 * scale[0]) & (points[:, 1] >= low) & (points[:, 1] <= high)
@@ -186,11 +186,11 @@ def _sides(bright: np.ndarray, scale: np.ndarray) -> tuple[tuple[float, float], 
 
 
 def _size_of_pixel(geometry: dict[str, float], **known: float | None) -> float:
-    """Millimetres per pixel from what is known of a geometry in pixels."""
+    """Millimetres per pixel, from one known length of a geometry in pixels."""
     given = {name: value for name, value in known.items() if value is not None}
-    require(len(given) == 1, "nothing says how large a pixel is, expected its spacing, or one of width_mm and depth_mm")
+    require(len(given) == 1, "the pixel size is not known, expected the pixel spacing, or one of width_mm and depth_mm")
     (name, value), *_ = given.items()
-    require(name in geometry, f"{name} is known of linear probes only, this one needs depth_mm or the pixel spacing")
+    require(name in geometry, f"{name} is for linear probes only, expected depth_mm or the pixel spacing for this one")
     require_between("estimate_field", name, value, 1, 400)
     return value / geometry[name]
 
@@ -202,7 +202,7 @@ def _linear(points: np.ndarray, scale: np.ndarray) -> tuple[str, dict[str, float
 
 
 def _sector(points: np.ndarray, left, right, scale) -> tuple[str, dict[str, float], np.ndarray]:
-    require(right[1] > left[1], "the sides of the bright part of the images do not open away from the first row")
+    require(right[1] > left[1], "the sides of the bright region converge, expected a field that widens with depth")
     depth = (left[0] - right[0]) / (right[1] - left[1])
     apex = np.array([left[0] + left[1] * depth, depth])
     half = 0.5 * (np.arctan(right[1]) - np.arctan(left[1]))
@@ -211,15 +211,15 @@ def _sector(points: np.ndarray, left, right, scale) -> tuple[str, dict[str, floa
     in_sides = np.abs(angle) < half
     require(bool(in_sides.any()), "the bright part of the images is no probe's field, it lies beside its own sides")
     radius, angle = radius[in_sides], angle[in_sides]
-    # The face is a circle about the apex: the first bright pixel of each direction, one pixel wide, lies on it, and the
-    # pixel's centre half a pixel behind it on average.
+    # The probe face is a circle about the apex. The first bright pixel of each direction, one pixel wide, lies on it;
+    # the pixel's centre is on average half a pixel deeper.
     directions = max(int(2.0 * half * radius.min() / scale[0]), 20)
     bins = np.minimum((0.5 * (angle / half + 1.0) * directions).astype(int), directions - 1)
     first = np.full(directions, np.inf)
     np.minimum.at(first, bins, radius)
     middle = first[directions // 8 : directions - directions // 8]
     inner = max(float(np.median(middle[np.isfinite(middle)]) - 0.5 * scale[1]), 0.0)
-    # Pixels are spread evenly over the area, so their squared radii are, and the last of them follow from the others.
+    # Pixels are uniform over the area and therefore uniform in squared radius, so a percentile gives the outer radius.
     share = 0.999
     outer = float(np.sqrt(inner**2 + (np.percentile(radius**2, 100.0 * share) - inner**2) / share))
     opening = {"field_of_view_deg": float(2.0 * np.rad2deg(half))}

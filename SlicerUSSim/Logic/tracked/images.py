@@ -1,4 +1,4 @@
-"""TrackedImages: what simulated images are compared with, from a tracked sequence: probe, poses, images, field."""
+"""TrackedImages: real images of a tracked sequence, prepared for comparison: probe, poses, images, imaged field."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _SKEW = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class TrackedImages:
-    """Real images with everything that it takes to simulate the same."""
+    """Real images with the data needed to simulate the same images."""
 
     probe: Probe
-    #: (4, 4) probe_to_ras each
+    #: (4, 4) probe_to_ras of each image
     poses: list[np.ndarray]
-    #: (rows, columns) uint8 each, cropped to the field
+    #: (rows, columns) uint8, each cropped to the field
     images: list[np.ndarray]
-    #: Their pixels in the probe frame
+    #: Pixels of the cropped images in the probe frame
     grid: ImageGrid
     #: (rows, columns) bool, the field in the cropped images
     mask: np.ndarray
-    #: Their numbers in the sequence, and the field in whole images
+    #: Numbers of the images in the sequence, and the field in the uncropped images
     numbers: list[int]
     field: ImagedField
 
@@ -50,29 +50,31 @@ class TrackedImages:
         beam: Probe | None = None,
         most: int | None = None,
     ) -> TrackedImages:
-        """The images of a sequence as a simulator would see them.
+        """Prepare images of a sequence.
 
         Parameters
         ----------
-        numbers : which images (default: all whose pose is known, or `most` of them, evenly spread).
-        path : transform from pixels to the reference frame, in which the patient lies.
-        reference_to_ras : (4, 4) rigid, where that frame is in the MRI (default: the same).
-        probe : known; its place in the image is then taken from ImageToProbe, if the sequence has one in that probe's
-            frame (as those that this package writes), else found in the images. Without it, it is estimated too.
+        numbers : which images (default: all whose pose is known, or `most` of them, evenly distributed).
+        path : transform from pixels to the reference frame, which is fixed to the patient.
+        reference_to_ras : (4, 4) rigid map from that frame to the MRI (default: identity).
+        probe : the probe, if known. Its position in the image is then taken from ImageToProbe, if the sequence has this
+            transform in the probe frame (as in sequences written by this package), or else estimated from the images.
+            Without `probe` the probe is estimated too.
+        beam : probe whose parameters other than the geometry are used for an estimated probe.
 
-        Raises SimulationError for images that do not exist or were not tracked, for a skewed or mirrored calibration, a
-        field that is not found, and images that are all black.
+        Raises SimulationError for images that do not exist or were not tracked, a skewed or mirrored calibration, a
+        field that cannot be estimated, and images that are entirely black.
         """
         require(
             sequence.image_type == "BRIGHTNESS",
-            f"the sequence holds {sequence.image_type} data, expected B-mode images (BRIGHTNESS)",
+            f"the sequence has {sequence.image_type} data, expected B-mode images (BRIGHTNESS)",
         )
         kept = [n for n in range(len(sequence)) if sequence.has_pose(n, path)] if numbers is None else list(numbers)
         if numbers is None and 0 < len(kept) < len(sequence):
             _log.warning("%d of %d images have no %s and are left out", len(sequence) - len(kept), len(sequence), path)
         if numbers is None and most is not None and len(kept) > most:
             kept = [kept[place] for place in np.linspace(0, len(kept) - 1, most).round().astype(int)]
-        # With none tracked, the first says what is missing.
+        # If no image was tracked, the error for the first one names the missing transform.
         matrices = [sequence.pose(number, path) for number in kept or [0]]
         chosen = sequence.select(kept)
         if numbers is None:
@@ -138,7 +140,7 @@ def _located_field(
         return estimate_field(images, spacing, **known)
     if all("ImageToProbe" in entry for entry in sequence.transforms):
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
-        # In this package's probe frame it is upright and lies in the plane; a tracker's marker is anywhere.
+        # In this package's probe frame the image is upright and in the plane z = 0; a tracker's marker can be anywhere.
         upright = np.diag([*spacing, 1.0, 1.0])
         upright[:, 3] = image_to_probe[:, 3]
         upright[2, 2] = image_to_probe[2, 2]
@@ -151,19 +153,19 @@ def _located_field(
     kinds = found.probe.to_dict()["kind"], probe.to_dict()["kind"]
     require(
         kinds[0] == kinds[1] or {"convex", "phased"} == set(kinds),
-        f"the images show the field of a {kinds[0]} probe, but the probe given is {kinds[1]}",
+        f"the probe is {kinds[1]}, expected {kinds[0]} as in the images",
     )
     depth = found.probe.depth_mm
     if abs(depth - probe.depth_mm) > 0.1 * depth:
         raise SimulationError(
-            f"the images show a field {depth:.1f} mm deep, but the probe given sees {probe.depth_mm:g} mm; check the "
+            f"the probe's depth is {probe.depth_mm:g} mm, expected {depth:.1f} mm as in the images; check the "
             "calibration"
         )
     return replace(ImagedField.of(probe, found.image_to_probe, images.shape[1:]), overlap=found.overlap)
 
 
 def _probe_pose(image_to_world: np.ndarray, field: ImagedField, path: str) -> np.ndarray:
-    """(4, 4) rigid probe_to_world: an image has pixels as its unit, the probe frame millimetres."""
+    """(4, 4) rigid probe_to_world from (4, 4) image_to_world; the image frame is in pixels, the probe frame in mm."""
     in_pixels = np.linalg.inv(field.image_to_probe)
     pose = np.eye(4)
     for axis in range(2):

@@ -1,6 +1,6 @@
-"""TrackerLink: probe poses in and simulated images out over OpenIGTLink, through drop-outs, with pyigtl's messages.
+"""TrackerLink: receives probe poses and sends images over OpenIGTLink, with reconnection; uses pyigtl's messages.
 
-pyigtl's own client and server notice a peer that has gone only when they fail to send to it; hence a loop of our own.
+pyigtl's client and server detect a lost peer only when sending to it fails, so TrackerLink has a loop of its own.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from SlicerUSSim.Logic.base.volume import Volume
 
 _log = logging.getLogger(__name__)
 
-#: OpenIGTLink's usual port.
+#: The default port of OpenIGTLink.
 DEFAULT_PORT = 18944
-#: Seconds until the next try after a connection was lost or refused; until a peer that stops in mid-message is dropped.
+#: Seconds between attempts to connect; seconds until a peer that stops within a message is disconnected.
 _RETRY_S, _STALLED_S = 0.25, 5.0
-#: No transform, image or string that concerns us is larger; whoever says so does not speak OpenIGTLink.
+#: Limit of the message size; a larger size in a header means that the data are not OpenIGTLink.
 _LARGEST_BYTES = 1 << 28
 
 #: A name or IPv4 address, or an IPv6 address in brackets.
@@ -39,7 +39,7 @@ class Address(NamedTuple):
 
     host: str
     port: int
-    #: Whether it is ours, where we wait for the other end to connect
+    #: Whether this is the local end, which waits for the peer to connect
     listen: bool
 
     def __str__(self) -> str:
@@ -47,9 +47,9 @@ class Address(NamedTuple):
 
 
 def parse_address(text: str) -> Address:
-    """What --igtl says: HOST:PORT to connect to, :PORT to wait on loopback, listen:HOST:PORT to wait at an address.
+    """Parse --igtl: HOST:PORT to connect to, :PORT to wait on loopback, listen:HOST:PORT to wait at an address.
 
-    IPv6 hosts are in brackets: [::1]:18944. Raises SimulationError for other text.
+    IPv6 hosts are in brackets: [::1]:18944. Raises SimulationError for an invalid address.
     """
     match = _ADDRESS.fullmatch(text)
     require(
@@ -63,23 +63,24 @@ def parse_address(text: str) -> Address:
 
 
 def require_usable(address: Address) -> None:
-    """Raise SimulationError where a TrackerLink could not be made: without pyigtl, or where nobody can listen."""
+    """Raise SimulationError if pyigtl is missing, or if it is not possible to listen at the address."""
     _require_pyigtl()
     if address.listen:
         _listening(address).close()
 
 
 class TrackerLink:
-    """One OpenIGTLink connection that is kept up until stop().
+    """An OpenIGTLink connection that is maintained until stop().
 
     Parameters
     ----------
-    host, port : of the other end, or with `listen` our own.
-    moved : told every pose, (4, 4) probe_to_ras in mm, and told in the link's own thread.
-    device : name of the TRANSFORM to follow (default: the first that comes).
-    listen : wait for the other end to connect, instead of connecting to it.
+    host, port : of the peer, or with `listen` the local address.
+    moved : called with every pose, (4, 4) probe_to_ras in mm, in the thread of the link.
+    device : name of the TRANSFORM to follow (default: the first received).
+    listen : wait for the peer to connect, instead of connecting to it.
+    image_name : device name of the IMAGE messages.
 
-    Raises SimulationError without pyigtl, and with `listen` for a port that is taken.
+    Raises SimulationError without pyigtl, and with `listen` for a port that is in use.
     """
 
     def __init__(
@@ -95,15 +96,15 @@ class TrackerLink:
         self._address, self._moved = Address(host, port, listen), moved
         _require_pyigtl()
         self._device, self._image_name = device, image_name
-        #: What to tell the user
+        #: State of the connection, for display
         self.status = ""
-        #: Poses that came, images that went
+        #: Numbers of poses received and images sent
         self.received = self.sent = 0
         self._refused = 0  # poses since the last that was used
         self._passed_over: set[str] = set()
         self._outgoing: bytes | None = None
         self._lock = threading.Lock()
-        # Wakes the loop for an image to send, or to stop.
+        # Wakes the loop to send an image or to stop.
         self._wake_out, self._wake_in = socket.socketpair()
         self._wake_in.setblocking(False)
         self._stopping = False
@@ -112,7 +113,7 @@ class TrackerLink:
         self._thread.start()
 
     def send(self, image: Volume) -> None:
-        """Send an image with its place (RAS); one that still waits to be sent is replaced."""
+        """Send an image with its position (RAS); an image that is still waiting to be sent is replaced."""
         from pyigtl import ImageMessage
 
         message = ImageMessage(
@@ -123,7 +124,7 @@ class TrackerLink:
         self._wake()
 
     def stop(self) -> None:
-        """Close the connection and wait until nothing more comes; once more does nothing."""
+        """Close the connection and wait for its thread to end; further calls have no effect."""
         if self._stopping:
             return
         self._stopping = True
@@ -133,7 +134,7 @@ class TrackerLink:
             if end is not None:
                 end.close()
 
-    # ---- the loop, in its own thread ---------------------------------------------------------------------------
+    # ---- the loop, in a separate thread ------------------------------------------------------------------------
 
     def _run(self) -> None:
         while not self._stopping:
@@ -144,10 +145,10 @@ class TrackerLink:
                 with peer:
                     self._serve(peer)
             except (OSError, ValueError, SimulationError) as error:
-                self._say(f"{self._peer_name} was lost ({error}), trying again", logging.WARNING)
+                self._say(f"connection to {self._peer_name} lost ({error}), reconnecting", logging.WARNING)
                 self._wait(_RETRY_S)
-            except Exception as error:  # a message that cannot be understood: whoever sent it is not worth listening to
-                self._say(f"{self._peer_name} sent what is not OpenIGTLink ({error}), trying again", logging.WARNING)
+            except Exception as error:  # a message that cannot be parsed: drop the connection
+                self._say(f"invalid OpenIGTLink data from {self._peer_name} ({error}), reconnecting", logging.WARNING)
                 self._wait(_RETRY_S)
 
     def _say(self, status: str, level: int = logging.INFO) -> None:
@@ -188,7 +189,7 @@ class TrackerLink:
 
         header = MessageBase.parse_header(_exactly(peer, MessageBase.IGTL_HEADER_SIZE))
         size = header["body_size"]
-        require(size <= _LARGEST_BYTES, f"a message claims {size} bytes")
+        require(size <= _LARGEST_BYTES, f"message size is {size} bytes, expected at most {_LARGEST_BYTES}")
         body = _exactly(peer, size)
         if header["message_type"] != "TRANSFORM":
             self._notice(f"messages of type {header['message_type']!s} are passed over")
@@ -203,7 +204,7 @@ class TrackerLink:
             return
         try:
             pose = check_rigid(f"transform {message.device_name!r}", _orthonormal(message.matrix))
-        except SimulationError as error:  # a tracker that loses sight of its tool may send anything
+        except SimulationError as error:  # a tracker may send any matrix while it does not see its tool
             self._refuse(str(error))
             return
         following = f"connected to {self._peer_name}, following {self._device}"
@@ -227,7 +228,7 @@ class TrackerLink:
 
     @property
     def _peer_name(self) -> str:
-        return "the other end" if self._listener is not None else str(self._address)
+        return "the client" if self._listener is not None else str(self._address)
 
     def _wake(self) -> None:
         self._wake_out.send(b"!")
@@ -254,28 +255,28 @@ def _require_pyigtl() -> None:
 
 
 def _listening(address: Address) -> socket.socket:
-    """A socket that waits there. Raises SimulationError where that cannot be."""
+    """A socket that listens at an address. Raises SimulationError if that is not possible."""
     try:
         family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
         return socket.create_server((address.host, address.port), family=family)
     except OSError as error:
-        raise SimulationError(f"cannot wait for a tracker at {address} ({error}); choose another") from None
+        raise SimulationError(f"cannot wait for a tracker at {address} ({error}); choose another address") from None
 
 
 def _exactly(peer: socket.socket, count: int) -> bytes:
-    """So many bytes, or ConnectionError where the other end closes before."""
+    """Read exactly `count` bytes. Raises ConnectionError if the peer closes the connection before."""
     parts, missing = [], count
     while missing:
         part = peer.recv(min(missing, 1 << 20))
         if not part:
-            raise ConnectionError("closed by the other end")
+            raise ConnectionError("closed by the peer")
         parts.append(part)
         missing -= len(part)
     return b"".join(parts)
 
 
 def _orthonormal(matrix: np.ndarray) -> np.ndarray:
-    """Single precision leaves a rotation slightly off; one that is not near a rotation stays as it is."""
+    """Correct rounding errors of a rotation in single precision; other matrices are returned unchanged."""
     matrix = np.array(matrix, float)
     if np.isfinite(matrix).all():
         rotation = nearest_rotation(matrix[:3, :3])

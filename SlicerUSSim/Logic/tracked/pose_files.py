@@ -1,4 +1,4 @@
-"""Probe poses in files: JSON, plain text, and ITK transforms as 3D Slicer saves them."""
+"""Files of probe poses: JSON, plain text, and ITK transforms as written by 3D Slicer; MNI transforms and tags."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _ITK_SUFFIXES = (".tfm", ".h5", ".hdf5", ".mat")
 def read_pose(path: str | os.PathLike) -> np.ndarray:
     """(4, 4) probe_to_ras from a file.
 
-    JSON holds {"probe_to_ras": [[...], ...]} or the bare matrix; a text file sixteen numbers by rows. ITK files (.tfm,
-    .h5, .mat, .txt) hold, as Slicer writes a linear transform, the map from world to probe in LPS.
-    Raises SimulationError for anything else and for a matrix that is not rigid.
+    A JSON file contains {"probe_to_ras": [[...], ...]} or only the matrix; a text file sixteen numbers by rows. An ITK
+    file (.tfm, .h5, .mat, .txt) contains the map from world to probe in LPS, as Slicer writes a linear transform.
+    Raises SimulationError for other files and for a matrix that is not rigid.
     """
     path = Path(path)
     require(path.is_file(), f"{path}: no such file")
@@ -43,9 +43,9 @@ def read_pose(path: str | os.PathLike) -> np.ndarray:
 
 
 def read_matrix(path: str | os.PathLike) -> np.ndarray:
-    """(4, 4) affine matrix from a text file of sixteen numbers by rows, or JSON rows; it may scale, as calibrations do.
+    """(4, 4) affine matrix, such as a calibration, from a text file of sixteen numbers by rows or from JSON rows.
 
-    Raises SimulationError for anything else.
+    The matrix may scale. Raises SimulationError for other files.
     """
     path = Path(path)
     require(path.is_file(), f"{path}: no such file")
@@ -62,12 +62,12 @@ def _numbers(path: Path) -> np.ndarray:
         numbers = np.array(path.read_text().replace(",", " ").split(), float)
     except (ValueError, UnicodeDecodeError):
         raise SimulationError(f"{path}: is not a pose, expected 16 numbers by rows, JSON or an ITK transform") from None
-    require(numbers.size == 16, f"{path}: holds {numbers.size} numbers, expected 16 (a 4x4 matrix by rows)")
+    require(numbers.size == 16, f"{path}: has {numbers.size} numbers, expected 16 (a 4x4 matrix by rows)")
     return numbers.reshape(4, 4)
 
 
 def write_pose(path: str | os.PathLike, probe_to_ras: np.ndarray) -> None:
-    """Write a pose as JSON, whole or not at all."""
+    """Write a pose as JSON; an existing file is replaced only when the new one is complete."""
     write_json(path, {"probe_to_ras": np.asarray(probe_to_ras).tolist()})
 
 
@@ -86,7 +86,7 @@ def _read_itk(path: Path) -> np.ndarray:
             f"{path}: cannot be read as a transform ({str(error).splitlines()[-1].strip()})"
         ) from None
     require(transform.IsLinear(), f"{path}: the transform is not linear, expected a rigid one")
-    # A linear map is known from where it takes the origin and the axes.
+    # A linear map is determined by the images of the origin and the axes.
     origin = np.array(transform.TransformPoint((0.0, 0.0, 0.0)))
     world_to_probe = np.eye(4)
     for axis, unit in enumerate(np.eye(3)):
@@ -97,9 +97,9 @@ def _read_itk(path: Path) -> np.ndarray:
 
 
 def read_transform(path: str | os.PathLike) -> np.ndarray:
-    """(4, 4) affine map from a file: whatever read_pose reads, or a linear MNI .xfm, which may scale.
+    """(4, 4) affine map from a file: all formats of read_pose, or a linear MNI .xfm, which may scale.
 
-    Raises SimulationError for anything else.
+    Raises SimulationError for other files.
     """
     path = Path(path)
     if path.suffix.lower() == ".xfm":
@@ -108,9 +108,9 @@ def read_transform(path: str | os.PathLike) -> np.ndarray:
 
 
 def read_tags(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray | None]:
-    """((n, 3), (n, 3) or None) RAS points of an MNI .tag file, as BITE and RESECT mark landmarks in one or two volumes.
+    """((n, 3), (n, 3) or None) RAS points of an MNI .tag file: landmarks in one or two volumes, as in BITE and RESECT.
 
-    Raises SimulationError for a file that is none.
+    Raises SimulationError for other files.
     """
     path = Path(path)
     text = _mni_text(path, "MNI Tag Point File")
@@ -126,7 +126,7 @@ def read_tags(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray | None]:
             rows.append([float(number) for number in numbers[:per_point]])
         else:
             require(not numbers, f"{path}: a point has {len(numbers)} numbers, expected {per_point}")
-    require(bool(rows), f"{path}: holds no points")
+    require(bool(rows), f"{path}: has no points, expected at least one")
     array = np.array(rows)
     return array[:, :3], (array[:, 3:] if per_point == 6 else None)
 
@@ -135,15 +135,15 @@ def _read_xfm(path: Path) -> np.ndarray:
     text = _mni_text(path, "MNI Transform File")
     kind = re.search(r"Transform_Type\s*=\s*(\w+)", text)
     name = kind.group(1) if kind else "none"
-    require(name == "Linear", f"{path}: holds a transform of type {name}, expected Linear")
+    require(name == "Linear", f"{path}: the transform type is {name}, expected Linear")
     match = re.search(r"Linear_Transform\s*=([^;]*);", text)
     numbers = match.group(1).split() if match else []
-    require(len(numbers) == 12, f"{path}: holds {len(numbers)} numbers, expected 12 (a 3x4 matrix by rows)")
+    require(len(numbers) == 12, f"{path}: has {len(numbers)} numbers, expected 12 (a 3x4 matrix by rows)")
     matrix = np.eye(4)
     try:
         matrix[:3] = np.array(numbers, float).reshape(3, 4)
     except ValueError:
-        raise SimulationError(f"{path}: Linear_Transform is not made of numbers") from None
+        raise SimulationError(f"{path}: Linear_Transform is not numeric, expected 12 numbers") from None
     if re.search(r"Invert_Flag\s*=\s*True", text):
         _log.info("%s: Invert_Flag is set, the matrix is inverted", path)
         matrix = np.linalg.inv(matrix)

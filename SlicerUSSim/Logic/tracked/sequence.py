@@ -1,9 +1,9 @@
-"""TrackedSequence: ultrasound images with the transforms that a tracker measured for each.
+"""TrackedSequence: ultrasound images, each with the transforms measured by a tracker.
 
-Files are the sequence metafiles of Plus and IGSIO, which 3D Slicer reads too: MetaImage or NRRD with fields such as
-Seq_Frame0003_ProbeToTrackerTransform. Transforms take homogeneous column vectors; the frame called Image counts pixels
-(column, row, 0, 1) of the image as it is here, oriented MF: columns towards the marked side of the probe, rows away
-from it. World frames are RAS millimetres, as those programs take them.
+The files are sequence metafiles of Plus and IGSIO, which 3D Slicer reads too: MetaImage or NRRD with fields such as
+Seq_Frame0003_ProbeToTrackerTransform. Transforms apply to homogeneous column vectors. Coordinates in the frame called
+Image are pixels (column, row, 0, 1) of the image in memory, which has the orientation MF: columns towards the marked
+side of the probe, rows away from the probe. World frames are RAS in millimetres, as in those programs.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from SlicerUSSim.Logic.base.volume import Volume
 
 _log = logging.getLogger(__name__)
 
-#: Names that `write` accepts.
+#: File name endings that `write` accepts.
 SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".mhd", ".seq.nrrd", ".nrrd")
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 _ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
 _OK = "OK"
-#: What ITK and NRRD files hold beside the fields of a sequence.
+#: Fields of ITK and NRRD files that do not belong to a sequence.
 _NOT_OURS = (
     "ITK_", "Kinds", "Modality", "NRRD_", "ObjectType", "AnatomicalOrientation", "type", "dimension", "space", "sizes",
     "kinds", "endian", "encoding", "measurement frame", "centers", "spacings", "thicknesses", "axis", "labels", "units",
@@ -42,7 +42,7 @@ _OPPOSITE = {"M": "U", "U": "M", "F": "N", "N": "F"}
 class TrackedSequence:
     """Tracked images of one sweep.
 
-    Raises SimulationError if images, transforms and timestamps are not as many, and for matrices that are not 4x4.
+    Raises SimulationError if the numbers of images, transforms and timestamps differ, or for matrices that are not 4x4.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic import TrackedSequence
@@ -57,9 +57,9 @@ class TrackedSequence:
     1
     """
 
-    #: [n, row, column]; for RF data [n, scan line, sample]
+    #: [n, row, column], or [n, scan line, sample] for RF data
     images: np.ndarray
-    #: {"ProbeToTracker": (4, 4), ...} for each image; what was not tracked is missing
+    #: {"ProbeToTracker": (4, 4), ...} for each image, without transforms that were not tracked
     transforms: tuple[Mapping[str, np.ndarray], ...]
     #: Seconds
     timestamps: np.ndarray
@@ -93,14 +93,14 @@ class TrackedSequence:
     # ---- poses -------------------------------------------------------------------------------------------------
 
     def frames_of_reference(self) -> list[str]:
-        """The coordinate frames that the transforms connect."""
+        """The coordinate frames connected by the transforms."""
         return sorted({end for entry in self.transforms for name in entry for end in _ends(name)})
 
     def pose(self, number: int, name: str) -> np.ndarray:
-        """(4, 4) transform of image `number`, such as ImageToReference: measured, or composed of measured ones and
-        their inverses along the shortest path.
+        """(4, 4) transform of image `number`, such as ImageToReference: measured, or composed of measured transforms
+        and their inverses along the shortest path.
 
-        Raises SimulationError for an image that does not exist and where no path leads from one frame to the other.
+        Raises SimulationError for an image that does not exist, or if no path connects the two frames.
         """
         return self._composed(number, name)[0]
 
@@ -138,7 +138,7 @@ class TrackedSequence:
         return found[target]
 
     def has_pose(self, number: int, name: str) -> bool:
-        """Whether `pose` knows this transform of this image: whether it was tracked."""
+        """Whether `pose` can give this transform of this image, that is, whether it was tracked."""
         try:
             self.pose(number, name)
         except SimulationError:
@@ -146,7 +146,7 @@ class TrackedSequence:
         return True
 
     def with_transforms(self, constant: Mapping[str, np.ndarray]) -> TrackedSequence:
-        """The same with transforms that are the same for all images: a calibration, a registration."""
+        """The sequence with additional transforms that are constant over all images: a calibration, a registration."""
         constant = {name: _matrix(name, matrix) for name, matrix in constant.items()}
         for name in constant:
             replaced = any(name in entry for entry in self.transforms)
@@ -156,7 +156,7 @@ class TrackedSequence:
         return replace(self, transforms=tuple({**entry, **constant} for entry in self.transforms))
 
     def select(self, numbers: Sequence[int]) -> TrackedSequence:
-        """Only these images. Raises SimulationError for one that does not exist."""
+        """The sequence of only these images. Raises SimulationError for images that do not exist."""
         count = len(self)
         for number in numbers:
             require(
@@ -174,7 +174,7 @@ class TrackedSequence:
         )
 
     def with_images(self, numbers: Sequence[int], images: np.ndarray) -> TrackedSequence:
-        """The images `numbers` with other pixels [n, row, column]; transforms and times stay theirs."""
+        """The images `numbers` with other pixels [n, row, column], and with their original transforms and times."""
         return replace(self.select(numbers), images=images)
 
     def _asked_ends(self, name: str, known: set[str]) -> tuple[str, str]:
@@ -189,8 +189,8 @@ class TrackedSequence:
     def read(cls, path: str | os.PathLike) -> TrackedSequence:
         """Read a sequence metafile (.igs.mha, .seq.mha, .mhd, .nrrd), compressed or not, in any image orientation.
 
-        A transform whose status is not OK was not tracked and is left out. Colours become grey.
-        Raises SimulationError for a file that is missing, unreadable or none of these.
+        Transforms whose status is not OK were not tracked and are omitted. Colours are converted to grey levels.
+        Raises SimulationError for a file that is missing, unreadable or of another format.
         """
         path = Path(path)
         require(path.is_file(), f"{path}: no such file")
@@ -199,9 +199,10 @@ class TrackedSequence:
         return _from_header(array, header, str(path))
 
     def write(self, path: str | os.PathLike, compress: bool = True) -> None:
-        """Write a sequence metafile whole or not at all; the format follows from the name (SEQUENCE_SUFFIXES).
+        """Write a sequence metafile; the format follows from the name (SEQUENCE_SUFFIXES).
 
-        Raises SimulationError for another name and where the file cannot be written.
+        An existing file is replaced only when the new one is complete. Raises SimulationError for another name, or if
+        the file cannot be written.
         """
         path = Path(path)
         require_sequence_name(path)
@@ -230,15 +231,15 @@ class TrackedSequence:
 
     @classmethod
     def from_slices(cls, paths: Iterable[str | os.PathLike]) -> TrackedSequence:
-        """From one image file per slice, each with its place in the patient, as the MNI's BITE has them (MINC 1 or 2).
+        """From one image file per slice with its position in the patient, as in the MNI's BITE database (MINC 1 or 2).
 
-        ImageToReference of each is the file's own geometry. Raises SimulationError for files that are not one slice
-        each, or not of one size.
+        ImageToReference of each image is the geometry of its file. Raises SimulationError for files that do not contain
+        exactly one slice each, or differ in size.
         """
         slices = [_read_slice(Path(path)) for path in paths]
         require(bool(slices), "no slice, expected at least one file")
         shapes = {image.shape for image, _ in slices}
-        require(len(shapes) == 1, f"the slices have the sizes {sorted(shapes)}, expected one")
+        require(len(shapes) == 1, f"the slices have the sizes {sorted(shapes)}, expected one size")
         images = np.stack([image for image, _ in slices])
         if images.dtype != np.uint8:
             top = float(images.max())
@@ -248,9 +249,10 @@ class TrackedSequence:
 
     @classmethod
     def from_volume(cls, volume: Volume, probe, poses: Iterable[np.ndarray], image_size=None) -> TrackedSequence:
-        """Slices of a 3D ultrasound volume (such as RESECT's) where a probe at these (4, 4) probe_to_ras would see.
+        """Slices of a 3D ultrasound volume (such as RESECT's) in the image planes of a probe at (4, 4) probe_to_ras.
 
-        ProbeToReference are the poses, ImageToProbe is that of the probe's image. Outside the field images are black.
+        ProbeToReference are the poses, ImageToProbe is that of the probe's image. Outside the imaged field the images
+        are black.
         """
         from SlicerUSSim.Logic.base.transforms import check_rigid
         from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -266,7 +268,7 @@ class TrackedSequence:
 
 
 def require_sequence_name(path: Path) -> None:
-    """Raise SimulationError unless TrackedSequence.write knows the format that the name stands for."""
+    """Raise SimulationError unless TrackedSequence.write supports the format of this file name."""
     require(
         path.name.lower().endswith(SEQUENCE_SUFFIXES),
         f"{path}: unknown sequence format, expected a name ending in one of {', '.join(SEQUENCE_SUFFIXES)}",
@@ -274,9 +276,9 @@ def require_sequence_name(path: Path) -> None:
 
 
 def frame_numbers(text: str, count: int) -> list[int]:
-    """Numbers of images from text: 0,5,10, or from:to:step as in Python, or both.
+    """Numbers of images from a text: 0,5,10, or start:stop:step as in Python, or both.
 
-    Raises SimulationError for text that is neither and for a choice of none of `count` images.
+    Raises SimulationError for other text, and if it selects none of the `count` images.
     """
     numbers: list[int] = []
     for part in text.split(","):
@@ -285,16 +287,16 @@ def frame_numbers(text: str, count: int) -> list[int]:
                 numbers += range(count)[slice(*(int(end) if end.strip() else None for end in part.split(":")))]
             else:
                 numbers.append(int(part))
-        except (TypeError, ValueError):  # no numbers; more than three of them; a step of 0
-            raise SimulationError(f"frames are {text!r}, expected such as 0,5,10 or 0:20:5") from None
-    require(bool(numbers), f"frames {text} choose none of the {count} images, expected at least one")
+        except (TypeError, ValueError):  # not numbers; more than three; a step of 0
+            raise SimulationError(f"frames are {text!r}, expected numbers such as 0,5,10 or 0:20:5") from None
+    require(bool(numbers), f"frames are {text!r}, expected at least one of the {count} images")
     return numbers
 
 
 def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """{"ImageToProbe": (4, 4), ...} of the <CoordinateDefinitions> in a Plus configuration file (XML).
+    """{"ImageToProbe": (4, 4), ...} from the <CoordinateDefinitions> of a Plus configuration file (XML).
 
-    Raises SimulationError for a file that is none, and for a matrix that is not 4x4.
+    Raises SimulationError for other files, and for a matrix that is not 4x4.
     """
     from xml.etree import ElementTree
 
@@ -318,9 +320,9 @@ def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray
 
 
 def _ends(name: str) -> tuple[str, str]:
-    """Frames of a transform in a file: split at the last To that leaves a capital letter behind it."""
+    """Frames of a transform in a file: the name is split at the last To followed by a capital letter or digit."""
     splits = [m for m in re.finditer(r"To(?=[A-Z0-9])", name) if m.start() > 0]
-    require(bool(splits), f"transform is called {name!r}, expected two frames joined by To, such as ProbeToTracker")
+    require(bool(splits), f"transform is {name!r}, expected two frames joined by To, such as ProbeToTracker")
     return name[: splits[-1].start()], name[splits[-1].end() :]
 
 
@@ -339,12 +341,12 @@ def _numbers(name: str, text: str) -> np.ndarray:
         values = np.array(text.split(), float)
     except ValueError:
         raise SimulationError(f"{name} is {text.strip()[:40]!r}, expected 16 numbers") from None
-    require(values.size == 16, f"{name} holds {values.size} numbers, expected 16")
+    require(values.size == 16, f"{name} has {values.size} numbers, expected 16")
     return _matrix(name, values.reshape(4, 4))
 
 
 def _from_header(array: np.ndarray, header: Mapping[str, str], source: str) -> TrackedSequence:
-    """From [n, y, x] pixels as the file has them, and its fields."""
+    """A sequence from the [n, y, x] pixels of a file and its header fields."""
     count = len(array)
     transforms: list[dict] = [{} for _ in range(count)]
     others: list[dict] = [{} for _ in range(count)]
@@ -357,7 +359,7 @@ def _from_header(array: np.ndarray, header: Mapping[str, str], source: str) -> T
                 fields[key] = text
             continue
         number, name = int(match.group(1)), match.group(2)
-        require(number < count, f"{source}: has {key}, but {count} images")
+        require(number < count, f"{source}: has the field {key}, expected numbers below {count}, the number of images")
         if name.endswith("TransformStatus"):
             continue
         if name.endswith("Transform"):
@@ -378,8 +380,8 @@ def _from_header(array: np.ndarray, header: Mapping[str, str], source: str) -> T
     if left_out:
         _log.info("%s: %d transforms were not tracked (their status is not OK) and are left out", source, left_out)
     if not np.isfinite(timestamps).all():
-        _log.info("%s: has images without a time, which take their number for it", source)
-    # A file without times still has an order.
+        _log.info("%s: some images have no timestamp; their number is used instead", source)
+    # Without timestamps the order of the images is used.
     timestamps = np.where(np.isfinite(timestamps), timestamps, np.arange(count))
     for key, default in ((_TYPE, "BRIGHTNESS"), (_ORIENTATION, "rows away from the probe, columns to its mark")):
         if key not in header:
@@ -392,15 +394,15 @@ def _from_header(array: np.ndarray, header: Mapping[str, str], source: str) -> T
 
 
 def _oriented(array: np.ndarray, orientation: str, wanted: str, source: str) -> np.ndarray:
-    """[n, y, x] images whose axes x, y point as `orientation` says, turned to `wanted`."""
+    """[n, y, x] images, transposed and flipped from `orientation` of the axes x, y to `wanted`."""
     letters = orientation[:2]
     known = len(orientation) in (2, 3) and any(letters in (a + b, b + a) for a in "MU" for b in "FN")
     if orientation in ("XX", "XXX"):
         _log.info("%s: its orientation is unknown (%s), images stay as they are", source, orientation)
         return array
-    require(known, f"{source}: {_ORIENTATION} is {orientation!r}, expected such as MF, UF, MN or MFA")
+    require(known, f"{source}: {_ORIENTATION} is {orientation!r}, expected a code such as MF, UF, MN or MFA")
     if letters != wanted:
-        _log.info("%s: images are turned from %s to %s", source, letters, wanted)
+        _log.info("%s: images are reoriented from %s to %s", source, letters, wanted)
     if letters[0] not in (wanted[0], _OPPOSITE[wanted[0]]):
         array, letters = array.swapaxes(1, 2), letters[::-1]
     if letters[0] != wanted[0]:
@@ -411,13 +413,13 @@ def _oriented(array: np.ndarray, orientation: str, wanted: str, source: str) -> 
 
 
 def _as_images(array: np.ndarray, components: int, source: str) -> np.ndarray:
-    """[n, y, x] from an array with or without a slice axis of one, and a last axis of colours if components > 1."""
+    """[n, y, x] from an array with or without a slice axis of length 1, and with a colour axis if components > 1."""
     if components > 1:
         require(components in (3, 4), f"{source}: has {components} components per pixel, expected 1 or colours")
         _log.info("%s: colours become grey (ITU-R BT.601)", source)
         array = (array[..., :3] @ np.array([0.299, 0.587, 0.114])).round().astype(array.dtype)  # ITU-R BT.601
     if array.ndim == 4:
-        require(array.shape[1] == 1, f"{source}: holds volumes of {array.shape[1]} slices, expected images")
+        require(array.shape[1] == 1, f"{source}: has volumes of {array.shape[1]} slices, expected images")
         array = array[:, 0]
     if array.ndim == 2:
         array = array[None]
@@ -462,7 +464,7 @@ def _read_nrrd(path: Path) -> tuple[np.ndarray, dict[str, str]]:
             array = np.moveaxis(array, axis, 0)
         elif "color" in kind.lower() or "vector" in kind.lower():
             array, components = np.moveaxis(array, axis, -1), array.shape[axis]
-    # Plus writes the two general fields in words of NRRD's own style.
+    # Plus writes the two general fields in the style of NRRD.
     names = {"ultrasound image orientation": _ORIENTATION, "ultrasound image type": _TYPE}
     return _as_images(array, components, str(path)), {
         names.get(key, key): value for key, value in header.items() if isinstance(value, str)
@@ -484,7 +486,7 @@ def _write_nrrd(path: Path, images: np.ndarray, header: Mapping[str, str], compr
 
 
 def _read_slice(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """((rows, columns), image_to_ras) of a file that holds one slice: the axis of one sample may be any."""
+    """((rows, columns), image_to_ras) of a file with one slice, whose axis of length 1 may be any of the three."""
     from SlicerUSSim.Logic.base.volume import read_array
 
     array, ijk_to_ras = read_array(path)

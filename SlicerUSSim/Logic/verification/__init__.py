@@ -1,6 +1,6 @@
-"""Is it right, and is it fast: phantoms, measurements, validation, twins, benchmark, a model in numpy.
+"""Verification and benchmarks: phantoms, measurements, validation, twins, benchmark, numpy model.
 
-Nothing outside of this room imports it but the commands that run it.
+Only the commands that run it import this room.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""What can be measured in a frame: levels, places and widths of echoes, correlations, the Rayleigh fit."""
+"""Measurements in a frame: levels, positions and widths of echoes, correlations, the Rayleigh fit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.probe.arrays import Probe
 
 
 def level_db(signal: np.ndarray) -> float:
-    """Mean power in dB; -300 for silence."""
+    """Mean power in dB; -300 for a signal of zeros."""
     return float(10.0 * np.log10(max((np.abs(signal) ** 2).mean(), 1e-30)))
 
 
@@ -22,7 +22,7 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def sample_positions(frame: Frame, probe: Probe) -> tuple[np.ndarray, np.ndarray]:
-    """((scan_lines, samples) lateral, likewise depth) of every sample in the probe frame, millimetres."""
+    """(lateral (scan_lines, samples), depth (scan_lines, samples)) of every sample in the probe frame, millimetres."""
     along = np.arange(frame.iq.shape[1]) * frame.sample_interval_mm
     origins, directions = probe.origins_mm(), probe.directions()
     return tuple(origins[:, a, None] + along * directions[:, a, None] for a in (0, 1))
@@ -39,22 +39,22 @@ def region_level_db(frame: Frame, probe: Probe, region_mm: tuple[float, float, f
     x, y = sample_positions(frame, probe)
     left, right, top, bottom = region_mm
     inside = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
-    require(bool(inside.any()), f"no sample lies in the region {region_mm} mm of the probe frame")
+    require(bool(inside.any()), f"region is {region_mm} mm in the probe frame, expected samples in it")
     return level_db(frame.iq[inside])
 
 
 def echo_near(
     frame: Frame, probe: Probe, place_mm: tuple[float, float], within_mm: float
 ) -> tuple[float, float, float]:
-    """(lateral mm, depth mm, amplitude) of the strongest echo within a distance of a place (lateral, depth).
+    """(lateral mm, depth mm, amplitude) of the strongest echo within a distance of a position (lateral, depth).
 
-    Across the lines the place is the centroid of the power within half a millimetre of the echo's range; along the
-    line that of the power between the -6 dB points. Not a number where all is silent.
-    Raises SimulationError for a place outside the imaged field.
+    Across the lines the position is the centroid of the power within half a millimetre of the echo's range; along the
+    line it is the centroid of the power between the -6 dB points. NaN if the signal is zero there.
+    Raises SimulationError for a position outside the imaged field.
     """
     x, y = sample_positions(frame, probe)
     near = np.hypot(x - place_mm[0], y - place_mm[1]) < within_mm
-    require(bool(near.any()), f"no sample lies within {within_mm:g} mm of {place_mm}")
+    require(bool(near.any()), f"position is {place_mm} mm, expected samples within {within_mm:g} mm of it")
     amplitude = np.where(near, np.abs(frame.iq), 0.0)
     line, sample = np.unravel_index(np.argmax(amplitude), amplitude.shape)
     if amplitude[line, sample] == 0.0:
@@ -77,7 +77,7 @@ def echo_near(
 
 
 def full_width(positions: np.ndarray, amplitudes: np.ndarray, at: float = 0.5) -> float:
-    """Width between the outermost crossings of `at` times the maximum, next to it (default: -6 dB, FWHM)."""
+    """Width between the crossings of `at` times the maximum on either side of it (default: -6 dB, FWHM)."""
     top = int(np.argmax(amplitudes))
     limit = at * amplitudes[top]
 
@@ -85,7 +85,7 @@ def full_width(positions: np.ndarray, amplitudes: np.ndarray, at: float = 0.5) -
         n = top
         while 0 <= n + step < len(amplitudes) and amplitudes[n + step] >= limit:
             n += step
-        require(0 <= n + step < len(amplitudes), f"the profile does not fall to {at:g} of its maximum")
+        require(0 <= n + step < len(amplitudes), f"profile ends above {at:g} of its maximum, expected a fall below it")
         inner, outer = amplitudes[n], amplitudes[n + step]
         return float(positions[n] + (positions[n + step] - positions[n]) * (inner - limit) / (inner - outer))
 
@@ -100,7 +100,7 @@ class RayleighFit:
     sigma: float
     #: Sum of squared differences between the normalised histogram and the density, over 256 bins
     sse: float
-    #: (256,) share of the samples per grey level
+    #: (256,) fraction of the samples per grey level
     histogram: np.ndarray
     #: (256,) fitted density
     density: np.ndarray

@@ -1,8 +1,8 @@
-"""Test objects made by code: phantoms that say what theory expects of their image.
+"""Digital phantoms with the theoretical prediction of their image.
 
-A phantom is described in the frame of the probe that looks at it (mm: x lateral, y depth, z elevational, origin at the
-probe face; no object changes along z unless it says so) and voxelised in patient space under any rotation: the same
-object then lies differently on the voxels, and nothing about its image may change.
+A phantom is defined in the probe frame (mm: x lateral, y depth, z elevational, origin at the probe face; objects are
+constant along z unless stated otherwise) and voxelised in patient space under any rotation. The rotation changes the
+orientation of the object to the voxels, but must not change its image.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 REFERENCE_SPEED_M_S = 1540.0
-#: Speckle in a medium that the scanner takes for what it is
+#: Speckle in a medium with the reference speed of sound
 BACKGROUND = Tissue("background", REFERENCE_SPEED_M_S, 1.6, 0.5, mu0=0.33, sigma0=0.15)
-#: No echo, no attenuation
+#: No scatterers, no attenuation
 FLUID = Tissue("fluid", REFERENCE_SPEED_M_S, 1.6, 0.0)
-#: Reflects nearly everything and absorbs the rest, so that no comet tail covers what lies behind
+#: Reflects nearly all energy and absorbs the rest, so that no comet-tail artefact covers the region behind
 STEEL = Tissue("steel", REFERENCE_SPEED_M_S, 46.0, 30.0)
 
 
 class _Box(NamedTuple):
-    """What a phantom holds at least, in the probe frame (mm)."""
+    """The minimum extent of a phantom in the probe frame (mm)."""
 
     half_width: float = 18.0
     top: float = -4.0
@@ -42,18 +42,18 @@ class _Box(NamedTuple):
 
 @dataclass(frozen=True)
 class Echo:
-    """Theory: the image shows an echo here."""
+    """Prediction: an echo at this position of the image."""
 
     name: str
-    #: (lateral, depth) in the probe frame, where the image shows it
+    #: (lateral, depth) in the probe frame, position of the echo in the image
     shown_mm: tuple[float, float]
-    #: (lateral, depth) of the object it comes from
+    #: (lateral, depth) of the object that causes it
     object_mm: tuple[float, float]
 
 
 @dataclass(frozen=True)
 class EchoLevel(Echo):
-    """Theory: the image shows an echo here, and how strong it is."""
+    """Prediction: an echo at this position of the image, with its level."""
 
     #: In dB re the first echo of the phantom
     level_db: float
@@ -61,7 +61,7 @@ class EchoLevel(Echo):
 
 @dataclass(frozen=True)
 class LevelChange:
-    """Theory: in this region the mean level differs from that of the phantom's `baseline` tissues."""
+    """Prediction: the difference of the mean level in this region from that with the `baseline` tissues."""
 
     name: str
     #: (left, right, top, bottom) in the probe frame
@@ -71,7 +71,7 @@ class LevelChange:
 
 @dataclass(frozen=True)
 class Level:
-    """Theory: the mean level in this region."""
+    """Prediction: the mean level in this region."""
 
     name: str
     #: (left, right, top, bottom) in the probe frame
@@ -80,20 +80,20 @@ class Level:
     level_db: float
 
 
-#: What theory says of a phantom's image
+#: A prediction about a phantom's image
 Expected = TypeVar("Expected", bound="Echo | LevelChange | Level", covariant=True)
 
 
 @dataclass(frozen=True, eq=False)
 class Phantom(Generic[Expected]):
-    """A test object: labels, tissues, the pose to look at it from, and what its image must show."""
+    """A test object: labels, tissues, the probe's pose, and the predictions for its image."""
 
     name: str
     labels: Volume
     tissues: TissueTable
     #: (4, 4)
     probe_to_ras: np.ndarray
-    #: What a given probe sees, by theory
+    #: Predictions for a given probe
     expected: Callable[[Probe], tuple[Expected, ...]]
     #: The same object without the effect it demonstrates, for comparison
     baseline: TissueTable | None = None
@@ -102,7 +102,7 @@ class Phantom(Generic[Expected]):
 
 
 def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence: float | np.ndarray = 1.0) -> np.ndarray:
-    """Pressure reflection coefficient r of a border between two fluids; 1 beyond the critical angle.
+    """Pressure reflection coefficient r of an interface between two fluids; 1 beyond the critical angle.
 
     r = (Z2 cos i - Z1 cos t) / (Z2 cos i + Z1 cos t), sin t / c2 = sin i / c1 (docs/physics.md#3-rays).
     """
@@ -119,7 +119,7 @@ def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence: float 
 def attenuating_block(
     attenuation_db_cm_mhz: float = 1.2, rotation: np.ndarray | None = None, *, thickness_mm: float = 12.0
 ) -> Phantom[LevelChange]:
-    """Shadow, or enhancement with less attenuation than the background's: a block in the middle of speckle.
+    """Shadow, or enhancement if the attenuation is below that of the background: a block within speckle.
 
     Behind it the mean level changes by -2 (alpha_block - alpha_background) f d dB (docs/physics.md#3-rays).
     """
@@ -145,7 +145,7 @@ def attenuating_block(
 def speed_block(
     speed_m_s: float = 1450.0, rotation: np.ndarray | None = None, *, thickness_mm: float = 16.0
 ) -> Phantom[Echo]:
-    """Range distortion: a wire behind a block of another speed of sound moves by d (c_ref / c - 1)."""
+    """Range distortion: a wire behind a block of another speed of sound is displaced by d (c_ref / c - 1)."""
     block = replace(BACKGROUND, name="block", speed_of_sound_m_s=speed_m_s)
     top, wire, radius = 12.0, (0.0, 40.0), 0.8
 
@@ -165,7 +165,7 @@ def speed_block(
 
 
 def mirror(rotation: np.ndarray | None = None, *, tilt_deg: float = 30.0) -> Phantom[Echo]:
-    """Mirroring: a rod before an oblique strong reflector appears again behind it, at its mirror image."""
+    """Mirroring: a rod in front of an oblique strong reflector appears again behind it, at its mirror image."""
     tilt = np.radians(tilt_deg)
     point, normal = np.array([0.0, 30.0]), np.array([-np.sin(tilt), -np.cos(tilt)])  # towards the probe
     radius, away = 0.6, 9.0
@@ -191,7 +191,7 @@ def mirror(rotation: np.ndarray | None = None, *, tilt_deg: float = 30.0) -> Pha
 def refracting_wedge(
     rotation: np.ndarray | None = None, *, tilt_deg: float = 25.0, speeds_m_s: tuple[float, float] = (1450.0, 1620.0)
 ) -> Phantom[Echo]:
-    """Refraction: wires behind an oblique interface are shown where the unbent ray would have met them."""
+    """Refraction: wires behind an oblique interface are shown on the unrefracted scan line."""
     tilt, radius = np.radians(tilt_deg), 0.6
     point, normal = np.array([0.0, 20.0]), np.array([np.sin(tilt), -np.cos(tilt)])
     wires = [np.array(wire) for wire in ((-8.0, 36.0), (0.0, 40.0), (8.0, 44.0))]
@@ -208,7 +208,7 @@ def refracting_wedge(
             for n, wire in enumerate(wires, 1)
         )
 
-    # One impedance on either side: what bends the ray is the speed alone.
+    # The same impedance on both sides: the ray is refracted by the difference in speed alone.
     above, below = (
         replace(BACKGROUND, name=name, speed_of_sound_m_s=c, mu0=0.1, sigma0=0.045)
         for name, c in zip(("slow", "fast"), speeds_m_s, strict=True)
@@ -219,7 +219,7 @@ def refracting_wedge(
 def parallel_plates(
     rotation: np.ndarray | None = None, *, gap_mm: float = 7.2, speed_m_s: float = 1600.0, spacing_mm: float = 0.2
 ) -> Phantom[EchoLevel]:
-    """Reverberation between two plane borders: an echo every d c_ref / c, each weaker by 20 log10(r1 r2) dB."""
+    """Reverberation between two plane interfaces: echoes d c_ref / c apart, the level changing by 20 log10(r1 r2)."""
     top = 15.0
     above, gap = FLUID, Tissue("gap", speed_m_s, 9.0, 0.0)
     below = replace(FLUID, name="below", impedance_mrayl=1.8)
@@ -250,10 +250,10 @@ def parallel_plates(
 def curved_mirror(
     rotation: np.ndarray | None = None, *, radius_mm: float = 12.0, is_sphere: bool = True
 ) -> Phantom[Level]:
-    """A steel ball or a rod across the image, in speckle that it mirrors, thinner the further away.
+    """A steel ball, or a rod across the image, that mirrors the surrounding speckle; the level falls with distance.
 
-    A convex mirror of radius r has the focal length r/2, so at a distance l a narrow beam is 1 + 2 l / r times as wide:
-    in both directions behind a ball, laterally behind a rod. The power of what it shows falls by as much.
+    A convex mirror of radius r has the focal length r/2, so at a distance l a narrow beam is 1 + 2 l / r times as wide,
+    in both directions behind a ball and laterally behind a rod. The power of mirrored speckle falls by these factors.
     """
     top = 22.0
     plain = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
@@ -282,7 +282,7 @@ def curved_mirror(
 def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0.2) -> Phantom[Echo | LevelChange]:
     """A quality-assurance phantom: wires every 10 mm of depth, black cysts, and blocks 6 dB above and below."""
     radius = 0.4
-    # None is on another's scan line, or on a cyst's, for any kind of probe.
+    # No wire is on a scan line through another wire or a cyst, for any kind of probe.
     wires = [(-2.0, 10.0), (2.0, 20.0), (-1.0, 30.0), (1.0, 40.0), (0.0, 50.0)]
     cysts = {2: [(-12.0, 20.0), (-12.0, 45.0)], 3: [(12.0, 20.0)], 4: [(12.0, 45.0)]}
     changes_db = {3: 6.0, 4: -6.0}
@@ -322,7 +322,7 @@ def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0
 
 
 def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom[Level]:
-    """One tissue everywhere: the level is Var of its scatterers, the envelope Rayleigh; the PSF sets correlations."""
+    """A single tissue: the level is Var of its scatterers, the envelope is Rayleigh, the PSF sets correlations."""
 
     def expected(probe: Probe):
         if tissue.attenuation_db_cm_mhz > 0.0:
@@ -335,7 +335,7 @@ def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = N
 
 
 def thin_rod(rotation: np.ndarray | None = None, *, depth_mm: float = 30.0, width_mm: float = 1.2) -> Phantom[Echo]:
-    """A thin echogenic bar along the lateral axis, square in section, in a fluid: shows how thick the slice is."""
+    """A thin echogenic bar of square cross-section along the lateral axis, in a fluid, to measure slice thickness."""
 
     def label(x, y, z):
         return np.where((np.abs(y - depth_mm) < 0.5 * width_mm) & (np.abs(z) < 0.5 * width_mm), 1, 0)
@@ -357,8 +357,11 @@ def layered(
     spacing_mm: float = 0.5,
     half_width_mm: float = 50.0,
 ) -> Phantom[Echo]:
-    """Plane layers of labels 1, 2, ... with borders at the given depths on the axis, tilted about z."""
-    require(len(tissues) == len(borders_mm) + 1, f"{len(tissues)} tissues and {len(borders_mm)} borders do not fit")
+    """Plane layers of labels 1, 2, ... with interfaces at the given depths on the axis, tilted about z."""
+    require(
+        len(tissues) == len(borders_mm) + 1,
+        f"there are {len(borders_mm)} borders, expected {len(tissues) - 1} between {len(tissues)} tissues",
+    )
     tilt = np.radians(tilt_deg)
 
     def label(x, y, z):
@@ -367,7 +370,7 @@ def layered(
 
     def expected(probe: Probe):
         if tilt_deg != 0.0:
-            return ()  # off the axis, or off the perpendicular
+            return ()  # lines do not meet the layers at right angles
         thickness = np.diff([0.0, *borders_mm])
         speeds = [tissue.speed_of_sound_m_s for tissue in tissues[:-1]]
         shown = np.cumsum(thickness * REFERENCE_SPEED_M_S / speeds)
@@ -377,13 +380,13 @@ def layered(
         )
 
     table = TissueTable(dict(enumerate(tissues, 1)))
-    # In a fast layer the field reaches farther than its nominal depth.
+    # In a fast layer the field extends beyond its nominal depth.
     box = _Box(half_width=half_width_mm, bottom=60.0)
     return _phantom("layers", label, table, rotation, spacing_mm, expected, box=box)
 
 
 def small_sheet(rotation: np.ndarray | None = None, *, depth_mm: float = 20.0, half_mm: float = 2.0) -> Phantom[Echo]:
-    """A square plate, small against the beam's changes and fine against its width, that faces the probe."""
+    """A square plate that faces the probe, so small that the beam hardly changes over it; voxels of 0.1 mm."""
 
     def label(x, y, z):
         return np.where((y > depth_mm) & (y < depth_mm + 1.5) & (np.abs(x) < half_mm) & (np.abs(z) < half_mm), 1, 0)
@@ -403,9 +406,9 @@ def voxel_sphere(
     spacing_mm: float = 1.0,
     centre_mm=(0.31, 0.17, -0.42),
 ) -> Phantom[Echo]:
-    """A sphere on coarse voxels, its centre nowhere special on them (docs/physics.md#2-interfaces).
+    """A sphere on coarse voxels, with its centre off the voxel centres (docs/physics.md#2-interfaces).
 
-    `centre_mm` is in RAS; the probe face is 29 mm before it.
+    `centre_mm` is in RAS; the probe face is 29 mm in front of it.
     """
     centre = np.asarray(centre_mm, float)
     half = int(np.ceil((radius_mm + 10.0) / spacing_mm))
@@ -416,12 +419,12 @@ def voxel_sphere(
     matrix[:3, 3] = axis[0]
     pose = _pose(rotation)
     pose[:3, 3] = -(radius_mm + 9.0) * pose[:3, 1]
-    # An impedance of its own makes it a border; a speed of its own would bend the rays inside.
+    # A different impedance makes it an interface; a different speed of sound would refract the rays.
     tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="sphere", impedance_mrayl=2.0)})
     x0, y0, z0 = pose[:3, :3].T @ (centre - pose[:3, 3])  # in the probe frame
 
     def expected(probe: Probe):
-        # The image plane cuts the sphere beside its centre; the line towards the cut's centre meets it at right angles.
+        # The image plane cuts the sphere off its centre; the line to the centre of the cut meets it at right angles.
         front = np.array([x0, y0]) - np.sqrt(radius_mm**2 - z0**2) * _line_direction_at(probe, (x0, y0))
         return (Echo("front", tuple(front), tuple(front)),)
 
@@ -432,7 +435,7 @@ def voxel_sphere(
 def voxel_sheet(
     rotation: np.ndarray | None = None, *, depth_mm: float = 20.5, spacing_mm: float = 1.0
 ) -> Phantom[Echo]:
-    """A sheet one voxel thick across the beam (falx, dura); an oblique one has voxels that touch by edges at least."""
+    """A sheet one voxel thick across the beam (falx, dura); if oblique, its voxels are connected at least by edges."""
     thickness = spacing_mm if rotation is None or np.allclose(np.abs(rotation).max(axis=0), 1.0) else 1.5 * spacing_mm
 
     def label(x, y, z):
@@ -451,7 +454,7 @@ def voxel_sheet(
 
 
 def _facing(depth_mm: float) -> Callable[[Probe], tuple[Echo, ...]]:
-    """What a face across the axis shows."""
+    """The prediction for a face perpendicular to the axis."""
     return lambda probe: (Echo("face", (0.0, depth_mm), (0.0, depth_mm)),)
 
 
@@ -479,8 +482,8 @@ def _pose(rotation: np.ndarray | None) -> np.ndarray:
 
 
 def _voxelise(label, rotation: np.ndarray, spacing_mm: float, box: _Box) -> Volume:
-    """Labels on a grid along RAS. Voxel centres lie at odd multiples of half the spacing, so that a plane at a multiple
-    of the spacing is half-way between two layers: where the object lies straight, its borders are exact."""
+    """Labels on a grid along RAS. Voxel centres are at odd multiples of half the spacing, so that a plane at a multiple
+    of the spacing is half-way between two layers: borders of aligned objects are exact."""
     sides = (-box.half_width, box.half_width), (box.top, box.bottom), (-box.half_thickness, box.half_thickness)
     corners = np.array(list(itertools.product(*sides))) @ rotation.T
     low = np.floor(corners.min(axis=0) / spacing_mm).astype(int)
@@ -488,7 +491,7 @@ def _voxelise(label, rotation: np.ndarray, spacing_mm: float, box: _Box) -> Volu
     x, y, z = (spacing_mm * (np.arange(a, b) + 0.5) for a, b in zip(low, high, strict=True))
     array = np.empty((len(z), len(y), len(x)), np.uint8)
     yx = np.stack(np.meshgrid(y, x, indexing="ij"))
-    for k, depth in enumerate(z):  # slice by slice: whole volumes of coordinates would fill the memory
+    for k, depth in enumerate(z):  # slice by slice, since volumes of coordinates would need too much memory
         points = [rotation[0, a] * yx[1] + rotation[1, a] * yx[0] + rotation[2, a] * depth for a in range(3)]
         array[k] = label(*points)
     matrix = np.diag([spacing_mm] * 3 + [1.0])
@@ -520,9 +523,9 @@ def _line_direction_at(probe: Probe, point) -> np.ndarray:
 
 
 def _shown_behind_plane(probe, target, radius, point, normal, speeds_m_s) -> tuple[float, float]:
-    """Where a cylinder behind a plane border is shown: on the scan line whose refracted ray aims at its axis.
+    """Position in the image of a cylinder behind a plane interface: on the line whose refracted ray meets its axis.
 
-    Snell's law in vector form; `normal` points towards the probe, `speeds_m_s` are before and behind the plane.
+    Snell's law in vector form; `normal` points towards the probe, `speeds_m_s` are in front of and behind the plane.
     """
 
     def bent(position: float):
@@ -538,7 +541,7 @@ def _shown_behind_plane(probe, target, radius, point, normal, speeds_m_s) -> tup
         return direction[0] * to_target[1] - direction[1] * to_target[0]
 
     end = 0.9 * abs(probe.first_line)
-    position = cast(float, brentq(miss, -end, end))  # one of several things that it returns, as arguments say
+    position = cast(float, brentq(miss, -end, end))  # its return type depends on its arguments
     before, crossing, _ = bent(position)
     behind = np.linalg.norm(target - crossing) - radius
     depth = REFERENCE_SPEED_M_S * (before / speeds_m_s[0] + behind / speeds_m_s[1])

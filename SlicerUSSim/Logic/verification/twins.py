@@ -1,8 +1,8 @@
-"""Twin experiments: patients whose true parameters are known, to see what an optimisation finds.
+"""Twin experiments: simulated patients with known parameters, to measure the accuracy of an optimisation.
 
-A twin's "real" images are simulated with parameters, speckle and noise of their own from the true segmentation; what
-is fitted to them starts from the presets and has a slightly wrong segmentation: white matter and fluid grown or shrunk
-by about half a voxel, and everything 0.5 mm off.
+A twin's "real" images are simulated from the true segmentation with parameters, speckle and noise of their own. The fit
+starts from the presets and has a slightly wrong segmentation: white matter grown or shrunk by 0.4 voxels, fluid by
+less, and everything displaced by 0.5 mm.
 """
 
 from __future__ import annotations
@@ -23,39 +23,39 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
-#: What is fitted, and what a twin has of its own, four parameters each.
+#: The tissue with four parameters that differ between twins and are fitted.
 TISSUE = "white matter"
 #: The paper's 196 lines and 73 mm.
 TWIN_PROBE = PhasedProbe(field_of_view_deg=75.0, depth_mm=73.0, scan_lines=196)
 _OFFSET_MM = 0.5
-#: (tissue, sigma in voxels of its smoothed indicator, how far from 1/2 it is cut): a flat border moves by 0.39 voxels
-#: for white matter, and for CSF by so little that sulci and the midline of one voxel stay.
+#: (tissue, sigma in voxels of its smoothed indicator, offset of the threshold from 1/2): a flat border moves by 0.39
+#: voxels for white matter, and for CSF by so little that sulci and the midline of one voxel remain.
 _MISTAKES = ((TISSUE, 1.0, 0.15), ("csf", 0.6, 0.08))
 _PRESSED_MM = 3.0
 _TILT_DEG = 24.0
-#: Places tried for a good window, and how deep it reaches.
+#: Number of positions tried for a good acoustic window, and the depth of the window.
 _PLACES, _WINDOW_MM = 8, 15.0
 
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """One patient with known parameters."""
+    """A simulated patient with known parameters."""
 
     seed: int
-    #: Where the optimisation starts: the presets on the slightly wrong segmentation
+    #: Start of the optimisation: the presets on the slightly wrong segmentation
     simulator: UltrasoundSimulator
     display: DisplaySettings
     probe: Probe
     poses: list[np.ndarray]
-    #: (rows, columns) uint8 each
+    #: Reference images, (rows, columns) uint8 each
     references: list[np.ndarray]
-    #: What drew the references
+    #: True labels, tissues and display of the reference images
     labels: Volume
     true_tissues: TissueTable
     true_display: DisplaySettings
 
     def sequence(self) -> TrackedSequence:
-        """The references as a tracked sequence, as a tracker would have recorded them."""
+        """The reference images as a tracked sequence."""
         to_probe = ImageGrid.for_probe(self.probe, self.true_display.image_size).image_to_probe
         transforms = tuple({"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in self.poses)
         return TrackedSequence(np.stack(self.references), transforms, 0.1 * np.arange(len(self.poses)))
@@ -73,10 +73,10 @@ def make_twin(
     display_is_known: bool = False,
     device: DeviceChoice = None,
 ) -> Twin:
-    """Patient number `seed` on true `labels` (1 is CSF), seen in `frames` images of a tilted probe.
+    """Patient number `seed` on true `labels` (1 is CSF), with `frames` images of a tilted probe.
 
-    With `crossing` come as many again of the probe turned by 90 degrees about its axis.
-    `display` is where the optimisation starts; with `display_is_known` the references have it too.
+    With `crossing` there are as many images again with the probe turned by 90 degrees about its axis.
+    `display` is the start of the optimisation; with `display_is_known` it is that of the reference images too.
     """
     random = np.random.default_rng(1000 + seed)
     display = display or DisplaySettings()
@@ -88,7 +88,7 @@ def make_twin(
         turned = poses[frames // 2] @ np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
         poses += tilt_sweep(turned, _TILT_DEG, frames)
     real = UltrasoundSimulator(labels, true_tissues, SimulationSettings(seed=50_000 + seed), device)
-    # All with one draw of the noise, as twins have been since their tables were published.
+    # All images have the same noise, as in the published tables.
     references = [real.simulate(probe, pose, true_display).image for pose in poses]
     mistaken = mistaken_labels(labels, tissues, random)
     simulator = UltrasoundSimulator(mistaken, tissues, SimulationSettings(seed=seed), device)
@@ -96,7 +96,7 @@ def make_twin(
 
 
 def mistaken_labels(labels: Volume, tissues: TissueTable, random: np.random.Generator) -> Volume:
-    """A segmentation as it may come out: white matter and CSF a little grown or shrunk into grey matter, 0.5 mm off."""
+    """A segmentation with typical errors: white matter and CSF slightly grown or shrunk, all displaced by 0.5 mm."""
     array = labels.array.copy()
     other = tissues.label_of("grey matter")
     for name, sigma, step in _MISTAKES:
@@ -112,10 +112,10 @@ def mistaken_labels(labels: Volume, tissues: TissueTable, random: np.random.Gene
 
 
 def _own_view(random: np.random.Generator, labels: Volume, probe: Probe, frames: int) -> list[np.ndarray]:
-    """A tilt about a craniotomy view a little elsewhere, in contact with a gyrus.
+    """A tilt sweep about a randomly displaced craniotomy view, in contact with a gyrus.
 
-    Over a sulcus the CSF in front of the face mirrors and bends what passes it, and half a voxel decides where to: a
-    surgeon slides the probe until the window is good.
+    Over a sulcus the CSF in front of the face reflects and refracts the beam, and half a voxel changes its direction.
+    A surgeon slides the probe to a good acoustic window.
     """
     places: list[tuple[float, list[np.ndarray]]] = []
     for _ in range(_PLACES):
@@ -130,7 +130,7 @@ def _own_view(random: np.random.Generator, labels: Volume, probe: Probe, frames:
 
 
 def _fluid_before(labels: Volume, pose: np.ndarray, probe: Probe) -> float:
-    """The share of coupling and CSF in the first part of the field."""
+    """The fraction of coupling medium and CSF in the first part of the field."""
     lines, along = np.meshgrid(np.linspace(probe.first_line, -probe.first_line, 41), np.linspace(0.5, _WINDOW_MM, 24))
     origin, direction = probe.line_at(lines)
     points = origin + along[..., None] * direction
@@ -138,7 +138,7 @@ def _fluid_before(labels: Volume, pose: np.ndarray, probe: Probe) -> float:
 
 
 def _own_tissue(random: np.random.Generator, tissue: Tissue) -> Tissue:
-    """Within about one standard deviation of the paper's Table 1."""
+    """A tissue with random parameters within about one standard deviation of the paper's Table 1."""
     level = 10.0 ** (random.uniform(-4.0, 4.0) / 20.0)
     return replace(
         tissue,

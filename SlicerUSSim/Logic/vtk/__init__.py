@@ -1,6 +1,6 @@
 """The simulator as filters of a VTK pipeline: an MRI to labels, labels to the image under a probe.
 
-They execute again when their input, the probe's transform or a parameter changes, and only then.
+They execute again only if their input, the probe's transform or a parameter has changed.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""The simulator as VTK filters: an MRI goes in, labels come out; labels go in, a B-mode image comes out.
+"""The simulator as VTK filters: from an MRI to labels, and from labels to a B-mode image.
 
     segmentation = SegmentationFilter()
     segmentation.SetInputConnection(reader.GetOutputPort())
@@ -7,8 +7,8 @@
     simulation.SetProbeTransform(transform)
     actor.GetMapper().SetInputConnection(simulation.GetOutputPort())
 
-All images are in patient space (RAS, mm), with origin, spacing and direction matrix. What the caller caused is an
-ErrorEvent with one line, and the text of GetErrorMessage; the output is then empty.
+All images are in patient space (RAS, mm), with origin, spacing and direction matrix. Errors caused by the caller are
+reported by an ErrorEvent with one line, and by GetErrorMessage; the output is then empty.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ TISSUE_NAMES = "TissueNames"
 
 
 class _ImageFilter(VTKPythonAlgorithmBase):
-    """Whole images in, whole images out, and errors as VTK users expect them."""
+    """A filter that processes whole images and reports errors by VTK's means."""
 
     def __init__(self, **ports) -> None:
         super().__init__(inputType="vtkImageData", outputType="vtkImageData", **ports)
@@ -60,7 +60,7 @@ class _ImageFilter(VTKPythonAlgorithmBase):
         self._change("_device", device)
 
     def SetInputData(self, image: vtkImageData | None) -> None:
-        """The input itself, where no filter makes it."""
+        """Set the input image directly, without a pipeline connection."""
         self.SetInputDataObject(0, image)
 
     def GetOutput(self, port: int = 0):
@@ -68,7 +68,7 @@ class _ImageFilter(VTKPythonAlgorithmBase):
         return self.GetOutputDataObject(port)
 
     def GetErrorMessage(self) -> str:
-        """What was wrong in the last update, one line; empty if nothing was."""
+        """The error of the last update, one line; empty without an error."""
         return self._message
 
     def ProcessRequest(self, request, inInfo, outInfo):  # noqa: N803
@@ -106,18 +106,17 @@ class _ImageFilter(VTKPythonAlgorithmBase):
             vtkOutputWindow.GetInstance().DisplayErrorText(f"{type(self).__name__}: {message}\n")
 
     def _change(self, name: str, value) -> None:
-        """Set an attribute; only another value makes the filter execute again."""
+        """Set an attribute; only a different value makes the filter execute again."""
         if getattr(self, name) != value:
             setattr(self, name, value)
             self.Modified()
 
 
 class SegmentationFilter(_ImageFilter):
-    """An MRI (port 0), and a mask if the brain is not stripped (port 1, optional), to uint8 tissue labels.
+    """From an MRI (port 0), and a mask if it is not skull-stripped (port 1, optional), to uint8 tissue labels.
 
-    The names of the labels travel with the output as field data "TissueNames"; UltrasoundSimulationFilter knows its
-    tissues by them. Parameters and defaults are those of SegmentationSettings; segmentation.segment_mri says what is
-    refused.
+    The names of the labels are field data "TissueNames" of the output, from which UltrasoundSimulationFilter identifies
+    the tissues. Parameters and defaults are those of SegmentationSettings, errors those of segmentation.segment_mri.
     """
 
     def __init__(self) -> None:
@@ -126,7 +125,7 @@ class SegmentationFilter(_ImageFilter):
         self._segmentation: Segmentation | None = None
 
     def SetClasses(self, classes: int) -> None:
-        """Number of tissues that intensity tells apart."""
+        """Number of tissues to distinguish by intensity."""
         self._set("classes", classes)
 
     def SetContrast(self, contrast: str) -> None:
@@ -134,7 +133,7 @@ class SegmentationFilter(_ImageFilter):
         self._set("contrast", contrast)
 
     def SetFilterRadius(self, voxels: int) -> None:
-        """Radius of the guided filter; 0 for none."""
+        """Radius of the guided filter in voxels; 0 disables it."""
         self._set("filter_radius", voxels)
 
     def SetFilterEpsilon(self, epsilon: float | None) -> None:
@@ -142,7 +141,7 @@ class SegmentationFilter(_ImageFilter):
         self._set("filter_epsilon", epsilon)
 
     def SetBiasCorrection(self, on: bool) -> None:
-        """N4 first, for scans with an intensity gradient."""
+        """Apply N4 first, for scans with an intensity gradient."""
         self._set("bias_correction", bool(on))
 
     def SetThinSulci(self, on: bool) -> None:
@@ -150,11 +149,11 @@ class SegmentationFilter(_ImageFilter):
         self._set("thin_sulci", bool(on))
 
     def SetMaskConnection(self, port) -> None:
-        """Where the mask comes from: an image on the MRI's grid, not zero inside."""
+        """Set the output port that provides the mask: an image on the MRI's grid, non-zero inside."""
         self.SetInputConnection(1, port)
 
     def SetMaskData(self, mask: vtkImageData | None) -> None:
-        """The mask itself."""
+        """Set the mask image directly."""
         self.SetInputDataObject(1, mask)
 
     def GetSegmentation(self) -> Segmentation | None:
@@ -200,12 +199,12 @@ class SegmentationFilter(_ImageFilter):
 
 
 class UltrasoundSimulationFilter(_ImageFilter):
-    """Tissue labels (port 0) to the B-mode image under the probe (output 0) and the outline of its field (output 1).
+    """From tissue labels (port 0) to the B-mode image (output 0) and the outline of the imaged field (output 1).
 
-    The image is one slice at the probe's place. The filter executes again when the labels, the probe's transform (with
-    whatever it is concatenated from), or a parameter changes, and only then. Every pose has amplifier noise of its own
-    (noise.seed_of_pose). Labels are told apart by the names that
-    SegmentationFilter gave them (field data "TissueNames"); without names, by the labels of the tissue table.
+    The image is one slice in the image plane. The filter executes again only if the labels, the probe's transform
+    (including transforms from which it is concatenated) or a parameter has changed. Amplifier noise differs between
+    poses (noise.seed_of_pose). Labels are identified by the names from SegmentationFilter (field data "TissueNames");
+    without names, by the labels of the tissue table.
 
     >>> import numpy as np
     >>> from vtkmodules.vtkCommonTransforms import vtkTransform
@@ -226,8 +225,8 @@ class UltrasoundSimulationFilter(_ImageFilter):
     """
 
     def __init__(self) -> None:
-        # Port 1 is the filter's own: the outline, moved by the probe's transform. So the pipeline itself knows when the
-        # probe has moved, even where a transform inside a chain of transforms did, and no observer can outlive us.
+        # Port 1 is internal: the outline, moved by the probe's transform. The pipeline therefore detects every movement
+        # of the probe, also by a transform within a chain of transforms, and no observer can outlive the filter.
         super().__init__(nInputPorts=2, nOutputPorts=2)
         preset = Preset()
         self._probe, self._display, self._settings = preset.probe, preset.display, preset.settings
@@ -248,9 +247,9 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._change("_probe", probe)
 
     def SetProbeTransform(self, transform: vtkLinearTransform | vtkMatrix4x4) -> None:
-        """Where the probe is: probe_to_ras. The object is watched, not copied.
+        """Set the pose of the probe, probe_to_ras. The object is observed, not copied.
 
-        Raises SimulationError for anything else than a vtkLinearTransform or a vtkMatrix4x4.
+        Raises SimulationError for objects other than a vtkLinearTransform or a vtkMatrix4x4.
         """
         require(
             isinstance(transform, vtkLinearTransform | vtkMatrix4x4),
@@ -265,15 +264,15 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._placed_outline.SetTransform(transform)
 
     def SetTissues(self, tissues: TissueTable) -> None:
-        """Acoustic parameters of the labels; brain presets until set."""
+        """Acoustic parameters of the labels; default: presets of the brain."""
         self._change("_tissues", tissues)
 
     def SetSettings(self, settings: SimulationSettings) -> None:
-        """The physics."""
+        """Settings of the physical model."""
         self._change("_settings", settings)
 
     def SetDisplay(self, display: DisplaySettings) -> None:
-        """Gain, dynamic range, time-gain compensation, noise, image size."""
+        """Gain, dynamic range, time gain compensation, noise, image size."""
         self._change("_display", display)
 
     def SetPreset(self, preset: Preset) -> None:
@@ -284,11 +283,11 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self.SetTissues(preset.tissues)
 
     def SetTexture(self, texture: Texture | None) -> None:
-        """What the MRI knows beyond labels, where the settings ask for it (Segmentation.texture)."""
+        """Texture from the MRI (Segmentation.texture), for settings that use it."""
         self._change("_texture", texture)
 
     def SetFieldAlpha(self, on: bool) -> None:
-        """Give the image a second component, 255 in the imaged field and 0 outside, for laying it over others; off."""
+        """Add an alpha component to the image, 255 in the imaged field and 0 outside, for overlays; default off."""
         self._change("_field_alpha", bool(on))
 
     def GetFrame(self) -> Frame | None:
@@ -338,7 +337,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
 
 
 def set_tissue_names(image: vtkImageData, names) -> None:
-    """Let the names of label 1, 2, ... travel with a label image."""
+    """Store the names of labels 1, 2, ... in the field data of a label image."""
     array = vtkStringArray()
     array.SetName(TISSUE_NAMES)
     for name in names:
@@ -347,6 +346,6 @@ def set_tissue_names(image: vtkImageData, names) -> None:
 
 
 def tissue_names(image: vtkImageData) -> tuple[str, ...]:
-    """The names that set_tissue_names gave; empty if there are none."""
+    """The names stored by set_tissue_names; empty if there are none."""
     array = image.GetFieldData().GetAbstractArray(TISSUE_NAMES)
     return () if array is None else tuple(array.GetValue(n) for n in range(array.GetNumberOfValues()))

@@ -1,11 +1,11 @@
-// What the page does by itself: draws the images that streams.py sends, passes keys on, and measures how long it takes
-// from the mouse to the new image on the screen.
+// Client side of the page: draws the images from streams.py, forwards keys, and measures the latency from a mouse event
+// to the new image on the screen.
 (() => {
   const client = Math.random().toString(36).slice(2);
-  const measured = []; // milliseconds from an event to the image that shows what it did
-  const STAMP_EVERY_MS = 40; // events in between count from the one before, so as later than they are
+  const measured = []; // milliseconds from an event to the image that shows its effect
+  const STAMP_EVERY_MS = 40; // events in between share the stamp of the previous one, which overestimates their latency
   let stamped = 0;
-  const shown = []; // times at which simulated images came on the screen
+  const shown = []; // times at which simulated images were displayed
 
   const workstation = { measured, shown, measuring: false, images: 0, connected: false };
   window.ussim = workstation;
@@ -18,14 +18,14 @@
   };
 
   async function draw([{ name, meta, content }]) {
-    if (meta?.number === undefined) return; // a view of Slicer, which its own component draws
+    if (meta?.number === undefined) return; // a view of Slicer, drawn by its own component
     const canvas = canvasOf(name);
     if (!canvas) return;
     const bitmap = await createImageBitmap(new Blob([content], { type: meta.type }));
     if (Number(canvas.dataset.number ?? 0) > meta.number && meta.number > 1) return; // overtaken while it was decoded
     canvas.dataset.number = meta.number;
     if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
-      canvas.width = bitmap.width; // only then: it makes the browser lay the page out anew
+      canvas.width = bitmap.width; // only on a change, since it makes the browser redo the layout
       canvas.height = bitmap.height;
     }
     canvas.getContext("2d", { alpha: false }).drawImage(bitmap, 0, 0);
@@ -51,7 +51,7 @@
   };
 
   function showLatency() {
-    const place = document.getElementById("ussim-latency"); // there while the user wants it
+    const place = document.getElementById("ussim-latency"); // exists while the user displays it
     workstation.measuring = Boolean(place);
     if (!place) return;
     const { count, median: middle, p95, rate } = workstation.summary();
@@ -63,7 +63,7 @@
   const isWriting = (element) =>
     element && (element.isContentEditable || ["INPUT", "TEXTAREA", "SELECT"].includes(element.tagName));
 
-  // The server is told when the mouse moved just before it is told that it moved.
+  // The time of a mouse event is sent to the server just before the event itself.
   window.addEventListener(
     "pointermove",
     (event) => {
@@ -84,14 +84,14 @@
 
   workstation.save = async (kind) => {
     const result = await window.trame.trigger("export", [kind]);
-    if (!result) return; // the server has said why
+    if (!result) return; // the server shows the error
     const [name, content, type] = result;
     window.trame.utils.download(name, content, type);
   };
 
   workstation.copy = async (text) => {
     try {
-      await navigator.clipboard.writeText(text); // not where the page comes from another computer without https
+      await navigator.clipboard.writeText(text); // not available over plain http from another computer
     } catch {
       const area = document.getElementById("ussim-script");
       area?.focus();

@@ -1,7 +1,7 @@
-"""Is the simulator right? Every number of the model's specification, measured on phantoms against its prediction.
+"""Validation: the quantities of the model's specification, measured on phantoms and compared with theory.
 
-A check measures one phenomenon for one orientation of its phantom on the voxels, with every probe it applies to; its
-outcome is rows of a table (predicted, measured, tolerance) and a picture. `ussim validate` runs them all.
+A check measures one phenomenon for one orientation of its phantom to the voxels, with all probes to which it applies.
+Its outcome is rows of a table (predicted, measured, tolerance) and a figure. `ussim validate` runs all checks.
 """
 
 from typing import TYPE_CHECKING

@@ -29,7 +29,7 @@ from SlicerUSSim.Logic.verification.validation.pictures import View, draw_views
 
 _SEARCH_MM = 1.5  # around the predicted place; five times the widest tolerance
 _SETTINGS = SimulationSettings(reflection_threshold=1e-2)
-# Wide enough to show a mirror's and a speckle's echoes at once; the phantoms attenuate by 0.5 dB/(cm MHz) or less.
+# A dynamic range for both mirror echoes and speckle; the phantoms attenuate by 0.5 dB/(cm MHz) or less.
 _DISPLAY = DisplaySettings(dynamic_range_db=70.0, tgc_db_cm_mhz=0.5, noise_db=None)
 
 
@@ -38,13 +38,13 @@ def _simulator(phantom: Phantom, device, settings: SimulationSettings = _SETTING
 
 
 def _images(simulator: UltrasoundSimulator, phantom: Phantom, probes: dict[str, Probe] = PROBES) -> dict[str, Frame]:
-    """What each probe sees of the phantom."""
+    """The image of the phantom for each probe."""
     return {name: simulator.simulate(probe, phantom.probe_to_ras, _DISPLAY) for name, probe in probes.items()}
 
 
 def _images_and_baseline(phantom: Phantom, device) -> tuple[dict[str, Frame], dict[str, Frame]]:
-    """What each probe sees of the phantom, and of its baseline."""
-    assert phantom.baseline is not None, "of phantoms whose theory is about a change of level or place"
+    """The images of the phantom and of its baseline for each probe."""
+    assert phantom.baseline is not None, "needed for predictions of a change of level or position"
     simulator = _simulator(phantom, device)
     frames = _images(simulator, phantom)
     simulator.set_tissues(phantom.baseline)
@@ -52,7 +52,7 @@ def _images_and_baseline(phantom: Phantom, device) -> tuple[dict[str, Frame], di
 
 
 def _level_row(quantity: str, change: LevelChange, probe: Probe, frame: Frame, baseline: Frame) -> Row:
-    """How far a region's level is from that of the baseline."""
+    """The difference of a region's level from that of the baseline."""
     seen, plain = (region_level_db(image, probe, change.region_mm) for image in (frame, baseline))
     return Row(quantity, "dB", change.change_db, seen - plain, 0.5)
 
@@ -88,7 +88,7 @@ def range_distortion(rotation: np.ndarray, device) -> Outcome:
 
 
 def _displacements(phantom: Phantom, frames: dict[str, Frame], picture: str = "linear") -> Outcome:
-    """Rows for every echo of a phantom: how far from its predicted place it is shown."""
+    """Rows for every echo of a phantom: predicted and measured position."""
     tolerance_mm = 0.3
     rows = []
     for name, probe in PROBES.items():
@@ -105,7 +105,7 @@ def _displacements(phantom: Phantom, frames: dict[str, Frame], picture: str = "l
 
 
 def mirroring(rotation: np.ndarray, device) -> Outcome:
-    """A rod before an oblique strong reflector."""
+    """A rod in front of an oblique strong reflector."""
     phantom = mirror(rotation)
     return _displacements(phantom, _images(_simulator(phantom, device), phantom))
 
@@ -133,16 +133,16 @@ def curved_mirrors(rotation: np.ndarray, device) -> Outcome:
 
 
 def refraction(rotation: np.ndarray, device) -> Outcome:
-    """Wires behind an oblique border between two speeds."""
+    """Wires behind an oblique interface between two speeds of sound."""
     phantom = refracting_wedge(rotation)
     return _displacements(phantom, _images(_simulator(phantom, device), phantom))
 
 
 def reverberation(rotation: np.ndarray, device) -> Outcome:
-    """Two parallel borders.
+    """Two parallel interfaces.
 
-    At 2 MHz: borders taken from voxels waver by some hundredths of a millimetre, and an echo that has met several of
-    them loses coherence where that is not small against the wavelength.
+    At 2 MHz: borders reconstructed from voxels have errors of some hundredths of a millimetre, and an echo that has met
+    several of them loses coherence if the errors are not small compared with the wavelength.
     """
     phantom = parallel_plates(rotation)
     probes = {name: replace(probe, frequency_mhz=2.0) for name, probe in PROBES.items()}
@@ -165,7 +165,7 @@ def reverberation(rotation: np.ndarray, device) -> Outcome:
 
 
 def wires_cysts_and_contrast(rotation: np.ndarray, device) -> Outcome:
-    """A quality-assurance phantom: places of wires, levels of cysts and contrast targets."""
+    """A quality-assurance phantom: positions of wires, levels of cysts and contrast targets."""
     phantom = wires_and_cysts(rotation)
     frames, plain = _images_and_baseline(phantom, device)
     placed = _displacements(phantom, frames, "convex")
@@ -174,7 +174,7 @@ def wires_cysts_and_contrast(rotation: np.ndarray, device) -> Outcome:
         for change in phantom.expected(probe):
             if isinstance(change, LevelChange):
                 rows.append(_level_row(f"{change.name} target, {name}", change, probe, frames[name], plain[name]))
-        # Inside a cyst there is nothing but what the beam's edges see of its surroundings.
+        # Inside a cyst there are only echoes from its surroundings at the edges of the beam.
         black = region_level_db(frames[name], probe, (-13.5, -10.5, 18.5, 21.5))
         around = region_level_db(frames[name], probe, (-10.0, -8.0, 24.0, 34.0))
         rows.append(Row(f"cyst below its surroundings, {name}", "dB", -40.0, black - around, 0.0, "at most"))
@@ -189,24 +189,24 @@ CHECKS = (
     ),
     Check(
         "range distortion",
-        "An echo behind a block of thickness d and speed c moves by d (c_ref/c - 1).",
+        "An echo behind a block of thickness d and speed of sound c is displaced by d (c_ref/c - 1).",
         range_distortion,
     ),
-    Check("mirroring", "A target before an oblique mirror appears again at its mirror image.", mirroring),
+    Check("mirroring", "A target in front of an oblique mirror appears again at its mirror image.", mirroring),
     Check(
         "curved mirrors",
-        "A convex mirror of radius r spreads what it shows at a distance l: by 1 + 2 l / r in each curved direction.",
+        "At a distance l a convex mirror of radius r has widened the beam by 1 + 2 l / r in each curved direction.",
         curved_mirrors,
     ),
-    Check("refraction", "A target behind an oblique border is displaced as Snell's law says.", refraction),
+    Check("refraction", "A target behind an oblique interface is displaced as Snell's law predicts.", refraction),
     Check(
         "reverberation",
-        "Between borders d apart: an echo every d c_ref/c, each weaker by 20 log10(r1 r2) dB.",
+        "Between interfaces d apart there are echoes d c_ref/c apart, the level changing by 20 log10(r1 r2) dB each.",
         reverberation,
     ),
     Check(
         "wires and cysts",
-        "Wires are shown where they are, targets as bright as their scatterers, cysts black.",
+        "Wires appear at their positions, targets with the level of their scatterers, and cysts are black.",
         wires_cysts_and_contrast,
     ),
 )

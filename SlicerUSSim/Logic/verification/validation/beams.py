@@ -1,5 +1,5 @@
-"""Checks of the beam: echoes as wide as the point spread function (docs/physics.md#3-rays), resolution and slice
-thickness (docs/physics.md#4-beam-and-pulse)."""
+"""Checks of the beam: level and width of interface echoes (docs/physics.md#3-rays), resolution and slice thickness
+(docs/physics.md#4-beam-and-pulse)."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from SlicerUSSim.Logic.verification.phantoms import (
 from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_cross_sections, draw_plots
 
-#: A border with FLUID that bends no ray
+#: Forms an interface with FLUID that does not refract
 BEHIND = replace(FLUID, name="behind", impedance_mrayl=1.9)
 
 
 def echo_level(rotation: np.ndarray, device) -> Outcome:
-    """A plane border across the beam, at every probe's focus and away from it."""
+    """A plane interface across the beam, with the pressure and the energy reflection coefficient."""
     r = reflection_coefficient(FLUID, BEHIND)
     rows = []
     phantom = layered([FLUID, BEHIND], [25.0], rotation, spacing_mm=0.25, half_width_mm=14.0)
@@ -44,7 +44,7 @@ def echo_level(rotation: np.ndarray, device) -> Outcome:
         for name, probe in PROBES.items():
             low = replace(probe, frequency_mhz=2.0)  # as for reverberation
             peak = echo_near(simulator.simulate(low, phantom.probe_to_ras), low, (0.0, 25.0), 1.0)[2]
-            # The lines of a sector meet a plane at right angles only in the middle: y aside, it is y^2 / 2 R farther.
+            # The lines of a sector meet a plane at right angles only in the middle: at y it is y^2 / 2 R further away.
             radius = low.apex_radius_mm + 25.0
             turns = 2 * np.pi * low.cycles_per_mm * float(low.beam_sigma_mm(25.0)[0]) ** 2 / radius
             predicted = 20 * np.log10(expected * (1 + turns**2) ** -0.25) + settings.interface_gain_db
@@ -55,7 +55,7 @@ def echo_level(rotation: np.ndarray, device) -> Outcome:
 def specular_echoes(rotation: np.ndarray, device) -> Outcome:
     """The echo of every hit is w A |r| cos^n(i): a plane tilted by 15 degrees, two exponents."""
     before = replace(FLUID, attenuation_db_cm_mhz=0.4)
-    r = reflection_coefficient(before, BEHIND)  # of one speed, so the same at every angle
+    r = reflection_coefficient(before, BEHIND)  # the same speed on both sides, so independent of the angle
     phantom = layered([before, BEHIND], [20.0], rotation, tilt_deg=15.0)
     settings = SimulationSettings(reflections=False)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
@@ -67,7 +67,7 @@ def specular_echoes(rotation: np.ndarray, device) -> Outcome:
             loss = 10 ** (-0.4 * probe.frequency_mhz * 2 * hits["path_mm"].astype(float) / 10 / 20)
             gain = 10 ** (settings.interface_gain_db / 20) / settings.elevational_rays
             ratio = hits["echo"] / (loss * r * gain * hits["cos_incidence"].astype(float) ** exponent)
-            # Where a voxelised normal leans out of plane, a ray's echo is a little short of this; never above.
+            # If a voxelised normal is tilted out of the plane, the echo of a ray is slightly lower, but never higher.
             rows += [
                 Row(f"median, n = {exponent:.0f}, {name}", "", 1.0, float(np.median(ratio)), 0.01),
                 Row(f"largest, n = {exponent:.0f}, {name}", "", 1.0, float(ratio.max()), 0.01, "at most"),
@@ -76,10 +76,11 @@ def specular_echoes(rotation: np.ndarray, device) -> Outcome:
 
 
 def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
-    """A plane that leans out of the image plane: over a Gaussian beam its echo is the Gaussian's Fourier transform.
+    """A plane tilted out of the image plane: for a Gaussian beam its echo is the Fourier transform of a Gaussian.
 
-    Where the beam is wide, rays meet a steep plane at ranges a pulse and more apart. The integral over each ray's
-    stratum still vanishes there, as that over the whole beam does; without it the plane would show as a line per ray.
+    Where the beam is wide, rays meet a steep plane at ranges that differ by a pulse length or more. The integral over
+    the stratum of each ray still vanishes, as does the integral over the whole beam. Without it, the image would show
+    one line per ray.
     """
     phantom = layered([FLUID, BEHIND], [25.0], rotation, spacing_mm=0.25, half_width_mm=14.0)
     settings = SimulationSettings(scattering=False, specular_exponent=0.0)
@@ -109,7 +110,7 @@ def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
 
 
 def interface_width(rotation: np.ndarray, device) -> Outcome:
-    """A small sheet away from the focus: a box convolved with the beam."""
+    """A small sheet away from the focus: its profile is a box convolved with the beam."""
     half, depth = 1.5, 20.0
     phantom = small_sheet(rotation, depth_mm=depth, half_mm=half)
     settings = SimulationSettings(scattering=False, elevational_rays=16, specular_exponent=0.0)
@@ -117,7 +118,7 @@ def interface_width(rotation: np.ndarray, device) -> Outcome:
     offsets = np.arange(-5.0, 5.01, 0.5)
     rows, plots = [], []
     for name, probe in PROBES.items():
-        # At 2 MHz a flat sheet is in phase with the curved wave of a sector.
+        # At 2 MHz the echo of a flat sheet is in phase over the curved wavefront of a sector.
         low = replace(probe, focus_mm=35.0, elevation_focus_mm=35.0, frequency_mhz=2.0)
         sigma_l, sigma_e = (float(s) for s in low.beam_sigma_mm(depth))
 
@@ -145,13 +146,13 @@ def interface_width(rotation: np.ndarray, device) -> Outcome:
 
 
 def _spread(positions: np.ndarray, values: np.ndarray) -> float:
-    """Second moment about the mean of values that stand for a box convolved with a Gaussian."""
+    """Standard deviation of a profile: square root of the second moment about its mean."""
     mean = np.average(positions, weights=values)
     return float(np.sqrt(np.average((positions - mean) ** 2, weights=values)))
 
 
 def resolution(rotation: np.ndarray, device) -> Outcome:
-    """Wires thinner than the beam: their echoes are as wide as the point spread function at their depth."""
+    """Wires thinner than the beam: their echoes have the width of the point spread function at their depth."""
     phantom = wires_and_cysts(rotation)
     settings = SimulationSettings(scattering=False, reflections=False)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
@@ -181,10 +182,10 @@ def resolution(rotation: np.ndarray, device) -> Outcome:
 
 
 def slice_thickness(rotation: np.ndarray, device) -> Outcome:
-    """A thin bar along the image, seen from a probe that moves away from it: its power falls as the beam says."""
+    """A thin bar in the image plane of a probe that moves away from it: its power follows the elevational profile."""
     depth, width = 30.0, 1.2
     phantom = thin_rod(rotation, depth_mm=depth, width_mm=width)
-    # Dense scatterers: what varies with the offset must be the beam, not which scatterers it meets.
+    # Dense scatterers, so that the power depends on the beam and not on individual scatterers.
     settings = SimulationSettings(scatterers_per_mm3=1000.0)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     rows, curves = [], []
@@ -206,16 +207,16 @@ def slice_thickness(rotation: np.ndarray, device) -> Outcome:
 
 
 def _bar_fall_db(offsets_mm: np.ndarray, sigma_mm: float, width_mm: float) -> np.ndarray:
-    """Theory: power of a bar, so wide, at distances from the image plane; re the first."""
+    """Theoretical power in dB of a bar of this width at distances from the image plane, relative to the first."""
     across = np.linspace(-0.5 * width_mm, 0.5 * width_mm, 25)
     power = np.exp(-((across - offsets_mm[:, None]) ** 2) / sigma_mm**2).mean(axis=1)
     return 10 * np.log10(power / power[0])
 
 
 def _band_power(frame, probe, depth_mm: float) -> float:
-    """Mean power about the bar on the middle lines; curved arrays see it deeper, the further they look aside."""
+    """Mean power around the bar on the middle lines; the outer lines of curved arrays meet it at a larger range."""
     middle = slice(len(frame.iq) // 2 - 40, len(frame.iq) // 2 + 41)
-    # How far along the outermost of them the bar is.
+    # Range of the bar on the outermost of these lines.
     origin, direction = probe.line_at(probe.line_positions()[middle][-1])
     farthest = (depth_mm - origin[1]) / direction[1]
     ends = (depth_mm - 2.0, farthest + 2.0)
@@ -224,7 +225,7 @@ def _band_power(frame, probe, depth_mm: float) -> float:
 
 
 def compounding(rotation: np.ndarray, device) -> Outcome:
-    """The thin bar in volumes compounded from a slide, from a tilt as of a matrix array, and from a free hand."""
+    """The thin bar in volumes compounded from a slide, a tilt (as of a matrix array) and a freehand sweep."""
     depth, width = 30.0, 1.2
     phantom = thin_rod(rotation, depth_mm=depth, width_mm=width)
     settings = SimulationSettings(scatterers_per_mm3=300.0)
@@ -249,17 +250,17 @@ def compounding(rotation: np.ndarray, device) -> Outcome:
         ]
         _, y, z = _bar_centre(volume, phantom.probe_to_ras, depth)
         off = float(np.hypot(y - depth, z))
-        rows.append(Row(f"bar is off its place, {name}", "mm", 0.0, off, 0.3, "at most"))
+        rows.append(Row(f"position error of the bar, {name}", "mm", 0.0, off, 0.3, "at most"))
     draw = partial(draw_cross_sections, volumes=volumes, probe_to_ras=phantom.probe_to_ras, depth_mm=depth)
     return Outcome(tuple(rows), draw)
 
 
 def freehand_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int, seed: int = 0) -> list[np.ndarray]:
-    """A slide as a hand does it: uneven steps, drift and tilt in every direction."""
+    """A freehand slide: uneven steps, drift and tilt in every direction."""
     rng = np.random.default_rng(seed)
     along = np.cumsum(rng.uniform(0.3, 1.7, frames))
     along = (along - along[0]) / (along[-1] - along[0]) - 0.5
-    # Slow waves of a few degrees and half a millimetre, no two axes alike.
+    # Slow oscillations of a few degrees and half a millimetre, different for every axis.
     wave = np.sin(2 * np.pi * (along[:, None] * rng.uniform(0.5, 2.0, 6) + rng.uniform(0, 1, 6)))
     poses = []
     for offset, (a, b, c, x, y, z) in zip(along * length_mm, wave, strict=True):
@@ -271,7 +272,7 @@ def freehand_sweep(probe_to_ras: np.ndarray, length_mm: float, frames: int, seed
 
 
 def _bar_level_db(volume: Volume, probe_to_ras: np.ndarray, depth_mm: float, offsets_mm: np.ndarray) -> np.ndarray:
-    """Mean grey level of the bar at distances from its plane, on both sides."""
+    """(offsets,) mean grey level of the bar at distances from its plane, on both sides."""
     x, y = np.meshgrid(np.linspace(-7, 7, 80), depth_mm + np.linspace(-0.3, 0.3, 5))
     levels = []
     for offset in offsets_mm:
@@ -293,25 +294,25 @@ def _bar_centre(volume: Volume, probe_to_ras: np.ndarray, depth_mm: float) -> np
 CHECKS = (
     Check(
         "echo level",
-        "A plane border across the beam echoes r, or r^2 by the paper's eq. 2, times the gain.",
+        "The echo of a plane interface across the beam is r, or r^2 by the paper's eq. 2, times the gain.",
         echo_level,
     ),
     Check("specular echoes", "The echo of a hit is w A |r| cos^n of the angle of incidence.", specular_echoes),
     Check(
         "elevational tilt",
-        "A plane leaning out of the image by t echoes exp(-(2 pi f tan t sigma)^2 / 2) as much, f in cycles per mm.",
+        "A plane tilted out of the image by t lowers its echo by exp(-(2 pi f tan t sigma)^2 / 2), f in cycles per mm.",
         tilted_in_elevation,
     ),
-    Check("interface width", "A small sheet spreads over lines and slices as the beam does.", interface_width),
-    Check("resolution", "A wire is as wide as the beam at its depth.", resolution),
+    Check("interface width", "The echo of a small sheet is widened by the beam in both directions.", interface_width),
+    Check("resolution", "The echo of a wire has the width of the beam at its depth.", resolution),
     Check(
         "slice thickness",
-        "A thin bar out of plane fades by exp(-z^2 / sigma^2) in power, averaged over its width.",
+        "The power of a thin bar out of plane falls as exp(-z^2 / sigma^2), averaged over its width.",
         slice_thickness,
     ),
     Check(
         "compounding",
-        "In a volume made of many images the bar lies where it is and is as thick as the elevational beam.",
+        "In a volume compounded from many images the bar has its position and the thickness of the elevational beam.",
         compounding,
     ),
 )

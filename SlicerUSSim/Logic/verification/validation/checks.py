@@ -1,4 +1,4 @@
-"""What a check is: one phenomenon, measured with some probes in some orientations; rows of a table and a picture."""
+"""Check: one phenomenon, measured with several probes and orientations; gives rows of a table and a figure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic.probe.arrays import ConvexProbe, LinearProbe, PhasedProbe, Probe
 
-#: How the phantoms, and the probes with them, lie on the voxels: along them, and two oblique ways.
+#: Orientations of the phantoms, with their probes, to the voxels: aligned, and two oblique ones.
 ORIENTATIONS: dict[str, np.ndarray] = {
     "aligned": np.eye(3),
     "oblique": Rotation.from_euler("xyz", [20, 33, 11], degrees=True).as_matrix(),
@@ -28,9 +28,9 @@ PROBES: dict[str, Probe] = {
 
 @dataclass(frozen=True)
 class Row:
-    """One number: what theory predicts and what was measured."""
+    """One quantity: predicted and measured value."""
 
-    #: What is measured, and on which probe or at which depth
+    #: Measured quantity, with the probe or depth
     quantity: str
     unit: str
     predicted: float
@@ -41,7 +41,7 @@ class Row:
 
     @property
     def passed(self) -> bool:
-        """Whether the measured number is as predicted; not for one that is not finite."""
+        """Whether the measured value is within its limits; False if it is not finite."""
         off = self.measured - self.predicted
         if self.kind == "at most":
             return bool(off <= self.tolerance)
@@ -51,7 +51,7 @@ class Row:
 
     @property
     def limits(self) -> str:
-        """What the measured number may be, in words."""
+        """The limits of the measured value as text."""
         if self.kind == "at most":
             return f"≤ {self.predicted + self.tolerance:.3g}"
         if self.kind == "at least":
@@ -60,33 +60,33 @@ class Row:
 
     @property
     def strain(self) -> float:
-        """How near the measured number is to its limit: 0 as predicted, 1 at the limit, above it failed."""
-        if np.isnan(self.measured):  # what was to be measured was not there
+        """Deviation of the measured value as a fraction of its limit: 0 as predicted, 1 at the limit, more fails."""
+        if np.isnan(self.measured):  # the echo to measure was missing
             return float("inf")
         if self.kind == "within":
             off = abs(self.measured - self.predicted)
             return off / self.tolerance if self.tolerance > 0 else float(off > 0)
         limit = self.predicted + (self.tolerance if self.kind == "at most" else -self.tolerance)
         pair = (self.measured, limit) if self.kind == "at most" else (limit, self.measured)
-        # Of numbers of one sign, the share of the limit; a limit of zero or of another sign says only yes or no.
+        # If both have the same sign, the fraction of the limit; otherwise only 0 or 1.
         return pair[0] / pair[1] if min(pair) > 0 else float(not self.passed)
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one check found in one orientation."""
+    """The result of one check in one orientation."""
 
     rows: tuple[Row, ...]
-    #: Writes the picture to a path; None where there is nothing to see
+    #: Writes the figure to a path; None if there is none
     draw: Callable[[Path], None] | None = None
 
 
 @dataclass(frozen=True)
 class Check:
-    """One phenomenon. `measure(rotation, device)` gives an Outcome."""
+    """One phenomenon. `measure(rotation, device)` returns an Outcome."""
 
     name: str
-    #: What theory says, in one line
+    #: The theoretical prediction, in one line
     claim: str
     measure: Callable[[np.ndarray, object], Outcome]
     orientations: tuple[str, ...] = tuple(ORIENTATIONS)

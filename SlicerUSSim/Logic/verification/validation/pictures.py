@@ -1,4 +1,4 @@
-"""Pictures of the validation: phantom beside simulation, prediction drawn in, in the style of the paper's Fig. 2."""
+"""Figures of the validation: phantom next to simulation with the predictions, in the style of the paper's Fig. 2."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.verification.phantoms import Echo, LevelChange, Phantom
 
 _OBJECT, _PREDICTION = "#4fb0c6", "#ffc83d"
 _CURVES = ("#c0392b", "#2c5f8a", "#5f9e6e")
-# One grey per label, so that the phantom reads as a drawing: background, then its parts.
+# One grey level per label: background, then the parts of the phantom.
 _LABEL_GREYS = np.array([45, 75, 130, 255, 30, 255, 190], np.uint8)
 
 
@@ -32,8 +32,8 @@ class View:
 
 
 def draw_views(path: Path, views: list[View]) -> None:
-    """Phantom and simulated image side by side, one row per view; circles where objects are, crosses where theory says
-    that the image shows them, boxes where it predicts the level."""
+    """Phantom and simulated image side by side, one row per view: circles at objects, crosses at their predicted
+    positions in the image, boxes around regions of predicted level."""
     from matplotlib import patches
 
     left, right, top, bottom = views[0].probe.image_bounds_mm()
@@ -80,14 +80,14 @@ def draw_rayleigh(path: Path, fit: RayleighFit, envelope: np.ndarray) -> None:
     histogram.plot(grey, fit.density, color="#c0392b", label=f"Rayleigh, sigma {fit.sigma:.2f}")
     histogram.set_title(f"SSE {fit.sse:.2e} (paper 3.14e-05)", fontsize=10)
     histogram.set_xlabel("grey level")
-    histogram.set_ylabel("share of samples")
+    histogram.set_ylabel("fraction of samples")
     histogram.legend(fontsize=8)
     _save(figure, path)
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """What was measured at some places, and theory's curve through them."""
+    """Measured points and the theoretical curve."""
 
     name: str
     x: np.ndarray
@@ -98,7 +98,7 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """Curves in one frame."""
+    """Curves in one pair of axes."""
 
     title: str
     x_label: str

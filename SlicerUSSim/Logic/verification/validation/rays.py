@@ -58,7 +58,7 @@ def refraction_and_reflectance(rotation: np.ndarray, device) -> Outcome:
 
 
 def _sine_ratio(tree, normal: np.ndarray) -> float:
-    """Median over lines of the refracted by the incident sine, against the true normal."""
+    """Median over lines of the sine of refraction divided by that of incidence, both to the true normal."""
     first = tree.segments["reflections"] == 0
     segments, lines = tree.segments[first], tree.segment_line[first]
     ratios = []
@@ -67,7 +67,7 @@ def _sine_ratio(tree, normal: np.ndarray) -> float:
         behind = np.flatnonzero(path["label"] == 2)
         if behind.size and behind[0] > 0:
             sines = [np.linalg.norm(np.cross(path[n]["direction"], normal)) for n in (behind[0] - 1, behind[0])]
-            if sines[0] > 0.1:  # nearly perpendicular rays do not bend
+            if sines[0] > 0.1:  # at nearly normal incidence the ratio is not accurate
                 ratios.append(sines[1] / sines[0])
     return float(np.median(ratios))
 
@@ -146,7 +146,7 @@ def thin_sheet(rotation: np.ndarray, device) -> Outcome:
         front = tree.hits["label_behind"] == 1
         crossed = set(zip(tree.hit_line[front], tree.hit_ray[front], strict=True))
         rays = len(np.unique(tree.segment_line)) * simulator.settings.elevational_rays
-        rows.append(Row(f"share of rays that see it, {name}", "", 1.0, len(crossed) / rays, 0.0))
+        rows.append(Row(f"fraction of rays that hit it, {name}", "", 1.0, len(crossed) / rays, 0.0))
     frame = simulator.simulate(PROBES["convex"], phantom.probe_to_ras)
     return Outcome(
         tuple(rows), partial(draw_views, views=[View("sheet of one voxel", phantom, PROBES["convex"], frame)])
@@ -154,7 +154,7 @@ def thin_sheet(rotation: np.ndarray, device) -> Outcome:
 
 
 def energy(rotation: np.ndarray, device) -> Outcome:
-    """Leaves and cut branches of every tree carry the weight of its root: R + T = 1 at each node."""
+    """The weights of leaves and cut branches of every tree add up to that of its root: R + T = 1 at each node."""
     phantom = layered([SLOW, FAST, SLOW, FAST], [10.0, 18.0, 29.0], rotation, tilt_deg=12.0)
     threshold = 1e-3
     settings = SimulationSettings(reflection_threshold=threshold, intensity_threshold=1e-9)
@@ -165,14 +165,14 @@ def energy(rotation: np.ndarray, device) -> Outcome:
         rows += [
             Row(f"largest sum of weights, {name}", "", 1.0, total.max(), 1e-4, "at most"),
             Row(f"smallest sum of weights, {name}", "", 1.0, total.min(), 1e-4, "at least"),
-            # Every node has met one interface, which may cost it one branch below the threshold.
+            # Every node has met one interface, at which at most one branch below the threshold was cut.
             Row(f"cut / (nodes x threshold), {name}", "", 1.0, (cut / branches / threshold).max(), 0.0, "at most"),
         ]
     return Outcome(tuple(rows))
 
 
 def _carried(simulator, probe, phantom: Phantom) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per traced line: weight of leaves and cut branches, of the cut ones alone, and the number of segments."""
+    """Per traced line: weight of leaves and cut branches, weight of the cut branches, and number of segments."""
     tree = simulator.trace(probe, phantom.probe_to_ras)
     lines = np.unique(tree.segment_line)
     cut = tree.cut_weight[:, 0].astype(float)
@@ -195,10 +195,10 @@ CHECKS = (
     Check("total reflection", "Beyond the critical angle R = 1 and nothing is refracted.", total_reflection),
     Check(
         "attenuation and time",
-        "Amplitude falls by 2 alpha f l dB; a border is shown at c_ref/2 times its two-way travel time.",
+        "Amplitude falls by 2 alpha f l dB; an interface is shown at c_ref/2 times its two-way travel time.",
         attenuation_and_time,
     ),
-    Check("sub-voxel interfaces", "A voxelised sphere shows no stairs.", sub_voxel_interfaces),
-    Check("thin sheet", "A sheet one voxel thick does not vanish.", thin_sheet),
-    Check("energy", "Weights over the tree and what was cut sum to one.", energy),
+    Check("sub-voxel interfaces", "A voxelised sphere has the normals of a smooth one.", sub_voxel_interfaces),
+    Check("thin sheet", "A sheet one voxel thick is hit by every ray.", thin_sheet),
+    Check("energy", "The weights of the leaves and the cut branches of a tree sum to one.", energy),
 )

@@ -1,4 +1,4 @@
-"""Runs the checks, and reports what they find."""
+"""Runs the checks and reports their results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.verification.validation.checks import ORIENTATIONS, Check
 
 @dataclass(frozen=True)
 class Finding:
-    """A row with the check and the orientation it belongs to."""
+    """A row with its check and orientation."""
 
     check: str
     orientation: str
@@ -31,7 +31,7 @@ class Report:
 
     @property
     def failed(self) -> tuple[Finding, ...]:
-        """The rows that are not as predicted."""
+        """The rows outside their limits."""
         return tuple(finding for finding in self.findings if not finding.row.passed)
 
     def to_dict(self) -> dict:
@@ -42,21 +42,21 @@ class Report:
             "pictures": list(self.pictures),
             "rows": [
                 {"check": f.check, "orientation": f.orientation, **asdict(f.row), "passed": f.row.passed}
-                # What is no number, because the echo to be measured was not there, has no place in JSON either.
+                # NaN (the echo to measure was missing) is not allowed in JSON.
                 | {"measured": float(f.row.measured) if np.isfinite(f.row.measured) else None}
                 for f in self.findings
             ],
         }
 
     def to_markdown(self) -> str:
-        """The table, a section per check, with its claim and its picture."""
+        """The tables as Markdown: a summary, then a section per check with its claim and its figure."""
         lines = ["# Validation", "", f"Device: {self.device}. {self.summary()}", ""]
         checks = {check.name: check for check in all_checks()}
         rows = {
             name: [f for f in self.findings if f.check == name]
             for name in dict.fromkeys(f.check for f in self.findings)
         }
-        lines += ["| check | rows | passed | nearest to its limit | share of it |", "|---|---|---|---|---|"]
+        lines += ["| check | rows | passed | closest to its limit | fraction of limit |", "|---|---|---|---|---|"]
         for name, findings in rows.items():
             passed = sum(f.row.passed for f in findings)
             worst = max(findings, key=lambda f: f.row.strain)
@@ -94,10 +94,10 @@ def validate(
     only: Iterable[str] = (),
     progress: Callable[[str], None] = lambda name: None,
 ) -> Report:
-    """Run the checks (all, or those whose names contain one of `only`) and write report.md, report.json and pictures.
+    """Run the checks (all, or those whose names contain one of `only`) and write report.md, report.json and figures.
 
-    Raises SimulationError without matplotlib, for an `only` that no check has in its name, and for a folder that cannot
-    be made. A row that fails is no error: see Report.failed.
+    Raises SimulationError without matplotlib, for a text in `only` that matches no check, and for a folder that cannot
+    be created. A failed row does not raise: see Report.failed.
     """
     from SlicerUSSim.Logic.base.files import make_folder, write_json, written_whole
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
@@ -125,12 +125,12 @@ def validate(
 
 
 def chosen_checks(only: Iterable[str]) -> tuple[Check, ...]:
-    """The checks whose names contain one of the texts; all if there are none. SimulationError for one nobody has."""
+    """The checks whose names contain one of the texts; all without texts. SimulationError for a text without match."""
     wanted, checks = tuple(only), all_checks()
     for text in wanted:
         require(
             any(text in check.name for check in checks),
-            f"no check has {text!r} in its name, expected part of: {', '.join(check.name for check in checks)}",
+            f"check is {text!r}, expected part of: {', '.join(check.name for check in checks)}",
         )
     return tuple(check for check in checks if not wanted or any(text in check.name for text in wanted))
 

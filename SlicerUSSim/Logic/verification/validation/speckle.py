@@ -1,4 +1,4 @@
-"""Checks of the speckle (docs/physics.md#5-scatterers): statistics, correlations, level, a fixed patient."""
+"""Checks of the speckle (docs/physics.md#5-scatterers): statistics, correlations, level, fixed scatterers."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def statistics(rotation: np.ndarray, device) -> Outcome:
 
 
 def _spectral_peak(envelope: np.ndarray) -> float:
-    """How far the highest line of the mean intensity spectrum stands out; a lattice or a tiling would show as one.
+    """Ratio of the highest peak of the mean intensity spectrum to its surroundings; a lattice or a tiling has peaks.
 
     The mean of eight exponential variables exceeds its median eightfold less than once in 10^18.
     """
@@ -118,7 +118,7 @@ def correlations(rotation: np.ndarray, device) -> Outcome:
 
 
 def coherence(rotation: np.ndarray, device) -> Outcome:
-    """The probe moves along its own lateral axis by one scan line; the patient stays."""
+    """The probe moves laterally by one scan line; the scatterers remain fixed in the patient."""
     phantom, (simulator,) = _simulators(rotation, device, seeds=(0,))
     rows, images = [], {}
     probes = {"linear": replace(PROBES["linear"], width_mm=36.0, scan_lines=181)} | {
@@ -143,7 +143,7 @@ def coherence(rotation: np.ndarray, device) -> Outcome:
 
 
 def one_line_on(probe: Probe) -> np.ndarray:
-    """(4, 4) motion in the probe frame that takes every scan line to the next one's place."""
+    """(4, 4) motion in the probe frame that moves every scan line to the position of the next."""
     motion = np.eye(4)
     if probe.is_linear:
         motion[0, 3] = probe.line_spacing
@@ -171,9 +171,9 @@ def echogenicity(rotation: np.ndarray, device) -> Outcome:
     return Outcome(tuple(rows))
 
 
-#: The paper's Fig. 4: a lattice of 20 um of which one site in a hundred is taken, 1250 scatterers per mm^3.
+#: The paper's Fig. 4: a lattice of 20 um of which one site in a hundred is occupied, 1250 scatterers per mm^3.
 RAYLEIGH_SITES_PER_MM3, RAYLEIGH_SHARE = 125_000.0, 0.01
-#: A high frequency and a low f-number give many resolution cells in a small volume; each holds some 60 scatterers.
+#: A high frequency and a low f-number give many resolution cells in a small volume, each with some 60 scatterers.
 RAYLEIGH_PROBE = LinearProbe(
     24.0, 16.0, scan_lines=241, frequency_mhz=10.0, receive_f_number=1.5, aperture_mm=12.0, focus_mm=400.0,
     elevation_aperture_mm=2.4, elevation_focus_mm=10.0,
@@ -181,7 +181,7 @@ RAYLEIGH_PROBE = LinearProbe(
 
 
 def rayleigh(rotation: np.ndarray, device) -> Outcome:
-    """The envelope's distribution, by the paper's protocol."""
+    """The distribution of the envelope, by the paper's protocol."""
     probe, first_mm = RAYLEIGH_PROBE, 3.0
     tissue = replace(SPECKLE, mu1=float(stats.norm.isf(RAYLEIGH_SHARE)))
     phantom, simulators = _simulators(
@@ -191,7 +191,7 @@ def rayleigh(rotation: np.ndarray, device) -> Outcome:
     first = int(first_mm / frames[0].sample_interval_mm)
     envelope = np.abs(np.stack([frame.iq[:, first:-64] for frame in frames]))
     fit = fit_rayleigh(envelope)
-    # Four sigmas apart, signals correlate by exp(-4) = 2 %; the level is known beforehand, so nothing is fitted.
+    # Signals four sigmas apart have the correlation exp(-4) = 2 %. The level is known, so no parameter is fitted.
     deep = first_mm + np.arange(envelope.shape[2]) * frames[0].sample_interval_mm
     lines = int(np.ceil(4 * probe.beam_sigma_mm(deep)[0].max() / probe.line_spacing))
     samples = int(np.ceil(4 * probe.axial_sigma_mm / frames[0].sample_interval_mm))
@@ -213,15 +213,15 @@ def rayleigh(rotation: np.ndarray, device) -> Outcome:
 CHECKS = (
     Check(
         "speckle statistics",
-        "Mean over standard deviation 1.913, mean power = Var of the scatterers, no lattice in the spectrum.",
+        "Mean / standard deviation is 1.913, mean power is Var of the scatterers, and the spectrum shows no lattice.",
         statistics,
     ),
     Check(
         "speckle correlation",
-        "exp(-d^2 / 4 sigma^2) between signals d apart, with the sigma of the beam at that depth.",
+        "Signals d apart have the correlation exp(-d^2 / 4 sigma^2), with the sigma of the beam at that depth.",
         correlations,
     ),
-    Check("speckle coherence", "The same scatterers from every pose.", coherence),
+    Check("speckle coherence", "The scatterers are the same at every pose.", coherence),
     Check("echogenicity", "Var = p (1 - p) mu0^2 + p sigma0^2 alone sets the level.", echogenicity),
     Check(
         "rayleigh",
