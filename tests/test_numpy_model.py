@@ -76,7 +76,7 @@ def test_the_kernels_draw_what_numpy_draws(kind, turn):
     difference = np.abs(image.astype(int) - model.simulate(PROBES[kind], pose, display, noise_seed=seed))
     assert image.max() > 100
     assert (difference <= 1).mean() > 0.97  # a ray that just grazes a voxel may go the other way: a line of 48
-    assert set(model.timings_ms) == {
+    assert set(model.timings_ms) >= {
         "ray tree", "scatterers", "interfaces", "beam", "pulse", "B-mode", "scan conversion"
     }  # fmt: skip
 

@@ -47,6 +47,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+_ATTENUATION = "attenuation_db_cm_mhz"
+#: Tissue parameters whose effect on an image the bases and paths have
+VARIABLE = SCATTERING | {_ATTENUATION}
 _BANDS = CONSTANTS["BANDS"]
 #: Memory that bases and paths of all images may take; more is asked for by mistake.
 _MOST_BYTES = 4 * 2**30
@@ -65,8 +68,8 @@ class AppearanceModel:
     varied : {tissue name: parameter names among parameters.TISSUE_BOUNDS}.
     grid : the pixels of the images (default: what just holds the imaged field, as many as display.image_size says).
 
-    Raises SimulationError for a tissue the simulator does not have, a pose that is not rigid, and for more images and
-    parameters than fit into memory.
+    Raises SimulationError for a tissue the simulator does not have, a parameter outside VARIABLE, a pose that is not
+    rigid, and for more images and parameters than fit into memory.
     """
 
     def __init__(
@@ -83,9 +86,13 @@ class AppearanceModel:
         self.varied = {name: frozenset(parameters) for name, parameters in varied.items()}
         for name in self.varied:
             simulator.medium.tissues.tissue(name)
+            others = sorted(self.varied[name] - VARIABLE)
+            require(
+                not others, f"{name}: a fit cannot vary {', '.join(others)}, expected {', '.join(sorted(VARIABLE))}"
+            )
         #: Tissues whose scatterers vary, and whose attenuation does, in the order of the bases and of the paths
         self.scattering = [n for n, p in self.varied.items() if p & SCATTERING]
-        self.attenuating = [n for n, p in self.varied.items() if "attenuation_db_cm_mhz" in p]
+        self.attenuating = [n for n, p in self.varied.items() if _ATTENUATION in p]
         self._check_memory()
         device = self.device
         mixing = device.kernels("appearance.cl", device.lanes)
