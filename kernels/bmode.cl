@@ -23,8 +23,7 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
 
 // Amplifier noise, time gain compensation, envelope, log compression, eight bits.
 __kernel void compress(__global const float *iq, int samples, float noise, uint noise_seed, float tgc_per_sample,
-                       float level_of_white_db, float dynamic_range_db, __global float *envelope,
-                       __global uchar *grey) {
+                       float level_of_white_db, Display display, __global float *envelope, __global uchar *grey) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int here = line * samples + sample;
   floatn re, im;
@@ -39,7 +38,7 @@ __kernel void compress(__global const float *iq, int samples, float noise, uint 
   const floatn tgc_db = TO_FLOATN(index) * tgc_per_sample;
   const floatn level_db = 3.01029996f * log2_fast(power) + tgc_db;
   STORE_LANES(sqrt(power) * exp2_fast(clamp(tgc_db * 0.166096405f, -100.0f, 100.0f)), envelope + here);
-  STORE_GREY(grey_level(level_db, level_of_white_db, dynamic_range_db), grey + here);
+  STORE_GREY(grey_level(level_db, level_of_white_db, display.dynamic_range_db), grey + here);
 }
 
 // Mean grey level over `width` samples about each sample, the depth range of one pixel of the image. Single samples

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from SlicerUSSim.Logic import DisplaySettings, LinearProbe, Membrane, SimulationError, Tissue
-from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
+from SlicerUSSim.Logic.fitting.appearance import VARIABLE, AppearanceModel
+from SlicerUSSim.Logic.fitting.parameters import TISSUE_BOUNDS
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from tests.conftest import block, simulator
@@ -160,6 +161,12 @@ def test_without_scattering_only_interfaces_are_left(layers):
 def test_a_tissue_that_is_not_there_is_named(layers):
     with pytest.raises(SimulationError, match=r"no tissue named 'liver', expected one of: fluid, upper, lower, plate"):
         AppearanceModel(layers[0], PROBE, layers[1], {"liver": ("mu0",)})
+
+
+def test_every_tissue_parameter_with_bounds_of_a_fit_has_an_effect_and_others_are_refused(layers):
+    assert set(TISSUE_BOUNDS) == VARIABLE
+    with pytest.raises(SimulationError, match="upper: a fit cannot vary impedance_mrayl, expected attenuation_db_cm_m"):
+        AppearanceModel(layers[0], PROBE, layers[1], {"upper": ("mu0", "impedance_mrayl")})
 
 
 def test_more_images_than_memory_holds_are_refused(layers):

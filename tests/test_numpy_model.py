@@ -61,7 +61,7 @@ def scene(membrane: bool = True):
     return block(label, half_mm=(22, 34, 12)), TissueTable(tissues, membrane=skin)
 
 
-@pytest.mark.parametrize("kind", PROBES)
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k == "convex")) for k in PROBES])
 @pytest.mark.parametrize(
     "turn",
     [np.eye(3), pytest.param([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]], marks=pytest.mark.slow)],
@@ -76,7 +76,7 @@ def test_the_kernels_draw_what_numpy_draws(kind, turn):
     difference = np.abs(image.astype(int) - model.simulate(PROBES[kind], pose, display, noise_seed=seed))
     assert image.max() > 100
     assert (difference <= 1).mean() > 0.97  # a ray that just grazes a voxel may go the other way: a line of 48
-    assert set(model.timings_ms) == {
+    assert set(model.timings_ms) >= {
         "ray tree", "scatterers", "interfaces", "beam", "pulse", "B-mode", "scan conversion"
     }  # fmt: skip
 
@@ -86,7 +86,10 @@ def test_the_kernels_draw_what_numpy_draws(kind, turn):
     [
         SimulationSettings(scattering=False, reflection_spreading=False),
         pytest.param(SimulationSettings(interfaces=False, seed=7, scatterers_per_mm3=10), marks=pytest.mark.slow),
-        SimulationSettings(interface_reflection="energy", max_ray_depth=2, reference_speed_m_s=1480),
+        pytest.param(
+            SimulationSettings(interface_reflection="energy", max_ray_depth=2, reference_speed_m_s=1480),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_numpy_follows_the_settings(settings):

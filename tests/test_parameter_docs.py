@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mrml.parameter_node import PanelSettings
 from SlicerUSSim.Logic.probe.arrays import PROBE_KIND, PROBE_KINDS, Probe
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 
@@ -55,6 +56,7 @@ SECTIONS: list[tuple[str, type[Declared], str]] = [
      "`free`, `ussim optimize` has options of the same names."),
     ("Similarity", SimilaritySettings, "The cost of a fit ([optimization.md](optimization.md#cost-function)); set in "
      "Python only."),
+    ("Panel", PanelSettings, "Further values of the panel that are saved with a scene ([slicer.md](slicer.md))."),
 ]  # fmt: skip
 
 
@@ -138,6 +140,8 @@ def test_every_declared_class_is_on_the_page():
         return {kind}.union(*map(below, kind.__subclasses__()))
 
     ours = {kind for kind in below(Declared) - {Declared} if kind.__module__.startswith("SlicerUSSim.Logic")}
+    # What only a scene remembers is imported with Slicer's libraries, and is no parameter of images.
+    ours = {kind for kind in ours if not kind.__module__.startswith("SlicerUSSim.Logic.mrml")}
     assert ours == {kind for _, kind, _ in SECTIONS}
 
 

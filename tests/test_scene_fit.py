@@ -218,6 +218,7 @@ def test_geometry_can_be_estimated(scene):
         scene.logic.preset = scene_preset
 
 
+@pytest.mark.slow
 def test_registration_is_written_as_a_transform_of_the_tracking(brain, monkeypatch):
     monkeypatch.setattr(tracked_fit, "_ROUNDS", ((8.0, 60), (4.0, 40)))  # how well: test_registration
     own = Scene(brain)

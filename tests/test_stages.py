@@ -52,14 +52,23 @@ def test_the_simulator_runs_the_stages_of_the_list_in_its_order():
     frame = found.simulate(PROBE, POSE)
     names = [stage.name for stage in ALL_STAGES]
     assert list(frame.timings_ms) == ["upload", *names, "download"]
-    assert names == ["ray tree", "scatterers", "interfaces", "beam", "pulse", "B-mode", "scan conversion"]
+    assert [name for name in names if name in TWINS] == [
+        "ray tree",
+        "scatterers",
+        "interfaces",
+        "beam",
+        "pulse",
+        "B-mode",
+        "scan conversion",
+    ]
 
 
 @pytest.mark.parametrize("kind", ALL_STAGES, ids=lambda kind: kind.name)
 def test_every_stage_has_its_work_and_one_twin(plain, kind):
     stage, frame = plain.stage(kind), plain.device_frame(PROBE, POSE)
     work = stage.work(frame, plain.trace(PROBE, POSE))
-    assert (work.operations >= 0 and work.bytes > 0) or kind.name == "interfaces"  # these tissues have none
+    # These tissues have no interfaces; and a stage that came later may be off by default.
+    assert (work.operations >= 0 and work.bytes > 0) or kind.name == "interfaces" or kind.has_own_twin()
     assert callable(twin_of(stage))
     assert kind.has_own_twin() != (kind.name in TWINS)
 
@@ -217,8 +226,9 @@ def added(request, monkeypatch, tmp_path):
     (folder / "lateral_smoothing.cl").write_text(SMOOTHING_SOURCE)
     (folder / "edge_enhancement.cl").write_text(EDGE_SOURCE)
     monkeypatch.setattr(opencl_device, "kernel_folder", lambda: folder)
-    assert (Compressor, ScanConverter) == stages.DISPLAY_STAGES
-    monkeypatch.setattr(stages, "DISPLAY_STAGES", (Compressor, request.param, ScanConverter))
+    *before, last = stages.DISPLAY_STAGES
+    assert Compressor in before and last is ScanConverter
+    monkeypatch.setattr(stages, "DISPLAY_STAGES", (*before, request.param, last))
     return request.param
 
 
@@ -233,12 +243,7 @@ def test_the_simulator_uses_an_added_stage(added, plain):
     assert np.array_equal(on.iq, off.iq) and not np.array_equal(on.bmode, off.bmode)
     assert np.array_equal(on.envelope, off.envelope) == (added is LateralSmoothing)
     found.profiling = True
-    assert list(found.simulate(PROBE, POSE, ON).timings_ms)[-4:] == [
-        "B-mode",
-        added.name,
-        "scan conversion",
-        "download",
-    ]
+    assert list(found.simulate(PROBE, POSE, ON).timings_ms)[-3:] == [added.name, "scan conversion", "download"]
 
 
 def test_the_appearance_model_uses_an_added_stage(added):
@@ -268,7 +273,7 @@ def test_numpy_uses_an_added_stage(added):
     found = make()
     model = NumpyModel(found)
     image = model.simulate(PROBE, POSE, ON)
-    assert list(model.timings_ms)[-3:] == ["B-mode", added.name, "scan conversion"]
+    assert list(model.timings_ms)[-2:] == [added.name, "scan conversion"]
     on, off = (found.simulate(PROBE, POSE, display).image.astype(int) for display in (ON, OFF))
     assert (np.abs(on - image) <= 1).mean() > 0.99 > 0.9 > (np.abs(off - image) <= 1).mean()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import cached_property
 from pathlib import Path
 
 import click
@@ -11,7 +12,18 @@ from SlicerUSSim.Command.options import device_option, parameter_option
 from SlicerUSSim.Command.progress import Steps, note
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 
-PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # probe.PROBES, which would import numpy
+
+class ProbeName(click.Choice):
+    """A name of probe.PROBES, which imports numpy and therefore waits until a choice is made or --help asks for it."""
+
+    def __init__(self) -> None:
+        self.case_sensitive = True
+
+    @cached_property
+    def choices(self) -> tuple[str, ...]:
+        from SlicerUSSim.Logic.probe.arrays import PROBES
+
+        return tuple(PROBES)
 
 
 @click.command()
@@ -19,7 +31,7 @@ PROBE_NAMES = ["phased", "convex", "linear", "microconvex", "abdominal"]  # prob
     "--out", type=click.Path(path_type=Path), default="ussim-demo", show_default=True, help="Folder for the results."
 )
 @click.option("--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain of nilearn).")
-@click.option("--probe", "kind", type=click.Choice(PROBE_NAMES), default="phased", show_default=True)
+@click.option("--probe", "kind", type=ProbeName(), default="phased", show_default=True)
 @parameter_option(SimulationSettings, "seed")
 @device_option
 def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -> None:

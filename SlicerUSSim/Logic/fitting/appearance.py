@@ -46,6 +46,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+_ATTENUATION = "attenuation_db_cm_mhz"
+#: Tissue parameters whose effect on an image the bases and paths have
+VARIABLE = SCATTERING | {_ATTENUATION}
 _BANDS = CONSTANTS["BANDS"]
 #: Limit for the memory of bases and paths of all images.
 _MOST_BYTES = 4 * 2**30
@@ -64,8 +67,8 @@ class AppearanceModel:
     varied : {tissue name: parameter names among parameters.TISSUE_BOUNDS}.
     grid : the pixels of the images (default: the bounding box of the imaged field, with display.image_size pixels).
 
-    Raises SimulationError for a tissue that the simulator does not have, a pose that is not rigid, and if the images
-    and parameters need too much memory.
+    Raises SimulationError for a tissue that the simulator does not have, a parameter outside VARIABLE, a pose that is
+    not rigid, and if the images and parameters need too much memory.
     """
 
     def __init__(
@@ -82,9 +85,13 @@ class AppearanceModel:
         self.varied = {name: frozenset(parameters) for name, parameters in varied.items()}
         for name in self.varied:
             simulator.medium.tissues.tissue(name)
+            others = sorted(self.varied[name] - VARIABLE)
+            require(
+                not others, f"{name}: a fit cannot vary {', '.join(others)}, expected {', '.join(sorted(VARIABLE))}"
+            )
         #: Tissues with varied scatterers, in the order of the bases, and with varied attenuation, in that of the paths
         self.scattering = [n for n, p in self.varied.items() if p & SCATTERING]
-        self.attenuating = [n for n, p in self.varied.items() if "attenuation_db_cm_mhz" in p]
+        self.attenuating = [n for n, p in self.varied.items() if _ATTENUATION in p]
         self._check_memory()
         device = self.device
         mixing = device.kernels("appearance.cl", device.lanes)

@@ -87,7 +87,7 @@ class Compressor(Stage):
             np.uint32(noise_key(acquisition, frame.noise_seed)),
             np.float32(tgc),
             np.float32(FULL_SCALE_DB - display.gain_db),
-            np.float32(display.dynamic_range_db),
+            frame.display_record,
             frame.envelope,
             frame.grey,
         )

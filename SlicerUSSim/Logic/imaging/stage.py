@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.imaging.medium import Medium
 from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree, TreeBuffers
 from SlicerUSSim.Logic.opencl.device import Device
+from SlicerUSSim.Logic.opencl.layout import DISPLAY
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 
@@ -54,6 +55,15 @@ class FrameInputs:
     def line_shape(self) -> tuple[int, int]:
         """(scan lines, samples) of the signals along lines; samples are whole blocks."""
         return int(self.acquisition["scan_lines"]), int(self.acquisition["samples"])
+
+    @property
+    def display_record(self) -> np.ndarray:
+        """() record of layout.DISPLAY: what `display` says, which kernels take by value."""
+        record = np.zeros((), DISPLAY)
+        for name in DISPLAY.names or ():
+            value = getattr(self.display, name)
+            record[name] = np.nan if value is None else value
+        return record
 
 
 @dataclass(eq=False)

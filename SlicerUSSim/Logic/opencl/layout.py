@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.declaration import parameters_of
+from SlicerUSSim.Logic.base.settings import DisplaySettings
+
 #: Constants with the same name in host and kernels.
 CONSTANTS = {
     "LABEL_MASK": 0x3F,  # low byte of a medium voxel: six bits of label, ...
@@ -136,6 +139,9 @@ HIT = np.dtype(
     ]
 )
 
+#: The numbers of DisplaySettings by their names, for kernels of display stages; nan stands for None.
+DISPLAY = np.dtype([(entry.name, _FLOAT) for entry in parameters_of(DisplaySettings) if entry.type in (int, float)])
+
 _C_TYPES = {np.dtype(_FLOAT): "float", np.dtype(_INT): "int", np.dtype(_UINT): "uint"}
 
 
@@ -150,5 +156,5 @@ def _c_struct(name: str, dtype: np.dtype) -> str:
 def shared_source() -> str:
     """C source of all constants and structs above; Device.kernels prepends it to a kernel file."""
     constants = [f"#define {name} {value}{'f' * isinstance(value, float)}" for name, value in CONSTANTS.items()]
-    structs = [("Acquisition", ACQUISITION), ("Tissue", TISSUE), ("Segment", SEGMENT), ("Hit", HIT)]
-    return "\n".join(constants + [_c_struct(name, dtype) for name, dtype in structs])
+    dtypes = {"Acquisition": ACQUISITION, "Display": DISPLAY, "Tissue": TISSUE, "Segment": SEGMENT, "Hit": HIT}
+    return "\n".join(constants + [_c_struct(name, dtype) for name, dtype in dtypes.items()])

@@ -18,7 +18,7 @@ def _level(text: str) -> str:
 def _tissue(name, c, c_source, z, z_source, alpha, alpha_source, mu0=0.0, mu1=0.0, sigma0=0.0, scatter="") -> Tissue:
     sources = {"speed_of_sound_m_s": c_source, "impedance_mrayl": z_source, "attenuation_db_cm_mhz": alpha_source}
     sources |= dict.fromkeys(("mu0", "mu1", "sigma0"), scatter or "no scatterers")
-    return Tissue(name, c, z, alpha, mu0, mu1, sigma0, sources)
+    return Tissue(name, c, z, alpha, mu0, mu1, sigma0, sources=sources)
 
 
 _DENSITY = f"density ({_ITIS}) x speed of sound"
