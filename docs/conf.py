@@ -1,9 +1,8 @@
-"""Sphinx: README, docs and changelog as they lie in the repository, and the API reference from docstrings.
+"""Sphinx: README, docs and changelog of the repository, and the API reference from docstrings.
 
     sphinx-build -W --keep-going -c docs . build/docs
 
-The source folder is the root of the repository, so that links and images lead where they lead on GitHub. Nothing is
-taken from the network.
+The source folder is the root of the repository, so that links and images work as on GitHub. No network is used.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ templates_path: list[str] = []
 
 smartquotes = False  # quotation marks in docstrings are often code
 
-myst_heading_anchors = 4  # the anchors that GitHub makes
+myst_heading_anchors = 4  # the same anchors as on GitHub
 
 autosummary_generate = False
 autodoc_member_order = "bysource"
@@ -73,18 +72,18 @@ REPOSITORY = json.loads((ROOT / "USSim.json").read_text(encoding="utf-8"))["scm_
 
 
 def adapt_page(app, docname: str, source: list[str]) -> None:
-    """A page as it lies in the repository becomes one of the site."""
+    """Adapt a page of the repository to the site."""
     folder = (ROOT / docname).parent
     # The site has pages for rooms and none for folders.
     source[0] = re.sub(r"\]\(([\w./-]+)\)", lambda link: f"]({_without_folders(folder, link[1])})", source[0])
     if docname == root_doc:
-        # The README is the first page: the table of contents goes behind it, where GitHub does not show it.
+        # The README is the first page; the table of contents is added at its end, only on the site.
         for caption, pages in PAGES.items():
             source[0] += "\n\n```{toctree}\n:hidden:\n:caption: " + caption + "\n\n" + "\n".join(pages) + "\n```\n"
 
 
 def _without_folders(folder: Path, target: str) -> str:
-    """What a link to a folder of the repository leads to: the page of that room, or the folder in the web."""
+    """Target of a link to a folder of the repository: the page of the room, or the folder on the web."""
     path = (folder / target).resolve()
     if not path.is_dir() or not path.is_relative_to(ROOT):
         return target
@@ -98,15 +97,15 @@ def rewrite_docstring(app, what, name, obj, options, lines: list[str]) -> None:
 
 
 def skip_undocumented(app, what, name, obj, skip: bool, options) -> bool | None:
-    """Fields are shown without a comment too, methods only with a docstring: VTK's are none of a user's business."""
+    """Show fields even without a comment, but methods only with a docstring, which excludes those of VTK."""
     return True if inspect.isroutine(obj) and not obj.__doc__ else None
 
 
 def describe_declared_fields() -> None:
-    """Fields that are declared with a description have it in the place of a comment above them."""
+    """Use the description in a field's declaration instead of a comment."""
     for name, home in reference.homes().items():
         room = home.rpartition(".")[0]
-        if room.endswith(".mrml"):  # which declares none, and cannot be imported everywhere
+        if room.endswith(".mrml"):  # cannot be imported everywhere
             continue
         for owner in getattr(getattr(importlib.import_module(room), name), "__mro__", ()):
             for field, text in reference.declared_fields(owner).items():
@@ -116,7 +115,7 @@ def describe_declared_fields() -> None:
 
 
 def shorten_defaults(app, what, name, obj, options, signature: str | None, returns: str | None):
-    """Defaults that are objects, without what is in them; and in a form that Sphinx can parse."""
+    """Shorten defaults that are objects, in a form that Sphinx can parse."""
     if signature is None:
         return None
     signature = signature.replace("<factory>", "...")
@@ -124,7 +123,7 @@ def shorten_defaults(app, what, name, obj, options, signature: str | None, retur
 
 
 def write_first_page(app, exception) -> None:
-    """index.html, where browsers and hosts look for the first page."""
+    """Write index.html, which redirects to the first page."""
     if exception is None and app.builder.format == "html":
         text = f'<!doctype html><meta http-equiv="refresh" content="0; url={root_doc}.html"><title>{project}</title>\n'
         (Path(app.outdir) / "index.html").write_text(text, encoding="utf-8")

@@ -1,6 +1,6 @@
-"""The reference from what the code declares: a page per room with the names of its face, and a page of the command.
+"""Generates the reference from the code: a page per room with its public names, and a page of the command.
 
-Nothing here imports Sphinx; conf.py connects it. It is written as reST into docs/reference, which is not kept in git.
+Nothing here imports Sphinx; conf.py calls it. It is written as reST into docs/reference, which is not in git.
 
 Docstrings of this package are plain text with three conventions: names in `single backticks`, "Parameters" underlined
 with hyphens and then `name : text`, and pages such as docs/physics.md, with or without a heading.
@@ -40,8 +40,8 @@ INDEX = """API reference
 .. automodule:: SlicerUSSim.Logic
    :no-members:
 
-Names that ``SlicerUSSim.Logic`` gives
---------------------------------------
+Public names of ``SlicerUSSim.Logic``
+-------------------------------------
 
 .. autosummary::
    :nosignatures:
@@ -86,7 +86,7 @@ def homes() -> dict[str, str]:
 
 
 def room_page(room: str) -> str:
-    """The page of a room, in reST: what its face says, a table of its names, and each of them."""
+    """The page of a room, in reST: its description, a table of its names, and each of them."""
     package = f"SlicerUSSim.Logic.{room}"
     names = exports(room)
     entries = {name: _entry(room, module, name) for name, module in names.items()}
@@ -101,7 +101,7 @@ def room_page(room: str) -> str:
 
 
 def index_page() -> str:
-    """The first page of the reference: what `SlicerUSSim.Logic` gives, and the rooms."""
+    """The first page of the reference: the public names of `SlicerUSSim.Logic`, and the rooms."""
     where = homes()
     return INDEX.format(
         summary="\n".join(f"   ~{where[name].removeprefix('SlicerUSSim.Logic.')}" for name in exports("")),
@@ -110,7 +110,7 @@ def index_page() -> str:
 
 
 def command_page(group: click.Group) -> str:
-    """The page of the command: what --help says of it and of each of its subcommands."""
+    """The page of the command: the --help texts of it and of its subcommands."""
     parts = ["The command", "===========", "", _help(group, "ussim")]
     for name, command in sorted(group.commands.items()):
         parts += [f"ussim {name}", "-" * len(f"ussim {name}"), "", _help(command, f"ussim {name}")]
@@ -131,7 +131,7 @@ def _help(command: click.Command, name: str) -> str:
 
 
 def write_pages(folder: Path, group: click.Group) -> None:
-    """Write all pages into a folder; files that would not change are left as they are."""
+    """Write all pages into a folder; unchanged files are not written."""
     folder.mkdir(parents=True, exist_ok=True)
     pages = {"index": index_page(), "command": command_page(group), **{room: room_page(room) for room in rooms()}}
     for old in folder.glob("*.rst"):
@@ -159,7 +159,7 @@ def _entry(room: str, module: str, name: str) -> str:
 
 
 def _inheritance(node: ast.ClassDef, body: list[ast.stmt]) -> str:
-    """What belongs below the directive of a class: its bases, or the methods of one that is not public, in reST."""
+    """Content of the directive of a class: its bases, or the methods of bases that are not public, in reST."""
     bases = {ast.unparse(base) for base in node.bases}
     hidden = [base for base in body if isinstance(base, ast.ClassDef) and base.name in bases and base.name[0] == "_"]
     if hidden or not bases:
@@ -170,7 +170,7 @@ def _inheritance(node: ast.ClassDef, body: list[ast.stmt]) -> str:
 
 
 def _comment_above(lines: list[str], number: int) -> str:
-    """What the `#:` comment above a line says, in reST."""
+    """The `#:` comment above a line, in reST."""
     first = number
     while first and lines[first - 1].startswith("#:"):
         first -= 1
@@ -181,7 +181,7 @@ def _comment_above(lines: list[str], number: int) -> str:
 
 
 def docstring_as_rest(lines: list[str], where: dict[str, str] | None = None) -> list[str]:
-    """The lines of a docstring as reST; names that `where` knows (see homes) become links to it."""
+    """The lines of a docstring as reST; names in `where` (see homes) become links."""
     out: list[str] = []
     in_parameters = in_example = False
     number = 0
@@ -207,7 +207,7 @@ def docstring_as_rest(lines: list[str], where: dict[str, str] | None = None) -> 
 
 
 def declared_fields(owner: type) -> dict[str, str]:
-    """{field: what its declaration says} of the fields of a dataclass that have one (metadata "parameter")."""
+    """{field: text of its declaration} of the declared fields of a dataclass (metadata "parameter")."""
     own = get_annotations(owner) if is_dataclass(owner) else {}
     entries = [entry for entry in fields(owner) if entry.name in own and "parameter" in entry.metadata] if own else []
     return {entry.name: _described(entry.metadata["parameter"]) for entry in entries}
@@ -223,7 +223,7 @@ def _described(about: object) -> str:
 
 
 def _parameter(line: str, where: dict[str, str] | None) -> list[str]:
-    """A line below "Parameters": a term and the begin of its text, or more of the text."""
+    """A line below "Parameters": a term and the beginning of its text, or a continuation."""
     found = re.match(r"([\w*]+(?:, [\w*]+)*) : (.*)", line)
     if found is None:
         return ["        " + _inline(line.strip(), where)]
@@ -238,7 +238,7 @@ _MARKS = re.compile(
 
 
 def _inline(line: str, where: dict[str, str] | None) -> str:
-    """`name` as code, or as a link where it is known, as names such as TissueTable are; docs/page.md as a link."""
+    """`name` as code, or as a link if it is known, such as TissueTable; docs/page.md as a link."""
     known = where or {}
 
     def marked(found: re.Match) -> str:

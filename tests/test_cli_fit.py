@@ -78,7 +78,7 @@ def test_optimize_writes_result_report_preset_and_state(folder):
     assert not re.search(r"(src|href)=\"(?!data:)", report)  # nothing outside the file
     for words in (
         "simulated, before", "real", "Blink", "white matter.mu0", "net attenuation", "Var of white matter",
-        "<td>Mean amplitude μ₀</td>", 'title="Mean amplitude of scatterers.', "<td>dB/(cm MHz)</td>",
+        "<td>Mean amplitude μ₀</td>", 'title="Mean amplitude of the scatterers.', "<td>dB/(cm MHz)</td>",
     ):  # fmt: skip
         assert words in report
 
@@ -217,7 +217,7 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
     done = ussim("sweep", *common, "-o", tmp_path / "cut.igs.mha")
     assert done.exit_code == 0 and len(TrackedSequence.read(tmp_path / "cut.igs.mha")) == 1
     both = ussim("sweep", *common, "--cut-tilt", 5, "--cut-slide", 5, "-o", tmp_path / "no.igs.mha")
-    assert both.exit_code == 2 and "either --cut-tilt DEGREES or --cut-slide" in both.output
+    assert both.exit_code == 2 and "--cut-tilt and --cut-slide are both given" in both.output
 
 
 @pytest.mark.parametrize(
@@ -229,13 +229,13 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
         (["--transform", "ImageToPatient"], "no path from Image to Patient"),
         (["--free", "brightness"], "no free parameter 'brightness'"),
         (["--free", "gain_db=5:1"], "bounds of gain_db are 5.0 to 1.0, expected two numbers, the smaller one first"),
-        (["--free", "gain_db=5"], "expected such as white matter.mu0=0.1:0.8"),
+        (["--free", "gain_db=5"], "as in white matter.mu0=0.1:0.8"),
         (["--free", "liver.mu0"], "no free parameter 'liver.mu0'"),
         (["--calibration", "nowhere.xml"], "nowhere.xml: cannot be read"),
         (["--to-mri", "nowhere.tag"], "nowhere.tag: no such file"),
         (["--save-transform", "there.json"], "--save-transform needs --register"),
         (["--register", "--save-transform", "there.tfm"], "there.tfm, expected a name ending in .json"),
-        (["--state", "result.json"], "is given for 2 outputs, expected a file for each"),
+        (["--state", "result.json"], "given for 2 outputs, expected a separate file for each"),
         (["--report", "/nowhere/report.html"], "the folder /nowhere does not exist"),
         (["--state", "probe.json"], "the state to resume is invalid"),
     ],

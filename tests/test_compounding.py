@@ -213,5 +213,5 @@ def test_the_command_wants_one_kind_of_sweep(tmp_path, options):
     )
     assert result.exit_code == 2
     assert (
-        result.stderr.strip() == "ussim: expected either --tilt DEGREES or --slide MILLIMETRES, for a sweep of one kind"
+        result.stderr.strip() == "ussim: expected exactly one of --tilt DEGREES and --slide MILLIMETRES"
     )

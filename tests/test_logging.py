@@ -112,7 +112,7 @@ def test_the_medium_and_the_use_of_echoes_are_logged(log):
     labels = Volume(np.ones((20, 20, 20), np.uint8), np.eye(4))
     simulator = UltrasoundSimulator(labels, TissueTable.brain(), SimulationSettings())
     assert any(re.match(r"acoustic medium: 20x20x20 voxels, labels 1, 1 acoustic groups", m) for m in messages(log))
-    for expected in ("rays and echoes computed", "the echoes of the last one used again"):
+    for expected in ("rays and echoes computed", "the echoes of the last frame are reused"):
         simulator.simulate(PROBE, np.eye(4))
         assert [text for text in messages(log) if text.startswith("frame: ")][-1] == f"frame: {expected}"
 
@@ -128,7 +128,7 @@ def test_the_medium_and_the_use_of_echoes_are_logged(log):
 )
 def test_a_guess_about_a_volume_is_logged_with_what_it_comes_from(log, array, said):
     Volume(np.resize(array, (8, 8, 8)), np.eye(4)).looks_like_labels()
-    assert messages(log, logging.INFO) == [f"the volume holds {said}"]
+    assert messages(log, logging.INFO) == [f"the volume contains {said}"]
 
 
 def nifti(path, sform, qform, unit: str = "mm"):
@@ -152,7 +152,7 @@ def test_orientation_and_unit_of_nifti_are_logged(log, tmp_path, mirrored):
     shifted = matrix.copy()
     shifted[0, 3] += 20.0
     nifti(tmp_path / "same.nii", (matrix, 1), (matrix, 1))
-    assert "NIfTI orientation by its sform and qform" in log.text and not messages(log, logging.WARNING)
+    assert "NIfTI orientation from its sform and qform" in log.text and not messages(log, logging.WARNING)
     assert f"i, j, k towards {'RAS' if mirrored > 0 else 'RAI'}" in log.text
     used = nifti(tmp_path / "differ.nii", (shifted, 4), (matrix, 1))
     (warning,) = messages(log, logging.WARNING)
@@ -253,7 +253,7 @@ def test_verbose_counts_before_and_after_the_subcommand(files, before, after, le
     assert {line[1] for line in lines} == levels
     assert result.stdout == ""
     if levels:
-        assert "labels.nii.gz is taken for a label map; --mri says otherwise" in result.stderr
+        assert "labels.nii.gz is read as a label map; use --mri if it is not" in result.stderr
         assert "tissues: the table beside the label map" in result.stderr
 
 

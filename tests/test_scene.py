@@ -668,7 +668,7 @@ def test_a_sequence_that_fails_or_is_cancelled_leaves_the_old_images(bench):
     def remove(share):
         bench.scene.RemoveNode(bench.labels)
 
-    with pytest.raises(SimulationError, match=r"label map .* is not in a scene any more"):
+    with pytest.raises(SimulationError, match=r"label map .* has been removed from the scene"):
         bench.logic.simulateSequence(bench.labels, sequence_of(bench.scene, [ABOVE] * 3), images, progress=remove)
     assert images.GetNumberOfDataNodes() == 1
 

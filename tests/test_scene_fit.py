@@ -197,7 +197,7 @@ def test_a_3d_volume_is_cut_where_the_probe_is(scene):
     volume = scene.volume("3D ultrasound")
     simulator = scene.twin.simulator
     write_volume(volume, simulator.volume(PROBE, scene.twin.poses, scene.twin.display, spacing_mm=1.0))
-    with pytest.raises(SimulationError, match="is a 3D volume; choose a probe transform"):
+    with pytest.raises(SimulationError, match="is a 3D volume, expected a probe transform"):
         scene.optimize(volume)
     probe = scene.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Probe")
     probe.SetMatrixTransformToParent(vtk_matrix(scene.twin.poses[1]))

@@ -1,1 +1,1 @@
-"""`ussim bench`: time per stage and per frame on every OpenCL device, against what the machine could do at most."""
+"""`ussim bench`: time per stage and per frame on every OpenCL device, compared with lower bounds."""

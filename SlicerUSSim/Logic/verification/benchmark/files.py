@@ -1,4 +1,4 @@
-"""Files that benchmark scripts read and write, as argparse types: refused before anything is measured."""
+"""Files of benchmark scripts as argparse types, checked before the measurements."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from SlicerUSSim.Logic.base.files import require_place
 
 
 def output_file(text: str) -> Path:
-    """A file that can be written when the work is done."""
+    """A file name to which the results can be written."""
     path = Path(text)
     try:
         require_place(path)
@@ -21,11 +21,11 @@ def output_file(text: str) -> Path:
 
 
 def result_file(text: str) -> dict:
-    """What `ussim bench --json` kept."""
+    """The content of a file of `ussim bench --json`."""
     try:
         result = json.loads(Path(text).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise argparse.ArgumentTypeError(f"{text}: cannot be read ({error})") from None
     if not isinstance(result, dict) or "devices" not in result:
-        raise argparse.ArgumentTypeError(f"{text}: holds no devices, expected a file of ussim bench --json")
+        raise argparse.ArgumentTypeError(f"{text}: has no devices, expected a file of ussim bench --json")
     return result

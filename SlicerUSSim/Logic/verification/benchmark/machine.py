@@ -1,4 +1,4 @@
-"""What a device can do at most: bytes and floating-point operations per second, measured with kernels of our own."""
+"""Memory bandwidth and arithmetic throughput of a device, measured with the kernels of kernels/machine.cl."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.verification.benchmark.timing import measured
 
 _CHAINS = 16  # kernels/machine.cl
-_MOVED_BYTES = 128 * 2**20  # each way: more than caches hold
+_MOVED_BYTES = 128 * 2**20  # in each direction: more than the size of caches
 
 
 @dataclass(frozen=True)
 class Machine:
-    """The most a device does in a second."""
+    """Largest measured throughput of a device per second."""
 
     bytes_per_s: float
     operations_per_s: float
 
     @classmethod
     def measure(cls, device: Device, repeat: int = 7) -> Machine:
-        """Moves memory and chains multiply-adds; the best of `repeat` counts."""
+        """Copies memory and computes chains of multiply-adds; the best of `repeat` runs is used."""
         kernels = device.kernels("machine.cl", device.lanes)
         nbytes = min(_MOVED_BYTES, device.info.handle.max_mem_alloc_size // 2)
         floats = nbytes // 4 // device.lanes * device.lanes
@@ -44,5 +44,5 @@ class Machine:
         return cls(8.0 * floats / seconds[0], 2.0 * _CHAINS * device.lanes * items * rounds / seconds[1])
 
     def floor_ms(self, work: Work) -> float:
-        """Milliseconds below which no implementation of this work can come."""
+        """Lower bound for the time of this work in any implementation, milliseconds."""
         return 1e3 * max(work.bytes / self.bytes_per_s, work.operations / self.operations_per_s)

@@ -1,4 +1,4 @@
-"""The measurements on each device: frames A and B with their stages, sweep, segmentation, optimisation; images checked.
+"""The measurements on each device: frames A and B with their stages, sweep, segmentation, optimisation, images.
 
 Frame A: phased array, 196 scan lines, 73 mm deep, 5 MHz. Frame B: convex array, 192 scan lines, 120 mm deep. Both on
 the MNI152 labels from the demo's view, ray tree to depth 6, from pose to scan-converted image on the host.
@@ -34,7 +34,7 @@ from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
 
 FRAMES = {"A": PhasedProbe(75, 73, scan_lines=196), "B": ConvexProbe(60, 70, 120, scan_lines=192)}
 SWEEP_IMAGES, SWEEP_DEG = 128, 50.0
-#: Least share of pixels within one grey level of another device's, and of numpy's, which rounds otherwise
+#: Smallest fraction of pixels within one grey level of another device's, and of numpy's, with its other rounding
 SAME_AS_DEVICE, SAME_AS_NUMPY = 0.999, 0.99
 _WHITE = "white matter"
 _FREE = {
@@ -46,11 +46,11 @@ _FREE = {
 def run_benchmark(
     devices: Sequence[DeviceInfo], *, repeat: int = 30, brief: bool = False, progress: Callable[[str], None] = print
 ) -> dict:
-    """Measure every device; what `ussim bench --json` keeps.
+    """Measure every device; returns the content of `ussim bench --json`.
 
-    `brief` leaves out frame B, sweep and optimisation. `progress` is told each device and what is measured on it.
-    The result's "wrong" lists what differs from other devices or from numpy by more than it may.
-    Raises SimulationError for a `repeat` outside 1 to 10000, and where a device fails.
+    `brief` omits frame B, sweep and optimisation. `progress` is called with each device and measurement.
+    The result's "wrong" lists images that differ too much from those of other devices or of numpy.
+    Raises SimulationError for a `repeat` outside 1 to 10000, and if a device fails.
     """
     require_between("run_benchmark", "repeat", repeat, 1, 10_000)
     mri, source = demo_mri()
@@ -75,13 +75,13 @@ def run_benchmark(
 
 
 class _DeviceBenchmark:
-    """One device's turn."""
+    """The measurements on one device."""
 
     def __init__(self, info: DeviceInfo, mri, repeat: int, progress: Callable[[str], None]) -> None:
         self.info, self.mri, self.repeat, self.progress = info, mri, repeat, progress
         self.device = Device.get(info)
         self.images: dict[str, np.ndarray] = {}
-        # Made on the way: what later measurements start from
+        # Intermediate results, for later measurements
         self.segmentation: Segmentation
         self.poses: dict[str, np.ndarray]
         self.simulator: UltrasoundSimulator
@@ -142,7 +142,7 @@ class _DeviceBenchmark:
         self.simulator.volume(FRAMES["A"], tilt_sweep(self.poses["A"], SWEEP_DEG, SWEEP_IMAGES))
 
     def _evaluations(self) -> dict:
-        """One evaluation of the cost of frame A against itself, by what is free."""
+        """One evaluation of the cost of frame A against itself, for several sets of free parameters."""
         display, tissues = DisplaySettings(), self.simulator.medium.tissues
         numbers = {}
         for name, free in _FREE.items():
@@ -160,7 +160,7 @@ def _at_random(cost: AppearanceCost, parameters: int) -> Callable[[], object]:
 
 
 def _compare(numbers: dict, images: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> list[str]:
-    """Note how much of each frame is as the first device has it; what is wrong with that."""
+    """Record the fraction of each frame that agrees with the first device; returns the errors."""
     wrong = []
     for name, image in images.items():
         if name in reference:
@@ -174,7 +174,7 @@ def _compare(numbers: dict, images: dict[str, np.ndarray], reference: dict[str, 
 
 
 def _numpy(measurement: _DeviceBenchmark) -> tuple[dict, list[str]]:
-    """(times of frame A in numpy and how much of it is the same, what is wrong with that)."""
+    """(times of frame A in numpy and the fraction of pixels that agree, errors)."""
     model = NumpyModel(measurement.simulator)
     image = model.simulate(FRAMES["A"], measurement.poses["A"])
     same = _same(image, measurement.images["A"])
@@ -184,7 +184,7 @@ def _numpy(measurement: _DeviceBenchmark) -> tuple[dict, list[str]]:
 
 
 def _same(image: np.ndarray, other: np.ndarray) -> float:
-    """Share of pixels within one grey level."""
+    """Fraction of pixels within one grey level."""
     return float((np.abs(image.astype(int) - other) <= 1).mean())
 
 

@@ -1,4 +1,4 @@
-"""What was measured, as text."""
+"""The measurements as text."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def rows_of(numbers: dict) -> Iterator[tuple[str, dict]]:
 
 
 def comparison(before: dict, after: dict) -> str:
-    """Two results side by side: best times and how many times faster the second is. Common devices and rows only."""
+    """Two results side by side: best times and their ratio. Common devices and rows only."""
     lines = [f"{'':40s}{'before':>12s}{'after':>12s}{'faster':>9s}"]
     for name in before["devices"].keys() & after["devices"].keys():
         lines.append(name)

@@ -1,4 +1,4 @@
-"""Timing a function: best and median of many."""
+"""Timing of a function: best and median of several calls."""
 
 from __future__ import annotations
 
@@ -20,6 +20,6 @@ def timed(function: Callable[[], object]) -> float:
 
 
 def measured(function: Callable[[], object], repeat: int) -> dict[str, float]:
-    """Best and median milliseconds of `repeat` calls, after one that warms up."""
+    """Best and median milliseconds of `repeat` calls, after a warm-up call."""
     function()
     return summary(timed(function) for _ in range(repeat))

@@ -1,4 +1,4 @@
-"""How much work a frame is, stage by stage: Stage.work of every stage, for the frame's ray tree."""
+"""The minimum work of a frame: Stage.work of every stage, for the frame's ray tree."""
 
 from __future__ import annotations
 

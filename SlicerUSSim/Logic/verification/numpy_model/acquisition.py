@@ -1,7 +1,7 @@
-"""What the stages need to know of one frame, computed from the equations of docs/physics.md and what a user chose.
+"""The acquisition record of one frame, computed from the equations of docs/physics.md and the user's inputs.
 
-Of a probe only its fields are read, none of what Probe derives from them. The record has the type of
-layout.ACQUISITION: names and number formats of what the kernels read, not values.
+Of a probe only its fields are read, no derived values of Probe. The record has the type layout.ACQUISITION, from which
+it takes names and number formats, but no values.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.probe.arrays import ConvexProbe, LinearProbe, PhasedProbe
 from SlicerUSSim.Logic.verification.numpy_model.elementary import hash_mix
 from SlicerUSSim.Logic.verification.numpy_model.medium import HostMedium
 
-_DESIGN_SPEED_M_S = 1540.0  # which wavelengths and focus widths of an array are for
+_DESIGN_SPEED_M_S = 1540.0  # for wavelengths and focus widths of an array
 _FWHM = np.sqrt(8.0 * np.log(2.0))  # of a Gaussian, in standard deviations
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
@@ -104,14 +104,14 @@ def line_roots(acquisition: np.ndarray) -> np.ndarray:
 
 
 def elevational_quantiles(traced: int, rays: int) -> np.ndarray:
-    """(traced, rays) float32 places of the rays in the elevational beam, in its standard deviations."""
+    """(traced, rays) float32 positions of the rays in the elevational beam, in its standard deviations."""
     line, ray = np.arange(traced)[:, None], np.arange(rays)
     place_in_stratum = 0.05 + 0.9 * ((0.5 + line * _GOLDEN) % 1.0)
     return special.ndtri((ray + place_in_stratum) / rays).astype(np.float32)
 
 
 def pulse_taps(sigma: float) -> np.ndarray:
-    """(2 n + 1,) float32 envelope of the pulse: with the triangle that places impulses it is `sigma` samples wide."""
+    """(2 n + 1,) float32 envelope of the pulse; its width with the interpolation of impulses is `sigma` samples."""
     own = np.sqrt(np.maximum(sigma * sigma - 1.0 / 6.0, 0.25))
     at = np.arange(np.ceil(3.7 * own) + 1.0)
     half = sigma / own * np.exp(-(at * at) / (2.0 * own * own))
@@ -119,7 +119,7 @@ def pulse_taps(sigma: float) -> np.ndarray:
 
 
 def noise_key(acquisition: np.ndarray, noise_seed: int) -> np.uint32:
-    """What the hash of the noise starts from."""
+    """Initial value of the noise's hash."""
     seed, draw = np.array([acquisition["seed"]], np.uint32), np.array([noise_seed], np.uint32)
     return (seed * np.uint32(0x9E3779B1) + np.uint32(0x7F4A7C15) + hash_mix(draw))[0]
 
@@ -162,6 +162,6 @@ def _traced_lines(probe: Probe, settings: SimulationSettings) -> tuple[int, int]
     _, spacing, radius = _geometry(probe)
     apart = spacing * (np.ones_like(depth) if isinstance(probe, LinearProbe) else radius + depth)
     count = settings.lateral_rays or int(np.clip(np.ceil((apart / lateral).max() / 1.5), 1, 128))
-    below = depth >= 0.1 * probe.depth_mm  # next to the apex of a phased array all lines lie within the beam
+    below = depth >= 0.1 * probe.depth_mm  # near the apex of a phased array all lines are within the beam
     reach = np.ceil(settings.beam_cutoff * (lateral[below] / apart[below]).max() * count)
     return count, int(min(reach, 16 * count))

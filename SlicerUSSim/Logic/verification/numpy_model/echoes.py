@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.verification.numpy_model.elementary import (
 )
 from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
 
-_BLOCK = CONSTANTS["BLOCK"]  # samples over which widths and gains are taken as linear
+_BLOCK = CONSTANTS["BLOCK"]  # samples with linear interpolation of widths and gains
 _AXIS_STEPS = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint32)
 
 
@@ -67,7 +67,7 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     gain = strength - LOG2_E * segment["decay_per_mm"] * np.array([low, high])
     gain = gain + f32(0.5) * np.log2(lateral / (elevation * along_tube[0] * along_tube[1])) - np.log2(apart)
 
-    # Lattice axes as the kernel orders them: sums of products round as they do there.
+    # Lattice axes in the kernel's order, for the same rounding of sums.
     u = int(np.abs(segment["elevational"]).argmax())
     v, w = (u + 1) % 3, (u + 2) % 3
     if abs(segment["direction"][v]) < abs(segment["direction"][w]):
@@ -129,7 +129,7 @@ def _cells_of_box(acquisition, start, d, side, e, low, high, radius_l, sigma_e) 
 
 
 def drawn_labels(acquisition, labels: Labels, voxel: np.ndarray, random: np.ndarray) -> np.ndarray:
-    """The labels of scatterers at (n, 3) voxel positions: a corner drawn by its weight, or the membrane."""
+    """The labels of scatterers at (n, 3) voxel positions: that of a random corner by weight, or the membrane."""
     here, f = labels.cells(voxel)
     threshold = ((random[:, None] >> np.array([0, 5, 10], np.uint32)) & np.uint32(31)).astype(np.float32) + f32(0.5)
     corner = here + (f * f32(32) > threshold) @ labels.steps
@@ -144,7 +144,7 @@ def drawn_labels(acquisition, labels: Labels, voxel: np.ndarray, random: np.ndar
 
 
 def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndarray, lines: np.ndarray) -> None:
-    """Add every hit as an impulse at its own time, half on either side of its line."""
+    """Add every hit as an impulse at its time, half on either side of its line."""
     place = hits["depth_mm"] / acquisition["sample_mm"]
     bins = np.floor(place).astype(int)
     fits = (bins >= 0) & (bins + 1 < int(acquisition["samples"]))
@@ -157,12 +157,12 @@ def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndar
 
 
 def lateral_beam(acquisition: np.ndarray, lines: np.ndarray) -> np.ndarray:
-    """(scan lines, samples) complex64 from the impulses of the traced lines, spread as the lateral profile says."""
+    """(scan lines, samples) complex64 from the impulses of the traced lines, distributed by the lateral profile."""
     beam = Beam(acquisition)
     s = np.arange(int(acquisition["samples"]), dtype=np.float32) * acquisition["sample_mm"]
     step = beam.line_distance(s) / beam.lateral_sigma(s)
     narrow2 = np.maximum(f32(1) - step * step / f32(6), f32(0.25))
-    edges = lines[1:-1:2] + lines[2::2]  # edge n lies half a step behind traced line n
+    edges = lines[1:-1:2] + lines[2::2]  # edge n is half a step after traced line n
     scale = step / np.sqrt(narrow2) * f32(0.39894228)
     result = np.empty((int(acquisition["scan_lines"]), len(s)), np.complex64)
     reach = np.ceil(acquisition["beam_cutoff"] * beam.lateral_sigma(s) / beam.line_distance(s)) + f32(0.5)

@@ -1,4 +1,4 @@
-"""Elementary functions in float32, as kernels/common.clh has them."""
+"""Elementary functions in float32, as in kernels/common.clh."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def unit(a: np.ndarray) -> np.ndarray:
 
 
 def ramp(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    """From 0 to 1 as x goes from low to high, with level ends."""
+    """Smooth step from 0 to 1 as x goes from low to high, with zero slope at the ends."""
     t = np.clip((x - f32(low)) / (f32(high) - f32(low)), f32(0), f32(1))
     return t * t * (f32(3) - f32(2) * t)
 

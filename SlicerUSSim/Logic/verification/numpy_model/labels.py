@@ -1,4 +1,4 @@
-"""Label map, acoustic groups and borders of a medium, looked up for many points at once (kernels/borders.clh)."""
+"""Vectorised look-up of label map, acoustic groups and borders of a medium (kernels/borders.clh)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _EIGHT = np.arange(8, dtype=np.float32)
 
 
 class Labels:
-    """A medium, flat, so that many places are looked up at once."""
+    """A medium as flat arrays, for vectorised look-ups."""
 
     def __init__(self, medium: HostMedium) -> None:
         self.dims = medium.dims.astype(np.int64)
@@ -25,14 +25,14 @@ class Labels:
         # Whether the eight voxels of the cell at (k, j, i) + {0, 1}^3 have one label
         lowest, highest = (f(medium.label, 2, origin=-1) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
         self.one_label = (lowest == highest).ravel()
-        # Rows of eight voxels are read at once, the last one too.
+        # Rows of eight voxels are read at once, including the last one.
         self.groups = np.pad(medium.group.ravel(), (0, 8))
         self.smooth_groups = medium.smooth_groups
         self.smooth = medium.smooth.reshape(self.smooth_groups, -1)
         self.distance = None if medium.distance is None else medium.distance.ravel()
 
     def cells(self, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(index of the cell, fraction (..., 3) inside it) of (..., 3) voxel positions, those outside moved in."""
+        """(index of the cell, fraction (..., 3) inside it) of (..., 3) voxel positions, clamped to the volume."""
         voxel = np.clip(voxel, f32(0), f32(self.dims) - f32(1.001))
         base = voxel.astype(np.int32)
         return base @ self.steps, voxel - base.astype(np.float32)
@@ -72,7 +72,7 @@ class Labels:
         return towards, overshoot
 
     def _fine(self, voxel, before, behind):
-        """By the labels within 3.5 voxels, smoothed here."""
+        """From the labels within 3.5 voxels, smoothed here."""
         top = self.dims - 1
         inside = np.clip(voxel, f32(0), f32(top))
         low = np.maximum(np.ceil(inside - _FINE_REACH).astype(np.int64), 0)
@@ -87,7 +87,7 @@ class Labels:
         for k in range(8):
             for j in range(8):
                 yz, y, z = (wy[:, j] * wz[:, k])[:, None], dy[:, j : j + 1], dz[:, k : k + 1]
-                # Beyond the window the weight is 0, whatever is read.
+                # Outside the window the weight is 0.
                 row = np.minimum((low + [0, j, k]) @ self.steps, len(self.groups) - 8)
                 group = self.groups[row[:, None] + np.arange(8)]
                 sign = f32(group == before[:, None]) - f32(group == behind[:, None])
@@ -108,7 +108,7 @@ class Labels:
         return towards, overshoot, f32(np.abs(overshoot) < 0.5)
 
     def _wide(self, voxel, before, behind):
-        """By the indicators smoothed beforehand; confidence 0 where they do not know."""
+        """From the indicators smoothed in advance; confidence 0 if they do not determine the border."""
         towards, overshoot, confidence = np.zeros_like(voxel), *np.zeros((2, len(voxel)), np.float32)
         if self.dims.min() < 4:
             return towards, overshoot, confidence

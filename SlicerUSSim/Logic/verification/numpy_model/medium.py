@@ -10,14 +10,14 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 
-WIDE_SIGMA = 3.0  # of the Gaussian that smooths the indicators, voxels
-_FARTHEST = 2.2  # standard deviations, where the fluid distance ends; it takes eight bits
-_SHARES = 4095  # steps of the smoothed indicator that it is computed from
+WIDE_SIGMA = 3.0  # of the Gaussian for smoothing the indicators, voxels
+_FARTHEST = 2.2  # limit of the fluid distance in standard deviations; it has eight bits
+_SHARES = 4095  # quantisation steps of the smoothed indicator for the fluid distance
 _MOST_GROUPS, _MOST_VALUES = 6, 100_000_000  # of the smoothed indicators of acoustic groups
 
 
 class HostMedium:
-    """Labels, fluid distance, acoustic groups with their smoothed indicators, and a row of numbers per tissue.
+    """Labels, fluid distance, acoustic groups with their smoothed indicators, and a record per tissue.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class HostMedium:
         self.distance, self.membrane_reach = self._fluid_distance(spacing)
 
     def _fluid_distance(self, spacing_mm: np.ndarray) -> tuple[np.ndarray | None, float]:
-        """A plane at distance d from a voxel has the share Phi(d / sigma) of a Gaussian on its far side."""
+        """The fraction Phi(d / sigma) of a Gaussian is behind a plane at distance d from its centre."""
         membrane = self.tissues.membrane
         if membrane is None or membrane.thickness_mm == 0:
             return None, -1.0
@@ -75,7 +75,7 @@ class HostMedium:
 
 
 def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
-    """Tissues of one speed and impedance form a group; groups are numbered from the commonest label on."""
+    """Tissues of equal speed and impedance form a group; groups are numbered by decreasing frequency of labels."""
     members = {label: tissues[label] for label in present}
     members.update((label, tissue) for label, tissue in tissues.items() if label not in members)
     if tissues.membrane is not None:

@@ -1,4 +1,4 @@
-"""NumpyModel: the line from a pose to an image, as UltrasoundSimulator has it, in numpy."""
+"""NumpyModel: the stages of UltrasoundSimulator from a pose to an image, in numpy."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from SlicerUSSim.Logic.verification.numpy_model.stages import TwinFrame, twin_of
 
 
 class NumpyModel:
-    """Simulates what `simulator` would, on the host.
+    """Simulates the images of `simulator` on the host.
 
-    Of the simulator only what a user gave it is read, label map, tissues and settings, and the names and order of its
-    stages; nothing comes from its device. Raises SimulationError if the settings ask for a texture, which this model
+    Of the simulator only the user's inputs are read (label map, tissues and settings), and the names and order of its
+    stages; nothing is read from its device. Raises SimulationError for settings that need a texture, which this model
     does not have, and for a stage without a twin.
     """
 
@@ -51,7 +51,7 @@ class NumpyModel:
         *,
         noise_seed: int = 0,
     ) -> np.ndarray:
-        """(rows, columns) uint8 image; arguments as UltrasoundSimulator.simulate has them."""
+        """(rows, columns) uint8 image; arguments as in UltrasoundSimulator.simulate."""
         if self.simulator.medium.tissues is not self.medium.tissues:
             self._read_medium()
         display, settings = display or DisplaySettings(), self.simulator.settings

@@ -1,6 +1,6 @@
-"""Every stage's twin: the same in numpy, on a TwinFrame, by the name of the stage.
+"""The twins of the stages: their implementation in numpy, on a TwinFrame, by the name of the stage.
 
-Those of the first seven stages are here. A stage that came later brings its own, Stage.on_host.
+Those of the first seven stages are here. Later stages define their own, Stage.on_host.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from SlicerUSSim.Logic.verification.numpy_model.tracing import Tracer
 
 @dataclass(eq=False)
 class TwinFrame(HostFrame):
-    """A HostFrame with what the stages before the baseband signal need and hand on."""
+    """A HostFrame with the inputs and outputs of the stages before the baseband signal."""
 
     labels: Labels
     #: layout.TISSUE per label
@@ -91,7 +91,7 @@ def b_mode(frame: TwinFrame) -> None:
         )
         iq = iq + noise * (gaussian(key) + 1j * gaussian(hash_mix(key + np.uint32(0x9E3779B9))))
     power = np.real(iq) ** 2 + np.imag(iq) ** 2 + f32(1e-30)
-    # Twice the depth, in cm
+    # Two-way path, in cm
     tgc_db = index * (2.0 * display.tgc_db_cm_mhz * float(record["frequency_mhz"]) * float(record["sample_mm"]) * 0.1)
     frame.envelope = (np.sqrt(power) * 10.0 ** (tgc_db / 20.0)).astype(np.float32)
     level_db = 10.0 * np.log10(power) + tgc_db

@@ -1,4 +1,4 @@
-"""The ray trees of all lines at once, wave by wave (kernels/raytracing.cl)."""
+"""The ray trees of all lines, vectorised by tree level (kernels/raytracing.cl)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from SlicerUSSim.Logic.verification.numpy_model.labels import Labels, border_nor
 
 @dataclass
 class Rays:
-    """Rays on their way, one row each. Besides raytracing.cl's Ray: where in the output they write, and their node."""
+    """Active rays, one row each: the fields of raytracing.cl's Ray, their position in the output, and their node."""
 
     line: np.ndarray
     ray: np.ndarray  # 0 on the axis
@@ -45,7 +45,7 @@ class Rays:
     blind_until: np.ndarray
     reflections: np.ndarray
     label: np.ndarray
-    # The node, which Tracer._begin fills in: course in voxels, where it ends, what happened since it began
+    # The node, set by Tracer._begin: course in voxels, its end, state since its start
     start: np.ndarray = field(init=False)
     step: np.ndarray = field(init=False)
     aside: np.ndarray = field(init=False)
@@ -67,7 +67,7 @@ class Rays:
 
     @staticmethod
     def joined(parts: list[Rays]) -> Rays:
-        """All rows of some rays, which are at nodes all or none."""
+        """All rows of several sets of rays; either all or none of them are at nodes."""
         return parts[0]._with({name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
 
     def _with(self, values: dict[str, np.ndarray]) -> Rays:
@@ -77,7 +77,7 @@ class Rays:
 
 
 class Tracer:
-    """Traces an acquisition; `segments` and `hits` are layout records with their lines and rays beside them."""
+    """Traces an acquisition; `segments` and `hits` are layout records, with arrays of their lines and rays."""
 
     def __init__(self, acquisition: np.ndarray, labels: Labels, tissues: np.ndarray) -> None:
         self.acquisition, self.labels, self.tissues = acquisition, labels, tissues
@@ -115,7 +115,7 @@ class Tracer:
         )  # fmt: skip
 
     def _begin(self, rays: Rays) -> Rays:
-        """Every ray at the start of a node."""
+        """Set every ray to the start of a node."""
         acquisition = self.acquisition
         rays.start = affine_point(self.to_voxel, rays.axis)
         rays.step = affine_vector(self.to_voxel, rays.direction)
@@ -173,7 +173,7 @@ class Tracer:
         return inside, beyond, other
 
     def _bisect(self, rays: Rays, which: np.ndarray, times: int, inside, beyond, other) -> None:
-        """Halve the stretch between `inside` and `beyond` of some rays, in place."""
+        """Bisect the interval between `inside` and `beyond` of some rays, in place."""
         some = rays.of(which)
         for _ in range(times if len(which) else 0):
             middle = f32(0.5) * (inside[which] + beyond[which])
@@ -184,7 +184,7 @@ class Tracer:
             other[which] = np.where(same, other[which], found)
 
     def _advance(self, rays: Rays) -> Rays:
-        """Every ray to its next change of tissue; the rays that go on from there."""
+        """Advance every ray to its next change of tissue; returns the rays that continue."""
         acquisition, group = self.acquisition, self.tissues["group"]
         decay = self.decay[rays.label]
         reserve = log(rays.weight / acquisition["intensity_threshold"]) + rays.log_attenuation - rays.spent
@@ -205,7 +205,7 @@ class Tracer:
         return Rays.joined([on, *branches])
 
     def _write_segments(self, rays: Rays, decay, until, spent_until, ends) -> np.ndarray:
-        """Write what the axis rays have come through; returns where each ray's last segment lies (-1: none)."""
+        """Write the segments of the axis rays; returns the index of each ray's last segment (-1: none)."""
         earlier = rays.since - rays.open
         with np.errstate(divide="ignore", invalid="ignore"):
             mean_decay = np.where(earlier > 0, (rays.spent - rays.spent_open) / earlier, decay)
@@ -217,7 +217,7 @@ class Tracer:
         last = on_axis & ends & (until > rays.open)
         self._segment_of(rays, last, rays.open, until, rays.spent_open, spent_until)
         written = np.full(len(rays), -1)
-        written[last] = np.arange(last.sum())  # in the block written last
+        written[last] = np.arange(last.sum())  # in the last written block
         return written
 
     def _segment_of(self, rays: Rays, which, begin, end, spent_begin, spent_end) -> None:
