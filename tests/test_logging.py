@@ -157,7 +157,7 @@ def test_orientation_and_unit_of_nifti_are_logged(log, tmp_path, mirrored):
     used = nifti(tmp_path / "differ.nii", (shifted, 4), (matrix, 1))
     (warning,) = messages(log, logging.WARNING)
     form = "qform" if np.allclose(used.ijk_to_ras, matrix, atol=1e-3) else "sform"
-    assert "up to 20.0 mm apart" in warning and f"the {form} is used" in warning
+    assert "differ by up to 20.0 mm" in warning and f"ITK uses the {form}" in warning
     log.clear()
     nifti(tmp_path / "none.nii", (None, 0), (None, 0))
     assert "without an orientation" in messages(log, logging.WARNING)[0]
@@ -254,7 +254,7 @@ def test_verbose_counts_before_and_after_the_subcommand(files, before, after, le
     assert result.stdout == ""
     if levels:
         assert "labels.nii.gz is read as a label map; use --mri if it is not" in result.stderr
-        assert "tissues: the table beside the label map" in result.stderr
+        assert "tissues: the table next to the label map" in result.stderr
 
 
 def test_a_command_leaves_the_loggers_as_they_were(files):
