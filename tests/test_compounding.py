@@ -212,6 +212,4 @@ def test_the_command_wants_one_kind_of_sweep(tmp_path, options):
         main, ["volume", "x.nii.gz", "--pose", "auto", "-o", str(tmp_path / "v.nrrd"), *options]
     )
     assert result.exit_code == 2
-    assert (
-        result.stderr.strip() == "ussim: expected exactly one of --tilt DEGREES and --slide MILLIMETRES"
-    )
+    assert result.stderr.strip() == "ussim: expected exactly one of --tilt DEGREES and --slide MILLIMETRES"
