@@ -132,7 +132,7 @@ def test_files_of_the_scripts_are_refused_before_anything_is_measured(tmp_path):
     kept = tmp_path / "kept.json"
     kept.write_text(json.dumps(result(1.0)))
     assert result_file(str(kept)) == result(1.0)
-    for text, message in (("{", "cannot be read"), ("[1]", "holds no devices"), ('{"a": 1}', "holds no devices")):
+    for text, message in (("{", "cannot be read"), ("[1]", "has no devices"), ('{"a": 1}', "has no devices")):
         kept.write_text(text)
         with pytest.raises(argparse.ArgumentTypeError, match=message):
             result_file(str(kept))

@@ -148,7 +148,7 @@ def test_the_command_says_what_is_off_and_exits_with_one(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "all_checks", lambda: (replace(good, measure=off),))
     result = CliRunner().invoke(main, ["validate", "--out", str(tmp_path)])
     assert result.exit_code == 1
-    assert "off: thin sheet, fraction of rays that hit it, linear, oblique: 1" in result.output
+    assert "out of limits: thin sheet, fraction of rays that hit it, linear, oblique: 1" in result.output
     assert json.loads((tmp_path / "report.json").read_text())["passed"] is False
     assert "**FAIL**" in (tmp_path / "report.md").read_text()
 
