@@ -1,6 +1,7 @@
-"""What 3D Slicer loads: module, widget, logic and test of the scripted module USSim.
+"""The scripted module USSim of 3D Slicer: its module, widget, logic and test classes.
 
-The module's code is in the package SlicerUSSim, in Logic and Widget; this file is the part that requires Slicer.
+The implementation is in the package SlicerUSSim, in Logic and Widget. This file is the part that needs the Slicer
+application.
 """
 
 import functools
@@ -25,8 +26,8 @@ from slicer.ScriptedLoadableModule import (
 )
 from slicer.util import VTKObservationMixin
 
-if sys.version_info < (3, 10):  # noqa: UP036, Slicer runs this file whatever its Python is
-    raise RuntimeError(f"USSim needs Slicer 5.10 or newer: Python is {sys.version.split()[0]}, expected 3.10 or newer")
+if sys.version_info < (3, 10):  # noqa: UP036, older versions of Slicer can also load this file
+    raise RuntimeError(f"USSim needs Python 3.10 (Slicer 5.10) or newer, but this is Python {sys.version.split()[0]}")
 
 _HERE = Path(__file__).absolute().parent
 _RESOURCES = _HERE / "Resources"
@@ -34,11 +35,11 @@ _HOME = "https://github.com/SlicerUSSim/SlicerUSSim"
 
 
 def bindPackage() -> None:
-    """Make `import SlicerUSSim` import the package of this file, independent of Python's search path.
+    """Bind the name `SlicerUSSim` to the package to which this file belongs.
 
-    Slicer adds only the folder of this file to sys.path. After a build with CMake the package is a subfolder of it; in
-    a checkout or a pip installation it is the folder itself, with any name. Modules that Python has already imported
-    from another copy, or before "Reload" from this one, are removed.
+    Slicer adds only the folder of this file to sys.path. The package is a folder next to this file in a build tree of
+    CMake. In a checkout, and after installation with pip, it is the folder of this file, under any name. Modules that
+    were already imported, from another copy or from before a "Reload", are removed from sys.modules.
     """
     beside = _HERE / "SlicerUSSim"
     spec = importlib.machinery.ModuleSpec("SlicerUSSim", loader=None, is_package=True)
@@ -50,15 +51,15 @@ def bindPackage() -> None:
 
 bindPackage()
 
-# Slicer logs everything from DEBUG on, which would be several lines for each live image.
+# Slicer's log includes DEBUG messages by default, which would be several lines for each live image.
 if logging.getLogger("SlicerUSSim").level == logging.NOTSET:
     logging.getLogger("SlicerUSSim").setLevel(logging.INFO)
 
-# Slicer executes this file at start-up; slow imports follow when the module is first used.
+# Slicer runs this file at start-up. Imports that take time are therefore postponed until the module is first used.
 
 
 class USSim(ScriptedLoadableModule):
-    """The module's entry in Slicer."""
+    """The module's entry in Slicer's list of modules."""
 
     def __init__(self, parent) -> None:
         ScriptedLoadableModule.__init__(self, parent)
@@ -67,14 +68,15 @@ class USSim(ScriptedLoadableModule):
         self.parent.dependencies = []
         self.parent.contributors = ["The SlicerUSSim developers"]
         self.parent.helpText = _(
-            "Simulates B-mode ultrasound images of a patient from the patient's MRI: "
-            "choose a skull-stripped MRI, press Segment, tick Live, and move the probe. See the "
+            "Simulates the B-mode image of an ultrasound probe from the MRI of a patient. "
+            "Choose a skull-stripped MRI, press Segment, tick Live, and move the probe. See the "
             '<a href="{home}/blob/main/docs/slicer.md">documentation</a>.'
         ).format(home=_HOME)
         self.parent.acknowledgementText = _(
             "Implements Salehi et al., Patient-specific 3D Ultrasound Simulation Based on Convolutional Ray-tracing "
             "and Appearance Optimization, MICCAI 2015. The sample MRI is the ICBM 152 2009a template (© 1993-2009 "
-            "Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute), from nilearn."
+            "Louis Collins, McConnell Brain Imaging Centre, Montreal Neurological Institute), as distributed "
+            "with nilearn."
         )
         slicer.app.connect("startupCompleted()", registerSampleData)
 
@@ -96,9 +98,9 @@ def registerSampleData() -> None:
 
 
 def ensurePackages() -> None:
-    """Install missing packages in Slicer's Python, after confirmation; on first use, not at start-up.
+    """Install the packages that Slicer's Python lacks, after the user has confirmed; on first use, not at start-up.
 
-    Raises SimulationError if packages are still missing, and if Slicer must be restarted after the installation.
+    Raises SimulationError if packages are still missing, or if Slicer must be restarted after the installation.
     """
     from SlicerUSSim.Widget.packages import ensure_packages, offer_opencl_runtime
 
@@ -108,10 +110,11 @@ def ensurePackages() -> None:
 
 @functools.cache
 def makeParameterNodeClass() -> type:
-    """USSimParameterNode: what a scene remembers of the module, typed, as Logic/mrml/parameter_node.py declares it.
+    """USSimParameterNode: the parameters of a scene, typed, as declared in Logic/mrml/parameter_node.py.
 
-    Roles that nodes of several classes can play are vtkMRMLNode here. Values that may be None are left out: Slicer
-    keeps those in another form. Made at first use, since the declarations need packages that Slicer may yet lack.
+    Roles that allow several classes of nodes have the type vtkMRMLNode. Values that may be None are omitted, since
+    Slicer stores them in another format. The class is created on first use, because the declarations import packages
+    that may not be installed before.
     """
     from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, VALUE_PARAMETERS
 
@@ -137,7 +140,7 @@ def __getattr__(name: str):
 
 
 class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
-    """The panel's life in Slicer: it shows the parameters of the scene that is open."""
+    """Creates the panel, and connects it to the parameter node of the open scene."""
 
     def __init__(self, parent=None) -> None:
         ScriptedLoadableModuleWidget.__init__(self, parent)
@@ -151,14 +154,14 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         ScriptedLoadableModuleWidget.setup(self)
         try:
             self.showPanel()
-        except ImportError:  # a Slicer that lacks packages of which the panel itself is made
+        except ImportError:  # packages that the panel itself needs are missing
             self.installButton = qt.QPushButton(_("Install the Python packages that this module needs"))
             self.installButton.clicked.connect(self.onInstall)
             self.layout.addWidget(self.installButton)
             self.onInstall()
 
     def onInstall(self, *_unused) -> None:
-        """Ask for the packages, and show the panel if they are there then."""
+        """Offer to install the packages; show the panel if they are installed."""
         from SlicerUSSim.Logic.base.errors import SimulationError
 
         try:
@@ -170,7 +173,7 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         self.showPanel()
 
     def showPanel(self) -> None:
-        """Make the panel. Raises ImportError where a package is missing."""
+        """Create the panel. Raises ImportError if a package is missing."""
         from SlicerUSSim.Widget.panel import Panel
 
         self.logic = USSimLogic()
@@ -202,18 +205,18 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         self.setParameterNode(None)
 
     def onSceneStartChange(self, caller, event) -> None:
-        """Called before the scene is closed or another one is loaded: disconnects the panel."""
+        """Called just before the scene is closed or imported; disconnects the panel from it."""
         self.setParameterNode(None)
 
     def onSceneEndChange(self, caller, event) -> None:
-        """Called afterwards: the panel shows the parameters of the new scene."""
+        """Called just after the scene was closed or imported; connects the panel to it."""
         if self.parent.isEntered:
             self.initializeParameterNode()
 
     def initializeParameterNode(self) -> None:
-        """Create the scene's parameter node if necessary, and show it in the panel."""
+        """Ensure that the scene has a parameter node and that the panel shows it."""
         if self.logic is None:
-            return  # entered before the setup
+            return  # the panel could not be created yet
         self.setParameterNode(self.logic.getParameterNode())
         if self.panel is not None:
             self.panel.presenter.chooseDefaultNodes()
@@ -230,13 +233,13 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
             self.onParametersModified()
 
     def onParametersModified(self, caller=None, event=None) -> None:
-        """Show what the parameters now are."""
+        """Show the current parameters."""
         if self.panel is not None:
             self.panel.presenter.parametersChanged()
 
 
 class USSimLogic(ScriptedLoadableModuleLogic):
-    """`ultrasound` is the logic (see Logic/mrml/logic.py); this class provides it in Slicer.
+    """Provides the UltrasoundSceneLogic of the scene (Logic/mrml/logic.py) to Slicer, as `ultrasound`.
 
     In scripts: logic = slicer.util.getModuleLogic("USSim").ultrasound
     """
@@ -253,13 +256,13 @@ class USSimLogic(ScriptedLoadableModuleLogic):
 
 
 class USSimTest(ScriptedLoadableModuleTest):
-    """All steps in Slicer: phantom head, Segment, placement, Live."""
+    """The main workflow in Slicer: phantom head, Segment, placement of the probe, Live."""
 
     def setUp(self) -> None:
         slicer.mrmlScene.Clear()
 
     def runTest(self) -> None:
-        """Called by the SelfTests module and the panel's Test button; CTest calls the test_ methods directly."""
+        """Called by the SelfTests module and by Reload and Test; CTest calls the test_ methods directly."""
         self.setUp()
         try:
             self.test_image_follows_probe()
@@ -274,11 +277,11 @@ class USSimTest(ScriptedLoadableModuleTest):
         try:
             ensurePackages()
             choose_device()
-        except SimulationError as error:  # in testing mode nothing is installed
+        except SimulationError as error:  # nothing is installed in testing mode
             self.skipTest(str(error))
         from SlicerUSSim.Logic.mri.samples import head_mri
 
-        self.delayDisplay("Create a head phantom")
+        self.delayDisplay("Create a phantom head")
         mri = head_mri(2.0)
         node = slicer.util.addVolumeFromArray(mri.array, mri.ijk_to_ras, "Head")
         logic = USSimLogic().ultrasound

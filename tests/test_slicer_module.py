@@ -926,7 +926,7 @@ def test_packages_are_installed_without_changing_what_slicer_has(bare_slicer):
 
 def test_a_package_of_slicers_that_is_too_old_is_named_and_left_alone(bare_slicer, simulation_error):
     bare_slicer.versions["scipy"] = "1.9"
-    message = r'needs scipy>=1.10, and this Slicer has 1.9, .* slicer.util.pip_install\("scipy>=1.10"\)'
+    message = r'needs scipy>=1.10, but this Slicer has 1.9, .* slicer.util.pip_install\("scipy>=1.10"\)'
     with pytest.raises(simulation_error(), match=message):
         bare_slicer.ensure()
     assert not bare_slicer.app.installed and not bare_slicer.app.questions

@@ -1,4 +1,5 @@
-"""The panel: what it shows (sections.py), what it does (presenter.py), both without Qt, for Slicer and the browser.
+"""The panel: its contents (sections.py) and its behaviour (presenter.py), without Qt, for Slicer and the browser.
 
-In Slicer: its widgets (widgets.py), wired to the presenter (panel.py), and the packages it needs (packages.py).
+Only for Slicer: the Qt widgets (widgets.py), their connection to the presenter (panel.py), and the installation of
+packages (packages.py).
 """

@@ -1,7 +1,7 @@
-"""What a panel is made of, for every user interface: controls in sections, and how declared values are shown in them.
+"""Sections and controls of a panel, for every user interface; conversion between declared and displayed values.
 
-A value has the name "section.name" of the preset ("display.gain_db") or "scene.name" of what the scene remembers
-("scene.contrast"). Everything else about it, its label, tool tip, range and unit, is its declaration's.
+A value is named "section.name" in the preset ("display.gain_db") and "scene.name" in the parameters of the scene
+("scene.contrast"). Its label, tool tip, range and unit come from its declaration.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, VALUE_PARAMET
 
 SCENE = "scene"
 Kind = Literal["slider", "number", "tick", "choice", "text", "node", "button", "words", "table", "list"]
-#: What the widget of a kind is called after the name of what it shows.
+#: Suffix of the widget's name, by kind of control.
 _WIDGETS: dict[Kind, str] = {
     "slider": "Slider", "number": "SpinBox", "tick": "CheckBox", "choice": "ComboBox", "text": "LineEdit",
     "node": "Selector", "button": "Button", "words": "Label", "table": "Table", "list": "List",
@@ -27,30 +27,30 @@ _WIDGETS: dict[Kind, str] = {
 
 @dataclass(frozen=True)
 class Control:
-    """One thing that a user sees, sets or presses; value(), node(), button() and the like make them.
+    """One element of the panel, which displays or sets a value or runs an action; see also value(), node(), button().
 
-    `shows`, `action` and `enabled` are names of the presenter's properties and methods, "fits.apply" of a part of it.
+    `shows`, `action` and `enabled` name properties and methods of the presenter, or of a part of it ("fits.apply").
     """
 
     name: str
     kind: Kind
-    #: Beside it; on ticks and buttons
+    #: Text beside the widget, or on a check box or button
     label: str = ""
     tip: str = ""
-    #: Name of the value that it shows, with its declaration
+    #: Name of the displayed value, and its declaration
     value: str = ""
     parameter: Parameter | None = None
-    #: Role of the node that it shows, and the name of nodes that it makes; "": it makes none
+    #: Role of the selected node, and base name of the nodes that the selector creates; "": it cannot create nodes
     node: str = ""
     new_node: str = ""
-    #: What a choice offers, if that is always the same
+    #: Options of a choice, if they are constant
     choices: tuple[str, ...] = ()
-    #: What gives the value or the words
+    #: Source of the displayed value or text
     shows: str = ""
-    #: What is called, with the value if there is one
+    #: Method to call, with the value if there is one
     action: str = ""
-    #: What says whether it can be used: true or false, or (true or false, why not). Without it, it can always be used,
-    #: and needs no packages.
+    #: Source of whether it can be used: a bool, or (bool, the reason if not). "": it can always be used, and its action
+    #: needs no additional packages.
     enabled: str = ""
 
     @property
@@ -60,46 +60,46 @@ class Control:
 
     @property
     def range(self) -> Shown:
-        """What a slider or a number offers."""
+        """Range, step and decimals of a slider or number."""
         shown = None if self.parameter is None else self.parameter.shown
         return shown if isinstance(shown, Shown) else Shown(0, 0)
 
     @property
     def unit(self) -> str:
-        """What the number is shown in."""
+        """Unit of the displayed number."""
         if self.range.as_db:
             return "dB"
         return "" if self.parameter is None else self.parameter.unit
 
     @property
     def suffix(self) -> str:
-        """The unit as it follows a number."""
+        """The unit as displayed after a number: with a space before it, except for °."""
         return f" {self.unit}" if self.unit and self.unit != "°" else self.unit
 
     @property
     def decimals(self) -> int:
-        """Decimals of the number: a spin box of what is no whole number has one at least."""
+        """Number of decimals; at least one in a spin box for a float."""
         is_whole = self.parameter is None or self.parameter.type is int
         return max(self.range.decimals, 0 if is_whole or self.kind == "slider" else 1)
 
     @property
     def hint(self) -> str:
-        """What an empty text stands for, if the tool tip says "empty for ..."."""
+        """Meaning of an empty text field: the part of the tool tip after "empty for ", or ""."""
         return self.tip.partition("empty for ")[2]
 
     @property
     def node_classes(self) -> tuple[str, ...]:
-        """Classes of the nodes that can be chosen."""
+        """Classes of the nodes that can be selected."""
         return NODE_PARAMETERS[self.node]
 
 
-#: A line of the panel: one control, or some side by side.
+#: A line of the panel: one control, or several side by side.
 Row: TypeAlias = Control | tuple[Control, ...]
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the panel that opens and closes."""
+    """A collapsible section of the panel."""
 
     title: str
     is_open: bool
@@ -107,7 +107,7 @@ class Section:
 
     @property
     def controls(self) -> Iterator[Control]:
-        """All of them in their order."""
+        """All controls in order."""
         for row in self.rows:
             yield from (row,) if isinstance(row, Control) else row
 
@@ -116,7 +116,7 @@ class Section:
 
 
 def value(name: str) -> Control:
-    """The control of a declared value: a slider, a number, a tick, a choice or a text, as its declaration says."""
+    """The control for a declared value: slider, number, tick, choice or text, depending on the declaration."""
     declared = value_parameter(name)
     kind: Kind = "text"
     if isinstance(declared.shown, Shown):
@@ -134,17 +134,17 @@ def value(name: str) -> Control:
 
 
 def values(*names: str) -> tuple[Control, ...]:
-    """The controls of those values that panels show."""
+    """The controls for those of the named values that panels show."""
     return tuple(value(name) for name in names if value_parameter(name).shown)
 
 
 def node(role: str, label: str, tip: str, new_node: str = "") -> Control:
-    """The choice of the node that plays a role of SceneParameters."""
+    """The node selector for a role of SceneParameters."""
     return Control(_camel_case(role), "node", label, tip, node=role, new_node=new_node)
 
 
 def button(name: str, label: str, tip: str, action: str = "", enabled: str = "") -> Control:
-    """A button; its action is the presenter's method of its name, if no other is given."""
+    """A button; by default its action is the presenter's method of the same name."""
     return Control(name, "button", label, tip, action=action or name, enabled=enabled)
 
 
@@ -167,20 +167,20 @@ def value_parameter(name: str) -> Parameter:
 
 
 def to_shown(declared: Parameter, found: Any) -> Any:
-    """What a panel shows for a value; None: nothing."""
+    """The displayed form of a value; None if nothing is displayed."""
     return declared.shown.number(found) if isinstance(declared.shown, Shown) else found
 
 
 def from_shown(declared: Parameter, entered: Any) -> Any:
-    """The value that is meant by what a widget holds, to be checked by whoever takes it.
+    """The value for the content of a widget, not yet checked.
 
-    Widgets hold whole numbers as floats.
+    Values of type int are rounded, since widgets hold them as floats.
     """
     is_number = isinstance(entered, int | float) and not isinstance(entered, bool) and math.isfinite(entered)
     if not is_number or not isinstance(declared.shown, Shown):
         return entered
-    meant = declared.shown.value(entered)
-    return round(meant) if declared.type is int and meant is not None else meant
+    converted = declared.shown.value(entered)
+    return round(converted) if declared.type is int and converted is not None else converted
 
 
 def part_of(presenter: Any, name: str) -> Any:
@@ -191,20 +191,20 @@ def part_of(presenter: Any, name: str) -> Any:
 
 
 def shown_by(presenter: Any, name: str) -> Any:
-    """What a property of the presenter, or a method without arguments, now is."""
+    """The current value of a property of the presenter, or of a method without arguments."""
     found = part_of(presenter, name)
     return found() if callable(found) else found
 
 
 def usable(presenter: Any, control: Control) -> tuple[bool, str]:
-    """(whether a control can be used, its tool tip, which says why not)"""
+    """(whether a control can be used, its tool tip, which is the reason if it cannot)"""
     found = shown_by(presenter, control.enabled) if control.enabled else True
     can, why_not = found if isinstance(found, tuple) else (found, "")
     return can, why_not or control.tip
 
 
 def _without_unit(declared: Parameter) -> str:
-    """The name without the unit at its end: gain_db is gain."""
+    """The name without the suffix of its unit: gain for gain_db."""
     unit = "deg" if declared.unit == "°" else re.sub(r"[^a-z]+", "_", declared.unit.lower()).strip("_")
     return declared.name.removesuffix(f"_{unit}") if unit else declared.name
 

@@ -1,4 +1,4 @@
-"""FitPresenter: the part of the panel that fits simulated to real ultrasound, without Qt."""
+"""FitPresenter: fits of simulated to real ultrasound for the panel, without Qt."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _REGISTRATION = "Ultrasound registration"
 
 
 class FitHost(Protocol):
-    """What it needs of the panel's presenter."""
+    """What FitPresenter requires of the panel's presenter."""
 
     @property
     def logic(self) -> UltrasoundSceneLogic: ...
@@ -34,11 +34,11 @@ class FitHost(Protocol):
     def view(self) -> PanelView: ...
 
     def value(self, name: str) -> Any:
-        """What is shown for a value."""
+        """The displayed form of a value."""
         ...
 
     def setValue(self, name: str, shown: Any) -> None:
-        """Give a value another one."""
+        """Set a value from its displayed form."""
         ...
 
     def tissueTable(self) -> TissueTable:
@@ -46,39 +46,39 @@ class FitHost(Protocol):
         ...
 
     def canSimulate(self) -> tuple[bool, str]:
-        """(whether there is something to simulate, why not)"""
+        """(whether an image can be simulated, the reason if not)"""
         ...
 
     def shown(self) -> AbstractContextManager[None]:
-        """Show what the user caused in one line."""
+        """Show errors caused by the user in one line."""
         ...
 
     def working(self, title: str) -> AbstractContextManager[Callable[[float], None]]:
-        """Show progress, and let nothing else begin."""
+        """Show progress; no other work can start meanwhile."""
         ...
 
 
 class FitPresenter:
-    """Chooses, runs, applies and shows fits for the panel."""
+    """Sets up, runs, applies and shows fits for the panel."""
 
     def __init__(self, panel: FitHost) -> None:
         self._panel = panel
-        self._fit: tuple[Fit, object] | None = None  # and the labels it is of
-        self._before: Preset | None = None  # what Apply replaced
-        #: What the last fit found, for the panel
+        self._fit: tuple[Fit, object] | None = None  # with its labels
+        self._before: Preset | None = None  # the preset that Apply replaced
+        #: Result of the last fit, as text
         self.summary = ""
 
-    # ---- what is free ------------------------------------------------------------------------------------------
+    # ---- free parameters ---------------------------------------------------------------------------------------
 
     def freeParameters(self) -> list[tuple[str, bool]]:
-        """(name, whether it is free) of all that could be, for the tissues in use."""
+        """(name, whether it is free) of each parameter that a fit can vary, for the tissues in use."""
         tissues, free = self._panel.tissueTable(), set(self._free())
         return [(name, name in free) for name in all_names(tissues)]
 
     def setFree(self, name: str, on: bool) -> None:
-        """The user ticked a parameter, or took the tick away."""
+        """Called when the user ticks or unticks a parameter."""
         names = [known for known, is_free in self.freeParameters() if (on if known == name else is_free)]
-        self._panel.setValue(_FREE, ", ".join(names) or "none")  # an empty text would be the default
+        self._panel.setValue(_FREE, ", ".join(names) or "none")  # an empty text means the default
 
     def _free(self) -> list[str]:
         names = [name.strip() for name in self._panel.value(_FREE).split(",") if name.strip()]
@@ -94,14 +94,14 @@ class FitPresenter:
     # ---- fit ---------------------------------------------------------------------------------------------------
 
     def canFit(self) -> tuple[bool, str]:
-        """(whether Fit can be pressed, why not)"""
+        """(whether Fit is enabled, the reason if not)"""
         can, why_not = self._panel.canSimulate()
         if can and self._parameters.real is None:
             return False, "Choose real images first"
         return can, why_not
 
     def fit(self) -> None:
-        """Fit to the chosen real images; Apply takes the result over."""
+        """Fit to the chosen real images; the preset does not change until apply()."""
         panel, parameters = self._panel, self._parameters
         with panel.shown(), panel.working("Fit") as progress:
             require(parameters.real is not None, "no real images chosen, expected a sequence or a volume")
@@ -110,7 +110,7 @@ class FitPresenter:
             plot = CostPlot(panel.logic.scene)
             panel.view.showChart(plot.chart)
 
-            def told(step: Progress) -> None:
+            def report(step: Progress) -> None:
                 panel.view.showStatus(f"{step.stage}: cost {step.best_cost:.4f}")
                 progress(step.share)
 
@@ -118,7 +118,7 @@ class FitPresenter:
             found = panel.logic.optimize(
                 labels, parameters.real, probe_transform_node=parameters.probe_transform, frames=self._frames(),
                 free=free, register=settings.register, estimate_geometry=settings.estimate,
-                max_evaluations=settings.evaluations, restarts=settings.restarts, plot=plot, progress=told,
+                max_evaluations=settings.evaluations, restarts=settings.restarts, plot=plot, progress=report,
             )  # fmt: skip
             self._fit, self._before = (found, labels), None
             self.summary = _in_words(found)
@@ -143,7 +143,7 @@ class FitPresenter:
         return self._before is not None
 
     def apply(self) -> None:
-        """Take the result into the preset; what registration found becomes a transform to put above the tracking."""
+        """Write the result to the preset, and a registration to a transform node, the future parent of the tracking."""
         panel = self._panel
         with panel.shown():
             found, labels = required(self._fit, "nothing to apply, fit first")
@@ -155,7 +155,7 @@ class FitPresenter:
         panel.view.refresh()
 
     def revert(self) -> None:
-        """Back to what was before Apply."""
+        """Restore the preset from before apply()."""
         with self._panel.shown():
             self._panel.logic.preset = required(self._before, "nothing to revert to, apply a fit first")
             self._before = None
@@ -172,14 +172,14 @@ class FitPresenter:
         return self._fit is not None
 
     def compare(self, kind: str, number: int) -> None:
-        """Show one image of the fit in the slice view: one of scene_fit.COMPARED."""
+        """Show one image of the fit in the slice view; `kind` is one of fit_nodes.COMPARED."""
         with self._panel.shown():
             required(self._fit, "nothing to show, fit first")
-            require(kind in COMPARED, f"nothing is called {kind!r}, expected one of {', '.join(COMPARED)}")
+            require(kind in COMPARED, f"unknown image {kind!r}, expected one of {', '.join(COMPARED)}")
             self._show(kind, number)
 
     def blink(self) -> None:
-        """Switch the slice view between the real image and the one before it."""
+        """Toggle the foreground of the slice view, which covers the real image in the background."""
         view = self._panel.view.sliceNode()
         composite = None if view is None else composite_of(view)
         if composite is not None:
@@ -211,6 +211,6 @@ def _in_words(found: Fit) -> str:
         if name in result.at_bounds:
             line += " (at its bound)"
         elif spread.is_determined is False:
-            line += f" (not determined: {spread.low:.3g} to {spread.high:.3g} fit as well)"
+            line += f" (not determined: {spread.low:.3g} to {spread.high:.3g} fit equally well)"
         lines.append(line)
     return "\n".join(lines)

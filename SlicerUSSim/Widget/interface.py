@@ -1,4 +1,4 @@
-"""PanelView: what the presenters want of a user interface, in Slicer or in the browser."""
+"""PanelView: what the presenters require of a user interface, in Slicer or in the browser."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Any, Protocol
 
 
 class PanelView(Protocol):
-    """What the presenter wants of a user interface."""
+    """What the presenters require of a user interface."""
 
     def showError(self, message: str) -> None:
         """Show one line in a message box."""
         ...
 
     def showStatus(self, message: str) -> None:
-        """Show one line in the panel, beside Live."""
+        """Show one line as the panel's status."""
         ...
 
     def refresh(self) -> None:
-        """Show everything anew: fields, tissues, what can be done."""
+        """Update everything: values, tissues, which controls are enabled."""
         ...
 
     def progress(self, title: str) -> AbstractContextManager[Callable[[float], None]]:
-        """Show a progress bar; the function is told the share done and raises Cancelled if the user wants."""
+        """Show a progress bar; the function takes the share done, 0 to 1, and raises Cancelled after Cancel."""
         ...
 
     def schedule(self, function: Callable[[], None]) -> None:
@@ -31,9 +31,9 @@ class PanelView(Protocol):
         ...
 
     def sliceNode(self) -> Any:
-        """The vtkMRMLSliceNode of the chosen slice view, or None."""
+        """The vtkMRMLSliceNode of the selected slice view, or None."""
         ...
 
     def showChart(self, chart_node) -> None:
-        """Show a vtkMRMLPlotChartNode where plots are shown."""
+        """Show a vtkMRMLPlotChartNode in the plot view."""
         ...

@@ -1,7 +1,7 @@
-"""What the module needs and Slicer's Python lacks: found out, asked for, installed.
+"""Installation of the packages that the module needs and Slicer's Python lacks, after the user has confirmed.
 
-Nothing that Slicer has is changed by it: pip is given every installed distribution, at its version, as a constraint,
-and finds versions of what is missing that fit, or fails.
+Packages that Slicer has are not changed: every installed distribution, at its version, is a constraint for pip, which
+installs compatible versions of the missing packages, or fails.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _NAME = "SlicerUSSim"
 
 
 def ensure_packages(requirements_file: Path) -> None:
-    """Install what is missing of a requirements file, after asking.
+    """Install the missing packages of a requirements file, after the user has confirmed.
 
-    Raises SimulationError if the user declines, if pip fails, if Slicer has a package in a version that will not do,
-    and if something is missing in Slicer's testing mode, in which nothing is installed.
+    Raises SimulationError if the user declines, if pip fails, if Slicer has an incompatible version of a package, and
+    if packages are missing in Slicer's testing mode, in which nothing is installed.
     """
     missing = _missing(requirements_file)
     if not missing:
@@ -38,7 +38,7 @@ def ensure_packages(requirements_file: Path) -> None:
         version = _installed_version(requirement.name)
         require(
             version is None,
-            f"{_NAME} needs {requirement}, and this Slicer has {version}, which the module leaves as it is; to change "
+            f"{_NAME} needs {requirement}, but this Slicer has {version}, which the module does not change; to change "
             f'it, run slicer.util.pip_install("{requirement}") and restart Slicer',
         )
     _ask_and_install(missing)
@@ -47,10 +47,10 @@ def ensure_packages(requirements_file: Path) -> None:
 
 
 def offer_opencl_runtime() -> None:
-    """On Windows without any OpenCL device, offer Intel's runtime, which computes on the processor.
+    """On Windows without an OpenCL device, offer to install Intel's runtime for processors.
 
-    Untested on Windows. Elsewhere nothing happens: on Linux PoCL is a requirement, and macOS has a runtime of its own.
-    Raises SimulationError if the runtime was installed, since Slicer has to be restarted, and if pip failed.
+    Not tested on Windows. Does nothing on other systems: on Linux PoCL is a requirement, and macOS includes OpenCL.
+    Raises SimulationError after an installation, since Slicer must be restarted, and if pip fails.
     """
     if sys.platform != "win32" or slicer.app.testingEnabled():
         return
@@ -60,12 +60,12 @@ def offer_opencl_runtime() -> None:
     if _installed_version(INTEL_RUNTIME) is not None or list_devices():
         return
     question = _(
-        "{name} found no OpenCL device. The driver of a graphics card brings one. On the processor Intel's runtime "
-        "computes (Python package {package}, 120 MB). Install it now?"
+        "{name} found no OpenCL device. The driver of a graphics card provides one. Intel's runtime for processors "
+        "is another (Python package {package}, 120 MB). Install it now?"
     )
     if slicer.util.confirmOkCancelDisplay(question.format(name=_NAME, package=INTEL_RUNTIME)):
         _install([Requirement(INTEL_RUNTIME)])
-        raise SimulationError("Intel's OpenCL runtime is installed; restart Slicer, which looks for runtimes only once")
+        raise SimulationError("Intel's OpenCL runtime is installed; restart Slicer to use it")
 
 
 def _ask_and_install(missing: list[Requirement]) -> None:
@@ -73,14 +73,14 @@ def _ask_and_install(missing: list[Requirement]) -> None:
         from slicer.packaging import pip_ensure
     except ImportError:  # before Slicer 5.11
         names = ", ".join(map(str, missing))
-        require(not slicer.app.testingEnabled(), _not_installed(f"{names}; in testing mode Slicer installs nothing"))
+        require(not slicer.app.testingEnabled(), _not_installed(f"{names}; nothing is installed in testing mode"))
         question = _("{name} needs these Python packages: {packages}. Install them now?")
-        wanted = slicer.util.confirmOkCancelDisplay(question.format(name=_NAME, packages=names))
-        require(wanted, _not_installed("the installation was declined"))
+        confirmed = slicer.util.confirmOkCancelDisplay(question.format(name=_NAME, packages=names))
+        require(confirmed, _not_installed("the installation was declined"))
         _install(missing)
         return
     with _in_one_line(), _constraints_file() as constraints:
-        pip_ensure(missing, constraints=constraints, requester=_NAME)  # in testing mode it does nothing, without a word
+        pip_ensure(missing, constraints=constraints, requester=_NAME)  # installs nothing in testing mode, without error
 
 
 def _install(missing: list[Requirement]) -> None:
@@ -89,12 +89,12 @@ def _install(missing: list[Requirement]) -> None:
 
 
 def _missing(requirements_file: Path) -> list[Requirement]:
-    """What concerns this computer and is not fulfilled, without its condition (the marker)."""
+    """The requirements that apply to this computer and are not met, without their environment markers."""
     lines = [line.strip() for line in requirements_file.read_text(encoding="utf-8").splitlines()]
-    wanted = [Requirement(line) for line in lines if line and not line.startswith("#")]
-    importlib.invalidate_caches()  # pip may just have been at work
+    requirements = [Requirement(line) for line in lines if line and not line.startswith("#")]
+    importlib.invalidate_caches()  # pip may have installed packages
     missing = []
-    for requirement in wanted:
+    for requirement in requirements:
         version = _installed_version(requirement.name)
         fulfilled = version is not None and requirement.specifier.contains(version, prereleases=True)
         if not fulfilled and (requirement.marker is None or requirement.marker.evaluate()):
@@ -125,7 +125,7 @@ def _constraints_file() -> Iterator[Path]:
 
 
 def _is_version(text: str | None) -> bool:
-    """Whether pip takes it for a version; one odd line would make it refuse the whole file."""
+    """Whether pip accepts it as a version; a single invalid line makes pip reject the whole file."""
     try:
         return text is not None and bool(Version(text))
     except InvalidVersion:
@@ -134,7 +134,7 @@ def _is_version(text: str | None) -> bool:
 
 @contextmanager
 def _in_one_line() -> Iterator[None]:
-    """Whatever goes wrong in Slicer's installer is one line to the user."""
+    """Convert any exception of Slicer's installer to a SimulationError of one line."""
     try:
         yield
     except Exception as error:

@@ -1,6 +1,6 @@
-"""Panel: the widgets of sections.py in Slicer, wired to a PanelPresenter. All it decides is how things look.
+"""Panel: the widgets for sections.py in Slicer, connected to a PanelPresenter, which has all other behaviour.
 
-Widgets are read and written by property() and setProperty(), which PythonQt and other bindings of Qt share.
+Widgets are read and written with property() and setProperty(), which exist in PythonQt and in other Qt bindings.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter, TissueR
 from SlicerUSSim.Widget.sections import panel_sections
 from SlicerUSSim.Widget.widgets import build
 
-#: Property that holds a value, and signal that says that it changed, by what a widget has.
+#: Property that holds a widget's value, and the signal of its change. The first property that the widget has applies.
 _VALUES = (
     ("value", "valueChanged"), ("checked", "toggled"), ("currentText", "currentTextChanged"),
     ("text", "editingFinished"),
@@ -29,13 +29,13 @@ _BLINK_MS = 500
 
 
 class Panel:
-    """What the user sees of one PanelPresenter; it is that presenter's view.
+    """The view of one PanelPresenter in Slicer.
 
     Parameters
     ----------
-    column : QVBoxLayout that the widgets go into; `ui` has them as attributes, by their names.
+    column : QVBoxLayout to which the widgets are added; they are attributes of `ui`, by object name.
     logic : UltrasoundSceneLogic of the scene.
-    ensure_packages : called before work that needs them; raises SimulationError if they are not there then.
+    ensure_packages : called before actions that need packages; raises SimulationError if any are missing afterwards.
     """
 
     def __init__(self, column: Any, logic: UltrasoundSceneLogic, ensure_packages: Callable[[], None]) -> None:
@@ -43,15 +43,15 @@ class Panel:
         self.ui = build(sections, column)
         self.logic = logic
         self.presenter = PanelPresenter(logic, self)
-        #: Whether what the widgets hold goes to the scene: not while it is closed or loaded, nor in other modules
+        #: Whether changes of widgets are written to the scene: not while it is closed or loaded, nor in other modules
         self.isConnected = True
         self._ensure_packages = ensure_packages
         self._cancelled = False
         self._rows: list[TissueRow] = []
         self._blinking = False
-        #: The controls with their widgets
+        #: Controls with their widgets
         self._controls = [(control, getattr(self.ui, name)) for name, control in by_widget(sections).items()]
-        #: What buttons do that need something of the panel
+        #: Actions of buttons that use widgets or dialogs of the panel
         self._own_actions = {
             "assignTissue": self._assign_tissue, "loadPreset": self._load_preset, "savePreset": self._save_preset,
         }  # fmt: skip
@@ -78,7 +78,7 @@ class Panel:
         return next((node for node in self._slice_nodes() if node.GetLayoutName() == wanted), None)
 
     def showChart(self, chart_node) -> None:
-        plots = getattr(getattr(slicer, "modules", None), "plots", None)  # not where Slicer runs without windows
+        plots = getattr(getattr(slicer, "modules", None), "plots", None)  # missing if Slicer runs without a main window
         if plots is not None:
             plots.logic().ShowChartInLayout(chart_node)
 
@@ -91,7 +91,7 @@ class Panel:
 
         def report(share: float) -> None:
             self.ui.progressBar.setValue(int(100 * share))
-            slicer.app.processEvents()  # which lets Cancel be pressed
+            slicer.app.processEvents()  # so that Cancel can be pressed
             if self._cancelled:
                 raise Cancelled
 
@@ -122,7 +122,7 @@ class Panel:
             elif control.shows:
                 self._show(widget, shown_by(presenter, control.shows))
 
-    # ---- wiring ------------------------------------------------------------------------------------------------
+    # ---- connections -------------------------------------------------------------------------------------------
 
     def _connect(self) -> None:
         ui, presenter = self.ui, self.presenter
@@ -144,13 +144,13 @@ class Panel:
         ui.blinkCheckBox.toggled.connect(self._blink)
 
     def _changed(self, method: Callable[[Control, Any], None], control: Control, widget: Any) -> Callable[..., None]:
-        """What a signal calls, which carries what the widget holds in a form that differs between bindings of Qt."""
+        """A slot that calls `method`. It ignores the signal's arguments, which differ between Qt bindings."""
 
-        def called(*_) -> None:
+        def slot(*_) -> None:
             if self.isConnected or control.kind == "button":
                 method(control, widget)
 
-        return called
+        return slot
 
     def _choose_node(self, control: Control, widget: Any) -> None:
         with self.presenter.shown():
@@ -167,7 +167,7 @@ class Panel:
         self._do(control, self._own_actions.get(control.name) or part_of(self.presenter, control.action))
 
     def _do(self, control: Control, action: Callable[[], None]) -> None:
-        """Do what a control is for, with the packages that work needs: what always can be done is none."""
+        """Run the action of a control, after installing the packages that it needs (see Control.enabled)."""
         try:
             if control.enabled:
                 self._ensure_packages()
@@ -189,7 +189,7 @@ class Panel:
     @staticmethod
     def _with_file(ask, title: str, proposal: str, action: Callable[[str], None]) -> None:
         path = ask(None, title, proposal, "Presets (*.json)")
-        path = path if isinstance(path, str) else path[0]  # with the chosen filter, where it is not PythonQt
+        path = path if isinstance(path, str) else path[0]  # other Qt bindings return (path, filter)
         if path:
             action(path)
 
@@ -224,13 +224,13 @@ class Panel:
     def _tissue_changed(self, line: int, column: int) -> None:
         row, name = self._rows[line], TISSUE_COLUMNS[column - 1][0]
         text = self.ui.tissueTable.item(line, column).text()
-        self._rows = []  # show it anew, whatever becomes of the change
+        self._rows = []  # redraw the table even if the change is rejected
         self.presenter.setTissue(row.name, name, text)
         self._show_tissues()
 
     def _assign_tissue(self) -> None:
         line = self.ui.tissueTable.currentRow
-        line = line if isinstance(line, int) else line()  # a property in PythonQt
+        line = line if isinstance(line, int) else line()  # a property in PythonQt, a method elsewhere
         if 0 <= line < len(self._rows):
             self.presenter.assignTissue(self._rows[line].name, self.ui.tissuePresetComboBox.property("currentText"))
 
@@ -269,7 +269,7 @@ class Panel:
             self.presenter.fits.blink()
             self._blink()
 
-    # ---- small things ------------------------------------------------------------------------------------------
+    # ---- helpers -----------------------------------------------------------------------------------------------
 
     def _slice_nodes(self) -> list:
         return nodes_of_class(self.logic.scene, "vtkMRMLSliceNode")
@@ -290,7 +290,7 @@ class Panel:
         prop = _property_of(widget)
         with _silent(widget):
             if prop == "value":
-                # A preset from elsewhere may go beyond what a slider offers.
+                # Values of a loaded preset can exceed the slider's range.
                 if value > widget.property("maximum"):
                     widget.setProperty("maximum", value)
                 if value < widget.property("minimum"):
@@ -307,7 +307,7 @@ def _property_of(widget) -> str:
 
 
 def _signal_of(widget):
-    """The signal that says that this property changed."""
+    """The signal emitted when this property changes."""
     return getattr(widget, dict(_VALUES)[_property_of(widget)])
 
 

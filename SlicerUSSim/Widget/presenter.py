@@ -1,7 +1,7 @@
-"""PanelPresenter: everything the Slicer panel does, without Qt.
+"""PanelPresenter: the behaviour of the panel, without Qt.
 
-The panel (panel.py) tells the presenter what the user did and shows what the presenter knows; the browser and the tests
-do the same. Nothing here raises for what a user did: it is shown, in one line, and everything stays as it was.
+A view calls it for each action of the user and displays its state. Views are the panel in Slicer (panel.py), the page
+in the browser, and the view of the tests. Errors caused by the user are not raised, but shown in one line.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class TissueRow:
     name: str
     #: In the order of TISSUE_COLUMNS
     values: tuple[float, ...]
-    #: Where the numbers come from
+    #: Sources of the values
     sources: tuple[str, ...]
 
 
 class PanelPresenter:
-    """Acts on one scene for one view.
+    """Operates on one scene for one view.
 
-    With `handles`, a probe that is placed gets Slicer's handles to move and turn it by.
+    With `handles`, a placed probe has Slicer's interaction handles for translation and rotation.
     """
 
     def __init__(self, logic: UltrasoundSceneLogic, view: PanelView, handles: bool = True) -> None:
@@ -59,25 +59,25 @@ class PanelPresenter:
         self._busy = False
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
-        #: The part that fits simulated to real ultrasound
+        #: Fits of simulated to real ultrasound
         self.fits = FitPresenter(self)
 
     # ---- values of preset and scene ----------------------------------------------------------------------------
 
     def value(self, name: str):
-        """What to show for a value, named as in controls.py; None where the probe has no such value."""
+        """The displayed form of a value, named as in controls.py; None if the probe has no such value."""
         declared = value_parameter(name)
         section, attribute = name.split(".")
         if section == SCENE:
             try:
                 return to_shown(declared, getattr(self.logic.parameters, attribute))
-            except SimulationError:  # a scene made by hand: what needs the value says what is wrong with it
+            except SimulationError:  # an invalid value in the scene: the error is shown when it is used
                 return to_shown(declared, declared.default)
         owner = getattr(self._preset(), section)
         return to_shown(declared, getattr(owner, attribute)) if hasattr(owner, attribute) else None
 
     def setValue(self, name: str, shown) -> None:
-        """The user gave a value, as it is shown, another one."""
+        """Set a value from its displayed form."""
         declared = value_parameter(name)
         section, attribute = name.split(".")
         with self.shown():
@@ -90,7 +90,7 @@ class PanelPresenter:
                 self.logic.preset = preset
 
     def chooseProbe(self, name: str) -> None:
-        """Take a probe of probe.PROBES; a custom one is not chosen but made."""
+        """Select a probe of probe.PROBES; CUSTOM_PROBE changes nothing."""
         with self.shown():
             if name != CUSTOM_PROBE:
                 require(name in PROBES, f"no probe is called {name!r}, expected one of {', '.join(PROBES)}")
@@ -98,25 +98,25 @@ class PanelPresenter:
         self.view.refresh()
 
     def probeName(self) -> str:
-        """Which of probe.PROBES is in use, or sections.CUSTOM_PROBE."""
+        """Name of the probe in probe.PROBES; sections.CUSTOM_PROBE if it is not one of them."""
         probe = self._preset().probe
         return next((name for name, known in PROBES.items() if known == probe), CUSTOM_PROBE)
 
     def loadPreset(self, path: str | os.PathLike) -> None:
-        """Take everything from a JSON file, one of the `ussim` command too."""
+        """Read the preset from a JSON file of the module or the `ussim` command."""
         with self.shown():
             self.logic.preset = Preset.read(path)
         self.view.refresh()
 
     def savePreset(self, path: str | os.PathLike) -> None:
-        """Write everything to a JSON file."""
+        """Write the preset to a JSON file."""
         with self.shown():
             self._preset().write(path)
 
     # ---- tissues -----------------------------------------------------------------------------------------------
 
     def tissues(self) -> list[TissueRow]:
-        """The tissues of the chosen labels, coupling medium first and membrane last; of the preset without labels."""
+        """The tissues of the chosen labels, or of the preset without labels; coupling medium first, membrane last."""
         rows: dict[str, TissueRow] = {}
         for tissue in self.tissueTable().all_tissues():
             values = tuple(getattr(tissue, parameter) for parameter, _, _ in TISSUE_COLUMNS)
@@ -125,7 +125,7 @@ class PanelPresenter:
         return list(rows.values())
 
     def setTissue(self, name: str, parameter: str, text: str) -> None:
-        """The user wrote `text` into the tissue table."""
+        """Set a parameter of a tissue from the text of a table cell."""
         with self.shown():
             try:
                 value = float(text.strip().replace(",", "."))
@@ -135,24 +135,24 @@ class PanelPresenter:
             self._change_tissue(name, lambda old: replace(old, **{parameter: value}, sources=_without(old, parameter)))
 
     def assignTissue(self, name: str, preset: str) -> None:
-        """Give the tissue `name` the numbers of the preset tissue `preset`."""
+        """Copy the parameters of the preset tissue `preset` to the tissue `name`."""
         with self.shown():
             require(preset in TISSUES, f"no tissue is called {preset!r}, expected one of {', '.join(TISSUES)}")
             self._change_tissue(name, lambda old: replace(TISSUES[preset], name=old.name))
         self.view.refresh()
 
     def resetTissues(self) -> None:
-        """All numbers back to the presets'."""
+        """Reset all tissues to the presets."""
         with self.shown():
             preset = self._preset()
             table = {label: TISSUES.get(tissue.name, tissue) for label, tissue in preset.tissues.items()}
             self.logic.preset = replace(preset, tissues=TissueTable(table, Preset().tissues.membrane))
         self.view.refresh()
 
-    # ---- what the buttons do -----------------------------------------------------------------------------------
+    # ---- actions -----------------------------------------------------------------------------------------------
 
     def canSegment(self) -> tuple[bool, str]:
-        """(whether Segment can be pressed, why not)"""
+        """(whether Segment is enabled, the reason if not)"""
         if self._busy:
             return False, _BUSY
         if self.logic.parameters.mri is None:
@@ -160,7 +160,7 @@ class PanelPresenter:
         return True, ""
 
     def canSimulate(self) -> tuple[bool, str]:
-        """(whether there is something to simulate, why not)"""
+        """(whether an image can be simulated, the reason if not)"""
         if self._busy:
             return False, _BUSY
         if self.logic.parameters.labels is None:
@@ -168,7 +168,7 @@ class PanelPresenter:
         return True, ""
 
     def segment(self) -> None:
-        """Label the tissues of the MRI into the chosen label map or segmentation, or a new segmentation."""
+        """Segment the MRI into the chosen label map or segmentation, or a new segmentation."""
         parameters = self.logic.parameters
         with self.shown(), self.working("Segment") as progress:
             require(parameters.mri is not None, "no MRI chosen, expected a scalar volume")
@@ -184,14 +184,14 @@ class PanelPresenter:
         self.view.refresh()
 
     def placeProbe(self) -> None:
-        """Put the probe on the surface in the slice view, or where a craniotomy might be; make one if there is none."""
+        """Place the probe on the surface in the slice view, or at a craniotomy; create its transform if needed."""
         with self.shown():
             require(self.logic.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
             self._put_probe(self.view.sliceNode())
         self.view.refresh()
 
     def simulate(self) -> None:
-        """One image, into the chosen volume or a new one."""
+        """Simulate one image, into the chosen volume or a new one."""
         with self.shown():
             nodes = self._nodes()
             start = perf_counter()
@@ -207,7 +207,7 @@ class PanelPresenter:
         return self.logic.isLive
 
     def setLive(self, on: bool) -> None:
-        """Let the image follow the probe, or rest."""
+        """Start or stop live update."""
         if on == self.logic.isLive:
             return
         if not on:
@@ -226,7 +226,7 @@ class PanelPresenter:
         self.view.refresh()
 
     def simulateSequence(self) -> None:
-        """Images for the chosen sequence of transforms, which the browser of that sequence then plays."""
+        """Simulate an image for each transform of the chosen sequence; its sequence browser plays both."""
         parameters = self.logic.parameters
         transforms_node, images_node = parameters.transform_sequence, parameters.image_sequence
         with self.shown(), self.working("Simulate sequence") as progress:
@@ -243,7 +243,7 @@ class PanelPresenter:
         self.view.refresh()
 
     def chooseDefaultNodes(self) -> None:
-        """Take the first volume of the scene for the MRI, if none was chosen, which saves a few clicks."""
+        """Select the first volume of the scene as the MRI, if none is selected."""
         parameters = self.logic.parameters
         if parameters.mri is not None:
             return
@@ -253,18 +253,18 @@ class PanelPresenter:
                 return
 
     def parametersChanged(self) -> None:
-        """Something in the scene's parameters, or the slice view, is another: show it, and follow with those nodes."""
+        """Update the view and the nodes of live update after a change of the scene's parameters or slice view."""
         if self.logic.isLive and self._live_nodes() != self._followed:
             self.logic.stopLiveUpdate()
             self.setLive(True)
         self.view.refresh()
 
-    # ---- inside ------------------------------------------------------------------------------------------------
+    # ---- helpers -----------------------------------------------------------------------------------------------
 
     def _preset(self) -> Preset:
         try:
             return self.logic.preset
-        except SimulationError:  # a scene made by hand: simulating says what is wrong, here one can begin anew
+        except SimulationError:  # an invalid preset in the scene: the error is shown by simulate()
             return Preset()
 
     def tissueTable(self) -> TissueTable:
@@ -272,11 +272,11 @@ class PanelPresenter:
         labels = self.logic.parameters.labels
         try:
             return self.logic.tissues(labels) if labels is not None else self._preset().tissues
-        except SimulationError:  # an empty node, or names nobody knows: simulating will say so
+        except SimulationError:  # an empty node, or unknown names: the error is shown by simulate()
             return self._preset().tissues
 
     def _change_tissue(self, name: str, change: Callable[[Tissue], Tissue]) -> None:
-        """Change a tissue of the table in use; one that the preset did not have is added to it."""
+        """Change a tissue of the table in use; it is added to the preset if missing there."""
         preset, used = self._preset(), self.tissueTable()
         old = required(
             next((tissue for tissue in used.all_tissues() if same_name(tissue.name, name)), None),
@@ -285,7 +285,7 @@ class PanelPresenter:
         self.logic.preset = replace(preset, tissues=preset.tissues.with_tissue(change(old)))
 
     def _nodes(self):
-        """The parameters, with the nodes that simulating needs; those that were not chosen are made."""
+        """The parameters, with the nodes that simulation needs; nodes that are not selected are created."""
         parameters = self.logic.parameters
         require(parameters.labels is not None, "no label map chosen; segment the MRI first")
         if parameters.probe_transform is None:
@@ -297,7 +297,7 @@ class PanelPresenter:
         return parameters
 
     def _put_probe(self, slice_node=None) -> None:
-        """Place the probe's transform, a new one if none was chosen."""
+        """Place the probe's transform, or a new one if none is selected."""
         parameters = self.logic.parameters
         with self._made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
             self.logic.placeProbe(parameters.labels, probe, slice_node)
@@ -319,7 +319,7 @@ class PanelPresenter:
 
     @contextmanager
     def _made(self, node, kind: str, name: str):
-        """`node`, or a new one, which goes again if the work with it fails."""
+        """`node`, or a new one, which is removed if an exception is raised."""
         made = node is None
         if made:
             node = self._add(kind, name)
@@ -346,7 +346,7 @@ class PanelPresenter:
 
     @contextmanager
     def shown(self) -> Iterator[None]:
-        """What the user caused is shown in one line; the panel then shows what really is."""
+        """Show errors caused by the user in one line, then refresh the view."""
         try:
             yield
         except Exception as error:
@@ -370,5 +370,5 @@ class PanelPresenter:
 
 
 def _without(tissue: Tissue, parameter: str) -> dict[str, str]:
-    """The sources of the other numbers: this one is the user's now."""
+    """The sources of all parameters except `parameter`."""
     return {name: source for name, source in tissue.sources.items() if name != parameter}

@@ -1,8 +1,8 @@
-"""The panel: its sections, in Slicer and in the browser, which make their widgets from this list.
+"""The sections of the panel, from which Slicer and the browser generate their widgets.
 
-A declared parameter that says how it is shown (Parameter.shown) is here by itself: those of probe, display and settings
-in the sections Probe, Ultrasound and Rays, those of SegmentationSettings and FitSettings in Inputs and Fit. A button
-needs its line here and the presenter's method; a value beside those a declaration in mrml/parameter_node.py.
+Declared parameters with Parameter.shown are included automatically: those of probe, display and settings in Probe,
+Ultrasound and Rays, those of SegmentationSettings and FitSettings in Inputs and Fit. A button needs an entry here and a
+method of the presenter. Any other value needs a declaration in mrml/parameter_node.py.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 from SlicerUSSim.Widget.controls import SCENE, Control, Row, Section, button, node, value, values
 
-#: What the choice of probes shows for one of the user's own.
+#: Option of the probe preset for a probe that is not one of PROBES.
 CUSTOM_PROBE = "custom"
-#: What one turns while one looks at the image.
+#: Values of the probe that are adjusted while viewing the image; shown in Ultrasound.
 _CONSOLE = ("probe.depth_mm", "probe.frequency_mhz", "probe.focus_mm")
 
 
 def panel_sections() -> tuple[Section, ...]:
-    """The sections in their order."""
+    """The sections in order."""
     return (
         Section("Inputs", True, _inputs()),
         Section("Probe", True, _probe()),
@@ -38,19 +38,19 @@ def panel_sections() -> tuple[Section, ...]:
 
 def _inputs() -> tuple[Row, ...]:
     return (
-        node("mri", "MRI", "Skull-stripped brain MRI, or any with a mask"),
+        node("mri", "MRI", "Brain MRI, skull-stripped or with a mask"),
         node(
             "mask", "Mask",
-            "Where the brain is: a segmentation, or a label map on the MRI's grid. None: everything brighter than the "
+            "Brain mask: a segmentation, or a label map on the MRI's grid; none: every voxel brighter than the "
             "background",
         ),
         *_of_scene(SceneParameters.segmentation),
         node(
             "labels", "Tissues",
-            "Segmentation or label map with the tissues: the output of Segment, or one of your own whose names are "
-            "tissues (csf, grey matter, white matter, tumour, blood, skull, ...)", new_node="Tissues",
+            "Segmentation or label map of the tissues: the output of Segment, or your own with names of tissues "
+            "(csf, grey matter, white matter, tumour, blood, skull, ...)", new_node="Tissues",
         ),
-        button("segment", "Segment", "Label the tissues of the MRI; takes one or two seconds", enabled="canSegment"),
+        button("segment", "Segment", "Segment the tissues of the MRI (one or two seconds)", enabled="canSegment"),
     )  # fmt: skip
 
 
@@ -63,17 +63,17 @@ def _probe() -> tuple[Row, ...]:
         *values(*(name for name in _probe_values() if name not in _CONSOLE)),
         node(
             "probe_transform", "Transform",
-            "Linear transform that moves the probe: x to the right of the image, y along its depth, origin in the "
-            "middle of the probe's face [mm]", new_node="Probe",
+            "Linear transform of the probe [mm]: x to the right of the image, y along its depth, origin in the "
+            "middle of the probe face", new_node="Probe",
         ),
         (
             button(
                 "place", "Place on surface at this slice",
-                "Put the probe on the surface of the tissues, in the plane of the chosen slice view, looking down in "
-                "it",
+                "Place the probe on the surface of the tissues, in the plane of the selected slice view, pointing down "
+                "in the view",
                 action="placeProbe", enabled="canSimulate",
             ),
-            Control("sliceView", "choice", tip="Slice view that the probe is placed in, and that shows the image"),
+            Control("sliceView", "choice", tip="Slice view in which the probe is placed and the image is shown"),
         ),
         value("scene.show_in_slice"),
     )  # fmt: skip
@@ -84,19 +84,19 @@ def _tissues() -> tuple[Row, ...]:
     return (
         Control(
             "tissue", "table",
-            tip=f"Acoustic parameters and scatterers of every tissue: {', '.join(columns)}; double-click to change. "
-            "The tool tip of a number is its source",
+            tip=f"Acoustic and scatterer parameters of each tissue: {', '.join(columns)}; double-click to edit; "
+            "the tool tip of a value is its source",
         ),
         (
             Control(
-                "tissuePreset", "choice", tip="Tissue whose numbers the selected line shall take",
+                "tissuePreset", "choice", tip="Tissue to copy to the selected line",
                 choices=tuple(TISSUES),
             ),
             button(
                 "assignTissue", "Use for selected line",
-                "Give the selected tissue the numbers of the tissue on the left",
+                "Copy the parameters of the tissue on the left to the selected line",
             ),
-            button("resetTissues", "Reset", "All numbers back to the presets of the project"),
+            button("resetTissues", "Reset", "Reset all tissues to the presets"),
         ),
     )  # fmt: skip
 
@@ -105,12 +105,12 @@ def _sequence() -> tuple[Row, ...]:
     return (
         node("transform_sequence", "Transforms", "Recorded sequence of probe transforms"),
         node(
-            "image_sequence", "Images", "Sequence that the simulated images go to; none: a new one",
+            "image_sequence", "Images", "Sequence for the simulated images; none: a new one",
             new_node="Ultrasound",
         ),
         button(
             "simulateSequence", "Simulate sequence",
-            "One image for every transform of the sequence; played by the same sequence browser", enabled="canSimulate",
+            "Simulate one image for each transform; the same sequence browser plays them", enabled="canSimulate",
         ),
     )  # fmt: skip
 
@@ -120,37 +120,41 @@ def _fit() -> tuple[Row, ...]:
         node(
             "real", "Real images",
             "Real ultrasound: a sequence of tracked images with its browser, a volume of one slice, or a 3D volume, "
-            "which is cut where the probe is",
+            "which is resliced in the image plane",
         ),
         *_of_scene(SceneParameters.fit),
-        Control("free", "list", "Free", "What may be changed; what the images cannot tell is said after the fit"),
+        Control(
+            "free", "list", "Free",
+            "Parameters that the fit varies; its result marks those that the images do not determine",
+        ),
         (
             button(
-                "fit", "Fit", "Change the free parameters until simulated and real images agree",
+                "fit", "Fit", "Adjust the free parameters so that simulated images match the real ones",
                 action="fits.fit", enabled="fits.canFit",
             ),
             button(
-                "applyFit", "Apply", "Take the fitted probe, display and tissues over; Save preset keeps them",
+                "applyFit", "Apply", "Adopt the fitted probe, display and tissues; Save preset saves them",
                 action="fits.apply", enabled="fits.canApply",
             ),
             button(
-                "revertFit", "Revert", "Go back to what was before Apply",
+                "revertFit", "Revert", "Restore the values from before Apply",
                 action="fits.revert", enabled="fits.canRevert",
             ),
         ),
-        Control("fit", "words", tip="What the last fit found", shows="fits.summary"),
+        Control("fit", "words", tip="Result of the last fit", shows="fits.summary"),
         Control(
             "compare", "choice", "Show",
-            "What the slice view shows of the fit: the real image, the simulated ones, or their difference (grey is "
-            "none). The real one lies in the background, so that the view's opacity slider fades between them",
+            "Image of the fit in the slice view: real, simulated, or their difference (grey: zero); the real image is "
+            "in the background, and the view's opacity slider blends the two",
             choices=tuple(COMPARED), enabled="fits.canCompare",
         ),
         Control(
-            "compareNumber", "choice", "Image", "Which of the fitted images the slice view shows",
+            "compareNumber", "choice", "Image", "Number of the fitted image in the slice view",
             enabled="fits.canCompare",
         ),
         Control(
-            "blink", "tick", "Blink", "Switch between real and simulated twice a second", enabled="fits.canCompare"
+            "blink", "tick", "Blink", "Alternate between real and simulated image twice a second",
+            enabled="fits.canCompare",
         ),
     )  # fmt: skip
 
@@ -159,30 +163,30 @@ def _output() -> tuple[Row, ...]:
     return (
         node(
             "output", "Ultrasound",
-            "Volume that the image goes to; none: a new one. It is put under the probe's transform",
+            "Volume for the image, placed under the probe's transform; none: a new one",
             new_node="Ultrasound",
         ),
         node(
-            "outline", "Outline", "Model that shows the imaged field; none: a new one", new_node="Ultrasound outline"
+            "outline", "Outline", "Model for the imaged field; none: a new one", new_node="Ultrasound outline"
         ),
         (
-            button("simulate", "Simulate", "Simulate the image under the probe", enabled="canSimulate"),
+            button("simulate", "Simulate", "Simulate one image at the pose of the probe", enabled="canSimulate"),
             Control(
-                "live", "tick", "Live", "The image follows the probe and every change of the parameters",
+                "live", "tick", "Live", "Update the image when the probe or a parameter changes",
                 shows="isLive", action="setLive", enabled="canSimulate",
             ),
         ),
         (
             button(
                 "loadPreset", "Load preset...",
-                "Probe, ultrasound, tissues and rays from a JSON file, of this module or of the ussim command",
+                "Load probe, ultrasound, tissues and rays from a JSON file of this module or the ussim command",
             ),
             button(
                 "savePreset", "Save preset...",
-                "Probe, ultrasound, tissues and rays to a JSON file, for this module and for the ussim command",
+                "Save probe, ultrasound, tissues and rays to a JSON file for this module and the ussim command",
             ),
         ),
-        Control("status", "words", tip="Images per second, or what is wrong"),
+        Control("status", "words", tip="Images per second, or a warning"),
     )  # fmt: skip
 
 
@@ -191,7 +195,7 @@ def _of_preset(section: str) -> tuple[Control, ...]:
 
 
 def _probe_values() -> list[str]:
-    """Names of the probe's values, those that only some kinds have before those that all share."""
+    """Names of the probe's values; those of only some kinds come before those of all kinds."""
     shared = {f"probe.{entry.name}" for entry in parameters_of(Probe)}
     return sorted((name for name in preset_parameters() if name.startswith("probe.")), key=lambda name: name in shared)
 

@@ -1,7 +1,7 @@
-"""The widgets of a panel, in Qt: one for each control of its sections.
+"""The Qt widgets of a panel: one for each control of its sections.
 
-Properties are set by setProperty(), which PythonQt and other bindings of Qt share. A widget is called what its control
-says, and is an attribute of that name of what build() returns.
+Properties are set with setProperty(), which exists in PythonQt and in other Qt bindings. Control.widget is the object
+name of a widget, and the name of its attribute in the result of build().
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _TABLE_HEIGHT, _LIST_HEIGHT = 220, 140
 
 
 def build(sections: tuple[Section, ...], column: Any) -> SimpleNamespace:
-    """The widgets of all controls, laid out in a QVBoxLayout, with those that show progress below them."""
+    """Create the widgets of all controls in a QVBoxLayout, with a progress bar below them."""
     ui = SimpleNamespace(**{name: _widget(control) for name, control in by_widget(sections).items()})
     for name, widget in vars(ui).items():
         widget.setObjectName(name)
@@ -71,14 +71,14 @@ def _slider(control: Control) -> Any:
 
 
 def _number(control: Control) -> Any:
-    # Whole numbers too: a seed can be larger than a QSpinBox holds.
+    # For whole numbers too: a seed can exceed the range of a QSpinBox.
     result = _with_range(qt.QDoubleSpinBox(), control)
     result.setProperty("keyboardTracking", False)
     return result
 
 
 def _with_range(widget: Any, control: Control) -> Any:
-    widget.setProperty("decimals", control.decimals)  # before what they would round
+    widget.setProperty("decimals", control.decimals)  # first, since the other values are rounded to them
     widget.setProperty("minimum", control.range.low)
     widget.setProperty("maximum", control.range.high)
     widget.setProperty("singleStep", control.range.step)
@@ -149,8 +149,8 @@ _MAKERS = {
 def _add_progress(column: Any, ui: SimpleNamespace) -> None:
     ui.progressWidget = qt.QWidget()
     ui.progressBar, ui.cancelButton = qt.QProgressBar(), qt.QPushButton("Cancel")
-    ui.progressBar.setToolTip("Share of the work done [%]")
-    ui.cancelButton.setToolTip("Stop the work; nothing is changed")
+    ui.progressBar.setToolTip("Progress [%]")
+    ui.cancelButton.setToolTip("Stop the work without changing anything")
     line = qt.QHBoxLayout(ui.progressWidget)
     line.setContentsMargins(0, 0, 0, 0)
     for name in ("progressBar", "cancelButton"):

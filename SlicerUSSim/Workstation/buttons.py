@@ -1,4 +1,4 @@
-"""Buttons: what the buttons of the panel do on the page."""
+"""Buttons: actions of the panel's buttons on the page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from SlicerUSSim.Workstation.tasks import Tasks
 
 
 class Buttons:
-    """Does what a button says, by the name of its widget: the action of its control, or what the page does instead."""
+    """Runs the action of a button, by the name of its widget: that of its control, or one specific to the page."""
 
     def __init__(
         self,
@@ -32,7 +32,7 @@ class Buttons:
         }
 
     def press(self, name: str) -> None:
-        """The user pressed a button."""
+        """Called when the user presses a button."""
         self._tasks.start(self._own_actions.get(name) or part_of(self._presenter, self._controls[name].action))
 
     def _assign_tissue(self) -> None:

@@ -34,7 +34,7 @@ FILE = "SlicerUSSim.file"
 
 @dataclass(frozen=True)
 class Files:
-    """Files and options at the start; without an MRI and labels it is the demo brain."""
+    """Files and options at the start; without an MRI and labels, the demo brain is used."""
 
     mri: str | None = None
     labels: str | None = None
@@ -146,7 +146,7 @@ class Opener:
                     kind = "labels" if volume.looks_like_labels() else "mri"
                     _log.info("%s: opened as %s", name, "a label map" if kind == "labels" else "an MRI")
                 yield str(path), kind
-            except SimulationError as error:  # the user knows only the file name, not the temporary folder
+            except SimulationError as error:  # without the temporary folder: the user chose only the file name
                 raise SimulationError(str(error).replace(folder + os.sep, "")) from None
 
     def _volume(self, path: str) -> Volume:

@@ -1,7 +1,7 @@
-"""The page: the panel's sections on the left, the ultrasound image, the anatomy around the probe.
+"""Layout of the page: the panel's sections (left), the ultrasound image (middle), the anatomy and the probe (right).
 
-Written in trame's widgets. What it shows are fields of state.PageState, by their NAMES in trame's state; what happens
-on it goes to the workstation as triggers (Workstation._answer_pages) and as changes of those fields.
+The page is built from trame's widgets, which are bound to fields of state.PageState through their NAMES. Actions of the
+user reach the workstation as triggers (Workstation._answer_pages) and as changes of those fields.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS
 from SlicerUSSim.Workstation.state import NAMES, PLANES, SLICE_VIEWS, ComparisonMode
 
 _STATIC = Path(__file__).parent / "static"
-#: What the page loads beside trame's own files.
+#: Files that the page loads in addition to those of trame.
 MODULE = {
     "serve": {"ussim": str(_STATIC)},
     "scripts": ["ussim/workstation.js"],
     "styles": ["ussim/workstation.css"],
 }
-#: Controls of the panel that the page has no use for: its slice views follow the probe by themselves, and the fit is
-#: compared in the ultrasound view; the probe is put back to where it began by a button of the page.
+#: Controls of the panel that are not on the page: its slice views follow the probe, it compares the fit in the
+#: ultrasound view, and it has a button of its own to place the probe.
 NOT_SHOWN = {
     "sliceViewComboBox", "showInSliceCheckBox", "compareComboBox", "compareNumberComboBox", "blinkCheckBox",
     "statusLabel", "placeButton",
 }  # fmt: skip
-#: What buttons do in the page itself.
+#: JavaScript of buttons that act on the page, by widget name.
 _IN_PAGE = {
     "savePresetButton": "window.ussim.save('json')",
     "loadPresetButton": "window.document.getElementById('open-file').click()",
 }
-#: Colours of the slice views' names.
+#: Colours of the marks beside the slice views' planes.
 _STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
 
 
 @dataclass(frozen=True)
 class PoseSlider:
-    """One number of the probe's pose."""
+    """The slider of one component of the probe's pose."""
 
     #: Field of surface.SurfacePose
     name: str
@@ -57,12 +57,12 @@ class PoseSlider:
 
 
 POSE_SLIDERS = (
-    PoseSlider("right_deg", "Left - right", "Where on the patient, from the vertex of the head", -120, 120, 0.5, "°"),
-    PoseSlider("front_deg", "Back - front", "Where on the patient, from the vertex of the head", -120, 120, 0.5, "°"),
-    PoseSlider("rotate_deg", "Rotate", "About the probe's own axis (keys Q, E; Ctrl and drag)", -180, 180, 1.0, "°"),
+    PoseSlider("right_deg", "Left - right", "Position on the head, from its vertex", -120, 120, 0.5, "°"),
+    PoseSlider("front_deg", "Back - front", "Position on the head, from its vertex", -120, 120, 0.5, "°"),
+    PoseSlider("rotate_deg", "Rotate", "About the probe's axis (keys Q, E; Ctrl and drag)", -180, 180, 1.0, "°"),
     PoseSlider("rock_deg", "Rock", "In the image plane (keys A, D; Shift and drag)", -75, 75, 0.5, "°"),
     PoseSlider("tilt_deg", "Tilt", "Out of the image plane (keys W, S; Shift and drag)", -75, 75, 0.5, "°"),
-    PoseSlider("lift_mm", "Lift", "Off the surface; negative is pressed in (keys +, -)", -10, 30, 0.5, "mm"),
+    PoseSlider("lift_mm", "Lift", "Off the surface; negative: pressed in (keys +, -)", -10, 30, 0.5, "mm"),
 )
 _EXPORTS = (
     ("png", "Image (PNG)"),
@@ -76,7 +76,7 @@ _EXPORTS = (
 
 
 def build_page(server: Server, sections: tuple[Section, ...], layout: LayoutManager, keys: tuple[str, ...]) -> None:
-    """Lay the page out for a server; `layout` is the anatomy's, `keys` are those that the page passes on."""
+    """Build the page of a server. `layout` is that of the anatomy views, `keys` are the keys sent to the server."""
     server.enable_module(MODULE)
     server.state.trame__title = "SlicerUSSim"
     with VAppLayout(server) as page:
@@ -96,7 +96,7 @@ def build_page(server: Server, sections: tuple[Section, ...], layout: LayoutMana
 
 
 def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
-    """What lies over a view of Slicer: for slices, the plane that it follows the probe in."""
+    """Tools over a view: a selector of its plane for slice views, a camera button for the 3D view."""
     name = view.get_singleton_tag()
     with html.Div(classes="ussim-view-tool"):
         if name in SLICE_VIEWS:
@@ -109,7 +109,7 @@ def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
         else:
             with v3.VBtn(icon=True, size="x-small", variant="text", click="trigger('look')", id="look"):
                 v3.VIcon("mdi-camera-flip-outline")
-                v3.VTooltip("See the probe", activator="parent")
+                v3.VTooltip("Turn the camera to the probe", activator="parent")
 
 
 # ---- left ------------------------------------------------------------------------------------------------------------
@@ -146,7 +146,7 @@ def _control(control: Control) -> None:
     key = f"{NAMES.panel.values}.{name}"
     disabled = f"{NAMES.panel.can}.{name} === false"
     if kind == "slider":
-        # A preset from elsewhere may go beyond what the slider offers.
+        # Values of a loaded preset can exceed the slider's range.
         _slider(
             key, name, control.label, control.tip, f"Math.min({low}, {key} ?? 0)", f"Math.max({high}, {key} ?? 0)",
             control.range.step, control.unit, control.decimals, f"trigger('set', ['{name}', $event])",
@@ -164,13 +164,13 @@ def _control(control: Control) -> None:
             classes="ussim-line", title=control.tip,
         )  # fmt: skip
     elif kind == "tick":
-        with html.Div(title=control.tip):  # a title of the check box would not be its label's
+        with html.Div(title=control.tip):  # a title of the check box would not apply to its label
             v3.VCheckbox(
                 label=control.label, model_value=(key,), density="compact", hide_details=True, id=name,
                 update_modelValue=f"trigger('set', ['{name}', $event])", disabled=(disabled,),
             )  # fmt: skip
     elif kind in ("choice", "node"):
-        if kind == "node":  # none has no ID, and a choice of HTML no null
+        if kind == "node":  # an HTML option cannot be null: "" is no node
             items = f"{NAMES.panel.nodes}.{name} ?? []"
             options = f"""<option v-for="item in ({items})" :value="item.value ?? ''">{{{{ item.title }}}}
             </option>"""
@@ -206,7 +206,7 @@ def _slider(
     key: str, name: str, label: str, tip: str, minimum: str, maximum: str, step: float, unit: str, decimals: int,
     event: str,
 ) -> None:  # fmt: skip
-    """A slider with its number beside it; `key`, `minimum` and `maximum` are expressions of the page, `event` too."""
+    """A slider with its value beside it; `key`, `minimum`, `maximum` and `event` are JavaScript expressions."""
     with html.Div(classes="ussim-slider", title=tip):
         html.Div(label)
         v3.VSlider(
@@ -242,14 +242,16 @@ def _pose_sliders() -> None:
         )  # fmt: skip
     v3.VCheckbox(
         label="Keep the probe along the surface normal", v_model=(NAMES.upright,), density="compact", hide_details=True,
-        title="When it slides; otherwise it keeps its angles to the surface", id="upright",
+        title="While it slides; otherwise it keeps its angles to the normal", id="upright",
     )  # fmt: skip
     v3.VBtn(
-        "Back to a craniotomy", size="small", classes="ma-1", id="place", click="trigger('press', ['placeButton'])",
+        "Place at craniotomy", size="small", classes="ma-1", id="place", click="trigger('press', ['placeButton'])",
         disabled=(f"{NAMES.panel.can}.placeButton === false",),
-        title="A coronal view through a parasagittal craniotomy",
+        title="Coronal view through a parasagittal craniotomy",
     )  # fmt: skip
-    v3.VBtn("Stand upright", size="small", classes="ma-1", click="trigger('key', ['Home', false])", id="stand-upright")
+    v3.VBtn(
+        "Align with normal", size="small", classes="ma-1", click="trigger('key', ['Home', false])", id="stand-upright"
+    )
 
 
 def _cost_curve() -> None:
@@ -273,7 +275,7 @@ def _tools() -> None:
             click=f"trigger('set', ['liveCheckBox', !{live}])", color=(f"{live} ? 'success' : undefined",),
         ):  # fmt: skip
             v3.VIcon(icon=(f"{live} ? 'mdi-play-circle' : 'mdi-snowflake'",))
-            v3.VTooltip("Live, or frozen", activator="parent")
+            v3.VTooltip("Live or frozen", activator="parent")
         v3.VSpacer()
         html.Div("Blend", classes="text-caption")
         v3.VSlider(
@@ -282,8 +284,8 @@ def _tools() -> None:
         )  # fmt: skip
         for state, name, icon, tip in (
             (NAMES.views.show_tissues, "show-tissues", "mdi-palette", "Colour the tissues in the slice views"),
-            (NAMES.views.follow, "follow", "mdi-crosshairs-gps", "Slice views follow the probe"),
-            (NAMES.show_latency, "show-latency", "mdi-timer-outline", "Measure the time from mouse to image"),
+            (NAMES.views.follow, "follow", "mdi-crosshairs-gps", "Let the slice views follow the probe"),
+            (NAMES.show_latency, "show-latency", "mdi-timer-outline", "Measure images per second and latency"),
         ):
             with v3.VBtn(
                 icon=True, size="small", variant="text", click=f"{state} = !{state}", id=name,
@@ -343,7 +345,7 @@ def _player() -> None:
                 v3.VBtn(mode.value, value=mode.value, size="small", id=f"compare-{mode.value.lower()}")
         html.Div(
             f"{{{{ {NAMES.sequence.similarity} }}}}", classes="ussim-similarity", id="similarity",
-            title="The paper's cost between simulated and real image: 0 for equal ones",
+            title="Cost of the paper for the simulated and the real image; 0 if they are equal",
         )  # fmt: skip
     with html.Div(classes="ussim-bar", v_if=f"{length} > 0", id="player"):
         with v3.VBtn(icon=True, size="x-small", variant="text", click="trigger('play')", id="play"):
@@ -368,7 +370,7 @@ def _status() -> None:
         html.Span(f"{{{{ {messages.status} }}}}", id="status")
         v3.VSpacer()
         html.Span(f"{{{{ {messages.tracker} }}}}", v_if=messages.tracker, id="tracker")
-        html.Span(v_if=NAMES.show_latency, id="ussim-latency")  # workstation.js measures while it is there
+        html.Span(v_if=NAMES.show_latency, id="ussim-latency")  # workstation.js measures while it exists
 
 
 def _messages() -> None:

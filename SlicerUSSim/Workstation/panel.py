@@ -1,4 +1,4 @@
-"""BrowserPanel: the panel's controls on the page: shows what its PanelPresenter knows, tells it what the user did."""
+"""BrowserPanel: connects the panel's controls on the page to a PanelPresenter."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from SlicerUSSim.Workstation.observed import Observed
 from SlicerUSSim.Workstation.state import FreeParameter, NodeItem, SharedState, TissueLine
 from SlicerUSSim.Workstation.tasks import Tasks
 
-#: How the presenter says how fast images come, and seconds for which a page shows it.
+#: End of the presenter's messages about the frame rate, and the least time between two of them on a page.
 _RATE, _STATUS_EVERY_S = "images per second", 1.0
-#: Points of the curve of costs that the page draws.
+#: Maximum number of points of the cost curve on the page.
 _CURVE_POINTS = 150
 
 
 class BrowserPanel:
-    """What the pages show of one PanelPresenter; it is that presenter's view, as panel.Panel is in Slicer.
+    """The view of one PanelPresenter on the pages, as Widget/panel.py is in Slicer.
 
     Parameters
     ----------
-    tasks : who runs what may wait.
+    tasks : runs functions that may wait for computations.
     sections : of the panel.
     about_to_compute : called before a live image is computed, in the event loop.
     """
@@ -51,7 +51,7 @@ class BrowserPanel:
         self._thread = threading.get_ident()
         self._cancelled = False
         self._status, self._status_until = "", 0.0
-        self._table: Any = None  # vtkMRMLTableNode of the costs of a fit
+        self._table: Any = None  # vtkMRMLTableNode with the costs of a fit
         self._costs = Observed("ModifiedEvent", self._show_costs)
         self.presenter = PanelPresenter(logic, self, handles=False)
         with shared.changing() as now:
@@ -65,11 +65,11 @@ class BrowserPanel:
         self._messages.show(message)
 
     def showStatus(self, message: str) -> None:
-        # Images per second are told with every image, which would be too often for a page to draw itself anew.
+        # The frame rate is reported with every image, which is too often for updates of the page.
         now = perf_counter()
         if message != self._status and (now > self._status_until or not message.endswith(_RATE)):
             self._status, self._status_until = message, now + _STATUS_EVERY_S
-            self._in_loop(lambda: self._tell_status(message))
+            self._in_loop(lambda: self._send_status(message))
 
     def schedule(self, function: Callable[[], None]) -> None:
         def run() -> None:
@@ -79,11 +79,11 @@ class BrowserPanel:
         self._tasks.start(run)
 
     def sliceNode(self) -> None:
-        """None: anatomy.py keeps the slice views on the probe."""
+        """None: anatomy.py aligns the slice views with the probe."""
         return None
 
     def showChart(self, chart_node: Any) -> None:
-        """Draw the costs of the table behind a chart, whenever it changes."""
+        """Draw the costs in the table of a chart, and update the curve when the table changes."""
         self._table = chart_node.GetNthPlotSeriesNode(0).GetTableNode()
         self._costs.watch(self._table)
         with self._shared.changing() as now:
@@ -106,16 +106,16 @@ class BrowserPanel:
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:
         self._cancelled = False
-        told = 0
+        reported_percent = 0
         with self._shared.changing() as now:
-            now.messages.progress_title, now.messages.progress_percent = title, told
+            now.messages.progress_title, now.messages.progress_percent = title, reported_percent
 
         def report(share: float) -> None:
-            nonlocal told
+            nonlocal reported_percent
             percent = int(100 * share)
-            if percent != told:
-                told = percent
-                self._in_loop(lambda: self._tell_percent(percent))
+            if percent != reported_percent:
+                reported_percent = percent
+                self._in_loop(lambda: self._send_percent(percent))
             if self._cancelled:
                 raise Cancelled
 
@@ -125,19 +125,19 @@ class BrowserPanel:
             with self._shared.changing() as now:
                 now.messages.progress_title = ""
 
-    # ---- what the page says ------------------------------------------------------------------------------------
+    # ---- triggers of the page ----------------------------------------------------------------------------------
 
     def cancel(self) -> None:
         """Stop the work under way."""
         self._cancelled = True
 
     def set(self, name: str, value: Any) -> None:
-        """The user gave a control another value."""
+        """Called when the user changes the value of a control."""
         control = self._controls[name]
         if control.value or control.node or control.action:
             self._tasks.start(lambda: self._changed(control, value))
         else:
-            with self._shared.changing() as now:  # what a button will take
+            with self._shared.changing() as now:  # used when a button is pressed
                 now.panel.values = {**now.panel.values, name: value}
 
     def _changed(self, control: Control, value: Any) -> None:
@@ -153,7 +153,7 @@ class BrowserPanel:
             part_of(presenter, control.action)(value)
         self.refresh()
 
-    # ---- inside ------------------------------------------------------------------------------------------------
+    # ---- helpers -----------------------------------------------------------------------------------------------
 
     def _shown_values(self) -> dict[str, object]:
         return {
@@ -183,17 +183,17 @@ class BrowserPanel:
         if len(columns) < 3 or not columns[0].GetNumberOfTuples():
             return
         evaluations, best = (np.asarray(memoryview(columns[n])) for n in (0, 2))
-        best = np.minimum.accumulate(best)  # restarts, which tell what the images determine, begin high again
+        best = np.minimum.accumulate(best)  # restarts, which measure identifiability, begin with high costs
         chosen = np.unique(np.linspace(0, len(best) - 1, _CURVE_POINTS).round().astype(int))
         with self._shared.changing() as now:
             now.fit.curve = best[chosen].round(5).tolist()
             now.fit.costs = f"cost {best[0]:.3f} → {best[-1]:.3f} after {evaluations[-1]:.0f} evaluations"
 
-    def _tell_status(self, message: str) -> None:
+    def _send_status(self, message: str) -> None:
         with self._shared.changing() as now:
             now.messages.status = message
 
-    def _tell_percent(self, percent: int) -> None:
+    def _send_percent(self, percent: int) -> None:
         with self._shared.changing() as now:
             now.messages.progress_percent = percent
 

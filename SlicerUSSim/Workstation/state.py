@@ -1,7 +1,7 @@
-"""PageState: everything that the page and the code behind it share, and SharedState, which keeps it in trame's state.
+"""PageState: all data that page and server share. SharedState: a PageState in trame's state.
 
-The page builds its bindings from NAMES, the code behind it reads and writes `SharedState.now`: both from the one
-declaration here, so that nothing is called by a string that only a user's browser would find wrong.
+The page builds its bindings from NAMES, and the server reads and writes `SharedState.now`. Both use the declaration
+below, so that a wrong name is an error of Python and not only of the browser.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from trame_server.utils.typed_state import TypedState
 
 from SlicerUSSim.Logic.probe.surface import SurfacePose
 
-#: Planes that a slice view follows the probe in: of the image, across it, and the patient's own.
+#: Planes in which a slice view follows the probe: image plane, plane across it, and anatomical planes.
 IN_PLANE, ACROSS = "In plane", "Across"
 PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
-#: The slice views with the plane that each begins with, by the names that Slicer gives them.
+#: Initial planes of the slice views, by Slicer's names of the views.
 SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
 
 
@@ -33,15 +33,15 @@ class ComparisonMode(Enum):
     DIFFERENCE = "Difference"
 
 
-# ---- values, which change as a whole ---------------------------------------------------------------------------------
+# ---- immutable values ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class NodeItem:
-    """A node that can be chosen."""
+    """A node that can be selected."""
 
     title: str
-    #: Its ID in the scene; None is no node
+    #: Its ID in the scene; None: no node
     value: str | None
 
 
@@ -51,7 +51,7 @@ class TissueLine:
 
     name: str
     values: list[str]
-    #: Where the numbers come from
+    #: Sources of the values
     sources: list[str]
 
 
@@ -69,7 +69,7 @@ class DepthTick:
 
     #: Depth, mm
     y: float
-    #: Beside it; "" for the marks in between
+    #: Text beside the mark; "" for intermediate marks
     text: str
 
 
@@ -82,45 +82,45 @@ class ImageGeometry:
     w: float = 0.0
     h: float = 1.0
     ticks: list[DepthTick] = field(default_factory=list)
-    #: Of letters and marks, mm
+    #: Size of letters and marks, mm
     size: float = 1.0
     #: Depth of the transmit focus, mm
     focus: float = 0.0
-    #: Dynamic range, dB, as it is written
+    #: Dynamic range, dB, as text
     range: str = ""
 
 
-# ---- what page and control share, by concern -------------------------------------------------------------------------
+# ---- shared state, by topic ------------------------------------------------------------------------------------------
 
 
 @dataclass
 class PanelState:
-    """The controls of Widget/sections.py: the mappings are by Control.widget."""
+    """The controls of Widget/sections.py. The keys of all mappings are Control.widget."""
 
-    #: What each shows; None where the preset has no such value
+    #: Displayed values; None if the preset has no such value
     values: dict[str, object] = field(default_factory=dict)
-    #: What choices offer
+    #: Options of the choices
     choices: dict[str, list[str]] = field(default_factory=dict)
-    #: The nodes that can be chosen
+    #: Nodes that can be selected
     nodes: dict[str, list[NodeItem]] = field(default_factory=dict)
-    #: Whether it can be used; those that are missing can
+    #: Whether a control can be used; those without an entry can
     can: dict[str, bool] = field(default_factory=dict)
-    #: Their tool tips, which say why not
+    #: Tool tips; the reason if a control cannot be used
     tips: dict[str, str] = field(default_factory=dict)
-    #: The tissue table, and the name in its chosen line
+    #: The tissue table, and the name in its selected line
     tissues: list[TissueLine] = field(default_factory=list)
     chosen_tissue: str = ""
 
 
 @dataclass
 class MessageState:
-    """What the user is told."""
+    """Messages to the user."""
 
-    #: One line each, until the user closes them
+    #: Errors, one line each, until the user closes them
     errors: list[str] = field(default_factory=list)
     #: One line in the bar below the image
     status: str = ""
-    #: The work under way, "" for none, and how much of it is done, in percent
+    #: Title of the work under way ("": none), and its progress in percent
     progress_title: str = ""
     progress_percent: int = 0
     #: State of the tracker's connection; "" without a tracker
@@ -129,11 +129,11 @@ class MessageState:
 
 @dataclass
 class ViewState:
-    """How the slice views show things."""
+    """Display of the slice views."""
 
     #: Plane of PLANES by slice view
     planes: dict[str, str] = field(default_factory=lambda: dict(SLICE_VIEWS))
-    #: How much of the image, against the MRI: 0 to 1
+    #: Opacity of the image over the MRI, 0 to 1
     blend: float = 0.6
     #: Whether they follow the probe
     follow: bool = True
@@ -143,16 +143,16 @@ class ViewState:
 
 @dataclass
 class SequenceState:
-    """Real ultrasound beside the simulated."""
+    """The sequence of real ultrasound images."""
 
-    #: Number of its images; 0 without a sequence
+    #: Number of images; 0 without a sequence
     length: int = 0
-    #: The place of the image that is shown, from 0, and what it is called
+    #: Index of the displayed image, from 0, and its name
     number: int = 0
     name: str = ""
     playing: bool = False
     comparison: ComparisonMode = ComparisonMode.BESIDE
-    #: How alike simulated and real image are, in words
+    #: Cost between simulated and real image, as text
     similarity: str = ""
 
 
@@ -161,7 +161,7 @@ class FitState:
     """The fit to real ultrasound."""
 
     free: list[FreeParameter] = field(default_factory=list)
-    #: The best costs so far, and the same in words
+    #: Best cost during the fit, and a summary as text
     curve: list[float] = field(default_factory=list)
     costs: str = ""
 
@@ -176,21 +176,21 @@ class ScriptState:
 
 @dataclass
 class PageState:
-    """All of it, with what the page needs before anything is loaded."""
+    """The complete state, with the values before any file is loaded."""
 
     #: Name of the MRI
     title: str = ""
     #: Titles of the panel's sections that are open
     open_sections: list[str] = field(default_factory=list)
-    #: The file that the user just gave to the page, as its input has it (name, content); None once it is taken
+    #: File uploaded by the user, as the file input provides it (name, content); None after it was read
     opened_file: object = None
     #: None before the first image
     image: ImageGeometry | None = None
-    #: Where the probe is on the patient; None without a probe or a patient
+    #: Pose of the probe on the patient; None without a probe or a patient
     pose: SurfacePose | None = None
-    #: Whether a probe that slides stands along the normal of the surface
+    #: Whether the probe is aligned with the surface normal while it slides
     upright: bool = True
-    #: Whether the time from mouse to image is measured
+    #: Whether the latency from mouse to image is measured
     show_latency: bool = False
     panel: PanelState = field(default_factory=PanelState)
     messages: MessageState = field(default_factory=MessageState)
@@ -200,12 +200,12 @@ class PageState:
     script: ScriptState = field(default_factory=ScriptState)
 
 
-#: A PageState that has, instead of every value, the name of that value in trame's state, for the page's expressions.
+#: A PageState whose fields are the names of the values in trame's state, for the page's expressions.
 NAMES = cast(PageState, TypedState(State(), PageState).name)
 
 
 class SharedState:
-    """A PageState in the state of a trame server, which keeps the pages up to date.
+    """A PageState in the state of a trame server, which sends its changes to the pages.
 
     Parameters
     ----------
@@ -218,15 +218,15 @@ class SharedState:
 
     @property
     def now(self) -> PageState:
-        """To read; what is written here reaches the pages when the server next tells them something."""
+        """For reading; a value that is written here is sent to the pages with the next change."""
         return cast(PageState, self._typed.data)
 
     @contextmanager
     def changing(self) -> Iterator[PageState]:
-        """To write; the pages are told at the end."""
+        """For writing; the changes are sent to the pages at the end of the context."""
         with self._state:
             yield self.now
 
     def on_change(self, field_of_now: object, method: Callable[..., object]) -> None:
-        """Call `method` with the new value whenever a page or the code behind it changes a field of NAMES."""
+        """Call `method` with the new value when a page or the server changes a field of NAMES."""
         self._typed.bind_changes({field_of_now: method})

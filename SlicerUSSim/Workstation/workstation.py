@@ -110,7 +110,7 @@ class Workstation:
             "dismiss": self._messages.dismiss,
             "export": self._export,
             "script": self._show_script,
-            "stamp": stamps.told,
+            "stamp": stamps.receive,
             "page_opened": self._images.show_again,
             "at_rest": self._at_rest,
         }
@@ -190,7 +190,7 @@ class Workstation:
             self._tasks.start(self._follow_parameters)
 
     def _follow_parameters(self) -> None:
-        """Observe, draw and simulate the nodes that the scene's parameters now name."""
+        """Observe, draw and simulate the nodes that the scene's parameters refer to."""
         self._following = False
         parameters = self._logic.parameters
         self._probe_node.watch(parameters.probe_transform)

@@ -57,7 +57,7 @@
     const { count, median: middle, p95, rate } = workstation.summary();
     place.textContent = count
       ? `${rate.toFixed(0)} images/s · mouse to image ${middle.toFixed(0)} ms, 95 % within ${p95.toFixed(0)} ms (last ${count})`
-      : "move the probe with the mouse to measure";
+      : "Move the probe with the mouse to measure latency";
   }
 
   const isWriting = (element) =>
