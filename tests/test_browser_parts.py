@@ -418,7 +418,7 @@ def test_the_script_of_a_label_map_simulates_the_same_image_whatever_files_and_t
     for label, name in enumerate(head.tissue_names, 1):
         back[numbers[name]] = label
     probe = PhasedProbe(60.0, 60.0, scan_lines=48)
-    in_name = nasty.replace("\n", " ")  # a name is one line
+    in_name = nasty.replace("\n", "")  # a name is one line
     tissues = TissueTable(
         {
             label: replace(tissue, name=f"{in_name}{tissue.name}{in_name}", sources={"mu0": f"measured {nasty}"})
@@ -437,7 +437,7 @@ def test_the_script_of_a_label_map_simulates_the_same_image_whatever_files_and_t
 @given(name=st.one_of(st.sampled_from(NASTY), st.text(min_size=1)).filter(str.strip), path=st.text(min_size=1))
 def test_a_script_means_the_very_names_it_was_given(name, path):
     in_one_line = " ".join(name.split())
-    assume(in_one_line.encode(errors="replace").decode() == in_one_line)
+    assume(in_one_line.isprintable() and len(in_one_line) <= 200)
     tissues = Preset().tissues.with_tissue(Tissue(in_one_line, 1540.0, 1.6, 0.5, sources={"mu0": name}))
     preset = replace(Preset(), tissues=tissues)
     source = LabelSource(path, mask=path, options={"contrast": name})

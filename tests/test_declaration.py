@@ -6,7 +6,7 @@ import copy
 import json
 import math
 import re
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, dataclass, fields, make_dataclass
 
 import numpy as np
 import pytest
@@ -15,10 +15,19 @@ from hypothesis import given, strategies as st
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import DisplaySettings, Preset, SimulationError, SimulationSettings, Tissue
-from SlicerUSSim.Logic.base.declaration import Parameter, Shown, parameter_of, parameters_of
+from SlicerUSSim.Logic.base.declaration import (
+    Declared,
+    Fit,
+    Parameter,
+    Shown,
+    parameter,
+    parameter_of,
+    parameters_of,
+)
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
-from SlicerUSSim.Logic.probe.arrays import PROBE_KIND, PROBES, ConvexProbe
+from SlicerUSSim.Logic.probe import arrays
+from SlicerUSSim.Logic.probe.arrays import PROBES, ConvexProbe, probe_kind
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Membrane
 from tests.test_parameter_docs import SECTIONS
@@ -313,9 +322,9 @@ BAD = [
     ({"tissues": {"1": {"name": "x"}}}, "tissue 1: lacks speed_of_sound_m_s, impedance_mrayl, attenuation_db_cm_mhz"),
     (tissue(colour="red"), "tissue 1: 'colour' is unknown, expected one of name, speed_of_sound_m_s, impedance_mrayl"),
     (tissue(name=5), "tissue 1: name is 5, expected text"),
-    (tissue(name=" "), "tissue 1: tissue name is ' ', expected text in one line"),
-    (tissue(name="a\nb"), "tissue 1: tissue name is 'a\\nb', expected text in one line"),
-    (tissue(name="\ud800"), "tissue 1: tissue name is '\\ud800', expected text in one line"),
+    (tissue(name=" "), "tissue 1: tissue name is ' ', expected one line of printable text"),
+    (tissue(name="a\nb"), "tissue 1: tissue name is 'a\\nb', expected one line of printable text"),
+    (tissue(name="\ud800"), "tissue 1: tissue name is '\\ud800', expected one line of printable text"),
     (tissue(mu0="0.5"), "tissue 1: mu0 is '0.5', expected a number between -100 and 100"),
     (tissue(speed_of_sound_m_s=15), "tissue 1: speed_of_sound_m_s is 15, expected a number between 100 and 10000"),
     (tissue(sources=["Duck"]), "tissue 1: sources is ['Duck'], expected an object of texts"),
@@ -530,4 +539,74 @@ def test_set_changes_tissues_and_membrane_by_name():
 
 
 def test_the_kind_of_probe_is_declared_too():
-    assert PROBE_KIND.checked("probe", "convex") == "convex" and preset_parameters()["probe.kind"] is PROBE_KIND
+    assert probe_kind().checked("probe", "convex") == "convex" and preset_parameters()["probe.kind"] == probe_kind()
+
+
+# ---- declarations that cannot be checked -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("hint", "more", "message"),
+    [
+        (list[float], {}, r"Wrong\.value: the type is list\[float\], expected bool, int, float, str"),
+        (int | str, {}, r"Wrong\.value: the type is int \| str"),
+        (bool, {"bounds": (0, 1)}, r"Wrong\.value: bounds are \(0, 1\) for <class 'bool'>"),
+        (tuple[str, str], {"bounds": (0, 1)}, r"Wrong\.value: bounds are"),
+        (tuple[float, ...], {"bounds": (0, 1)}, r"Wrong\.value: bounds are"),
+        (float, {"bounds": (1, 0)}, r"Wrong\.value: bounds are \(1, 0\)"),
+        (int, {"choices": ("1", "2")}, r"Wrong\.value: has choices"),
+        (bool, {"fit": Fit(0, 1, 0.1)}, r"Wrong\.value: has a fit"),
+    ],
+)
+def test_a_declaration_that_cannot_be_checked_names_its_field(hint, more, message):
+    kind = make_dataclass("Wrong", [("value", hint, parameter(label="Value", tip="A value", **more))])
+    with pytest.raises(TypeError, match=message):
+        parameters_of(kind)
+
+
+def test_tuples_of_numbers_say_which_numbers_they_take():
+    kind = make_dataclass(
+        "Box", [("size", tuple[float, float], parameter(label="Size", tip="A size", bounds=(0, 9)))], bases=(Declared,)
+    )
+    assert kind(np.array([1.0, 2.5])).size == (1.0, 2.5)
+    with pytest.raises(SimulationError, match="size is 5, expected 2 numbers between 0 and 9"):
+        kind(5)
+
+
+@pytest.mark.parametrize("text", ["\u0663", "1_0", "0x10", "", "1,5"])
+def test_only_plain_numbers_are_numbers_in_texts(text):
+    with pytest.raises(SimulationError, match=r"gain_db is .*expected a number"):
+        parameter_of(DisplaySettings, "gain_db").from_text("here", text)
+
+
+@given(st.lists(st.text(alphabet="abc ", min_size=1).filter(lambda t: t == t.strip()), max_size=4))
+def test_texts_are_read_back_from_their_text(names):
+    fluids = parameter_of(Membrane, "fluids")
+    assert fluids.from_text("here", fluids.to_text(tuple(names))) == tuple(names)
+
+
+@pytest.fixture
+def kinds():
+    """The kinds of probes, which are as before afterwards."""
+    before = dict(arrays.PROBE_KINDS)
+    yield arrays.PROBE_KINDS
+    arrays.PROBE_KINDS.clear()
+    arrays.PROBE_KINDS.update(before)
+
+
+def test_a_kind_of_probe_is_taken_once(kinds):
+    with pytest.raises(TypeError, match="kind is 'linear', which is LinearProbe already"):
+        type("Second", (ConvexProbe,), {"kind": "linear"})
+    type("Variant", (arrays.LinearProbe,), {})  # presets do not distinguish it
+    assert type(arrays.probe_from_dict({"kind": "linear", "width_mm": 30, "depth_mm": 40})) is arrays.LinearProbe
+    ring = dataclass(frozen=True)(type("Ring", (ConvexProbe,), {"kind": "ring", "geometry": "a closed ring"}))
+    values = {"kind": "ring", "radius_mm": 10, "field_of_view_deg": 90, "depth_mm": 40}
+    assert type(arrays.probe_from_dict(values)) is ring
+    assert Preset().changed("probe", **values).probe.to_dict()["kind"] == "ring"
+
+
+@pytest.mark.parametrize("values", [{"display": None}, {"probe": "x"}, {"tissues": {}}, {"settings": {"seed": 3}}])
+def test_a_preset_checks_its_sections(values):
+    (name,) = values
+    with pytest.raises(SimulationError, match=f"preset: {name} is .*, expected a "):
+        Preset(**values)

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.mrml.parameter_node import PanelSettings
-from SlicerUSSim.Logic.probe.arrays import PROBE_KIND, PROBE_KINDS, Probe
+from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, Probe, probe_kind
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 
 PAGE = Path(__file__).parents[1] / "docs" / "parameters.md"
@@ -66,7 +66,7 @@ def page() -> str:
     for heading, kind, text in SECTIONS:
         entries = list(parameters_of(kind))
         if kind is Probe:
-            entries = [replace(PROBE_KIND, is_required=True), *entries]
+            entries = [replace(probe_kind(), is_required=True), *entries]
         elif issubclass(kind, Probe):
             shared = {entry.name for entry in parameters_of(Probe)}
             entries = [entry for entry in entries if entry.name not in shared]

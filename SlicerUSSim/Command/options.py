@@ -181,6 +181,5 @@ def check_output(out: Path, png: bool = False) -> None:
     from SlicerUSSim.Logic.base.files import require_place
     from SlicerUSSim.Logic.base.volume import require_image_name
 
-    if not (png and out.suffix.lower() == ".png"):
-        require_image_name(out)
+    require_image_name(out, also=(".png",) if png else ())
     require_place(out)

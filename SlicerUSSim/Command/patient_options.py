@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.tissue import TissueTable
 
 pose_option = click.option(
-    "--pose", required=True, help='File with probe_to_ras (JSON, 16 numbers, or a Slicer transform), or "auto".'
-)
+    "--pose", required=True,
+    help='File with probe_to_ras (4 x 4 in JSON, 16 numbers in text, or a Slicer transform), or "auto".',
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 _T = TypeVar("_T")
 
-#: Larger than any parameter
-_HUGE = 10**300
+#: Larger than any parameter, and longer than any
+_HUGE, _LONGEST_ARRAY = 10**300, 64
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,9 @@ class Parameter:
             words = "a whole number" if kind is int else "a number"
             words += "" if self.bounds is None else f" between {self.bounds[0]:.10g} and {self.bounds[1]:.10g}"
         elif kind is tuple and self.bounds is not None:
-            count = len(get_args(self.type))
-            words = f"{count} whole numbers between {self.bounds[0]:g} and {self.bounds[1]:g}"
+            elements = get_args(self.type)
+            numbers = "numbers" if float in elements else "whole numbers"
+            words = f"{len(elements)} {numbers} between {self.bounds[0]:g} and {self.bounds[1]:g}"
         elif kind is tuple:
             words = "a list of texts"
         else:
@@ -157,6 +158,10 @@ class Parameter:
             with suppress(msgspec.ValidationError):
                 return msgspec.convert(plain, self._accepted, strict=True)
         raise SimulationError(f"{owner}: {self.name} is {short(value)}, expected {self.expected}")
+
+    def to_text(self, value: Any) -> str:
+        """The text of a value; from_text is the inverse."""
+        return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
     def from_text(self, owner: str, text: str) -> Any:
         """The value of a text, in the format of the command and of scenes. Raises SimulationError for other texts."""
@@ -191,12 +196,16 @@ def parameter(
 
 @cache
 def parameters_of(kind: type) -> tuple[Parameter, ...]:
-    """The declared parameters of a dataclass, in the order of its fields."""
+    """The declared parameters of a dataclass, in the order of its fields.
+
+    Raises TypeError that names the field for a declaration that cannot be checked.
+    """
     hints = get_type_hints(kind)
     found = []
     for entry in fields(kind):
         if "parameter" in entry.metadata:
             hint, can_be_none = _without_none(hints[entry.name])
+            _check_declaration(f"{kind.__name__}.{entry.name}", hint, entry.metadata["parameter"])
             found.append(
                 replace(
                     entry.metadata["parameter"],
@@ -258,6 +267,21 @@ def built(kind: type[_T], values: Any, source: str) -> _T:
         raise SimulationError(f"{source}: {error}") from None
 
 
+def _check_declaration(where: str, hint: Any, declared: Parameter) -> None:
+    elements = get_args(hint) if get_origin(hint) is tuple else (hint,)
+    are_numbers = all(element in (int, float) for element in elements)
+    is_mapping = get_origin(hint) in (dict, Mapping)
+    plain = all(element in (bool, int, float, str) for element in elements if element is not Ellipsis)
+    if not (plain or is_mapping):
+        raise TypeError(f"{where}: the type is {hint}, expected bool, int, float, str, a tuple of one or a mapping")
+    if declared.bounds is not None and not (are_numbers and declared.bounds[0] <= declared.bounds[1]):
+        raise TypeError(f"{where}: bounds are {declared.bounds} for {hint}, expected (low, high) of numbers")
+    if declared.choices and hint is not str:
+        raise TypeError(f"{where}: has choices, expected the type str for them, not {hint}")
+    if declared.fit is not None and hint is not float:
+        raise TypeError(f"{where}: has a fit, expected the type float for it, not {hint}")
+
+
 def _without_none(hint: Any) -> tuple[Any, bool]:
     if get_origin(hint) in (Union, UnionType) and NoneType in get_args(hint):
         (only,) = (kind for kind in get_args(hint) if kind is not NoneType)
@@ -267,7 +291,8 @@ def _without_none(hint: Any) -> tuple[Any, bool]:
 
 def _number(kind: type, text: str) -> Any:
     """The number in a text; other texts are returned unchanged, to be checked later."""
-    if kind in (int, float) and "_" not in text:  # Python accepts underscores in numbers, other programs do not
+    # Python accepts underscores and the digits of all scripts in numbers, other programs do not.
+    if kind in (int, float) and text.isascii() and "_" not in text:
         with suppress(ValueError):
             return kind(text)
     return text
@@ -280,10 +305,11 @@ def kind_of(value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A numpy scalar as the Python value that it is, in lists and tuples too."""
+    """Numpy scalars and short arrays as Python values, also in lists and tuples."""
     if isinstance(value, list | tuple):
         return (tuple if isinstance(value, tuple) else list)(map(_plain, value))
-    return value.item() if getattr(value, "ndim", None) == 0 else value
+    is_short_array = hasattr(value, "ndim") and hasattr(value, "tolist") and value.size <= _LONGEST_ARRAY
+    return value.tolist() if is_short_array else value
 
 
 def short(value: Any) -> str:

@@ -243,11 +243,12 @@ def axis_letters(ijk_to_ras: np.ndarray) -> str:
     return "".join("RAS"[n] if axis[n] > 0 else "LPI"[n] for axis, n in zip(axes, main, strict=True))
 
 
-def require_image_name(path: Path) -> None:
-    """Raise SimulationError unless Volume.write supports the format of this file name."""
+def require_image_name(path: Path, also: tuple[str, ...] = ()) -> None:
+    """Raise SimulationError unless Volume.write supports the format of this file name, or it ends in one of `also`."""
+    suffixes = (*also, *WRITABLE_SUFFIXES)
     require(
-        path.name.lower().endswith(WRITABLE_SUFFIXES),
-        f"{path}: unknown image format, expected a name ending in one of {', '.join(WRITABLE_SUFFIXES)}",
+        path.name.lower().endswith(suffixes),
+        f"{path}: unknown image format, expected a name ending in one of {', '.join(suffixes)}",
     )
 
 

@@ -11,7 +11,7 @@ from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parame
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.probe.arrays import PROBE_KIND, PROBE_KINDS, PROBES, Probe, probe_from_dict
+from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, Probe, probe_from_dict, probe_kind
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
 _log = logging.getLogger(__name__)
@@ -42,6 +42,11 @@ class Preset:
     display: DisplaySettings = field(default_factory=DisplaySettings)
     settings: SimulationSettings = field(default_factory=SimulationSettings)
     tissues: TissueTable = field(default_factory=lambda: TissueTable.brain(_BRAIN))
+
+    def __post_init__(self) -> None:
+        for name, kind in {"probe": Probe, **SECTIONS, "tissues": TissueTable}.items():
+            value = getattr(self, name)
+            require(isinstance(value, kind), f"preset: {name} is {short(value)}, expected a {kind.__name__}")
 
     def changed(self, section: str, **values) -> Preset:
         """A preset with values of one section changed: changed("display", gain_db=3).
@@ -101,7 +106,7 @@ class Preset:
 
 def preset_parameters() -> dict[str, Parameter]:
     """{"section.name": Parameter} of probe, display and settings; the probe's include those of all kinds."""
-    found = {"probe.kind": PROBE_KIND}
+    found = {"probe.kind": probe_kind()}
     for kind in PROBE_KINDS.values():
         found |= {f"probe.{entry.name}": entry for entry in parameters_of(kind)}
     for section, owner in SECTIONS.items():
@@ -122,7 +127,8 @@ def _changed_probe(probe: Probe, values: dict) -> Probe:
         old |= {name: None for name in ("focus_mm", "elevation_focus_mm") if old[name] == default}
     kind = values.get("kind", old["kind"])
     if kind != old["kind"]:
-        PROBE_KIND.checked("probe", kind)
-        needed = PROBES[kind].to_dict()
-        old = {name: old.get(name, value) for name, value in needed.items()}
-    return probe_from_dict({**old, **values}, "probe")
+        probe_kind().checked("probe", kind)
+        preset = PROBES[kind].to_dict() if kind in PROBES else {}
+        known = preset | old
+        old = {entry.name: known[entry.name] for entry in parameters_of(PROBE_KINDS[kind]) if entry.name in known}
+    return probe_from_dict({**old, "kind": kind, **values}, "probe")

@@ -82,7 +82,11 @@ class UltrasoundSimulator:
         device: DeviceChoice = None,
         texture: Texture | None = None,
     ) -> None:
-        self.settings = settings or SimulationSettings()
+        self.settings = SimulationSettings() if settings is None else settings
+        require(
+            isinstance(self.settings, SimulationSettings),
+            f"settings are {self.settings!r:.80}, expected SimulationSettings",
+        )
         self.device = Device.get(device)
         self.medium = Medium(labels, tissues, self.device, _packed_texture(texture, labels, self.settings))
         #: The stages of stages.py, also for the appearance model and verification
@@ -114,7 +118,8 @@ class UltrasoundSimulator:
         Warns with EmptyViewWarning and returns a black image if the field is outside the volume.
         Raises SimulationError for a pose that is not rigid and a noise_seed that is not a whole number of 32 bits.
         """
-        display = display or DisplaySettings()
+        display = DisplaySettings() if display is None else display
+        require(isinstance(display, DisplaySettings), f"display is {display!r:.80}, expected DisplaySettings")
         grid = grid or ImageGrid.for_probe(probe, display.image_size)
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self._warn_if_empty(probe, pose)
@@ -258,7 +263,7 @@ class UltrasoundSimulator:
             "along the patient's axes" if like is None else "of the grid given",
         )  # fmt: skip
         compounder = Compounder(grid, probe, self.device)
-        display = display or DisplaySettings()
+        display = DisplaySettings() if display is None else display
         pixels = ImageGrid.for_probe(probe, display.image_size)
         before = None
         for number, pose in enumerate(poses):
@@ -302,7 +307,7 @@ class UltrasoundSimulator:
         buffer: Buffer | None = None,
     ) -> DeviceFrame:
         """The inputs of the stages of one frame; its record is written to `buffer`, by default a new one."""
-        display = display or DisplaySettings()
+        display = DisplaySettings() if display is None else display
         frame = DeviceFrame(
             probe=probe,
             settings=self.settings,

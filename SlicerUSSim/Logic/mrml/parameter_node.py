@@ -71,7 +71,7 @@ class ValueParameter:
         return self.declared.default if text == "" else self.declared.from_text(_OWNER, text)
 
     def __set__(self, parameters: SceneParameters, value) -> None:
-        parameters.node.SetParameter(self.declared.name, str(self.declared.checked(_OWNER, value)))
+        parameters.node.SetParameter(self.declared.name, self.declared.to_text(self.declared.checked(_OWNER, value)))
 
 
 class SettingsParameter(Generic[S]):

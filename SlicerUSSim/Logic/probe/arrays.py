@@ -94,7 +94,11 @@ class Probe(Declared):
                 object.__setattr__(self, name, self.default_focus_mm(self.depth_mm))
 
     def __init_subclass__(cls) -> None:
-        PROBE_KINDS[cls.kind] = cls
+        kind = cls.__dict__.get("kind")
+        if kind in PROBE_KINDS:
+            raise TypeError(f"{cls.__name__}: kind is {kind!r}, which is {PROBE_KINDS[kind].__name__} already")
+        if kind is not None:  # otherwise a variant of its base, which presets do not distinguish
+            PROBE_KINDS[kind] = cls
 
     @staticmethod
     def default_focus_mm(depth_mm: float) -> float:
@@ -323,10 +327,12 @@ class PhasedProbe(Probe):
         return np.deg2rad(self.field_of_view_deg) / (self.scan_lines - 1)
 
 
-PROBE_KIND = Parameter(
-    name="kind", type=str, default="phased", label="Kind", choices=tuple(PROBE_KINDS), shown=True,
-    tip="; ".join(f"{name}: {kind.geometry}" for name, kind in PROBE_KINDS.items()),
-)  # fmt: skip
+def probe_kind() -> Parameter:
+    """The declaration of "kind" in a preset, which chooses among PROBE_KINDS."""
+    return Parameter(
+        name="kind", type=str, default="phased", label="Kind", choices=tuple(PROBE_KINDS), shown=True,
+        tip="; ".join(f"{name}: {kind.geometry}" for name, kind in PROBE_KINDS.items()),
+    )  # fmt: skip
 
 
 def probe_from_dict(values: dict, source: str = "probe") -> Probe:
@@ -340,9 +346,9 @@ def probe_from_dict(values: dict, source: str = "probe") -> Probe:
     0.171
     """
     require(isinstance(values, dict), f'{source}: is {kind_of(values)}, expected an object with a "kind"')
-    require("kind" in values, f"{source}: lacks kind, expected {PROBE_KIND.expected}")
+    require("kind" in values, f"{source}: lacks kind, expected {probe_kind().expected}")
     kind: Any = values["kind"]
-    PROBE_KIND.checked(source, kind)
+    probe_kind().checked(source, kind)
     arguments = {name: value for name, value in values.items() if name != "kind"}
     known = sorted(entry.name for entry in parameters_of(PROBE_KINDS[kind]))
     for name in arguments:

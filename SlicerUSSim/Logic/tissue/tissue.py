@@ -14,14 +14,13 @@ from statistics import NormalDist
 from SlicerUSSim.Logic.base.declaration import Declared, Fit, parameter, parameters_of, short
 from SlicerUSSim.Logic.base.errors import require
 
+_LONGEST_NAME = 200
 _ECHOGENICITY = "Bounds of a fit: some 40 dB of echogenicity"
 
 
 def _is_line(name: object) -> bool:
-    """Whether a name can be shown in messages and files: one line, not empty, valid Unicode."""
-    if not isinstance(name, str) or not name.strip():
-        return False
-    return name.splitlines() == [name] and name == name.encode(errors="ignore").decode()
+    """Whether a name can be shown in messages and files: one line of printable characters, not too long."""
+    return isinstance(name, str) and bool(name.strip()) and name.isprintable() and len(name) <= _LONGEST_NAME
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,11 @@ class Tissue(Declared):
     )
 
     def __post_init__(self) -> None:
-        require(_is_line(self.name), f"tissue name is {short(self.name)}, expected text in one line")
+        require(
+            _is_line(self.name),
+            f"tissue name is {short(self.name)}, expected one line of printable text of at most "
+            f"{_LONGEST_NAME} characters",
+        )
         super().__post_init__()
 
     def _owner(self) -> str:

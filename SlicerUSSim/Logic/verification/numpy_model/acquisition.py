@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import ConvexProbe, LinearProbe, PhasedProbe, Probe
@@ -129,7 +130,10 @@ def _geometry(probe: Probe) -> tuple[float, float, float]:
     if isinstance(probe, LinearProbe):
         whole, radius = probe.width_mm, 0.0
     else:
-        assert isinstance(probe, ConvexProbe | PhasedProbe)
+        require(
+            isinstance(probe, ConvexProbe | PhasedProbe),
+            f"the numpy model has no {type(probe).__name__}, expected LinearProbe, ConvexProbe or PhasedProbe",
+        )
         whole = probe.field_of_view_deg * np.pi / 180.0
         radius = probe.radius_mm if isinstance(probe, ConvexProbe) else 0.0
     return -0.5 * whole, whole / (probe.scan_lines - 1), radius
