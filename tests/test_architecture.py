@@ -4,8 +4,8 @@
 
 prints rooms, levels and imports of the tree that holds SlicerUSSim/, to compare two states of it. A room is a package
 of Logic/ (or a single file there), Widget, Workstation, Command or the file that Slicer loads. What counts are imports
-at the top of a file, inside functions and for types alone; but not what a face re-exports, since whoever imports a name
-from a face is taken to import the module that defines it.
+at the top of a file, inside functions and for types alone; but not what a face re-exports, since an import of a name
+from a face counts as an import of the module that defines it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PACKAGE = "SlicerUSSim"
 _TABLE = re.findall(r"^\| \[(\w+)\]", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"), re.MULTILINE)
 ORDER = [room for entry in _TABLE for room in (["module", entry] if entry == "Workstation" else [entry])]
 #: Libraries that take long to import, and the rooms whose files may do so at their top. Elsewhere it is left to the
-#: functions that need them, so that whoever wants something else does not wait.
+#: functions that need them, so that other uses do not wait for them.
 HEAVY = {
     "pyopencl": set(),
     "SimpleITK": set(),

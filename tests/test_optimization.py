@@ -140,7 +140,7 @@ def test_equally_good_is_what_another_draw_of_the_speckle_could_make_of_the_best
 
 
 def test_the_last_search_sees_what_whole_simulations_show(twin):
-    """Far from the presets the cost is approximate until it is computed anew about the best of the search before."""
+    """Far from the presets the cost is approximate until it is recomputed at the best result of the previous search."""
     from SlicerUSSim.Logic import similarity
 
     found = optimize_appearance(

@@ -86,7 +86,7 @@ def test_a_known_mixture_is_recovered():
     st.floats(20, 200),
 )
 def test_brighter_voxels_never_have_a_darker_class(classes, beyond):
-    """Whatever widths the classes have, and as far beyond the outermost as intensities go."""
+    """For all widths of the classes, and far beyond the outermost means."""
     means, deviations, weights = (np.array(column) for column in zip(*sorted(classes), strict=True))
     values = np.linspace(means[0] - beyond, means[-1] + beyond, 400, dtype=np.float32)
     labels = classify(values, means, deviations, weights / weights.sum())

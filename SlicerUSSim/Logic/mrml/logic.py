@@ -303,7 +303,7 @@ class UltrasoundSceneLogic:
         tracked = replace(tracked, poses=[patient.pose(pose) for pose in tracked.poses])
         texture = self._texture_of(patient)
 
-        def told(step: Progress) -> None:
+        def report(step: Progress) -> None:
             if plot is not None:
                 self._work.tell(partial(plot.add, step))
             if progress is not None:
@@ -318,7 +318,7 @@ class UltrasoundSceneLogic:
                 register=register,
                 restarts=restarts,
                 max_evaluations=max_evaluations,
-                progress=told,
+                progress=report,
             )
 
         try:

@@ -1,9 +1,9 @@
-"""Workarounds for PoCL 3.0: a processor name that its compiler knows, and a check for a linker.
+"""Workarounds for PoCL 3.0: a processor name that its compiler supports, and a check for a linker.
 
 LLVM 14 calls a processor it does not know "generic" (AMD Zen 4 and 5, for instance). PoCL passes that name to clang,
 which rejects it: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open since 2022). PoCL 3.0 has no setting for
 the name, but stores it as a C string that is read at every build. This module replaces the string by the name of a
-processor that LLVM 14 knows and whose instructions this processor has.
+processor that LLVM 14 supports and whose instructions this processor has.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import ConvexProbe, LinearProbe, PhasedProbe, Probe
@@ -130,10 +130,9 @@ def _geometry(probe: Probe) -> tuple[float, float, float]:
     if isinstance(probe, LinearProbe):
         whole, radius = probe.width_mm, 0.0
     else:
-        require(
-            isinstance(probe, ConvexProbe | PhasedProbe),
-            f"the numpy model has no {type(probe).__name__}, expected LinearProbe, ConvexProbe or PhasedProbe",
-        )
+        if not isinstance(probe, ConvexProbe | PhasedProbe):
+            name = type(probe).__name__
+            raise SimulationError(f"the numpy model has no {name}, expected LinearProbe, ConvexProbe or PhasedProbe")
         whole = probe.field_of_view_deg * np.pi / 180.0
         radius = probe.radius_mm if isinstance(probe, ConvexProbe) else 0.0
     return -0.5 * whole, whole / (probe.scan_lines - 1), radius
