@@ -108,6 +108,36 @@ def test_holes_between_images_are_filled_and_nothing_else_is(kind):
     assert not whole.array[outside].any()
 
 
+def test_holes_are_filled_up_to_the_widest_gap_of_an_uneven_sweep():
+    """Images 1, 1, 6 and 2 mm apart: every layer of voxels between the first and the last one is filled."""
+    places = np.array([0.0, 1.0, 2.0, 8.0, 10.0])
+    poses = [rigid(np.eye(3), [0, 0, z]) for z in places]
+    grid = sweep_grid(PROBE, poses, 1.0)
+    whole, narrow = (compounded(PROBE, poses, lambda p: 100 + 0 * p[..., 0], grid, hole) for hole in (None, 1.0))
+    points = centres(whole)
+    x, y, z = np.moveaxis(points, -1, 0)
+    # Away from the edge of the field, where a filled gap is slightly concave.
+    inside = PROBE.holds(1.4 * x, y) & (y > 6) & (y < 29) & (z > 0) & (z < 10)
+    gap = inside & (z > 3.5) & (z < 6.5)
+    assert gap.sum() > 1000 and not narrow.array[gap].any()
+    assert (whole.array[inside] == 100).all()
+
+
+@pytest.mark.parametrize("angles", [(0, 40, 0), (40, 0, 0), (30, 40, 25)])
+def test_the_directions_of_the_grids_axes_do_not_matter(angles):
+    """The same voxels in reversed order have the same grey levels, at the first end of each axis and at the last."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    grid = sweep_grid(PROBE, [pose], 2.0)
+    forth, reverse = grid.ijk_to_ras.copy(), grid.ijk_to_ras.copy()
+    forth[:3, 3] += 0.37, -0.23, 0.11  # no voxel is exactly at the limit of the image's weight
+    reverse[:3, 3] = (forth @ [*(np.array(grid.array.shape[::-1]) - 1), 1.0])[:3]
+    reverse[:3, :3] *= -1.0
+    there, back = (compounded(PROBE, [pose], slope, Volume(grid.array, m), 0).array for m in (forth, reverse))
+    assert (there > 0).sum() > 300
+    np.testing.assert_allclose(there.astype(int), back[::-1, ::-1, ::-1].astype(int), atol=1)
+
+
 def test_the_grid_of_a_sweep_just_holds_its_field():
     """A voxel of margin on each side, and less than a voxel more."""
     poses = slide_sweep(rigid(np.eye(3), [3, -5, 11]), 12, 5)

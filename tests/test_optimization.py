@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,8 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.fitting.identifiability import variance_db
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
+from SlicerUSSim.Logic.fitting.optimization import _identifiability
+from SlicerUSSim.Logic.fitting.parameters import FreeParameters
 from SlicerUSSim.Logic.fitting.search import Evaluation, Search
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -137,6 +140,35 @@ def test_equally_good_is_what_another_draw_of_the_speckle_could_make_of_the_best
     for parameter, column in zip(result.parameters, values.T, strict=True):
         spread = found[parameter.name]
         assert (spread.low, spread.high) == pytest.approx((column.min(), column.max())), parameter.name
+
+
+def test_every_restart_has_other_scatterers(result):
+    """The best fit, evaluated before each restart with that restart's seed, has another cost each time."""
+    last = [entry for entry in result.history if entry.stage == "polish"]
+    best = min(last, key=lambda entry: entry.cost)
+    redrawn = [entry for entry in result.history if entry.stage in ("redraw 1", "redraw 2")]
+    assert [entry.units for entry in redrawn] == [best.units] * 2
+    assert len({best.cost, *(entry.cost for entry in redrawn)}) == 3
+
+
+@pytest.mark.parametrize("offset", [-0.4, 0.4])
+def test_a_restart_is_compared_with_the_best_fit_of_its_own_scatterers(offset):
+    """With other scatterers all costs are higher or lower; a restart that finds the same place is as good."""
+    display, tissues = DisplaySettings(), TissueTable.named(["liver"])
+    parameters = FreeParameters.of(["gain_db"], tissues, display)
+    best = parameters.units(tissues, display)
+    simulator = SimpleNamespace(settings=SimulationSettings(seed=5))
+
+    def cost(units):
+        return 1.0 + float(((units - best) ** 2).sum()) + offset * (simulator.settings.seed != 5)
+
+    search = Search(cost, lambda units: {}, 100)
+    search.evaluate("polish", best)
+    model = SimpleNamespace(anchor=lambda tissues: None, probe=SMALL)
+    problem = SimpleNamespace(parameters=parameters, tissues=tissues, display=display, model=model)
+    found = _identifiability(problem, search, simulator, best, restarts=1, budget=40, algorithm="LN_SBPLX")
+    assert found.cost_tolerance == pytest.approx(0.2)
+    assert (found.restarts, found.restarts_as_good) == (1, 1)
 
 
 def test_the_last_search_sees_what_whole_simulations_show(twin):

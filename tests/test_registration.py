@@ -119,6 +119,23 @@ def test_the_coarse_search_compares_the_same_field_at_half_the_resolution():
     assert first.stage == "coarse" and first.cost == pytest.approx(expected.total, abs=2e-3)
 
 
+def test_poses_that_fit_exactly_are_returned_although_the_coarse_search_leaves_them():
+    """The reference is the simulated image itself, so every other pose has a higher cost."""
+    seen, rotation = cysts()
+    display = DisplaySettings(image_size=(96, 96))
+    grid = ImageGrid.for_probe(SMALL, display.image_size)
+    pose = rotation @ rigid_from([0, -12, 0, 0, 0, 0])
+    reference = seen.simulate(SMALL, pose, display, grid).image
+    found = register_poses(
+        seen, SMALL, [pose], [reference], display=display, grid=grid, range_mm=1, range_deg=1, max_evaluations=12
+    )
+    fine = [entry for entry in found.history if entry.stage == "fine"]
+    assert fine and min(entry.cost for entry in fine) > 0.0
+    assert found.cost_before == found.cost_after == 0.0
+    np.testing.assert_allclose(found.poses, [pose], atol=1e-12)
+    assert found.shift_mm == pytest.approx(0.0, abs=1e-12) and found.turn_deg == pytest.approx(0.0, abs=1e-4)
+
+
 def test_the_cost_found_is_that_of_images_at_the_corrected_poses():
     """At oblique poses, where correction @ pose and pose @ correction lie apart; costs by plain simulations."""
     seen, rotation = cysts()

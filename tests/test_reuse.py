@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from SlicerUSSim.Logic import SimulationSettings, Texture, TissueTable
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
@@ -38,3 +39,14 @@ def test_other_voxels_need_another_simulator():
         assert seen[-1] is not seen[-2] and seen[-1].settings == settings
     reused.forget()
     assert reused.get(2, LABELS, TABLE, settings, texture=known) is not seen[-1]
+
+
+@pytest.mark.parametrize("partial_volume", [False, True])
+def test_each_setting_of_the_texture_needs_another_simulator(partial_volume):
+    """One setting changes at a time."""
+    reused, known = ReusedSimulator(), Texture.from_mri(LABELS.with_array(LABELS.array.astype(float)), LABELS)
+    before = replace(SETTINGS, partial_volume=partial_volume, mri_modulation_db=1.0)
+    for change in ({"mri_modulation_db": 2.0}, {"partial_volume": not partial_volume}):
+        first = reused.get(1, LABELS, TABLE, before, texture=known)
+        assert reused.get(1, LABELS, TABLE, before, texture=known) is first
+        assert reused.get(1, LABELS, TABLE, replace(before, **change), texture=known) is not first

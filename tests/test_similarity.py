@@ -33,6 +33,17 @@ def test_cost_is_that_of_the_equations():
     assert (found.total, found.bhattacharyya, found.sad) == pytest.approx((total, rho, sad), abs=1e-6)
 
 
+@pytest.mark.parametrize("histogram_weight", [0.0, 1.0, 2.0])
+def test_both_parts_of_the_cost_have_a_weight(histogram_weight):
+    random = np.random.default_rng(4)
+    a, b = random.integers(0, 256, (2, 40, 60), dtype=np.uint8)
+    weights = SimilaritySettings(5.0, 16, sad_weight=0.7, histogram_weight=histogram_weight)
+    found = PatchComparison(Device.get(), b, np.ones(b.shape, bool), (0.5, 0.5), weights).of(a)
+    _, rho, sad = by_the_equations(a, b, 10, 16, 0.7)
+    assert (found.bhattacharyya, found.sad) == pytest.approx((rho, sad), abs=1e-6)
+    assert found.total == pytest.approx(histogram_weight * rho + 0.7 * sad, abs=2e-6)
+
+
 @given(images, st.integers(2, 256), st.floats(0.5, 20.0))
 def test_an_image_is_at_no_distance_from_itself(image, bins, patch_mm):
     assert similarity(image, image, (1.0, 1.0), patch_mm=patch_mm, bins=bins).total == 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from inspect import signature
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -338,6 +339,41 @@ def test_a_changed_display_tissue_or_setting_gives_the_image_of_a_new_simulator(
         sim.settings = simulation
         fresh = UltrasoundSimulator(labels, tissues, simulation).simulate(probe, pose, display)
         np.testing.assert_array_equal(sim.simulate(probe, pose, display).image, fresh.image)
+
+
+def test_acoustic_groups_that_split_or_merge_give_the_image_of_a_new_simulator():
+    """Groups are tissues of equal speed and impedance; there is an interface wherever two of them meet."""
+    labels = block(lambda x, y, z: 1 + (y > 0) + (y > 6), half_mm=(12, 14, 8))
+    probe, pose = LinearProbe(16, 22, scan_lines=48), rigid(np.eye(3), [0, -12, 0])
+    sim = simulator(labels, *(replace(SPECKLE, name=name) for name in ("upper", "middle", "lower")))
+    together = sim.medium.tissues
+    split = together.replace("middle", impedance_mrayl=2.0)
+    regrouped = together.replace("upper", impedance_mrayl=2.0).replace("middle", impedance_mrayl=2.0)
+    slower = regrouped.replace("lower", speed_of_sound_m_s=1400.0)
+    images = []
+    for tissues in (together, split, regrouped, slower, together):
+        sim.set_tissues(tissues)
+        images.append(sim.simulate(probe, pose, QUIET).image)
+        fresh = UltrasoundSimulator(labels, tissues, sim.settings)
+        np.testing.assert_array_equal(images[-1], fresh.simulate(probe, pose, QUIET).image)
+    for before, after in pairwise(images):
+        assert not np.array_equal(before, after)
+
+
+@pytest.mark.parametrize("name", ["interfaces", "scattering"])
+def test_echoes_follow_a_change_of_one_setting(name):
+    """Also of one that changes only which echoes are computed: everything else, such as the seed, stays equal."""
+    labels = block(lambda x, y, z: 1 + (y > 0), half_mm=(12, 14, 8))
+    probe, pose = LinearProbe(16, 22, scan_lines=48), rigid(np.eye(3), [0, -12, 0])
+    sim = simulator(labels, SPECKLE, replace(SPECKLE, name="dense", impedance_mrayl=2.0))
+    complete = sim.settings
+    images = []
+    for wanted in (complete, replace(complete, **{name: False}), complete):
+        sim.settings = wanted
+        images.append(sim.simulate(probe, pose, QUIET).image)
+        fresh = UltrasoundSimulator(labels, sim.medium.tissues, wanted)
+        np.testing.assert_array_equal(images[-1], fresh.simulate(probe, pose, QUIET).image)
+    assert not np.array_equal(images[0], images[1])
 
 
 def test_stages_are_timed_on_request(solid):
