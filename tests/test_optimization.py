@@ -327,10 +327,10 @@ def test_a_state_is_refused_if_any_input_is_another_and_the_line_says_which(twin
     ):
         with pytest.raises(SimulationError) as caught:
             fitted(**changes, resume=state)
-        assert f"is of another problem: other {other}; begin without it" in str(caught.value)
+        assert f"is of another problem: other {other}; start without it" in str(caught.value)
         assert "\n" not in str(caught.value)
     start.settings = settings
-    with pytest.raises(SimulationError, match="other simulation settings; begin without it"):
+    with pytest.raises(SimulationError, match="other simulation settings; start without it"):
         fitted(resume=state)
 
 
