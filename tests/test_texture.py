@@ -213,4 +213,4 @@ def test_the_commands_take_the_settings_from_an_mri_and_refuse_them_for_labels(t
     arguments[1] = str(tmp_path / "labels.nii.gz")
     result = CliRunner().invoke(main, [*arguments, "--partial-volume"])
     assert result.exit_code == 2
-    assert "is a label map; --partial-volume and --mri-modulation need the MRI it came from" in result.stderr
+    assert "is a label map; --partial-volume and --mri-modulation need an MRI" in result.stderr
