@@ -150,7 +150,9 @@ def focused_probe() -> LinearProbe:
     return replace(probe(), width_mm=20.0, scan_lines=201, aperture_mm=ELEMENTS * PITCH_MM, focus_mm=FOCUS_MM)
 
 
-@pytest.mark.parametrize("depth", [10.0, 15.0, 30.0, 35.0, 40.0])
+@pytest.mark.parametrize(
+    "depth", [10.0, 15.0, 30.0, *(pytest.param(depth, marks=pytest.mark.slow) for depth in (35.0, 40.0))]
+)
 def test_a_focused_transmit_beam_is_as_wide_at_and_away_from_its_focus(depth):
     """Not just before the focus (20 to 25 mm): there the near field of a real aperture has ripples of 20 %."""
     lines = np.arange(-2.0, 2.01, 0.1)

@@ -20,13 +20,18 @@ from SlicerUSSim.Logic.verification.measurement import echo_near, fit_rayleigh, 
 from SlicerUSSim.Logic.verification.phantoms import Echo
 from SlicerUSSim.Logic.verification.validation import ORIENTATIONS, PROBES, Outcome, Row, all_checks, run, validate
 
+#: Checks that take long: of these the suite has one orientation
+_LONG = ("compounding", "curved mirrors", "slice thickness", "speckle statistics")
 #: All of them; of the two oblique orientations the suite takes one, and the slow tests the other.
 CASES = [
     pytest.param(
         check,
         orientation,
         id=f"{check.name}-{orientation}",
-        marks=[pytest.mark.slow] if orientation == "diagonal" and "oblique" in check.orientations else [],
+        marks=[pytest.mark.slow]
+        if (orientation == "diagonal" and "oblique" in check.orientations)
+        or (orientation == "aligned" and check.name in _LONG)
+        else [],
     )
     for check in all_checks()
     for orientation in check.orientations

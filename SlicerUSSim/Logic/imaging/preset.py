@@ -44,7 +44,9 @@ class Preset:
     tissues: TissueTable = field(default_factory=lambda: TissueTable.brain(_BRAIN))
 
     def __post_init__(self) -> None:
-        for name, kind in {"probe": Probe, **SECTIONS, "tissues": TissueTable}.items():
+        for name, kind in (
+            ("probe", Probe), ("display", DisplaySettings), ("settings", SimulationSettings), ("tissues", TissueTable),
+        ):  # fmt: skip
             value = getattr(self, name)
             require(isinstance(value, kind), f"preset: {name} is {short(value)}, expected a {kind.__name__}")
 
