@@ -67,15 +67,11 @@ def _sform(header: dict[str, str], scale: float) -> np.ndarray:
 
 def _qform(header: dict[str, str], scale: float, way: float) -> np.ndarray:
     """Method 2 of nifti1.h: a rotation by a quaternion, voxel sizes, and the `way` of the third axis, 1 or -1."""
+    from scipy.spatial.transform import Rotation  # imported here to keep base light
+
     b, c, d = (float(header[f"quatern_{letter}"]) for letter in "bcd")
     a = np.sqrt(max(1.0 - b * b - c * c - d * d, 0.0))
-    rotation = np.array(
-        [
-            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
-            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
-            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
-        ]
-    )
+    rotation = Rotation.from_quat([b, c, d, a]).as_matrix()
     sizes = np.array([float(header[f"pixdim[{n}]"]) for n in (1, 2, 3)])
     sizes[2] *= way
     matrix = np.eye(4)

@@ -118,9 +118,6 @@ class UltrasoundSimulator:
         Warns with EmptyViewWarning and returns a black image if the field is outside the volume.
         Raises SimulationError for a pose that is not rigid and a noise_seed that is not a whole number of 32 bits.
         """
-        display = DisplaySettings() if display is None else display
-        require(isinstance(display, DisplaySettings), f"display is {display!r:.80}, expected DisplaySettings")
-        grid = grid or ImageGrid.for_probe(probe, display.image_size)
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self._warn_if_empty(probe, pose)
         timings: dict[str, float] = {}
@@ -138,7 +135,7 @@ class UltrasoundSimulator:
             image=image,
             sample_interval_mm=self._sample_mm(probe),
             cycles_per_mm=self._cycles_per_mm(probe),
-            grid=grid,
+            grid=frame.grid,
             probe_to_ras=pose,
             timings_ms=timings,
         )
@@ -170,8 +167,8 @@ class UltrasoundSimulator:
         self,
         probe: Probe,
         pose: np.ndarray,
-        display: DisplaySettings,
-        grid: ImageGrid,
+        display: DisplaySettings | None,
+        grid: ImageGrid | None,
         timings: dict[str, float],
         noise_seed: int,
     ) -> DeviceFrame:
@@ -308,6 +305,7 @@ class UltrasoundSimulator:
     ) -> DeviceFrame:
         """The inputs of the stages of one frame; its record is written to `buffer`, by default a new one."""
         display = DisplaySettings() if display is None else display
+        require(isinstance(display, DisplaySettings), f"display is {display!r:.80}, expected DisplaySettings")
         frame = DeviceFrame(
             probe=probe,
             settings=self.settings,
