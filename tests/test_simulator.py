@@ -384,3 +384,13 @@ def test_stages_are_timed_on_request(solid):
         solid.profiling = False
     assert {"ray tree", "scatterers", "pulse", "B-mode", "scan conversion"} <= set(frame.timings_ms)
     assert solid.simulate(PROBES["linear"], rigid(np.eye(3), [0, -25, 0])).timings_ms == {}
+
+
+def test_plain_dictionaries_are_refused_for_settings_and_display():
+    labels = block(lambda x, y, z: np.ones_like(x), half_mm=(10, 10, 5))
+    sim, pose = simulator(labels, SPECKLE), rigid(np.eye(3), [0, -10, 0])
+    probe = LinearProbe(10, 10, scan_lines=16)
+    with pytest.raises(SimulationError, match=r"display is \{'gain_db': 3\}, expected DisplaySettings"):
+        sim.simulate(probe, pose, {"gain_db": 3})
+    with pytest.raises(SimulationError, match=r"settings are \{'seed': 3\}, expected SimulationSettings"):
+        UltrasoundSimulator(labels, sim.medium.tissues, {"seed": 3})
