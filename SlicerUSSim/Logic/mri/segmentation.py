@@ -6,6 +6,7 @@ import itertools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from time import perf_counter
 from typing import cast
 
@@ -15,6 +16,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
 from SlicerUSSim.Logic.mri.filtering import guided_filter
 from SlicerUSSim.Logic.mri.mixture import classify, fit_mixture, mixture_posteriors
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
@@ -55,6 +57,8 @@ class Segmentation:
     #: Standard deviation of the estimated noise, and the filter's epsilon
     noise: float
     filter_epsilon: float
+    #: Where tissues were looked for, and how it was found
+    brain: BrainMask
     _filtered: np.ndarray = field(repr=False)
 
     @property
@@ -97,6 +101,8 @@ def segment_mri(
     filter_epsilon: float | None = SegmentationSettings.filter_epsilon,
     bias_correction: bool = SegmentationSettings.bias_correction,
     thin_sulci: bool = False,
+    skull_strip: str = SegmentationSettings.skull_strip,
+    keep_mask_at: Path | None = None,
     device: DeviceChoice = None,
     progress: Callable[[float], None] | None = None,
 ) -> Segmentation:
@@ -104,15 +110,17 @@ def segment_mri(
 
     Parameters
     ----------
-    mri : the image; skull-stripped, or with a `mask`.
+    mri : the image: a whole head, a skull-stripped brain, or any image with a `mask`.
     classes : number of tissues.
     contrast : "t1", "t1gd", "t2" or "flair"; orders and names the classes.
-    mask : foreground on the same grid (non-zero is inside); default: Otsu's threshold and the largest component.
+    mask : foreground on the same grid (non-zero is inside); default: found by `skull_strip`.
     filter_radius : of the guided filter in voxels; 0 disables it.
     filter_epsilon : of the guided filter, squared intensity; default: from the noise estimated in the image.
     bias_correction : run N4 first (slow); for scans with a visible intensity gradient.
     thin_sulci : also label the middle of sulci that are too narrow to reach CSF intensity, one voxel thick, as an extra
         tissue "leptomeninges" within the grey matter. Ultrasound shows these sulci, but intensity classes miss them.
+    skull_strip : how the brain is found without a `mask`; see brain.find_brain.
+    keep_mask_at : file in which the mask of a whole head is kept, so that it is extracted once; see brain.find_brain.
     progress : called with the completed fraction, 0 to 1.
 
     Raises SimulationError for an unknown contrast or number of classes, an image that is constant or not finite, and a
@@ -128,13 +136,21 @@ def segment_mri(
     """
     report = progress or (lambda share: None)
     names = _class_names(contrast, classes)
-    settings = SegmentationSettings(contrast, classes, thin_sulci, bias_correction, filter_radius, filter_epsilon)
+    settings = SegmentationSettings(
+        contrast, classes, skull_strip, thin_sulci, bias_correction, filter_radius, filter_epsilon
+    )
     timed = _StepTimes()
     intensity = _finite(mri)
-    foreground = _foreground(intensity) if mask is None else _given_mask(mask, mri)
-    timed("foreground")
-    how = "found by Otsu's threshold" if mask is None else "as given"
-    _log.info("foreground %s: %.0f %% of the MRI's voxels", how, 100 * foreground.mean())
+    if mask is None:
+        brain = find_brain(
+            mri.with_array(intensity), settings.skull_strip, keep_at=keep_mask_at,
+            progress=lambda share: report(0.2 * share),
+        )  # fmt: skip
+    else:
+        brain = given_brain(mask, mri)
+    foreground = brain.mask.array > 0
+    timed("brain")
+    _log.info("%s", brain.message)
     report(0.2)
     if bias_correction:
         intensity = _without_bias(mri.with_array(intensity), foreground, lambda share: report(0.2 + 0.4 * share))
@@ -186,6 +202,7 @@ def segment_mri(
         log_likelihoods=likelihoods,
         noise=noise,
         filter_epsilon=epsilon,
+        brain=brain,
         _filtered=filtered,
     )
 
@@ -269,27 +286,6 @@ def _finite(mri: Volume) -> np.ndarray:
     low, high = float(intensity.min()), float(intensity.max())
     require(high > low, f"MRI is constant ({low:g}), expected different intensities")
     return intensity
-
-
-def _foreground(intensity: np.ndarray) -> np.ndarray:
-    from skimage.filters import threshold_otsu
-
-    inside = intensity > 0.5 * threshold_otsu(intensity)  # half: Otsu's threshold itself would exclude CSF in T1
-    # Casts: the return types of scipy's functions depend on their arguments, without type annotations for that.
-    components, count = cast(tuple[np.ndarray, int], ndimage.label(inside))
-    if count > 1:
-        inside = components == np.argmax(np.bincount(components.ravel())[1:]) + 1
-    return cast(np.ndarray, ndimage.binary_fill_holes(inside))
-
-
-def _given_mask(mask: Volume, mri: Volume) -> np.ndarray:
-    require(
-        mask.array.shape == mri.array.shape and np.allclose(mask.ijk_to_ras, mri.ijk_to_ras, atol=1e-3),
-        f"mask has shape {mask.array.shape} and the MRI {mri.array.shape}, expected the same grid; resample the mask",
-    )
-    inside = mask.array > 0
-    require(bool(inside.any()), "mask is empty, expected at least one voxel inside")
-    return inside
 
 
 def _without_bias(mri: Volume, foreground: np.ndarray, report: Callable[[float], None]) -> np.ndarray:

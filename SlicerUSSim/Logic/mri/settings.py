@@ -19,6 +19,10 @@ class SegmentationSettings(Declared):
         3, "Classes", "Number of tissues to distinguish by intensity: 3, or 4 with t1gd and flair", bounds=(3, 4),
         shown=Shown(3, 4), option="classes",
     )  # fmt: skip
+    skull_strip: str = parameter(
+        "auto", "Brain extraction", "How the brain is found in a whole head", option="skull-strip", shown=True,
+        choices=("auto", "robex", "deepbet", "atlas", "none"),
+    )  # fmt: skip
     thin_sulci: bool = parameter(
         True, "Label thin sulci",
         "Label sulci too narrow to reach CSF intensity as leptomeninges, one voxel thick", shown=True,

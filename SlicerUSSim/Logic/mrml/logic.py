@@ -133,6 +133,7 @@ class UltrasoundSceneLogic:
         filter_epsilon: float | None = SegmentationSettings.filter_epsilon,
         bias_correction: bool = SegmentationSettings.bias_correction,
         thin_sulci: bool = SegmentationSettings.thin_sulci,
+        skull_strip: str = SegmentationSettings.skull_strip,
         progress: Callable[[float], None] | None = None,
     ) -> Segmentation:
         """Label the tissues of a scalar volume into a label map or segmentation node, with names and colours.
@@ -151,7 +152,7 @@ class UltrasoundSceneLogic:
             lambda: segment_mri(
                 mri, classes=classes, contrast=contrast, mask=mask, filter_radius=filter_radius,
                 filter_epsilon=filter_epsilon, bias_correction=bias_correction, thin_sulci=thin_sulci,
-                device=self.device, progress=progress,
+                skull_strip=skull_strip, device=self.device, progress=progress,
             )
         )  # fmt: skip
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
