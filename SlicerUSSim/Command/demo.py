@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.options import device_option, parameter_option
 from SlicerUSSim.Command.progress import Steps, note
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
@@ -33,8 +34,9 @@ class ProbeName(click.Choice):
 @click.option("--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain of nilearn).")
 @click.option("--probe", "kind", type=ProbeName(), default="phased", show_default=True)
 @parameter_option(SimulationSettings, "seed")
+@add_option
 @device_option
-def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -> None:
+def demo(out: Path, mri: str | None, kind: str, seed: int, additions: tuple[str, ...], device: str | None) -> None:
     """Segment a brain MRI, simulate a view through a craniotomy, and write figures."""
     from SlicerUSSim.Command.whole_line import run_whole_line
     from SlicerUSSim.Logic.base.volume import Volume
@@ -42,10 +44,11 @@ def demo(out: Path, mri: str | None, kind: str, seed: int, device: str | None) -
     from SlicerUSSim.Logic.probe.arrays import PROBES
 
     settings = SimulationSettings(seed=seed)
+    masks = Additions.read(additions)
     volume, source = (Volume.read(mri), os.path.abspath(mri)) if mri else demo_mri()
     note(f"MRI: {source}, {'x'.join(map(str, volume.array.shape[::-1]))} voxels")
     with Steps(5) as step:
-        summary = run_whole_line(out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step)
+        summary = run_whole_line(out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step, masks)
     times = summary["milliseconds"]
     note(f"device: {summary['device']}")
     note(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")

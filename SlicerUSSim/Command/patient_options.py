@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.options import declared, declared_parameters, device_option, mask_option
 from SlicerUSSim.Command.progress import Share
 from SlicerUSSim.Command.set_option import Changes, set_option
@@ -63,6 +64,8 @@ class PatientOptions:
     #: {parameter: value}
     segmentation: Mapping[str, Any] = declared_parameters(SegmentationSettings, ("contrast", "thin_sulci"))
     mask: str | None = declared(mask_option)
+    #: TISSUE=FILE
+    additions: tuple[str, ...] = declared(add_option)
     #: {parameter: value} of the options that were given
     display: Mapping[str, Any] = declared_parameters(DisplaySettings, of_preset=True)
     settings: Mapping[str, Any] = declared_parameters(SimulationSettings, of_preset=True)
@@ -117,6 +120,7 @@ def open_examination(patient: PatientOptions) -> Examination:
 
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+    from SlicerUSSim.Logic.mri.pathology import texture_below
     from SlicerUSSim.Logic.tissue.presets import TISSUES
 
     log = logging.getLogger(__name__)
@@ -137,18 +141,24 @@ def open_examination(patient: PatientOptions) -> Examination:
     else:
         log.info("tissues: %s", patient.tissues or "the table next to the label map")
     tissues = preset.tissues if table is None else table
-    is_known = is_labels or table is not None
-    if is_known:
-        tissues = changes.to_tissues(tissues)
-    else:  # the tissues are not known before the segmentation
-        changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
+    additions = Additions.read(patient.additions, (tissue.name for tissue in tissues.all_tissues()))
     labels, texture = volume, None
-    if not is_labels:
+    if is_labels:
+        added = additions.on(volume, tissues.names_by_label())
+        labels, tissues = added.labels, changes.to_tissues(added.table(tissues))
+    else:
+        if table is None:  # the tissues are not known before the segmentation
+            changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
+        else:
+            changes.to_tissues(additions.with_presets(tissues))
         segmentation = _segmented(volume, patient)
-        labels = segmentation.labels
-        if not is_known:
-            tissues = changes.to_tissues(tissues.for_names(segmentation.tissue_names))
-        texture = segmentation.texture() if preset.settings.needs_texture else None
+        names = segmentation.tissue_names if table is None else tissues.names_by_label()
+        added = additions.on(segmentation.labels, names)
+        labels = added.labels
+        tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
+        tissues = changes.to_tissues(tissues)
+        if preset.settings.needs_texture:
+            texture = texture_below(segmentation.texture(), volume, segmentation.labels, labels)
     simulator = UltrasoundSimulator(labels, tissues, preset.settings, patient.device, texture)
     return Examination(simulator, preset.probe, preset.display, is_labels)
 

@@ -9,6 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
+from SlicerUSSim.Command.additions import Additions
 from SlicerUSSim.Logic.base.files import make_folder, write_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
@@ -18,6 +19,7 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, slice_under_probe
+from SlicerUSSim.Logic.tissue.label_files import require_replaceable, write_label_files
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.pose_files import write_pose
 
@@ -31,6 +33,7 @@ def run_whole_line(
     display: DisplaySettings,
     device: str | None = None,
     progress: Callable[[str], None] = lambda stage: None,
+    additions: Additions | None = None,
 ) -> dict:
     """Segment, place the probe, simulate, and write figures, volumes and a summary to the folder `out`.
 
@@ -39,6 +42,7 @@ def run_whole_line(
     """
     require_matplotlib()  # before the computation, not after it
     make_folder(out)
+    require_replaceable(out / "labels.nii.gz", "choose another folder (--out)")
     timings: dict[str, float] = {}
 
     progress("segment the MRI")
@@ -48,9 +52,11 @@ def run_whole_line(
 
     progress("build the acoustic medium")
     start = perf_counter()
-    tissues = TissueTable.brain(segmentation.tissue_names)
-    simulator = UltrasoundSimulator(segmentation.labels, tissues, settings, device)
-    pose = craniotomy_pose(segmentation.labels, probe)
+    added = (additions or Additions()).on(segmentation.labels, segmentation.tissue_names)
+    labels, names = added.labels, added.tissue_names
+    tissues = TissueTable.brain(names)
+    simulator = UltrasoundSimulator(labels, tissues, settings, device)
+    pose = craniotomy_pose(labels, probe)
     timings["medium"] = (perf_counter() - start) * 1e3
 
     progress("simulate")
@@ -65,9 +71,8 @@ def run_whole_line(
 
     progress("draw")
     bounds = probe.image_bounds_mm()
-    names = segmentation.tissue_names
     seen = ("MRI under the probe", slice_under_probe(mri, frame.grid, pose), "mri")
-    labelled = ("Tissues", slice_under_probe(segmentation.labels, frame.grid, pose, order=0), "labels")
+    labelled = ("Tissues", slice_under_probe(labels, frame.grid, pose, order=0), "labels")
     simulated = ("Simulated B-mode", frame.image, "bmode")
     draw_views(out / "figure.png", [seen, labelled, simulated], probe, bounds, names)
     draw_views(out / "mri.png", [seen], probe, bounds, names)
@@ -76,8 +81,7 @@ def run_whole_line(
     progress("write")
     write_png(out / "bmode.png", frame.image)
     frame.to_volume().write(out / "bmode.mha")
-    segmentation.labels.write(out / "labels.nii.gz")
-    tissues.write(out / "labels.json")
+    write_label_files(out / "labels.nii.gz", labels, tissues)
     write_pose(out / "pose.json", pose)
     Preset(probe, display, settings, tissues).write(out / "preset.json")
     summary = {
@@ -93,7 +97,8 @@ def run_whole_line(
             "standard_deviations": segmentation.standard_deviations.tolist(),
             "weights": segmentation.weights.tolist(),
             "noise": segmentation.noise,
-            "voxels": np.bincount(segmentation.labels.array.ravel()).tolist(),
+            "added": list(added.messages),
+            "voxels": np.bincount(labels.array.ravel()).tolist(),
         },
         "tissues": tissues.to_dict(),
         "milliseconds": {name: round(value, 3) for name, value in timings.items()},

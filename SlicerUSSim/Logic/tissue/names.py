@@ -8,7 +8,8 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 #: Synonyms in label maps and segmentations.
 _ALIASES = {
-    "background": "coupling", "cerebrospinal fluid": "csf", "ventricles": "csf", "cyst": "csf",
+    "background": "coupling", "cerebrospinal fluid": "csf", "ventricles": "csf", "edema": "oedema",
+    "hematoma": "haematoma", "clot": "haematoma",
     "gray matter": "grey matter",
     "gm": "grey matter", "wm": "white matter", "tumor": "tumour", "dura": "falx", "skin": "scalp", "vessels": "blood",
     "vessel": "blood", "cortical bone": "bone", "choroid plexus": "enhancing",
@@ -17,6 +18,9 @@ _ALIASES = {
 
 #: Tissue of a longer name, such as one of FreeSurfer's, by a word in it; the first match is used.
 _WORDS = {
+    "necrosis": "necrosis", "necrotic": "necrosis", "oedema": "oedema", "edema": "oedema", "cyst": "cyst",
+    "cystic": "cyst", "resection": "cavity", "surgical cavity": "cavity", "haematoma": "haematoma",
+    "hematoma": "haematoma", "haemorrhage": "haematoma", "hemorrhage": "haematoma", "clot": "haematoma",
     "white matter": "white matter", "corpus callosum": "white matter", "ventricle": "csf", "csf": "csf",
     "choroid plexus": "enhancing", "grey matter": "grey matter", "gray matter": "grey matter", "cortex": "grey matter",
     "ctx": "grey matter", "thalamus": "grey matter", "caudate": "grey matter", "putamen": "grey matter",
@@ -24,7 +28,7 @@ _WORDS = {
     "brain stem": "white matter", "tumor": "tumour", "tumour": "tumour", "glioma": "tumour", "metastasis": "tumour",
     "meningioma": "tumour", "falx": "falx", "tentorium": "falx", "dura": "falx", "artery": "blood", "vein": "blood",
     "vessel": "blood", "sinus": "blood", "skull": "skull", "scalp": "scalp", "skin": "scalp", "bone": "bone",
-    "muscle": "muscle", "liver": "liver", "kidney": "kidney", "fat": "fat", "cyst": "csf", "air": "air",
+    "muscle": "muscle", "liver": "liver", "kidney": "kidney", "fat": "fat", "air": "air",
 }  # fmt: skip
 
 

@@ -89,6 +89,10 @@ class TissueTable(Mapping[int, Tissue]):
         """Tissue names in the order of their labels."""
         return [tissue.name for tissue in self.values()]
 
+    def names_by_label(self) -> tuple[str, ...]:
+        """Names of labels 1, 2, ... to the last; "" for one that the table lacks."""
+        return tuple(self[label].name if label in self else "" for label in range(1, max(self) + 1))
+
     def all_tissues(self) -> list[Tissue]:
         """Tissues in the order of their labels, the membrane's last."""
         return [*self.values(), *([] if self.membrane is None else [self.membrane.tissue])]

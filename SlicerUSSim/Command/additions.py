@@ -1,0 +1,81 @@
+"""--add: tissues laid over the labels, from masks in files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Logic.base.errors import require
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.base import Volume
+    from SlicerUSSim.Logic.mri import Added
+    from SlicerUSSim.Logic.tissue import TissueTable
+
+add_option = click.option(
+    "--add", "additions", multiple=True, metavar="TISSUE=FILE",
+    help="Lay a tissue over the labels where the mask in FILE is not 0 (any grid) or above 0.5: tumour, oedema, "
+    "necrosis, cyst, haematoma, cavity or another of the presets; brats=FILE for the tissues of a BraTS map; may be "
+    "repeated, the last is on top.",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Additions:
+    """The masks of --add, read and checked."""
+
+    #: (tissue, mask, file name)
+    masks: tuple[tuple[str, Volume, str], ...] = ()
+    #: Names of tissues besides the presets
+    own_tissues: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, texts: Iterable[str], own_tissues: Iterable[str] = ()) -> Additions:
+        """From the values of --add; tissues are among `own_tissues` and the presets.
+
+        Raises SimulationError, before anything slow is done, for a value that is not TISSUE=FILE, for an unknown
+        tissue, and for a file that is not a mask.
+        """
+        texts = tuple(texts)
+        if not texts:
+            return cls()
+        from SlicerUSSim.Logic.base.volume import Volume  # imported here to keep --help fast
+        from SlicerUSSim.Logic.mri.masks import read_masks
+        from SlicerUSSim.Logic.mri.pathology import mask_tissue
+
+        masks, own = [], tuple(own_tissues)
+        for text in texts:
+            name, equals, file = text.partition("=")
+            require(
+                equals and name.strip() and file, f"--add is {text!r}, expected TISSUE=FILE, such as tumour=mask.nii.gz"
+            )
+            tissue, mask = mask_tissue(name, own), Volume.read(file)
+            read_masks(mask, tissue, Path(file).name)
+            masks.append((tissue, mask, Path(file).name))
+        return cls(tuple(masks), own)
+
+    def with_presets(self, tissues: TissueTable) -> TissueTable:
+        """A table with the presets of those tissues that it lacks."""
+        from SlicerUSSim.Logic.tissue.presets import TISSUES
+
+        known = [tissue.name for tissue in tissues.all_tissues()]
+        for tissue in dict.fromkeys(tissue for tissue, _, _ in self.masks):
+            if tissue in TISSUES and tissue not in known:
+                tissues = tissues.with_tissue(TISSUES[tissue])
+        return tissues
+
+    def on(self, labels: Volume, tissue_names: Iterable[str]) -> Added:
+        """The labels with these tissues on top, after notes of what was done and warnings."""
+        from SlicerUSSim.Logic.mri.pathology import add_tissues
+
+        added = add_tissues(labels, tuple(tissue_names), self.masks, also=self.own_tissues)
+        for message in added.messages:
+            note(message)
+        for warning in added.warnings:
+            note(f"ussim: warning: {warning}")
+        return added

@@ -1,0 +1,237 @@
+"""Tissues added on top of a segmentation: tumour, oedema, cyst and others, from masks on any grid.
+
+Segmentations by intensity cannot tell a tumour from grey matter; a mask drawn by hand, by a network or published with
+the images can.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.masks import Masks, read_masks, resampled
+from SlicerUSSim.Logic.tissue.names import same_name, tissue_named
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
+from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
+
+_log = logging.getLogger(__name__)
+
+#: A mask of more than this share of the patient is not a lesion.
+_LARGEST_SHARE = 0.6
+#: A mask without a voxel in the patient may lie this far from it: a meningioma that brain extraction has cut off.
+_FARTHEST_MM = 5.0
+#: Shares below these are not mentioned.
+_LEAST_LEFT_OUT, _LEAST_OVER, _LEAST_LOST = 0.02, 0.01, 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Added:
+    """A label map with one or several tissues on top, and what was done."""
+
+    labels: Volume
+    #: Name of label 1, 2, ...; "" for a label that is not in use
+    tissue_names: tuple[str, ...]
+    #: A line for each tissue: "tumour: 799 voxels, 0.8 ml, added over grey matter 60 %, white matter 38 %"
+    messages: tuple[str, ...] = ()
+    #: A line for each thing that a user should check
+    warnings: tuple[str, ...] = ()
+
+    def table(self, tissues: TissueTable) -> TissueTable:
+        """The tissue table of the labels before, with the tissues of new labels from the presets."""
+        mine = {tissue.name: tissue for tissue in tissues.all_tissues()[::-1]}
+        new = {label: name for label, name in enumerate(self.tissue_names, 1) if name and label not in tissues}
+        table = {**tissues, **{label: mine.get(name) or tissue_named(name) for label, name in new.items()}}
+        return TissueTable(table, tissues.membrane)
+
+
+def tissue_to_add(name: str, tissue_names: Iterable[str] = ()) -> str:
+    """The tissue that `name` means: one of `tissue_names` or of the presets.
+
+    Raises SimulationError that lists the tissues for an unknown one.
+
+    >>> tissue_to_add("Edema")
+    'oedema'
+    """
+    known = next((mine for mine in tissue_names if mine and same_name(mine, name)), None)
+    if known is not None:
+        return known
+    try:
+        return tissue_named(name).name
+    except SimulationError:
+        mine = [own for own in dict.fromkeys(tissue_names) if own and own not in TISSUES]
+        raise SimulationError(
+            f"no tissue is called {name!r}, expected one of: {', '.join([*mine, *TISSUES])}"
+        ) from None
+
+
+def add_tissue(
+    labels: Volume, tissue_names: Sequence[str], mask: Volume, tissue: str, *, source: str = "the mask"
+) -> Added:
+    """Lay a tissue over a label map, where a mask on any grid is inside.
+
+    Parameters
+    ----------
+    labels : (k, j, i) whole numbers, 0 outside the patient.
+    tissue_names : of labels 1, 2, ...
+    mask : not zero inside; or probabilities from 0 to 1, inside above 0.5. It is interpolated linearly at the voxels of
+        `labels`, or averaged over them where they are larger.
+    tissue : a name of `tissue_names` or of the presets: "tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity";
+        "brats" adds the tissues of a BraTS map: 1 necrosis, 2 oedema, 3 or 4 enhancing.
+    source : of the mask, for messages.
+
+    Voxels outside the patient are labelled too, with a warning. Raises SimulationError for an unknown tissue, a mask
+    that is empty or no mask, one that does not meet the patient (other patient, other frame), and one that covers more
+    than 60 % of it.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import Volume
+    >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
+    >>> ball = np.zeros((20, 20, 20), np.uint8)
+    >>> ball[8:13, 8:13, 8:13] = 1
+    >>> added = add_tissue(labels, ["white matter"], Volume(ball, np.diag([2.0, 2.0, 2.0, 1.0])), "tumor")
+    >>> added.messages
+    ('tumour: 729 voxels, 0.7 ml, added over white matter 100 %',)
+    >>> added.tissue_names
+    ('white matter', 'tumour')
+    """
+    return _added(labels, tissue_names, read_masks(mask, mask_tissue(tissue, tissue_names), source))
+
+
+def add_tissues(
+    labels: Volume, tissue_names: Sequence[str], masks: Iterable[tuple[str, Volume, str]], *, also: Iterable[str] = ()
+) -> Added:
+    """Lay several tissues over a label map, the last on top; each is (tissue, mask, source) as in add_tissue.
+
+    `also` are names of tissues besides those of the labels and the presets.
+    """
+    result = Added(labels, tuple(tissue_names))
+    for name, mask, source in masks:
+        tissue = mask_tissue(name, (*result.tissue_names, *also))
+        more = _added(result.labels, result.tissue_names, read_masks(mask, tissue, source))
+        result = replace(more, messages=result.messages + more.messages, warnings=result.warnings + more.warnings)
+    return result
+
+
+def mask_tissue(name: str, tissue_names: Iterable[str] = ()) -> str:
+    """As tissue_to_add; "brats" is itself."""
+    return "brats" if name.strip().lower() == "brats" else tissue_to_add(name, tissue_names)
+
+
+def texture_below(texture: Texture, mri: Volume, before: Volume, after: Volume) -> Texture:
+    """The texture of an MRI's segmentation `before`, with tissues added on top in `after`: their labels are certain.
+
+    All are on one grid.
+    """
+    changed = after.array != before.array
+    region = np.where(changed, after.array, 0)
+    deviation = tissue_deviation(np.where(changed, mri.array, 0).astype(np.float32), region)
+    return Texture(
+        texture.second_label,
+        np.where(changed, np.float32(0), texture.second_share),
+        np.where(changed, deviation, texture.deviation).astype(np.float32),
+    )
+
+
+def _added(labels: Volume, names: Sequence[str], masks: Masks) -> Added:
+    array, names = labels.array, tuple(names)
+    require(
+        bool(np.issubdtype(array.dtype, np.integer)), f"the labels hold {array.dtype} numbers, expected whole numbers"
+    )
+    patient = int((array > 0).sum())
+    require(patient > 0, "the labels are all 0, expected a patient to add to")
+    where, numbers, lost = resampled(masks, labels)
+    below = array[where]
+    covered = below[numbers > 0]
+    met = int((covered > 0).sum())
+    if not met:
+        _check_place(labels, masks, where, numbers > 0)
+    require(
+        met <= _LARGEST_SHARE * patient,
+        f"{masks.source}: covers {100 * met / patient:.0f} % of the patient, expected a lesion in it; is it the mask "
+        "of the brain (--mask)?",
+    )
+    voxel_mm3 = abs(np.linalg.det(labels.ijk_to_ras[:3, :3]))
+    require(
+        covered.size > 0,
+        f"{masks.source}: {masks.volume_ml * 1000:.2g} mm³ are too small for the voxels of the labels, "
+        f"{voxel_mm3:.2g} mm³; nothing would be added",
+    )
+    result, messages = array.astype(np.promote_types(array.dtype, np.uint8)), []
+    for number, tissue in enumerate(masks.tissues, 1):
+        over = below[numbers == number]
+        if over.size:
+            label, names = _label_of(tissue, array, names)
+            result[where][numbers == number] = label
+            messages.append(_message(tissue, over, names, voxel_mm3))
+    warnings = (*masks.warnings, *_warnings(masks, covered, lost, covered.size * voxel_mm3 / 1000.0))
+    return Added(labels.with_array(result), names, tuple(messages), warnings)
+
+
+def _label_of(tissue: str, array: np.ndarray, names: Sequence[str]) -> tuple[int, tuple[str, ...]]:
+    """The label of a tissue, a free one if it has none, and the names with it."""
+    if tissue in names:
+        return list(names).index(tissue) + 1, tuple(names)
+    used = np.bincount(array.ravel(), minlength=MAX_LABEL + 1) > 0
+    named = [*(bool(name) for name in names), *[False] * MAX_LABEL]
+    free = [label for label in range(1, MAX_LABEL + 1) if not used[label] and not named[label - 1]]
+    require(bool(free), f"the labels 1 to {MAX_LABEL} are all in use, expected a free one for {tissue}")
+    longer = [*names, *[""] * (free[0] - len(names))]
+    longer[free[0] - 1] = tissue
+    return free[0], tuple(longer)
+
+
+def _check_place(labels: Volume, masks: Masks, where: tuple[slice, ...], inside: np.ndarray) -> None:
+    """Raise SimulationError for masks without a voxel in the patient, unless they are just beside it."""
+    low, high = box_ras(labels.array > 0, labels)
+    mask_low, mask_high = box_ras(masks.inside, masks.union)
+    apart = float(np.linalg.norm(np.maximum(np.maximum(mask_low - high, low - mask_high), 0.0)))
+    if apart == 0.0 and inside.any():  # the boxes overlap
+        distance = ndimage.distance_transform_edt(labels.array == 0, sampling=labels.spacing_mm[::-1].tolist())
+        assert isinstance(distance, np.ndarray)
+        apart = float(distance[where][inside].min())
+    require(
+        apart <= _FARTHEST_MM,
+        f"{masks.source}: lies {apart:.0f} mm outside the patient, expected a mask in the frame of the MRI; is it of "
+        "another patient, or not registered?",
+    )
+
+
+def box_ras(inside: np.ndarray, volume: Volume) -> tuple[np.ndarray, np.ndarray]:
+    """((3,) lowest, (3,) highest) RAS mm of the voxels of a (k, j, i) mask that is not empty."""
+    ends = [np.flatnonzero(inside.any(axis=tuple({0, 1, 2} - {axis})))[[0, -1]] for axis in (2, 1, 0)]
+    corners = np.array(np.meshgrid(*ends, indexing="ij")).reshape(3, -1)
+    points = (volume.ijk_to_ras @ np.vstack([corners, np.ones(corners.shape[1])]))[:3]
+    return points.min(axis=1), points.max(axis=1)
+
+
+def _message(tissue: str, before: np.ndarray, names: Sequence[str], voxel_mm3: float) -> str:
+    counts = np.bincount(before)
+    over = []
+    for label in np.argsort(-counts, kind="stable"):
+        share = counts[label] / before.size
+        name = names[label - 1] if 0 < label <= len(names) and names[label - 1] else f"label {label}"
+        if share >= _LEAST_OVER:
+            over.append(f"{name if label else 'voxels outside'} {100 * share:.0f} %")
+    message = f"{tissue}: {before.size} voxels, {before.size * voxel_mm3 / 1000:.1f} ml, added over {', '.join(over)}"
+    _log.info("%s", message)
+    return message
+
+
+def _warnings(masks: Masks, covered: np.ndarray, lost: float, volume_ml: float) -> Iterable[str]:
+    left_out = float((covered == 0).mean())
+    if left_out >= _LEAST_LEFT_OUT:
+        yield f"the brain mask leaves out {left_out * 100:.0f} % of {masks.source}; those voxels are added"
+    if lost >= _LEAST_LEFT_OUT:
+        yield f"{lost * 100:.0f} % of {masks.source} lie outside the volume of the labels and are not added"
+    elif abs(volume_ml - masks.volume_ml) > _LEAST_LOST * masks.volume_ml:
+        yield (
+            f"{masks.source}: {masks.volume_ml:.2g} ml become {volume_ml:.2g} ml on the voxels of the labels, which "
+            "are coarse for it"
+        )
