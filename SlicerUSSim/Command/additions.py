@@ -25,6 +25,16 @@ add_option = click.option(
 )  # fmt: skip
 
 
+def split_additions(texts: Iterable[str]) -> list[tuple[str, str]]:
+    """[(tissue, file)] of the values of --add. Raises SimulationError for one that is not TISSUE=FILE."""
+    parts = []
+    for text in texts:
+        name, _, file = text.partition("=")
+        require(name.strip() and file, f"--add is {text!r}, expected TISSUE=FILE, such as tumour=mask.nii.gz")
+        parts.append((name.strip(), file))
+    return parts
+
+
 @dataclass(frozen=True, eq=False)
 class Additions:
     """The masks of --add, read and checked."""
@@ -41,23 +51,24 @@ class Additions:
         Raises SimulationError, before anything slow is done, for a value that is not TISSUE=FILE, for an unknown
         tissue, and for a file that is not a mask.
         """
-        texts = tuple(texts)
-        if not texts:
+        parts = split_additions(texts)
+        if not parts:
             return cls()
         from SlicerUSSim.Logic.base.volume import Volume  # imported here to keep --help fast
+
+        return cls.of(((name, Volume.read(file), file) for name, file in parts), own_tissues)
+
+    @classmethod
+    def of(cls, parts: Iterable[tuple[str, Volume, str]], own_tissues: Iterable[str] = ()) -> Additions:
+        """From (tissue, mask, its file); errors as in read()."""
         from SlicerUSSim.Logic.mri.masks import read_masks
         from SlicerUSSim.Logic.mri.pathology import mask_tissue
 
-        masks, own = [], tuple(own_tissues)
-        for text in texts:
-            name, equals, file = text.partition("=")
-            require(
-                equals and name.strip() and file, f"--add is {text!r}, expected TISSUE=FILE, such as tumour=mask.nii.gz"
-            )
-            tissue, mask = mask_tissue(name, own), Volume.read(file)
-            read_masks(mask, tissue, Path(file).name)
-            masks.append((tissue, mask, Path(file).name))
-        return cls(tuple(masks), own)
+        own = tuple(own_tissues)
+        masks = tuple((mask_tissue(name, own), mask, Path(file).name) for name, mask, file in parts)
+        for tissue, mask, file in masks:
+            read_masks(mask, tissue, file)
+        return cls(masks, own)
 
     def with_presets(self, tissues: TissueTable) -> TissueTable:
         """A table with the presets of those tissues that it lacks."""

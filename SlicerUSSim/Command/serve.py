@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from SlicerUSSim.Command.additions import Additions, add_option, split_additions
 from SlicerUSSim.Command.options import device_option, mask_option, parameter_option
 from SlicerUSSim.Command.sequence_options import (
     calibration_option,
@@ -37,6 +38,7 @@ _PORT = 8080
 @click.option("--preset", type=click.Path(), help="Probe, display, settings and tissues as JSON.")
 @parameter_option(SegmentationSettings, "contrast")
 @mask_option
+@add_option
 @click.option("--port", type=click.IntRange(0, 65535), help=f"Port (default: {_PORT}, or a free one if it is taken).")
 @click.option(
     "--host",
@@ -62,6 +64,7 @@ def serve(
     preset: str | None,
     contrast: str,
     mask: str | None,
+    additions: tuple[str, ...],
     port: int | None,
     host: str,
     igtl: str | None,
@@ -70,7 +73,8 @@ def serve(
 ) -> None:
     """The workstation in the browser, with live images. Without a file it shows the demo brain."""
     _require_workstation()
-    files = [file for file in (mri, labels, mask) if file is not None]
+    added = split_additions(additions)
+    files = [file for file in (mri, labels, mask, *(file for _, file in added)) if file is not None]
     # Checked here, so that the error is reported in the terminal and not on the page.
     for file in files:
         if not Path(file).exists():
@@ -87,6 +91,8 @@ def serve(
 
     choose_device(device)
     volumes = {file: Volume.read(file) for file in files}
+    checked = Additions.of((tissue, volumes[file], file) for tissue, file in added).masks
+    masks = tuple((tissue, file) for (tissue, _, _), (_, file) in zip(checked, added, strict=True))
     chosen_preset = Preset.read(preset) if preset else None
     tracked = read_sequence(sequence, calibration) if sequence else None
     to_ras = read_to_mri(to_mri) if to_mri else None
@@ -97,9 +103,9 @@ def serve(
 
     workstation = Workstation(
         Files(
-            mri=mri, labels=labels, contrast=contrast, mask=mask, preset=chosen_preset, sequence=tracked,
-            sequence_name=Path(sequence).name.split(".")[0] if sequence else "", transform=transform, to_ras=to_ras,
-            tracker=igtl, tracker_device=igtl_device, volumes=volumes,
+            mri=mri, labels=labels, contrast=contrast, mask=mask, additions=masks, preset=chosen_preset,
+            sequence=tracked, sequence_name=Path(sequence).name.split(".")[0] if sequence else "", transform=transform,
+            to_ras=to_ras, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
         ),
         device,
     )  # fmt: skip

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from time import perf_counter
+from typing import Any
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.imaging.preset import Preset
@@ -49,13 +50,17 @@ class TissueRow:
 class PanelPresenter:
     """Operates on one scene for one view.
 
-    With `handles`, a placed probe has Slicer's interaction handles for translation and rotation.
+    With `handles`, a placed probe has Slicer's interaction handles for translation and rotation. With `label_maps`, new
+    labels are label maps and not segmentations.
     """
 
-    def __init__(self, logic: UltrasoundSceneLogic, view: PanelView, handles: bool = True) -> None:
+    def __init__(
+        self, logic: UltrasoundSceneLogic, view: PanelView, handles: bool = True, label_maps: bool = False
+    ) -> None:
         self.logic = logic
         self.view = view
-        self._handles = handles
+        self._handles, self._label_maps = handles, label_maps
+        self._notes: list[str] = []
         self._busy = False
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
@@ -167,21 +172,50 @@ class PanelPresenter:
             return False, "Segment the MRI, or choose a label map or segmentation"
         return True, ""
 
+    def canAddTissues(self) -> tuple[bool, str]:
+        """(whether lesions can be laid over the tissues, the reason if not)"""
+        if self._busy:
+            return False, _BUSY
+        if self.logic.parameters.labels is None:
+            return False, "Segment the MRI, or choose a label map or segmentation"
+        if self.logic.parameters.lesions is None:
+            return False, "Choose a segmentation with segments called tumour, oedema, ..."
+        return True, ""
+
     def segment(self) -> None:
-        """Segment the MRI into the chosen label map or segmentation, or a new segmentation."""
+        """Segment the MRI into the chosen label map or segmentation, or into a new node (see _replaceable)."""
         parameters = self.logic.parameters
         with self.shown(), self.working("Segment") as progress:
             require(parameters.mri is not None, "no MRI chosen, expected a scalar volume")
-            with self._made(parameters.labels, "Segmentation", f"{parameters.mri.GetName()} tissues") as labels:
+            with self._replaceable(f"{parameters.mri.GetName()} tissues") as labels:
                 self.logic.segment(
                     parameters.mri,
                     labels,
                     mask_node=parameters.mask,
+                    lesions_node=parameters.lesions,
                     progress=progress,
                     **asdict(parameters.segmentation),
                 )
-            parameters.labels = labels
         self.view.refresh()
+
+    def addTissues(self) -> None:
+        """Lay the lesions over the chosen tissues, or over a copy of them in a new node (see _replaceable)."""
+        with self.shown():
+            self.layLesions()
+        self.view.refresh()
+
+    def layLesions(self) -> None:
+        """As addTissues, but raises errors."""
+        parameters = self.logic.parameters
+        with self.working("Add to tissues"):
+            require(parameters.labels is not None, "no label map chosen; segment the MRI first")
+            before = parameters.labels
+            with self._replaceable(f"{before.GetName()} with lesions") as labels:
+                self.logic.addTissues(before, parameters.lesions, labels)
+
+    def notes(self) -> str:
+        """What the last segmentation or addition did, and what a user should check, in lines."""
+        return "\n".join(self._notes)
 
     def placeProbe(self) -> None:
         """Place the probe on the surface in the slice view, or at a craniotomy; create its transform if needed."""
@@ -318,7 +352,26 @@ class PanelPresenter:
         return self.logic.scene.AddNewNodeByClass(f"vtkMRML{kind}Node", self.logic.scene.GenerateUniqueName(name))
 
     @contextmanager
-    def _made(self, node, kind: str, name: str):
+    def _replaceable(self, name: str) -> Iterator[Any]:
+        """The chosen labels if Segment made them and nobody has edited them; otherwise a new node, which is selected.
+
+        Afterwards the notes are those of the logic.
+        """
+        chosen: Any = self.logic.parameters.labels
+        kept = chosen is not None and not self.logic.mayReplace(chosen)
+        kind = "LabelMapVolume" if self._label_maps else "Segmentation"
+        with self._made(None if kept else chosen, kind, name) as node:
+            yield node
+        self.logic.parameters.labels = node
+        self._notes = [*self.logic.notes, *(f"Check: {warning}" for warning in self.logic.warnings)]
+        if kept:
+            self._notes.append(
+                f"{chosen.GetName()!r} was not made by Segment, or edited since, and is kept; the result is "
+                f"{node.GetName()!r}"
+            )
+
+    @contextmanager
+    def _made(self, node: Any, kind: str, name: str) -> Iterator[Any]:
         """`node`, or a new one, which is removed if an exception is raised."""
         made = node is None
         if made:

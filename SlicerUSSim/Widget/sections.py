@@ -50,7 +50,27 @@ def _inputs() -> tuple[Row, ...]:
             "Segmentation or label map of the tissues: the output of Segment, or your own with names of tissues "
             "(csf, grey matter, white matter, tumour, blood, skull, ...)", new_node="Tissues",
         ),
-        button("segment", "Segment", "Segment the tissues of the MRI (one or two seconds)", enabled="canSegment"),
+        node(
+            "lesions", "Lesions",
+            "Segmentation whose segments are called tumour, oedema, necrosis, cyst, haematoma, cavity or as another "
+            "tissue, on any grid; Segment and Add to tissues lay them over the tissues, the last on top",
+            new_node="Lesions",
+        ),
+        (
+            button(
+                "segment", "Segment",
+                "Segment the tissues of the MRI (some seconds), and lay the lesions over them; tissues that were not "
+                "made by Segment, or edited since, are kept: the result is then a new node",
+                enabled="canSegment",
+            ),
+            button(
+                "addTissues", "Add to tissues",
+                "Lay the lesions over these tissues; tissues that were not made by Segment, or edited since, are kept: "
+                "the result is then a new node",
+                enabled="canAddTissues",
+            ),
+        ),
+        Control("notes", "words", tip="What was found in the MRI, what was done, and what to check", shows="notes"),
     )  # fmt: skip
 
 

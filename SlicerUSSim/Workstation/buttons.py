@@ -27,6 +27,7 @@ class Buttons:
         self._controls = by_widget(sections)
         self._own_actions: dict[str, Callable[[], None]] = {
             "segmentButton": loading.segment,
+            "addTissuesButton": loading.add_tissues,
             "placeButton": loading.place_probe,
             "assignTissueButton": self._assign_tissue,
         }

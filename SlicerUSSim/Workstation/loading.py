@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import asdict, replace
 from typing import Any
 
 from trame_slicer.core import SlicerApp
 
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
@@ -50,8 +53,12 @@ class Loading:
                 self._take_mri(files.mri)
             if files.mask is not None:
                 parameters.mask = self._opener.mask(files.mask)
+            for tissue, path in files.additions:
+                parameters.lesions = self._opener.lesion_of_file(parameters.lesions, tissue, path)
             if files.labels is not None:
                 self._take_labels(files.labels)
+                if files.additions:
+                    self.add_tissues()
             else:
                 self.segment()
             if files.sequence is not None:
@@ -70,23 +77,24 @@ class Loading:
                 self._take_mri(path)
                 self.segment()
 
+    def add(self, name: str, content: bytes, tissue: str) -> None:
+        """Add a mask sent by a page to the lesions, and lay them over the tissues."""
+        with self._presenter.shown(), self._opener.uploaded_mask(name, content) as volume:
+            self._lay(volume, tissue, name)
+
     def segment(self) -> None:
         """Segment the MRI into tissues, and place a probe on the patient if there is none."""
         parameters: Any = self._logic.parameters
-        if parameters.mri is not None and parameters.labels is None:
-            # A label map: filled ten times as fast as a segmentation, and usable as an overlay of the slice views.
-            name = self._scene.GenerateUniqueName(f"{parameters.mri.GetName()} tissues")
-            parameters.labels = self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
-        labels, mri, mask = parameters.labels, parameters.mri, parameters.mask
-        options = asdict(parameters.segmentation)
-        before = None if labels is None else labels_version(labels)
-        self._presenter.segment()
-        if labels is None or labels_version(labels) == before:
-            if labels is not None and labels.IsA("vtkMRMLVolumeNode") and labels.GetImageData() is None:
-                self._scene.RemoveNode(labels)  # created above, but the segmentation failed
-            return
-        self._opener.segmented(labels, mri, mask, options)
-        self._labels_ready()
+        inputs = parameters.mri, parameters.mask, asdict(parameters.segmentation)
+        lesions = self._opener.lesion_files(parameters.lesions)
+        if self._changed(self._presenter.segment):
+            self._opener.segmented(parameters.labels, *inputs, lesions)
+            self._labels_ready()
+
+    def add_tissues(self) -> None:
+        """Lay the lesions over the tissues."""
+        if self._changed(self._presenter.addTissues):
+            self._labels_ready()
 
     def place_probe(self) -> None:
         """Place the probe at a typical craniotomy."""
@@ -94,6 +102,33 @@ class Loading:
         self._probe.look()
 
     # ---- implementation ----------------------------------------------------------------------------------------
+
+    def _lay(self, mask: Volume, tissue: str, name: str) -> None:
+        """Add a mask to the lesions, and lay them over the tissues, if there are any; otherwise Segment does so."""
+        parameters: Any = self._logic.parameters
+        before = parameters.lesions
+        node, undo = self._opener.add_lesion(before, mask, tissue, name)
+        parameters.lesions = node
+        try:
+            if parameters.labels is not None:
+                self._presenter.layLesions()
+        except SimulationError:
+            undo()
+            parameters.lesions = before
+            raise
+        if parameters.labels is not None:
+            self._labels_ready()
+
+    def _changed(self, action: Callable[[], None]) -> bool:
+        """Whether an action has written labels."""
+
+        def version() -> Hashable:
+            labels = self._logic.parameters.labels
+            return None if labels is None else labels_version(labels)
+
+        before = version()
+        action()
+        return version() not in (before, None)
 
     def _take_labels(self, path: str) -> None:
         node = self._opener.labels(path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
+from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
 from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
@@ -40,6 +41,8 @@ class Files:
     labels: str | None = None
     contrast: str = "t1"
     mask: str | None = None
+    #: (tissue, file) of masks that are laid over the labels
+    additions: tuple[tuple[str, str], ...] = ()
     preset: Preset | None = None
     sequence: TrackedSequence | None = None
     sequence_name: str = "sequence"
@@ -59,6 +62,8 @@ class Opener:
     def __init__(self, scene, logic: UltrasoundSceneLogic, tasks: Tasks, files: Files) -> None:
         self._scene, self._logic, self._tasks, self._files = scene, logic, tasks, files
         self._sources: dict[tuple, LabelSource] = {}
+        #: {segments of a node: (tissue, file) of each}
+        self._lesion_files: dict[tuple, tuple[tuple[str, str], ...]] = {}
         self._volumes = dict(files.volumes)  # read, but not yet used
 
     def mri(self, path: str | None):
@@ -100,12 +105,48 @@ class Opener:
         self._sources = {_voxels_of(node): LabelSource(os.path.abspath(path), True, relabelled=relabelled)}
         return node
 
-    def segmented(self, labels_node, mri_node, mask_node, options: dict) -> None:
-        """Record the source of labels."""
+    def lesion_of_file(self, lesions_node, tissue: str, path: str):
+        """The segmentation node with the lesions, with a mask of a file; made if it is None."""
+        mask = self._volume(path)
+        files = self.lesion_files(lesions_node)
+        node, _ = self.add_lesion(lesions_node, mask, tissue, Path(path).name)
+        if files is not None and tissue != "brats":  # whose segments overlap
+            self._lesion_files[_segments_of(node)] = (*files, (tissue, os.path.abspath(path)))
+        return node
+
+    def add_lesion(self, lesions_node, mask: Volume, tissue: str, name: str):
+        """(segmentation node with the lesions, function that takes the mask out of it again)."""
+        made = lesions_node is None
+        node = self._scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions") if made else lesions_node
+
+        def undo(ids: Iterable[str] = ()) -> None:
+            for segment_id in ids:
+                node.GetSegmentation().RemoveSegment(segment_id)
+            if made:
+                self._scene.RemoveNode(node)
+
+        try:
+            ids = add_lesion(node, mask, tissue, name)
+        except SimulationError:
+            undo()
+            raise
+        return node, lambda: undo(ids)
+
+    def lesion_files(self, lesions_node) -> tuple[tuple[str, str], ...] | None:
+        """(tissue, file) of all lesions; None if they are not all of files."""
+        if lesions_node is None:
+            return ()
+        return self._lesion_files.get(_segments_of(lesions_node))
+
+    def segmented(
+        self, labels_node, mri_node, mask_node, options: dict, additions: tuple[tuple[str, str], ...] | None = ()
+    ) -> None:
+        """Record the source of labels; `additions` are (tissue, file), or None if they are not of files."""
         file, mask = mri_node.GetAttribute(FILE), None if mask_node is None else mask_node.GetAttribute(FILE)
         self._sources = {}
-        if file is not None and (mask_node is None or mask is not None):
-            self._sources[_voxels_of(labels_node)] = LabelSource(file, mask=mask, options=options)
+        if file is not None and (mask_node is None or mask is not None) and additions is not None:
+            source = LabelSource(file, mask=mask, options=options, additions=additions)
+            self._sources[_voxels_of(labels_node)] = source
 
     def source_of(self, labels_node) -> LabelSource:
         """The source of labels. Raises SimulationError if they were not made from files."""
@@ -129,6 +170,18 @@ class Opener:
             self._logic.parameters.probe_transform,
         )  # fmt: skip
         return tracked, browser, images
+
+    @contextmanager
+    def uploaded_mask(self, name: str, content: bytes) -> Iterator[Volume]:
+        """The volume of a file with a mask uploaded from a page."""
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / name
+            path.write_bytes(content)
+            try:
+                volume = self._volume(str(path))
+            except SimulationError as error:  # without the temporary folder, as below
+                raise SimulationError(str(error).replace(folder + os.sep, "")) from None
+        yield volume
 
     @contextmanager
     def uploaded(self, name: str, content: bytes) -> Iterator[tuple[str, str]]:
@@ -159,6 +212,11 @@ class Opener:
         node.SetAttribute(FILE, os.path.abspath(path))
         write_labels(node, volume.with_array(volume.array.astype(np.uint8)), names, node)
         return node
+
+
+def _segments_of(lesions_node) -> tuple:
+    """A key that changes with the number of segments of a node."""
+    return lesions_node.GetID(), lesions_node.GetSegmentation().GetNumberOfSegments()
 
 
 def _require_labels(volume: Volume, path: str) -> None:

@@ -16,6 +16,7 @@ from trame_server import Server
 from trame_slicer.core import LayoutManager
 from trame_slicer.views import AbstractView
 
+from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Widget.controls import Control, Section
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS
 from SlicerUSSim.Workstation.state import NAMES, PLANES, SLICE_VIEWS, ComparisonMode
@@ -38,6 +39,7 @@ _IN_PAGE = {
     "savePresetButton": "window.ussim.save('json')",
     "loadPresetButton": "window.document.getElementById('open-file').click()",
 }
+_LESION_TEXTS = {"brats": "BraTS map (necrosis, oedema, enhancing)"}
 #: Colours of the marks beside the slice views' planes.
 _STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
 
@@ -138,6 +140,16 @@ def _open_file() -> None:
     v3.VFileInput(
         label="Open an MRI, label map or tracked sequence", v_model=(NAMES.opened_file, None), density="compact",
         hide_details=True, variant="outlined", id="open-file", classes="mb-1",
+    )  # fmt: skip
+    options = "".join(f'<option value="{name}">{_LESION_TEXTS.get(name, name)}</option>' for name in LESIONS)
+    html.Div(
+        f"""<label for="added-as">Add a mask as</label>
+        <select id="added-as" v-model="{NAMES.added_as}">{options}</select>""",
+        classes="ussim-line", title="Tissue that is laid over the labels where the mask is not 0",
+    )  # fmt: skip
+    v3.VFileInput(
+        label="Mask to add, on any grid", v_model=(NAMES.added_file, None), density="compact",
+        hide_details=True, variant="outlined", id="add-file", classes="mb-1",
     )  # fmt: skip
 
 

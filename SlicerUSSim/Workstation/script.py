@@ -44,6 +44,8 @@ class LabelSource:
     options: dict = field(default_factory=dict)
     #: The simulator's numbers of the file's labels 0, 1, 2, ...
     relabelled: tuple[int, ...] = ()
+    #: (tissue, file) of the masks added on top
+    additions: tuple[tuple[str, str], ...] = ()
 
 
 def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray) -> str:
@@ -66,14 +68,23 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
             imports.append("Volume")
             options.append(f"mask=Volume.read({source.mask!r})")
         lines += [f"segmentation = segment_mri({', '.join(['mri', *options])})", "labels = segmentation.labels"]
+    texture = "segmentation.texture()"
+    if source.additions:
+        imports.append("Volume")
+        more += "from SlicerUSSim.Logic.mri import add_tissues\n"
+        masks = ", ".join(f"({name!r}, Volume.read({path!r}), {path!r})" for name, path in source.additions)
+        lines.append(f"labels = add_tissues(labels, segmentation.tissue_names, [{masks}]).labels")
+        texture = f"texture_below({texture}, mri, segmentation.labels, labels)"
     needs_texture = preset.settings.needs_texture and not source.is_labels
+    if needs_texture and source.additions:
+        more += "from SlicerUSSim.Logic.mri.pathology import texture_below\n"
     return _TEMPLATE.format(
         imports=", ".join(sorted(set(imports))),
         more_imports=more,
         labels="\n".join(lines),
         preset=indent(pformat(_plain(preset), width=112, sort_dicts=False), "    ").strip(),
         pose=np.array2string(probe_to_ras, separator=", ", floatmode="unique", max_line_width=118),
-        texture=", texture=segmentation.texture()" if needs_texture else "",
+        texture=f", texture={texture}" if needs_texture else "",
     )
 
 

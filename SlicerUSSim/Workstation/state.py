@@ -15,6 +15,7 @@ from typing import cast
 from trame_server.state import State
 from trame_server.utils.typed_state import TypedState
 
+from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.probe.surface import SurfacePose
 
 #: Planes in which a slice view follows the probe: image plane, plane across it, and anatomical planes.
@@ -184,6 +185,9 @@ class PageState:
     open_sections: list[str] = field(default_factory=list)
     #: File uploaded by the user, as the file input provides it (name, content); None after it was read
     opened_file: object = None
+    #: As opened_file: a mask to add, and the tissue that it is
+    added_file: object = None
+    added_as: str = LESIONS[0]
     #: None before the first image
     image: ImageGeometry | None = None
     #: Pose of the probe on the patient; None without a probe or a patient

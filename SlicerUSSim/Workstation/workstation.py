@@ -124,21 +124,28 @@ class Workstation:
         self._shared.on_change(NAMES.views.show_tissues, self._probe.show_tissues)
         self._shared.on_change(NAMES.sequence.comparison, lambda _: self._comparison.send())
         self._shared.on_change(NAMES.opened_file, self._file_opened)
+        self._shared.on_change(NAMES.added_file, self._file_added)
 
     def _in_task(self, method: Callable[..., None]) -> Callable[..., None]:
         return lambda *arguments: self._tasks.start(lambda: method(*arguments))
 
     def _file_opened(self, given: Any) -> None:
-        given = given[0] if isinstance(given, list) and given else given
-        if not given or not given.get("content"):
-            return
-        name, content = Path(given["name"]).name, bytes(given["content"])
-        with self._shared.changing() as now:
-            now.opened_file = None
-        self._tasks.start(lambda: self._open(name, content))
+        file = _uploaded(given)
+        if file is not None:
+            with self._shared.changing() as now:
+                now.opened_file = None
+            self._tasks.start(lambda: self._then_refresh(self._loading.open, *file))
 
-    def _open(self, name: str, content: bytes) -> None:
-        self._loading.open(name, content)
+    def _file_added(self, given: Any) -> None:
+        file = _uploaded(given)
+        if file is not None:
+            tissue = self._shared.now.added_as
+            with self._shared.changing() as now:
+                now.added_file = None
+            self._tasks.start(lambda: self._then_refresh(self._loading.add, *file, tissue))
+
+    def _then_refresh(self, method: Callable[..., None], *arguments: object) -> None:
+        method(*arguments)
         self._panel.refresh()
 
     async def _export(self, kind: str) -> list[object] | None:
@@ -201,3 +208,11 @@ class Workstation:
             with self._presenter.shown():
                 self._probe.update_surface()
         self._presenter.parametersChanged()
+
+
+def _uploaded(given: Any) -> tuple[str, bytes] | None:
+    """(name, content) of a page's file input; None if it is empty."""
+    given = given[0] if isinstance(given, list) and given else given
+    if not given or not given.get("content"):
+        return None
+    return Path(given["name"]).name, bytes(given["content"])

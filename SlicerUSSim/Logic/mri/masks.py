@@ -15,6 +15,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 BRATS = (("oedema", (2,)), ("necrosis", (1,)), ("enhancing", (3, 4)))
 #: More different whole numbers are an image and not a label map.
 _MOST_LABELS = 32
+#: Smallest and largest share at which a voxel becomes inside.
+_CUTS = (0.3, 0.7)
 #: Most samples along an edge of a voxel of the labels.
 _MOST_SAMPLES = 4
 
@@ -111,9 +113,10 @@ def _listed(values: np.ndarray) -> str:
 def resampled(masks: Masks, like: Volume) -> tuple[tuple[slice, ...], np.ndarray, float]:
     """(part of the grid of `like`; (k, j, i) number of the tissue there, from 1, or 0; share of the masks outside).
 
-    Masks are interpolated linearly and cut at one half, so that borders are surfaces and not the steps of their own
-    voxels. Where the voxels of `like` are larger, the mean over each is cut instead. Of several tissues, that with the
-    largest share is taken, so that there are no gaps between them.
+    Masks are interpolated linearly and cut near one half, so that borders are surfaces and not the steps of their own
+    voxels; just where their volume stays the same, since one half would shrink what is small and round. Where the
+    voxels of `like` are larger, the mean over each is cut instead. Of several tissues, that with the largest share is
+    taken, so that there are no gaps between them.
     """
     to_like, shape = like.ras_to_ijk @ masks.union.ijk_to_ras, np.array(like.array.shape[::-1])
 
@@ -132,8 +135,18 @@ def resampled(masks: Masks, like: Volume) -> tuple[tuple[slice, ...], np.ndarray
     numbers = np.zeros(size, np.uint8)
     if all(size):
         shares = np.stack([_mean_over_voxels(masks.union.with_array(one), like, first, size) for one in masks.shares])
-        numbers[:] = np.where(shares.sum(axis=0) > 0.5, shares.argmax(axis=0) + 1, 0)
+        here = np.count_nonzero(masks.inside) * (1.0 - outside.mean()) * abs(np.linalg.det(to_like[:3, :3]))
+        union = shares.sum(axis=0)
+        numbers[:] = np.where(union >= _cut_at(union, round(here)), shares.argmax(axis=0) + 1, 0)
     return where, numbers, float(outside.mean())
+
+
+def _cut_at(shares: np.ndarray, count: int) -> float:
+    """The share, within _CUTS, from which on nearest to `count` voxels are inside."""
+    low, high = _CUTS
+    cuts, of_each = np.unique(np.append(shares[(shares > low) & (shares < high)], high), return_counts=True)
+    counts = np.count_nonzero(shares >= high) + np.cumsum(of_each[::-1])[::-1] - 1  # -1: the one appended
+    return float(cuts[np.lexsort((np.abs(cuts - 0.5), np.abs(counts - count)))[0]])
 
 
 def _mean_over_voxels(volume: Volume, like: Volume, first: np.ndarray, size: tuple[int, ...]) -> np.ndarray:

@@ -23,6 +23,8 @@ from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
 
 _log = logging.getLogger(__name__)
 
+#: Tissues that are usually added, for choices; "brats" is a map of several.
+LESIONS = ("tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity", "enhancing", "blood", "brats")
 #: A mask of more than this share of the patient is not a lesion.
 _LARGEST_SHARE = 0.6
 #: A mask without a voxel in the patient may lie this far from it: a meningioma that brain extraction has cut off.
@@ -56,6 +58,7 @@ def tissue_to_add(name: str, tissue_names: Iterable[str] = ()) -> str:
 
     Raises SimulationError that lists the tissues for an unknown one.
 
+    >>> from SlicerUSSim.Logic.mri.pathology import tissue_to_add
     >>> tissue_to_add("Edema")
     'oedema'
     """
@@ -92,12 +95,13 @@ def add_tissue(
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic import Volume
+    >>> from SlicerUSSim.Logic.mri import add_tissue
     >>> labels = Volume(np.ones((40, 40, 40), np.uint8), np.eye(4))
-    >>> ball = np.zeros((20, 20, 20), np.uint8)
-    >>> ball[8:13, 8:13, 8:13] = 1
-    >>> added = add_tissue(labels, ["white matter"], Volume(ball, np.diag([2.0, 2.0, 2.0, 1.0])), "tumor")
+    >>> cube = np.zeros((40, 40, 40), np.uint8)
+    >>> cube[10:20, 10:20, 10:20] = 1
+    >>> added = add_tissue(labels, ["white matter"], Volume(cube, np.eye(4)), "tumor")
     >>> added.messages
-    ('tumour: 729 voxels, 0.7 ml, added over white matter 100 %',)
+    ('tumour: 1000 voxels, 1.0 ml, added over white matter 100 %',)
     >>> added.tissue_names
     ('white matter', 'tumour')
     """
@@ -189,13 +193,14 @@ def _label_of(tissue: str, array: np.ndarray, names: Sequence[str]) -> tuple[int
 
 def _check_place(labels: Volume, masks: Masks, where: tuple[slice, ...], inside: np.ndarray) -> None:
     """Raise SimulationError for masks without a voxel in the patient, unless they are just beside it."""
-    low, high = box_ras(labels.array > 0, labels)
-    mask_low, mask_high = box_ras(masks.inside, masks.union)
-    apart = float(np.linalg.norm(np.maximum(np.maximum(mask_low - high, low - mask_high), 0.0)))
-    if apart == 0.0 and inside.any():  # the boxes overlap
+    if inside.any():
         distance = ndimage.distance_transform_edt(labels.array == 0, sampling=labels.spacing_mm[::-1].tolist())
         assert isinstance(distance, np.ndarray)
         apart = float(distance[where][inside].min())
+    else:  # outside of the grid: between the bounding boxes
+        low, high = box_ras(labels.array > 0, labels)
+        mask_low, mask_high = box_ras(masks.inside, masks.union)
+        apart = float(np.linalg.norm(np.maximum(np.maximum(mask_low - high, low - mask_high), 0.0)))
     require(
         apart <= _FARTHEST_MM,
         f"{masks.source}: lies {apart:.0f} mm outside the patient, expected a mask in the frame of the MRI; is it of "

@@ -159,6 +159,21 @@ def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
     return LabelledTissues(volume.with_array(table[volume.array]), order)
 
 
+def node_labels(labels_node) -> tuple[Volume, dict[int, str]]:
+    """(labels in the node's own frame, {label: name of its segment or colour}) as they are, whether tissues or not.
+
+    Raises SimulationError for a node without labels.
+    """
+    if labels_node.IsA("vtkMRMLSegmentationNode"):
+        return _read_segmentation(labels_node)
+    volume, colours = read_volume(labels_node, "label map"), _colour_node(labels_node)
+    present = [int(label) for label in np.unique(volume.array) if label]
+    if colours is None:
+        return volume, dict.fromkeys(present, "")
+    known = colours.GetNumberOfColors()
+    return volume, {label: colours.GetColorName(label) if 0 < label < known else "" for label in present}
+
+
 def _tissue_name(name: str, tissues: TissueTable) -> str | None:
     for tissue in tissues.values():
         if same_name(tissue.name, name):
@@ -238,12 +253,14 @@ def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int
 
 
 def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -> None:
-    """Write labels with named, coloured tissues into a label map or segmentation node, aligned with a volume node."""
+    """Write labels with named, coloured tissues into a label map or segmentation node, aligned with another
+    node of volumes or labels."""
     parent = like_node.GetParentTransformNode()
     labels_node.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
     if labels_node.IsA("vtkMRMLSegmentationNode"):
-        # After the transform, since the node converts the reference geometry to its own frame.
-        labels_node.SetReferenceImageGeometryParameterFromVolumeNode(like_node)
+        if like_node.IsA("vtkMRMLVolumeNode"):
+            # After the transform, since the node converts the reference geometry to its own frame.
+            labels_node.SetReferenceImageGeometryParameterFromVolumeNode(like_node)
         _write_segmentation(labels_node, labels, tuple(names))
     else:
         _write_label_map(labels_node, labels, tuple(names))

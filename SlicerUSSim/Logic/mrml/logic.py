@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
@@ -22,6 +22,7 @@ from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot, tracked_images, write_compared
@@ -30,9 +31,11 @@ from SlicerUSSim.Logic.mrml.label_nodes import (
     Patient,
     PatientReader,
     labels_version,
+    read_labels,
     read_mask,
     write_labels,
 )
+from SlicerUSSim.Logic.mrml.lesion_nodes import padded_for, read_lesions
 from SlicerUSSim.Logic.mrml.live import LiveNodes, LiveUpdate
 from SlicerUSSim.Logic.mrml.nodes import (
     named,
@@ -46,6 +49,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     write_image,
     write_outline,
 )
+from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_in_slice
@@ -68,6 +72,20 @@ class AtOnce:
         function()
 
 
+@dataclass(frozen=True, eq=False)
+class _Segmented:
+    """Labels of a node that Segment wrote, and the texture of their MRI."""
+
+    #: Of the node, see labels_version
+    version: Hashable
+    labels: Volume
+    #: Of labels 1, 2, ...
+    names: tuple[str, ...]
+    texture: Callable[[], Texture]
+    #: On the grid of the labels
+    mri: Volume
+
+
 class UltrasoundSceneLogic:
     """Simulates on the nodes of one scene.
 
@@ -88,7 +106,10 @@ class UltrasoundSceneLogic:
         self.parameters = SceneParameters(scene)
         self._simulators = ReusedSimulator()
         self._patients = PatientReader()
-        self._segmented: tuple[Hashable, Segmentation] | None = None  # with the version of its labels
+        self._segmented: _Segmented | None = None
+        #: What the last segment() or addTissues() did, and what a user should check, one line each
+        self.notes: tuple[str, ...] = ()
+        self.warnings: tuple[str, ...] = ()
         self._texture: tuple[Hashable, Texture] | None = None  # with the version of its labels
         self._preset: tuple[str, Preset] = ("", Preset())
         self._live: LiveUpdate | None = None
@@ -127,6 +148,8 @@ class UltrasoundSceneLogic:
         labels_node,
         *,
         mask_node=None,
+        lesions_node=None,
+        overwrite: bool = False,
         classes: int = SegmentationSettings.classes,
         contrast: str = SegmentationSettings.contrast,
         filter_radius: int = SegmentationSettings.filter_radius,
@@ -138,8 +161,11 @@ class UltrasoundSceneLogic:
     ) -> Segmentation:
         """Label the tissues of a scalar volume into a label map or segmentation node, with names and colours.
 
-        See segmentation.segment_mri; `mask_node` is a label map on the MRI's grid, or a segmentation. `progress` may
-        raise errors.Cancelled; the nodes are then as they were.
+        See segmentation.segment_mri; `mask_node` is a label map on the MRI's grid, or a segmentation. The segments of
+        `lesions_node` are laid over the labels, as by addTissues, but are not in the result. `progress` may raise
+        errors.Cancelled; the nodes are then as they were.
+        Raises SimulationError for a node with labels that were not made by this method, or edited since; `overwrite`
+        replaces them nevertheless.
         """
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         require(labels_node is not mri_node, f"input and output are both {named(mri_node)}, expected different nodes")
@@ -148,6 +174,11 @@ class UltrasoundSceneLogic:
         require(
             mask_node is not labels_node, f"mask and output are both {named(labels_node)}, expected different nodes"
         )
+        require(
+            overwrite or self.mayReplace(labels_node),
+            f"{named(labels_node)} was not made by Segment, or edited since, and is not replaced; choose another node",
+        )
+        lesions, skipped = ([], []) if lesions_node is None else self._lesions(lesions_node, mri_node)
         result = self._work.do(
             lambda: segment_mri(
                 mri, classes=classes, contrast=contrast, mask=mask, filter_radius=filter_radius,
@@ -156,9 +187,56 @@ class UltrasoundSceneLogic:
             )
         )  # fmt: skip
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
-        write_labels(labels_node, result.labels, result.tissue_names, mri_node)
-        self._segmented = (labels_version(labels_node), result)
+        added = self._with_lesions(result.labels, result.tissue_names, lesions)
+        write_labels(labels_node, added.labels, added.tissue_names, mri_node)
+        mark_as_made(labels_node)
+        self._segmented = _Segmented(
+            labels_version(labels_node), added.labels, added.tissue_names,
+            lambda: texture_below(result.texture(), mri, result.labels, added.labels), mri,
+        )  # fmt: skip
+        self.notes, self.warnings = added.messages, (*skipped, *added.warnings)
         return result
+
+    def mayReplace(self, labels_node) -> bool:
+        """Whether segment() may write into a node: if it is empty, or has what segment() wrote and nobody edited."""
+        require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
+        return may_replace(labels_node)
+
+    def addTissues(self, labels_node, lesions_node, output_node=None) -> Added:
+        """Lay the segments of a segmentation node over the tissues of a label map or segmentation node.
+
+        Segments are called as tissues: tumour, oedema, necrosis, cyst, haematoma, cavity, or others of the preset and
+        the presets; the last is on top. The result is written into `output_node`, by default into `labels_node` itself,
+        which must then be made by segment() and not be edited since. `notes` and `warnings` tell what was done.
+        Raises SimulationError if no segment is called as a tissue, and for one that is not a lesion of this patient
+        (see pathology.add_tissue); nothing is changed then.
+        """
+        output = labels_node if output_node is None else output_node
+        require_node(output, *LABEL_CLASSES, use="output of Add to tissues")
+        require(
+            self.mayReplace(output),
+            f"{named(output)} was not made by Segment, or edited since, and is not replaced; choose another node",
+        )
+        require(lesions_node is not output, f"lesions and output are both {named(output)}, expected different nodes")
+        was = self._segmented
+        if was is not None and was.version == labels_version(labels_node):
+            labels, names = was.labels, was.names
+        else:
+            was, labelled = None, read_labels(labels_node, self.preset.tissues)
+            labels, names = labelled.volume, labelled.names
+        lesions, skipped = self._lesions(lesions_node, labels_node)
+        if labels_node.IsA("vtkMRMLSegmentationNode"):
+            labels = padded_for(lesions, labels)  # it is cropped to what it holds
+        added = self._with_lesions(labels, names, lesions)
+        write_labels(output, added.labels, added.tissue_names, labels_node)
+        mark_as_made(output)
+        if was is not None and labels is was.labels:
+            self._segmented = _Segmented(
+                labels_version(output), added.labels, added.tissue_names,
+                lambda: texture_below(was.texture(), was.mri, was.labels, added.labels), was.mri,
+            )  # fmt: skip
+        self.notes, self.warnings = added.messages, (*skipped, *added.warnings)
+        return added
 
     def simulate(
         self, labels_node, probe_transform_node, output_node, *, warned: Callable[[Warning], None] = warn_again
@@ -410,6 +488,13 @@ class UltrasoundSceneLogic:
 
     # ---- internal ------------------------------------------------------------------------------------------------
 
+    def _lesions(self, lesions_node, to_frame_of) -> tuple[list[tuple[str, Volume, str]], list[str]]:
+        return read_lesions(lesions_node, to_frame_of, self.preset.tissues)
+
+    def _with_lesions(self, labels: Volume, names: Sequence[str], lesions: list[tuple[str, Volume, str]]) -> Added:
+        own = [tissue.name for tissue in self.preset.tissues.all_tissues()]
+        return self._work.do(lambda: add_tissues(labels, names, lesions, also=own))
+
     def _check_output(self, labels_node, output_node) -> None:
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
         require(
@@ -459,13 +544,13 @@ class UltrasoundSceneLogic:
         if not self.preset.settings.needs_texture:
             return None
         segmented = self._segmented
-        if segmented is None or segmented[0] != patient.node_version:
+        if segmented is None or segmented.version != patient.node_version:
             raise SimulationError(
                 f"the settings need a texture from the MRI, which {patient.name} lacks; segment the MRI again, or set "
                 "partial_volume to false and mri_modulation_db to 0"
             )
         if self._texture is None or self._texture[0] != patient.version:
             # A segmentation node returns its labels cropped to their content.
-            texture = segmented[1].texture().on_grid_of(patient.labels, segmented[1].labels)
+            texture = segmented.texture().on_grid_of(patient.labels, segmented.labels)
             self._texture = (patient.version, texture)
         return self._texture[1]

@@ -117,6 +117,8 @@ class SceneParameters:
     mri = NodeParameter("vtkMRMLScalarVolumeNode")
     mask = NodeParameter("vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     labels = NodeParameter("vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
+    #: Its segments are laid over the labels
+    lesions = NodeParameter("vtkMRMLSegmentationNode")
     probe_transform = NodeParameter("vtkMRMLLinearTransformNode")
     output = NodeParameter("vtkMRMLScalarVolumeNode")
     outline = NodeParameter("vtkMRMLModelNode")

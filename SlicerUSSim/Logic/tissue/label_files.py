@@ -60,7 +60,7 @@ def _why_not_ours(path: Path, beside: Path) -> str | None:
 
 def _hash_of_labels(labels: Volume) -> str:
     content = hashlib.sha256(repr((labels.array.shape, labels.ijk_to_ras.round(4).tolist())).encode())
-    content.update(np.ascontiguousarray(labels.array.astype(np.int32)))
+    content.update(labels.array.astype(np.int32).tobytes())
     return content.hexdigest()
 
 

@@ -1,0 +1,453 @@
+"""Tissues added on top of labels: where they go, what is refused, and how they look in ultrasound."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from SlicerUSSim.Command.cli import main
+from SlicerUSSim.Logic import (
+    DisplaySettings,
+    LinearProbe,
+    SimulationError,
+    SimulationSettings,
+    TissueTable,
+    UltrasoundSimulator,
+    Volume,
+    segment_mri,
+)
+from SlicerUSSim.Logic.base.volume import read_array
+from SlicerUSSim.Logic.mri import add_tissue, add_tissues
+from SlicerUSSim.Logic.mri.pathology import texture_below
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.probe import pose_looking_at
+from SlicerUSSim.Logic.tissue.label_files import require_replaceable, write_label_files
+from SlicerUSSim.Logic.tissue.names import tissue_named
+from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
+
+from .conftest import SHARED, block, needs_shared, rigid
+
+#: White matter around the origin in a margin that is not the patient
+BRAIN = block(lambda x, y, z: np.where(x**2 + y**2 + z**2 < 24**2, 1, 0))
+CENTRE, RADIUS = np.array([4.0, -3.0, 2.0]), 8.0
+LESIONS = ("tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity")
+
+
+def ussim(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def distances(volume: Volume, centre=CENTRE) -> np.ndarray:
+    """(k, j, i) mm of voxel centres from a point."""
+    index = np.indices(volume.array.shape)[::-1].reshape(3, -1)
+    points = volume.ijk_to_ras[:3, :3] @ index + volume.ijk_to_ras[:3, 3:]
+    return np.linalg.norm(points - np.asarray(centre)[:, None], axis=0).reshape(volume.array.shape)
+
+
+def empty(spacing_mm=(1.0, 1.0, 1.0), axes=None, half_mm=28.0) -> Volume:
+    """A volume of zeros around the origin with these axes (columns: i, j, k in RAS)."""
+    spacing = np.array(spacing_mm)
+    counts = np.ceil(2 * half_mm / spacing).astype(int)
+    matrix = np.eye(4)
+    matrix[:3, :3] = (np.eye(3) if axes is None else axes) * spacing
+    matrix[:3, 3] = -matrix[:3, :3] @ (counts - 1) / 2
+    return Volume(np.zeros(counts[::-1], np.uint8), matrix)
+
+
+def ball(volume: Volume, radius=RADIUS, centre=CENTRE) -> Volume:
+    return volume.with_array((distances(volume, centre) < radius).astype(np.uint8))
+
+
+def added(mask: Volume, tissue="tumour", labels=BRAIN, names=("white matter",), source="lesion.nii.gz"):
+    return add_tissue(labels, names, mask, tissue, source=source)
+
+
+def dice(a: np.ndarray, b: np.ndarray) -> float:
+    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
+
+
+# ---- where it goes ---------------------------------------------------------------------------------------------------
+
+
+def test_a_mask_on_the_grid_of_the_labels_is_taken_voxel_by_voxel():
+    mask = ball(BRAIN)
+    result = added(mask)
+    assert ((result.labels.array == 2) == (mask.array > 0)).all()
+    assert (result.labels.array[mask.array == 0] == BRAIN.array[mask.array == 0]).all()
+    assert result.tissue_names == ("white matter", "tumour") and result.labels.array.dtype == np.uint8
+    count = int(mask.array.sum())
+    assert result.messages == (f"tumour: {count} voxels, {count / 1000:.1f} ml, added over white matter 100 %",)
+    assert not result.warnings and BRAIN.array.max() == 1  # the labels given are as they were
+
+
+TURNED = rigid(np.linalg.qr(np.array([[1.0, 0.4, 0.2], [-0.3, 1.0, 0.5], [0.1, -0.6, 1.0]]))[0], [0, 0, 0])[:3, :3]
+
+
+@pytest.mark.parametrize(
+    ("grid", "least"),
+    [
+        (empty((0.4, 0.5, 0.6), half_mm=16), 0.98),
+        (empty((1.0, 1.0, 1.0), np.diag([-1.0, -1.0, 1.0])), 0.97),  # LPS, as most NIfTI files
+        (empty((1.2, 1.2, 1.2), np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]])), 0.95),  # axes exchanged
+        (empty((1.1, 1.1, 1.1), TURNED), 0.95),
+        (empty((0.8, 0.8, 3.0)), 0.93),  # thick slices
+        (empty((2.0, 2.0, 2.0)), 0.91),
+    ],
+)
+def test_a_mask_on_another_grid_covers_the_same_place(grid, least):
+    result = added(ball(grid)).labels
+    assert dice(result.array == 2, distances(result) < RADIUS) > least
+    assert float(distances(result)[result.array == 2].max()) < RADIUS + 0.6 * max(grid.spacing_mm)
+
+
+def test_borders_of_coarse_masks_are_surfaces_and_not_steps():
+    """Compared with the nearest voxel of the mask, which is what a lookup gives."""
+    fine, coarse = block(lambda x, y, z: 1, spacing_mm=0.5, half_mm=(16, 16, 16)), ball(empty((3.0, 3.0, 3.0)))
+    truth = distances(fine) < RADIUS
+    smooth = added(coarse, labels=fine).labels.array == 2
+    index = np.indices(fine.array.shape)[::-1].reshape(3, -1)
+    there = coarse.ras_to_ijk @ fine.ijk_to_ras @ np.vstack([index, np.ones(index.shape[1])])
+    i, j, k = np.rint(there[:3]).astype(int)
+    steps = (coarse.array[k, j, i] > 0).reshape(truth.shape)
+    assert (smooth != truth).sum() < 0.7 * (steps != truth).sum()
+
+
+def test_labels_coarser_than_a_mask_take_the_mean_of_their_voxels_and_not_a_sample():
+    coarse = block(lambda x, y, z: 1, spacing_mm=3.0)
+    fine = empty((0.5, 0.5, 0.5), half_mm=20)
+    holes = ball(fine).array.copy()
+    holes[::3, ::3, ::3] = 0  # does not matter: 1 of 27
+    whole, sieve = added(ball(fine), labels=coarse).labels.array, added(fine.with_array(holes), labels=coarse).labels
+    assert dice(whole == 2, sieve.array == 2) > 0.94
+
+
+def test_probabilities_count_from_one_half_on():
+    grid = empty()
+    probability = np.clip(0.5 + (RADIUS - distances(grid)) / 4.0, 0.0, 1.0).astype(np.float32)
+    result = added(grid.with_array(probability)).labels
+    assert dice(result.array == 2, distances(result) < RADIUS) > 0.98
+
+
+def test_a_mask_of_255_or_of_whole_numbers_as_floats_is_a_mask():
+    expected = added(ball(BRAIN)).labels.array
+    for array in (ball(BRAIN).array * np.uint8(255), ball(BRAIN).array.astype(float), ball(BRAIN).array > 0):
+        result = added(BRAIN.with_array(array))
+        np.testing.assert_array_equal(result.labels.array, expected)
+        assert not result.warnings
+
+
+def test_the_last_is_on_top_and_a_tissue_that_is_there_keeps_its_label():
+    small, large = ball(BRAIN, 4.0), ball(BRAIN, 9.0)
+    result = add_tissues(BRAIN, ["white matter"], [("tumor", large, "a"), ("Cyst", small, "b"), ("tumour", small, "c")])
+    assert result.tissue_names == ("white matter", "tumour", "cyst")
+    assert (result.labels.array == 3).sum() == 0 and ((result.labels.array == 2) == (large.array > 0)).all()
+    assert [message.split(":")[0] for message in result.messages] == ["tumour", "cyst", "tumour"]
+    assert result.messages[1].endswith("added over tumour 100 %")
+
+
+def test_thin_sulci_in_a_lesion_are_overwritten():
+    labels = BRAIN.with_array(np.where((BRAIN.array > 0) & (np.indices(BRAIN.array.shape)[0] == 32), 2, BRAIN.array))
+    result = added(ball(labels), labels=labels, names=("white matter", "leptomeninges"))
+    assert not (result.labels.array[ball(labels).array > 0] == 2).any() and (result.labels.array == 2).any()
+    assert "leptomeninges" in result.messages[0]
+
+
+def test_labels_of_the_user_may_have_gaps_and_large_numbers():
+    labels = BRAIN.with_array(np.where(BRAIN.array > 0, 7, 0).astype(np.int16))
+    table = TissueTable({7: TISSUES["white matter"], 2: TISSUES["csf"]})
+    result = added(ball(BRAIN), "haematoma", labels, table.names_by_label())
+    after = result.table(table)
+    assert result.labels.array.max() == 7 and after[1].name == "haematoma" and set(after) == {0, 1, 2, 7}
+    own = TissueTable.brain(["white matter"]).replace("leptomeninges", mu0=1.2)
+    over = added(ball(BRAIN), "leptomeninges", BRAIN, own.names_by_label())
+    assert over.table(own)[2].mu0 == 1.2  # of the membrane in the user's own table
+
+
+def test_a_brats_map_becomes_its_tissues_without_gaps_between_them():
+    """On another grid, where voxels between two labels belong to neither by more than one half."""
+    grid = empty((1.3, 1.1, 1.7), TURNED)
+    r = distances(grid)
+    for enhancing in (3, 4):
+        values = np.select([r < 5, r < 8, r < 14], [1, enhancing, 2], 0).astype(np.float32)
+        result = added(grid.with_array(values), "brats")
+        assert result.tissue_names == ("white matter", "oedema", "necrosis", "enhancing")
+        r_labels = distances(result.labels)
+        assert not (result.labels.array[r_labels < 12.5] == 1).any()
+        for label, low, high in ((2, 9.2, 12.8), (3, 0, 3.8), (4, 6.2, 6.8)):
+            shell = (r_labels >= low) & (r_labels <= high)
+            assert (result.labels.array[shell] == label).mean() > 0.95, label
+        assert len(result.messages) == 3
+
+
+# ---- what is refused or said -----------------------------------------------------------------------------------------
+
+
+def moved(volume: Volume, *mm) -> Volume:
+    return Volume(volume.array, rigid(np.eye(3), mm) @ volume.ijk_to_ras)
+
+
+@pytest.mark.parametrize(
+    ("mask", "tissue", "message"),
+    [
+        (BRAIN.with_array(np.zeros_like(BRAIN.array)), "tumour", "is empty, expected voxels that are not 0"),
+        (moved(ball(BRAIN), 200, 0, 0), "tumour", "lies 174 mm outside the patient, expected a mask in the frame of"),
+        (ball(BRAIN, 2.0, [27, 27, 27]), "tumour", "lies 21 mm outside the patient"),
+        (BRAIN, "tumour", "covers 100 % of the patient, expected a lesion in it; is it the mask of the brain"),
+        (head_mri(8.0), "tumour", "holds numbers from 0 to .*, expected a mask"),
+        (BRAIN.with_array(np.arange(BRAIN.array.size).reshape(BRAIN.array.shape)), "cyst", "226981 whole numbers from"),
+        (BRAIN.with_array(BRAIN.array * np.nan), "tumour", "has 226981 voxels that are not finite numbers"),
+        (BRAIN.with_array(ball(BRAIN).array * 0.4), "tumour", r"no probability is above 0.5 \(the largest is 0.4\)"),
+        (ball(BRAIN), "cheese", "no tissue is called 'cheese', expected one of: coupling, csf, .*oedema, necrosis"),
+        (BRAIN.with_array(ball(BRAIN).array * 5), "brats", "holds the labels 5, expected those of BraTS: 1 necrosis"),
+        (BRAIN.with_array(ball(BRAIN).array * 0.7), "brats", "holds numbers from 0 to 0.7, expected a mask"),
+        (ball(empty((0.1, 0.1, 0.1), half_mm=1), 0.3, [0, 0, 0]), "tumour", "mm³ are too small for the voxels"),
+    ],
+)
+def test_what_is_no_lesion_of_this_patient_is_refused_in_one_line(mask, tissue, message):
+    with pytest.raises(SimulationError, match=message) as caught:
+        added(mask, tissue)
+    assert "\n" not in str(caught.value)
+    assert tissue == "cheese" or str(caught.value).startswith("lesion.nii.gz: ")
+
+
+def test_what_the_brain_mask_leaves_out_is_added_and_said():
+    mask = ball(BRAIN, 8.0, [22, 0, 0])
+    result = added(mask)
+    left_out = float((BRAIN.array[mask.array > 0] == 0).mean())
+    assert 0.2 < left_out < 0.6 and ((result.labels.array == 2) == (mask.array > 0)).all()
+    percent = f"{100 * left_out:.0f}"
+    assert result.warnings == (f"the brain mask leaves out {percent} % of lesion.nii.gz; those voxels are added",)
+    assert f"voxels outside {percent} %" in result.messages[0]
+    beside = added(ball(BRAIN, 3.0, [27.9, 0, 0]))  # a meningioma that the brain mask cuts off wholly
+    assert "leaves out 100 %" in beside.warnings[0]
+
+
+def test_labels_given_as_a_mask_are_all_added_and_said():
+    both = np.select([distances(BRAIN) < 4, distances(BRAIN) < 8], [1, 2], 0)
+    result = added(BRAIN.with_array(both))
+    assert (result.labels.array == 2).sum() == (both > 0).sum()
+    assert result.warnings == (
+        "lesion.nii.gz holds the labels 1, 2; all of them are added as tumour (brats=FILE adds the tissues of a BraTS "
+        "map)",
+    )
+
+
+def test_a_mask_that_reaches_out_of_the_volume_or_gets_lost_in_coarse_voxels_is_said():
+    box = Volume(np.ones((30, 30, 30), np.uint8), np.eye(4))
+    out = added(ball(Volume(np.zeros((40, 40, 40), np.uint8), np.eye(4)), 6.0, [28, 15, 15]), labels=box)
+    assert any("% of lesion.nii.gz lie outside the volume of the labels" in warning for warning in out.warnings)
+    coarse = block(lambda x, y, z: 1, spacing_mm=4.0)
+    lost = added(ball(empty((0.5, 0.5, 0.5)), 3.0, [1, 1, 1]), labels=coarse)
+    assert any("ml on the voxels of the labels, which are coarse for it" in warning for warning in lost.warnings)
+
+
+# ---- how it looks ----------------------------------------------------------------------------------------------------
+
+PROBE = LinearProbe(30, 60, scan_lines=96, frequency_mhz=5.0, focus_mm=30, elevation_focus_mm=30)
+POSE = pose_looking_at(face_ras=(0, 0, 0), target_ras=(0, 0, -10))
+HEIGHT_MM, DEPTH_MM = 16.0, 22.0
+
+
+@pytest.fixture(scope="module")
+def levels():
+    """{tissue: (dB inside a 16 mm ball relative to white matter, dB behind it)} without compression of the display."""
+    brain = block(lambda x, y, z: np.where(z < 0, 1, 0), half_mm=(18, 8, 62))
+    lesion = ball(brain, HEIGHT_MM / 2, [0, 0, -DEPTH_MM])
+    settings = SimulationSettings(interfaces=False)
+
+    def power(labels: Volume, names) -> tuple[float, float]:
+        frame = UltrasoundSimulator(labels, TissueTable.named(names), settings).simulate(
+            PROBE, POSE, DisplaySettings(noise_db=None, tgc_db_cm_mhz=0.0)
+        )
+        mm = np.arange(frame.envelope.shape[1]) * frame.sample_interval_mm
+        middle = slice(40, 56)
+        inside, behind = np.abs(mm - DEPTH_MM) < 5, (mm > DEPTH_MM + 11) & (mm < DEPTH_MM + 25)
+        return tuple(float((frame.envelope[middle][:, part].astype(float) ** 2).mean()) for part in (inside, behind))
+
+    before = power(brain, ["white matter"])
+    result = {}
+    for tissue in (*LESIONS, "blood"):
+        after = add_tissue(brain, ["white matter"], lesion, tissue)
+        powers = power(after.labels, after.tissue_names)
+        result[tissue] = tuple(
+            10 * np.log10(max(now, 1e-12 * then) / then) for now, then in zip(powers, before, strict=True)
+        )
+    return result
+
+
+def test_a_tumour_is_bright_and_a_cyst_black_with_enhancement_behind(levels):
+    assert levels["tumour"][0] > 3.0 and levels["haematoma"][0] > 4.0
+    assert 0.5 < levels["oedema"][0] < levels["tumour"][0]
+    assert -8.0 < levels["necrosis"][0] < -1.0
+    for fluid in ("cyst", "cavity"):
+        assert levels[fluid][0] < -30.0 and levels[fluid][1] > 5.0
+    assert levels["blood"][0] < -12.0  # flowing blood stays what it was
+
+
+def test_the_level_behind_a_lesion_is_that_of_its_attenuation(levels):
+    """Twice its thickness, 1.6 cm, at 5 MHz: theory, within the fluctuation of speckle."""
+    for tissue in LESIONS:
+        missing = TISSUES["white matter"].attenuation_db_cm_mhz - TISSUES[tissue].attenuation_db_cm_mhz
+        assert levels[tissue][1] == pytest.approx(missing * 5.0 * 2 * HEIGHT_MM / 10, abs=1.5), tissue
+
+
+@pytest.mark.parametrize("name", LESIONS)
+def test_a_lesion_has_a_preset_with_sources_and_a_colour_of_its_own(name):
+    tissue = TISSUES[name]
+    assert all(tissue.sources.values()) and tissue_named(name.upper()) == tissue
+    assert sum(colour_of(other) == colour_of(name) for other in TISSUES) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "tissue"),
+    [
+        ("Edema", "oedema"), ("peritumoral edema", "oedema"), ("Necrotic core", "necrosis"), ("arachnoid cyst", "cyst"),
+        ("Hematoma", "haematoma"), ("intracerebral haemorrhage", "haematoma"), ("resection cavity", "cavity"),
+        ("Tumor", "tumour"), ("kidney_cyst_left", "cyst"), ("vessels", "blood"),
+    ],
+)  # fmt: skip
+def test_names_of_lesions_are_known(name, tissue):
+    assert tissue_named(name).name == tissue
+
+
+def test_the_texture_of_the_mri_is_certain_in_a_lesion_and_follows_its_intensity():
+    mri = head_mri(3.0)
+    segmentation = segment_mri(mri)
+    result = added(ball(mri, 12.0, [30, 0, 30]), "tumour", segmentation.labels, segmentation.tissue_names)
+    lesion = result.labels.array == 4
+    before = segmentation.texture()
+    after = texture_below(before, mri, segmentation.labels, result.labels)
+    assert before.second_share[lesion].max() > 0.0 and after.second_share[lesion].max() == 0.0
+    for name in ("second_label", "second_share", "deviation"):
+        np.testing.assert_array_equal(getattr(after, name)[~lesion], getattr(before, name)[~lesion])
+    assert after.deviation[lesion].std() == pytest.approx(1.0, abs=0.01)
+    assert np.corrcoef(after.deviation[lesion], mri.array[lesion])[0, 1] > 0.999
+
+
+# ---- the command -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A head, and masks on a finer grid of their own."""
+    folder = tmp_path_factory.mktemp("lesions")
+    head = head_mri(3.0)
+    head.write(folder / "head.nii.gz")
+    grid = moved(empty((1.5, 1.5, 2.0), np.diag([-1.0, -1.0, 1.0]), 20), 30, 10, 35)
+    ball(grid, 10.0, [30, 10, 35]).write(folder / "tumour.nii.gz")
+    ball(grid, 5.0, [30, 10, 35]).write(folder / "cyst.nrrd")
+    moved(ball(grid, 5.0, [30, 10, 35]), 300, 0, 0).write(folder / "far.nrrd")
+    return folder
+
+
+def test_segment_writes_added_tissues_and_says_what_it_added(files, tmp_path):
+    out = tmp_path / "labels.nii.gz"
+    adding = ("--add", f"tumour={files / 'tumour.nii.gz'}", "--add", f"cyst={files / 'cyst.nrrd'}")
+    result = ussim("segment", files / "head.nii.gz", "-o", out, *adding)
+    assert result.exit_code == 0, result.output
+    assert "tumour: " in result.stderr and " ml, added over " in result.stderr and "over tumour 100 %" in result.stderr
+    table, labels = TissueTable.read(tmp_path / "labels.json"), Volume.read(out)
+    cyst = table.label_of("cyst")
+    assert table.names() == ["coupling", "csf", "grey matter", "white matter", "leptomeninges", "tumour", "cyst"]
+    volume_ml = (labels.array == cyst).sum() * 0.027
+    assert volume_ml == pytest.approx(4 / 3 * np.pi * 0.5**3, rel=0.2)
+    again = ussim("segment", files / "head.nii.gz", "-o", out)  # its own and not edited
+    assert again.exit_code == 0 and "tumour" not in TissueTable.read(tmp_path / "labels.json").names()
+
+
+def test_every_command_that_simulates_takes_additions_for_an_mri_and_for_labels(files, tmp_path):
+    labels = tmp_path / "l.nii.gz"
+    assert ussim("segment", files / "head.nii.gz", "-o", labels).exit_code == 0
+    adding = ("--add", f"tumour={files / 'tumour.nii.gz'}", "--set", "tumour.mu0=3.0")
+    for source in (files / "head.nii.gz", labels):
+        pictures = []
+        for options in ((), adding):
+            out = tmp_path / "image.mha"
+            result = ussim("simulate", source, "--pose", "auto", "-o", out, *options)
+            assert result.exit_code == 0, result.output
+            pictures.append(read_array(out)[0].astype(float))
+        assert np.abs(pictures[1] - pictures[0]).max() > 50
+    for command in ("segment", "simulate", "sweep", "volume", "optimize", "demo"):
+        assert "additions" in {parameter.name for parameter in main.commands[command].params}
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("tumour", "--add is 'tumour', expected TISSUE=FILE"),
+        ("=x.nrrd", "--add is '=x.nrrd', expected TISSUE=FILE"),
+        ("tumour=none.nrrd", "none.nrrd: no such file"),
+        ("cheese={cyst.nrrd}", "no tissue is called 'cheese', expected one of: coupling"),
+        ("tumour={head.nii.gz}", "head.nii.gz: holds numbers from"),
+        ("brats={far.nrrd}", "far.nrrd: lies 2"),
+    ],
+)
+def test_a_mistake_in_an_addition_is_one_line_and_writes_nothing(files, tmp_path, value, message):
+    for name in ("head.nii.gz", "cyst.nrrd", "far.nrrd"):
+        value = value.replace("{" + name + "}", str(files / name))
+    result = ussim("segment", files / "head.nii.gz", "-o", tmp_path / "l.nii.gz", "--add", value)
+    assert result.exit_code == 2 and not list(tmp_path.iterdir())
+    errors = [line for line in result.stderr.splitlines() if line.startswith("ussim: ")]
+    assert len(errors) == 1 and message in errors[0], result.stderr
+
+
+# ---- files that are not replaced -------------------------------------------------------------------------------------
+
+
+def test_segment_replaces_only_labels_that_it_wrote_and_nobody_edited(files, tmp_path):
+    head, out, beside = files / "head.nii.gz", tmp_path / "l.nii.gz", tmp_path / "l.json"
+
+    def refused() -> str:
+        before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+        result = ussim("segment", head, "-o", out)
+        assert result.exit_code == 2 and {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+        (line,) = (line for line in result.stderr.splitlines() if line.startswith("ussim: "))
+        assert line.endswith("so it is not replaced; give another name, or --overwrite to replace it"), line
+        return line
+
+    assert ussim("segment", head, "-o", out).exit_code == ussim("segment", head, "-o", out).exit_code == 0
+    labels = Volume.read(out)
+    labels.with_array(np.where(labels.array == 3, 2, labels.array).astype(np.uint8)).write(out)
+    assert "l.nii.gz: the labels have been edited since this program wrote them" in refused()
+    assert ussim("segment", head, "-o", out, "--overwrite").exit_code == 0
+    Volume.read(out).write(out)  # the same voxels, saved by another program
+    assert ussim("segment", head, "-o", out).exit_code == 0
+    TissueTable.read(beside).replace("csf", mu0=0.5).write(beside)
+    assert "l.nii.gz: exists and was not written by this program (l.json does not say so)" in refused()
+    assert ussim("segment", head, "-o", out, "--overwrite").exit_code == 0
+    values = json.loads(beside.read_text())
+    values["tissues"]["3"]["mu0"] = 0.6
+    beside.write_text(json.dumps(values))
+    assert "the tissues in l.json have been edited" in refused()
+    out.unlink()  # the user's table alone is not replaced either
+    assert "l.json: the tissues in l.json have been edited" in refused()
+    beside.unlink()
+    head_mri(5.0).write(out)
+    assert "l.nii.gz: exists and was not written by this program (l.json is not beside it)" in refused()
+
+
+@pytest.mark.parametrize("name", ["l.nii.gz", "l.nrrd", "l.mha", "l.vti"])
+def test_labels_are_recognised_in_every_format(name, tmp_path):
+    turned = Volume(BRAIN.array, rigid(TURNED, [0.1, 0.2, 1 / 3]) @ np.diag([0.7, 0.7, 0.7, 1.0]) @ BRAIN.ijk_to_ras)
+    write_label_files(tmp_path / name, turned, TissueTable.brain())
+    require_replaceable(tmp_path / name)
+    written = Volume.read(tmp_path / name)
+    Volume(written.array, rigid(np.eye(3), [0.5, 0, 0]) @ written.ijk_to_ras).write(tmp_path / name)
+    with pytest.raises(SimulationError, match="have been edited"):
+        require_replaceable(tmp_path / name)
+
+
+# ---- a real patient --------------------------------------------------------------------------------------------------
+
+
+@needs_shared
+def test_the_published_glioma_of_a_patient_lies_in_her_head():
+    """ReMIND-022: 799 voxels on the T1's grid (../shared/data)."""
+    mri = Volume.read(SHARED / "remind022" / "t1_contrast.nii.gz")
+    labels = mri.with_array((mri.array > 0.2 * mri.array.max()).astype(np.uint8))
+    glioma = Volume.read(SHARED / "remind022" / "glioma.nii.gz")
+    result = add_tissue(labels, ["brain"], glioma, "tumour", source="glioma.nii.gz")
+    assert result.messages[0].startswith("tumour: 799 voxels, 0.8 ml, added over brain ")
