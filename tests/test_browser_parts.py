@@ -295,7 +295,7 @@ def test_a_section_with_a_value_and_a_button_works_on_the_page_without_further_c
     messages = Messages(shared)
     logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     panel = BrowserPanel(shared, messages, logic, tasks, sections, lambda: None)
-    loading = SimpleNamespace(segment=None, place_probe=None)
+    loading = SimpleNamespace(segment=None, add_tissues=None, place_probe=None)
     buttons = Buttons(shared, tasks, panel.presenter, sections, loading)
     panel.refresh()
     assert shared.now.panel.values["marginSpinBox"] == 2.0 and shared.now.panel.can["extractButton"]
@@ -321,7 +321,7 @@ def test_a_section_with_a_value_and_a_button_works_on_the_page_without_further_c
 def test_what_the_page_does_otherwise_is_there_to_be_done_otherwise():
     names = set(controls.by_widget(panel_sections()))
     assert names.issuperset(page_of.NOT_SHOWN | set(page_of._IN_PAGE))
-    loading = SimpleNamespace(segment=None, place_probe=None)
+    loading = SimpleNamespace(segment=None, add_tissues=None, place_probe=None)
     assert names.issuperset(Buttons(None, None, None, panel_sections(), loading)._own_actions)
 
 

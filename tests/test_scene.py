@@ -791,7 +791,7 @@ def test_parameters_have_the_form_of_slicers_parameter_node_wrapper(bench):
 def test_every_declared_setting_is_remembered_one_by_one_and_together(bench):
     parameters, node = bench.logic.parameters, bench.logic.parameters.node
     assert parameters.segmentation == SegmentationSettings() and parameters.fit == FitSettings()
-    settings = SegmentationSettings("flair", 4, False, True, 2, 0.25)
+    settings = SegmentationSettings("flair", 4, thin_sulci=False, filter_radius=2, filter_epsilon=0.25)
     parameters.segmentation = settings
     assert parameters.segmentation == settings and (parameters.contrast, parameters.filter_epsilon) == ("flair", 0.25)
     assert node.GetParameter("filter_epsilon") == "0.25" and node.GetParameter("thin_sulci") == "False"
