@@ -1,18 +1,30 @@
-"""The brain in an MRI: recognition of what the image shows, and extraction from a whole head."""
+"""The brain in an MRI: as the image shows it, as a program extracts it from a whole head, or as the user gives it."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import cast
 
 import numpy as np
-from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.declaration import parameter_of
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri import extractors
+from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
+from SlicerUSSim.Logic.mri.atlas import mni152
+from SlicerUSSim.Logic.mri.kept_mask import keep, mask_beside as mask_beside, read_kept
+from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML, Shown, above_noise, recognise
+from SlicerUSSim.Logic.mri.refinement import on_grid, refined, signed_distance
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+
+_log = logging.getLogger(__name__)
+
+Report = Callable[[float], None]
+_NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the registered atlas"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,41 +44,155 @@ class BrainMask:
     @property
     def volume_ml(self) -> float:
         """Volume of the mask in millilitres."""
-        return float((self.mask.array > 0).sum() * abs(np.linalg.det(self.mask.ijk_to_ras[:3, :3])) / 1000.0)
+        return _millilitres(self.mask.array > 0, self.mask)
 
 
 def find_brain(
-    mri: Volume,
-    method: str = "auto",
-    *,
-    keep_at: Path | None = None,
-    progress: Callable[[float], None] | None = None,
+    mri: Volume, method: str = "auto", *, keep_at: Path | None = None, progress: Report | None = None
 ) -> BrainMask:
-    """The brain in an MRI of a whole head, or of a brain."""
-    start = perf_counter()
-    inside = _foreground(mri.array)
-    mask = mri.with_array(inside.astype(np.uint8))
-    return BrainMask(mask, "none", "foreground found by Otsu's threshold", seconds=perf_counter() - start)
+    """The brain in an MRI of a whole head, or of a brain.
+
+    Parameters
+    ----------
+    mri : the image, with its orientation and voxel size as in the patient.
+    method : how a brain is extracted from a whole head: "robex", "deepbet", "atlas", or "auto" for the first of them
+        that is installed; "none" takes everything brighter than the background, whatever the image shows.
+    keep_at : file in which the mask of a whole head is kept and from which it is read again; see mask_beside.
+    progress : called with the fraction done, 0 to 1; may raise errors.Cancelled, which ends the extraction at once.
+
+    Raises SimulationError if the image shows neither a head nor a brain, or if no method is available or succeeds.
+    """
+    method = parameter_of(SegmentationSettings, "skull_strip").checked("segmentation", method)
+    start, report = perf_counter(), progress or (lambda share: None)
+    if method == "none":
+        inside = above_noise(mri)
+        mask = mri.with_array(inside.astype(np.uint8))
+        return BrainMask(mask, "none", "everything brighter than the background", (), perf_counter() - start)
+    kept = _kept(keep_at, mri, method) if keep_at is not None else None
+    if kept is not None:
+        return kept
+    shown = recognise(mri, lambda share: report(0.15 * share))
+    if shown.stripped is not None:
+        mask = mri.with_array(shown.stripped.astype(np.uint8))
+        millilitres = _millilitres(shown.stripped, mri)
+        warnings = (*shown.warnings, *_volume_warnings(millilitres))
+        message = f"skull-stripped brain, {millilitres:.0f} ml"
+        return BrainMask(mask, "stripped", message, warnings, perf_counter() - start)
+    inside, used, failures = _extracted(mri, shown, method, lambda share: report(0.15 + 0.85 * share))
+    seconds = perf_counter() - start
+    millilitres = _millilitres(inside, mri)
+    warnings = (*shown.warnings, *failures, *_volume_warnings(millilitres))
+    if keep_at is not None:
+        warnings_kept = warnings
+        _log.info("%s", note := keep(keep_at, mri, inside, used, seconds, warnings_kept))
+        if not note.startswith("the brain mask is kept in"):
+            warnings = (*warnings, note)
+    message = f"whole head: brain extracted by {_NAMES[used]} in {seconds:.0f} s, {millilitres:.0f} ml"
+    report(1.0)
+    return BrainMask(mri.with_array(inside.astype(np.uint8)), used, message, warnings, seconds)
 
 
 def given_brain(mask: Volume, mri: Volume) -> BrainMask:
-    """The mask that a user gives. Raises SimulationError if it is empty or on another grid."""
+    """The mask that a user gives. Raises SimulationError if it is empty, on another grid, or covers everything."""
     require(
         mask.array.shape == mri.array.shape and np.allclose(mask.ijk_to_ras, mri.ijk_to_ras, atol=1e-3),
         f"mask has shape {mask.array.shape} and the MRI {mri.array.shape}, expected the same grid; resample the mask",
     )
     inside = mask.array > 0
     require(bool(inside.any()), "mask is empty, expected at least one voxel inside")
-    found = BrainMask(mri.with_array(inside.astype(np.uint8)), "given", "")
-    return BrainMask(found.mask, "given", f"brain mask as given, {found.volume_ml:.0f} ml")
+    share = float(inside.mean())
+    require(
+        share < 0.98, f"mask covers {share:.0%} of the image, expected the brain only; --skull-strip none needs no mask"
+    )
+    return BrainMask(
+        mri.with_array(inside.astype(np.uint8)), "given", f"brain mask as given, {_millilitres(inside, mri):.0f} ml"
+    )
 
 
-def _foreground(intensity: np.ndarray) -> np.ndarray:
-    from skimage.filters import threshold_otsu
+def left_out(mask: Volume, lesion: Volume) -> float:
+    """Share of a lesion's volume (non-zero voxels, on any grid) that a brain mask leaves out, 0 to 1.
 
-    inside = intensity > 0.5 * threshold_otsu(intensity)  # half: Otsu's threshold itself would exclude CSF in T1
-    # Casts: the return types of scipy's functions depend on their arguments, without type annotations for that.
-    components, count = cast(tuple[np.ndarray, int], ndimage.label(inside))
-    if count > 1:
-        inside = components == np.argmax(np.bincount(components.ravel())[1:]) + 1
-    return cast(np.ndarray, ndimage.binary_fill_holes(inside))
+    Raises SimulationError if the lesion is empty.
+    """
+    inside = lesion.array > 0
+    require(bool(inside.any()), "lesion is empty, expected at least one voxel inside")
+    return float((on_grid(mask.with_array(mask.array > 0), lesion)[inside] < 0.5).mean())
+
+
+def _extracted(mri: Volume, shown: Shown, method: str, report: Report) -> tuple[np.ndarray, str, tuple[str, ...]]:
+    """((k, j, i) True inside, the method, what others failed with)."""
+    failures: list[str] = []
+    for name in _candidates(method):
+        try:
+            inside = _by(name, mri, shown.alignment, report)
+        except Cancelled:
+            raise
+        except SimulationError as error:
+            if method != "auto":
+                raise
+            failures.append(str(error))
+            continue
+        millilitres = _millilitres(inside, mri)
+        if POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1]:
+            return inside, name, tuple(failures)
+        failures.append(
+            f"{_NAMES[name]} found {millilitres:.0f} ml, expected {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml"
+        )
+    raise SimulationError(f"no brain was found in this head: {'; '.join(failures)}; give a brain mask (--mask)")
+
+
+def _candidates(method: str) -> list[str]:
+    if method != "auto":
+        return [method]
+    available = {
+        "robex": extractors.robex_folder() is not None,
+        "deepbet": extractors.has_deepbet(),
+        "atlas": mni152() is not None,
+    }
+    found = [name for name, is_available in available.items() if is_available]
+    require(
+        bool(found),
+        "image shows a whole head, and no program for brain extraction is installed; install one with: "
+        "pip install SlicerUSSim[head], or give a brain mask (--mask)",
+    )
+    return found
+
+
+def _by(name: str, mri: Volume, alignment: Alignment | None, report: Report) -> np.ndarray:
+    """The brain by one method, with its border moved to the dark valley outside the cortex."""
+    if name == "atlas":
+        if alignment is None:
+            require(mni152() is not None, "the brain atlas needs nilearn; install it with: pip install nilearn")
+            alignment = align_template(mri, progress=lambda share: report(0.5 * share))
+        return refined(mri, alignment.brain_on(mri), core_mm=8.0, reach_mm=12.0, keeps=False)
+    program = extractors.robex if name == "robex" else extractors.deepbet
+    inside = program(mri, lambda share: report(0.9 * share))
+    require(bool(inside.any()), f"{_NAMES[name]} found no brain")
+    return refined(mri, signed_distance(inside, mri.spacing_mm, 20.0), core_mm=6.0, reach_mm=12.0, keeps=True)
+
+
+def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
+    kept = read_kept(path, mri, method)
+    if kept is None:
+        return None
+    millilitres = _millilitres(kept.inside, mri)
+    if kept.is_edited:
+        message = f"whole head: brain mask as edited in {kept.path}, {millilitres:.0f} ml"
+    else:
+        by = _NAMES.get(kept.method, kept.method)
+        message = f"whole head: brain mask kept in {kept.path}, by {by} in {kept.seconds:.0f} s, {millilitres:.0f} ml"
+    mask = mri.with_array(kept.inside.astype(np.uint8))
+    return BrainMask(mask, "given" if kept.is_edited else kept.method, message, kept.warnings, 0.0)
+
+
+def _volume_warnings(millilitres: float) -> tuple[str, ...]:
+    if USUAL_ML[0] <= millilitres <= USUAL_ML[1]:
+        return ()
+    return (
+        f"the brain has {millilitres:.0f} ml, expected {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml of an adult; "
+        "check the mask",
+    )
+
+
+def _millilitres(inside: np.ndarray, grid: Volume) -> float:
+    return float(inside.sum() * abs(np.linalg.det(grid.ijk_to_ras[:3, :3])) / 1000.0)

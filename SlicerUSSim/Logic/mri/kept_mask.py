@@ -1,0 +1,145 @@
+"""Brain masks kept beside their MRI, so that a brain is extracted once."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.files import make_folder, written_whole
+from SlicerUSSim.Logic.base.version import __version__
+from SlicerUSSim.Logic.base.volume import Volume, read_itk_image
+
+_log = logging.getLogger(__name__)
+
+_PREFIX = "ussim_"
+_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti", ".dcm", ".mgz", ".img", ".hdr")
+
+
+@dataclass(frozen=True, eq=False)
+class KeptMask:
+    """A mask that was read from its file."""
+
+    inside: np.ndarray
+    method: str
+    seconds: float
+    #: Whether somebody changed its voxels since it was written
+    is_edited: bool
+    path: Path
+    warnings: tuple[str, ...] = ()
+
+
+def mask_beside(mri_path: str | Path) -> Path:
+    """The file of an MRI's brain mask: head.nii.gz has head.brain-mask.nrrd, a DICOM folder the same beside it."""
+    path = Path(mri_path)
+    if path.is_dir():
+        path = path.resolve()  # "." has no name
+    name = path.name
+    suffix = next((end for end in _SUFFIXES if not path.is_dir() and name.lower().endswith(end)), "")
+    return path.with_name(f"{name[: len(name) - len(suffix)]}.brain-mask.nrrd")
+
+
+def read_kept(path: Path, mri: Volume, method: str) -> KeptMask | None:
+    """The mask kept for this MRI and method; None if there is none, or it belongs to another image or method."""
+    fingerprint = fingerprint_of(mri)
+    for place in (path, _in_cache(path, fingerprint)):
+        kept = _read(place, mri, method, fingerprint)
+        if kept is not None:
+            return kept
+    return None
+
+
+def keep(path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: float, warnings: tuple[str, ...]) -> str:
+    """Write the mask to `path`, or to the user's cache folder if that cannot be written; returns one line about it.
+
+    A file that was not written by this function is never replaced.
+    """
+    if path.exists() and not _is_ours(path):
+        return f"{path} was not written by ussim and stays as it is; the brain mask is not kept"
+    mask = mri.with_array(inside.astype(np.uint8))
+    entries = {
+        "mri": fingerprint_of(mri), "mask": _hash(mask.array), "method": method, "seconds": f"{seconds:.1f}",
+        "version": __version__, "warnings": " | ".join(warnings),
+    }  # fmt: skip
+    try:
+        _write(path, mask, entries)
+        return f"the brain mask is kept in {path}"
+    except SimulationError as error:
+        _log.info("the mask cannot be kept beside the MRI: %s", error)
+    place = _in_cache(path, entries["mri"])
+    try:
+        make_folder(place.parent)
+        _write(place, mask, entries)
+    except SimulationError as error:
+        return f"the brain mask cannot be kept: {error}"
+    return f"the brain mask is kept in {place}, since {path.parent} cannot be written"
+
+
+def fingerprint_of(mri: Volume) -> str:
+    """A hash of voxels and geometry. Rounded, so that it survives the formats in which an MRI is stored."""
+    return _hash(mri.array.astype(np.float32)) + _hash(np.round(mri.ijk_to_ras, 3) + 0.0)
+
+
+def _hash(array: np.ndarray) -> str:
+    digest = hashlib.sha256(str(array.shape).encode())
+    digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _in_cache(path: Path, fingerprint: str) -> Path:
+    import platformdirs
+
+    return Path(platformdirs.user_cache_dir("ussim", appauthor=False)) / "brain-masks" / f"{fingerprint}-{path.name}"
+
+
+def _write(path: Path, mask: Volume, entries: dict[str, str]) -> None:
+    import SimpleITK as sitk
+
+    image = mask.to_sitk()
+    for name, value in entries.items():
+        image.SetMetaData(_PREFIX + name, value)
+    with written_whole(path) as partial:
+        sitk.WriteImage(image, str(partial), useCompression=True)
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        return read_itk_image(path).HasMetaDataKey(f"{_PREFIX}mask")
+    except SimulationError:
+        return False
+
+
+def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | None:
+    if not path.is_file():
+        return None
+    try:
+        image = read_itk_image(path)
+        mask = Volume.from_sitk(image, str(path))
+    except SimulationError as error:
+        _log.warning("%s", error)
+        return None
+    entries = {
+        key.removeprefix(_PREFIX): image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith(_PREFIX)
+    }
+    if entries.get("mri") != fingerprint or mask.array.shape != mri.array.shape:
+        _log.info("%s: is not used, since it was made for another image", path)
+        return None
+    inside = mask.array > 0
+    is_edited = entries.get("mask") != _hash(inside.astype(np.uint8))
+    made_by = entries.get("method", "")
+    if not is_edited and method not in ("auto", made_by):
+        _log.info("%s: is not used, since it was made by %s", path, made_by)
+        return None
+    if not inside.any():
+        _log.warning("%s: is empty and is not used", path)
+        return None
+    try:
+        seconds = float(entries.get("seconds", "0"))
+    except ValueError:
+        seconds = 0.0
+    warnings = tuple(line for line in entries.get("warnings", "").split(" | ") if line)
+    return KeptMask(inside, made_by, seconds, is_edited, path, () if is_edited else warnings)

@@ -1,0 +1,69 @@
+"""How a head lies that the atlas does not fit: axes turned or flipped, or a wrong voxel size, in its header."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse
+
+_ENDS = ("RL", "AP", "SI")
+_NAMES = {"R": "right", "L": "left", "A": "front", "P": "back", "S": "top", "I": "bottom"}
+
+
+def how_it_lies(image: CoarseImage, alignment: Alignment, least: float, remedy: str) -> str:
+    """One line: what the image is, where the head lies in another way than its header says, or that there is none."""
+    size = " x ".join(f"{n * image.spacing_mm:.0f}" for n in image.array.shape[::-1])
+    found = (
+        f"no head or brain is recognised in this {size} mm image (agreement with the atlas {alignment.agreement:.2f}"
+    )
+    best, turn = 0.0, np.eye(3)
+    for candidate in _turns():
+        other = align_coarse(image, turn=candidate, quick=True)
+        if other.agreement > best:
+            best, turn = other.agreement, candidate
+    if best >= max(least, 1.3 * alignment.agreement):
+        return (
+            f"the head does not lie as the header says: {_described(turn)} (agreement with the atlas {best:.2f}, "
+            f"in the header's orientation {alignment.agreement:.2f}); correct the header, or {remedy}"
+        )
+    for factors in _sizes():
+        wrong = CoarseImage(image.array, image.origin, image.spacing_mm)
+        other = align_coarse(wrong, turn=np.diag(factors), quick=True)
+        if other.agreement >= max(least, 1.3 * alignment.agreement):
+            words = ", ".join(
+                f"{f:g} times in {axis}"
+                for f, axis in zip(factors, ("width", "length", "height"), strict=True)
+                if f != 1
+            )
+            return f"the head has a wrong size: {words} of an adult's; check the voxel size in the header, or {remedy}"
+    return f"{found}, expected {least:g} or more); {remedy}"
+
+
+def _turns() -> list[np.ndarray]:
+    """Signed permutations but the identity; left and right cannot be told, so that one of each pair is enough."""
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[list(order), range(3)] = signs
+            if np.linalg.det(matrix) > 0 and not np.allclose(matrix, np.eye(3)):
+                found.append(matrix)
+    return found
+
+
+def _sizes() -> list[tuple[float, float, float]]:
+    return [(0.5, 0.5, 0.5), (2.0, 2.0, 2.0), (1.0, 1.0, 2.0), (1.0, 1.0, 0.5), (1.0, 2.0, 1.0), (1.0, 0.5, 1.0),
+            (2.0, 1.0, 1.0), (0.5, 1.0, 1.0)]  # fmt: skip
+
+
+def _described(turn: np.ndarray) -> str:
+    """Where the top and the front of the head point, in the header's words."""
+    words = []
+    for axis, name in ((2, "top"), (1, "face")):
+        towards = turn[:, axis]
+        row = int(np.abs(towards).argmax())
+        letter = _ENDS[row][0 if towards[row] > 0 else 1]
+        words.append(f"its {name} is where the header says {_NAMES[letter]}")
+    return " and ".join(words)

@@ -1,0 +1,189 @@
+"""What an image shows: a skull-stripped brain, a whole head, or something else, which is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse
+from SlicerUSSim.Logic.mri.atlas import mni152
+from SlicerUSSim.Logic.mri.orientation import how_it_lies
+
+#: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
+USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
+#: Least agreement with the template (Alignment.agreement). Heads and brains that were tried had 0.19 (proton density)
+#: to 0.88; CT, bodies, phantoms, and heads that lie wrongly 0.00 to 0.14.
+LEAST_AGREEMENT = 0.16
+#: Share of the template's brain that must show tissue, and below which a user should look
+_LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
+_REMEDY = "give a brain mask (--mask), or --skull-strip none to take everything brighter than the background"
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What an image shows."""
+
+    #: (k, j, i) True in the brain of a skull-stripped image; None for a whole head
+    stripped: np.ndarray | None
+    #: None without the atlas, or where it was not needed
+    alignment: Alignment | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> Shown:
+    """What the image shows. Raises SimulationError, saying what was found, if it is neither a brain nor a head."""
+    report = progress or (lambda share: None)
+    _check_values(mri)
+    brain = _on_constant_background(mri)
+    report(0.1)
+    if brain is not None:
+        return Shown(brain)
+    image = CoarseImage.of(mri)
+    _check_size(image)
+    if mni152() is None:
+        return Shown(None, warnings=("without nilearn it is not checked that the image shows a head",))
+    alignment = align_coarse(image, progress=lambda share: report(0.1 + 0.9 * share))
+    if alignment.agreement < LEAST_AGREEMENT:
+        raise SimulationError(how_it_lies(image, alignment, LEAST_AGREEMENT, _REMEDY))
+    return _head(mri, image, alignment)
+
+
+def _check_values(mri: Volume) -> None:
+    values = mri.array
+    if np.issubdtype(values.dtype, np.floating):
+        bad = int(values.size - np.isfinite(values).sum())
+        require(bad == 0, f"MRI has {bad} voxels that are not finite numbers, expected none")
+    low, high = float(values.min()), float(values.max())
+    require(high > low, f"MRI is constant ({low:g}), expected different intensities")
+    sample = np.unique(values[::3, ::3, ::3])
+    require(
+        len(sample) > 12,
+        f"MRI has only {len(sample)} different values, as a mask or label map has, expected the intensities of an MRI",
+    )
+    air = float(np.percentile(values[::3, ::3, ::3], 5.0))
+    require(
+        not (low <= -900.0 and air < -500.0),
+        f"image has values from {low:g} to {high:g}, as CT has (Hounsfield units; air is -1000), expected an MRI",
+    )
+
+
+def _on_constant_background(mri: Volume) -> np.ndarray | None:
+    """(k, j, i) the brain of a skull-stripped image; None if it is not one.
+
+    Its background has exactly one value, and its foreground the volume and the shape of a brain, without a skull.
+    """
+    values = mri.array
+    border = np.concatenate([values[[0, -1]].ravel(), values[:, [0, -1]].ravel(), values[:, :, [0, -1]].ravel()])
+    levels, counts = np.unique(border, return_counts=True)
+    background = levels[counts.argmax()]
+    if counts.max() < 0.5 * border.size or (values == background).mean() < 0.15:
+        return None
+    inside = _largest(values != background)
+    inside = ndimage.binary_fill_holes(inside)
+    millilitres = inside.sum() * _voxel_ml(mri)  # type: ignore[union-attr]
+    if not POSSIBLE_ML[0] <= millilitres <= 2300.0:
+        return None
+    coarse = CoarseImage.of(mri.with_array(np.where(inside, 1.0, 0.0).astype(np.float32)))
+    intensity = CoarseImage.of(mri.with_array(np.where(inside, values - values.min(), 0).astype(np.float32)))
+    shape = coarse.array > 0.5
+    return inside if _is_brain_shaped(shape) and _has_tissues(intensity.array, shape) else None
+
+
+def _is_brain_shaped(shape: np.ndarray) -> bool:
+    """Whether the principal axes and their ellipsoid fit: a brain is longer than wide and fills its ellipsoid."""
+    points = np.argwhere(shape).astype(float)
+    points -= points.mean(axis=0)
+    variances, axes = np.linalg.eigh(points.T @ points / len(points))
+    deviations = np.sqrt(variances)
+    # Of MNI152, Colin27, three patients and the synthetic phantom: 1.15 to 1.33, 1.21 to 1.45.
+    if not (1.06 <= deviations[2] / deviations[1] <= 1.7 and 1.1 <= deviations[2] / deviations[0] <= 2.0):
+        return False
+    radius = np.sqrt((((points @ axes) / deviations) ** 2).sum(axis=1))
+    filled = float((radius <= np.sqrt(5.0)).mean())  # of the voxels, in the ellipsoid of the same second moments
+    return filled >= 0.86
+
+
+def _has_tissues(intensity: np.ndarray, shape: np.ndarray) -> bool:
+    """Whether intensities inside vary as tissues do, and there is no skull: no dark shell below a brighter surface."""
+    depth = 4.0 * ndimage.distance_transform_edt(shape)  # type: ignore[operator]
+    smooth = ndimage.gaussian_filter(intensity, 1.0)
+    deep = smooth[depth > 12.0]
+    if deep.size < 100:
+        return False
+    low, middle, high = np.percentile(deep, (5, 50, 95))
+    if high - low < 0.08 * middle:
+        return False
+    profile = np.array([np.median(smooth[(depth > d) & (depth <= d + 4.0)]) for d in np.arange(0.0, 32.0, 4.0)])
+    notch = max(min(profile[:n].max(), profile[n + 1 :].max()) - profile[n] for n in range(1, len(profile) - 1))
+    return bool(notch < 0.25 * profile.max())
+
+
+def _check_size(image: CoarseImage) -> None:
+    inside = image.foreground()
+    millilitres = inside.sum() * image.spacing_mm**3 / 1000.0
+    extent = np.ptp(np.argwhere(inside), axis=0)[::-1] * image.spacing_mm
+    size = " x ".join(f"{mm:.0f}" for mm in extent)
+    require(
+        millilitres >= 900.0 and extent.max() >= 110.0,
+        f"image shows {millilitres:.0f} ml of tissue in {size} mm, too little for a head; check the voxel size in its "
+        f"header, or {_REMEDY}",
+    )
+
+
+def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
+    """A whole head, or a brain on a background with noise; in half of one there is nothing to extract."""
+    counts = image.array.shape
+    grid = Volume(np.zeros(counts, np.uint8), _matrix(image))
+    pad = 40
+    wide = Volume(np.zeros([n + 2 * pad for n in counts], np.uint8), grid.ijk_to_ras @ _shift(-pad))
+    distance = alignment.brain_on(wide)
+    tissue = np.pad(image.foreground(), pad)
+    brain = distance < -4.0
+    shown = float(tissue[brain].mean())
+    require(
+        shown >= _LEAST_SHOWN,
+        f"image shows only {shown:.0%} of a brain, expected a whole one; use a series of the whole head, or {_REMEDY}",
+    )
+    warnings = ()
+    if shown < _USUAL_SHOWN:
+        warnings = (f"the image shows only {shown:.0%} of the brain; the rest is outside its field of view",)
+    # In a head, scalp and muscle lie around the brain. The foreground of a stripped brain ends with it.
+    around = (distance > 8.0) & (distance < 24.0)
+    bright = float((np.pad(image.array, pad)[around] > 0.25 * np.median(np.pad(image.array, pad)[brain])).mean())
+    if bright < 0.06:
+        return Shown(above_noise(mri), alignment, warnings)
+    return Shown(None, alignment, warnings)
+
+
+def above_noise(mri: Volume) -> np.ndarray:
+    """(k, j, i) True where the image is brighter than its background: the largest component, without holes."""
+    from skimage.filters import threshold_otsu
+
+    # Half: Otsu's threshold itself would exclude CSF in T1.
+    return ndimage.binary_fill_holes(_largest(mri.array > 0.5 * threshold_otsu(mri.array)))  # type: ignore[return-value]
+
+
+def _largest(inside: np.ndarray) -> np.ndarray:
+    components, count = ndimage.label(inside)  # type: ignore[misc]
+    return inside if count < 2 else components == np.argmax(np.bincount(components.ravel())[1:]) + 1
+
+
+def _voxel_ml(volume: Volume) -> float:
+    return float(abs(np.linalg.det(volume.ijk_to_ras[:3, :3])) / 1000.0)
+
+
+def _matrix(image: CoarseImage) -> np.ndarray:
+    matrix = np.diag([image.spacing_mm] * 3 + [1.0])
+    matrix[:3, 3] = image.origin
+    return matrix
+
+
+def _shift(voxels: int) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = voxels
+    return matrix

@@ -1,0 +1,117 @@
+"""The border of a brain mask, moved to the dark valley between cortex and scalp."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.alignment import resampled_to_ras
+
+_SPACING_MM = 1.2
+#: Brightness, relative to the brain nearby, between tissue and the skull or CSF of a T1
+_TISSUE = 0.6
+
+
+def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: float, keeps: bool) -> np.ndarray:
+    """(k, j, i) True in the brain.
+
+    `distance` is the signed distance to a first mask in mm on the MRI's grid, negative inside. What is deeper than
+    `core_mm` is brain, what is further out than `reach_mm` is not. Between them a watershed on the brightness, after
+    division by that of the brain nearby (bias field), puts the border into the darkest valley (Hahn and Peitgen, MICCAI
+    2000); darker tissue than grey matter is then taken off outside, and sulci are closed. `keeps`: what the first mask
+    has on this side of the valley stays.
+    """
+    from skimage.segmentation import watershed
+
+    image, origin = resampled_to_ras(mri, _SPACING_MM)
+    matrix = np.diag([_SPACING_MM] * 3 + [1.0])
+    matrix[:3, 3] = origin
+    # Outside the field of view there is no brain.
+    far = on_grid(mri.with_array(distance), Volume(image, matrix), outside=reach_mm + 6.0)
+    box = _box(far <= reach_mm + 6.0)
+    image, far = image[box], far[box]
+    mm = _SPACING_MM
+    core = far < -core_mm
+    air = float(np.percentile(image, 1.0))
+    tissue = np.median(image[core]) - air
+    level = _level(image - air, core, tissue)
+    brightness = ndimage.gaussian_filter(np.clip((image - air) / level, 0.0, 1.3), 0.5)
+    markers = np.where(core, 1, np.where(far > reach_mm, 2, 0)).astype(np.int32)
+    region = watershed(-brightness, markers, mask=far <= reach_mm + 3.0) == 1
+    bright = region & (brightness > _TISSUE)
+    ball = _ball(2.0 / mm)
+    opened = _connected(ndimage.binary_erosion(bright, ball) | core, core)
+    brain = ndimage.binary_dilation(opened, _ball(3.0 / mm)) & bright
+    if keeps:
+        brain |= region & (far <= 0.0)
+    brain = _closed(brain | core, 5.0 / mm) & region
+    brain = ndimage.binary_fill_holes(brain)
+    smooth = ndimage.gaussian_filter(brain.astype(np.float32), 0.8)
+    matrix[:3, 3] += mm * np.array([part.start for part in box][::-1])
+    return on_grid(Volume(smooth, matrix), mri) > 0.5
+
+
+def _level(values: np.ndarray, core: np.ndarray, tissue: float) -> np.ndarray:
+    """(k, j, i) brightness of the brain nearby: the bias field times that of tissue, continued beyond the core."""
+    step, deviation = 4, 15.0 / _SPACING_MM / 4
+    some = values[::step, ::step, ::step]
+    weight = (core[::step, ::step, ::step] & (np.abs(some - tissue) < 0.5 * tissue)).astype(np.float32)
+    weight += 1e-6 * core[::step, ::step, ::step]
+    near = ndimage.gaussian_filter(weight, deviation, truncate=6.0)
+    level = ndimage.gaussian_filter(weight * some, deviation, truncate=6.0) / np.maximum(near, 1e-9)
+    level = np.where(near > 1e-6, level, tissue)
+    wide = ndimage.zoom(level, step, order=1, grid_mode=True, mode="nearest")
+    padding = [(0, max(0, n - m)) for n, m in zip(values.shape, wide.shape, strict=True)]
+    wide = np.pad(wide, padding, mode="edge")[tuple(slice(n) for n in values.shape)]
+    return np.maximum(wide, 0.2 * tissue)
+
+
+def on_grid(volume: Volume, grid: Volume, outside: float = 0.0) -> np.ndarray:
+    """(k, j, i) float32 values of the volume on another grid, by linear interpolation; `outside` beyond it."""
+    matrix = volume.ras_to_ijk @ grid.ijk_to_ras
+    return ndimage.affine_transform(
+        volume.array.astype(np.float32), matrix[:3, :3][::-1, ::-1], matrix[:3, 3][::-1], grid.array.shape,
+        output=np.float32, order=1, mode="constant",
+ cval=outside,
+    )  # fmt: skip
+
+
+def signed_distance(inside: np.ndarray, spacing_mm: np.ndarray, most_mm: float) -> np.ndarray:
+    """(k, j, i) float32 distance to the border of `inside`, negative in it, in a box that reaches `most_mm` outside."""
+    box = _box(inside, [int(np.ceil(most_mm / size)) + 1 for size in spacing_mm[::-1]])
+    result = np.full(inside.shape, most_mm, np.float32)
+    part = inside[box]
+    outer = ndimage.distance_transform_edt(~part, spacing_mm[::-1])
+    inner = ndimage.distance_transform_edt(part, spacing_mm[::-1])
+    result[box] = np.minimum(outer - inner, most_mm)  # type: ignore[operator]
+    return result
+
+
+def _box(inside: np.ndarray, margin=(0, 0, 0)) -> tuple[slice, ...]:
+    slices = ndimage.find_objects(inside.astype(np.uint8))[0]
+    return tuple(
+        slice(max(part.start - more, 0), min(part.stop + more, size))
+        for part, more, size in zip(slices, margin, inside.shape, strict=True)
+    )
+
+
+def _ball(radius: float) -> np.ndarray:
+    n = int(radius)
+    z, y, x = np.mgrid[-n : n + 1, -n : n + 1, -n : n + 1]
+    return x * x + y * y + z * z <= radius * radius
+
+
+def _closed(inside: np.ndarray, radius: float) -> np.ndarray:
+    """Closing with a ball, by distances, which is quick for large balls."""
+    n = int(radius) + 2
+    padded = np.pad(inside, n)
+    grown = ndimage.distance_transform_edt(~padded) <= radius  # type: ignore[operator]
+    return (ndimage.distance_transform_edt(grown) > radius)[n:-n, n:-n, n:-n]  # type: ignore[operator]
+
+
+def _connected(inside: np.ndarray, core: np.ndarray) -> np.ndarray:
+    components, _ = ndimage.label(inside)  # type: ignore[misc]
+    counts = np.bincount(components[core])
+    counts[0] = 0
+    return components == counts.argmax()
