@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.mri import add_tissue, add_tissues
 from SlicerUSSim.Logic.mri.pathology import texture_below
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import pose_looking_at
-from SlicerUSSim.Logic.tissue.label_files import require_replaceable, write_label_files
+from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
 from SlicerUSSim.Logic.tissue.names import tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
 

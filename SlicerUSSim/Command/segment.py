@@ -36,7 +36,7 @@ def segment(
     """Segment a skull-stripped brain MRI into tissues."""
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
-    from SlicerUSSim.Logic.tissue.label_files import require_replaceable, write_label_files
+    from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
     from SlicerUSSim.Logic.tissue.table import TissueTable
 
     check_output(out)

@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, slice_under_probe
-from SlicerUSSim.Logic.tissue.label_files import require_replaceable, write_label_files
+from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.pose_files import write_pose
 
