@@ -3,7 +3,7 @@
 Numbers and names are those of FreeSurfer's FreeSurferColorLUT.txt
 (https://surfer.nmr.mgh.harvard.edu/fswiki/FsTutorial/AnatomicalROI/FreeSurferColorLUT, version of FreeSurfer 8):
 structures in the brain, subfields of hippocampus and hypothalamus, lobules of the cerebellum, and those around the
-brain whose tissue is known. Left out: 500 to 558, subfields of the hippocampus that other programs use for bone and skin.
+brain whose tissue is known. Left out: 500 to 558, parts of the hippocampus, which other programs use for bone and skin.
 """
 
 from __future__ import annotations
