@@ -203,7 +203,7 @@ class _Reading:
         unknown = [label for label in self._present if self._tissue(label, self._names.get(label)) is None]
         if not unknown or (self._names and len(unknown) < len(self._present)):
             return None
-        recognition = recognised(self._volume, self._present)
+        recognition = recognised(self._volume, unknown)
         if recognition.is_mirrored:
             self._warnings.append(
                 f"{self._source}: labels of the left side are on the right; check the orientation in its header"

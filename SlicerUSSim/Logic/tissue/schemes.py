@@ -21,6 +21,8 @@ from SlicerUSSim.Logic.tissue.names import same_name
 _AGREEING, _FEWEST = 0.85, 3
 #: Share of a file's labels that a scheme has to know.
 _KNOWN = 0.85
+#: The same if the places of structures leave no doubt; the other labels are then listed as unknown.
+_KNOWN_IF_SURE = 0.6
 #: Pairs of left and right that leave no doubt about FreeSurfer's numbers; or regions of the cortex
 _SURE = 8
 #: Share of a volume that has to be outside a brain to tell how deep its tissues are
@@ -99,14 +101,15 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
     centres = _centres(labels)
     fits: list[tuple[int, Scheme]] = []
     for scheme in schemes().values():
-        if not scheme.order or np.mean([value in scheme.names for value in values]) < _KNOWN:
+        known = np.mean([value in scheme.names for value in values])
+        if not scheme.order or known < _KNOWN_IF_SURE:
             continue
         holds, count = _agreement(scheme.order, centres)
         if scheme.key == "freesurfer":
-            recognition = _freesurfer(scheme, values, holds, count)
+            recognition = _freesurfer(scheme, values, holds, count, float(known))
             if recognition is not None:
                 return recognition
-        elif count >= _FEWEST and holds >= _AGREEING * count:
+        elif known >= _KNOWN and count >= _FEWEST and holds >= _AGREEING * count:
             fits.append((holds, scheme))
     if not fits:
         return _of_brain(labels, values)
@@ -117,7 +120,7 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
     return Recognition(best[0])
 
 
-def _freesurfer(scheme: Scheme, values: list[int], holds: int, count: int) -> Recognition | None:
+def _freesurfer(scheme: Scheme, values: list[int], holds: int, count: int, known: float) -> Recognition | None:
     """FreeSurfer's numbers, if enough pairs of a left and a right structure lie as they should, or all are mirrored."""
     usual = np.mean([freesurfer.is_usual(value) for value in values])
     if count >= _SURE and count - holds >= _AGREEING * count:
@@ -125,7 +128,7 @@ def _freesurfer(scheme: Scheme, values: list[int], holds: int, count: int) -> Re
     if holds < _AGREEING * count:
         return None
     regions = sum(map(freesurfer.is_region, values))
-    is_sure = count >= _SURE or (usual >= _KNOWN and (count >= 2 or regions >= _SURE))
+    is_sure = count >= _SURE or (min(usual, known) >= _KNOWN and (count >= 2 or regions >= _SURE))
     return Recognition(scheme) if is_sure else None
 
 
