@@ -14,6 +14,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -27,29 +28,6 @@ LARGEST_LABEL = 99_999
 _LONGEST_LIST = 12
 #: Tissues of a lesion, which alone are no patient
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
-
-
-@dataclass(frozen=True)
-class Advice:
-    """What a user can do about a label map, in the words of one door."""
-
-    #: About labels without a tissue; {label} is one of them
-    unknown: str = "map them with --map {label}=TISSUE (0 removes a label), a .json file, or a table of names"
-    #: About a mask or lesion without a patient; {tissue}, {source} and {label} are those of the label map
-    lesion: str = "add it to a segmentation with --add {tissue}={source}, or allow it with --map {label}={tissue}"
-    #: About numbers that several programs use; {key} is one of them
-    ambiguous: str = "say which with --map {key}"
-    #: About voxels without a label between organs
-    between: str = "--map 0=fat gives it a tissue"
-
-
-COMMAND = Advice()
-SCENE = Advice(
-    "rename them, or give the label map colours with the names of its structures",
-    "add it to a segmentation as a segment",
-    "give the label map colours with the names of its structures",
-    "a segment below all others gives it a tissue",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +60,7 @@ def read_label_map(
     source: str = "label map",
     tissues: TissueTable | None = None,
     by_number: TissueTable | None = None,
+    renumber: bool = False,
     advice: Advice = COMMAND,
 ) -> LabelledTissues:
     """The tissues of a label map: by the user's mapping, by names, by a table, or by the numbers of a known program.
@@ -95,6 +74,7 @@ def read_label_map(
     tissues : tissues that are known by their names before the presets, and the membrane; default: of the brain.
     by_number : a table made for this label map; used for labels without a name. If it has every label, and there are
         no names, labels are not renumbered.
+    renumber : renumber them also then, from 1.
     advice : remedies in messages.
 
     Raises SimulationError for numbers that are no labels, labels without a tissue, which it lists, numbers that fit
@@ -114,7 +94,7 @@ def read_label_map(
         as_whole(volume, source), names or {}, mapping or LabelMapping(), source,
         tissues or by_number or TissueTable.brain(), by_number, advice,
     )  # fmt: skip
-    found = reading.unchanged() or reading.by_tissue()
+    found = (None if renumber else reading.unchanged()) or reading.by_tissue()
     _log.info("%s: %s: %s", source, found.message, ", ".join(name for name in found.names if name))
     return found
 
@@ -259,7 +239,7 @@ class _Reading:
         if mine == set(names):
             return
         first = next(label for label in self._present if label not in mine)
-        size = f"{self._labels()}, {self._volume_ml(self._present):.3g} ml"
+        size = f"{self._labels()}, {self._size(self._present)}"
         known = [None if tissue is None else tissue.name for tissue in found.values()]
         name = names[first]
         if len(names) == 1 and (known[0] is None or (name is not None and _is_nearest(name))):
@@ -284,17 +264,14 @@ class _Reading:
         if not unknown:
             return
         listed = _listed(
-            (f"{names[label]!r} ({label}, " if names[label] else f"{label} (") + f"{self._volume_ml([label]):.3g} ml)"
+            repr(names[label] or f"label {label}")
+            + (f" ({self._label_and_size(label)})" if self._advice.gives_sizes else "")
             for label in unknown
         )
         remedy = self._advice.unknown.format(label=unknown[0])
-        all_of = "no program's numbers are recognised, and " if len(unknown) == len(self._present) else ""
-        have = "have" if len(unknown) > 1 else "has"
-        plural = "s" if len(unknown) > 1 else ""
-        raise SimulationError(
-            f"{self._source}: {all_of}label{plural} {listed} {have} no tissue; {remedy}; tissues: "
-            f"{', '.join(dict.fromkeys([*self._tissues.names()[1:], *TISSUES]))}"
-        )
+        nothing = "no program's numbers are recognised, and " if len(unknown) == len(self._present) else ""
+        known = ", ".join(dict.fromkeys([*self._tissues.names()[1:], *TISSUES]))
+        raise SimulationError(f"{self._source}: {nothing}no tissue is called {listed}; {remedy}: {known}")
 
     def _say_doubts(
         self, scheme: Scheme | None, names: Mapping[int, str | None], found: Mapping[int, Tissue | None]
@@ -317,6 +294,14 @@ class _Reading:
                 f"{self._source}: {share:.0%} of the volume has no label and is the coupling medium, also between the "
                 f"organs; {self._advice.between}"
             )
+
+    def _label_and_size(self, label: int) -> str:
+        number = f"{label}, " if label in self._names else ""
+        return f" ({number}{self._size([label])})" if self._advice.gives_sizes else ""
+
+    def _size(self, labels: list[int]) -> str:
+        size_ml = self._volume_ml(labels)
+        return f"{size_ml:.0f} ml" if size_ml >= 10 else f"{size_ml:.2g} ml"
 
     def _volume_ml(self, labels: list[int]) -> float:
         return float(self._counts[labels].sum() * abs(np.linalg.det(self._volume.ijk_to_ras[:3, :3])) / 1e3)

@@ -10,9 +10,10 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_files import names_of_file
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
-from SlicerUSSim.Logic.tissue.label_maps import COMMAND, Advice, LabelledTissues, as_whole, read_label_map
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole, read_label_map
 from SlicerUSSim.Logic.tissue.probability_maps import combined_probability_maps
 from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 

@@ -190,7 +190,7 @@ def _is_grey_between(labels: Volume) -> bool:
     thin = array[::step, ::step, ::step]
     if np.mean(thin == 0) < _OUTSIDE:
         return True  # a part of a brain
-    depth = ndimage.distance_transform_edt(thin > 0)
+    depth = np.asarray(ndimage.distance_transform_edt(thin > 0))
     return float(depth[thin == 3].mean()) > float(depth[thin == 2].mean())
 
 

@@ -7,6 +7,8 @@ Numbers and names are those of the class details in its documentation
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 _CT = """
 spleen kidney_right kidney_left gallbladder liver stomach pancreas adrenal_gland_right adrenal_gland_left
 lung_upper_lobe_left lung_lower_lobe_left lung_upper_lobe_right lung_middle_lobe_right lung_lower_lobe_right
@@ -67,12 +69,12 @@ _UPWARDS = (
 _RIGHTWARDS = (["spleen", "liver"], ["stomach", "gallbladder"])
 
 
-def numbered(names: list[str]) -> dict[int, str]:
+def numbered(names: Sequence[str]) -> dict[int, str]:
     """{label: name} of CT, CT_V1 or MR."""
     return dict(enumerate(names, 1))
 
 
-def anatomical_order(names: list[str]) -> list[tuple[int, list[int]]]:
+def anatomical_order(names: Sequence[str]) -> list[tuple[int, list[int]]]:
     """(axis of RAS, labels whose centres have increasing coordinates along it) of CT, CT_V1 or MR."""
     label = {name: number for number, name in numbered(names).items()}
     pairs = ([name, name.replace("left", "right")] for name in names if "left" in name)
