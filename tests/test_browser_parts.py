@@ -427,7 +427,7 @@ def test_the_script_of_a_label_map_simulates_the_same_image_whatever_files_and_t
     )
     preset = Preset(probe=probe, tissues=tissues).changed("display", gain_db=4.0)
     pose = craniotomy_pose(head.labels, probe)
-    script = python_script(LabelSource(str(file), True, relabelled=tuple(back)), preset, pose)
+    script = python_script(LabelSource(str(file), True, relabelled=dict(enumerate(back))), preset, pose)
     frame = UltrasoundSimulator(head.labels, preset.tissues).simulate(
         probe, pose, preset.display, noise_seed=seed_of_pose(pose)
     )

@@ -203,7 +203,7 @@ def bad_inputs(folder):
         (["simulate", mri, "--pose", "auto", "--device", "abacus", "-o", out], "no OpenCL device fits 'abacus'"),
         (["simulate", mri, "--pose", "auto", "--seed", -1, "-o", out], "seed is -1"),
         (["simulate", mri, "--pose", "auto", "--dynamic-range", 0, "-o", out], "dynamic_range_db is 0"),
-        (["simulate", folder / "nine.nrrd", "--pose", "auto", "-o", out], "label 9 has no tissue"),
+        (["simulate", folder / "nine.nrrd", "--pose", "auto", "-o", out], "a binary mask (1 label"),
         (["simulate", mri, "--pose", "auto", "-o", folder / "out.xyz"], "unknown image format"),
         (["simulate", mri, "--pose", "auto", "-o", folder / "nowhere" / "o.png"], "does not exist"),
         (["demo", "--mri", mri, "--out", folder / "probe.json" / "x"], "cannot be created"),

@@ -24,8 +24,8 @@ from SlicerUSSim.Logic.mri import add_tissue, add_tissues
 from SlicerUSSim.Logic.mri.pathology import texture_below
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import pose_looking_at
-from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
 from SlicerUSSim.Logic.tissue.names import tissue_named
+from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
 from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
 
 from .conftest import SHARED, block, needs_shared, rigid
@@ -180,6 +180,9 @@ def test_a_brats_map_becomes_its_tissues_without_gaps_between_them():
             shell = (r_labels >= low) & (r_labels <= high)
             assert (result.labels.array[shell] == label).mean() > 0.95, label
         assert len(result.messages) == 3
+        assert any("label 4 is read as enhancing" in warning for warning in result.warnings) == (enhancing == 4)
+    values = np.select([r < 5, r < 8, r < 14], [4, 3, 2], 0)
+    assert added(grid.with_array(values), "brats").tissue_names[1:] == ("oedema", "enhancing", "cavity")
 
 
 # ---- what is refused or said -----------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.options import declared, declared_parameters, device_option, mask_option
-from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
@@ -26,6 +26,13 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri import Segmentation
     from SlicerUSSim.Logic.probe import Probe
     from SlicerUSSim.Logic.tissue import TissueTable
+
+map_option = click.option(
+    "--map", "maps", multiple=True, metavar="LABEL=TISSUE",
+    help="Tissue of a label of the label map, by its number or its name: 24=csf; 0 removes a label. Or a .json file "
+    'with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: freesurfer, totalsegmentator, '
+    "totalsegmentator-v1, totalsegmentator-mr, ussim, brats. May be repeated.",
+)  # fmt: skip
 
 pose_option = click.option(
     "--pose", required=True,
@@ -61,6 +68,8 @@ class PatientOptions:
             help="Tissue table as JSON (default: the preset's, the file beside the labels, or brain).",
         )
     )  # fmt: skip
+    #: LABEL=TISSUE, NAME=TISSUE, files and numbering schemes
+    maps: tuple[str, ...] = declared(map_option)
     #: {parameter: value}
     segmentation: Mapping[str, Any] = declared_parameters(SegmentationSettings, ("contrast", "thin_sulci"))
     mask: str | None = declared(mask_option)
@@ -121,45 +130,50 @@ def open_examination(patient: PatientOptions) -> Examination:
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
     from SlicerUSSim.Logic.mri.pathology import texture_below
+    from SlicerUSSim.Logic.tissue.label_sources import is_label_file
     from SlicerUSSim.Logic.tissue.presets import TISSUES
+    from SlicerUSSim.Logic.tissue.table import TissueTable
 
     log = logging.getLogger(__name__)
     preset = patient.changed_preset()
     volume = Volume.read(patient.mri_or_labels)
-    is_labels = volume.looks_like_labels() if patient.is_labels is None else patient.is_labels
-    if patient.is_labels is None:
+    is_labels = patient.is_labels
+    if is_labels is None:
+        is_labels = is_label_file(Path(patient.mri_or_labels), volume)
         kinds = ("a label map", "--mri") if is_labels else ("an MRI, to be segmented", "--labels")
         log.info("%s is read as %s; use %s if it is not", patient.mri_or_labels, *kinds)
     if is_labels and preset.settings.needs_texture:
         raise SimulationError(
             f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need an MRI"
         )
+    if patient.maps and not is_labels:
+        raise SimulationError(
+            f"{patient.mri_or_labels}: is an MRI, and --map is for labels; use --labels if it is none"
+        )
     changes = Changes.of(patient.changes)
-    table = _tissues_from_file(patient, is_labels)
-    if table is None:
-        log.info("tissues: %s", "the preset's" if patient.preset else "presets of the brain")
-    else:
-        log.info("tissues: %s", patient.tissues or "the table next to the label map")
+    table = TissueTable.read(patient.tissues) if patient.tissues else None
+    if is_labels:
+        labels, tissues = _labelled(volume, patient, table, preset.tissues)
+        added = Additions.read(patient.additions, tissues.names()).on(labels, tissues.names_by_label())
+        tissues = changes.to_tissues(added.table(tissues))
+        simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device)
+        return Examination(simulator, preset.probe, preset.display, is_labels)
+    log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
     tissues = preset.tissues if table is None else table
     additions = Additions.read(patient.additions, (tissue.name for tissue in tissues.all_tissues()))
-    labels, texture = volume, None
-    if is_labels:
-        added = additions.on(volume, tissues.names_by_label())
-        labels, tissues = added.labels, changes.to_tissues(added.table(tissues))
+    if table is None:  # the tissues are not known before the segmentation
+        changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
     else:
-        if table is None:  # the tissues are not known before the segmentation
-            changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
-        else:
-            changes.to_tissues(additions.with_presets(tissues))
-        segmentation = _segmented(volume, patient)
-        names = segmentation.tissue_names if table is None else tissues.names_by_label()
-        added = additions.on(segmentation.labels, names)
-        labels = added.labels
-        tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
-        tissues = changes.to_tissues(tissues)
-        if preset.settings.needs_texture:
-            texture = texture_below(segmentation.texture(), volume, segmentation.labels, labels)
-    simulator = UltrasoundSimulator(labels, tissues, preset.settings, patient.device, texture)
+        changes.to_tissues(additions.with_presets(tissues))
+    segmentation = _segmented(volume, patient)
+    names = segmentation.tissue_names if table is None else tissues.names_by_label()
+    added = additions.on(segmentation.labels, names)
+    tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
+    texture = None
+    if preset.settings.needs_texture:
+        texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
+    tissues = changes.to_tissues(tissues)
+    simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device, texture)
     return Examination(simulator, preset.probe, preset.display, is_labels)
 
 
@@ -175,14 +189,25 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
     return examination, craniotomy_pose(examination.simulator.medium.labels, examination.probe)
 
 
-def _tissues_from_file(patient: PatientOptions, is_labels: bool) -> TissueTable | None:
-    """The table of --tissues, or of the file next to a label map; None if there is none or a preset overrides it."""
-    from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
+def _labelled(
+    volume: Volume, patient: PatientOptions, table: TissueTable | None, preset: TissueTable
+) -> tuple[Volume, TissueTable]:
+    """The labels of a label map and their tissues; says what was recognised."""
+    import logging
 
-    if patient.tissues:
-        return TissueTable.read(patient.tissues)
-    beside = tissues_beside(Path(patient.mri_or_labels))
-    return TissueTable.read(beside) if is_labels and not patient.preset and beside.exists() else None
+    from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
+    from SlicerUSSim.Logic.tissue.label_sources import read_label_file
+
+    log = logging.getLogger(__name__)
+    mapping = LabelMapping.of(patient.maps, table or preset)
+    given = preset if patient.preset else None
+    found = read_label_file(
+        Path(patient.mri_or_labels), volume, mapping, table=table, preset=given, default=preset
+    )  # fmt: skip
+    note(f"{patient.mri_or_labels}: {found.message}")
+    for warning in found.warnings:
+        log.warning("%s", warning)
+    return found.labels, found.tissues
 
 
 def _segmented(mri: Volume, patient: PatientOptions) -> Segmentation:

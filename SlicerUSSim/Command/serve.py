@@ -12,6 +12,7 @@ import click
 
 from SlicerUSSim.Command.additions import Additions, add_option, split_additions
 from SlicerUSSim.Command.options import device_option, mask_option, parameter_option
+from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.sequence_options import (
     calibration_option,
     read_sequence,
@@ -31,6 +32,7 @@ _PORT = 8080
 @click.command()
 @click.argument("mri", type=click.Path(), required=False)
 @click.option("--labels", type=click.Path(), help="Label map, used instead of a segmentation of the MRI.")
+@map_option
 @click.option("--sequence", type=click.Path(), help="Tracked ultrasound for replay and comparison.")
 @transform_option
 @calibration_option
@@ -57,6 +59,7 @@ _PORT = 8080
 def serve(
     mri: str | None,
     labels: str | None,
+    maps: tuple[str, ...],
     sequence: str | None,
     transform: str,
     calibration: str | None,
@@ -79,6 +82,12 @@ def serve(
     for file in files:
         if not Path(file).exists():
             raise SimulationError(f"{file}: no such file")
+    if maps:
+        from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
+
+        if labels is None:
+            raise SimulationError("--map is for a label map, expected --labels too")
+        LabelMapping.of(maps)
     if igtl is not None:
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
 
@@ -103,7 +112,7 @@ def serve(
 
     workstation = Workstation(
         Files(
-            mri=mri, labels=labels, contrast=contrast, mask=mask, additions=masks, preset=chosen_preset,
+            mri=mri, labels=labels, maps=maps, contrast=contrast, mask=mask, additions=masks, preset=chosen_preset,
             sequence=tracked, sequence_name=Path(sequence).name.split(".")[0] if sequence else "", transform=transform,
             to_ras=to_ras, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
         ),

@@ -131,7 +131,10 @@ class Loading:
         return version() not in (before, None)
 
     def _take_labels(self, path: str) -> None:
-        node = self._opener.labels(path)
+        node, found = self._opener.labels(path)
+        self._presenter.view.showStatus(f"{node.GetName()}: {found.message}")
+        for warning in found.warnings:
+            self._presenter.view.showError(warning)
         if self._logic.parameters.mri is None:
             self._take_volume(node)
         self._logic.parameters.labels = node

@@ -9,10 +9,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.samples import demo_mri
@@ -21,7 +22,10 @@ from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
 from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
-from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
+from SlicerUSSim.Logic.tissue.label_advice import PAGE
+from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
+from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file, table_beside
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.script import LabelSource
@@ -39,6 +43,8 @@ class Files:
 
     mri: str | None = None
     labels: str | None = None
+    #: Tissues of the labels, as label_mapping.LabelMapping.of reads them
+    maps: tuple[str, ...] = ()
     contrast: str = "t1"
     mask: str | None = None
     #: (tissue, file) of masks that are laid over the labels
@@ -83,27 +89,30 @@ class Opener:
         """A label map node with the mask of a file."""
         return self._label_map(self._volume(path), path, ["inside"])
 
-    def labels(self, path: str):
-        """A label map node; its tissues come from the .json file next to it, or from the preset."""
+    def labels(self, path: str) -> tuple[Any, LabelledTissues]:
+        """(label map node, what was recognised) of a file; see label_sources.read_label_file.
+
+        Tissues are those of the table or names beside it, of the preset, or of a known program's numbers.
+        """
         volume = self._volume(path)
-        beside, preset = tissues_beside(Path(path)), self._logic.preset
-        _log.info("%s: tissues of %s", path, beside if beside.exists() else "the preset")
-        tissues = TissueTable.read(beside) if beside.exists() else preset.tissues
-        _require_labels(volume, path)
-        values = [int(label) for label in np.unique(volume.array) if label]
-        unknown = [label for label in values if label not in tissues]
-        require(not unknown, f"{path}: labels {unknown} have no tissue, expected a tissue table with them at {beside}")
-        if beside.exists():
-            mine = preset.tissues
-            for tissue in tissues.values():
+        mine = self._logic.preset.tissues
+        mapping = LabelMapping.of(self._files.maps if path == self._files.labels else (), mine)
+        beside = None if mapping else table_beside(Path(path))
+        is_chosen = mine.names() != Preset().tissues.names()
+        found = self._tasks.do(
+            lambda: read_label_file(
+                Path(path), volume, mapping, table=beside, preset=mine if is_chosen else None, default=mine, advice=PAGE
+            )
+        )  # fmt: skip
+        if beside is not None:
+            for tissue in beside.values():
                 mine = mine.with_tissue(tissue)
-            self._logic.preset = replace(preset, tissues=mine)
-        names = [tissues[label].name if label in tissues else "" for label in range(1, max(values) + 1)]
-        node = self._label_map(volume, path, names)
+            self._logic.preset = replace(self._logic.preset, tissues=mine)
+        node = self._label_map(found.labels, path, found.names)
         order = read_labels(node, self._logic.preset.tissues).names
-        relabelled = (0, *(order.index(name) + 1 if name in order else 0 for name in names))
+        relabelled = {old: order.index(found.names[new - 1]) + 1 if new else 0 for old, new in found.relabelled.items()}
         self._sources = {_voxels_of(node): LabelSource(os.path.abspath(path), True, relabelled=relabelled)}
-        return node
+        return node, found
 
     def lesion_of_file(self, lesions_node, tissue: str, path: str):
         """The segmentation node with the lesions, with a mask of a file; made if it is None."""
@@ -196,7 +205,7 @@ class Opener:
                     kind = "sequence"
                 else:
                     volume = self._volumes[str(path)] = self._volume(str(path))
-                    kind = "labels" if volume.looks_like_labels() else "mri"
+                    kind = "labels" if is_label_file(path, volume) else "mri"
                     _log.info("%s: opened as %s", name, "a label map" if kind == "labels" else "an MRI")
                 yield str(path), kind
             except SimulationError as error:  # without the temporary folder: the user chose only the file name
@@ -207,7 +216,7 @@ class Opener:
         return self._volumes.pop(path, None) or self._tasks.do(lambda: Volume.read(path))
 
     def _label_map(self, volume: Volume, path: str, names):
-        _require_labels(volume, path)
+        volume = as_whole(volume, path)
         node = self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", Path(path).name)
         node.SetAttribute(FILE, os.path.abspath(path))
         write_labels(node, volume.with_array(volume.array.astype(np.uint8)), names, node)
@@ -217,14 +226,6 @@ class Opener:
 def _segments_of(lesions_node) -> tuple:
     """A key that changes with the number of segments of a node."""
     return lesions_node.GetID(), lesions_node.GetSegmentation().GetNumberOfSegments()
-
-
-def _require_labels(volume: Volume, path: str) -> None:
-    array = volume.array
-    require(
-        bool(np.issubdtype(array.dtype, np.integer)) and int(array.min()) >= 0 and 0 < int(array.max()) < 256,
-        f"{path}: is not a label map, expected whole numbers from 0 to 255",
-    )
 
 
 def _voxels_of(labels_node) -> tuple:

@@ -138,7 +138,7 @@ class ProbeControl:
         if version == self._surface_version:
             return
         self._surface_version = version
-        volume = read_labels(labels, self._logic.preset.tissues).volume
+        volume = read_labels(labels, self._logic.preset.tissues).labels
         placed = Volume(volume.array, node_to_world(labels) @ volume.ijk_to_ras)
         self.surface = self._tasks.do(lambda: PatientSurface(placed))
         self._views.show_surface(self.surface)

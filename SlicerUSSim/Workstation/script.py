@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pprint import pformat
 from textwrap import indent
@@ -42,8 +43,8 @@ class LabelSource:
     mask: str | None = None
     #: Other arguments of segment_mri
     options: dict = field(default_factory=dict)
-    #: The simulator's numbers of the file's labels 0, 1, 2, ...
-    relabelled: tuple[int, ...] = ()
+    #: {label in the file: the simulator's number}
+    relabelled: Mapping[int, int] = field(default_factory=dict)
     #: (tissue, file) of the masks added on top
     additions: tuple[tuple[str, str], ...] = ()
 
@@ -59,8 +60,12 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         imports.append("Volume")
         lines.append(f"{'labels' if source.is_labels else 'mri'} = Volume.read({source.path!r})")
     if source.is_labels:
-        if source.relabelled and source.relabelled != tuple(range(len(source.relabelled))):
-            lines.append(f"labels = labels.with_array(np.array({list(source.relabelled)}, np.uint8)[labels.array])")
+        if any(old != new for old, new in source.relabelled.items()):
+            lines += [
+                f"numbers = np.zeros({max(source.relabelled) + 1}, np.uint8)",
+                f"numbers[{list(source.relabelled)}] = {list(source.relabelled.values())}",
+                "labels = labels.with_array(numbers[labels.array.astype(int)])",
+            ]
     else:
         imports.append("segment_mri")
         options = [f"{name}={value!r}" for name, value in source.options.items()]

@@ -18,6 +18,15 @@ _log = logging.getLogger(__name__)
 
 #: A larger side of a volume indicates a wrong unit.
 _SMALLEST_MM, _LARGEST_MM = 5.0, 2500.0
+#: Numbers from here on are not labels.
+_TOO_LARGE = 100_000
+#: Label maps of up to this many labels are not examined further. Above, at least this share of neighbours has to be
+#: equal; a label map of a brain has 0.65 (voxels of 5 mm) to 0.95, an MRI 0.1 to 0.3.
+_FEW, _EQUAL_NEIGHBOURS = 8, 0.6
+#: An MRI of few grey levels has more equal neighbours, but evenly spaced levels, and the others are the next level.
+_FEW_LEVELS, _EQUAL_NEIGHBOURS_OF_LEVELS, _NEXT_LEVEL = 32, 0.8, 0.5
+#: Voxels along each side of the part of a volume that is examined
+_EXAMINED = 128
 WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
 
 
@@ -77,15 +86,27 @@ class Volume:
         return Volume(array, self.ijk_to_ras)
 
     def looks_like_labels(self) -> bool:
-        """Whether the image contains few different whole numbers and none is negative, as in a label map."""
+        """Whether the image has regions of equal whole numbers, none of them negative, as a label map has.
+
+        Also as floating point, and with numbers up to 99999. An MRI with few grey levels differs from a label map:
+        its neighbours differ everywhere, and mostly by one level.
+        """
         array = self.array
-        if not np.issubdtype(array.dtype, np.integer):
+        low, high = array.min(), array.max()
+        if (
+            not np.isfinite(low)
+            or not np.isfinite(high)
+            or (_is_float(array) and not np.array_equal(array, np.rint(array)))
+        ):
             found, is_labels = f"{array.dtype} numbers", False
-        elif int(array.min()) < 0:
-            found, is_labels = f"negative numbers (down to {array.min()})", False
+        elif low < 0:
+            found, is_labels = f"negative numbers (down to {low:g})", False
         else:
-            values = np.unique(array)
-            found, is_labels = f"{len(values)} whole numbers from {values[0]} to {values[-1]}", len(values) <= 32
+            values = (
+                np.flatnonzero(np.bincount(array.ravel().astype(np.int64))) if high < _TOO_LARGE else np.unique(array)
+            )
+            found = f"{len(values)} whole numbers from {values[0]:g} to {values[-1]:g}"
+            is_labels = high < _TOO_LARGE and (len(values) <= _FEW or _has_regions(array, values))
         _log.info("the volume contains %s, as %s does", found, "a label map" if is_labels else "an MRI")
         return is_labels
 
@@ -93,7 +114,7 @@ class Volume:
 
     @classmethod
     def read(cls, path: str | os.PathLike) -> Volume:
-        """Read NIfTI, NRRD, MetaImage, MINC 1 and 2, VTI, or a folder with one DICOM series.
+        """Read NIfTI, NRRD, MetaImage, MINC 1 and 2, FreeSurfer's MGZ, VTI, or a folder with one DICOM series.
 
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
@@ -104,6 +125,8 @@ class Volume:
             _log.info("%s: coordinates are read as RAS millimetres, since VTI files do not specify them", path)
         elif path.is_dir():
             volume = cls.from_sitk(_read_dicom_series(path), name=str(path))
+        elif path.name.lower().endswith((".mgz", ".mgh")):
+            volume = cls(*_read_mgh(path))
         elif not is_minc1(path):
             image = read_itk_image(path)
             volume = cls.from_sitk(image, name=str(path))
@@ -222,6 +245,28 @@ class Volume:
         require(writer.Write() == 1, f"{path}: cannot be written")
 
 
+def _is_float(array: np.ndarray) -> bool:
+    return bool(np.issubdtype(array.dtype, np.floating))
+
+
+def _has_regions(array: np.ndarray, values: np.ndarray) -> bool:
+    """Whether neighbours that are not 0 have mostly equal `values`, as in a label map; see the constants above."""
+    middle = tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)
+    part = np.searchsorted(values, array[middle]) + (values[0] > 0)  # ranks; 0 is 0
+    total = equal = following = 0
+    for axis in range(3):
+        first, second = np.moveaxis(part, axis, 0)[:-1], np.moveaxis(part, axis, 0)[1:]
+        steps = np.abs(first - second)[(first > 0) & (second > 0)]
+        total += steps.size
+        equal += int(np.count_nonzero(steps == 0))
+        following += int(np.count_nonzero(steps == 1))
+    if equal < _EQUAL_NEIGHBOURS * total:
+        return False
+    spacing = np.diff(values[values > 0])
+    is_graded = len(values) <= _FEW_LEVELS and len(spacing) > 0 and spacing.max() <= 2 * spacing.min()
+    return not (is_graded and equal < _EQUAL_NEIGHBOURS_OF_LEVELS * total and following > _NEXT_LEVEL * (total - equal))
+
+
 def _log_size(volume: Volume, path: Path) -> None:
     """Log the volume, and warn if its size in millimetres is implausible."""
     size = volume.spacing_mm * volume.array.shape[::-1]
@@ -318,6 +363,24 @@ def _read_minc1(path: Path) -> tuple[np.ndarray, np.ndarray]:
         _log.info("%s: values are read as whole numbers, as they are stored", path)
     # nibabel's indices are (z, y, x) as in the file; its millimetres are in MNI world coordinates, which are RAS.
     return values, np.array(image.affine)[:, [2, 1, 0, 3]]
+
+
+def _read_mgh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """FreeSurfer's MGH and MGZ, whose millimetres are RAS of the scanner."""
+    require_package("nibabel", "nibabel", f"{path}: reading MGZ")
+    import nibabel
+
+    try:
+        image = nibabel.MGHImage.from_filename(path)
+        values = np.asarray(image.dataobj)
+    except Exception as error:  # nibabel and gzip raise various exceptions for damaged files
+        reason = str(error).strip() or type(error).__name__
+        raise SimulationError(f"{path}: cannot be read as MGZ ({reason.splitlines()[0]})") from None
+    if values.ndim == 4 and values.shape[3] == 1:
+        values = values[..., 0]
+    _require_volume(values.shape, str(path))
+    native = values.astype(values.dtype.newbyteorder("="), copy=False)  # files have the most significant byte first
+    return np.ascontiguousarray(native.T), np.array(image.affine)
 
 
 def _read_dicom_series(folder: Path):

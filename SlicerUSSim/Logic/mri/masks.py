@@ -10,9 +10,10 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 
-#: Tissues of a BraTS map, in the order in which they are added: what is inside is on top. 1 is the necrotic core with
-#: tumour that does not enhance, 4 is called 3 since 2023 (Menze et al., IEEE TMI 34(10), 2015; BraTS 2023).
-BRATS = (("oedema", (2,)), ("necrosis", (1,)), ("enhancing", (3, 4)))
+#: Tissues of BraTS maps, from outside to inside: 1 is the necrotic core with tumour that does not enhance. Enhancing
+#: tumour is 4 until 2022 and 3 since, when 4 is a resection cavity (Menze et al., IEEE TMI 34(10), 2015; BraTS 2023).
+_BRATS_2022 = {"oedema": 2, "necrosis": 1, "enhancing": 4}
+_BRATS = {"oedema": 2, "necrosis": 1, "enhancing": 3, "cavity": 4}
 #: More different whole numbers are an image and not a label map.
 _MOST_LABELS = 32
 #: Smallest and largest share at which a voxel becomes inside.
@@ -88,11 +89,17 @@ def _masks(volume: Volume, shares: dict[str, np.ndarray], source: str, warnings:
 def _brats(volume: Volume, values: np.ndarray, source: str) -> Masks:
     there = set(values.tolist())
     require(
-        there <= {0, *(label for _, labels in BRATS for label in labels)} and not {3, 4} <= there,
-        f"{source}: holds the labels {_listed(values[values > 0])}, expected those of BraTS: 1 necrosis, 2 oedema, and "
-        "either 3 or 4 enhancing",
+        there <= {0, 1, 2, 3, 4},
+        f"{source}: holds the labels {_listed(values[values > 0])}, expected those of BraTS: 1 necrosis, 2 oedema, 3 "
+        "enhancing and 4 cavity, or without 3: 4 enhancing",
     )
-    return _masks(volume, {name: np.isin(volume.array, labels) for name, labels in BRATS if there & {*labels}}, source)
+    is_old = 4 in there and 3 not in there
+    tissues = _BRATS_2022 if is_old else _BRATS
+    warnings = (
+        f"{source}: label 4 is read as enhancing, as until 2022, and not as a cavity, since there is no label 3",
+    )
+    masks = {name: volume.array == label for name, label in tissues.items() if label in there}
+    return _masks(volume, masks, source, warnings if is_old else ())
 
 
 def _whole_numbers(array: np.ndarray) -> np.ndarray | None:

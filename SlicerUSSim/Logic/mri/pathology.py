@@ -86,7 +86,7 @@ def add_tissue(
     mask : not zero inside; or probabilities from 0 to 1, inside above 0.5. It is interpolated linearly at the voxels of
         `labels`, or averaged over them where they are larger.
     tissue : a name of `tissue_names` or of the presets: "tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity";
-        "brats" adds the tissues of a BraTS map: 1 necrosis, 2 oedema, 3 or 4 enhancing.
+        "brats" adds the tissues of a BraTS map: 1 necrosis, 2 oedema, 3 enhancing, 4 cavity (4 enhancing without 3).
     source : of the mask, for messages.
 
     Voxels outside the patient are labelled too, with a warning. Raises SimulationError for an unknown tissue, a mask

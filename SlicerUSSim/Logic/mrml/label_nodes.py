@@ -11,9 +11,10 @@ import slicer
 from vtkmodules.vtkCommonCore import vtkIntArray, vtkStringArray
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
+from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.nodes import (
     display_of,
     ijk_to_ras,
@@ -24,8 +25,10 @@ from SlicerUSSim.Logic.mrml.nodes import (
     require_node,
     write_volume,
 )
-from SlicerUSSim.Logic.tissue.names import same_name, tissue_named
-from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
+from SlicerUSSim.Logic.tissue.label_advice import SCENE
+from SlicerUSSim.Logic.tissue.label_files import is_meaningful
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole, read_label_map
+from SlicerUSSim.Logic.tissue.presets import colour_of
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
 _log = logging.getLogger(__name__)
@@ -33,15 +36,8 @@ _log = logging.getLogger(__name__)
 #: Classes of nodes with labels.
 LABEL_CLASSES = ("vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode")
 
-
-@dataclass(frozen=True, eq=False)
-class LabelledTissues:
-    """A label map or segmentation in the form for the simulator: one label per tissue."""
-
-    #: uint8 labels in the node's own frame, before its parent transform
-    volume: Volume
-    #: Name of the tissue of label 1, 2, ...
-    names: tuple[str, ...]
+#: Tissues of label 0, 1, 2, ... of every preset that nobody has changed
+_OF_EVERY_BRAIN = tuple(Preset().tissues.names())
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +79,7 @@ class PatientReader:
             _log.debug("%s: labels read from the node", named(labels_node))
         labelled = self._read[1]
         world_to_patient, scaling = pose_in_labels(labels_node, np.eye(4))
-        labels = Volume(labelled.volume.array, scaling @ labelled.volume.ijk_to_ras)
+        labels = Volume(labelled.labels.array, scaling @ labelled.labels.ijk_to_ras)
         return Patient(
             named(labels_node), labels, labelled.names, world_to_patient, node_version, (version, scaling.tobytes())
         )
@@ -132,31 +128,27 @@ def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
 
     The names are those of segments, or of a label map's colours. They are looked up in `tissues`, then in the presets.
     A label whose colour has no tissue's name, or only the name in Slicer's default table, is the tissue with that
-    label in `tissues`.
-    Raises SimulationError for a node without voxels or segments, and for unknown names, which it lists.
+    label in `tissues`; if these are the brain's, or do not have it, the numbers of other programs are recognised
+    (label_maps.read_label_map).
+    Raises SimulationError for a node without voxels or segments, for unknown names, which it lists, and for a mask or
+    lesion without a patient.
     """
     require_node(labels_node, *LABEL_CLASSES, use="label map")
+    by_number = None
     if labels_node.IsA("vtkMRMLSegmentationNode"):
         volume, names = _read_segmentation(labels_node)
     else:
         volume = read_volume(labels_node, "label map")
-        names = _colour_names(labels_node, volume, tissues)
-    found = {label: _tissue_name(name, tissues) for label, name in names.items()}
-    known = {label: tissue for label, tissue in found.items() if tissue is not None}
-    unknown = [names[label] for label in names if label not in known]
-    require(
-        not unknown,
-        f"{named(labels_node)}: no tissue is called {', '.join(map(repr, unknown))}; rename to one of: "
-        f"{', '.join([*tissues.names()[1:], *(name for name in TISSUES if name not in tissues.names())])}",
+        names = _colour_names(labels_node, volume)
+        if tuple(tissues.names()) != _OF_EVERY_BRAIN:  # somebody chose which tissue has which number
+            by_number = tissues
+    found = read_label_map(
+        volume, names, source=named(labels_node), tissues=tissues, by_number=by_number, renumber=True, advice=SCENE
     )
-    taken = [f"{label} {names[label]!r} for {tissue}" for label, tissue in known.items() if names[label] != tissue]
-    if taken:
-        _log.info("%s: labels are identified by their names: %s", named(labels_node), ", ".join(taken))
-    order = tuple(dict.fromkeys(known.values()))
-    table = np.zeros(max(names, default=0) + 1, np.uint8)
-    for label, tissue in known.items():
-        table[label] = order.index(tissue) + 1
-    return LabelledTissues(volume.with_array(table[volume.array]), order)
+    _log.info("%s: %s", named(labels_node), found.message)
+    for warning in found.warnings:
+        _log.warning("%s", warning)
+    return found
 
 
 def node_labels(labels_node) -> tuple[Volume, dict[int, str]]:
@@ -172,16 +164,6 @@ def node_labels(labels_node) -> tuple[Volume, dict[int, str]]:
         return volume, dict.fromkeys(present, "")
     known = colours.GetNumberOfColors()
     return volume, {label: colours.GetColorName(label) if 0 < label < known else "" for label in present}
-
-
-def _tissue_name(name: str, tissues: TissueTable) -> str | None:
-    for tissue in tissues.values():
-        if same_name(tissue.name, name):
-            return tissue.name
-    try:
-        return tissue_named(name).name
-    except SimulationError:
-        return None
 
 
 def _require_segments(segmentation_node, use: str) -> None:
@@ -222,33 +204,22 @@ def _colour_node(labels_node):
     return None if display is None else display.GetColorNode()
 
 
-def _colour_names(labels_node, volume: Volume, tissues: TissueTable) -> dict[int, str]:
-    values = volume.array
-    require(
-        np.issubdtype(values.dtype, np.integer) and int(values.min()) >= 0 and int(values.max()) < 100_000,
-        f"label map {named(labels_node)} holds {values.dtype} from {values.min()} to {values.max()}, expected whole "
-        "numbers from 0 to 99999",
-    )
+def _colour_names(labels_node, volume: Volume) -> dict[int, str]:
+    """{label: name} of the colours of a label map; labels without a name are left out."""
+    as_whole(volume, f"label map {named(labels_node)}")
     colours, names = _colour_node(labels_node), {}
     # Slicer assigns this table to every label map; its names (2 is bone, 3 is skin) are therefore ignored.
     is_default = colours is not None and colours.GetName() == "GenericAnatomyColors"
     if is_default:
         _log.info("%s: has Slicer's default colours, so labels are identified by their numbers", named(labels_node))
-    for label in map(int, np.flatnonzero(np.bincount(values.ravel()))):
-        if label == 0:
-            continue
-        name = colours.GetColorName(label) if colours is not None and label < colours.GetNumberOfColors() else None
-        if name in (None, "", "(none)"):
-            name = f"label {label}"
-        if label in tissues and (is_default or _tissue_name(name, tissues) is None):
-            if not is_default:
-                _log.info(
-                    "%s: label %d, %r, is identified by its number as %s", named(labels_node), label, name,
-                    tissues[label].name,
-                )  # fmt: skip
-            name = tissues[label].name
-        names[label] = name
-    require(bool(names), f"label map {named(labels_node)} is empty, expected voxels that are not 0")
+    present = [label for label in map(int, np.unique(volume.array)) if label]
+    require(present, f"label map {named(labels_node)} is empty, expected voxels that are not 0")
+    if colours is None or is_default:
+        return {}
+    for label in present:
+        name = colours.GetColorName(label) if label < colours.GetNumberOfColors() else None
+        if is_meaningful(name):
+            names[label] = name
     return names
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from functools import cache
+
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Tissue
@@ -16,20 +19,60 @@ _ALIASES = {
 }  # fmt: skip
 
 
-#: Tissue of a longer name, such as one of FreeSurfer's, by a word in it; the first match is used.
-_WORDS = {
-    "necrosis": "necrosis", "necrotic": "necrosis", "oedema": "oedema", "edema": "oedema", "cyst": "cyst",
-    "cystic": "cyst", "resection": "cavity", "surgical cavity": "cavity", "haematoma": "haematoma",
-    "hematoma": "haematoma", "haemorrhage": "haematoma", "hemorrhage": "haematoma", "clot": "haematoma",
-    "white matter": "white matter", "corpus callosum": "white matter", "ventricle": "csf", "csf": "csf",
-    "choroid plexus": "enhancing", "grey matter": "grey matter", "gray matter": "grey matter", "cortex": "grey matter",
-    "ctx": "grey matter", "thalamus": "grey matter", "caudate": "grey matter", "putamen": "grey matter",
-    "pallidum": "grey matter", "hippocampus": "grey matter", "amygdala": "grey matter", "accumbens": "grey matter",
-    "brain stem": "white matter", "tumor": "tumour", "tumour": "tumour", "glioma": "tumour", "metastasis": "tumour",
-    "meningioma": "tumour", "falx": "falx", "tentorium": "falx", "dura": "falx", "artery": "blood", "vein": "blood",
-    "vessel": "blood", "sinus": "blood", "skull": "skull", "scalp": "scalp", "skin": "scalp", "bone": "bone",
-    "muscle": "muscle", "liver": "liver", "kidney": "kidney", "fat": "fat", "air": "air",
-}  # fmt: skip
+#: Words by which a longer name, such as one of FreeSurfer's or TotalSegmentator's, has a tissue. The first line with a
+#: word in the name is used, so that what is special comes before what is general: a cyst of the kidney is no kidney,
+#: and the ventricle of the heart is not the brain's.
+_WORDS: tuple[tuple[str, str], ...] = (
+    ("necrosis", "necrosis, necrotic"),
+    ("oedema", "oedema, edema"),
+    ("cyst", "cyst, cystic"),
+    ("cavity", "resection, surgical cavity"),
+    ("tumour", "tumor, tumour, glioma, metastasis, meningioma, cancer"),
+    ("blood", "heart atrium, heart ventricle, atrial appendage, left atrium, right atrium"),
+    ("haematoma", "haematoma, hematoma, haemorrhage, hemorrhage, clot"),
+    ("enhancing", "choroid plexus"),
+    ("grey matter", "non wm, cortical dysplasia, hippocampal fissure"),
+    ("white matter", "white matter, whitematter, wm, wmsa, corpus callosum, corpuscallosum, cc, cbmwm"),
+    ("white matter", "unsegmentedwhitematter"),
+    ("csf", "ventricle, vent, csf"),
+    ("kidney", "kidney, renal"),
+    ("grey matter", "grey matter, gray matter, graymatter, cortex, ctx, thalamus, caudate, putamen, pallidum"),
+    ("grey matter", "hippocampus, amygdala, accumbens, ventraldc, ventral dc, vdc, claustrum, insula, operculum"),
+    ("grey matter", "hypothalamus, cbm, cblumnodulus, floculus, vermis, basal ganglia, substancia nigra"),
+    ("grey matter", "substantia nigra, subiculum, presubiculum, parasubiculum, ca1, ca2, ca3, ca4, gc dg, hata"),
+    ("grey matter", "molecular layer hp, molecular layer subiculum, hp tail, cadg head, dcg, perirhinal, ectorhinal"),
+    ("grey matter", "olfactory bulb, mammilare, tuberal region"),
+    ("white matter", "brain stem, brainstem, midbrain, pons, medulla, scp, optic chiasm, chiasma, optic tract"),
+    ("white matter", "optic nerve, opticus, fornix, fimbria, alveus, intcapsule, perforant pathway, commisure"),
+    ("white matter", "commissure, spinal cord"),
+    ("falx", "falx, tentorium, dura"),
+    ("blood", "artery, arteries, arterie, vein, vena, vessel, aorta, sinus, brachiocephalic, blood"),
+    ("skull", "skull, cranium, diploe, outer table, inner table"),
+    ("scalp", "scalp, skin, epidermis"),
+    ("bone", "bone, vertebra, vertebrae, rib, sternum, sacrum, humerus, scapula, clavicula, clavicle, femur, hip"),
+    ("bone", "pelvis, tibia, fibula, patella, tarsal, metatarsal, carpal, metacarpal, phalanges, radius, ulna"),
+    ("bone", "mandible, teeth"),
+    ("muscle", "muscle, gluteus, autochthon, iliopsoas, psoas, tongue, diaphragm"),
+    ("heart", "heart, myocardium"),
+    ("liver", "liver"),
+    ("spleen", "spleen"),
+    ("lung", "lung"),
+    ("fat", "fat, adipose"),
+    ("air", "air, aircavity, trachea"),
+)
+
+#: The same for what has no preset of its own: the nearest tissue is used, and label_maps.py says so.
+_NEAREST: tuple[tuple[str, str], ...] = (
+    ("csf", "cerebral exterior, cerebellum exterior"),
+    ("tumour", "lesion"),
+    ("grey matter", "undetermined, epiphysis, hypophysis, infundibulum"),
+    ("white matter", "brain"),
+    ("water", "gallbladder, bladder, effusion, eye fluid, vitreous humor, globe, eyeball"),
+    ("liver", "pancreas, gland, thyroid, prostate"),
+    ("muscle", "esophagus, oesophagus, stomach, duodenum, bowel, colon, intestine, rectum, uterus, cartilage, disc"),
+    ("muscle", "face"),
+    ("fat", "breast"),
+)
 
 
 def plain_name(name: str) -> str:
@@ -46,10 +89,23 @@ def tissue_named(name: str) -> Tissue:
 
     Raises SimulationError for a name that matches no preset.
     """
+    found = _by_words(name, _WORDS)
+    require(found is not None, f"no preset for tissue {name!r}, expected one of: {', '.join(TISSUES)}")
+    return TISSUES[str(found)]
+
+
+def nearest_tissue(name: str) -> str | None:
+    """The preset nearest to a structure that has none, such as muscle for the wall of the stomach; None if unknown."""
+    return _by_words(name, _NEAREST)
+
+
+@cache
+def _by_words(name: str, lines: tuple[tuple[str, str], ...]) -> str | None:
     key = plain_name(name)
     key = _ALIASES.get(key, key)
-    if key not in TISSUES:
-        texts = f" {key} ", f" {key} ".replace("s ", " ")  # unchanged, and without plurals
-        key = next((tissue for word, tissue in _WORDS.items() if any(f" {word} " in text for text in texts)), key)
-    require(key in TISSUES, f"no preset for tissue {name!r}, expected one of: {', '.join(TISSUES)}")
-    return TISSUES[key]
+    if key in TISSUES:
+        return key
+    for tissue, words in lines:
+        if re.search(rf"\b(?:{words.replace(', ', '|')})s?\b", key):  # also in the plural: "kidneys"
+            return tissue
+    return None

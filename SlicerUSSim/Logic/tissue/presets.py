@@ -10,6 +10,7 @@ _DUCK = "Duck, Physical Properties of Tissue (1990)"
 _SHUNG = "Shung, Fei and Ballard, J. Clin. Ultrasound 14 (1986), on clots"
 _SELBEKK = "saline, which images the brain behind it too bright: Selbekk et al., Acta Neurochir. 155 (2013)"
 _MCGAHAN = "McGahan et al., Radiology 159 (1986)"
+_DUNN = "Dunn and Fry, Ultrasonic absorption and reflection by lung tissue, Phys. Med. Biol. 5 (1961)"
 _PAPER = "Salehi et al., MICCAI 2015, table 1 (mean after optimisation, rounded)"
 _PAPER_BEFORE = "Salehi et al., MICCAI 2015, table 1 (before optimisation)"
 
@@ -83,6 +84,12 @@ TISSUES: dict[str, Tissue] = {
                 _level("reference for the abdomen")),
         _tissue("kidney", 1560.0, _SZABO, 1.638, f"1050 kg/m3, {_SZABO}", 1.0, f"kidney, {_DUCK}", 0.28, 0.0, 0.13,
                 _level("cortex slightly below liver")),
+        _tissue("spleen", 1567.0, _SZABO, 1.651, f"1054 kg/m3, {_SZABO}", 0.40, _SZABO, 0.42, 0.0, 0.21,
+                _level("slightly above liver")),
+        _tissue("heart", 1554.0, f"heart muscle, {_SZABO}", 1.647, f"1060 kg/m3, {_SZABO}", 0.52, _SZABO, 0.28, 0.0,
+                0.14, _level("as muscle")),
+        _tissue("lung", 658.0, f"inflated, {_DUNN}", 0.263, f"inflated, 400 kg/m3, {_DUNN}", 40.0,
+                f"inflated, 41 dB/cm at 1 MHz, {_DUNN}", 0.50, 0.0, 0.30, _level("masked by its own surface echo")),
         _tissue("bone", 3198.0, _SZABO, 6.364, f"1990 kg/m3, {_SZABO}", 3.54, _SZABO, 0.50, 0.0, 0.30,
                 _level("masked by its own surface echo")),
     )
@@ -97,7 +104,8 @@ _COLOURS = {
     "cavity": (0.24, 0.24, 0.45), "haematoma": (0.48, 0.05, 0.16),
     "falx": (0.56, 0.42, 0.70), "blood": (0.75, 0.10, 0.10), "skull": (0.95, 0.93, 0.75), "bone": (0.95, 0.93, 0.75),
     "scalp": (0.87, 0.72, 0.63), "fat": (0.93, 0.83, 0.45), "muscle": (0.70, 0.33, 0.29), "liver": (0.52, 0.23, 0.19),
-    "kidney": (0.65, 0.30, 0.25), "water": (0.30, 0.60, 0.85), "gel": (0.45, 0.75, 0.85), "air": (0.85, 0.95, 1.0),
+    "kidney": (0.65, 0.30, 0.25), "water": (0.30, 0.60, 0.85), "gel": (0.45, 0.75, 0.85),
+    "spleen": (0.58, 0.30, 0.42), "heart": (0.72, 0.25, 0.25), "lung": (0.80, 0.85, 0.90), "air": (0.85, 0.95, 1.0),
 }  # fmt: skip
 _OTHER_COLOUR = (0.3, 0.75, 0.8)
 

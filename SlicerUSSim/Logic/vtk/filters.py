@@ -13,6 +13,7 @@ reported by an ErrorEvent with one line, and by GetErrorMessage; the output is t
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict
 
 import numpy as np
@@ -38,8 +39,12 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.shape import outline_polydata
-from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.label_advice import SCENE
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, read_label_map
+from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
+
+_log = logging.getLogger(__name__)
 
 _WHOLE_EXTENT = vtkStreamingDemandDrivenPipeline.WHOLE_EXTENT
 
@@ -204,7 +209,8 @@ class UltrasoundSimulationFilter(_ImageFilter):
     The image is one slice in the image plane. The filter executes again only if the labels, the probe's transform
     (including transforms from which it is concatenated) or a parameter has changed. Amplifier noise differs between
     poses (noise.seed_of_pose). Labels are identified by the names from SegmentationFilter (field data "TissueNames");
-    without names, by the labels of the tissue table.
+    without names, by the labels of the tissue table; with labels above 62, as those of another program
+    (tissue.read_label_map).
 
     >>> import numpy as np
     >>> from vtkmodules.vtkCommonTransforms import vtkTransform
@@ -235,6 +241,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._probe_transform: vtkLinearTransform | vtkMatrix4x4 = vtkTransform()  # as it was given
         self._simulator = ReusedSimulator()
         self._frame: Frame | None = None
+        self._read: tuple[tuple, LabelledTissues] | None = None  # labels of another program, and their version
         self._placed_outline = vtkTransformPolyDataFilter()
         self._placed_outline.SetInputData(outline_polydata(self._probe))
         self._placed_outline.SetTransform(self._probe_transform)
@@ -317,11 +324,8 @@ class UltrasoundSimulationFilter(_ImageFilter):
     def RequestData(self, request, inInfo, outInfo):  # noqa: N803
         self._frame = None
         labels = vtkImageData.GetData(inInfo[0])
-        names = tissue_names(labels)
-        tissues = self._tissues.for_names(names) if names else self._tissues
-        simulator = self._simulator.get(
-            labels.GetMTime(), Volume.from_vtk(labels), tissues, self._settings, self._device, self._texture
-        )
+        volume, tissues = self._patient(labels)
+        simulator = self._simulator.get(labels.GetMTime(), volume, tissues, self._settings, self._device, self._texture)
         pose = self._pose()
         self._frame = simulator.simulate(self._probe, pose, self._display, noise_seed=seed_of_pose(pose))
         image = vtkImageData.GetData(outInfo, 0)
@@ -331,6 +335,22 @@ class UltrasoundSimulationFilter(_ImageFilter):
             set_scalars(image, np.stack([self._frame.image, np.where(field, np.uint8(255), np.uint8(0))], axis=-1))
         vtkPolyData.GetData(outInfo, 1).ShallowCopy(vtkPolyData.GetData(inInfo[1]))
         return 1
+
+    def _patient(self, labels: vtkImageData) -> tuple[Volume, TissueTable]:
+        """The labels and their tissues; labels that a tissue table cannot have are read as another program's."""
+        names = tissue_names(labels)
+        if names:
+            return Volume.from_vtk(labels), self._tissues.for_names(names)
+        if labels.GetScalarRange()[1] <= MAX_LABEL:
+            return Volume.from_vtk(labels), self._tissues
+        version = (labels.GetMTime(), self._tissues)
+        if self._read is None or self._read[0] != version:
+            found = read_label_map(Volume.from_vtk(labels), source="label image", tissues=self._tissues, advice=SCENE)
+            _log.info("label image: %s", found.message)
+            for warning in found.warnings:
+                _log.warning("%s", warning)
+            self._read = (version, found)
+        return self._read[1].labels, self._read[1].tissues
 
     def _pose(self) -> np.ndarray:
         return check_rigid("probe transform", matrix_array(self._placed_outline.GetTransform().GetMatrix()))

@@ -1,0 +1,39 @@
+"""Advice: what a user can do about a label map, in the words of one door."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What a user can do about a label map, in the words of one door."""
+
+    #: About labels without a tissue, before the list of tissues; {label} is one of them
+    unknown: str = "map them with --map {label}=TISSUE (0 removes a label), a .json file or a table of names, to one of"
+    #: About a mask or lesion without a patient; {tissue}, {source} and {label} are those of the label map
+    lesion: str = "add it to a segmentation with --add {tissue}={source}, or allow it with --map {label}={tissue}"
+    #: About numbers that several programs use; {key} is one of them
+    ambiguous: str = "say which with --map {key}"
+    #: About voxels without a label between organs
+    between: str = "--map 0=fat gives it a tissue"
+    #: Whether the volumes of unknown labels are listed
+    gives_sizes: bool = True
+
+
+COMMAND = Advice()
+#: The page of the workstation
+PAGE = replace(
+    COMMAND,
+    unknown="name them in a table beside it (.txt), or start ussim serve --labels with --map {label}=TISSUE, one of",
+    lesion="add it to a segmentation, or start ussim serve --labels {source} --map {label}={tissue}",
+    ambiguous="start ussim serve --labels with --map {key}",
+)
+#: 3D Slicer
+SCENE = Advice(
+    "rename to one of",
+    "add it to a segmentation as a segment",
+    "give the label map colours with the names of its structures",
+    "a segment around them gives it a tissue",
+    gives_sizes=False,
+)

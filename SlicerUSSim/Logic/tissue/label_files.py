@@ -1,0 +1,129 @@
+"""Names of labels in files: in a label map's own header, or in a table beside it.
+
+Headers: segments of 3D Slicer's .seg.nrrd, and the label table that TotalSegmentator writes into a NIfTI extension.
+Tables: ITK-SNAP's label descriptions, 3D Slicer's colour tables (.ctbl), FreeSurfer's colour look-up tables, and those
+of BIDS (.tsv with columns index and name).
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+_log = logging.getLogger(__name__)
+
+_LARGEST_TABLE = 4 * 2**20
+TABLE_SUFFIXES = (".txt", ".ctbl", ".label", ".lut", ".tsv", ".csv")
+#: 1   255 0 0   1 1 1   "Left kidney"
+_SNAP = re.compile(r'\s*(\d+)\s[\d\s.]+"([^"]*)"\s*')
+#: 24  CSF  60 60 60 0
+_PLAIN = re.compile(r"\s*(\d+)[\s,;]+(.*?)((?:[\s,;]+[\d.]+){3,8})?\s*")
+#: Names that programs give when the user gave none
+_MEANINGLESS = re.compile(r"(label|segment|region|class|colou?r|unnamed|\(none\)|n/?a)?[ _-]*\d*", re.IGNORECASE)
+
+
+def names_of_file(path: Path) -> tuple[dict[int, str], str]:
+    """({label: name}, where they are from) of a label map's file; ({}, "") if it has none.
+
+    Raises SimulationError for a table beside it that cannot be read.
+    """
+    names = _header_names(path)
+    if names:
+        return names, "its header"
+    stem = path.name
+    for suffix in (".seg.nrrd", ".nii.gz", path.suffix):
+        if suffix and stem.lower().endswith(suffix.lower()):
+            stem = stem[: -len(suffix)]
+            break
+    for suffix in TABLE_SUFFIXES:
+        beside = path.with_name(stem + suffix)
+        if beside.is_file():
+            names = read_names(beside)
+            if names:
+                return names, beside.name
+            _log.info("%s: has no names of labels", beside)
+    return {}, ""
+
+
+def read_names(path: Path) -> dict[int, str]:
+    """{label: name} of a table; lines that have no label and name are skipped.
+
+    Raises SimulationError for a file that cannot be read and for a label with two names.
+    """
+    try:
+        size = path.stat().st_size
+        require(size <= _LARGEST_TABLE, f"{path}: has {size} bytes, expected at most {_LARGEST_TABLE} of a table")
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise SimulationError(f"{path}: cannot be read ({error.strerror})") from None
+    names: dict[int, str] = {}
+    for line in text.splitlines():
+        label, name = _entry(line)
+        if label is None or not is_meaningful(name):
+            continue
+        require(
+            names.get(label, name) == name, f"{path}: label {label} has two names, {names.get(label)!r} and {name!r}"
+        )
+        names[label] = name
+    return names
+
+
+def _entry(line: str) -> tuple[int | None, str]:
+    """(label, name) of a line of a table; None without."""
+    columns = [column.strip() for column in line.split("\t") if column.strip()]
+    if len(columns) > 1 and columns[0].isdecimal():
+        return int(columns[0]), columns[1]
+    found = _SNAP.fullmatch(line) or _PLAIN.fullmatch(line)
+    if line.lstrip().startswith("#") or not found:
+        return None, ""
+    return int(found[1]), found[2].strip().strip('"').strip()
+
+
+def is_meaningful(name: str | None) -> bool:
+    """Whether somebody gave this name, and no program ("Label 3", "Segment_1")."""
+    return bool(name) and not _MEANINGLESS.fullmatch(str(name).strip())
+
+
+def _header_names(path: Path) -> dict[int, str]:
+    name = path.name.lower()
+    try:
+        if name.endswith((".nrrd", ".nhdr")):
+            return _nrrd_names(path)
+        if name.endswith((".nii", ".nii.gz")):
+            return _nifti_names(path)
+    except Exception as error:  # the image itself was read by ITK; nibabel and nrrd raise various exceptions
+        _log.info("%s: names in its header cannot be read (%s)", path, error)
+    return {}
+
+
+def _nrrd_names(path: Path) -> dict[int, str]:
+    import nrrd
+
+    header = nrrd.read_header(str(path))
+    names = {}
+    for key, value in header.items():
+        found = re.fullmatch(r"Segment(\d+)_Name", key)
+        if found:
+            label = header.get(f"Segment{found[1]}_LabelValue", int(found[1]) + 1)
+            names[int(label)] = str(value)
+    return {label: name for label, name in names.items() if is_meaningful(name)}
+
+
+def _nifti_names(path: Path) -> dict[int, str]:
+    """Names in a label table of Connectome Workbench's XML, which TotalSegmentator writes."""
+    from xml.etree import ElementTree
+
+    import nibabel
+
+    names = {}
+    for extension in nibabel.load(path).header.extensions:  # type: ignore[attr-defined]
+        content = extension.get_content()
+        text = content.decode("utf-8", "replace") if isinstance(content, bytes) else str(content)
+        if "<LabelTable" not in text or "<!" in text.replace("<![CDATA[", "") or len(text) > _LARGEST_TABLE:
+            continue  # with a document type a small text can expand without limit
+        for label in ElementTree.fromstring(text.strip("\0 \n")).iter("Label"):
+            names[int(label.get("Key", "0"))] = (label.text or "").strip()
+    return {label: name for label, name in names.items() if label and is_meaningful(name)}

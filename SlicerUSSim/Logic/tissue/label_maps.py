@@ -1,0 +1,324 @@
+"""read_label_map: label maps of other programs as labels of tissues, recognised by their content.
+
+Every door (command, Slicer, workstation) uses it. What was recognised and done is said in `message`, what is doubtful
+in `warnings`; what cannot be known is an error with its remedy, and never a guess.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
+from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
+from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, tissue_named
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised, scheme_with_names, schemes, title_of
+from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+
+_log = logging.getLogger(__name__)
+
+LARGEST_LABEL = 99_999
+_LONGEST_LIST = 12
+#: Tissues of a lesion, which alone are no patient
+_LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledTissues:
+    """A label map in the form for the simulator: one label per tissue."""
+
+    #: uint8 labels
+    labels: Volume
+    #: The tissue of every label
+    tissues: TissueTable
+    #: {label in the input: label in `labels`} of those that occur
+    relabelled: Mapping[int, int]
+    #: What was recognised: "FreeSurfer aseg: 35 labels to 8 tissues"
+    message: str
+    #: What is doubtful, each in one line
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of the tissue of label 1, 2, ...; "" for a number that a table leaves out."""
+        table = self.tissues
+        return tuple(table[label].name if label in table else "" for label in range(1, max(table) + 1))
+
+
+def read_label_map(
+    volume: Volume,
+    names: Mapping[int, str] | None = None,
+    mapping: LabelMapping | None = None,
+    *,
+    source: str = "label map",
+    tissues: TissueTable | None = None,
+    by_number: TissueTable | None = None,
+    renumber: bool = False,
+    advice: Advice = COMMAND,
+) -> LabelledTissues:
+    """The tissues of a label map: by the user's mapping, by names, by a table, or by the numbers of a known program.
+
+    Parameters
+    ----------
+    volume : (k, j, i) whole numbers from 0 to 99999, also stored as floating point.
+    names : {label: name} of what is known about the labels: in the file, beside it, or in the scene.
+    mapping : the user's tissues for labels; goes before everything else.
+    source : the label map in messages.
+    tissues : tissues that are known by their names before the presets, and the membrane; default: of the brain.
+    by_number : a table made for this label map; used for labels without a name. If it has every label, and there are
+        no names, labels are not renumbered.
+    renumber : renumber them also then, from 1.
+    advice : remedies in messages.
+
+    Raises SimulationError for numbers that are no labels, labels without a tissue, which it lists, numbers that fit
+    several programs, and for a mask or lesion without a patient.
+
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic import Volume
+    >>> from SlicerUSSim.Logic.tissue import read_label_map
+    >>> aseg = Volume(np.zeros((20, 20, 20), np.float32), np.eye(4))
+    >>> for label, i in ((2, 4), (41, 14), (4, 8), (43, 11), (10, 7), (49, 12)):
+    ...     aseg.array[5:15, 5:15, i] = label
+    >>> found = read_label_map(aseg)
+    >>> found.message, found.names
+    ('FreeSurfer aseg: 6 labels to 3 tissues', ('white matter', 'csf', 'grey matter'))
+    """
+    reading = _Reading(
+        as_whole(volume, source), names or {}, mapping or LabelMapping(), source,
+        tissues or by_number or TissueTable.brain(), by_number, advice,
+    )  # fmt: skip
+    found = (None if renumber else reading.unchanged()) or reading.by_tissue()
+    _log.info("%s: %s: %s", source, found.message, ", ".join(name for name in found.names if name))
+    return found
+
+
+def as_whole(volume: Volume, source: str = "label map") -> Volume:
+    """The volume with labels as integers. Raises SimulationError unless it holds whole numbers from 0 to 99999."""
+    array = volume.array
+    if array.dtype == np.uint8:
+        return volume
+    low, high = array.min(), array.max()
+    require(
+        bool(np.isfinite(low) and np.isfinite(high)) and low >= 0 and high <= LARGEST_LABEL,
+        f"{source}: has values from {low:g} to {high:g}, expected labels, whole numbers from 0 to {LARGEST_LABEL}",
+    )
+    whole = array.astype(np.int32)
+    if not np.issubdtype(array.dtype, np.integer) and not np.array_equal(whole, array):
+        raise SimulationError(f"{source}: has fractions, expected labels, whole numbers; segment an MRI first")
+    return volume.with_array(whole)
+
+
+class _Reading:
+    """One label map on its way to tissues; see read_label_map for the parameters."""
+
+    def __init__(
+        self, volume: Volume, names: Mapping[int, str], mapping: LabelMapping, source: str, tissues: TissueTable,
+        by_number: TissueTable | None, advice: Advice,
+    ) -> None:  # fmt: skip
+        self._volume, self._mapping, self._source, self._advice = volume, mapping, source, advice
+        self._tissues, self._by_number = tissues, by_number
+        self._counts = np.bincount(volume.array.ravel())
+        self._present = [int(label) for label in np.flatnonzero(self._counts) if label]
+        require(self._present, f"{source}: is empty, expected labels that are not 0")
+        everything = {**names, **mapping.names}
+        self._names = {label: everything[label] for label in self._present if label in everything}
+        self._warnings: list[str] = []
+
+    def unchanged(self) -> LabelledTissues | None:
+        """The labels as they are, if the table by number has all of them and nobody says anything else about them."""
+        table = self._by_number
+        if table is None or self._mapping or self._names or any(label not in table for label in self._present):
+            return None
+        labels = self._volume.with_array(self._volume.array.astype(np.uint8))
+        same = {label: label for label in (0, *self._present)}
+        return LabelledTissues(labels, table, same, f"{self._labels()} by their numbers in the tissue table")
+
+    def by_tissue(self) -> LabelledTissues:
+        """Labels renumbered from 1, one for each tissue, in the order of their first labels."""
+        scheme = self._scheme()
+        names = {label: self._names.get(label, scheme.names.get(label) if scheme else None) for label in self._present}
+        found = {label: self._tissue(label, name) for label, name in names.items()}
+        self._require_patient(scheme, names, found)
+        self._require_known(names, found)
+        coupling = (self._by_number or self._tissues)[0]
+        order: list[Tissue] = []
+        relabelled = {0: 0}
+        between = self._mapping.by_label.get(0, "coupling")
+        if between != "coupling":
+            found = {0: self._named(between), **found}
+        for label, tissue in found.items():
+            assert tissue is not None
+            if tissue.name == "coupling":
+                relabelled[label] = 0
+                continue
+            if tissue not in order:
+                order.append(tissue)
+            relabelled[label] = order.index(tissue) + 1
+        require(order, f"{self._source}: all labels are mapped to 0, expected a tissue for one of them")
+        require(
+            len(order) <= MAX_LABEL, f"{self._source}: has {len(order)} different tissues, expected at most {MAX_LABEL}"
+        )
+        lookup = np.zeros(len(self._counts), np.uint8)
+        lookup[list(relabelled)] = list(relabelled.values())
+        table = TissueTable({0: coupling, **dict(enumerate(order, 1))}, self._tissues.membrane)
+        labels = self._volume.with_array(lookup[self._volume.array])
+        self._say_doubts(scheme, names, found)
+        tissues = f"{len(order)} tissue{'s' * (len(order) > 1)}"
+        message = f"{self._title(scheme, names)}: {self._labels()} to {tissues}"
+        return LabelledTissues(labels, table, relabelled, message, tuple(self._warnings))
+
+    # ---- what it is --------------------------------------------------------------------------------------------
+
+    def _scheme(self) -> Scheme | None:
+        """The numbering scheme, if some labels have neither a name nor a tissue of the user's."""
+        if self._mapping.scheme:
+            return schemes()[self._mapping.scheme]
+        unknown = [label for label in self._present if self._tissue(label, self._names.get(label)) is None]
+        if not unknown or (self._names and len(unknown) < len(self._present)):
+            return None
+        recognition = recognised(self._volume, unknown)
+        if recognition.is_mirrored:
+            self._warnings.append(
+                f"{self._source}: labels of the left side are on the right; check the orientation in its header"
+            )
+        if recognition.candidates:
+            titles = " and ".join(scheme.title for scheme in recognition.candidates)
+            remedy = self._advice.ambiguous.format(key=recognition.candidates[0].key)
+            raise SimulationError(f"{self._source}: labels {_listed(self._present)} fit {titles}; {remedy}")
+        return recognition.scheme
+
+    def _tissue(self, label: int, name: str | None) -> Tissue | None:
+        given = self._mapping.tissue_of(label, name)
+        if given is not None:
+            return self._named(given)
+        if name is not None:
+            named = self._named(name)
+            if named is not None:
+                return named
+        if self._by_number is not None and not self._mapping.scheme:
+            return self._by_number.get(label)
+        return None
+
+    def _named(self, name: str) -> Tissue | None:
+        """The tissue with a name among the user's tissues, among the presets, or the nearest."""
+        try:
+            preset = tissue_named(name).name
+        except SimulationError:
+            preset = nearest_tissue(name)
+        mine = self._tissues.all_tissues()[::-1]
+        exactly = {tissue.name: tissue for tissue in mine}
+        plainly = {plain_name(tissue.name): tissue for tissue in mine}
+        own = exactly.get(name) or plainly.get(plain_name(name))
+        if own is not None or preset is None:
+            return own
+        return exactly.get(preset) or TISSUES[preset]
+
+    def _title(self, scheme: Scheme | None, names: Mapping[int, str | None]) -> str:
+        if all(self._mapping.tissue_of(label, name) for label, name in names.items()):
+            return "mapped"
+        if scheme is None:
+            scheme = scheme_with_names(self._names)
+        if scheme is not None:
+            return title_of(scheme, self._present)
+        return "labels with names" if self._names else "labels by number"
+
+    # ---- refusals ----------------------------------------------------------------------------------------------
+
+    def _require_patient(
+        self, scheme: Scheme | None, names: Mapping[int, str | None], found: Mapping[int, Tissue | None]
+    ) -> None:
+        """Refuse a mask or a lesion, which is no patient, unless the user gave it a tissue."""
+        mine = {label for label, name in names.items() if self._mapping.tissue_of(label, name)}
+        if mine == set(names):
+            return
+        first = next(label for label in self._present if label not in mine)
+        size = f"{self._labels()}, {self._size(self._present)}"
+        known = [None if tissue is None else tissue.name for tissue in found.values()]
+        name = names[first]
+        if len(names) == 1 and (known[0] is None or (name is not None and _is_nearest(name))):
+            what = f"a binary mask ({size})"
+        elif scheme is not None and scheme.is_lesion:
+            what = (
+                f"a tumour's labels ({title_of(scheme, self._present)}: {', '.join(map(str, names.values()))}; {size})"
+            )
+        elif all(tissue in _LESIONS for tissue in known):
+            what = f"a lesion ({', '.join(str(name or '') for name in names.values())}; {size})"
+        else:
+            return
+        tissue = known[0] or "tumour"
+        if known[0] is None:
+            guess = self._named(self._source.rsplit("/")[-1].split(".")[0])
+            tissue = "tumour" if guess is None else guess.name
+        remedy = self._advice.lesion.format(tissue=tissue, source=self._source, label=first)
+        raise SimulationError(f"{self._source}: {what}, not a patient's tissues; {remedy}")
+
+    def _require_known(self, names: Mapping[int, str | None], found: Mapping[int, Tissue | None]) -> None:
+        unknown = [label for label in self._present if found[label] is None]
+        if not unknown:
+            return
+        listed = _listed(
+            repr(names[label] or f"label {label}")
+            + (f" ({self._label_and_size(label)})" if self._advice.gives_sizes else "")
+            for label in unknown
+        )
+        remedy = self._advice.unknown.format(label=unknown[0])
+        nothing = "no program's numbers are recognised, and " if len(unknown) == len(self._present) else ""
+        known = ", ".join(dict.fromkeys([*self._tissues.names()[1:], *TISSUES]))
+        raise SimulationError(f"{self._source}: {nothing}no tissue is called {listed}; {remedy}: {known}")
+
+    def _say_doubts(
+        self, scheme: Scheme | None, names: Mapping[int, str | None], found: Mapping[int, Tissue | None]
+    ) -> None:
+        nearest: dict[str, list[str]] = {}
+        for label, name in names.items():
+            tissue = found[label]
+            if tissue and name and not self._mapping.tissue_of(label, name) and _is_nearest(name):
+                nearest.setdefault(tissue.name, []).append(name)
+        if nearest:
+            pairs = "; ".join(f"{_listed(mine, 4)} as {tissue}" for tissue, mine in nearest.items())
+            self._warnings.append(f"{self._source}: the nearest tissue is used for {pairs}")
+        unused = self._mapping.unused(names)
+        if unused:
+            self._warnings.append(f"{self._source}: has no label {_listed(unused)}, which --map mentions")
+        body = scheme or scheme_with_names(self._names)
+        if body is not None and body.key.startswith("totalsegmentator") and 0 not in found and self._counts[0]:
+            share = self._counts[0] / self._counts.sum()
+            self._warnings.append(
+                f"{self._source}: {share:.0%} of the volume has no label and is the coupling medium, also between the "
+                f"organs; {self._advice.between}"
+            )
+
+    def _label_and_size(self, label: int) -> str:
+        number = f"{label}, " if label in self._names else ""
+        return f" ({number}{self._size([label])})" if self._advice.gives_sizes else ""
+
+    def _size(self, labels: list[int]) -> str:
+        size_ml = self._volume_ml(labels)
+        return f"{size_ml:.0f} ml" if size_ml >= 10 else f"{size_ml:.2g} ml"
+
+    def _volume_ml(self, labels: list[int]) -> float:
+        return float(self._counts[labels].sum() * abs(np.linalg.det(self._volume.ijk_to_ras[:3, :3])) / 1e3)
+
+    def _labels(self) -> str:
+        return f"{len(self._present)} label{'s' * (len(self._present) > 1)}"
+
+
+def _is_nearest(name: str) -> bool:
+    try:
+        tissue_named(name)
+    except SimulationError:
+        return nearest_tissue(name) is not None
+    return False
+
+
+def _listed(items: Iterable[object], most: int = _LONGEST_LIST) -> str:
+    texts = list(map(str, items))
+    more = [f"and {len(texts) - most} more"] if len(texts) > most else []
+    return ", ".join([*texts[:most], *more])

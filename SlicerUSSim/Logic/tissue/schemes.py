@@ -1,0 +1,215 @@
+"""Numbering schemes of programs that write label maps, and recognition of the one that a label map uses.
+
+Numbers alone are often not enough: 2, 3 and 4 are white matter, cortex and ventricle for FreeSurfer, kidneys and gall
+bladder for TotalSegmentator. What the numbers stand for has its place in the body, however: the left hemisphere is left
+of the right one, a vertebra is above the next lower one. A scheme is therefore accepted only if the positions agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tissue import freesurfer, totalsegmentator
+from SlicerUSSim.Logic.tissue.names import same_name
+
+#: At least this share of the positions of structures has to agree with a scheme, and this number of them.
+_AGREEING, _FEWEST = 0.85, 3
+#: Share of a file's labels that a scheme has to know.
+_KNOWN = 0.85
+#: The same if the places of structures leave no doubt; the other labels are then listed as unknown.
+_KNOWN_IF_SURE = 0.6
+#: Pairs of left and right that leave no doubt about FreeSurfer's numbers; or regions of the cortex
+_SURE = 8
+#: Share of a volume that has to be outside a brain to tell how deep its tissues are
+_OUTSIDE = 0.2
+#: Voxels for the centres of structures; a larger volume is thinned out.
+_VOXELS = 2_000_000
+#: A label map of a tumour alone is smaller than this, and fills less of its box; a labelled brain is larger, and a part
+#: of one fills its box.
+_LARGEST_LESION_ML, _LARGEST_LESION_SHARE = 400.0, 0.25
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """The numbering of one program."""
+
+    #: As a user writes it: --map freesurfer
+    key: str
+    title: str
+    #: {label: name}
+    names: Mapping[int, str]
+    #: (axis of RAS, labels whose centres have increasing coordinates along it)
+    order: list[tuple[int, list[int]]] = field(default_factory=list)
+    #: Whether it labels lesions only, and no patient around them
+    is_lesion: bool = False
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """What a label map was recognised as."""
+
+    scheme: Scheme | None
+    #: Other schemes that fit as well; then `scheme` is None
+    candidates: tuple[Scheme, ...] = ()
+    #: Whether what is labelled left is on the right
+    is_mirrored: bool = False
+
+
+@cache
+def schemes() -> dict[str, Scheme]:
+    """{key: Scheme} of all that are known."""
+    entries = [
+        Scheme(
+            "freesurfer", "FreeSurfer", freesurfer.freesurfer_names(),
+            [(0, list(pair)) for pair in freesurfer.freesurfer_sides()],
+        )
+    ]  # fmt: skip
+    for key, title, names in (
+        ("totalsegmentator", "TotalSegmentator CT", totalsegmentator.CT),
+        ("totalsegmentator-v1", "TotalSegmentator CT, version 1", totalsegmentator.CT_V1),
+        ("totalsegmentator-mr", "TotalSegmentator MR", totalsegmentator.MR),
+    ):
+        order = totalsegmentator.anatomical_order(names)
+        entries.append(Scheme(key, title, totalsegmentator.numbered(names), order))
+    # FSL's FAST (<name>_seg, <name>_pveseg of a T1) numbers alike: https://fsl.fmrib.ox.ac.uk/fsl/docs/structural/fast
+    entries.append(
+        Scheme(
+            "ussim", "ussim segment or FSL FAST", {1: "csf", 2: "grey matter", 3: "white matter", 4: "leptomeninges"}
+        )
+    )
+    # Menze et al., IEEE Trans. Med. Imaging 34 (2015); 2017 to 2022 with 4 for the enhancing tumour, since 2023 with 3;
+    # since 2024 (de Verdier et al., arXiv:2405.18368) with 4 for the resection cavity.
+    before = {1: "necrotic core", 2: "oedema", 4: "enhancing tumour"}
+    since = {1: "necrotic core", 2: "oedema", 3: "enhancing tumour", 4: "resection cavity"}
+    entries.append(Scheme("brats-2022", "BraTS 2017 to 2022", before, is_lesion=True))
+    entries.append(Scheme("brats", "BraTS since 2023", since, is_lesion=True))
+    return {scheme.key: scheme for scheme in entries}
+
+
+def recognised(labels: Volume, values: list[int]) -> Recognition:
+    """The scheme of a label map with these labels other than 0, by their numbers and places.
+
+    Parameters
+    ----------
+    labels : (k, j, i) whole numbers.
+    """
+    centres = _centres(labels)
+    fits: list[tuple[int, Scheme]] = []
+    for scheme in schemes().values():
+        known = np.mean([value in scheme.names for value in values])
+        if not scheme.order or known < _KNOWN_IF_SURE:
+            continue
+        holds, count = _agreement(scheme.order, centres)
+        if scheme.key == "freesurfer":
+            recognition = _freesurfer(scheme, values, holds, count, float(known))
+            if recognition is not None:
+                return recognition
+        elif known >= _KNOWN and count >= _FEWEST and holds >= _AGREEING * count:
+            fits.append((holds, scheme))
+    if not fits:
+        return _of_brain(labels, values)
+    most = max(holds for holds, _ in fits)
+    best = [scheme for holds, scheme in fits if holds == most]
+    if len({tuple(scheme.names.get(value) for value in values) for scheme in best}) > 1:
+        return Recognition(None, tuple(best))
+    return Recognition(best[0])
+
+
+def _freesurfer(scheme: Scheme, values: list[int], holds: int, count: int, known: float) -> Recognition | None:
+    """FreeSurfer's numbers, if enough pairs of a left and a right structure lie as they should, or all are mirrored."""
+    usual = np.mean([freesurfer.is_usual(value) for value in values])
+    if count >= _SURE and count - holds >= _AGREEING * count:
+        return Recognition(scheme, is_mirrored=True)
+    if holds < _AGREEING * count:
+        return None
+    regions = sum(map(freesurfer.is_region, values))
+    is_sure = count >= _SURE or (min(usual, known) >= _KNOWN and (count >= 2 or regions >= _SURE))
+    return Recognition(scheme) if is_sure else None
+
+
+def title_of(scheme: Scheme, values: list[int]) -> str:
+    """The scheme, and which of its segmentations this is."""
+    if scheme.key != "freesurfer":
+        return scheme.title
+    if any(value >= 11100 for value in values):
+        return "FreeSurfer aparc.a2009s+aseg"
+    if any(3000 <= value <= 5002 for value in values):
+        return "FreeSurfer wmparc"
+    if any(1000 <= value < 3000 for value in values):
+        return "FreeSurfer or FastSurfer aparc+aseg"
+    if any(value in (31, 63, 77, 85, *range(251, 256)) for value in values):
+        return "FreeSurfer aseg"
+    return "FreeSurfer's numbers, as SynthSeg uses them" if 24 in values else "FreeSurfer aseg"
+
+
+def scheme_with_names(names: Mapping[int, str]) -> Scheme | None:
+    """The scheme that gives these labels these names, if there is one."""
+    for scheme in schemes().values():
+        same = [same_name(name, scheme.names.get(label, "")) for label, name in names.items()]
+        if same and np.mean(same) >= _KNOWN:
+            return scheme
+    return None
+
+
+def _of_brain(labels: Volume, values: list[int]) -> Recognition:
+    """A brain as `ussim segment` numbers it, or a tumour as BraTS does: both have labels from 1 to 4."""
+    known = schemes()
+    if not set(values) <= set(known["brats"].names) or len(values) < 2:
+        return Recognition(None)
+    if 4 in values and 3 not in values:  # a brain without white matter, but with thin sulci, is none
+        return Recognition(known["brats-2022"])
+    filled = int(np.count_nonzero(labels.array))
+    volume_ml = filled * abs(np.linalg.det(labels.ijk_to_ras[:3, :3])) / 1e3
+    if volume_ml < _LARGEST_LESION_ML and filled < _LARGEST_LESION_SHARE * labels.array.size:
+        return Recognition(known["brats"])
+    return Recognition(known["ussim"] if {2, 3} <= set(values) and _is_grey_between(labels) else None)
+
+
+def _is_grey_between(labels: Volume) -> bool:
+    """Whether label 3 touches label 2 more than label 1, as white matter touches the grey more than the fluid.
+
+    And whether it is farther from the outside, so that programs that number white matter first, or the fluid last, are
+    not taken for this one.
+    """
+    from scipy import ndimage
+
+    array = labels.array.astype(np.uint8)
+    contacts = np.zeros(64, np.int64)
+    for axis in range(3):
+        first = np.moveaxis(array, axis, 0)
+        contacts += np.bincount((first[:-1] * np.uint8(8) + first[1:]).ravel(), minlength=64)
+    contacts = contacts.reshape(8, 8)
+    if (contacts + contacts.T)[3, 2] < (contacts + contacts.T)[3, 1]:
+        return False
+    step = max(1, int(np.ceil((array.size / _VOXELS) ** (1 / 3))))
+    thin = array[::step, ::step, ::step]
+    if np.mean(thin == 0) < _OUTSIDE:
+        return True  # a part of a brain
+    depth = np.asarray(ndimage.distance_transform_edt(thin > 0))
+    return float(depth[thin == 3].mean()) > float(depth[thin == 2].mean())
+
+
+def _agreement(order: list[tuple[int, list[int]]], centres: Mapping[int, np.ndarray]) -> tuple[int, int]:
+    """(pairs of neighbours in the order that lie as they should, all pairs) of the structures that are there."""
+    holds = count = 0
+    for axis, row in order:
+        there = [centres[label][axis] for label in row if label in centres]
+        steps = np.diff(there)
+        holds, count = holds + int(np.sum(steps > 0)), count + len(steps)
+    return holds, count
+
+
+def _centres(labels: Volume) -> dict[int, np.ndarray]:
+    """{label: its centre in RAS mm}."""
+    step = max(1, int(np.ceil((labels.array.size / _VOXELS) ** (1 / 3))))
+    array = labels.array[::step, ::step, ::step]
+    where = np.nonzero(array)
+    values, inverse, counts = np.unique(array[where], return_inverse=True, return_counts=True)
+    ijk = np.stack([np.bincount(inverse, axis) * step / counts for axis in where[::-1]], axis=1)
+    ras = ijk @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
+    return dict(zip(map(int, values), ras, strict=True))
