@@ -53,7 +53,7 @@ class Scene:
 
     def voxels(self, name: str, node=None) -> int:
         labelled = read_labels(self.labels if node is None else node, self.logic.preset.tissues)
-        return int((labelled.volume.array == labelled.names.index(name) + 1).sum())
+        return int((labelled.labels.array == labelled.names.index(name) + 1).sum())
 
     def presenter(self, **options) -> PanelPresenter:
         result = PanelPresenter(self.logic, PlainView(), **options)

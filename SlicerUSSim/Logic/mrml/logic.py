@@ -223,7 +223,7 @@ class UltrasoundSceneLogic:
             labels, names = was.labels, was.names
         else:
             was, labelled = None, read_labels(labels_node, self.preset.tissues)
-            labels, names = labelled.volume, labelled.names
+            labels, names = labelled.labels, labelled.names
         lesions, skipped = self._lesions(lesions_node, labels_node)
         if labels_node.IsA("vtkMRMLSegmentationNode"):
             labels = padded_for(lesions, labels)  # it is cropped to what it holds
