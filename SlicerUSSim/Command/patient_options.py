@@ -12,7 +12,8 @@ import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.options import declared, declared_parameters, device_option, mask_option
-from SlicerUSSim.Command.progress import Share, note
+from SlicerUSSim.Command.mri_options import also_option, segmented_file, split_also
+from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
@@ -71,8 +72,12 @@ class PatientOptions:
     #: LABEL=TISSUE, NAME=TISSUE, files and numbering schemes
     maps: tuple[str, ...] = declared(map_option)
     #: {parameter: value}
-    segmentation: Mapping[str, Any] = declared_parameters(SegmentationSettings, ("contrast", "thin_sulci"))
+    segmentation: Mapping[str, Any] = declared_parameters(
+        SegmentationSettings, ("contrast", "skull_strip", "thin_sulci")
+    )
     mask: str | None = declared(mask_option)
+    #: CONTRAST=FILE
+    also: tuple[str, ...] = declared(also_option)
     #: TISSUE=FILE
     additions: tuple[str, ...] = declared(add_option)
     #: {parameter: value} of the options that were given
@@ -150,6 +155,11 @@ def open_examination(patient: PatientOptions) -> Examination:
         raise SimulationError(
             f"{patient.mri_or_labels}: is an MRI, and --map is for labels; use --labels if it is none"
         )
+    if is_labels and patient.also:
+        raise SimulationError(
+            f"{patient.mri_or_labels}: is a label map, and --also is for an MRI; use --mri if it is one"
+        )
+    split_also(patient.also)
     changes = Changes.of(patient.changes)
     table = TissueTable.read(patient.tissues) if patient.tissues else None
     if is_labels:
@@ -165,7 +175,9 @@ def open_examination(patient: PatientOptions) -> Examination:
         changes.check_tissues((*(tissue.name for tissue in tissues.all_tissues()), *TISSUES))
     else:
         changes.to_tissues(additions.with_presets(tissues))
-    segmentation = _segmented(volume, patient)
+    segmentation = segmented_file(
+        patient.mri_or_labels, volume, patient.segmentation, mask=patient.mask, also=patient.also, device=patient.device
+    )
     names = segmentation.tissue_names if table is None else tissues.names_by_label()
     added = additions.on(segmentation.labels, names)
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
@@ -208,14 +220,3 @@ def _labelled(
     for warning in found.warnings:
         log.warning("%s", warning)
     return found.labels, found.tissues
-
-
-def _segmented(mri: Volume, patient: PatientOptions) -> Segmentation:
-    from SlicerUSSim.Logic.base.volume import Volume
-    from SlicerUSSim.Logic.mri.segmentation import segment_mri
-
-    with Share("segment") as progress:
-        return segment_mri(
-            mri, **patient.segmentation, mask=Volume.read(patient.mask) if patient.mask else None,
-            device=patient.device, progress=progress,
-        )  # fmt: skip

@@ -18,6 +18,8 @@ from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, VALUE_PARAMET
 
 SCENE = "scene"
 Kind = Literal["slider", "number", "tick", "choice", "text", "node", "button", "words", "table", "list"]
+#: The choices of a parameter that is true, false or none
+_OPTIONAL = {"automatic": None, "on": True, "off": False}
 #: Suffix of the widget's name, by kind of control.
 _WIDGETS: dict[Kind, str] = {
     "slider": "Slider", "number": "SpinBox", "tick": "CheckBox", "choice": "ComboBox", "text": "LineEdit",
@@ -124,9 +126,10 @@ def value(name: str) -> Control:
     elif declared.choices:
         kind = "choice"
     elif declared.type is bool:
-        kind = "tick"
+        kind = "choice" if declared.can_be_none else "tick"
     widget = _camel_case(_without_unit(declared))
-    result = Control(widget, kind, declared.label, declared.tip, name, declared, choices=declared.choices)
+    choices = tuple(_OPTIONAL) if kind == "choice" and declared.type is bool else declared.choices
+    result = Control(widget, kind, declared.label, declared.tip, name, declared, choices=choices)
     if isinstance(declared.shown, Shown):
         span = f"{declared.shown.low:.10g} to {declared.shown.high:.10g}{result.suffix}"
         result = replace(result, tip=f"{declared.tip} ({span})")
@@ -168,6 +171,8 @@ def value_parameter(name: str) -> Parameter:
 
 def to_shown(declared: Parameter, found: Any) -> Any:
     """The displayed form of a value; None if nothing is displayed."""
+    if declared.type is bool and declared.can_be_none:
+        return next(text for text, value in _OPTIONAL.items() if value is found)
     return declared.shown.number(found) if isinstance(declared.shown, Shown) else found
 
 
@@ -176,6 +181,8 @@ def from_shown(declared: Parameter, entered: Any) -> Any:
 
     Values of type int are rounded, since widgets hold them as floats.
     """
+    if declared.type is bool and declared.can_be_none:
+        return _OPTIONAL.get(entered, entered)
     is_number = isinstance(entered, int | float) and not isinstance(entered, bool) and math.isfinite(entered)
     if not is_number or not isinstance(declared.shown, Shown):
         return entered

@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -61,6 +62,8 @@ class PanelPresenter:
         self.view = view
         self._handles, self._label_maps = handles, label_maps
         self._notes: list[str] = []
+        #: File in which the brain mask of an MRI node is kept beside the MRI's; None: in the scene only
+        self.maskFile: Callable[[Any], Path | None] = lambda mri_node: None
         self._busy = False
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
@@ -186,17 +189,37 @@ class PanelPresenter:
         """Segment the MRI into the chosen label map or segmentation, or into a new node (see _replaceable)."""
         parameters = self.logic.parameters
         with self.shown(), self.working("Segment") as progress:
-            require(parameters.mri is not None, "no MRI chosen, expected a scalar volume")
-            with self._replaceable(f"{parameters.mri.GetName()} tissues") as labels:
-                self.logic.segment(
-                    parameters.mri,
-                    labels,
-                    mask_node=parameters.mask,
-                    lesions_node=parameters.lesions,
-                    progress=progress,
-                    **asdict(parameters.segmentation),
-                )
+            mri = required(parameters.mri, "no MRI chosen, expected a scalar volume")
+            told = self._forget_other_brain(mri)
+            others, untold = self._second_mri()
+            with self._replaceable(f"{mri.GetName()} tissues") as labels:
+                result = self.logic.segment(
+                    mri, labels, mask_node=parameters.mask, others=others, lesions_node=parameters.lesions,
+                    keep_mask_at=self.maskFile(mri), progress=progress, **asdict(parameters.segmentation),
+                )  # fmt: skip
+            if parameters.mask is None and result.brain.method not in ("stripped", "none"):
+                parameters.mask = brain = self.logic.writeBrain(result, mri)
+                told.append(f"the brain mask is {brain.GetName()!r}, which Segment uses from now on; edit it as needed")
+            self._notes += [*told, *untold]
         self.view.refresh()
+
+    def _forget_other_brain(self, mri: Any) -> list[str]:
+        """Deselect the mask that Segment extracted from another MRI; a line about it."""
+        parameters = self.logic.parameters
+        mask: Any = parameters.mask
+        if self.logic.brainOf(mask) in (None, mri.GetID()):
+            return []
+        parameters.mask = None
+        return [f"{mask.GetName()!r} is the mask of another MRI and was not used"]
+
+    def _second_mri(self) -> tuple[dict[str, Any], list[str]]:
+        """({contrast: node}, lines about it)"""
+        parameters = self.logic.parameters
+        node, contrast = parameters.second_mri, parameters.panel.second_contrast
+        if node is None or contrast == "none":
+            return {}, [] if node is None else ["the second MRI was not used: choose its contrast"]
+        require(node is not parameters.mri, f"first and second MRI are both {node.GetName()!r}, expected two volumes")
+        return {contrast: node}, []
 
     def addTissues(self) -> None:
         """Lay the lesions over the chosen tissues, or over a copy of them in a new node (see _replaceable)."""
@@ -362,6 +385,7 @@ class PanelPresenter:
         kind = "LabelMapVolume" if self._label_maps else "Segmentation"
         with self._made(None if kept else chosen, kind, name) as node:
             yield node
+        assert node is not None
         self.logic.parameters.labels = node
         self._notes = [*self.logic.notes, *(f"Check: {warning}" for warning in self.logic.warnings)]
         if kept:

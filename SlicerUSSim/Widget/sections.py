@@ -38,12 +38,18 @@ def panel_sections() -> tuple[Section, ...]:
 
 def _inputs() -> tuple[Row, ...]:
     return (
-        node("mri", "MRI", "Brain MRI, skull-stripped or with a mask"),
+        node("mri", "MRI", "MRI of a whole head, or of a skull-stripped brain"),
         node(
             "mask", "Mask",
-            "Brain mask: a segmentation, or a label map on the MRI's grid; none: every voxel brighter than the "
-            "background",
+            "Brain mask: a segmentation, or a label map on the MRI's grid; none: Segment extracts the brain from a "
+            "whole head, and keeps its mask here",
         ),
+        node(
+            "second_mri", "Second MRI",
+            "Another MRI of the same patient, on any grid, such as T2 or FLAIR: registered to the first and classified "
+            "together with it",
+        ),
+        value("scene.second_contrast"),
         *_of_scene(SceneParameters.segmentation),
         node(
             "labels", "Tissues",

@@ -6,7 +6,8 @@ import json
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -40,6 +41,7 @@ from SlicerUSSim.Logic.mrml.live import LiveNodes, LiveUpdate
 from SlicerUSSim.Logic.mrml.nodes import (
     named,
     node_to_world,
+    nodes_of_class,
     pose_in_labels,
     probe_pose,
     read_volume,
@@ -57,6 +59,8 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
 T = TypeVar("T")
+#: Attribute of a mask node: the ID of the MRI node from which it was extracted
+_BRAIN_OF = "SlicerUSSim.brainOf"
 
 
 class AtOnce:
@@ -148,20 +152,23 @@ class UltrasoundSceneLogic:
         labels_node,
         *,
         mask_node=None,
+        others: Mapping[str, Any] | None = None,
         lesions_node=None,
         overwrite: bool = False,
-        classes: int = SegmentationSettings.classes,
+        keep_mask_at: Path | None = None,
+        classes: int | None = SegmentationSettings.classes,
         contrast: str = SegmentationSettings.contrast,
         filter_radius: int = SegmentationSettings.filter_radius,
         filter_epsilon: float | None = SegmentationSettings.filter_epsilon,
-        bias_correction: bool = SegmentationSettings.bias_correction,
+        bias_correction: bool | None = SegmentationSettings.bias_correction,
         thin_sulci: bool = SegmentationSettings.thin_sulci,
         skull_strip: str = SegmentationSettings.skull_strip,
         progress: Callable[[float], None] | None = None,
     ) -> Segmentation:
         """Label the tissues of a scalar volume into a label map or segmentation node, with names and colours.
 
-        See segmentation.segment_mri; `mask_node` is a label map on the MRI's grid, or a segmentation. The segments of
+        See segmentation.segment_mri; `mask_node` is a label map on the MRI's grid, or a segmentation; `others` are
+        volume nodes of the same patient by their contrast. The segments of
         `lesions_node` are laid over the labels, as by addTissues, but are not in the result. `progress` may raise
         errors.Cancelled; the nodes are then as they were.
         Raises SimulationError for a node with labels that were not made by this method, or edited since; `overwrite`
@@ -178,12 +185,13 @@ class UltrasoundSceneLogic:
             overwrite or self.mayReplace(labels_node),
             f"{named(labels_node)} was not made by Segment, or edited since, and is not replaced; choose another node",
         )
+        volumes = {contrast: _in_frame_of(node, mri_node) for contrast, node in (others or {}).items()}
         lesions, skipped = ([], []) if lesions_node is None else self._lesions(lesions_node, mri_node)
         result = self._work.do(
             lambda: segment_mri(
-                mri, classes=classes, contrast=contrast, mask=mask, filter_radius=filter_radius,
+                mri, classes=classes, contrast=contrast, others=volumes, mask=mask, filter_radius=filter_radius,
                 filter_epsilon=filter_epsilon, bias_correction=bias_correction, thin_sulci=thin_sulci,
-                skull_strip=skull_strip, device=self.device, progress=progress,
+                skull_strip=skull_strip, keep_mask_at=keep_mask_at, device=self.device, progress=progress,
             )
         )  # fmt: skip
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
@@ -194,8 +202,30 @@ class UltrasoundSceneLogic:
             labels_version(labels_node), added.labels, added.tissue_names,
             lambda: texture_below(result.texture(), mri, result.labels, added.labels), mri,
         )  # fmt: skip
-        self.notes, self.warnings = added.messages, (*skipped, *added.warnings)
+        self.notes = (*result.notes, *result.table().splitlines(), *added.messages)
+        self.warnings = (*result.warnings, *skipped, *added.warnings)
         return result
+
+    def writeBrain(self, result: Segmentation, mri_node):
+        """The label map node "NAME brain" with the mask that segment() extracted from a whole head.
+
+        It is used again as long as nobody has edited it; otherwise another node is made.
+        """
+        name = f"{mri_node.GetName()} brain"
+        known = nodes_of_class(self.scene, "vtkMRMLLabelMapVolumeNode")
+        node = next(
+            (one for one in known if one.GetAttribute(_BRAIN_OF) == mri_node.GetID() and may_replace(one)), None
+        )
+        if node is None:
+            node = self.scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", self.scene.GenerateUniqueName(name))
+        write_labels(node, result.brain.mask, ("brain",), mri_node)
+        node.SetAttribute(_BRAIN_OF, mri_node.GetID())
+        mark_as_made(node)
+        return node
+
+    def brainOf(self, mask_node) -> str | None:
+        """The ID of the MRI node from which writeBrain's mask is, whether edited or not; None for other masks."""
+        return None if mask_node is None else mask_node.GetAttribute(_BRAIN_OF)
 
     def mayReplace(self, labels_node) -> bool:
         """Whether segment() may write into a node: if it is empty, or has what segment() wrote and nobody edited."""
@@ -554,3 +584,9 @@ class UltrasoundSceneLogic:
             texture = segmented.texture().on_grid_of(patient.labels, segmented.labels)
             self._texture = (patient.version, texture)
         return self._texture[1]
+
+
+def _in_frame_of(volume_node, node) -> Volume:
+    """A volume in the own frame of another node, before its parent transform."""
+    volume = read_volume(volume_node, "second MRI")
+    return Volume(volume.array, np.linalg.inv(node_to_world(node)) @ node_to_world(volume_node) @ volume.ijk_to_ras)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
-from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter, parameters_of
+from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter, parameter_of, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
@@ -27,6 +27,10 @@ class PanelSettings(Declared):
     show_in_slice: bool = parameter(
         True, "Show the image in this slice view",
         "Move the slice view to the image plane and overlay the image, with every new image", shown=True,
+    )  # fmt: skip
+    second_contrast: str = parameter(
+        "none", "Its contrast", "Contrast of the second MRI, which is classified together with the first",
+        choices=("none", *parameter_of(SegmentationSettings, "contrast").choices), shown=True,
     )  # fmt: skip
     preset: str = parameter("", "Preset", "The JSON text of a Preset; empty: the default")
 
@@ -115,6 +119,8 @@ class SceneParameters:
     """
 
     mri = NodeParameter("vtkMRMLScalarVolumeNode")
+    #: Of the same patient, with panel.second_contrast
+    second_mri = NodeParameter("vtkMRMLScalarVolumeNode")
     mask = NodeParameter("vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     labels = NodeParameter("vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     #: Its segments are laid over the labels

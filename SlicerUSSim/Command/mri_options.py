@@ -1,0 +1,66 @@
+"""--also, and the segmentation of an MRI file with a progress bar, notes and warnings, for all commands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from SlicerUSSim.Command.progress import Share, note
+from SlicerUSSim.Logic.base.declaration import parameter_of
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.base import Volume
+    from SlicerUSSim.Logic.mri import Segmentation
+
+also_option = click.option(
+    "--also", multiple=True, metavar="CONTRAST=FILE",
+    help="Another MRI of the same patient, on any grid, registered to the first and classified together with it: "
+    "t2=FILE, flair=FILE, t1=FILE or t1gd=FILE; may be repeated.",
+)  # fmt: skip
+
+
+def split_also(texts: Iterable[str]) -> dict[str, str]:
+    """{contrast: file} of the values of --also. Raises SimulationError for another text or contrast, or one twice."""
+    contrasts, found = parameter_of(SegmentationSettings, "contrast").choices, {}
+    for text in texts:
+        contrast, _, file = text.partition("=")
+        require(file, f"--also is {text!r}, expected CONTRAST=FILE, such as t2=t2.nii.gz")
+        require(contrast in contrasts, f"--also: contrast is {contrast!r}, expected one of {', '.join(contrasts)}")
+        require(contrast not in found, f"--also: {contrast} is given twice, expected one volume per contrast")
+        found[contrast] = file
+    return found
+
+
+def segmented_file(
+    path: str,
+    mri: Volume,
+    settings: Mapping[str, Any],
+    *,
+    mask: str | None = None,
+    also: Iterable[str] = (),
+    device: str | None = None,
+    tell_all: bool = False,
+) -> Segmentation:
+    """Segment the MRI of a file; its brain mask is kept beside it.
+
+    Says how the brain was found and what should be checked; with `tell_all` also what else was found.
+    """
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+    from SlicerUSSim.Logic.mri.segmentation import segment_mri
+
+    others = {contrast: Volume.read(file) for contrast, file in split_also(also).items()}
+    with Share("segment") as progress:
+        result = segment_mri(
+            mri, **settings, others=others, mask=Volume.read(mask) if mask else None, keep_mask_at=mask_beside(path),
+            device=device, progress=progress,
+        )  # fmt: skip
+    for line in result.notes if tell_all else (result.brain.message,):
+        note(line)
+    for line in result.warnings:
+        note(f"ussim: warning: {line}")
+    return result
