@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.options import declared, declared_parameters, device_option, mask_option
 from SlicerUSSim.Command.mri_options import also_option, segmented_file, split_also
+from SlicerUSSim.Command.options import declared, declared_parameters, device_option, mask_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Logic.base.errors import SimulationError
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.imaging import Preset, UltrasoundSimulator
-    from SlicerUSSim.Logic.mri import Segmentation
     from SlicerUSSim.Logic.probe import Probe
     from SlicerUSSim.Logic.tissue import TissueTable
 

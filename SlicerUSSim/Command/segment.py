@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.options import check_output, device_option, gathered, mask_option
 from SlicerUSSim.Command.mri_options import also_option, segmented_file, split_also
+from SlicerUSSim.Command.options import check_output, device_option, gathered, mask_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
