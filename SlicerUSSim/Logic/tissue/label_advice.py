@@ -11,8 +11,8 @@ class Advice:
 
     #: About labels without a tissue, before the list of tissues; {label} is one of them
     unknown: str = "map them with --map {label}=TISSUE (0 removes a label), a .json file or a table of names, to one of"
-    #: About a mask or lesion without a patient; {tissue}, {source} and {label} are those of the label map
-    lesion: str = "add it to a segmentation with --add {tissue}={source}, or allow it with --map {label}={tissue}"
+    #: About a mask or lesion without a patient; {tissue}, {source} and {maps} are for this label map
+    lesion: str = "add it to a segmentation with --add {tissue}={source}, or allow it with {maps}"
     #: About numbers that several programs use; {key} is one of them
     ambiguous: str = "say which with --map {key}"
     #: About voxels without a label between organs
@@ -26,7 +26,7 @@ COMMAND = Advice()
 PAGE = replace(
     COMMAND,
     unknown="name them in a table beside it (.txt), or start ussim serve --labels with --map {label}=TISSUE, one of",
-    lesion="add it to a segmentation, or start ussim serve --labels {source} --map {label}={tissue}",
+    lesion="add it to a segmentation, or start ussim serve --labels {source} {maps}",
     ambiguous="start ussim serve --labels with --map {key}",
 )
 #: 3D Slicer

@@ -7,7 +7,7 @@ in `warnings`; what cannot be known is an error with its remedy, and never a gue
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
+from SlicerUSSim.Logic.tissue.label_findings import Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -25,9 +26,6 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 _log = logging.getLogger(__name__)
 
 LARGEST_LABEL = 99_999
-_LONGEST_LIST = 12
-#: Tissues of a lesion, which alone are no patient
-_LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,16 +135,20 @@ class _Reading:
         if table is None or self._mapping or self._names or any(label not in table for label in self._present):
             return None
         labels = self._volume.with_array(self._volume.array.astype(np.uint8))
-        same = {label: label for label in (0, *self._present)}
-        return LabelledTissues(labels, table, same, f"{self._labels()} by their numbers in the tissue table")
+        same, count = {label: label for label in (0, *self._present)}, len(self._present)
+        return LabelledTissues(labels, table, same, f"{count} labels by their numbers in the tissue table")
 
     def by_tissue(self) -> LabelledTissues:
         """Labels renumbered from 1, one for each tissue, in the order of their first labels."""
         scheme = self._scheme()
         names = {label: self._names.get(label, scheme.names.get(label) if scheme else None) for label in self._present}
         found = {label: self._tissue(label, name) for label, name in names.items()}
-        self._require_patient(scheme, names, found)
-        self._require_known(names, found)
+        findings = Findings(
+            self._source, self._counts, abs(np.linalg.det(self._volume.ijk_to_ras[:3, :3])) / 1e3, names, found,
+            scheme or scheme_with_names(self._names), self._mapping, self._tissues, self._advice,
+        )  # fmt: skip
+        findings.require_patient()
+        findings.require_known()
         coupling = (self._by_number or self._tissues)[0]
         order: list[Tissue] = []
         relabelled = {0: 0}
@@ -169,10 +171,9 @@ class _Reading:
         lookup[list(relabelled)] = list(relabelled.values())
         table = TissueTable({0: coupling, **dict(enumerate(order, 1))}, self._tissues.membrane)
         labels = self._volume.with_array(lookup[self._volume.array])
-        self._say_doubts(scheme, names, found)
         tissues = f"{len(order)} tissue{'s' * (len(order) > 1)}"
-        message = f"{self._title(scheme, names)}: {self._labels()} to {tissues}"
-        return LabelledTissues(labels, table, relabelled, message, tuple(self._warnings))
+        message = f"{self._title(findings)}: {findings.labels()} to {tissues}"
+        return LabelledTissues(labels, table, relabelled, message, (*self._warnings, *findings.doubts()))
 
     # ---- what it is --------------------------------------------------------------------------------------------
 
@@ -191,7 +192,7 @@ class _Reading:
         if recognition.candidates:
             titles = " and ".join(scheme.title for scheme in recognition.candidates)
             remedy = self._advice.ambiguous.format(key=recognition.candidates[0].key)
-            raise SimulationError(f"{self._source}: labels {_listed(self._present)} fit {titles}; {remedy}")
+            raise SimulationError(f"{self._source}: labels {listed(self._present)} fit {titles}; {remedy}")
         return recognition.scheme
 
     def _tissue(self, label: int, name: str | None) -> Tissue | None:
@@ -220,105 +221,9 @@ class _Reading:
             return own
         return exactly.get(preset) or TISSUES[preset]
 
-    def _title(self, scheme: Scheme | None, names: Mapping[int, str | None]) -> str:
-        if all(self._mapping.tissue_of(label, name) for label, name in names.items()):
+    def _title(self, findings: Findings) -> str:
+        if findings.is_mapped:
             return "mapped"
-        if scheme is None:
-            scheme = scheme_with_names(self._names)
-        if scheme is not None:
-            return title_of(scheme, self._present)
+        if findings.scheme is not None:
+            return title_of(findings.scheme, self._present)
         return "labels with names" if self._names else "labels by number"
-
-    # ---- refusals ----------------------------------------------------------------------------------------------
-
-    def _require_patient(
-        self, scheme: Scheme | None, names: Mapping[int, str | None], found: Mapping[int, Tissue | None]
-    ) -> None:
-        """Refuse a mask or a lesion, which is no patient, unless the user gave it a tissue."""
-        mine = {label for label, name in names.items() if self._mapping.tissue_of(label, name)}
-        if mine == set(names):
-            return
-        first = next(label for label in self._present if label not in mine)
-        size = f"{self._labels()}, {self._size(self._present)}"
-        known = [None if tissue is None else tissue.name for tissue in found.values()]
-        name = names[first]
-        if len(names) == 1 and (known[0] is None or (name is not None and _is_nearest(name))):
-            what = f"a binary mask ({size})"
-        elif scheme is not None and scheme.is_lesion:
-            what = (
-                f"a tumour's labels ({title_of(scheme, self._present)}: {', '.join(map(str, names.values()))}; {size})"
-            )
-        elif all(tissue in _LESIONS for tissue in known):
-            what = f"a lesion ({', '.join(str(name or '') for name in names.values())}; {size})"
-        else:
-            return
-        tissue = known[0] or "tumour"
-        if known[0] is None:
-            guess = self._named(self._source.rsplit("/")[-1].split(".")[0])
-            tissue = "tumour" if guess is None else guess.name
-        remedy = self._advice.lesion.format(tissue=tissue, source=self._source, label=first)
-        raise SimulationError(f"{self._source}: {what}, not a patient's tissues; {remedy}")
-
-    def _require_known(self, names: Mapping[int, str | None], found: Mapping[int, Tissue | None]) -> None:
-        unknown = [label for label in self._present if found[label] is None]
-        if not unknown:
-            return
-        listed = _listed(
-            repr(names[label] or f"label {label}")
-            + (f" ({self._label_and_size(label)})" if self._advice.gives_sizes else "")
-            for label in unknown
-        )
-        remedy = self._advice.unknown.format(label=unknown[0])
-        nothing = "no program's numbers are recognised, and " if len(unknown) == len(self._present) else ""
-        known = ", ".join(dict.fromkeys([*self._tissues.names()[1:], *TISSUES]))
-        raise SimulationError(f"{self._source}: {nothing}no tissue is called {listed}; {remedy}: {known}")
-
-    def _say_doubts(
-        self, scheme: Scheme | None, names: Mapping[int, str | None], found: Mapping[int, Tissue | None]
-    ) -> None:
-        nearest: dict[str, list[str]] = {}
-        for label, name in names.items():
-            tissue = found[label]
-            if tissue and name and not self._mapping.tissue_of(label, name) and _is_nearest(name):
-                nearest.setdefault(tissue.name, []).append(name)
-        if nearest:
-            pairs = "; ".join(f"{_listed(mine, 4)} as {tissue}" for tissue, mine in nearest.items())
-            self._warnings.append(f"{self._source}: the nearest tissue is used for {pairs}")
-        unused = self._mapping.unused(names)
-        if unused:
-            self._warnings.append(f"{self._source}: has no label {_listed(unused)}, which --map mentions")
-        body = scheme or scheme_with_names(self._names)
-        if body is not None and body.key.startswith("totalsegmentator") and 0 not in found and self._counts[0]:
-            share = self._counts[0] / self._counts.sum()
-            self._warnings.append(
-                f"{self._source}: {share:.0%} of the volume has no label and is the coupling medium, also between the "
-                f"organs; {self._advice.between}"
-            )
-
-    def _label_and_size(self, label: int) -> str:
-        number = f"{label}, " if label in self._names else ""
-        return f" ({number}{self._size([label])})" if self._advice.gives_sizes else ""
-
-    def _size(self, labels: list[int]) -> str:
-        size_ml = self._volume_ml(labels)
-        return f"{size_ml:.0f} ml" if size_ml >= 10 else f"{size_ml:.2g} ml"
-
-    def _volume_ml(self, labels: list[int]) -> float:
-        return float(self._counts[labels].sum() * abs(np.linalg.det(self._volume.ijk_to_ras[:3, :3])) / 1e3)
-
-    def _labels(self) -> str:
-        return f"{len(self._present)} label{'s' * (len(self._present) > 1)}"
-
-
-def _is_nearest(name: str) -> bool:
-    try:
-        tissue_named(name)
-    except SimulationError:
-        return nearest_tissue(name) is not None
-    return False
-
-
-def _listed(items: Iterable[object], most: int = _LONGEST_LIST) -> str:
-    texts = list(map(str, items))
-    more = [f"and {len(texts) - most} more"] if len(texts) > most else []
-    return ", ".join([*texts[:most], *more])

@@ -77,11 +77,8 @@ def schemes() -> dict[str, Scheme]:
         order = totalsegmentator.anatomical_order(names)
         entries.append(Scheme(key, title, totalsegmentator.numbered(names), order))
     # FSL's FAST (<name>_seg, <name>_pveseg of a T1) numbers alike: https://fsl.fmrib.ox.ac.uk/fsl/docs/structural/fast
-    entries.append(
-        Scheme(
-            "ussim", "ussim segment or FSL FAST", {1: "csf", 2: "grey matter", 3: "white matter", 4: "leptomeninges"}
-        )
-    )
+    fluid_first = {1: "csf", 2: "grey matter", 3: "white matter", 4: "leptomeninges"}
+    entries.append(Scheme("ussim", "numbers of ussim segment and FSL FAST, with grey around white matter", fluid_first))
     # Menze et al., IEEE Trans. Med. Imaging 34 (2015); 2017 to 2022 with 4 for the enhancing tumour, since 2023 with 3;
     # since 2024 (de Verdier et al., arXiv:2405.18368) with 4 for the resection cavity.
     before = {1: "necrotic core", 2: "oedema", 4: "enhancing tumour"}
@@ -104,9 +101,9 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
         known = np.mean([value in scheme.names for value in values])
         if not scheme.order or known < _KNOWN_IF_SURE:
             continue
-        holds, count = _agreement(scheme.order, centres)
+        holds, reverse, count = _agreement(scheme.order, centres)
         if scheme.key == "freesurfer":
-            recognition = _freesurfer(scheme, values, holds, count, float(known))
+            recognition = _freesurfer(scheme, values, float(known), holds, reverse, count)
             if recognition is not None:
                 return recognition
         elif known >= _KNOWN and count >= _FEWEST and holds >= _AGREEING * count:
@@ -120,10 +117,12 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
     return Recognition(best[0])
 
 
-def _freesurfer(scheme: Scheme, values: list[int], holds: int, count: int, known: float) -> Recognition | None:
+def _freesurfer(
+    scheme: Scheme, values: list[int], known: float, holds: int, reverse: int, count: int
+) -> Recognition | None:
     """FreeSurfer's numbers, if enough pairs of a left and a right structure lie as they should, or all are mirrored."""
     usual = np.mean([freesurfer.is_usual(value) for value in values])
-    if count >= _SURE and count - holds >= _AGREEING * count:
+    if count >= _SURE and usual >= _KNOWN and reverse >= _AGREEING * count:
         return Recognition(scheme, is_mirrored=True)
     if holds < _AGREEING * count:
         return None
@@ -194,14 +193,17 @@ def _is_grey_between(labels: Volume) -> bool:
     return float(depth[thin == 3].mean()) > float(depth[thin == 2].mean())
 
 
-def _agreement(order: list[tuple[int, list[int]]], centres: Mapping[int, np.ndarray]) -> tuple[int, int]:
-    """(pairs of neighbours in the order that lie as they should, all pairs) of the structures that are there."""
-    holds = count = 0
+def _agreement(order: list[tuple[int, list[int]]], centres: Mapping[int, np.ndarray]) -> tuple[int, int, int]:
+    """Of pairs of neighbours in the order: those that lie as they should, those that lie the other way round, and all.
+
+    Pairs of which one structure is not there are left out.
+    """
+    holds = reverse = count = 0
     for axis, row in order:
-        there = [centres[label][axis] for label in row if label in centres]
-        steps = np.diff(there)
-        holds, count = holds + int(np.sum(steps > 0)), count + len(steps)
-    return holds, count
+        steps = np.diff([centres[label][axis] for label in row if label in centres])
+        holds, reverse = holds + int(np.sum(steps > 0)), reverse + int(np.sum(steps < 0))
+        count += len(steps)
+    return holds, reverse, count
 
 
 def _centres(labels: Volume) -> dict[int, np.ndarray]:

@@ -1,0 +1,142 @@
+"""Findings: what is known about the labels of a label map, what is wrong with it and what is doubtful."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import PurePath
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.tissue.label_advice import Advice
+from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
+from SlicerUSSim.Logic.tissue.names import nearest_tissue, same_name, tissue_named
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.schemes import Scheme, schemes
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+
+_LONGEST_LIST = 12
+#: Tissues of a lesion, which alone are no patient
+_LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """The labels of a label map, other than 0, with their names and tissues."""
+
+    #: The label map in messages
+    source: str
+    #: Voxels of label 0, 1, 2, ... and the volume of one
+    counts: np.ndarray
+    voxel_ml: float
+    #: {label: name}, None for one without
+    names: Mapping[int, str | None]
+    #: {label: tissue}, None for an unknown one
+    found: Mapping[int, Tissue | None]
+    scheme: Scheme | None
+    mapping: LabelMapping
+    tissues: TissueTable
+    advice: Advice
+
+    @property
+    def is_mapped(self) -> bool:
+        """Whether the user gave every label a tissue."""
+        return all(self.mapping.tissue_of(label, name) for label, name in self.names.items())
+
+    def labels(self) -> str:
+        """Their number in words: "41 labels"."""
+        return f"{len(self.names)} label{'s' * (len(self.names) > 1)}"
+
+    def require_patient(self) -> None:
+        """Raise SimulationError for a mask or lesion, which is no patient, unless the user gave it a tissue."""
+        if self.is_mapped:
+            return
+        size = f"{self.labels()}, {self._size(self.names)}"
+        known = [None if tissue is None else tissue.name for tissue in self.found.values()]
+        names = [str(name) for name in self.names.values() if name is not None]
+        if len(known) == 1 and (known[0] is None or any(map(_is_nearest, names))):
+            what = f"a binary mask ({size})"
+        elif self.scheme is not None and self.scheme.is_lesion:
+            what = f"a tumour's labels (as {self.scheme.title}: {', '.join(names)}; {size})"
+        elif all(tissue in _LESIONS for tissue in known):
+            what = f"a lesion ({', '.join(names)}; {size})"
+        else:
+            return
+        of_file = _tissue_of_file(self.source) or "tumour"
+        maps = " ".join(f"--map {label}={tissue or of_file}" for label, tissue in zip(self.names, known, strict=True))
+        remedy = self.advice.lesion.format(tissue=known[0] or of_file, source=self.source, maps=maps)
+        if self.scheme is not None and self.scheme.is_lesion and set(self.names) <= set(schemes()["ussim"].names):
+            remedy += f"; if it is a brain, {self.advice.ambiguous.format(key='ussim')}"
+        raise SimulationError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
+
+    def require_known(self) -> None:
+        """Raise SimulationError that lists the labels without a tissue, and what to do."""
+        unknown = [label for label, tissue in self.found.items() if tissue is None]
+        if not unknown:
+            return
+        remedy = self.advice.unknown.format(label=unknown[0])
+        nothing = "no program's numbers are recognised, and " if len(unknown) == len(self.names) else ""
+        known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
+        called = listed(map(self._described, unknown))
+        raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}; {remedy}: {known}")
+
+    def doubts(self) -> list[str]:
+        """What a user should know, each in one line."""
+        doubts = []
+        nearest: dict[str, list[str]] = {}
+        for label, name in self.names.items():
+            tissue = self.found[label]
+            is_mine = name is None or self.mapping.tissue_of(label, name) is not None
+            if tissue and not is_mine and not same_name(str(name), tissue.name) and _is_nearest(str(name)):
+                nearest.setdefault(tissue.name, []).append(str(name))
+        if nearest:
+            pairs = "; ".join(f"{listed(names, 4)} as {tissue}" for tissue, names in nearest.items())
+            doubts.append(f"{self.source}: the nearest tissue is used for {pairs}")
+        unused = self.mapping.unused(self.names)
+        if unused:
+            doubts.append(f"{self.source}: has no label {listed(unused)}, which --map mentions")
+        is_body = self.scheme is not None and self.scheme.key.startswith("totalsegmentator")
+        if is_body and 0 not in self.mapping.by_label and self.counts[0]:
+            share = self.counts[0] / self.counts.sum()
+            doubts.append(
+                f"{self.source}: {share:.0%} of the volume has no label and is the coupling medium, also between the "
+                f"organs; {self.advice.between}"
+            )
+        return doubts
+
+    def _described(self, label: int) -> str:
+        """'Left-Lesion' (25, 3.1 ml)"""
+        name = self.names[label]
+        if not self.advice.gives_sizes:
+            return repr(name or f"label {label}")
+        return f"{name!r} ({label}, {self._size([label])})" if name else f"label {label} ({self._size([label])})"
+
+    def _size(self, labels: Iterable[int]) -> str:
+        size_ml = float(self.counts[list(labels)].sum() * self.voxel_ml)
+        return f"{size_ml:.0f} ml" if size_ml >= 10 else f"{size_ml:.2g} ml"
+
+
+def listed(items: Iterable[object], most: int = _LONGEST_LIST) -> str:
+    """Items with commas; of more than `most`, the first and their number."""
+    texts = list(map(str, items))
+    more = [f"and {len(texts) - most} more"] if len(texts) > most else []
+    return ", ".join([*texts[:most], *more])
+
+
+def _is_nearest(name: str) -> bool:
+    try:
+        tissue_named(name)
+    except SimulationError:
+        return nearest_tissue(name) is not None
+    return False
+
+
+def _tissue_of_file(source: str) -> str | None:
+    """The tissue that a file is called after: glioma.nii.gz."""
+    name = PurePath(source).name.split(".")[0]
+    try:
+        return tissue_named(name).name
+    except SimulationError:
+        return None

@@ -1,0 +1,566 @@
+"""Label maps of other programs: recognised by numbers, places and names, or refused in one line with a remedy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from SlicerUSSim.Command.cli import main
+from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
+from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map
+from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
+from SlicerUSSim.Logic.tissue.names import nearest_tissue, tissue_named
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.schemes import schemes
+from SlicerUSSim.Logic.tissue.totalsegmentator import CT, CT_V1, MR, numbered
+
+#: Labels that recon-all of FreeSurfer 5.3 wrote for one person (a public aseg.mgz), and those of SynthSeg's own table
+ASEG = [
+    2, 3, 4, 5, 7, 8, 10, 11, 12, 13, 14, 15, 16, 17, 18, 24, 26, 28, 30, 31, 41, 42, 43, 44, 46, 47, 49, 50, 51, 52,
+    53, 54, 58, 60, 62, 63, 72, 77, 80, 85, 251, 252, 253, 254, 255,
+]  # fmt: skip
+SYNTHSEG = [n for n in ASEG if n <= 60 and n != 30 and n != 31]
+APARC = [n for n in ASEG if n not in (3, 42)] + [side + n for side in (1000, 2000) for n in range(1, 36) if n != 4]
+WMPARC = [*APARC, *(side + n for side in (3000, 4000) for n in range(1, 36) if n != 4), 5001, 5002]
+DESTRIEUX = [n for n in ASEG if n not in (3, 42)] + [
+    side + n for side in (11100, 12100) for n in range(1, 76) if n != 42
+]
+
+#: Heights in the body, centimetres above the floor; written down here from an anatomical atlas, not from the program.
+HEIGHTS = {
+    "femur": 65, "prostate": 85, "urinary_bladder": 87, "hip": 90, "gluteus": 88, "sacrum": 93, "colon": 105,
+    "liver": 118, "kidney": 112, "heart": 130, "lung": 132, "humerus": 130, "scapula": 138, "clavicula": 145,
+    "brain": 168, "skull": 172,
+}  # fmt: skip
+SIDES = {"spleen": -8, "stomach": -6, "liver": 8, "gallbladder": 6}
+
+
+def height_cm(name: str) -> float:
+    """Of a structure of TotalSegmentator; the spine from S1 at 95 to C1 at 157, the ribs from 12 to 1."""
+    part, _, number = name.rpartition("_")
+    if part == "vertebrae":
+        above = {"S": 0, "L": 6, "T": 18, "C": 25}[number[0]]
+        return 95 + 62 / 25 * (above - int(number[1:]) + (number[0] == "S"))
+    if part.startswith("rib"):
+        return 146 - 2.5 * int(number)
+    return next((cm for word, cm in HEIGHTS.items() if name.startswith(word)), 120)
+
+
+def side_cm(name: str) -> float:
+    """Towards the patient's right."""
+    plain = name.lower().replace("_", "-")
+    if "left" in plain or "-lh-" in plain:
+        return -10
+    return 10 if "right" in plain or "-rh-" in plain else SIDES.get(name, 0)
+
+
+def made(labels: dict[int, str], *, mirrored: bool = False, dtype=np.int16) -> Volume:
+    """A label map in which each structure is a small cube at its height and side, one behind the other."""
+    array = np.zeros((180, 2 * len(labels) + 2, 30), dtype)
+    for place, (label, name) in enumerate(labels.items()):
+        i = round(15 + side_cm(name) * (-1 if mirrored else 1))
+        k = round(height_cm(name))
+        array[k : k + 2, 2 * place + 1 : 2 * place + 3, i : i + 2] = label
+    matrix = np.diag([5.0, 5.0, 10.0, 1.0])
+    return Volume(array, matrix)
+
+
+def freesurfer(labels, **options) -> Volume:
+    names = freesurfer_names()
+    return made({label: names[label] for label in labels}, **options)
+
+
+def head(spacing_mm: float = 3.0) -> Volume:
+    """A round brain in FreeSurfer's numbers, as float32: white matter in cortex, with ventricles and thalamus."""
+    n = int(150 / spacing_mm)
+    z, y, x = (np.indices((n, n, n)) - (n - 1) / 2) * spacing_mm
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    ventricle = (np.abs(x) > 4) & (np.abs(x) < 12) & (np.abs(y) < 30) & (np.abs(z) < 8)
+    array = np.select([radius > 68, ventricle, radius < 15, radius < 58], [0, 4, 10, 2], 3)
+    array = np.where((x > 0) & (array > 0), array + 39, array).astype(np.float32)
+    matrix = np.diag([spacing_mm] * 3 + [1.0])
+    matrix[:3, 3] = -(n - 1) / 2 * spacing_mm
+    return Volume(array, matrix)
+
+
+def ussim(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def refused(*arguments) -> str:
+    """The one line of a command that failed."""
+    result = ussim(*arguments)
+    errors = [line for line in result.stderr.splitlines() if line.startswith("ussim: ")]
+    assert result.exit_code == 2 and len(errors) == 1 and "Traceback" not in result.output, result.output
+    return errors[0]
+
+
+# ---- names -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_structure_of_the_programs_has_a_tissue():
+    names = [*freesurfer_names().values(), *CT, *CT_V1, *MR]
+    for name in names:
+        try:
+            assert tissue_named(name)
+        except SimulationError:
+            assert nearest_tissue(name) in TISSUES, name
+    assert len(freesurfer_names()) > 600 and (len(CT), len(CT_V1), len(MR)) == (117, 104, 50)
+
+
+@pytest.mark.parametrize(
+    ("name", "tissue"),
+    [
+        ("Left-Cerebellum-Cortex", "grey matter"), ("Right-VentralDC", "grey matter"), ("Brain-Stem", "white matter"),
+        ("WM-hypointensities", "white matter"), ("non-WM-hypointensities", "grey matter"),
+        ("Optic-Chiasm", "white matter"), ("CC_Mid_Posterior", "white matter"), ("Left-vessel", "blood"),
+        ("Left-choroid-plexus", "enhancing"), ("5th-Ventricle", "csf"), ("Left-Inf-Lat-Vent", "csf"),
+        ("ctx-lh-insula", "grey matter"), ("wm-rh-insula", "white matter"), ("ctx_rh_G_insular_short", "grey matter"),
+        ("heart_ventricle_left", "blood"), ("heart", "heart"), ("kidney_cyst_left", "csf"), ("kidney_left", "kidney"),
+        ("liver tumor", "tumour"), ("rib_left_7", "bone"), ("vertebrae_L5", "bone"), ("Left lungs", "lung"),
+        ("portal_vein_and_splenic_vein", "blood"), ("spinal_cord", "white matter"), ("skull", "skull"),
+    ],
+)  # fmt: skip
+def test_a_name_finds_its_tissue_by_its_most_special_word(name, tissue):
+    assert tissue_named(name).name == tissue
+
+
+def test_the_nearest_tissue_is_not_taken_for_a_tissue():
+    for name in ("stomach", "pancreas", "brain", "urinary_bladder"):
+        with pytest.raises(SimulationError, match="no preset for tissue"):
+            tissue_named(name)
+    assert [nearest_tissue(name) for name in ("stomach", "pancreas", "cheese")] == ["muscle", "liver", None]
+
+
+# ---- programs, by their numbers alone --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32])
+@pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd"])
+@pytest.mark.parametrize(
+    ("labels", "title", "tissues"),
+    [
+        (ASEG, "FreeSurfer aseg", 5),
+        (SYNTHSEG, "FreeSurfer's numbers, as SynthSeg uses them", 3),
+        (APARC, "FreeSurfer or FastSurfer aparc+aseg", 5),
+        (WMPARC, "FreeSurfer wmparc", 5),
+        (DESTRIEUX, "FreeSurfer aparc.a2009s+aseg", 5),
+    ],
+    ids=["aseg", "synthseg", "aparc", "wmparc", "a2009s"],
+)
+def test_freesurfers_segmentations_are_recognised_in_every_file(labels, title, tissues, suffix, dtype, tmp_path):
+    path = tmp_path / f"seg{suffix}"
+    freesurfer(labels, dtype=dtype).write(path)
+    volume = Volume.read(path)
+    assert volume.array.dtype == dtype and volume.looks_like_labels()
+    found = read_label_file(path, volume)
+    assert found.message == f"{title}: {len(labels)} labels to {tissues} tissues" and not found.warnings
+    assert found.labels.array.dtype == np.uint8 and found.labels.array.max() == tissues == len(found.names)
+    for label in labels:
+        tissue = found.names[found.relabelled[label] - 1]
+        assert tissue == tissue_named(freesurfer_names()[label]).name
+        assert (found.labels.array[volume.array == label] == found.relabelled[label]).all()
+    assert not found.labels.array[volume.array == 0].any()
+
+
+@pytest.mark.parametrize(
+    ("names", "key"), [(CT, "totalsegmentator"), (CT_V1, "totalsegmentator-v1"), (MR, "totalsegmentator-mr")]
+)
+def test_totalsegmentators_whole_bodies_are_recognised_and_said(names, key):
+    found = read_label_map(made(numbered(names)))
+    assert found.message.startswith(f"{schemes()[key].title}: {len(names)} labels to ")
+    table = {name: found.names[found.relabelled[label] - 1] for label, name in numbered(names).items()}
+    assert (table["liver"], table["spleen"], table["aorta"], table["hip_left"]) == ("liver", "spleen", "blood", "bone")
+    doubts = "\n".join(found.warnings)
+    assert "the nearest tissue is used for" in doubts and "as muscle" in doubts and "has no label" in doubts
+
+
+def test_a_part_of_a_body_is_recognised_by_its_places():
+    abdomen = {n: name for n, name in numbered(CT).items() if n in (1, 2, 3, 5, 6, 29, 30, 31, 32, 52, 99, 100, 111)}
+    assert read_label_map(made(abdomen)).message.startswith("TotalSegmentator CT: 13 labels to ")
+
+
+def test_more_than_62_labels_are_merged_by_tissue_before_they_are_counted():
+    found = read_label_map(made(numbered(CT)))
+    assert len(found.relabelled) == 118 and found.labels.array.max() == len(found.names) < 20
+
+
+def test_numbers_alone_do_not_make_a_program():
+    """The controls: the same numbers elsewhere in the body, and atlases of others with the same range of numbers."""
+    rng = np.random.default_rng(5)
+    for names in (CT, MR):
+        shuffled = dict(zip(numbered(names), rng.permutation(names), strict=True))
+        with pytest.raises(SimulationError, match="no program's numbers are recognised, and no tissue is called lab"):
+            read_label_map(made(shuffled))
+    aal = {n: ("left" if n % 2 else "right") for n in range(1, 117)}  # AAL: odd numbers left, even ones right
+    with pytest.raises(SimulationError, match="no program's numbers are recognised"):
+        read_label_map(made(aal))
+    shuffled = dict(zip(ASEG, rng.permutation([freesurfer_names()[n] for n in ASEG]), strict=True))
+    with pytest.raises(SimulationError, match="no program's numbers are recognised"):
+        read_label_map(made(shuffled))
+
+
+def test_labels_that_several_programs_use_alike_are_an_error_that_names_them():
+    # Spleen, kidneys and liver have the same numbers in all of TotalSegmentator's; 30 to 33 have not.
+    shared = {n: numbered(CT)[n] for n in (1, 2, 3, 5)}
+    assert "TotalSegmentator" not in str(refusal_of(made(shared)))  # too few structures to be sure
+    few = {**shared, 4: "gallbladder", 6: "stomach"}
+    assert read_label_map(made(few)).names[:2] == ("spleen", "kidney")
+    both = {1: "spleen", 2: "kidney_right", 3: "kidney_left", 5: "liver", 6: "stomach", 4: "gallbladder", 7: "aorta"}
+    message = str(refusal_of(made(both)))
+    assert "labels 1, 2, 3, 5, 6, 4, 7 fit" in message.replace("1, 2, 3, 4, 5, 6, 7", "1, 2, 3, 5, 6, 4, 7")
+    assert "TotalSegmentator CT and TotalSegmentator CT, version 1" in message and "--map totalsegmentator" in message
+    mapped = read_label_map(made(both), mapping=LabelMapping.of(["totalsegmentator-v1"]))
+    assert mapped.names[mapped.relabelled[7] - 1] == "blood"
+
+
+def refusal_of(volume: Volume, *arguments, **options) -> SimulationError:
+    with pytest.raises(SimulationError) as caught:
+        read_label_map(volume, *arguments, **options)
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+def test_a_mirrored_head_is_read_with_a_warning():
+    found = read_label_map(freesurfer(ASEG, mirrored=True))
+    assert found.message.startswith("FreeSurfer aseg")
+    assert "labels of the left side are on the right; check the orientation" in found.warnings[0]
+
+
+# ---- brains and tumours, whose numbers are alike ---------------------------------------------------------------------
+
+
+def brain(numbers: dict[str, int], half_mm: int = 75) -> Volume:
+    """Spheres in each other: fluid outside, then grey and white matter."""
+    z, y, x = np.indices((2 * half_mm // 3,) * 3) * 3.0 - half_mm
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    names = ["nothing", "csf", "grey matter", "white matter"]
+    shells = np.select([radius > 68, radius > 65, radius > 50], [0, 1, 2], 3)
+    return Volume(
+        np.array([{"nothing": 0, **numbers}[name] for name in names], np.uint8)[shells], np.diag([3, 3, 3, 1])
+    )
+
+
+def test_a_brain_in_our_numbers_is_read_and_one_in_other_numbers_is_not():
+    ours = read_label_map(brain({"csf": 1, "grey matter": 2, "white matter": 3}))
+    assert ours.names == ("csf", "grey matter", "white matter") and "ussim segment and FSL FAST" in ours.message
+    for others in ((3, 1, 2), (3, 2, 1), (2, 1, 3)):  # fMRIPrep (1 grey, 2 white, 3 fluid), and white matter first
+        numbers = dict(zip(("csf", "grey matter", "white matter"), others, strict=True))
+        assert "no program's numbers are recognised" in str(refusal_of(brain(numbers)))
+        texts = [f"{number}={name}" for name, number in numbers.items()]
+        found = read_label_map(brain(numbers), mapping=LabelMapping.of(texts))
+        assert found.message == "mapped: 3 labels to 3 tissues"
+
+
+def tumour(labels: tuple[int, int, int]) -> Volume:
+    """A necrotic core, an enhancing rim and oedema in an empty head of 240 x 240 x 155 mm, at 3 mm."""
+    z, y, x = (np.indices((52, 80, 80)) - 30) * 3.0
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    core, oedema, rim = labels
+    return Volume(np.select([radius < 10, radius < 15, radius < 25], [core, rim, oedema], 0).astype(np.uint8),
+                  np.diag([3.0, 3.0, 3.0, 1.0]))  # fmt: skip
+
+
+@pytest.mark.parametrize(("labels", "title"), [((1, 2, 4), "BraTS 2017 to 2022"), ((1, 2, 3), "BraTS since 2023")])
+def test_a_tumour_of_brats_is_no_patient(labels, title, tmp_path):
+    path = tmp_path / "BraTS-GLI-00001-000-seg.nii.gz"
+    tumour(labels).write(path)
+    message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert f"a tumour's labels (as {title}: necrotic core, oedema, enhancing tumour; 3 labels, 67 ml)" in message
+    assert f"not a patient's tissues; add it to a segmentation with --add tumour={path}" in message
+    assert not (tmp_path / "o.png").exists()
+
+
+def test_a_binary_mask_is_no_patient_unless_the_user_says_what_it_is(tmp_path):
+    path = tmp_path / "glioma.nii.gz"
+    mask = tumour((255, 255, 255))
+    mask.write(path)
+    message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert f"{path}: a binary mask (1 label, 67 ml), not a patient's tissues" in message
+    assert f"--add tumour={path}, or allow it with --map 255=tumour" in message
+    for tissue in ("liver", "tumour"):
+        result = ussim("simulate", path, "--map", f"255={tissue}", "--pose", "auto", "-o", tmp_path / f"{tissue}.png")
+        assert result.exit_code == 0 and "glioma.nii.gz: mapped: 1 label to 1 tissue" in result.stderr, result.output
+    table = tmp_path / "tissues.json"
+    TissueTable({255 % 62: TISSUES["liver"]}).write(table)
+    assert "a binary mask" in refused("simulate", path, "--tissues", table, "--pose", "auto", "-o", tmp_path / "o.png")
+
+
+def test_a_lesion_with_a_name_is_no_patient_but_an_organ_is():
+    mask = tumour((1, 1, 1))
+    assert "a lesion (Glioma; 1 label, 67 ml)" in str(refusal_of(mask, {1: "Glioma"}))
+    assert "a binary mask" in str(refusal_of(mask, {1: "brain"}))  # a mask of the brain, and not white matter
+    assert read_label_map(mask, {1: "Liver"}).names == ("liver",)
+
+
+# ---- what the user says ----------------------------------------------------------------------------------------------
+
+
+def test_unknown_labels_are_listed_with_volumes_and_a_remedy_that_works(tmp_path):
+    volume = head()
+    array = volume.array.copy()
+    array[:6, :6, :6] = 512
+    path, out = tmp_path / "seg.nii.gz", tmp_path / "o.png"
+    volume.with_array(array).write(path)
+    message = refused("simulate", path, "--pose", "auto", "-o", out)
+    assert "seg.nii.gz: no tissue is called label 512 (5.8 ml); map them with --map 512=TISSUE" in message
+    mapping = tmp_path / "mapping.json"
+    mapping.write_text(json.dumps({"512": "skull", "3": "csf", "42": 0}))
+    for options in (("--map", mapping), ("--map", "512=skull", "--map", "Left-Cerebral-Cortex=csf", "--map", "42=0")):
+        result = ussim("simulate", path, *options, "--pose", "auto", "-o", out)
+        assert result.exit_code == 0 and "FreeSurfer aseg: 9 labels to 4 tissues" in result.stderr, result.output
+
+
+def test_a_mapping_goes_before_names_and_numbers_and_removes_labels():
+    volume = freesurfer(ASEG)
+    mapping = LabelMapping.of(["77=tumour", "Left-Cerebral-White-Matter=liver", "24=background", "0=fat", "9999=csf"])
+    found = read_label_map(volume, mapping=mapping)
+    tissue = {label: (found.names[new - 1] if new else None) for label, new in found.relabelled.items()}
+    assert (tissue[77], tissue[2], tissue[24], tissue[0], tissue[41]) == (
+        "tumour",
+        "liver",
+        None,
+        "fat",
+        "white matter",
+    )
+    assert "has no label 9999, which --map mentions" in found.warnings[0]
+    with pytest.raises(SimulationError, match="all labels are mapped to 0"):
+        read_label_map(volume, mapping=LabelMapping.of([f"{label}=0" for label in ASEG]))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("csf", "--map is 'csf', expected LABEL=TISSUE such as 24=csf"),
+        ("24=", "--map is '24=', expected LABEL=TISSUE"),
+        ("=csf", "--map is '=csf', expected LABEL=TISSUE"),
+        ("24=chese", "--map 24=chese: no tissue 'chese', expected 0"),
+        ("24=live", "no tissue 'live', expected 0 (nothing) or one of: liver"),
+        ("-1=csf", "label is -1, expected a whole number from 0 to 99999"),
+        ("2.5=csf", "label is 2.5, expected a whole number"),
+        ("100000=csf", "label is 100000, expected a whole number from 0 to 99999"),
+        ("none.json", "none.json: cannot be read"),
+        ("list.json", "list.json: is a list, expected a mapping such as"),
+        ("nested.json", "expected a mapping such as"),
+        ("broken.json", "broken.json: is not JSON"),
+        ("twice.json", "twice.json: is not JSON"),
+        ("table.json", "is a tissue table, give it with --tissues"),
+        ("empty.txt", "empty.txt: has no names of labels"),
+        ("two.txt", "two.txt: label 1 has two names, 'CSF' and 'Skull'"),
+    ],
+)
+def test_a_bad_mapping_is_one_line(text, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    files = {
+        "list.json": "[1]", "nested.json": '{"24": {"csf": 1}}', "broken.json": "{", "table.json": '{"tissues": {}}',
+        "twice.json": '{"1": "csf", "1": "fat"}', "empty.txt": "nothing\n",
+        "two.txt": "1 CSF 0 0 0 0\n1 Skull 0 0 0 0\n",
+    }  # fmt: skip
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    with pytest.raises(SimulationError) as caught:
+        LabelMapping.of([text])
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_mapping_of_an_mri_is_refused(tmp_path):
+    path = tmp_path / "mri.nii.gz"
+    Volume(np.random.default_rng(0).normal(100, 9, (20, 20, 20)).astype(np.float32), np.eye(4)).write(path)
+    assert "is an MRI, and --map is for labels" in refused(
+        "simulate", path, "--map", "1=csf", "--pose", "auto", "-o", tmp_path / "o.png"
+    )
+
+
+def test_a_tissue_table_that_has_every_label_goes_before_names_and_programs(tmp_path):
+    path = tmp_path / "seg.nii.gz"
+    volume = brain({"csf": 2, "grey matter": 3, "white matter": 41})
+    volume.write(path)
+    table = TissueTable({2: TISSUES["water"], 3: TISSUES["liver"], 41: TISSUES["fat"]})
+    (tmp_path / "seg.txt").write_text("2 CSF 0 0 0 0\n3 Skull 0 0 0 0\n41 Bone 0 0 0 0\n")
+    found = read_label_file(path, volume, table=table)
+    assert found.tissues == table and np.array_equal(found.labels.array, volume.array)
+    assert read_label_file(path, volume).names == ("csf", "skull", "bone")
+    table.write(tmp_path / "seg.json")
+    assert read_label_file(path, volume).tissues == table  # beside it
+    named = read_label_file(path, volume, table=TissueTable({1: TISSUES["csf"]}))  # lacks labels: read by their names
+    assert named.names == ("csf", "skull", "bone")
+    (tmp_path / "seg.json").write_text('{"Manufacturer": "another program\'s file"}')
+    assert read_label_file(path, volume).names == ("csf", "skull", "bone")
+
+
+# ---- names in files --------------------------------------------------------------------------------------------------
+
+SNAP = """################################################
+# ITK-SnAP Label Description File
+    0     0    0    0        0  0  0    "Clear Label"
+    5   255    0    0        1  1  1    "Left kidney"
+    9     0  255    0        1  1  1    "Label 9"
+   12     0    0  255        1  1  1    "Liver tumour"
+"""
+CTBL = "# Color table file seg.ctbl\n0 Background 0 0 0 0\n5 Left_kidney 255 0 0 255\n12 Liver_tumour 0 0 255 255\n"
+LUT = "#No. Label Name:   R G B A\n5  Left-kidney  70 130 180 0\n12 Liver-tumour 1 2 3 0\n"
+TSV = "index\tname\tabbreviation\n5\tLeft kidney\tK\n12\tLiver tumour\tT\n"
+CSV = "LabelValue,Name,Color_R,Color_G,Color_B\n5,Left kidney,255,0,0\n12,Liver tumour,0,0,255\n"
+
+
+@pytest.mark.parametrize(
+    ("suffix", "text"), [(".txt", SNAP), (".label", SNAP), (".ctbl", CTBL), (".txt", LUT), (".tsv", TSV), (".csv", CSV)]
+)
+def test_tables_of_names_of_every_program_are_read(suffix, text, tmp_path):
+    path = tmp_path / "seg.nii.gz"
+    volume = tumour((5, 12, 12))
+    volume.write(path)
+    (tmp_path / f"seg{suffix}").write_text(text)
+    names, where = names_of_file(path)
+    assert (names[5][-6:], names[12][:5], 9 in names) == ("kidney", "Liver", False)
+    found = read_label_file(path, volume)
+    assert found.message == f"labels with names: 2 labels to 2 tissues, named in {where}" and where == f"seg{suffix}"
+    assert found.names == ("kidney", "tumour")
+    bare = tmp_path / "bare.nii.gz"
+    volume.write(bare)
+    mapped = read_label_file(bare, volume, LabelMapping.of([str(tmp_path / f"seg{suffix}")]))
+    assert mapped.names == ("kidney", "tumour")
+
+
+def test_segments_of_slicer_and_totalsegmentators_header_name_the_labels(tmp_path):
+    import nibabel
+    import nrrd
+
+    volume = tumour((5, 12, 12))
+    header = {"Segment0_Name": "Left kidney", "Segment0_LabelValue": "5", "Segment1_Name": "Segment_2",
+              "Segment1_LabelValue": "7", "Segment2_Name": "Skull", "Segment2_LabelValue": "12"}  # fmt: skip
+    path = tmp_path / "painted.seg.nrrd"
+    nrrd.write(str(path), volume.array.T, {"space": "left-posterior-superior", **header})
+    assert names_of_file(path) == ({5: "Left kidney", 12: "Skull"}, "its header")
+    image = nibabel.Nifti1Image(volume.array.T, volume.ijk_to_ras)
+    labels = "".join(
+        f'<Label Key="{n}" Red="0"><![CDATA[{name}]]></Label>' for n, name in ((5, "liver"), (12, "aorta"))
+    )
+    xml = f"<CaretExtension><VolumeInformation><LabelTable>{labels}</LabelTable></VolumeInformation></CaretExtension>"
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, xml.encode()))
+    path = tmp_path / "segmentations.nii.gz"
+    nibabel.save(image, path)
+    assert names_of_file(path) == ({5: "liver", 12: "aorta"}, "its header")
+    assert read_label_file(path, volume).names == ("liver", "blood")
+
+
+def test_a_header_that_expands_without_limit_is_not_read(tmp_path):
+    import nibabel
+
+    bomb = '<!DOCTYPE a [<!ENTITY b "bbbb">]><LabelTable><Label Key="1">&b;</Label></LabelTable>'
+    image = nibabel.Nifti1Image(np.ones((4, 4, 4), np.uint8), np.eye(4))
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, bomb.encode()))
+    nibabel.save(image, tmp_path / "seg.nii.gz")
+    assert names_of_file(tmp_path / "seg.nii.gz") == ({}, "")
+
+
+def test_mgz_is_read_where_nifti_is(tmp_path):
+    import nibabel
+
+    volume = head()
+    matrix = np.array([[-1.0, 0, 0, 70], [0, 0, 1.2, -60], [0, -1.1, 0, 80], [0, 0, 0, 1]])  # as recon-all turns it
+    data = volume.array.T.astype(np.int32)
+    nibabel.save(nibabel.MGHImage(data, matrix), tmp_path / "aseg.mgz")
+    nibabel.save(nibabel.Nifti1Image(data, matrix), tmp_path / "aseg.nii.gz")
+    one, other = Volume.read(tmp_path / "aseg.mgz"), Volume.read(tmp_path / "aseg.nii.gz")
+    np.testing.assert_array_equal(one.array, other.array)
+    np.testing.assert_allclose(one.ijk_to_ras, other.ijk_to_ras, atol=1e-5)
+    (tmp_path / "broken.mgz").write_bytes(b"no")
+    with pytest.raises(SimulationError, match=r"broken\.mgz: cannot be read as MGZ"):
+        Volume.read(tmp_path / "broken.mgz")
+
+
+# ---- probability maps ------------------------------------------------------------------------------------------------
+
+NAMES = {
+    "SPM": {"grey matter": "c1T1.nii", "white matter": "c2T1.nii", "csf": "c3T1.nii"},
+    "FSL FAST": {"csf": "T1_pve_0.nii.gz", "grey matter": "T1_pve_1.nii.gz", "white matter": "T1_pve_2.nii.gz"},
+    "fMRIPrep": {"csf": "sub-1_label-CSF_probseg.nii.gz", "grey matter": "sub-1_label-GM_probseg.nii.gz",
+                 "white matter": "sub-1_label-WM_probseg.nii.gz"},
+}  # fmt: skip
+
+
+def probability_maps(folder, names: dict[str, str]) -> Volume:
+    """Smoothed maps of a brain in a folder; returns the labels."""
+    from scipy import ndimage
+
+    numbers = {"csf": 1, "grey matter": 2, "white matter": 3}
+    labels = brain(numbers)
+    for tissue, name in names.items():
+        smooth = ndimage.gaussian_filter((labels.array == numbers[tissue]).astype(np.float32), 0.7)
+        labels.with_array(smooth).write(folder / name)
+    return labels
+
+
+@pytest.mark.parametrize("program", list(NAMES))
+def test_tissue_probability_maps_are_combined_and_said(program, tmp_path):
+    labels = probability_maps(tmp_path, NAMES[program])
+    for tissue, name in NAMES[program].items():
+        result = ussim("simulate", tmp_path / name, "--pose", "auto", "-o", tmp_path / "o.png")
+        assert result.exit_code == 0, result.output
+        assert f"{name}: a tissue probability map ({program}, {tissue}), combined with" in result.stderr
+    path = tmp_path / name
+    found = read_label_file(path, Volume.read(path))
+    assert found.names == ("csf", "grey matter", "white matter")
+    assert np.mean(found.labels.array == labels.array) > 0.97  # but for voxels at the borders
+
+
+def test_a_probability_map_without_the_others_is_refused(tmp_path):
+    probability_maps(tmp_path, NAMES["SPM"])
+    (tmp_path / "c3T1.nii").unlink()
+    message = refused("simulate", tmp_path / "c1T1.nii", "--pose", "auto", "-o", tmp_path / "o.png")
+    assert "a tissue probability map (SPM, grey matter), not an MRI; put c3T1.nii beside it, or give the MRI" in message
+    (tmp_path / "c1T1.nii").rename(tmp_path / "grey.nii")
+    assert "a probability map (values from 0 to 1, most of them certain), not an MRI" in refused(
+        "simulate", tmp_path / "grey.nii", "--pose", "auto", "-o", tmp_path / "o.png"
+    )
+    labels = probability_maps(tmp_path, NAMES["SPM"])
+    Volume(labels.array[1:].astype(np.float32) * 0.3, labels.ijk_to_ras).write(tmp_path / "c2T1.nii")
+    assert "c2T1.nii: has another grid than c1T1.nii" in refused(
+        "simulate", tmp_path / "c1T1.nii", "--pose", "auto", "-o", tmp_path / "o.png"
+    )
+
+
+def test_an_mri_scaled_to_one_is_an_mri(mni):
+    from SlicerUSSim.Logic.tissue.label_sources import is_label_file
+
+    t1 = mni[0]
+    scaled = t1.with_array((t1.array / t1.array.max()).astype(np.float32))
+    assert not is_label_file(Path("t1.nii.gz"), scaled)
+    assert not is_label_file(Path("t1.nii.gz"), t1)
+
+
+# ---- label map or MRI ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("levels", [208, 54, 28, 15, 11])
+def test_an_mri_of_few_grey_levels_is_an_mri(levels, mni):
+    t1 = mni[0]
+    reduced = t1.with_array((t1.array.astype(int) * levels // 208).astype(np.float32 if levels == 28 else np.uint8))
+    assert not reduced.looks_like_labels()
+
+
+def test_a_label_map_is_one_in_every_resolution():
+    for spacing in (2.0, 4.0, 8.0):
+        assert head(spacing).looks_like_labels()
+    assert freesurfer(WMPARC, dtype=np.float32).looks_like_labels()
+
+
+def test_a_head_of_freesurfer_is_simulated_as_float_and_whole_numbers(tmp_path):
+    from PIL import Image
+
+    images = []
+    for name, dtype in (("seg.nii.gz", np.float32), ("seg.nrrd", np.int32)):
+        volume = head()
+        volume.with_array(volume.array.astype(dtype)).write(tmp_path / name)
+        out = tmp_path / f"{name}.png"
+        result = ussim("simulate", tmp_path / name, "--pose", "auto", "-o", out)
+        assert result.exit_code == 0, result.output
+        assert f"{name}: FreeSurfer aseg: 8 labels to 3 tissues" in result.stderr
+        images.append(np.asarray(Image.open(out)))
+    np.testing.assert_array_equal(*images)
+    assert images[0].std() > 10
