@@ -28,7 +28,9 @@ _VERBOSITY = "SlicerUSSim.verbosity"
 device_option = click.option(
     "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
 )
-mask_option = click.option("--mask", type=click.Path(), help="Foreground on the MRI's grid (default: found by Otsu).")
+mask_option = click.option(
+    "--mask", type=click.Path(), help="Brain mask on the MRI's grid (default: found in the MRI, see --skull-strip)."
+)
 
 
 def verbose_option(command: click.Command) -> click.Command:

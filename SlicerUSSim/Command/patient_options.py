@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.options import declared, declared_parameters, device_option, mask_option
-from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Command.progress import Share, note_brain
 from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
@@ -61,7 +61,9 @@ class PatientOptions:
         )
     )  # fmt: skip
     #: {parameter: value}
-    segmentation: Mapping[str, Any] = declared_parameters(SegmentationSettings, ("contrast", "thin_sulci"))
+    segmentation: Mapping[str, Any] = declared_parameters(
+        SegmentationSettings, ("contrast", "skull_strip", "thin_sulci")
+    )
     mask: str | None = declared(mask_option)
     #: {parameter: value} of the options that were given
     display: Mapping[str, Any] = declared_parameters(DisplaySettings, of_preset=True)
@@ -177,10 +179,13 @@ def _tissues_from_file(patient: PatientOptions, is_labels: bool) -> TissueTable 
 
 def _segmented(mri: Volume, patient: PatientOptions) -> Segmentation:
     from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
 
     with Share("segment") as progress:
-        return segment_mri(
+        segmentation = segment_mri(
             mri, **patient.segmentation, mask=Volume.read(patient.mask) if patient.mask else None,
-            device=patient.device, progress=progress,
+            keep_mask_at=mask_beside(patient.mri_or_labels), device=patient.device, progress=progress,
         )  # fmt: skip
+    note_brain(segmentation.brain)
+    return segmentation

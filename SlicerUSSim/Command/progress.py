@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from SlicerUSSim.Logic.fitting import Progress
+    from SlicerUSSim.Logic.mri.brain import BrainMask
 
 
 def note(text: str) -> None:
@@ -22,6 +23,13 @@ def note(text: str) -> None:
         tqdm.write(text, file=sys.stderr)
     else:
         click.echo(text, err=True)
+
+
+def note_brain(brain: BrainMask) -> None:
+    """Write to stderr how the brain was found in an MRI, and what to check."""
+    note(brain.message)
+    for warning in brain.warnings:
+        note(f"check: {warning}")
 
 
 class _Bar:
