@@ -81,12 +81,10 @@ class Additions:
         return tissues
 
     def on(self, labels: Volume, tissue_names: Iterable[str]) -> Added:
-        """The labels with these tissues on top, after notes of what was done and warnings."""
+        """The labels with these tissues on top, after notes of what was done; warnings are logged."""
         from SlicerUSSim.Logic.mri.pathology import add_tissues
 
         added = add_tissues(labels, tuple(tissue_names), self.masks, also=self.own_tissues)
         for message in added.messages:
             note(message)
-        for warning in added.warnings:
-            note(f"ussim: warning: {warning}")
         return added

@@ -9,9 +9,11 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.options import device_option, parameter_option
+from SlicerUSSim.Command.mri_options import also_option, read_also
+from SlicerUSSim.Command.options import device_option, mask_option, parameter_option
 from SlicerUSSim.Command.progress import Steps, note
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 
 class ProbeName(click.Choice):
@@ -31,15 +33,23 @@ class ProbeName(click.Choice):
 @click.option(
     "--out", type=click.Path(path_type=Path), default="ussim-demo", show_default=True, help="Folder for the results."
 )
-@click.option("--mri", type=click.Path(), help="Skull-stripped T1 MRI (default: the MNI152 brain of nilearn).")
+@click.option("--mri", type=click.Path(), help="MRI of a head or a brain (default: the MNI152 brain of nilearn).")
+@parameter_option(SegmentationSettings, "contrast")
+@parameter_option(SegmentationSettings, "skull_strip")
+@mask_option
 @click.option("--probe", "kind", type=ProbeName(), default="phased", show_default=True)
 @parameter_option(SimulationSettings, "seed")
+@also_option
 @add_option
 @device_option
-def demo(out: Path, mri: str | None, kind: str, seed: int, additions: tuple[str, ...], device: str | None) -> None:
+def demo(
+    out: Path, mri: str | None, contrast: str, skull_strip: str, mask: str | None, kind: str, seed: int,
+    also: tuple[str, ...], additions: tuple[str, ...], device: str | None,
+) -> None:  # fmt: skip
     """Segment a brain MRI, simulate a view through a craniotomy, and write figures."""
     from SlicerUSSim.Command.whole_line import run_whole_line
     from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.samples import demo_mri
     from SlicerUSSim.Logic.probe.arrays import PROBES
 
@@ -47,8 +57,15 @@ def demo(out: Path, mri: str | None, kind: str, seed: int, additions: tuple[str,
     masks = Additions.read(additions)
     volume, source = (Volume.read(mri), os.path.abspath(mri)) if mri else demo_mri()
     note(f"MRI: {source}, {'x'.join(map(str, volume.array.shape[::-1]))} voxels")
+    brain = {
+        "contrast": contrast, "skull_strip": skull_strip, "mask": Volume.read(mask) if mask else None,
+        "others": read_also(also), "keep_mask_at": mask_beside(mri) if mri else None,
+    }  # fmt: skip
     with Steps(5) as step:
-        summary = run_whole_line(out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step, masks)
+        summary = run_whole_line(
+            out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step,
+            segmentation_options=brain, found=lambda brain: note(brain.message), additions=masks,
+        )  # fmt: skip
     times = summary["milliseconds"]
     note(f"device: {summary['device']}")
     note(f"segmentation {times['segmentation']:.0f} ms, one frame {times['frame']:.1f} ms")

@@ -35,6 +35,13 @@ def split_also(texts: Iterable[str]) -> dict[str, str]:
     return found
 
 
+def read_also(texts: Iterable[str]) -> dict[str, Volume]:
+    """{contrast: volume} of the values of --also."""
+    from SlicerUSSim.Logic.base.volume import Volume  # imported here to keep --help fast
+
+    return {contrast: Volume.read(file) for contrast, file in split_also(texts).items()}
+
+
 def segmented_file(
     path: str,
     mri: Volume,
@@ -47,13 +54,13 @@ def segmented_file(
 ) -> Segmentation:
     """Segment the MRI of a file; its brain mask is kept beside it.
 
-    Says how the brain was found and what should be checked; with `tell_all` also what else was found.
+    Says how the brain was found, with `tell_all` also what else; what should be checked is logged as warnings.
     """
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
 
-    others = {contrast: Volume.read(file) for contrast, file in split_also(also).items()}
+    others = read_also(also)
     with Share("segment") as progress:
         result = segment_mri(
             mri, **settings, others=others, mask=Volume.read(mask) if mask else None, keep_mask_at=mask_beside(path),
@@ -61,6 +68,4 @@ def segmented_file(
         )  # fmt: skip
     for line in result.notes if tell_all else (result.brain.message,):
         note(line)
-    for line in result.warnings:
-        note(f"ussim: warning: {line}")
     return result

@@ -29,7 +29,7 @@ device_option = click.option(
     "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
 )
 mask_option = click.option(
-    "--mask", type=click.Path(), help="Brain mask on the MRI's grid (default: the brain is found, see --skull-strip)."
+    "--mask", type=click.Path(), help="Brain mask on the MRI's grid (default: found in the MRI, see --skull-strip)."
 )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from time import perf_counter
 
 import click
 
@@ -46,8 +47,10 @@ def segment(
     split_also(also)
     masks = Additions.read(additions)
     volume = Volume.read(mri)
+    start = perf_counter()
     result = segmented_file(mri, volume, asdict(settings), mask=mask, also=also, device=device, tell_all=True)
+    seconds = perf_counter() - start
     added = masks.on(result.labels, result.tissue_names)
     beside = write_label_files(out, added.labels, TissueTable.brain(added.tissue_names))
     click.echo(result.table())
-    note(f"wrote {out} and {beside}")
+    note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.figures import draw_views, require_matplotlib, write_png
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.mri.brain import BrainMask
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, slice_under_probe
@@ -33,11 +35,15 @@ def run_whole_line(
     display: DisplaySettings,
     device: str | None = None,
     progress: Callable[[str], None] = lambda stage: None,
+    *,
+    segmentation_options: Mapping[str, Any] | None = None,
+    found: Callable[[BrainMask], None] = lambda brain: None,
     additions: Additions | None = None,
 ) -> dict:
     """Segment, place the probe, simulate, and write figures, volumes and a summary to the folder `out`.
 
-    `progress` is called with the name of every step at its start. Returns the content of demo.json.
+    `progress` is called with the name of every step at its start, `found` with the brain; `segmentation_options` are
+    further arguments of segment_mri. Returns the content of demo.json.
     Raises SimulationError for errors that the caller can correct.
     """
     require_matplotlib()  # before the computation, not after it
@@ -47,7 +53,8 @@ def run_whole_line(
 
     progress("segment the MRI")
     start = perf_counter()
-    segmentation = segment_mri(mri, thin_sulci=True, device=device)
+    segmentation = segment_mri(mri, thin_sulci=True, device=device, **(segmentation_options or {}))
+    found(segmentation.brain)
     timings["segmentation"] = (perf_counter() - start) * 1e3
 
     progress("build the acoustic medium")
@@ -93,6 +100,12 @@ def run_whole_line(
         "display": asdict(display),
         "segmentation": {
             "tissue_names": list(names),
+            "brain": {
+                "method": segmentation.brain.method,
+                "message": segmentation.brain.message,
+                "warnings": list(segmentation.brain.warnings),
+                "volume_ml": segmentation.brain.volume_ml,
+            },
             "means": segmentation.means.tolist(),
             "standard_deviations": segmentation.standard_deviations.tolist(),
             "weights": segmentation.weights.tolist(),

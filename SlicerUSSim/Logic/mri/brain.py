@@ -100,13 +100,17 @@ def given_brain(mask: Volume, mri: Volume) -> BrainMask:
     )
     inside = mask.array > 0
     require(bool(inside.any()), "mask is empty, expected at least one voxel inside")
-    share = float(inside.mean())
+    millilitres, share = _millilitres(inside, mri), float(inside.mean())
     require(
-        share < 0.98, f"mask covers {share:.0%} of the image, expected the brain only; --skull-strip none needs no mask"
+        share < 0.98 or millilitres <= POSSIBLE_ML[1],
+        f"mask covers {share:.0%} of the image, {millilitres:.0f} ml, expected the brain only; "
+        "to use the whole image, give --skull-strip none and no mask",
     )
-    return BrainMask(
-        mri.with_array(inside.astype(np.uint8)), "given", f"brain mask as given, {_millilitres(inside, mri):.0f} ml"
-    )
+    warnings = ()
+    if millilitres > POSSIBLE_ML[1]:
+        warnings = (f"the mask has {millilitres:.0f} ml, more than any brain; check that it is one",)
+    found = mri.with_array(inside.astype(np.uint8))
+    return BrainMask(found, "given", f"brain mask as given, {millilitres:.0f} ml", warnings)
 
 
 def left_out(mask: Volume, lesion: Volume) -> float:

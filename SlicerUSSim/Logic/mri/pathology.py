@@ -175,6 +175,10 @@ def _added(labels: Volume, names: Sequence[str], masks: Masks) -> Added:
             result[where][numbers == number] = label
             messages.append(_message(tissue, over, names, voxel_mm3))
     warnings = (*masks.warnings, *_warnings(masks, covered, lost, covered.size * voxel_mm3 / 1000.0))
+    for line in messages:
+        _log.info("%s", line)
+    for line in warnings:
+        _log.warning("%s", line)
     return Added(labels.with_array(result), names, tuple(messages), warnings)
 
 
@@ -224,9 +228,7 @@ def _message(tissue: str, before: np.ndarray, names: Sequence[str], voxel_mm3: f
         name = names[label - 1] if 0 < label <= len(names) and names[label - 1] else f"label {label}"
         if share >= _LEAST_OVER:
             over.append(f"{name if label else 'voxels outside'} {100 * share:.0f} %")
-    message = f"{tissue}: {before.size} voxels, {before.size * voxel_mm3 / 1000:.1f} ml, added over {', '.join(over)}"
-    _log.info("%s", message)
-    return message
+    return f"{tissue}: {before.size} voxels, {before.size * voxel_mm3 / 1000:.1f} ml, added over {', '.join(over)}"
 
 
 def _warnings(masks: Masks, covered: np.ndarray, lost: float, volume_ml: float) -> Iterable[str]:
