@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option, split_additions
+from SlicerUSSim.Command.mri_options import also_option, split_also
 from SlicerUSSim.Command.options import device_option, mask_option, parameter_option
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.sequence_options import (
@@ -39,7 +40,9 @@ _PORT = 8080
 @to_mri_option
 @click.option("--preset", type=click.Path(), help="Probe, display, settings and tissues as JSON.")
 @parameter_option(SegmentationSettings, "contrast")
+@parameter_option(SegmentationSettings, "skull_strip")
 @mask_option
+@also_option
 @add_option
 @click.option("--port", type=click.IntRange(0, 65535), help=f"Port (default: {_PORT}, or a free one if it is taken).")
 @click.option(
@@ -66,7 +69,9 @@ def serve(
     to_mri: str | None,
     preset: str | None,
     contrast: str,
+    skull_strip: str,
     mask: str | None,
+    also: tuple[str, ...],
     additions: tuple[str, ...],
     port: int | None,
     host: str,
@@ -77,7 +82,10 @@ def serve(
     """The workstation in the browser, with live images. Without a file it shows the demo brain."""
     _require_workstation()
     added = split_additions(additions)
-    files = [file for file in (mri, labels, mask, *(file for _, file in added)) if file is not None]
+    others = split_also(also)
+    if len(others) > 1:
+        raise SimulationError(f"--also is given {len(others)} times, expected one further MRI in the workstation")
+    files = [file for file in (mri, labels, mask, *(file for _, file in added), *others.values()) if file is not None]
     # Checked here, so that the error is reported in the terminal and not on the page.
     for file in files:
         if not Path(file).exists():
@@ -112,7 +120,8 @@ def serve(
 
     workstation = Workstation(
         Files(
-            mri=mri, labels=labels, maps=maps, contrast=contrast, mask=mask, additions=masks, preset=chosen_preset,
+            mri=mri, labels=labels, maps=maps, contrast=contrast, mask=mask, skull_strip=skull_strip, also=others,
+            additions=masks, preset=chosen_preset,
             sequence=tracked, sequence_name=Path(sequence).name.split(".")[0] if sequence else "", transform=transform,
             to_ras=to_ras, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
         ),

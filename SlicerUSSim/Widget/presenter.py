@@ -391,7 +391,7 @@ class PanelPresenter:
         if kept:
             self._notes.append(
                 f"{chosen.GetName()!r} was not made by Segment, or edited since, and is kept; the result is "
-                f"{node.GetName()!r}"
+                f"{self.logic.parameters.labels.GetName()!r}"
             )
 
     @contextmanager

@@ -48,11 +48,16 @@ class Loading:
         with self._presenter.shown():
             if files.preset is not None:
                 self._logic.preset = files.preset
-            parameters.segmentation = replace(parameters.segmentation, contrast=files.contrast)
+            parameters.segmentation = replace(
+                parameters.segmentation, contrast=files.contrast, skull_strip=files.skull_strip
+            )
             if files.mri is not None or files.labels is None:
                 self._take_mri(files.mri)
             if files.mask is not None:
                 parameters.mask = self._opener.mask(files.mask)
+            for contrast, path in list(files.also.items())[:1]:  # the panel has one
+                parameters.second_mri = self._opener.second_mri(path)
+                parameters.panel = replace(parameters.panel, second_contrast=contrast)
             for tissue, path in files.additions:
                 parameters.lesions = self._opener.lesion_of_file(parameters.lesions, tissue, path)
             if files.labels is not None:
@@ -85,10 +90,13 @@ class Loading:
     def segment(self) -> None:
         """Segment the MRI into tissues, and place a probe on the patient if there is none."""
         parameters: Any = self._logic.parameters
-        inputs = parameters.mri, parameters.mask, asdict(parameters.segmentation)
+        # A mask that Segment extracted is found again by the same options.
+        mask = None if self._logic.isOwnBrain(parameters.mask) else parameters.mask
+        inputs = parameters.mri, mask, asdict(parameters.segmentation)
         lesions = self._opener.lesion_files(parameters.lesions)
         if self._changed(self._presenter.segment):
-            self._opener.segmented(parameters.labels, *inputs, lesions)
+            has_second = parameters.second_mri is not None and parameters.panel.second_contrast != "none"
+            self._opener.segmented(parameters.labels, *inputs, None if has_second else lesions)
             self._labels_ready()
 
     def add_tissues(self) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
@@ -47,6 +48,9 @@ class Files:
     maps: tuple[str, ...] = ()
     contrast: str = "t1"
     mask: str | None = None
+    skull_strip: str = "auto"
+    #: {contrast: file} of further MRIs of the patient; the first is selected
+    also: Mapping[str, str] = field(default_factory=dict)
     #: (tissue, file) of masks that are laid over the labels
     additions: tuple[tuple[str, str], ...] = ()
     preset: Preset | None = None
@@ -83,6 +87,18 @@ class Opener:
         display.SetAutoWindowLevel(False)  # the automatic window saturates bright tissue
         inside = volume.array[volume.array > 0]
         display.SetWindowLevelMinMax(0.0, 1.1 * float(np.percentile(inside, 99.8)) if inside.size else 1.0)
+        return node
+
+    def mask_file(self, mri_node) -> Path | None:
+        """Where the brain mask of an MRI is kept: beside the file with which the workstation was started."""
+        path = None if self._files.mri is None else os.path.abspath(self._files.mri)
+        return mask_beside(path) if path is not None and mri_node.GetAttribute(FILE) == path else None
+
+    def second_mri(self, path: str):
+        """A volume node with a further MRI of the patient."""
+        node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", Path(path).name)
+        write_volume(node, self._volume(path))
+        node.SetAttribute(FILE, os.path.abspath(path))
         return node
 
     def mask(self, path: str):

@@ -67,6 +67,7 @@ class Workstation:
         self._tracker = Tracker(shared, tasks, self._probe.move)
         self._images = ImageFlow(shared, logic, self._views, self._comparison, cine, self._tracker, stamps)
         opener = Opener(app.scene, logic, tasks, files)
+        presenter.maskFile = opener.mask_file
         self._exports = Exports(app, logic, opener, cine)
         self._loading = Loading(
             shared, app, logic, tasks, opener, presenter, self._views, self._probe, self._comparison

@@ -223,6 +223,10 @@ class UltrasoundSceneLogic:
         mark_as_made(node)
         return node
 
+    def isOwnBrain(self, mask_node) -> bool:
+        """Whether a mask is one that writeBrain wrote, and nobody has edited it."""
+        return self.brainOf(mask_node) is not None and may_replace(mask_node)
+
     def brainOf(self, mask_node) -> str | None:
         """The ID of the MRI node from which writeBrain's mask is, whether edited or not; None for other masks."""
         return None if mask_node is None else mask_node.GetAttribute(_BRAIN_OF)
