@@ -385,13 +385,12 @@ class PanelPresenter:
         kind = "LabelMapVolume" if self._label_maps else "Segmentation"
         with self._made(None if kept else chosen, kind, name) as node:
             yield node
-        assert node is not None
         self.logic.parameters.labels = node
         self._notes = [*self.logic.notes, *(f"Check: {warning}" for warning in self.logic.warnings)]
         if kept:
             self._notes.append(
                 f"{chosen.GetName()!r} was not made by Segment, or edited since, and is kept; the result is "
-                f"{self.logic.parameters.labels.GetName()!r}"
+                f"{node.GetName()!r}"
             )
 
     @contextmanager

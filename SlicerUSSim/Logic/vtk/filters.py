@@ -34,6 +34,7 @@ from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
+from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -120,6 +121,8 @@ class _ImageFilter(VTKPythonAlgorithmBase):
 class SegmentationFilter(_ImageFilter):
     """From an MRI (port 0), and a mask if it is not skull-stripped (port 1, optional), to uint8 tissue labels.
 
+    Tissues can be laid over the labels from masks (AddTissueData).
+
     The names of the labels are field data "TissueNames" of the output, from which UltrasoundSimulationFilter identifies
     the tissues. Parameters and defaults are those of SegmentationSettings, errors those of segmentation.segment_mri.
     """
@@ -128,9 +131,13 @@ class SegmentationFilter(_ImageFilter):
         super().__init__(nInputPorts=2)
         self._values = asdict(SegmentationSettings())
         self._segmentation: Segmentation | None = None
+        self._others: dict[str, vtkImageData] = {}
+        self._added: tuple[tuple[str, vtkImageData], ...] = ()
+        self._notes: tuple[str, ...] = ()
+        self._warnings: tuple[str, ...] = ()
 
-    def SetClasses(self, classes: int) -> None:
-        """Number of tissues to distinguish by intensity."""
+    def SetClasses(self, classes: int | None) -> None:
+        """Number of tissues to distinguish by intensity; None: by the contrast."""
         self._set("classes", classes)
 
     def SetContrast(self, contrast: str) -> None:
@@ -145,13 +152,44 @@ class SegmentationFilter(_ImageFilter):
         """Strength of the guided filter, squared intensity; None: from the noise in the image."""
         self._set("filter_epsilon", epsilon)
 
-    def SetBiasCorrection(self, on: bool) -> None:
-        """Apply N4 first, for scans with an intensity gradient."""
-        self._set("bias_correction", bool(on))
+    def SetBiasCorrection(self, on: bool | None) -> None:
+        """Apply N4, for scans with an intensity gradient; None: decided from the image."""
+        self._set("bias_correction", None if on is None else bool(on))
 
     def SetThinSulci(self, on: bool) -> None:
         """Label sulci too narrow to reach CSF intensity as leptomeninges."""
         self._set("thin_sulci", bool(on))
+
+    def SetSkullStrip(self, method: str) -> None:
+        """How the brain is found in a whole head without a mask: "auto", "robex", "deepbet", "atlas" or "none"."""
+        self._set("skull_strip", method)
+
+    def SetOtherData(self, contrast: str, image: vtkImageData | None) -> None:
+        """Another MRI of the same patient, on any grid, to classify together with the first; None removes it.
+
+        The image is not observed: call Modified() of the filter after changing it.
+        """
+        others = {name: other for name, other in self._others.items() if name != contrast}
+        self._change("_others", others if image is None else {**others, contrast: image})
+
+    def AddTissueData(self, tissue: str, mask: vtkImageData) -> None:
+        """Lay a tissue over the labels where a mask on any grid is not 0, the last on top; see mri.add_tissue.
+
+        The image is not observed: call Modified() of the filter after changing it.
+        """
+        self._change("_added", (*self._added, (tissue, mask)))
+
+    def RemoveAddedTissues(self) -> None:
+        """Undo AddTissueData."""
+        self._change("_added", ())
+
+    def GetNotes(self) -> tuple[str, ...]:
+        """What the last update recognised and decided, one line each."""
+        return self._notes
+
+    def GetWarnings(self) -> tuple[str, ...]:
+        """What should be checked after the last update, one line each."""
+        return self._warnings
 
     def SetMaskConnection(self, port) -> None:
         """Set the output port that provides the mask: an image on the MRI's grid, non-zero inside."""
@@ -180,17 +218,22 @@ class SegmentationFilter(_ImageFilter):
         return 1
 
     def RequestData(self, request, inInfo, outInfo):  # noqa: N803
-        self._segmentation = None
+        self._segmentation, self._notes, self._warnings = None, (), ()
         mri = vtkImageData.GetData(inInfo[0])
         masked = inInfo[1].GetNumberOfInformationObjects() > 0
-        self._segmentation = segment_mri(
-            Volume.from_vtk(mri), mask=Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None,
+        masks = [(tissue, Volume.from_vtk(image), f"the mask of {tissue}") for tissue, image in self._added]
+        found = segment_mri(
+            Volume.from_vtk(mri), others={name: Volume.from_vtk(image) for name, image in self._others.items()},
+            mask=Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None,
             **self._values, device=self._device, progress=self._report,
         )  # fmt: skip
         output = vtkImageData.GetData(outInfo)
         output.CopyStructure(mri)
-        set_scalars(output, self._segmentation.labels.array)
-        set_tissue_names(output, self._segmentation.tissue_names)
+        added = add_tissues(found.labels, found.tissue_names, masks)
+        set_scalars(output, added.labels.array)
+        set_tissue_names(output, added.tissue_names)
+        self._segmentation = found
+        self._notes, self._warnings = (*found.notes, *added.messages), (*found.warnings, *added.warnings)
         return 1
 
     def _set(self, name: str, value) -> None:
