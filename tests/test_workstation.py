@@ -797,6 +797,29 @@ def test_a_file_that_cannot_be_read_is_said_and_changes_nothing(page, name, cont
     eventually(page, lambda: not errors(page))
 
 
+def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_says(page, tmp_path):
+    mri = head_mri(2.0)
+    index = np.indices(mri.array.shape)[::-1].reshape(3, -1)
+    points = (mri.ijk_to_ras[:3, :3] @ index + mri.ijk_to_ras[:3, 3:]).reshape(3, *mri.array.shape)
+    mask = mri.with_array((((points.T - [30, 10, 40]) ** 2).sum(axis=-1).T < 15**2).astype(np.uint8))
+    mask.write(tmp_path / "mask.nii.gz")
+    far = Volume(mask.array, np.diag([1.0, 1, 1, 1]) @ mask.ijk_to_ras + np.array([[0, 0, 0, 400]] + [[0] * 4] * 3))
+    far.write(tmp_path / "far.nii.gz")
+    labels = shown(page, "labelsSelector")
+    page.select_option("#added-as", "cyst")
+    page.set_input_files("#add-file", tmp_path / "far.nii.gz")
+    text = shown_errors(page)
+    assert "far.nii.gz" not in text or "/tmp" not in text
+    assert "outside the patient" in text and shown(page, "lesionsSelector") is None
+    page.locator(".ussim-error button").first.click()
+    with new_image(page):
+        page.set_input_files("#add-file", tmp_path / "mask.nii.gz")
+    settled(page)
+    assert "cyst: " in page.locator("#notesLabel").inner_text() and not errors(page)
+    assert "cyst" in {row["name"] for row in state(page, NAMES.panel.tissues)}
+    assert shown(page, "labelsSelector") == labels and shown(page, "lesionsSelector") is not None
+
+
 def test_latency_is_measured_on_request(page):
     begun = monotonic()
     click(page, "#show-latency")

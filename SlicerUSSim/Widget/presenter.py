@@ -381,16 +381,15 @@ class PanelPresenter:
         Afterwards the notes are those of the logic.
         """
         chosen: Any = self.logic.parameters.labels
-        kept = chosen is not None and not self.logic.mayReplace(chosen)
+        kept = None if chosen is None or self.logic.mayReplace(chosen) else str(chosen.GetName())
         kind = "LabelMapVolume" if self._label_maps else "Segmentation"
-        with self._made(None if kept else chosen, kind, name) as node:
+        with self._made(chosen if kept is None else None, kind, name) as node:
             yield node
         self.logic.parameters.labels = node
         self._notes = [*self.logic.notes, *(f"Check: {warning}" for warning in self.logic.warnings)]
-        if kept:
+        if kept is not None:
             self._notes.append(
-                f"{chosen.GetName()!r} was not made by Segment, or edited since, and is kept; the result is "
-                f"{node.GetName()!r}"
+                f"{kept!r} was not made by Segment, or edited since, and is kept; the result is {node.GetName()!r}"
             )
 
     @contextmanager
