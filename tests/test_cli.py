@@ -220,7 +220,8 @@ def test_a_mistake_is_one_line_and_writes_nothing(number, head, tmp_path):
     before = sorted(tmp_path.rglob("*"))
     result = ussim(*arguments)
     assert result.exit_code == 2, result.output
-    errors = [line for line in result.stderr.splitlines() if line.startswith("ussim: ")]
+    lines = [line for line in result.stderr.splitlines() if not line.startswith("ussim: warning: ")]
+    errors = [line for line in lines if line.startswith("ussim: ")]
     assert len(errors) == 1 and message in errors[0], result.stderr
     assert "Traceback" not in result.output
     assert sorted(tmp_path.rglob("*")) == before
