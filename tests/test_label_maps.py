@@ -531,6 +531,7 @@ def test_an_mri_scaled_to_one_is_an_mri(mni):
     t1 = mni[0]
     scaled = t1.with_array((t1.array / t1.array.max()).astype(np.float32))
     assert not is_label_file(Path("t1.nii.gz"), scaled)
+    assert not is_label_file(Path("c1_t1.nii.gz"), scaled)  # called as SPM's maps are
     assert not is_label_file(Path("t1.nii.gz"), t1)
 
 
