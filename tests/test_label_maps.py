@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.schemes import schemes
 from SlicerUSSim.Logic.tissue.totalsegmentator import CT, CT_V1, MR, numbered
 
-#: Labels that recon-all of FreeSurfer 5.3 wrote for one person (a public aseg.mgz), and those of SynthSeg's own table
+#: Labels that recon-all wrote for one person (a public aseg.mgz), and those of SynthSeg's own table
 ASEG = [
     2, 3, 4, 5, 7, 8, 10, 11, 12, 13, 14, 15, 16, 17, 18, 24, 26, 28, 30, 31, 41, 42, 43, 44, 46, 47, 49, 50, 51, 52,
     53, 54, 58, 60, 62, 63, 72, 77, 80, 85, 251, 252, 253, 254, 255,
@@ -30,7 +30,7 @@ DESTRIEUX = [n for n in ASEG if n not in (3, 42)] + [
     side + n for side in (11100, 12100) for n in range(1, 76) if n != 42
 ]
 
-#: Heights in the body, centimetres above the floor; written down here from an anatomical atlas, not from the program.
+#: Heights in the body, centimetres above the floor: rough guesses, made without the order that the program expects.
 HEIGHTS = {
     "femur": 65, "prostate": 85, "urinary_bladder": 87, "hip": 90, "gluteus": 88, "sacrum": 93, "colon": 105,
     "liver": 118, "kidney": 112, "heart": 130, "lung": 132, "humerus": 130, "scapula": 138, "clavicula": 145,
@@ -531,6 +531,7 @@ def test_an_mri_scaled_to_one_is_an_mri(mni):
     t1 = mni[0]
     scaled = t1.with_array((t1.array / t1.array.max()).astype(np.float32))
     assert not is_label_file(Path("t1.nii.gz"), scaled)
+    assert not is_label_file(Path("c1_t1.nii.gz"), scaled)  # called as SPM's maps are
     assert not is_label_file(Path("t1.nii.gz"), t1)
 
 

@@ -356,6 +356,24 @@ def test_large_labels_as_freesurfer_has_them_are_told_by_their_colours(bench):
     assert sorted(tissue.name for label, tissue in table.items() if label) == ["grey matter", "white matter"]
 
 
+def test_label_maps_of_other_programs_are_recognised_without_colours_and_masks_refused(bench):
+    bench.logic.preset = Preset()
+    aseg, mask = add(bench.scene, "LabelMapVolume", "aseg"), add(bench.scene, "LabelMapVolume", "mask")
+    array = np.zeros((20, 20, 40), np.int16)
+    for label, i in ((2, 4), (3, 8), (4, 12), (43, 26), (42, 30), (41, 34)):
+        array[4:16, 4:16, i : i + 3] = label
+    write_volume(aseg, Volume(array, np.eye(4)))
+    table = bench.logic.tissues(aseg)
+    assert [table[n].name for n in (1, 2, 3)] == ["white matter", "grey matter", "csf"]
+    write_volume(mask, Volume((array > 0).astype(np.uint8), np.eye(4)))
+    with pytest.raises(SimulationError, match=r"'mask': a binary mask .*; add it to a segmentation as a segment"):
+        bench.logic.tissues(mask)
+    lesion = add(bench.scene, "Segmentation", "painted")
+    write_labels(lesion, Volume((array > 0).astype(np.uint8), np.eye(4)), ("tumour",), bench.grid())
+    with pytest.raises(SimulationError, match="'painted': a lesion"):
+        bench.logic.tissues(lesion)
+
+
 def test_a_label_map_without_names_is_told_by_the_labels_of_the_preset(bench):
     bare = add(bench.scene, "LabelMapVolume", "bare")
     write_volume(bare, cyst())

@@ -224,6 +224,25 @@ def test_alpha_is_the_imaged_field():
     assert 0.2 < outside.mean() < 0.6 and not algorithm.GetFrame().image[outside].any()
 
 
+def test_labels_of_freesurfer_are_read_as_those_of_the_same_tissues():
+    array = np.zeros((40, 40, 40), np.int16)
+    for label, i in ((1003, 2), (2, 8), (4, 14), (43, 20), (41, 26), (2003, 32), (10, 17), (49, 23)):
+        array[:, :, i : i + 3] = label
+    numbers = {0: 0, 2: 1, 41: 1, 4: 2, 43: 2, 10: 3, 49: 3, 1003: 3, 2003: 3}
+    merged = np.vectorize(numbers.get)(array).astype(np.uint8)
+    images = []
+    for labels, tissues in (
+        (array, TissueTable.brain()), (merged, TissueTable.brain(["white matter", "csf", "grey matter"])),
+    ):  # fmt: skip
+        algorithm = simulation()
+        algorithm.SetInputData(Volume(labels, np.eye(4)).to_vtk())
+        algorithm.SetTissues(tissues)
+        algorithm.Update()
+        assert algorithm.GetErrorMessage() == ""
+        images.append(algorithm.GetFrame().image)
+    np.testing.assert_array_equal(*images)
+
+
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [

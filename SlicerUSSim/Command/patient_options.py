@@ -215,7 +215,10 @@ def _labelled(
     found = read_label_file(
         Path(patient.mri_or_labels), volume, mapping, table=table, preset=given, default=preset
     )  # fmt: skip
-    note(f"{patient.mri_or_labels}: {found.message}")
+    if found.has_own_table:  # as `ussim segment` wrote it: nothing to be said
+        log.info("%s: %s", patient.mri_or_labels, found.message)
+    else:
+        note(f"{patient.mri_or_labels}: {found.message}")
     for warning in found.warnings:
         log.warning("%s", warning)
     return found.labels, found.tissues

@@ -21,7 +21,7 @@ _SMALLEST_MM, _LARGEST_MM = 5.0, 2500.0
 #: Numbers from here on are not labels.
 _TOO_LARGE = 100_000
 #: Label maps of up to this many labels are not examined further. Above, at least this share of neighbours has to be
-#: equal; a label map of a brain has 0.65 (voxels of 5 mm) to 0.95, an MRI 0.1 to 0.3.
+#: equal; a label map of a brain has 0.65 (voxels of 5 mm) to 0.95, an MRI 0.05 to 0.35.
 _FEW, _EQUAL_NEIGHBOURS = 8, 0.6
 #: An MRI of few grey levels has more equal neighbours, but evenly spaced levels, and the others are the next level.
 _FEW_LEVELS, _EQUAL_NEIGHBOURS_OF_LEVELS, _NEXT_LEVEL = 32, 0.8, 0.5

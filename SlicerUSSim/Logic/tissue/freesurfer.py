@@ -1,7 +1,7 @@
 """Label numbers of FreeSurfer, which FastSurfer, SynthSeg and SAMSEG use too.
 
 Numbers and names are those of FreeSurfer's FreeSurferColorLUT.txt
-(https://surfer.nmr.mgh.harvard.edu/fswiki/FsTutorial/AnatomicalROI/FreeSurferColorLUT, version of FreeSurfer 8):
+(https://surfer.nmr.mgh.harvard.edu/fswiki/FsTutorial/AnatomicalROI/FreeSurferColorLUT, as FastSurfer distributes it):
 structures in the brain, subfields of hippocampus and hypothalamus, lobules of the cerebellum, and those around the
 brain whose tissue is known. Left out: 500 to 558, parts of the hippocampus, which other programs use for bone and skin.
 """

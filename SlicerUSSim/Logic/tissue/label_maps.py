@@ -42,6 +42,8 @@ class LabelledTissues:
     message: str
     #: What is doubtful, each in one line
     warnings: tuple[str, ...] = ()
+    #: Whether the labels are as they were, with a tissue table that was made for them
+    has_own_table: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -136,7 +138,8 @@ class _Reading:
             return None
         labels = self._volume.with_array(self._volume.array.astype(np.uint8))
         same, count = {label: label for label in (0, *self._present)}, len(self._present)
-        return LabelledTissues(labels, table, same, f"{count} labels by their numbers in the tissue table")
+        message = f"{count} labels by their numbers in the tissue table"
+        return LabelledTissues(labels, table, same, message, has_own_table=True)
 
     def by_tissue(self) -> LabelledTissues:
         """Labels renumbered from 1, one for each tissue, in the order of their first labels."""

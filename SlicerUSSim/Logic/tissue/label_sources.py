@@ -84,5 +84,5 @@ def table_beside(path: Path) -> TissueTable | None:
     if not isinstance(values, dict) or "tissues" not in values:
         _log.info("%s: has no tissues and is not used", beside)
         return None
-    _log.info("tissues: %s", beside)
+    _log.info("tissues: the table next to the label map, %s", beside)
     return TissueTable.from_dict(values, str(beside))

@@ -29,9 +29,9 @@ _PATTERNS: tuple[tuple[str, str, dict[str, str]], ...] = (
         {"CSF": "csf", "GM": "grey matter", "WM": "white matter"},
     ),
 )  # fmt: skip
-#: A map without such a name is one of probabilities if this share of what is above zero is nearly one; an MRI scaled to
-#: one has very few voxels as bright.
-_CERTAIN, _CERTAIN_SHARE = 0.95, 0.1
+#: Probabilities are nearly one in a share of what is above zero: 0.05 in the averaged grey matter of MNI152, more in
+#: one person's; an MRI scaled to one has 0.00001. Without one of these names, more is demanded.
+_CERTAIN, _CERTAIN_SHARE, _CERTAIN_SHARE_OF_NAMED = 0.95, 0.1, 0.01
 #: A voxel is labelled if the tissues are together more probable than nothing.
 _INSIDE = 0.5
 _LARGEST = 1.0 + 1e-3
@@ -63,9 +63,12 @@ def combined_probability_maps(path: Path, volume: Volume) -> CombinedMaps | None
         return None
     for program, pattern, tissues in _PATTERNS:
         found = re.fullmatch(pattern, path.name)
-        if found:
-            return _combined(path, volume, program, found, tissues)
-    if not _is_certain(volume):
+        if found is None:
+            continue
+        paths = _companions(path, found, tissues)
+        if all(map(Path.exists, paths.values())) or _certain_share(volume) > _CERTAIN_SHARE_OF_NAMED:
+            return _combined(path, volume, program, paths)
+    if _certain_share(volume) < _CERTAIN_SHARE:
         return None
     raise SimulationError(
         f"{path}: a probability map (values from 0 to 1, most of them certain), not an MRI; the maps of the other "
@@ -73,11 +76,15 @@ def combined_probability_maps(path: Path, volume: Volume) -> CombinedMaps | None
     )
 
 
-def _combined(path: Path, volume: Volume, program: str, found: re.Match, tissues: dict[str, str]) -> CombinedMaps:
+def _companions(path: Path, found: re.Match, tissues: dict[str, str]) -> dict[str, Path]:
+    """{tissue: file}, in which the file itself has its own tissue, if it is one of the three."""
     start, end = found.span("part")
-    part = found["part"]
-    what = f"{path}: a tissue probability map ({program}{f', {tissues[part]}' if part in tissues else ''})"
-    paths = {tissue: path.with_name(path.name[:start] + other + path.name[end:]) for other, tissue in tissues.items()}
+    return {tissue: path.with_name(path.name[:start] + part + path.name[end:]) for part, tissue in tissues.items()}
+
+
+def _combined(path: Path, volume: Volume, program: str, paths: dict[str, Path]) -> CombinedMaps:
+    own = "".join(f", {tissue}" for tissue, other in paths.items() if other == path)
+    what = f"{path}: a tissue probability map ({program}{own})"
     missing = [other.name for other in paths.values() if not other.exists()]
     require(not missing, f"{what}, not an MRI; put {' and '.join(missing)} beside it, or give the MRI")
     maps = []
@@ -104,6 +111,6 @@ def _has_probabilities(volume: Volume) -> bool:
     return low >= -1e-3 and 0.5 < high <= _LARGEST and bool(np.any((array > 0.01) & (array < 0.99)))
 
 
-def _is_certain(volume: Volume) -> bool:
+def _certain_share(volume: Volume) -> float:
     above = volume.array[volume.array > 0.02]
-    return above.size > 0 and float(np.mean(above > _CERTAIN)) > _CERTAIN_SHARE
+    return float(np.mean(above > _CERTAIN)) if above.size else 0.0
