@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.nifti import log_nifti_geometry
@@ -93,7 +94,7 @@ class Volume:
 
     @classmethod
     def read(cls, path: str | os.PathLike) -> Volume:
-        """Read NIfTI, NRRD, MetaImage, MINC 1 and 2, VTI, or a folder with one DICOM series.
+        """Read NIfTI, NRRD, MetaImage, MINC 1 and 2, VTI, or DICOM: a folder with one volume, or any image of it.
 
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
@@ -103,7 +104,9 @@ class Volume:
             volume = cls._read_vti(path)
             _log.info("%s: coordinates are read as RAS millimetres, since VTI files do not specify them", path)
         elif path.is_dir():
-            volume = cls.from_sitk(_read_dicom_series(path), name=str(path))
+            volume = cls.from_sitk(read_dicom_folder(path), name=str(path))
+        elif (series := series_with(path)) is not None:
+            volume = cls.from_sitk(read_series(series, str(path)), name=str(path))
         elif not is_minc1(path):
             image = read_itk_image(path)
             volume = cls.from_sitk(image, name=str(path))
@@ -318,22 +321,3 @@ def _read_minc1(path: Path) -> tuple[np.ndarray, np.ndarray]:
         _log.info("%s: values are read as whole numbers, as they are stored", path)
     # nibabel's indices are (z, y, x) as in the file; its millimetres are in MNI world coordinates, which are RAS.
     return values, np.array(image.affine)[:, [2, 1, 0, 3]]
-
-
-def _read_dicom_series(folder: Path):
-    import SimpleITK as sitk
-
-    series = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
-    require(bool(series), f"{folder}: has no DICOM series")
-    require(
-        len(series) == 1,
-        f"{folder}: has {len(series)} DICOM series, expected 1; move the required series to its own folder",
-    )
-    reader = sitk.ImageSeriesReader()
-    files = sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0])
-    _log.info("%s: DICOM series %s with %d files", folder, series[0], len(files))
-    reader.SetFileNames(files)
-    try:
-        return reader.Execute()
-    except RuntimeError as error:
-        raise SimulationError(f"{folder}: cannot be read ({str(error).strip().splitlines()[-1]})") from None
