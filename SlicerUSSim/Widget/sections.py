@@ -38,7 +38,7 @@ def panel_sections() -> tuple[Section, ...]:
 
 def _inputs() -> tuple[Row, ...]:
     return (
-        node("mri", "MRI", "Brain MRI, skull-stripped or with a mask"),
+        node("mri", "MRI", "MRI of a head or a brain"),
         node(
             "mask", "Mask",
             "Brain mask: a segmentation, or a label map on the MRI's grid; none: every voxel brighter than the "

@@ -113,7 +113,7 @@ class _ImageFilter(VTKPythonAlgorithmBase):
 
 
 class SegmentationFilter(_ImageFilter):
-    """From an MRI (port 0), and a mask if it is not skull-stripped (port 1, optional), to uint8 tissue labels.
+    """From an MRI (port 0), and a brain mask (port 1, optional), to uint8 tissue labels.
 
     The names of the labels are field data "TissueNames" of the output, from which UltrasoundSimulationFilter identifies
     the tissues. Parameters and defaults are those of SegmentationSettings, errors those of segmentation.segment_mri.
