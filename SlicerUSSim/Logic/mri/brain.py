@@ -26,8 +26,9 @@ _log = logging.getLogger(__name__)
 
 Report = Callable[[float], None]
 _NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
-#: Overlap with the registered atlas above which a mask is taken without asking another method
-_SURE = 0.92
+#: Overlap with the registered atlas above which a mask is taken without asking another method, and below which it is
+#: refused
+_SURE, _LEAST_SURE = 0.92, 0.85
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +165,9 @@ def _extracted(mri: Volume, shown: Shown, method: str, report: Report) -> _Extra
                 check_position(mri, alignment)
             unsure.append(found)
             failures.append(f"the mask by {_NAMES[name]} agrees with the atlas by {sureness:.2f} only; check it")
-    if unsure:
-        return replace(max(unsure, key=lambda found: found.sureness or 0.0), warnings=tuple(failures))
+    best = max(unsure, key=lambda found: found.sureness or 0.0, default=None)
+    if best is not None and (best.sureness or 0.0) >= _LEAST_SURE:
+        return replace(best, warnings=tuple(failures))
     raise SimulationError(f"no brain was found in this head: {'; '.join(failures)}; give a brain mask (--mask)")
 
 

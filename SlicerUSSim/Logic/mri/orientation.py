@@ -37,8 +37,20 @@ def how_it_lies(image: CoarseImage, alignment: Alignment, least: float, remedy: 
     size = " x ".join(f"{n * image.spacing_mm:.0f}" for n in image.array.shape[::-1])
     return lies_otherwise(image, alignment, least, remedy) or (
         f"no head or brain is recognised in this {size} mm image (agreement with the atlas {alignment.agreement:.2f}, "
-        f"expected {least:g} or more in a usual position); {remedy}"
+        f"expected {least:g} or more in a usual position{_cut_ends(image)}); {remedy}"
     )
+
+
+def _cut_ends(image: CoarseImage) -> str:
+    """Where the image ends in the middle of the object, but for its bottom (the neck): of half a head, perhaps."""
+    inside = image.foreground()
+    ends = []
+    for axis, (first, last) in enumerate((("bottom", "top"), ("back", "front"), ("left", "right"))):
+        areas = inside.sum(axis=tuple(other for other in range(3) if other != axis))
+        for area, name in ((areas[1], first), (areas[-2], last)):
+            if area > 0.5 * areas.max() and name != "bottom":
+                ends.append(name)
+    return f"; the object is cut off at the {' and '.join(ends)} of the image" if ends else ""
 
 
 def _turns() -> list[np.ndarray]:

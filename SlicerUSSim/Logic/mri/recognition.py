@@ -21,7 +21,7 @@ USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
 #: to 0.88; CT, bodies, phantoms, and heads that lie wrongly 0.00 to 0.14.
 LEAST_AGREEMENT = 0.16
 #: A patient in a scanner nods by up to 40 degrees; brains of adults differ by less than this in shape and size.
-_MOST_TURN_DEG, _MOST_STRETCH, _SIZES = 48.0, 1.3, (0.74, 1.15)
+_MOST_TURN_DEG, _MOST_STRETCH, _SIZES = 48.0, 1.25, (0.74, 1.15)
 #: Share of the template's brain that must show tissue, and below which a user should look
 _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
 _REMEDY = "give a brain mask (--mask), or --skull-strip none to take everything brighter than the background"
