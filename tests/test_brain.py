@@ -152,6 +152,7 @@ def test_half_a_head_is_refused_with_where_it_is_cut(head, monkeypatch):
         find_brain(half)
 
 
+@pytest.mark.slow
 @needs_nilearn
 def test_a_head_on_its_side_is_refused_with_where_its_top_is(head, monkeypatch):
     swapped = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
