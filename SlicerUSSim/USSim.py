@@ -69,7 +69,7 @@ class USSim(ScriptedLoadableModule):
         self.parent.contributors = ["The SlicerUSSim developers"]
         self.parent.helpText = _(
             "Simulates the B-mode image of an ultrasound probe from the MRI of a patient. "
-            "Choose a skull-stripped MRI, press Segment, tick Live, and move the probe. See the "
+            "Choose an MRI of a head or a brain, press Segment, tick Live, and move the probe. See the "
             '<a href="{home}/blob/main/docs/slicer.md">documentation</a>.'
         ).format(home=_HOME)
         self.parent.acknowledgementText = _(

@@ -61,7 +61,7 @@ toc_object_entries_show_parents = "hide"
 
 PAGES = {
     "Use": ["docs/slicer", "docs/workstation", "docs/reference/command", "docs/reference/index"],
-    "How it works": ["docs/physics", "docs/optimization", "docs/performance"],
+    "How it works": ["docs/brain", "docs/physics", "docs/optimization", "docs/performance"],
     "Change it": ["docs/architecture", "docs/developer", "CONTRIBUTING", "CHANGELOG"],
 }
 

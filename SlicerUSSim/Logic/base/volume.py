@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.nifti import log_nifti_geometry
@@ -114,7 +115,8 @@ class Volume:
 
     @classmethod
     def read(cls, path: str | os.PathLike) -> Volume:
-        """Read NIfTI, NRRD, MetaImage, MINC 1 and 2, FreeSurfer's MGZ, VTI, or a folder with one DICOM series.
+        """Read NIfTI, NRRD, MetaImage, MINC 1 and 2, FreeSurfer's MGZ, VTI, or DICOM: a folder with one volume, or any
+        image of it.
 
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
@@ -124,9 +126,11 @@ class Volume:
             volume = cls._read_vti(path)
             _log.info("%s: coordinates are read as RAS millimetres, since VTI files do not specify them", path)
         elif path.is_dir():
-            volume = cls.from_sitk(_read_dicom_series(path), name=str(path))
+            volume = cls.from_sitk(read_dicom_folder(path), name=str(path))
         elif path.name.lower().endswith((".mgz", ".mgh")):
             volume = cls(*_read_mgh(path))
+        elif (series := series_with(path)) is not None:
+            volume = cls.from_sitk(read_series(series, str(path)), name=str(path))
         elif not is_minc1(path):
             image = read_itk_image(path)
             volume = cls.from_sitk(image, name=str(path))
@@ -381,22 +385,3 @@ def _read_mgh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     _require_volume(values.shape, str(path))
     native = values.astype(values.dtype.newbyteorder("="), copy=False)  # files have the most significant byte first
     return np.ascontiguousarray(native.T), np.array(image.affine)
-
-
-def _read_dicom_series(folder: Path):
-    import SimpleITK as sitk
-
-    series = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
-    require(bool(series), f"{folder}: has no DICOM series")
-    require(
-        len(series) == 1,
-        f"{folder}: has {len(series)} DICOM series, expected 1; move the required series to its own folder",
-    )
-    reader = sitk.ImageSeriesReader()
-    files = sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0])
-    _log.info("%s: DICOM series %s with %d files", folder, series[0], len(files))
-    reader.SetFileNames(files)
-    try:
-        return reader.Execute()
-    except RuntimeError as error:
-        raise SimulationError(f"{folder}: cannot be read ({str(error).strip().splitlines()[-1]})") from None

@@ -10,6 +10,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from typing import cast
 
 import numpy as np
 from scipy import ndimage
@@ -38,6 +39,22 @@ class Alignment:
     agreement: float
     #: Size relative to the template, as the cube root of the ratio of volumes
     size: float
+
+    @property
+    def turn_deg(self) -> float:
+        """Angle by which the head is turned against the template, degrees."""
+        return self.turn_from(np.eye(3))
+
+    def turn_from(self, turn: np.ndarray) -> float:
+        """Angle between the head and the template after a (3, 3) turn, degrees."""
+        left, _, right = np.linalg.svd(turn.T @ self.template_to_ras[:3, :3])
+        return float(np.degrees(np.arccos(np.clip((np.trace(left @ right) - 1.0) / 2.0, -1.0, 1.0))))
+
+    @property
+    def stretch(self) -> float:
+        """Largest over smallest size of the brain relative to the template, over all directions."""
+        sizes = np.linalg.svd(self.template_to_ras[:3, :3], compute_uv=False)
+        return float(sizes[0] / sizes[-1])
 
     def brain_on(self, grid: Volume) -> np.ndarray:
         """(k, j, i) float32 signed distance in template millimetres to the template's brain; negative inside it."""
@@ -132,7 +149,7 @@ class _Template:
         step = slice(None, None, _TEMPLATE_MM)
         brain = t1.array > 0
         spacing = t1.spacing_mm[::-1]
-        outside, inside = (ndimage.distance_transform_edt(side, spacing) for side in (~brain, brain))
+        outside, inside = (cast(np.ndarray, ndimage.distance_transform_edt(side, spacing)) for side in (~brain, brain))
         self.distance = t1.with_array((outside - inside).astype(np.float32))
         smooth = ndimage.gaussian_filter(t1.array.astype(np.float32), _TEMPLATE_MM / 2.4)
         self.image, self.is_brain = smooth[step, step, step], brain[step, step, step]
@@ -149,10 +166,10 @@ class _Template:
     def distance_on(self, grid: Volume, template_to_ras: np.ndarray) -> np.ndarray:
         matrix = self.distance.ras_to_ijk @ np.linalg.inv(template_to_ras) @ grid.ijk_to_ras
         order = matrix[:3, :3][::-1, ::-1]
-        shift = matrix[:3, 3][::-1]
+        shift = cast(float, matrix[:3, 3][::-1] + 1.0)  # annotated as a number, takes one for each axis
         padded = np.pad(self.distance.array, 1, mode="edge")  # far outside: at least the distance at the border
         return ndimage.affine_transform(
-            padded, order, shift + 1.0, grid.array.shape, output=np.float32, order=1, mode="nearest"
+            padded, order, shift, grid.array.shape, output=np.float32, order=1, mode="nearest"
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
@@ -16,15 +16,19 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri import extractors
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.kept_mask import keep, mask_beside as mask_beside, read_kept
-from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML, Shown, above_noise, recognise
+from SlicerUSSim.Logic.mri.kept_mask import keep, read_kept
+from SlicerUSSim.Logic.mri.mask_check import cut_off
+from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML, Shown, above_noise, check_position, recognise
 from SlicerUSSim.Logic.mri.refinement import on_grid, refined, signed_distance
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 _log = logging.getLogger(__name__)
 
 Report = Callable[[float], None]
-_NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the registered atlas"}
+_NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
+#: Overlap with the registered atlas above which a mask is taken without asking another method, and below which it is
+#: refused
+_SURE, _LEAST_SURE = 0.92, 0.85
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +59,9 @@ def find_brain(
     Parameters
     ----------
     mri : the image, with its orientation and voxel size as in the patient.
-    method : how a brain is extracted from a whole head: "robex", "deepbet", "atlas", or "auto" for the first of them
-        that is installed; "none" takes everything brighter than the background, whatever the image shows.
+    method : how a brain is extracted from a whole head: "robex", "deepbet" or "atlas"; "auto" for the atlas, and for
+        the programs that are installed if its result is doubtful; "none" takes everything brighter than the background,
+        whatever the image shows.
     keep_at : file in which the mask of a whole head is kept and from which it is read again; see mask_beside.
     progress : called with the fraction done, 0 to 1; may raise errors.Cancelled, which ends the extraction at once.
 
@@ -78,18 +83,19 @@ def find_brain(
         warnings = (*shown.warnings, *_volume_warnings(millilitres))
         message = f"skull-stripped brain, {millilitres:.0f} ml"
         return BrainMask(mask, "stripped", message, warnings, perf_counter() - start)
-    inside, used, failures = _extracted(mri, shown, method, lambda share: report(0.15 + 0.85 * share))
+    found = _extracted(mri, shown, method, lambda share: report(0.15 + 0.8 * share))
+    inside, millilitres = found.inside, _millilitres(found.inside, mri)
+    warnings = (*shown.warnings, *found.warnings, *_volume_warnings(millilitres), *cut_off(mri, inside))
     seconds = perf_counter() - start
-    millilitres = _millilitres(inside, mri)
-    warnings = (*shown.warnings, *failures, *_volume_warnings(millilitres))
+    message = f"whole head: brain extracted by {_NAMES[found.method]} in {seconds:.0f} s, {millilitres:.0f} ml"
+    if found.sureness is not None:
+        message += f", overlap with the registered atlas {found.sureness:.2f}"
     if keep_at is not None:
-        warnings_kept = warnings
-        _log.info("%s", note := keep(keep_at, mri, inside, used, seconds, warnings_kept))
-        if not note.startswith("the brain mask is kept in"):
-            warnings = (*warnings, note)
-    message = f"whole head: brain extracted by {_NAMES[used]} in {seconds:.0f} s, {millilitres:.0f} ml"
+        note = keep(keep_at, mri, inside, found.method, seconds, warnings)
+        _log.info("%s", note.text)
+        warnings = warnings if note.is_beside else (*warnings, note.text)
     report(1.0)
-    return BrainMask(mri.with_array(inside.astype(np.uint8)), used, message, warnings, seconds)
+    return BrainMask(mri.with_array(inside.astype(np.uint8)), found.method, message, warnings, seconds)
 
 
 def given_brain(mask: Volume, mri: Volume) -> BrainMask:
@@ -123,12 +129,22 @@ def left_out(mask: Volume, lesion: Volume) -> float:
     return float((on_grid(mask.with_array(mask.array > 0), lesion)[inside] < 0.5).mean())
 
 
-def _extracted(mri: Volume, shown: Shown, method: str, report: Report) -> tuple[np.ndarray, str, tuple[str, ...]]:
-    """((k, j, i) True inside, the method, what others failed with)."""
+@dataclass(frozen=True, eq=False)
+class _Extracted:
+    inside: np.ndarray
+    method: str
+    #: Dice of the mask with the aligned template's, 0 to 1; None if there is no alignment
+    sureness: float | None
+    warnings: tuple[str, ...] = ()
+
+
+def _extracted(mri: Volume, shown: Shown, method: str, report: Report) -> _Extracted:
+    """The brain by `method`, or by the first of the available ones whose result is plausible."""
     failures: list[str] = []
+    unsure: list[_Extracted] = []
     for name in _candidates(method):
         try:
-            inside = _by(name, mri, shown.alignment, report)
+            inside, alignment = _by(name, mri, shown.alignment, report)
         except Cancelled:
             raise
         except SimulationError as error:
@@ -137,42 +153,59 @@ def _extracted(mri: Volume, shown: Shown, method: str, report: Report) -> tuple[
             failures.append(str(error))
             continue
         millilitres = _millilitres(inside, mri)
-        if POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1]:
-            return inside, name, tuple(failures)
-        failures.append(
-            f"{_NAMES[name]} found {millilitres:.0f} ml, expected {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml"
-        )
+        sureness = None if alignment is None else _dice(inside, alignment.brain_on(mri) < 0.0)
+        found = _Extracted(inside, name, sureness)
+        if not POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1]:
+            usual = f"{USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml"
+            failures.append(f"{_NAMES[name]} found {millilitres:.0f} ml, expected {usual}")
+        elif sureness is None or sureness >= _SURE:
+            return replace(found, warnings=tuple(failures))
+        else:
+            if not unsure and alignment is not None:
+                check_position(mri, alignment)
+            unsure.append(found)
+            failures.append(f"the mask by {_NAMES[name]} agrees with the atlas by {sureness:.2f} only; check it")
+    best = max(unsure, key=lambda found: found.sureness or 0.0, default=None)
+    if best is not None and (best.sureness or 0.0) >= _LEAST_SURE:
+        return replace(best, warnings=tuple(failures))
     raise SimulationError(f"no brain was found in this head: {'; '.join(failures)}; give a brain mask (--mask)")
 
 
 def _candidates(method: str) -> list[str]:
+    """Methods to try. The atlas is first, as it was the best and quickest of the three (docs/brain.md)."""
     if method != "auto":
         return [method]
     available = {
+        "atlas": mni152() is not None,
         "robex": extractors.robex_folder() is not None,
         "deepbet": extractors.has_deepbet(),
-        "atlas": mni152() is not None,
     }
     found = [name for name, is_available in available.items() if is_available]
     require(
         bool(found),
         "image shows a whole head, and no program for brain extraction is installed; install one with: "
-        "pip install SlicerUSSim[head], or give a brain mask (--mask)",
+        'pip install "SlicerUSSim[head]", or give a brain mask (--mask)',
     )
     return found
 
 
-def _by(name: str, mri: Volume, alignment: Alignment | None, report: Report) -> np.ndarray:
+def _by(name: str, mri: Volume, alignment: Alignment | None, report: Report) -> tuple[np.ndarray, Alignment | None]:
     """The brain by one method, with its border moved to the dark valley outside the cortex."""
     if name == "atlas":
         if alignment is None:
             require(mni152() is not None, "the brain atlas needs nilearn; install it with: pip install nilearn")
             alignment = align_template(mri, progress=lambda share: report(0.5 * share))
-        return refined(mri, alignment.brain_on(mri), core_mm=8.0, reach_mm=12.0, keeps=False)
+        report(0.5)
+        return refined(mri, alignment.brain_on(mri), core_mm=8.0, reach_mm=12.0, keep_mm=3.0), alignment
     program = extractors.robex if name == "robex" else extractors.deepbet
     inside = program(mri, lambda share: report(0.9 * share))
     require(bool(inside.any()), f"{_NAMES[name]} found no brain")
-    return refined(mri, signed_distance(inside, mri.spacing_mm, 20.0), core_mm=6.0, reach_mm=12.0, keeps=True)
+    distance = signed_distance(inside, mri.spacing_mm, 20.0)
+    return refined(mri, distance, core_mm=6.0, reach_mm=12.0, keep_mm=2.0), alignment
+
+
+def _dice(one: np.ndarray, other: np.ndarray) -> float:
+    return float(2.0 * (one & other).sum() / max(int(one.sum()) + int(other.sum()), 1))
 
 
 def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:

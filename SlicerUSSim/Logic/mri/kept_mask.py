@@ -33,6 +33,15 @@ class KeptMask:
     warnings: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Kept:
+    """What became of a mask that was to be kept."""
+
+    #: One line for the user
+    text: str
+    is_beside: bool
+
+
 def mask_beside(mri_path: str | Path) -> Path:
     """The file of an MRI's brain mask: head.nii.gz has head.brain-mask.nrrd, a DICOM folder the same beside it."""
     path = Path(mri_path)
@@ -53,13 +62,16 @@ def read_kept(path: Path, mri: Volume, method: str) -> KeptMask | None:
     return None
 
 
-def keep(path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: float, warnings: tuple[str, ...]) -> str:
+def keep(path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: float, warnings: tuple[str, ...]) -> Kept:
     """Write the mask to `path`, or to the user's cache folder if that cannot be written; returns one line about it.
 
     A file that was not written by this function is never replaced.
     """
     if path.exists() and not _is_ours(path):
-        return f"{path} was not written by ussim and stays as it is; the brain mask is not kept"
+        return Kept(
+            f"{path} was not written by ussim, or was edited, and stays as it is; the brain mask is not kept (to use "
+            "that file, give it as --mask)", False,
+        )  # fmt: skip
     mask = mri.with_array(inside.astype(np.uint8))
     entries = {
         "mri": fingerprint_of(mri), "mask": _hash(mask.array), "method": method, "seconds": f"{seconds:.1f}",
@@ -67,7 +79,7 @@ def keep(path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: floa
     }  # fmt: skip
     try:
         _write(path, mask, entries)
-        return f"the brain mask is kept in {path}"
+        return Kept(f"the brain mask is kept in {path}", True)
     except SimulationError as error:
         _log.info("the mask cannot be kept beside the MRI: %s", error)
     place = _in_cache(path, entries["mri"])
@@ -75,8 +87,8 @@ def keep(path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: floa
         make_folder(place.parent)
         _write(place, mask, entries)
     except SimulationError as error:
-        return f"the brain mask cannot be kept: {error}"
-    return f"the brain mask is kept in {place}, since {path.parent} cannot be written"
+        return Kept(f"the brain mask cannot be kept: {error}", False)
+    return Kept(f"the brain mask is kept in {place}, since {path.parent} cannot be written", False)
 
 
 def fingerprint_of(mri: Volume) -> str:
@@ -107,10 +119,14 @@ def _write(path: Path, mask: Volume, entries: dict[str, str]) -> None:
 
 
 def _is_ours(path: Path) -> bool:
+    """Whether the file was written by `keep` and nobody has edited it since."""
     try:
-        return read_itk_image(path).HasMetaDataKey(f"{_PREFIX}mask")
+        image = read_itk_image(path)
+        mask = Volume.from_sitk(image, str(path))
     except SimulationError:
         return False
+    key = f"{_PREFIX}mask"
+    return image.HasMetaDataKey(key) and image.GetMetaData(key) == _hash(mask.array.astype(np.uint8))
 
 
 def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | None:

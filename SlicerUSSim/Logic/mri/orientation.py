@@ -12,33 +12,45 @@ _ENDS = ("RL", "AP", "SI")
 _NAMES = {"R": "right", "L": "left", "A": "front", "P": "back", "S": "top", "I": "bottom"}
 
 
-def how_it_lies(image: CoarseImage, alignment: Alignment, least: float, remedy: str) -> str:
-    """One line: what the image is, where the head lies in another way than its header says, or that there is none."""
-    size = " x ".join(f"{n * image.spacing_mm:.0f}" for n in image.array.shape[::-1])
-    found = (
-        f"no head or brain is recognised in this {size} mm image (agreement with the atlas {alignment.agreement:.2f}"
-    )
+def lies_otherwise(image: CoarseImage, alignment: Alignment, least: float, remedy: str) -> str | None:
+    """One line if the head fits the atlas better in another orientation or size than its header's; None if not."""
+    enough = max(least, 1.3 * alignment.agreement)
     best, turn = 0.0, np.eye(3)
     for candidate in _turns():
         other = align_coarse(image, turn=candidate, quick=True)
-        if other.agreement > best:
+        if other.turn_from(candidate) < 45.0 and other.agreement > best:
             best, turn = other.agreement, candidate
-    if best >= max(least, 1.3 * alignment.agreement):
-        return (
-            f"the head does not lie as the header says: {_described(turn)} (agreement with the atlas {best:.2f}, "
-            f"in the header's orientation {alignment.agreement:.2f}); correct the header, or {remedy}"
-        )
+    fits = f"agreement with the atlas {best:.2f}, in the header's orientation {alignment.agreement:.2f}"
+    if best >= enough:
+        return f"the head does not lie as its header says: {_described(turn)} ({fits}); correct the header, or {remedy}"
     for factors in _sizes():
-        wrong = CoarseImage(image.array, image.origin, image.spacing_mm)
-        other = align_coarse(wrong, turn=np.diag(factors), quick=True)
-        if other.agreement >= max(least, 1.3 * alignment.agreement):
-            words = ", ".join(
-                f"{f:g} times in {axis}"
-                for f, axis in zip(factors, ("width", "length", "height"), strict=True)
-                if f != 1
-            )
-            return f"the head has a wrong size: {words} of an adult's; check the voxel size in the header, or {remedy}"
-    return f"{found}, expected {least:g} or more); {remedy}"
+        other = align_coarse(image, turn=np.diag(factors), quick=True)
+        if other.agreement >= enough:
+            axes = zip(factors, ("width", "length", "height"), strict=True)
+            words = ", ".join(f"{axis} {factor:g} times" for factor, axis in axes if factor != 1)
+            return f"the head has a wrong size ({words} an adult's); check the voxel size in its header, or {remedy}"
+    return None
+
+
+def how_it_lies(image: CoarseImage, alignment: Alignment, least: float, remedy: str) -> str:
+    """One line about an image that the atlas does not fit: where the head lies, or that there is none."""
+    size = " x ".join(f"{n * image.spacing_mm:.0f}" for n in image.array.shape[::-1])
+    return lies_otherwise(image, alignment, least, remedy) or (
+        f"no head or brain is recognised in this {size} mm image (agreement with the atlas {alignment.agreement:.2f}, "
+        f"expected {least:g} or more in a usual position{_cut_ends(image)}); {remedy}"
+    )
+
+
+def _cut_ends(image: CoarseImage) -> str:
+    """Where the image ends in the middle of the object, but for its bottom (the neck): of half a head, perhaps."""
+    inside = image.foreground()
+    ends = []
+    for axis, (first, last) in enumerate((("bottom", "top"), ("back", "front"), ("left", "right"))):
+        areas = inside.sum(axis=tuple(other for other in range(3) if other != axis))
+        for area, name in ((areas[1], first), (areas[-2], last)):
+            if area > 0.5 * areas.max() and name != "bottom":
+                ends.append(name)
+    return f"; the object is cut off at the {' and '.join(ends)} of the image" if ends else ""
 
 
 def _turns() -> list[np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from scipy import ndimage
@@ -12,13 +13,15 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.orientation import how_it_lies
+from SlicerUSSim.Logic.mri.orientation import how_it_lies, lies_otherwise
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
 USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
 #: Least agreement with the template (Alignment.agreement). Heads and brains that were tried had 0.19 (proton density)
 #: to 0.88; CT, bodies, phantoms, and heads that lie wrongly 0.00 to 0.14.
 LEAST_AGREEMENT = 0.16
+#: A patient in a scanner nods by up to 40 degrees; brains of adults differ by less than this in shape and size.
+_MOST_TURN_DEG, _MOST_STRETCH, _SIZES = 48.0, 1.25, (0.74, 1.15)
 #: Share of the template's brain that must show tissue, and below which a user should look
 _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
 _REMEDY = "give a brain mask (--mask), or --skull-strip none to take everything brighter than the background"
@@ -48,9 +51,20 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     if mni152() is None:
         return Shown(None, warnings=("without nilearn it is not checked that the image shows a head",))
     alignment = align_coarse(image, progress=lambda share: report(0.1 + 0.9 * share))
-    if alignment.agreement < LEAST_AGREEMENT:
+    is_plausible = alignment.turn_deg <= _MOST_TURN_DEG and alignment.stretch <= _MOST_STRETCH
+    is_plausible &= _SIZES[0] <= alignment.size <= _SIZES[1]
+    if alignment.agreement < LEAST_AGREEMENT or not is_plausible:
         raise SimulationError(how_it_lies(image, alignment, LEAST_AGREEMENT, _REMEDY))
     return _head(mri, image, alignment)
+
+
+def check_position(mri: Volume, alignment: Alignment) -> None:
+    """Raise SimulationError if the head fits the atlas better in another orientation or size than its header's.
+
+    It takes some ten seconds, so that it is asked only about a doubtful result.
+    """
+    message = lies_otherwise(CoarseImage.of(mri), alignment, LEAST_AGREEMENT, _REMEDY)
+    require(message is None, message or "")
 
 
 def _check_values(mri: Volume) -> None:
@@ -84,8 +98,8 @@ def _on_constant_background(mri: Volume) -> np.ndarray | None:
     if counts.max() < 0.5 * border.size or (values == background).mean() < 0.15:
         return None
     inside = _largest(values != background)
-    inside = ndimage.binary_fill_holes(inside)
-    millilitres = inside.sum() * _voxel_ml(mri)  # type: ignore[union-attr]
+    inside = cast(np.ndarray, ndimage.binary_fill_holes(inside))
+    millilitres = inside.sum() * _voxel_ml(mri)
     if not POSSIBLE_ML[0] <= millilitres <= 2300.0:
         return None
     coarse = CoarseImage.of(mri.with_array(np.where(inside, 1.0, 0.0).astype(np.float32)))
@@ -104,8 +118,8 @@ def _is_brain_shaped(shape: np.ndarray) -> bool:
     if not (1.06 <= deviations[2] / deviations[1] <= 1.7 and 1.1 <= deviations[2] / deviations[0] <= 2.0):
         return False
     radius = np.sqrt((((points @ axes) / deviations) ** 2).sum(axis=1))
-    filled = float((radius <= np.sqrt(5.0)).mean())  # of the voxels, in the ellipsoid of the same second moments
-    return filled >= 0.86
+    filled = float((radius <= np.sqrt(5.0)).mean())  # 0.922 to 0.999; boxes and cylinders have 0.89 to 0.905
+    return filled >= 0.912
 
 
 def _has_tissues(intensity: np.ndarray, shape: np.ndarray) -> bool:
@@ -118,7 +132,8 @@ def _has_tissues(intensity: np.ndarray, shape: np.ndarray) -> bool:
     low, middle, high = np.percentile(deep, (5, 50, 95))
     if high - low < 0.08 * middle:
         return False
-    profile = np.array([np.median(smooth[(depth > d) & (depth <= d + 4.0)]) for d in np.arange(0.0, 32.0, 4.0)])
+    shells = [smooth[(depth > d) & (depth <= d + 4.0)] for d in np.arange(0.0, 32.0, 4.0)]
+    profile = np.array([np.median(shell) for shell in shells if shell.size > 50])
     notch = max(min(profile[:n].max(), profile[n + 1 :].max()) - profile[n] for n in range(1, len(profile) - 1))
     return bool(notch < 0.25 * profile.max())
 

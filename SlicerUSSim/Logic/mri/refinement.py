@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 from scipy import ndimage
 
@@ -13,14 +15,14 @@ _SPACING_MM = 1.2
 _TISSUE = 0.6
 
 
-def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: float, keeps: bool) -> np.ndarray:
+def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: float, keep_mm: float) -> np.ndarray:
     """(k, j, i) True in the brain.
 
     `distance` is the signed distance to a first mask in mm on the MRI's grid, negative inside. What is deeper than
     `core_mm` is brain, what is further out than `reach_mm` is not. Between them a watershed on the brightness, after
     division by that of the brain nearby (bias field), puts the border into the darkest valley (Hahn and Peitgen, MICCAI
-    2000); darker tissue than grey matter is then taken off outside, and sulci are closed. `keeps`: what the first mask
-    has on this side of the valley stays.
+    2000); darker tissue than grey matter is then taken off outside, and sulci are closed. What is deeper in
+    the first mask than `keep_mm` stays if it is on this side of the valley.
     """
     from skimage.segmentation import watershed
 
@@ -33,45 +35,48 @@ def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: floa
     image, far = image[box], far[box]
     mm = _SPACING_MM
     core = far < -core_mm
-    air = float(np.percentile(image, 1.0))
-    tissue = np.median(image[core]) - air
-    level = _level(image - air, core, tissue)
-    brightness = ndimage.gaussian_filter(np.clip((image - air) / level, 0.0, 1.3), 0.5)
+    brightness = ndimage.gaussian_filter(brightness_near(image, core, mm), 0.5)
     markers = np.where(core, 1, np.where(far > reach_mm, 2, 0)).astype(np.int32)
     region = watershed(-brightness, markers, mask=far <= reach_mm + 3.0) == 1
     bright = region & (brightness > _TISSUE)
     ball = _ball(2.0 / mm)
-    opened = _connected(ndimage.binary_erosion(bright, ball) | core, core)
-    brain = ndimage.binary_dilation(opened, _ball(3.0 / mm)) & bright
-    if keeps:
-        brain |= region & (far <= 0.0)
+    # Casts: the return types of scipy's functions depend on their arguments, without type annotations for that.
+    opened = _connected(cast(np.ndarray, ndimage.binary_erosion(bright, ball)) | core, core)
+    brain = cast(np.ndarray, ndimage.binary_dilation(opened, _ball(3.0 / mm))) & bright
+    brain |= region & (far <= -keep_mm)
     brain = _closed(brain | core, 5.0 / mm) & region
-    brain = ndimage.binary_fill_holes(brain)
+    brain = cast(np.ndarray, ndimage.binary_fill_holes(brain))
     smooth = ndimage.gaussian_filter(brain.astype(np.float32), 0.8)
     matrix[:3, 3] += mm * np.array([part.start for part in box][::-1])
     return on_grid(Volume(smooth, matrix), mri) > 0.5
 
 
-def _level(values: np.ndarray, core: np.ndarray, tissue: float) -> np.ndarray:
-    """(k, j, i) brightness of the brain nearby: the bias field times that of tissue, continued beyond the core."""
-    step, deviation = 4, 15.0 / _SPACING_MM / 4
+def brightness_near(image: np.ndarray, core: np.ndarray, spacing_mm: float) -> np.ndarray:
+    """(k, j, i) float32 brightness relative to that of the brain nearby, 0 (air) to 1.3.
+
+    The brain's is the mean in `core` in Gaussian windows of 15 mm deviation, continued beyond it: a bias field cancels.
+    """
+    air = float(np.percentile(image, 1.0))
+    values = image - air
+    tissue = float(np.median(values[core]))
+    step, deviation = 4, 15.0 / spacing_mm / 4
     some = values[::step, ::step, ::step]
     weight = (core[::step, ::step, ::step] & (np.abs(some - tissue) < 0.5 * tissue)).astype(np.float32)
-    weight += 1e-6 * core[::step, ::step, ::step]
     near = ndimage.gaussian_filter(weight, deviation, truncate=6.0)
     level = ndimage.gaussian_filter(weight * some, deviation, truncate=6.0) / np.maximum(near, 1e-9)
     level = np.where(near > 1e-6, level, tissue)
     wide = ndimage.zoom(level, step, order=1, grid_mode=True, mode="nearest")
     padding = [(0, max(0, n - m)) for n, m in zip(values.shape, wide.shape, strict=True)]
     wide = np.pad(wide, padding, mode="edge")[tuple(slice(n) for n in values.shape)]
-    return np.maximum(wide, 0.2 * tissue)
+    return np.clip(values / np.maximum(wide, max(0.2 * tissue, 1e-6)), 0.0, 1.3).astype(np.float32)
 
 
 def on_grid(volume: Volume, grid: Volume, outside: float = 0.0) -> np.ndarray:
     """(k, j, i) float32 values of the volume on another grid, by linear interpolation; `outside` beyond it."""
     matrix = volume.ras_to_ijk @ grid.ijk_to_ras
+    offset = cast(float, matrix[:3, 3][::-1])  # annotated as a number, takes one for each axis
     return ndimage.affine_transform(
-        volume.array.astype(np.float32), matrix[:3, :3][::-1, ::-1], matrix[:3, 3][::-1], grid.array.shape,
+        volume.array.astype(np.float32), matrix[:3, :3][::-1, ::-1], offset, grid.array.shape,
         output=np.float32, order=1, mode="constant",
  cval=outside,
     )  # fmt: skip

@@ -119,7 +119,7 @@ class _ImageFilter(VTKPythonAlgorithmBase):
 
 
 class SegmentationFilter(_ImageFilter):
-    """From an MRI (port 0), and a mask if it is not skull-stripped (port 1, optional), to uint8 tissue labels.
+    """From an MRI (port 0), and a brain mask (port 1, optional), to uint8 tissue labels.
 
     Tissues can be laid over the labels from masks (AddTissueData).
 

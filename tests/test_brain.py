@@ -1,0 +1,450 @@
+"""The brain in an MRI: recognition, extraction, kept masks, DICOM series."""
+
+import importlib.util
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.mri import brain as brain_module, extractors, orientation
+from SlicerUSSim.Logic.mri.alignment import align_template
+from SlicerUSSim.Logic.mri.atlas import mni152
+from SlicerUSSim.Logic.mri.brain import find_brain, given_brain, left_out
+from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+from SlicerUSSim.Logic.mri.mask_check import cut_off
+from SlicerUSSim.Logic.mri.recognition import recognise
+from SlicerUSSim.Logic.mri.samples import head_mri
+from tests.conftest import SHARED, needs_shared
+
+needs_nilearn = pytest.mark.skipif(importlib.util.find_spec("nilearn") is None, reason="nilearn is not installed")
+
+COLIN = Path("/usr/share/mricron/templates/ch2.nii.gz")
+COLIN_BRAIN = COLIN.with_name("ch2bet.nii.gz")
+
+
+def dice(one, other):
+    return 2.0 * (one & other).sum() / (one.sum() + other.sum())
+
+
+def ellipsoid(radii, spacing=3.0, margin=12.0):
+    """(Volume of zeros, scaled radius at every voxel)."""
+    n = [int(2 * (r + margin) / spacing) + 1 for r in radii]
+    matrix = np.diag([spacing] * 3 + [1.0])
+    matrix[:3, 3] = [-(m - 1) * spacing / 2 for m in n]
+    z, y, x = np.meshgrid(*[np.arange(m) * spacing - (m - 1) * spacing / 2 for m in n[::-1]], indexing="ij")
+    radius = np.sqrt((x / radii[0]) ** 2 + (y / radii[1]) ** 2 + (z / radii[2]) ** 2)
+    return Volume(np.zeros(radius.shape, np.float32), matrix), radius
+
+
+def whole_head(nod_deg=12.0, scale=0.93, spacing=2.0):
+    """(MRI of a head, its brain): the MNI152 brain, nodded and smaller, in CSF, skull and scalp, with noise."""
+    t1 = mni152().t1
+    n = (110, 130, 120)
+    matrix = np.diag([spacing, spacing, spacing, 1.0])
+    matrix[:3, 3] = [-110.0, -140.0, -120.0]
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("xz", [nod_deg, 4.0], degrees=True).as_matrix() * scale
+    turn[:3, 3] = [5.0, -8.0, 6.0]
+    back = t1.ras_to_ijk @ np.linalg.inv(turn) @ matrix
+    brain = ndimage.affine_transform(
+        t1.array.astype(np.float32), back[:3, :3][::-1, ::-1], back[:3, 3][::-1], n[::-1], order=1
+    )
+    inside = ndimage.binary_fill_holes(brain > 60)
+    outside = spacing * ndimage.distance_transform_edt(~inside)
+    rng = np.random.default_rng(0)
+    head = np.where(inside, brain, 12.0)
+    head[(outside > 0) & (outside <= 2.5)] = 50.0
+    head[(outside > 8) & (outside <= 15)] = 320.0
+    head[outside > 15] = 0.0
+    x = np.linspace(-0.15, 0.15, n[0])
+    head = np.abs(head * (1.0 + x) + rng.normal(0, 4.0, head.shape))
+    return Volume(head.astype(np.float32), matrix), inside
+
+
+@pytest.fixture(scope="module")
+def head():
+    return whole_head()
+
+
+@pytest.fixture(scope="module")
+def found(head, tmp_path_factory):
+    """The brain in the synthetic head by the atlas, kept."""
+    place = tmp_path_factory.mktemp("kept") / "head.brain-mask.nrrd"
+    shares = []
+    return find_brain(head[0], "atlas", keep_at=place, progress=shares.append), place, shares
+
+
+# ---- recognition -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spacing", [2.0, 4.0])
+def test_a_stripped_brain_is_recognised_and_taken_whole(spacing):
+    mri = head_mri(spacing)
+    result = find_brain(mri)
+    assert result.method == "stripped"
+    assert result.message == f"skull-stripped brain, {result.volume_ml:.0f} ml"
+    assert np.array_equal(result.mask.array > 0, ndimage.binary_fill_holes(mri.array != 0))
+
+
+@needs_nilearn
+def test_the_template_is_a_stripped_brain_of_its_volume():
+    result = find_brain(mni152().t1)
+    assert result.method == "stripped" and not result.warnings
+    assert result.volume_ml == pytest.approx(1886, abs=3)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda a: np.where(a > 100, np.nan, a), "not finite numbers"),
+        (lambda a: np.full_like(a, 7.0), "constant (7)"),
+        (lambda a: (a > 0).astype(np.uint8), "2 different values"),
+        (lambda a: np.where(a == 0, -1000.0, 40.0 + 0.1 * a), "CT has (Hounsfield"),
+    ],
+)
+def test_what_is_no_mri_is_said(change, message):
+    mri = head_mri(4.0)
+    with pytest.raises(SimulationError) as caught:
+        find_brain(mri.with_array(change(mri.array)))
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def phantom(shape):
+    """A phantom with a bright insert and noise in air."""
+    grid, _ = ellipsoid((75, 80, 75))
+    k, j, i = (np.indices(grid.array.shape).T * 3.0 - np.array(grid.array.shape) * 1.5).T
+    inside = {"box": (abs(i) < 55) & (abs(j) < 70) & (abs(k) < 50), "sphere": i**2 + j**2 + k**2 < 70**2}[shape]
+    rng = np.random.default_rng(1)
+    array = np.where(inside, 100.0 + rng.normal(0, 10, inside.shape), 0.0)
+    array[(i - 20) ** 2 + j**2 + k**2 < 25**2] *= 1.5
+    return Volume(array.astype(np.float32), grid.ijk_to_ras)
+
+
+@needs_nilearn
+@pytest.mark.parametrize("shape", ["box", "sphere"])
+def test_a_phantom_is_no_brain(shape, monkeypatch):
+    monkeypatch.setattr(orientation, "_turns", lambda: [])
+    monkeypatch.setattr(orientation, "_sizes", lambda: [])
+    with pytest.raises(SimulationError, match=r"no head or brain is recognised.*--skull-strip none"):
+        find_brain(phantom(shape))
+
+
+def test_a_tiny_object_is_too_small_for_a_head():
+    mri = head_mri(3.0)
+    with pytest.raises(SimulationError, match="too little for a head; check the voxel size"):
+        find_brain(Volume(mri.array, mri.ijk_to_ras @ np.diag([0.3, 0.3, 0.3, 1.0])))
+
+
+@needs_nilearn
+def test_half_a_head_is_refused_with_where_it_is_cut(head, monkeypatch):
+    monkeypatch.setattr(orientation, "_turns", lambda: [])
+    monkeypatch.setattr(orientation, "_sizes", lambda: [])
+    mri = head[0]
+    half = Volume(mri.array[:, : mri.array.shape[1] // 2], mri.ijk_to_ras)
+    with pytest.raises(SimulationError, match=r"only \d+% of a brain|cut off at the front of the image"):
+        find_brain(half)
+
+
+@pytest.mark.slow
+@needs_nilearn
+def test_a_head_on_its_side_is_refused_with_where_its_top_is(head, monkeypatch):
+    swapped = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
+    turns = [t for t in orientation._turns() if abs(t[1, 2]) == 1 and abs(t[0, 0]) == 1]
+    monkeypatch.setattr(orientation, "_turns", lambda: turns)
+    with pytest.raises(SimulationError, match="its top is where the header says front"):
+        find_brain(swapped)
+
+
+def test_none_takes_everything_brighter_than_the_background():
+    result = find_brain(phantom("box"), "none")
+    assert result.method == "none" and result.volume_ml == pytest.approx(1540, rel=0.1)
+
+
+# ---- extraction ------------------------------------------------------------------------------------------------------
+
+
+@needs_nilearn
+def test_the_atlas_finds_the_brain_of_a_nodding_head_and_says_how_sure_it_is(head, found):
+    result, _, shares = found
+    assert result.method == "atlas"
+    assert dice(result.mask.array > 0, head[1]) > 0.95
+    assert result.message.startswith("whole head: brain extracted by the atlas in ") and "overlap" in result.message
+    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 20
+
+
+@needs_nilearn
+def test_a_cancelled_alignment_stops(head):
+    def progress(share):
+        if share > 0.03:
+            raise Cancelled
+
+    start = time.perf_counter()
+    with pytest.raises(Cancelled):
+        find_brain(head[0], "atlas", progress=progress)
+    assert time.perf_counter() - start < 20.0
+
+
+def fake_robex(folder, script):
+    program = folder / "ROBEX"
+    program.write_text(f"#!{sys.executable}\n{script}")
+    program.chmod(0o700)
+    return folder
+
+
+COPY = """
+import sys, SimpleITK as sitk
+print("Step 1 of 9: ...It took roughly 1 seconds", flush=True)
+image = sitk.ReadImage(sys.argv[1])
+sitk.WriteImage(sitk.Cast(image > 60, sitk.sitkUInt8), sys.argv[3])
+"""
+
+
+def test_a_program_gets_a_copy_of_1_mm_along_lps_and_its_mask_comes_back_on_the_grid(tmp_path, monkeypatch):
+    monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, COPY))
+    mri = head_mri(3.0)
+    turned = Volume(mri.array[::-1].copy(), mri.ijk_to_ras @ np.diag([1.0, 1.0, -1.0, 1.0]))
+    mask = extractors.robex(turned, lambda share: None)
+    assert dice(mask, turned.array > 60) > 0.97
+
+
+def test_a_cancelled_program_is_ended_and_leaves_nothing(tmp_path, monkeypatch):
+    script = f"import os, time\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\ntime.sleep(60)"
+    monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, script))
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(extractors.tempfile, "tempdir", str(temporary))
+
+    def progress(share):
+        if (tmp_path / "pid").exists() and (tmp_path / "pid").read_text():
+            raise Cancelled
+
+    start = time.perf_counter()
+    with pytest.raises(Cancelled):
+        extractors.robex(head_mri(4.0), progress)
+    assert time.perf_counter() - start < 20.0
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
+    assert not list(temporary.iterdir())
+
+
+def test_a_program_that_fails_is_named_with_its_last_line(tmp_path, monkeypatch):
+    script = "import sys; print('no model'); sys.exit(3)"
+    monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, script))
+    with pytest.raises(SimulationError, match=r"ROBEX failed with status 3 \(no model\)"):
+        extractors.robex(head_mri(4.0), lambda share: None)
+
+
+def test_a_head_without_any_program_gets_the_remedy(monkeypatch):
+    monkeypatch.setattr(brain_module, "mni152", lambda: None)
+    monkeypatch.setattr(extractors, "robex_folder", lambda: None)
+    monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
+    with pytest.raises(SimulationError, match=r"whole head.*SlicerUSSim\[head\]"):
+        brain_module._candidates("auto")
+
+
+# ---- kept masks ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name, mask", [("a.nii.gz", "a.brain-mask.nrrd"), ("b.c.nrrd", "b.c.brain-mask.nrrd"), ("d", "d.brain-mask.nrrd")]
+)
+def test_the_mask_has_the_name_of_its_mri(tmp_path, name, mask):
+    assert mask_beside(tmp_path / name) == tmp_path / mask
+
+
+@needs_nilearn
+def test_a_kept_mask_is_read_instead_of_extracted_again(head, found):
+    result, place, _ = found
+    again = find_brain(head[0], keep_at=place)
+    assert again.seconds == 0.0 and "kept in" in again.message
+    assert np.array_equal(again.mask.array, result.mask.array)
+
+
+@needs_nilearn
+def test_an_edited_kept_mask_is_used_and_said_and_never_overwritten(head, found, tmp_path):
+    import SimpleITK as sitk
+
+    image = sitk.ReadImage(str(found[1]))
+    array = sitk.GetArrayFromImage(image)
+    array[: array.shape[0] // 2] = 0
+    edited = sitk.GetImageFromArray(array)
+    edited.CopyInformation(image)
+    for key in image.GetMetaDataKeys():
+        edited.SetMetaData(key, image.GetMetaData(key))
+    place = tmp_path / "edited.nrrd"
+    sitk.WriteImage(edited, str(place))
+    result = find_brain(head[0], "atlas", keep_at=place)
+    assert "as edited in" in result.message and result.method == "given"
+    assert np.array_equal(result.mask.array, array > 0)
+    other = head[0].with_array(head[0].array + 1.0)
+    before = place.read_bytes()
+    assert not brain_module.keep(place, other, array > 0, "atlas", 1.0, ()).is_beside
+    assert place.read_bytes() == before
+
+
+def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
+    mri = head_mri(4.0)
+    place = tmp_path / "head.brain-mask.nrrd"
+    mri.write(place)
+    before = place.read_bytes()
+    kept = brain_module.keep(place, mri, mri.array > 0, "atlas", 1.0, ())
+    assert "was not written by ussim" in kept.text and place.read_bytes() == before
+
+
+def test_a_mask_of_another_image_or_method_is_not_used(tmp_path):
+    mri = head_mri(4.0)
+    place = tmp_path / "head.brain-mask.nrrd"
+    assert brain_module.keep(place, mri, mri.array > 0, "robex", 1.0, ()).is_beside
+    assert brain_module.read_kept(place, mri, "auto") is not None
+    assert brain_module.read_kept(place, mri, "atlas") is None
+    assert brain_module.read_kept(place, mri.with_array(mri.array * 2), "auto") is None
+
+
+def test_where_the_folder_cannot_be_written_the_mask_goes_to_the_cache_and_is_found_there(tmp_path, monkeypatch):
+    import platformdirs
+
+    monkeypatch.setattr(platformdirs, "user_cache_dir", lambda *a, **k: str(tmp_path / "cache"))
+    mri = head_mri(4.0)
+    place = tmp_path / "absent" / "head.brain-mask.nrrd"  # a folder that cannot be written, also for root
+    kept = brain_module.keep(place, mri, mri.array > 0, "robex", 1.0, ())
+    assert str(tmp_path / "cache") in kept.text and not kept.is_beside
+    assert brain_module.read_kept(place, mri, "auto").method == "robex"
+
+
+# ---- masks that are given, and lesions -------------------------------------------------------------------------------
+
+
+def test_an_empty_mask_one_on_another_grid_and_one_of_everything_are_refused():
+    mri = head_mri(4.0)
+    with pytest.raises(SimulationError, match="mask is empty"):
+        given_brain(mri.with_array(np.zeros(mri.array.shape, np.uint8)), mri)
+    with pytest.raises(SimulationError, match="expected the same grid"):
+        given_brain(head_mri(3.0), mri)
+    with pytest.raises(SimulationError, match=r"covers 100% of the image"):
+        given_brain(mri.with_array(np.ones(mri.array.shape, np.uint8)), mri)
+
+
+def test_the_share_of_a_lesion_outside_the_mask_is_found_on_another_grid():
+    grid, radius = ellipsoid((70, 80, 60))
+    mask = grid.with_array((radius < 1.0).astype(np.uint8))
+    lesion = Volume(
+        np.ones((20, 20, 20), np.uint8), np.array([[1.0, 0, 0, 60], [0, 1, 0, -10], [0, 0, 1, -10], [0, 0, 0, 1]])
+    )
+    x = np.arange(60, 80)
+    assert left_out(mask, lesion) == pytest.approx((x > 69.5).mean(), abs=0.1)
+    with pytest.raises(SimulationError, match="lesion is empty"):
+        left_out(mask, lesion.with_array(np.zeros((20, 20, 20))))
+
+
+@needs_nilearn
+def test_a_mask_that_cuts_the_vertex_is_said_and_a_whole_one_is_not(head, found):
+    mri = head[0]
+    whole = found[0].mask.array > 0
+    assert cut_off(mri, whole) == ()
+    cut = whole.copy()
+    top = np.flatnonzero(whole.any(axis=(1, 2))).max()
+    cut[top - 6 :] = False
+    (warning,) = cut_off(mri, cut)
+    assert "at the top; check the cortex there" in warning
+
+
+# ---- DICOM -----------------------------------------------------------------------------------------------------------
+
+
+def write_series(folder, count, uid, number, description, skip=(), tilt=0.0):
+    import SimpleITK as sitk
+
+    folder.mkdir(exist_ok=True)
+    rng = np.random.default_rng(int(number))
+    voxels = rng.integers(0, 1000, (count, 12, 10)).astype(np.int16)
+    writer = sitk.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    for k in range(count):
+        if k in skip:
+            continue
+        image = sitk.GetImageFromArray(voxels[k])
+        image.SetSpacing((1.5, 1.5))
+        tags = {
+            "0008|0060": "MR", "0020|000d": "1.2.3", "0020|000e": uid, "0008|0018": f"{uid}.{k + 1}",
+            "0008|0016": "1.2.840.10008.5.1.4.1.1.4", "0020|0011": number, "0020|0013": str(k + 1),
+            "0008|103e": description, "0020|0037": "1\\0\\0\\0\\1\\0", "0020|0032": f"0\\{tilt * k}\\{2.0 * k}",
+            "0018|0050": "2",
+        }  # fmt: skip
+        for key, value in tags.items():
+            image.SetMetaData(key, value)
+        writer.SetFileName(str(folder / f"s{number}_{k:03d}.dcm"))
+        writer.Execute(image)
+    return voxels
+
+
+def test_the_only_volume_of_a_dicom_folder_is_read_and_said(tmp_path, caplog):
+    voxels = write_series(tmp_path / "d", 14, "1.2.3.5", "5", "t1 mprage")
+    write_series(tmp_path / "d", 3, "1.2.3.1", "1", "localizer")
+    mri = Volume.read(tmp_path / "d")
+    assert np.array_equal(mri.array, voxels)
+    assert "2 DICOM series; the only volume is read: 5 't1 mprage': 14 images of 10x12" in caplog.text
+
+
+def test_several_volumes_are_listed_and_one_is_chosen_by_one_of_its_images(tmp_path):
+    write_series(tmp_path / "d", 12, "1.2.3.5", "5", "t1")
+    voxels = write_series(tmp_path / "d", 11, "1.2.3.6", "6", "t2")
+    with pytest.raises(SimulationError, match=r"give the path of one image.*5 't1': 12 images.*6 't2': 11 images"):
+        Volume.read(tmp_path / "d")
+    assert np.array_equal(Volume.read(tmp_path / "d" / "s6_004.dcm").array, voxels)
+
+
+def test_a_missing_slice_and_a_tilted_stack_are_refused(tmp_path):
+    write_series(tmp_path / "gap", 14, "1.2.3.5", "5", "t1", skip=(6,))
+    with pytest.raises(
+        SimulationError, match="slices are missing or unevenly spaced at 1 places, first 4 mm after slice 6"
+    ):
+        Volume.read(tmp_path / "gap")
+    write_series(tmp_path / "tilt", 14, "1.2.3.5", "5", "t1", tilt=0.5)
+    with pytest.raises(SimulationError, match=r"tilted by 14\.0 degrees"):
+        Volume.read(tmp_path / "tilt")
+
+
+# ---- real heads ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@needs_nilearn
+@pytest.mark.skipif(not COLIN.exists(), reason="Debian's mricron-data is not installed")
+def test_the_atlas_finds_colin_as_his_own_mask_does():
+    mri = Volume.read(COLIN)
+    result = find_brain(mri, "atlas")
+    assert dice(result.mask.array > 0, Volume.read(COLIN_BRAIN).array > 0) > 0.95
+    assert recognise(Volume.read(COLIN_BRAIN)).stripped is not None
+
+
+@pytest.mark.slow
+@needs_shared
+@needs_nilearn
+@pytest.mark.parametrize("name", ["t1_contrast", "t2"])
+def test_the_brain_of_a_patient_is_found_with_her_tumour(name):
+    folder = SHARED / "remind022"
+    result = find_brain(Volume.read(folder / f"{name}.nii.gz"), "atlas")
+    assert 1200 < result.volume_ml < 1700
+    assert left_out(result.mask, Volume.read(folder / "glioma.nii.gz")) == 0.0
+
+
+@pytest.mark.slow
+@needs_nilearn
+@pytest.mark.skipif(not COLIN.exists(), reason="Debian's mricron-data is not installed")
+@pytest.mark.parametrize("order, top", [((1, 0, 2), "front"), ((2, 1, 0), "right|left")])
+def test_colin_on_his_side_is_refused(order, top):
+    mri = Volume.read(COLIN)
+    with pytest.raises(SimulationError, match=f"its top is where the header says ({top})"):
+        find_brain(Volume(np.ascontiguousarray(mri.array.transpose(order)), mri.ijk_to_ras))
+
+
+@needs_nilearn
+def test_the_alignment_finds_the_size_of_the_brain(head):
+    assert align_template(head[0]).size == pytest.approx(0.93, abs=0.02)
