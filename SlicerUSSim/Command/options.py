@@ -9,12 +9,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import Field, field, fields
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.shell_completion import CompletionItem
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter_of, parameters_of
+from SlicerUSSim.Logic.base.errors import require
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.base.volume import Volume
 
 Command = Callable[..., None]
 Decorator = Callable[[Command], Command]
@@ -29,6 +33,24 @@ device_option = click.option(
     "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
 )
 mask_option = click.option("--mask", type=click.Path(), help="Foreground on the MRI's grid (default: found by Otsu).")
+
+also_option = click.option(
+    "--also", multiple=True, metavar="CONTRAST=FILE",
+    help="Another MRI of the same patient, such as t2=t2.nii.gz; it is registered and classified together. Repeatable.",
+)  # fmt: skip
+
+
+def read_others(also: tuple[str, ...]) -> dict[str, Volume]:
+    """{contrast: volume} of --also. Raises SimulationError for other texts, and for a contrast that is given twice."""
+    from SlicerUSSim.Logic.base.volume import Volume  # imported here to keep --help fast
+
+    result: dict[str, Volume] = {}
+    for text in also:
+        contrast, equals, path = text.partition("=")
+        require(bool(equals and path), f"--also: is {text!r}, expected CONTRAST=FILE, such as t2=t2.nii.gz")
+        require(contrast not in result, f"--also: contrast {contrast} is given twice, expected one volume per contrast")
+        result[contrast] = Volume.read(path)
+    return result
 
 
 def verbose_option(command: click.Command) -> click.Command:
@@ -92,7 +114,8 @@ def _option(entry: Parameter, of_preset: bool = False) -> Decorator:
 def help_text(entry: Parameter, of_preset: bool = False) -> str:
     """Help text of a parameter, such as "Gain [dB]: brightness of all echoes (default: the preset's, 0)."."""
     if entry.type is bool:
-        text, default = entry.tip, f"--{(entry.option or '').split('/')[not entry.default]}"
+        text = entry.tip
+        default = "none" if entry.default is None else f"--{(entry.option or '').split('/')[not entry.default]}"
     else:
         tip = entry.tip[0].lower() + entry.tip[1:] if entry.tip[1:2].islower() else entry.tip
         says_it = not entry.unit and tip.startswith(entry.label.lower())

@@ -10,8 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from SlicerUSSim.Command.options import declared, declared_parameters, device_option, mask_option
-from SlicerUSSim.Command.progress import Share
+from SlicerUSSim.Command.options import (
+    also_option,
+    declared,
+    declared_parameters,
+    device_option,
+    mask_option,
+    read_others,
+)
+from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
@@ -62,6 +69,8 @@ class PatientOptions:
     )  # fmt: skip
     #: {parameter: value}
     segmentation: Mapping[str, Any] = declared_parameters(SegmentationSettings, ("contrast", "thin_sulci"))
+    #: CONTRAST=FILE
+    also: tuple[str, ...] = declared(also_option)
     mask: str | None = declared(mask_option)
     #: {parameter: value} of the options that were given
     display: Mapping[str, Any] = declared_parameters(DisplaySettings, of_preset=True)
@@ -180,7 +189,12 @@ def _segmented(mri: Volume, patient: PatientOptions) -> Segmentation:
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
 
     with Share("segment") as progress:
-        return segment_mri(
-            mri, **patient.segmentation, mask=Volume.read(patient.mask) if patient.mask else None,
-            device=patient.device, progress=progress,
+        result = segment_mri(
+            mri, **patient.segmentation, others=read_others(patient.also),
+            mask=Volume.read(patient.mask) if patient.mask else None, device=patient.device, progress=progress,
         )  # fmt: skip
+    for line in result.notes:
+        note(line)
+    for line in result.warnings:
+        note(f"warning: {line}")
+    return result

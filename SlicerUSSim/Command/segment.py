@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from SlicerUSSim.Command.options import check_output, device_option, gathered, mask_option
+from SlicerUSSim.Command.options import also_option, check_output, device_option, gathered, mask_option, read_others
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
@@ -22,10 +22,13 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
     help="Label map; the tissue table is written to a .json file of the same name.",
 )
 @gathered(settings=SegmentationSettings)
+@also_option
 @mask_option
 @device_option
-def segment(mri: str, out: Path, settings: SegmentationSettings, mask: str | None, device: str | None) -> None:
-    """Segment a skull-stripped brain MRI into tissues."""
+def segment(
+    mri: str, out: Path, settings: SegmentationSettings, also: tuple[str, ...], mask: str | None, device: str | None
+) -> None:
+    """Segment the MRI of a head or brain into tissues."""
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
     from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
@@ -34,12 +37,14 @@ def segment(mri: str, out: Path, settings: SegmentationSettings, mask: str | Non
     volume = Volume.read(mri)
     with Share("segment") as progress:
         result = segment_mri(
-            volume, **asdict(settings), mask=Volume.read(mask) if mask else None, device=device, progress=progress,
+            volume, **asdict(settings), others=read_others(also), mask=Volume.read(mask) if mask else None,
+            device=device, progress=progress,
         )  # fmt: skip
     result.labels.write(out)
     TissueTable.brain(result.tissue_names).write(tissues_beside(out))
-    for label, (name, mean, sd, weight) in enumerate(
-        zip(result.tissue_names, result.means, result.standard_deviations, result.weights, strict=False), 1
-    ):
-        click.echo(f"label {label}: {name:14s} mean {mean:8.2f}  sd {sd:7.2f}  share {weight:5.1%}")
+    for line in result.notes:
+        note(line)
+    for line in result.warnings:
+        note(f"warning: {line}")
+    click.echo(result.table())
     note(f"wrote {out} and {tissues_beside(out)}")

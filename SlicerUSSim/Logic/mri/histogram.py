@@ -46,7 +46,7 @@ class Histogram:
             code += codes * cells
         counts = np.bincount(code, minlength=codes * len(shares))
         occupied = np.flatnonzero(counts)
-        place = np.empty(len(counts), np.int32)
+        place = np.empty(counts.size, np.int32)
         place[occupied] = np.arange(len(occupied))
         cell, rest = np.divmod(occupied, codes)
         index = np.stack(np.unravel_index(rest, (bins,) * channels), axis=1)
