@@ -81,7 +81,8 @@ def aligned(other: Volume, reference: Volume, inside: np.ndarray, name: str) -> 
 
 def normalised_information(first: np.ndarray, second: np.ndarray, bins: int = 48) -> float:
     """(H(a) + H(b)) / H(a, b): 1 for two independent sets of values, 2 for two that determine each other."""
-    edges = [np.linspace(*np.percentile(values, (0.5, 99.5)), bins + 1) for values in (first, second)]
+    ranges = [np.percentile(values, (0.5, 99.5)) for values in (first, second)]
+    edges = [np.linspace(float(low), float(high), bins + 1) for low, high in ranges]
     clipped = [np.clip(values, edge[0], edge[-1]) for values, edge in zip((first, second), edges, strict=True)]
     if any(edge[0] == edge[-1] for edge in edges):
         return 1.0

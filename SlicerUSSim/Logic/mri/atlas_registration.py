@@ -57,7 +57,7 @@ class AtlasFit:
         shares = np.empty((3, int(inside.sum())), np.float32)
         for n, array in enumerate(source):
             smooth = ndimage.gaussian_filter(_block_means(array, shrink), _PRIOR_SIGMA_MM / (spacing * shrink))
-            warped = ndimage.affine_transform(smooth, linear, offset, coarse, order=1)
+            warped = ndimage.affine_transform(smooth, linear, offset, coarse, order=1)  # pyright: ignore[reportArgumentType]
             for axis, step in enumerate(stride):
                 warped = warped.repeat(step, axis)
             shares[n + 1] = warped[tuple(map(slice, inside.shape))][inside]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
@@ -16,7 +19,7 @@ _LEAST_EXTENT_MM = 90.0
 _LARGEST_ASYMMETRY = 0.05
 #: Prior share from which a voxel shows the atlas's tissue, and the least number of such voxels
 _SURE_SHARE, _LEAST_VOXELS = 0.7, 200
-_LIKELY_CSF = 0.3
+_LIKELY_CSF, _DEEP_MM = 0.3, 20.0
 
 
 def is_whole_brain(image: Volume, inside: np.ndarray) -> str:
@@ -36,19 +39,20 @@ def is_whole_brain(image: Volume, inside: np.ndarray) -> str:
     return ""
 
 
-def require_contrast(values: np.ndarray, prior: np.ndarray, contrast: str) -> list[str]:
+def require_contrast(image: Volume, inside: np.ndarray, prior: np.ndarray, contrast: str) -> list[str]:
     """Warnings where the atlas's grey and white matter are in another order than the contrast's.
 
-    `values` (voxels,) are intensities and `prior` (3, voxels) the atlas's shares. Raises SimulationError if the darkest
-    and the brightest of what the atlas takes for CSF say that CSF is at the other end.
+    `prior` (3, voxels) are the atlas's shares in the voxels `inside` (k, j, i). Raises SimulationError if ventricles
+    have CSF at the other end.
     """
+    values = image.array[inside]
     sure = prior > _SURE_SHARE
     if min(int(one.sum()) for one in sure[1:]) < _LEAST_VOXELS:
         return []
     grey, white = (float(np.median(values[one])) for one in sure[1:])
     solid = np.concatenate([values[sure[1]], values[sure[2]]])
-    # Half of the voxels that are likeliest to be CSF are grey matter or bone, so the tails decide, not the median.
-    likely = values[prior[0] >= max(_LIKELY_CSF, float(np.percentile(prior[0], 98.0)))]
+    # The atlas's ventricles also cover tissue, so the tails decide, not the median.
+    likely = values[(prior[0] >= _LIKELY_CSF) & _deep(image, inside)]
     if len(likely) < _LEAST_VOXELS:
         return []
     low, high = np.percentile(solid, (2.0, 98.0))
@@ -66,6 +70,17 @@ def require_contrast(values: np.ndarray, prior: np.ndarray, contrast: str) -> li
         how = "brighter" if white > grey else "darker"
         return [f"contrast is {contrast}, but white matter is {how} than grey matter, as in {fits}: check the contrast"]
     return []
+
+
+def _deep(image: Volume, inside: np.ndarray) -> np.ndarray:
+    """(voxels,) whether each voxel `inside` (k, j, i) is far from the border of the brain, as the ventricles are."""
+    step = np.maximum(np.rint(2.0 / image.spacing_mm[::-1]).astype(int), 1)
+    coarse = np.pad(inside[tuple(slice(None, None, n) for n in step)], 1)
+    distance = cast(np.ndarray, ndimage.distance_transform_edt(coarse, (image.spacing_mm[::-1] * step).tolist()))
+    deep = distance[1:-1, 1:-1, 1:-1] > _DEEP_MM
+    for axis, n in enumerate(step):
+        deep = deep.repeat(n, axis)
+    return deep[tuple(map(slice, inside.shape))][inside]
 
 
 def implausible(found: Classes, image: Volume, inside: np.ndarray, atlas: AtlasFit | None, contrast: str) -> list[str]:

@@ -182,7 +182,7 @@ def segment_mri(
     prior = atlas.prior(part.images[0], part.inside) if atlas else None
     if prior is not None:
         for name, image in zip(contrasts, part.images, strict=True):
-            warnings += require_contrast(image.array[part.inside], prior, name)
+            warnings += require_contrast(image, part.inside, prior, name)
 
     def classified() -> tuple[Classes, list[tuple[np.ndarray, float, float]]]:
         found = [
