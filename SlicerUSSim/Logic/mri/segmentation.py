@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.bias import LEAST_FIELD, field_strength, without_bias
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
-from SlicerUSSim.Logic.mri.classification import Classes, class_names, classify
+from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, Classes, class_names, classify
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.neighbours import smoothed_posteriors
 from SlicerUSSim.Logic.mri.plausibility import implausible, is_whole_brain, require_contrast
@@ -197,7 +197,7 @@ def segment_mri(
                 f"MRI is constant ({channel[0]:g}) inside the foreground, expected tissues of different intensity"
                 + (f" in {name}" if others else ""),
             )
-        result = classify(values, contrasts, names, prior)
+        result = classify(values, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0)
         result = replace(result, posteriors=smoothed_posteriors(result.posteriors, part.inside))
         timed("mixture")
         return result, found

@@ -124,8 +124,8 @@ class SegmentationFilter(_ImageFilter):
         self._values = asdict(SegmentationSettings())
         self._segmentation: Segmentation | None = None
 
-    def SetClasses(self, classes: int) -> None:
-        """Number of tissues to distinguish by intensity."""
+    def SetClasses(self, classes: int | None) -> None:
+        """Number of tissues to distinguish by intensity; None: as the contrast has."""
         self._set("classes", classes)
 
     def SetContrast(self, contrast: str) -> None:
@@ -140,9 +140,9 @@ class SegmentationFilter(_ImageFilter):
         """Strength of the guided filter, squared intensity; None: from the noise in the image."""
         self._set("filter_epsilon", epsilon)
 
-    def SetBiasCorrection(self, on: bool) -> None:
-        """Apply N4 first, for scans with an intensity gradient."""
-        self._set("bias_correction", bool(on))
+    def SetBiasCorrection(self, on: bool | None) -> None:
+        """Apply N4, for scans with an intensity gradient; None: where the image has one."""
+        self._set("bias_correction", None if on is None else bool(on))
 
     def SetThinSulci(self, on: bool) -> None:
         """Label sulci too narrow to reach CSF intensity as leptomeninges."""
