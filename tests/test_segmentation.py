@@ -124,13 +124,13 @@ def test_two_channels_tell_apart_what_neither_does():
 
 
 def test_a_prior_moves_only_what_intensity_leaves_open():
-    values = brain_of({"csf": 0.15, "grey": 0.45, "white": 0.4}, 5.0, 6)
+    values = brain_of({"csf": 0.15, "grey": 0.45, "white": 0.4}, 12.0, 6)
     prior = np.full((3, len(values)), 1 / 3, np.float32)
     prior[:, ::2] = np.array([[0.05], [0.9], [0.05]])
     names = class_names(("t1",), None)
     led = classify(values[None], ("t1",), names, prior)
     is_grey = led.posteriors.argmax(axis=0) == 1
-    between, clear = np.abs(values - 105) < 3, np.abs(values - 120) < 3
+    between, clear = np.abs(values - 105) < 3, values > 140
     assert is_grey[::2][between[::2]].mean() > is_grey[1::2][between[1::2]].mean() + 0.05
     assert is_grey[::2][clear[::2]].mean() < 0.02
 

@@ -66,7 +66,7 @@ def _outliers(levels: np.ndarray, size: np.ndarray, contrasts: tuple[str, ...]) 
         return np.full((1, len(levels)), 1.0 / np.prod(size)), np.array([_OUTLIERS_OF_SEVERAL])
     low = levels.min()
     middle = low + 0.5 * float(size.sum())
-    is_bright = levels.ravel() > middle
+    is_bright = levels.sum(axis=1) > middle
     density = np.stack([~is_bright, is_bright]) * (2.0 / float(size.sum()))
     return density, np.array(_OUTLIERS[contrasts[0]])
 
