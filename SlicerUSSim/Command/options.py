@@ -94,7 +94,8 @@ def _option(entry: Parameter, of_preset: bool = False) -> Decorator:
 def help_text(entry: Parameter, of_preset: bool = False) -> str:
     """Help text of a parameter, such as "Gain [dB]: brightness of all echoes (default: the preset's, 0)."."""
     if entry.type is bool:
-        text, default = entry.tip, f"--{(entry.option or '').split('/')[not entry.default]}"
+        text = entry.tip
+        default = "none" if entry.default is None else f"--{(entry.option or '').split('/')[not entry.default]}"
     else:
         tip = entry.tip[0].lower() + entry.tip[1:] if entry.tip[1:2].islower() else entry.tip
         says_it = not entry.unit and tip.startswith(entry.label.lower())

@@ -44,21 +44,24 @@ class AtlasFit:
 
     def prior(self, grid: Volume, inside: np.ndarray) -> np.ndarray:
         """(3, voxels) float32 share of CSF, grey and white matter to be expected in the voxels `inside` (k, j, i)."""
-        matrix = self._atlas.t1.ras_to_ijk @ self.patient_to_atlas @ grid.ijk_to_ras
+        source = (self._atlas.grey.array, self._atlas.white.array)  # the rest is CSF, also around the atlas
         spacing = self._atlas.t1.spacing_mm[::-1]
-        step = np.maximum(np.rint(_MAPS_MM / spacing).astype(int), 1)
-        coarse = tuple(slice(None, None, n) for n in step)
-        box = ndimage.find_objects(inside.astype(np.uint8))[0]
-        first = np.array([part.start for part in box])
+        shrink = np.maximum(np.rint(_MAPS_MM / spacing).astype(int), 1)
+        stride = np.maximum(np.rint(_MAPS_MM / grid.spacing_mm[::-1]).astype(int), 1)
+        matrix = self._atlas.t1.ras_to_ijk @ self.patient_to_atlas @ grid.ijk_to_ras
         # scipy wants the map from array indices (k, j, i) of the result to those of the input.
-        linear = matrix[:3, :3][::-1, ::-1] / step[:, None]
-        offset = matrix[:3, 3][::-1] / step + linear @ first
-        within = inside[box]
-        shares = np.empty((3, int(within.sum())), np.float32)
-        for n, volume in enumerate((self._atlas.csf, self._atlas.grey, self._atlas.white)):
-            smooth = ndimage.gaussian_filter(volume.array, _PRIOR_SIGMA_MM / spacing, truncate=3.0)[coarse]
-            shares[n] = ndimage.affine_transform(smooth, linear, offset, within.shape, order=1)[within]
-        shares[0] += np.maximum(0.0, 1.0 - shares.sum(axis=0))  # around the atlas's brain there is CSF
+        linear = matrix[:3, :3][::-1, ::-1]
+        offset = (matrix[:3, 3][::-1] + linear @ (0.5 * (stride - 1)) - 0.5 * (shrink - 1)) / shrink
+        linear = linear * stride / shrink[:, None]
+        coarse = tuple(-(-n // step) for n, step in zip(inside.shape, stride, strict=True))
+        shares = np.empty((3, int(inside.sum())), np.float32)
+        for n, array in enumerate(source):
+            smooth = ndimage.gaussian_filter(_block_means(array, shrink), _PRIOR_SIGMA_MM / (spacing * shrink))
+            warped = ndimage.affine_transform(smooth, linear, offset, coarse, order=1)  # pyright: ignore[reportArgumentType]
+            for axis, step in enumerate(stride):
+                warped = warped.repeat(step, axis)
+            shares[n + 1] = warped[tuple(map(slice, inside.shape))][inside]
+        shares[0] = 1.0 - shares[1] - shares[2]
         shares = np.maximum(shares, _PRIOR_FLOOR)
         return shares / shares.sum(axis=0)
 
@@ -96,18 +99,26 @@ def register_atlas(
         starts.append((_metric(fixed, moving, similarity), similarity))
     report(0.2)
     starts.sort(key=lambda start: start[0])
-    best = min((_optimised(fixed, moving, start, 50) for _, start in starts[:2]), key=lambda found: found[0])[1]
+    best = min((_optimised(fixed, moving, start, 40) for _, start in starts[:2]), key=lambda found: found[0])[1]
     report(0.6)
     affine = sitk.AffineTransform(3)
     linear, shift = _matrix(best)
     affine.SetCenter(centres[0].tolist())
     affine.SetMatrix(linear.ravel().tolist())
     affine.SetTranslation((linear @ centres[0] + shift - centres[0]).tolist())
-    found = _optimised(fixed, moving, affine, 60)[1]
+    found = _optimised(fixed, moving, affine, 50)[1]
     warped = sitk.GetArrayViewFromImage(sitk.Resample(moving_mask, fixed_mask, found)) > 0.5
     mask = sitk.GetArrayViewFromImage(fixed_mask) > 0.5
     report(1.0)
     return AtlasFit(_ras_matrix(found), 2.0 * float((warped & mask).sum()) / float(warped.sum() + mask.sum()), atlas)
+
+
+def _block_means(array: np.ndarray, shrink: np.ndarray) -> np.ndarray:
+    """(k, j, i) float32 means of blocks of `shrink` voxels; what is left over at the far ends is cut off."""
+    counts = [size // step for size, step in zip(array.shape, shrink, strict=True)]
+    cut = array[tuple(slice(0, n * step) for n, step in zip(counts, shrink, strict=True))]
+    shape = [n for pair in zip(counts, shrink, strict=True) for n in pair]
+    return cut.reshape(shape).mean(axis=(1, 3, 5), dtype=np.float32)
 
 
 def _coarse(image: Volume, inside: np.ndarray) -> tuple[sitk.Image, sitk.Image]:
@@ -135,8 +146,8 @@ def _coarse(image: Volume, inside: np.ndarray) -> tuple[sitk.Image, sitk.Image]:
 def _centroid(mask: sitk.Image) -> np.ndarray:
     import SimpleITK as sitk
 
-    k, j, i = ndimage.center_of_mass(sitk.GetArrayViewFromImage(mask))
-    return np.array(mask.TransformContinuousIndexToPhysicalPoint((float(i), float(j), float(k))))
+    centre = np.array(ndimage.center_of_mass(sitk.GetArrayViewFromImage(mask)), float)
+    return np.array(mask.TransformContinuousIndexToPhysicalPoint(centre[::-1].tolist()))
 
 
 def _method(moving: sitk.Image) -> sitk.ImageRegistrationMethod:

@@ -20,7 +20,9 @@ _BRIGHT_NAMES = {"t1gd": "enhancing", "flair": "tumour"}
 #: Contrasts from the one that tells grey from white matter best
 _PREFERENCE = ("t1", "t1gd", "flair", "t2")
 #: The spatial prior's exponent: the affine transform leaves the cortex some millimetres off
-_PRIOR_EXPONENT = 0.6
+_PRIOR_EXPONENT = 0.3
+#: Noise of posteriors per that of the fit, for filtered images: filters leave more error at borders than within tissues
+FILTER_BLUR = 1.5
 _START_ITERATIONS = 12
 #: Smallest and largest share of CSF, grey and white matter in the starts, and in a result without a warning
 START_SHARES = ((0.05, 0.15, 0.3), (0.3, 0.45))
@@ -68,13 +70,16 @@ def class_names(contrasts: tuple[str, ...], classes: int | None) -> tuple[str, .
 
 
 def classify(
-    values: np.ndarray, contrasts: tuple[str, ...], names: tuple[str, ...], prior: np.ndarray | None
+    values: np.ndarray, contrasts: tuple[str, ...], names: tuple[str, ...], prior: np.ndarray | None, blur: float = 1.0
 ) -> Classes:
-    """The classes of (channels, voxels) float32 intensities; `prior` (3, voxels) is the atlas's share of tissues."""
+    """The classes of (channels, voxels) float32 intensities; `prior` (3, voxels) is the atlas's share of tissues.
+
+    Posteriors assume `blur` times the noise of the fit.
+    """
     if prior is not None:
         prior = prior**_PRIOR_EXPONENT
         prior /= prior.sum(axis=0)
-    first = min(range(len(contrasts)), key=lambda n: _PREFERENCE.index(contrasts[n]))
+    first = _best_channel(contrasts)
     histogram = Histogram.of(values[first : first + 1], contrasts[first : first + 1], prior)
     mixture = _fit_one(histogram.points, contrasts[first])
     if len(contrasts) > 1:
@@ -89,7 +94,11 @@ def classify(
         )
         histogram = Histogram.of(values, contrasts, prior)
         mixture = fit_mixture(histogram.points, means, 0.5 * deviation)
-    return _named(histogram, mixture, contrasts, names, values)
+    return _named(histogram, mixture, contrasts, names, blur)
+
+
+def _best_channel(contrasts: tuple[str, ...]) -> int:
+    return min(range(len(contrasts)), key=lambda n: _PREFERENCE.index(contrasts[n]))
 
 
 def _fit_one(points: Points, contrast: str) -> TissueMixture:
@@ -110,7 +119,7 @@ def _fit_one(points: Points, contrast: str) -> TissueMixture:
 
 def _excess(fit: TissueMixture, points: Points) -> float:
     """By how much the shares of the tissues leave the expected range."""
-    shares, outside = fit.shares(points)
+    shares = fit.shares(points)[0]
     volumes = (shares * points.counts).sum(axis=1)
     volumes = volumes / volumes.sum()
     return float(sum(max(low - v, v - high, 0.0) for v, (low, high) in zip(volumes, EXPECTED_SHARES, strict=True)))
@@ -139,18 +148,20 @@ def _starts(points: Points, contrast: str) -> list[tuple[np.ndarray, np.ndarray]
 
 
 def _named(
-    histogram: Histogram, mixture: TissueMixture, contrasts: tuple[str, ...], names: tuple[str, ...], values: np.ndarray
+    histogram: Histogram, mixture: TissueMixture, contrasts: tuple[str, ...], names: tuple[str, ...], blur: float
 ) -> Classes:
     """The mixture's tissues under their names, and outliers where they belong."""
     points = histogram.points
-    shares, outside = mixture.shares(points)
+    shares, outside = mixture.shares(points, blur)
     deviation = np.sqrt(np.diag(mixture.covariance))
     bright = np.zeros(len(points.counts), bool)
     if len(names) > len(TISSUES):
         channel = next(n for n, contrast in enumerate(contrasts) if contrast in _BRIGHT_NAMES)
         brightest = mixture.means[:, channel].max()
         bright = points.values[:, channel] > brightest + 2.0 * deviation[channel]
-    away = np.stack([((points.values - mean) ** 2 / deviation**2).sum(axis=1) for mean in mixture.means])
+    # By the contrast that tells tissues apart best: what is dark in T1 and in T2 is nearest to white matter in T2.
+    best = _best_channel(contrasts)
+    away = np.abs(points.values[:, best] - mixture.means[:, best, None])
     nearest = away.argmin(axis=0)
     for tissue in range(len(TISSUES)):
         shares[tissue] += np.where((nearest == tissue) & ~bright, outside, 0.0)

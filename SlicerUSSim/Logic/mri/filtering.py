@@ -24,8 +24,10 @@ def denoised(
     noise = estimate_noise(image, mask)
     if radius == 0:
         return guided_filter(image, mask, 0, 0.0), noise, noise**2 if epsilon is None else epsilon
-    weight = ndimage.gaussian_filter(mask.astype(np.float32), _GAUSSIAN)
-    smooth = ndimage.gaussian_filter(np.where(mask, image, 0).astype(np.float32), _GAUSSIAN)
+    weight, smooth = (
+        ndimage.gaussian_filter(array, _GAUSSIAN, truncate=2.0)
+        for array in (mask.astype(np.float32), np.where(mask, image, 0).astype(np.float32))
+    )
     smooth = np.where(mask, smooth / np.maximum(weight, 1e-6), 0.0).astype(np.float32)
     if epsilon is None:
         epsilon = (_EPSILON_PER_NOISE * estimate_noise(smooth, mask)) ** 2

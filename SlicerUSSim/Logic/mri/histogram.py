@@ -46,7 +46,7 @@ class Histogram:
             code += codes * cells
         counts = np.bincount(code, minlength=codes * len(shares))
         occupied = np.flatnonzero(counts)
-        place = np.empty(len(counts), np.int32)
+        place = np.empty(counts.size, np.int32)
         place[occupied] = np.arange(len(occupied))
         cell, rest = np.divmod(occupied, codes)
         index = np.stack(np.unravel_index(rest, (bins,) * channels), axis=1)
@@ -65,9 +65,9 @@ def _outliers(levels: np.ndarray, size: np.ndarray, contrasts: tuple[str, ...]) 
     if len(contrasts) > 1:
         return np.full((1, len(levels)), 1.0 / np.prod(size)), np.array([_OUTLIERS_OF_SEVERAL])
     low = levels.min()
-    middle = low + 0.5 * size[0]
-    is_bright = levels[:, 0] > middle
-    density = np.stack([~is_bright, is_bright]) * (2.0 / size[0])
+    middle = low + 0.5 * float(size.sum())
+    is_bright = levels.sum(axis=1) > middle
+    density = np.stack([~is_bright, is_bright]) * (2.0 / float(size.sum()))
     return density, np.array(_OUTLIERS[contrasts[0]])
 
 

@@ -95,9 +95,7 @@ def _brats(volume: Volume, values: np.ndarray, source: str) -> Masks:
     )
     is_old = 4 in there and 3 not in there
     tissues = _BRATS_2022 if is_old else _BRATS
-    warnings = (
-        f"{source}: label 4 is read as enhancing, as until 2022, and not as a cavity, without a label 3",
-    )
+    warnings = (f"{source}: label 4 is read as enhancing, as until 2022, and not as a cavity, without a label 3",)
     masks = {name: volume.array == label for name, label in tissues.items() if label in there}
     return _masks(volume, masks, source, warnings if is_old else ())
 

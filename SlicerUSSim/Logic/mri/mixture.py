@@ -19,6 +19,10 @@ MIXED = ((0, 1), (1, 2))
 _INSIDE = len(TISSUES) + len(MIXED)
 #: Share of a mixed voxel above which it counts as the second tissue
 _MIDDLE = 0.5
+#: Least weight of the pure classes, and of the mixed ones: at 1 mm every tissue has borders. Without these, wide pure
+#: classes replace the mixed ones, or one class takes grey and white matter where their contrast is low
+_LEAST_PURE = np.array([1e-4, 0.2, 0.12])
+_LEAST_MIXED = np.array([0.1, 0.15])
 _MAX_ITERATIONS, _LEAST_GAIN = 150, 1e-6
 
 
@@ -52,12 +56,12 @@ class TissueMixture:
     #: Mean log-likelihood of every iteration, which never decreases
     log_likelihoods: np.ndarray
 
-    def shares(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
+    def shares(self, points: Points, blur: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """((K, points) probability that each tissue fills most of the voxel, (points,) that it is an outlier).
 
-        They add up to 1.
+        They add up to 1. The noise is taken to be `blur` times that of the fit.
         """
-        parts = _Parts(points, self.means, self.covariance)
+        parts = _Parts(points, self.means, blur**2 * self.covariance)
         density = parts.density * self.weights[:, None] * _affinity(points)
         density /= density.sum(axis=0) + 1e-300
         result = density[: len(TISSUES)].copy()
@@ -92,8 +96,8 @@ def fit_mixture(
         if len(likelihoods) > 1 and likelihoods[-1] - likelihoods[-2] < _LEAST_GAIN:
             break
         belonging = joint * (counts / total)
-        weights = belonging.sum(axis=1) / np.maximum(affinity @ (counts / around), 1e-12)
-        weights = _limited(weights / weights.sum(), points.limits)
+        weights = belonging.sum(axis=1) / np.maximum(affinity @ (counts / around), 1e-12) + 1e-12
+        weights = _limited(weights, points.limits)
         means, covariance = parts.update(belonging, means, scatter, least)
     return TissueMixture(means, covariance, weights, np.array(likelihoods))
 
@@ -175,10 +179,20 @@ def _content(along: np.ndarray, length: float, inside: np.ndarray) -> tuple[np.n
 
 
 def _limited(weights: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """The weights with those of the outliers within their limits, adding up to 1."""
-    weights = np.maximum(weights, 1e-6)
-    outside = np.minimum(weights[_INSIDE:], limits)
-    return np.concatenate([weights[:_INSIDE] * (1.0 - outside.sum()) / weights[:_INSIDE].sum(), outside])
+    """The weights within their limits, adding up to 1."""
+    weights = weights / weights.sum()
+    low = np.concatenate([_LEAST_PURE, _LEAST_MIXED, np.full(len(limits), 1e-6)])
+    high = np.concatenate([np.ones(_INSIDE), limits])
+    bound = np.zeros(len(weights), bool)
+    for _ in range(len(weights)):  # what a limit gives or takes is shared by the classes that are free
+        free = (1.0 - weights[bound].sum()) / weights[~bound].sum()
+        scaled = np.where(bound, weights, free * weights)
+        outside = ~bound & ((scaled < low) | (scaled > high))
+        weights = np.where(outside, np.clip(scaled, low, high), scaled)
+        if not outside.any():
+            break
+        bound |= outside
+    return weights
 
 
 def _affinity(points: Points) -> np.ndarray:

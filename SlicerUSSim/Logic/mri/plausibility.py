@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
@@ -16,6 +19,7 @@ _LEAST_EXTENT_MM = 90.0
 _LARGEST_ASYMMETRY = 0.05
 #: Prior share from which a voxel shows the atlas's tissue, and the least number of such voxels
 _SURE_SHARE, _LEAST_VOXELS = 0.7, 200
+_LIKELY_CSF, _DEEP_MM = 0.3, 20.0
 
 
 def is_whole_brain(image: Volume, inside: np.ndarray) -> str:
@@ -35,20 +39,48 @@ def is_whole_brain(image: Volume, inside: np.ndarray) -> str:
     return ""
 
 
-def require_contrast(image: Volume, inside: np.ndarray, atlas: AtlasFit, contrast: str) -> list[str]:
-    """Warnings where the medians of the atlas's tissues are in another order than the contrast's.
+def require_contrast(image: Volume, inside: np.ndarray, prior: np.ndarray, contrast: str) -> list[str]:
+    """Warnings where the atlas's grey and white matter are in another order than the contrast's.
 
-    Raises SimulationError if CSF is at the wrong end.
+    `prior` (3, voxels) are the atlas's shares in the voxels `inside` (k, j, i). Raises SimulationError if ventricles
+    have CSF at the other end.
     """
-    prior = atlas.prior(image, inside)
     values = image.array[inside]
-    medians = np.full(3, np.nan)
-    for n in (1, 2):
-        sure = prior[n] > _SURE_SHARE
-        if sure.sum() >= _LEAST_VOXELS:
-            medians[n] = np.median(values[sure])
-    # CSF of the ventricles: around the brain the mask decides what there is.
+    sure = prior > _SURE_SHARE
+    if min(int(one.sum()) for one in sure[1:]) < _LEAST_VOXELS:
+        return []
+    grey, white = (float(np.median(values[one])) for one in sure[1:])
+    solid = np.concatenate([values[sure[1]], values[sure[2]]])
+    # The atlas's ventricles also cover tissue, so the tails decide, not the median.
+    likely = values[(prior[0] >= _LIKELY_CSF) & _deep(image, inside)]
+    if len(likely) < _LEAST_VOXELS:
+        return []
+    low, high = np.percentile(solid, (2.0, 98.0))
+    dark, bright = float((likely < low).mean()), float((likely > high).mean())
+    csf_is_bright = ORDERS[contrast][-1] == 0
+    if max(dark, bright) > 3.0 * min(dark, bright) and max(dark, bright) > 0.3 and (bright > dark) != csf_is_bright:
+        where, fits = ("brightest", "t2") if bright > dark else ("darkest", "t1 and flair")
+        raise SimulationError(
+            f"contrast is {contrast}, but CSF is {where}, as in {fits}: choose {' or '.join(fits.split(' and '))}"
+        )
+    expected = ORDERS[contrast].index(2) > ORDERS[contrast].index(1)
+    spread = float(np.percentile(solid, 84.0) - np.percentile(solid, 16.0))
+    if (white > grey) != expected and abs(white - grey) > 0.25 * spread:
+        fits = "t1 or t1gd" if white > grey else "flair or t2"
+        how = "brighter" if white > grey else "darker"
+        return [f"contrast is {contrast}, but white matter is {how} than grey matter, as in {fits}: check the contrast"]
     return []
+
+
+def _deep(image: Volume, inside: np.ndarray) -> np.ndarray:
+    """(voxels,) whether each voxel `inside` (k, j, i) is far from the border of the brain, as the ventricles are."""
+    step = np.maximum(np.rint(2.0 / image.spacing_mm[::-1]).astype(int), 1)
+    coarse = np.pad(inside[tuple(slice(None, None, n) for n in step)], 1)
+    distance = cast(np.ndarray, ndimage.distance_transform_edt(coarse, (image.spacing_mm[::-1] * step).tolist()))
+    deep = distance[1:-1, 1:-1, 1:-1] > _DEEP_MM
+    for axis, n in enumerate(step):
+        deep = deep.repeat(n, axis)
+    return deep[tuple(map(slice, inside.shape))][inside]
 
 
 def implausible(found: Classes, image: Volume, inside: np.ndarray, atlas: AtlasFit | None, contrast: str) -> list[str]:

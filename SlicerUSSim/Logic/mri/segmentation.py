@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import cast
@@ -14,13 +14,14 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.bias import LEAST_FIELD, field_strength, without_bias
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
-from SlicerUSSim.Logic.mri.classification import Classes, class_names, classify
+from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, Classes, class_names, classify
+from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
+from SlicerUSSim.Logic.mri.neighbours import smoothed_posteriors
 from SlicerUSSim.Logic.mri.plausibility import implausible, is_whole_brain, require_contrast
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.sulci import sulcal_middles
@@ -179,8 +180,9 @@ def segment_mri(
     timed("atlas")
     report(0.4)
     prior = atlas.prior(part.images[0], part.inside) if atlas else None
-    if atlas:
-        warnings += require_contrast(part.images[0], part.inside, atlas, contrast)
+    if prior is not None:
+        for name, image in zip(contrasts, part.images, strict=True):
+            warnings += require_contrast(image, part.inside, prior, name)
 
     def classified() -> tuple[Classes, list[tuple[np.ndarray, float, float]]]:
         found = [
@@ -195,7 +197,8 @@ def segment_mri(
                 f"MRI is constant ({channel[0]:g}) inside the foreground, expected tissues of different intensity"
                 + (f" in {name}" if others else ""),
             )
-        result = classify(values, contrasts, names, prior)
+        result = classify(values, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0)
+        result = replace(result, posteriors=smoothed_posteriors(result.posteriors, part.inside))
         timed("mixture")
         return result, found
 
