@@ -46,6 +46,10 @@ class TissueMaps:
     mask: np.ndarray
     #: (4, 4) voxel (i, j, k, 1) to RAS mm
     ijk_to_ras: np.ndarray
+    #: Shares by which the image looks, if they differ from the tissues: deep nuclei are grey matter, and bright in T1
+    appearance: np.ndarray | None = None
+    #: (k, j, i) bool, where the tissue is known; None: in the whole mask
+    judged: np.ndarray | None = None
 
     @property
     def csf(self) -> np.ndarray:
@@ -158,7 +162,7 @@ class BrainPhantom:
     mri: Volume
     #: uint8, 1 where tissues are looked for
     mask: Volume
-    #: uint8, the label in TISSUES with the largest share, within the mask; 0 outside
+    #: uint8, the label in TISSUES with the largest share, within the mask; 0 outside and where it is not known
     truth: Volume
     #: Maps, bias field and noise it was made from. (k, j, i) float32 factor; standard deviation in the image's unit
     maps: TissueMaps
@@ -192,14 +196,16 @@ def phantom(
     require(mask in ("full", "tight"), f"mask is {mask!r}, expected full or tight")
     rng = np.random.default_rng(seed)
     means = np.array(MEANS[contrast], np.float32)
-    signal = np.tensordot(means[: len(maps.shares)], maps.shares, 1)
+    shares = maps.shares if maps.appearance is None else maps.appearance
+    signal = np.tensordot(means[: len(shares)], shares, 1)
     field = bias_field(maps.mask, bias, rng)
     deviation = noise * float(max(MEANS[contrast][:3]))
     real = signal * field + deviation * rng.standard_normal(signal.shape, np.float32)
     imaginary = deviation * rng.standard_normal(signal.shape, np.float32)
     image = np.where(maps.mask, np.hypot(real, imaginary), 0.0).astype(np.float32)
     inside = maps.mask if mask == "full" else tight_mask(maps)
-    truth = np.where(inside, maps.shares.argmax(axis=0) + 1, 0).astype(np.uint8)
+    known = inside if maps.judged is None else inside & maps.judged
+    truth = np.where(known, maps.shares.argmax(axis=0) + 1, 0).astype(np.uint8)
     words = [f"{noise:.0%} noise", *([f"{bias:.0%} bias"] if bias else []), f"{mask} mask"]
     mri, inside, truth = (Volume(array, maps.ijk_to_ras) for array in (image, inside.astype(np.uint8), truth))
     return BrainPhantom(f"{maps.name} {contrast}, {', '.join(words)}", mri, inside, truth, maps, field, deviation)

@@ -1,0 +1,81 @@
+"""Other methods to segment a brain, beside which segment_mri is judged.
+
+Each takes a BrainPhantom and returns (labels, names): (k, j, i) uint8, and the tissue of every label.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.verification.brain_phantoms import MEANS, TISSUES, BrainPhantom
+
+NAMES: dict[int, str] = dict(enumerate(TISSUES[:3], start=1))
+
+
+def true_thresholds(case: BrainPhantom, contrast: str) -> tuple[np.ndarray, dict[int, str]]:
+    """Thresholds midway between the true means, on the image without its true bias field.
+
+    What no method reaches that looks at the intensity of one voxel alone, and has to find means and bias itself.
+    """
+    image = case.mri.array / case.bias
+    means = np.array(MEANS[contrast][:3])
+    order = np.argsort(means)
+    thresholds = 0.5 * (means[order][1:] + means[order][:-1])
+    return _inside(order[np.digitize(image, thresholds)] + 1, case), NAMES
+
+
+def plain_mixture(case: BrainPhantom, contrast: str, seed: int = 0) -> tuple[np.ndarray, dict[int, str]]:
+    """A mixture of three normal distributions with free variances on the intensities as they are, from scikit-learn.
+
+    Starts from Otsu's thresholds, as this project did before it had classes for partial volumes. 200 000 voxels.
+    """
+    from skimage.filters import threshold_multiotsu
+
+    require(importlib.util.find_spec("sklearn") is not None, "plain mixture needs scikit-learn (comes with nilearn)")
+    mixture = importlib.import_module("sklearn.mixture")
+    values = case.mri.array[case.mask.array > 0]
+    some = np.random.default_rng(seed).choice(values, min(values.size, 200_000), replace=False)
+    member = np.digitize(some, threshold_multiotsu(some, classes=3))
+    start = np.array([[some[member == n].mean()] for n in range(3)])
+    model = mixture.GaussianMixture(3, means_init=start, random_state=seed, max_iter=300).fit(some[:, None])
+    return _in_order(model.predict(values[:, None]), values, case, contrast)
+
+
+def atropos(case: BrainPhantom, contrast: str) -> tuple[np.ndarray, dict[int, str]]:
+    """ANTs' N4 and Atropos with k-means and a Markov random field (Avants et al., Neuroinformatics 9(4), 2011).
+
+    Raises SimulationError if antspyx is not installed.
+    """
+    require(importlib.util.find_spec("ants") is not None, "Atropos needs ANTs: pip install antspyx")
+    ants = importlib.import_module("ants")
+    # The transform to RAS does not matter here: both methods work on the grid, in millimetres.
+    spacing = case.mri.spacing_mm.tolist()
+
+    def image(array: np.ndarray):
+        return ants.from_numpy(np.ascontiguousarray(array.T.astype(np.float32)), spacing=spacing)
+
+    mask = image(case.mask.array > 0)
+    corrected = ants.n4_bias_field_correction(image(case.mri.array), mask=mask, shrink_factor=4)
+    found = ants.atropos(a=corrected, m="[0.1,1x1x1]", c="[5,0]", i="kmeans[3]", x=mask)["segmentation"].numpy().T
+    inside = case.mask.array > 0
+    return _in_order(np.rint(found[inside]).astype(int), case.mri.array[inside], case, contrast)
+
+
+def _in_order(member: np.ndarray, values: np.ndarray, case: BrainPhantom, contrast: str):
+    """Classes named by the order of their mean intensity."""
+    classes = sorted(np.unique(member), key=lambda n: values[member == n].mean())
+    by_mean = np.argsort(MEANS[contrast][:3])
+    labels = np.zeros(case.mask.array.shape, np.uint8)
+    inside = np.zeros(member.shape, np.uint8)
+    for rank, number in enumerate(classes):
+        inside[member == number] = by_mean[min(rank, 2)] + 1
+    labels[case.mask.array > 0] = inside
+    return labels, NAMES
+
+
+def _inside(labels: np.ndarray, case: BrainPhantom) -> np.ndarray:
+    return np.where(case.mask.array > 0, labels, 0).astype(np.uint8)
