@@ -19,7 +19,7 @@ import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from brain_extraction import SHARED, measure_brains
@@ -27,10 +27,11 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic import Volume, segment_mri
 from SlicerUSSim.Logic.base import write_json
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.verification.benchmark.files import output_file
 from SlicerUSSim.Logic.verification.brain_phantoms import (
     BrainPhantom,
+    TissueMaps,
     calibration,
     phantom,
     scores,
@@ -49,31 +50,31 @@ TISSUES = ("csf", "grey matter", "white matter", "grey and white")
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[tuple[str, Callable[[], tuple[BrainPhantom, str]]]]:
-    """(name, function that makes the phantom and its contrast) of every chosen case."""
-    brains = [(name, lambda name=name: tissue_maps(name)) for name in ("mni152", "colin27")]
-    brains += [
-        (path.name.split(".")[0], lambda path=path: maps_of_labels(Volume.read(path), path.name.split(".")[0]))
-        for path in arguments.label_map
-    ]
-    for name, maps in brains:
+    """(name, function that makes the phantom and says its contrast) of every case."""
+    files = {path.name.split(".")[0]: path for path in arguments.label_map}
+
+    def maps(brain: str) -> TissueMaps:
+        if brain in files:
+            return maps_of_labels(Volume.read(files[brain]), brain)
+        found = tissue_maps(brain)
+        require(found, f"{brain} is not installed")
+        return cast(TissueMaps, found)
+
+    for brain in ("mni152", "colin27", *files):
         for mask in ("full", "tight"):
             for noise, bias in QUALITIES:
-                case = f"{name}, {noise:.0%} noise, {bias:.0%} bias, {mask} mask"
-                yield case, lambda maps=maps, n=noise, b=bias, m=mask: (phantom(maps(), noise=n, bias=b, mask=m), "t1")
-        if name in ("mni152", "colin27"):
-            for mask in ("full", "tight"):
                 yield (
-                    f"{name}, ring tumour, 3% noise, 20% bias, {mask} mask",
-                    lambda maps=maps, m=mask: (phantom(with_ring_tumour(maps()), "t1gd", mask=m), "t1gd"),
+                    f"{brain}, {noise:.0%} noise, {bias:.0%} bias, {mask} mask",
+                    lambda b=brain, n=noise, f=bias, m=mask: (phantom(maps(b), noise=n, bias=f, mask=m), "t1"),
+                )
+            if brain not in files:
+                yield (
+                    f"{brain}, ring tumour, 3% noise, 20% bias, {mask} mask",
+                    lambda b=brain, m=mask: (phantom(with_ring_tumour(maps(b)), "t1gd", mask=m), "t1gd"),
                 )
     for image, labels in arguments.scan:
-        name = Path(image).name.split(".")[0]
-        yield (
-            f"{name}, scan",
-            lambda image=image, labels=labels, name=name: (
-                labelled_scan(Volume.read(image), Volume.read(labels), name), "t1"
-            ),
-        )  # fmt: skip
+        name = Path(image).name.split(".")[0] + ", scan"
+        yield name, lambda i=image, l=labels, n=name: (labelled_scan(Volume.read(i), Volume.read(l), n), "t1")
 
 
 def ours(case: BrainPhantom, contrast: str, **changes):
@@ -94,7 +95,8 @@ def ours_smoothed(case: BrainPhantom, contrast: str):
 METHODS = {
     "true thresholds": true_thresholds,
     "plain mixture": plain_mixture,
-    "N4 + Atropos": atropos,
+    "Atropos": atropos,
+    "N4 + Atropos": lambda case, contrast: atropos(case, contrast, n4=True),
     "segment_mri": ours,
     "segment_mri, Gaussian": ours_smoothed,
 }
@@ -109,13 +111,15 @@ def measure_tissues(arguments: argparse.Namespace) -> list[dict]:
             continue
         try:
             case, contrast = make()
-        except AttributeError:
-            print(f"| {name} | not installed |", flush=True)
+        except SimulationError as error:
+            print(f"| {name} | {error} |", flush=True)
             continue
         pictures = {}
         for method, function in METHODS.items():
             if arguments.methods and method not in arguments.methods:
                 continue
+            if method == "Atropos" and " 0% bias" not in name:
+                continue  # with a bias field it is only worse
             if method == "true thresholds" and np.isnan(case.noise):
                 continue  # nobody knows them in a scan
             known = [row for row in arguments.reuse if (row["data"], row["method"]) == (name, method)]

@@ -9,6 +9,7 @@ import importlib
 import importlib.util
 
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.verification.brain_phantoms import MEANS, TISSUES, BrainPhantom
@@ -45,24 +46,39 @@ def plain_mixture(case: BrainPhantom, contrast: str, seed: int = 0) -> tuple[np.
     return _in_order(model.predict(values[:, None]), values, case, contrast)
 
 
-def atropos(case: BrainPhantom, contrast: str) -> tuple[np.ndarray, dict[int, str]]:
-    """ANTs' N4 and Atropos with k-means and a Markov random field (Avants et al., Neuroinformatics 9(4), 2011).
+def atropos(case: BrainPhantom, contrast: str, n4: bool = False) -> tuple[np.ndarray, dict[int, str]]:
+    """ANTs' Atropos with k-means and a Markov random field (Avants et al., Neuroinformatics 9(4), 2011), raw or after
+    N4.
+
+    N4 is SimpleITK's with its defaults on an image shrunken four times: ANTsPy's defaults, which iterate longer, leave
+    7 % of bias in the phantoms, and these 2 %.
 
     Raises SimulationError if antspyx is not installed.
     """
     require(importlib.util.find_spec("ants") is not None, "Atropos needs ANTs: pip install antspyx")
     ants = importlib.import_module("ants")
-    # The transform to RAS does not matter here: both methods work on the grid, in millimetres.
+    # The transform to RAS does not matter here: the method works on the grid, in millimetres.
     spacing = case.mri.spacing_mm.tolist()
 
     def image(array: np.ndarray):
         return ants.from_numpy(np.ascontiguousarray(array.T.astype(np.float32)), spacing=spacing)
 
-    mask = image(case.mask.array > 0)
-    corrected = ants.n4_bias_field_correction(image(case.mri.array), mask=mask, shrink_factor=4)
-    found = ants.atropos(a=corrected, m="[0.1,1x1x1]", c="[5,0]", i="kmeans[3]", x=mask)["segmentation"].numpy().T
     inside = case.mask.array > 0
-    return _in_order(np.rint(found[inside]).astype(int), case.mri.array[inside], case, contrast)
+    intensity = _without_bias(case) if n4 else case.mri.array
+    box = ndimage.find_objects(np.asarray(case.mask.array))[0]  # half the voxels, half the time
+    found = ants.atropos(a=image(intensity[box]), m="[0.1,1x1x1]", c="[5,0]", i="kmeans[3]", x=image(inside[box]))
+    member = np.rint(found["segmentation"].numpy().T[inside[box]]).astype(int)
+    return _in_order(member, intensity[inside], case, contrast)
+
+
+def _without_bias(case: BrainPhantom) -> np.ndarray:
+    import SimpleITK as sitk
+
+    image, mask = case.mri.to_sitk(), case.mask.to_sitk()
+    shrink = [4 if size >= 128 else 2 for size in image.GetSize()]
+    corrector = sitk.N4BiasFieldCorrectionImageFilter()
+    corrector.Execute(sitk.Shrink(image, shrink), sitk.Shrink(mask, shrink))
+    return case.mri.array / np.exp(sitk.GetArrayFromImage(corrector.GetLogBiasFieldAsImage(image)))
 
 
 def _in_order(member: np.ndarray, values: np.ndarray, case: BrainPhantom, contrast: str):
