@@ -74,7 +74,7 @@ def cases(arguments: argparse.Namespace) -> Iterator[tuple[str, Callable[[], tup
                 )
     for image, labels in arguments.scan:
         name = Path(image).name.split(".")[0] + ", scan"
-        yield name, lambda i=image, l=labels, n=name: (labelled_scan(Volume.read(i), Volume.read(l), n), "t1")
+        yield name, lambda i=image, t=labels, n=name: (labelled_scan(Volume.read(i), Volume.read(t), n), "t1")
 
 
 def ours(case: BrainPhantom, contrast: str, **changes):
