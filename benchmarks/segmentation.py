@@ -32,12 +32,11 @@ from SlicerUSSim.Logic.verification.benchmark.files import output_file
 from SlicerUSSim.Logic.verification.brain_phantoms import (
     BrainPhantom,
     TissueMaps,
-    calibration,
     phantom,
-    scores,
     tissue_maps,
     with_ring_tumour,
 )
+from SlicerUSSim.Logic.verification.brain_scores import calibration, scores
 from SlicerUSSim.Logic.verification.labelled_brains import labelled_scan, maps_of_labels
 from SlicerUSSim.Logic.verification.segmentation_controls import atropos, plain_mixture, true_thresholds
 
@@ -56,18 +55,19 @@ def cases(arguments: argparse.Namespace) -> Iterator[tuple[str, Callable[[], tup
     def maps(brain: str) -> TissueMaps:
         if brain in files:
             return maps_of_labels(Volume.read(files[brain]), brain)
-        found = tissue_maps(brain)
+        found = tissue_maps(brain.split()[0])
         require(found, f"{brain} is not installed")
-        return cast(TissueMaps, found)
+        found = cast(TissueMaps, found)
+        return found.warped() if brain.endswith("warped") else found
 
-    for brain in ("mni152", "colin27", *files):
+    for brain in ("mni152", "mni152 warped", "colin27", *files):
         for mask in ("full", "tight"):
             for noise, bias in QUALITIES:
                 yield (
                     f"{brain}, {noise:.0%} noise, {bias:.0%} bias, {mask} mask",
                     lambda b=brain, n=noise, f=bias, m=mask: (phantom(maps(b), noise=n, bias=f, mask=m), "t1"),
                 )
-            if brain not in files:
+            if brain in ("mni152", "colin27"):
                 yield (
                     f"{brain}, ring tumour, 3% noise, 20% bias, {mask} mask",
                     lambda b=brain, m=mask: (phantom(with_ring_tumour(maps(b)), "t1gd", mask=m), "t1gd"),

@@ -15,14 +15,12 @@ from SlicerUSSim.Logic.verification.brain_phantoms import (
     BrainPhantom,
     TissueMaps,
     bias_field,
-    calibration,
-    dice,
     phantom,
-    scores,
     tight_mask,
     tissue_maps,
     with_ring_tumour,
 )
+from SlicerUSSim.Logic.verification.brain_scores import calibration, dice, scores
 from SlicerUSSim.Logic.verification.labelled_brains import labelled_scan, maps_of_labels
 from SlicerUSSim.Logic.verification.segmentation_controls import NAMES, plain_mixture, true_thresholds
 
@@ -68,6 +66,14 @@ def test_coarser_voxels_keep_the_amount_of_every_tissue_and_its_place():
     assert middle[0] == pytest.approx(middle[1], abs=0.1)
 
 
+def test_a_warped_brain_has_the_same_tissues_at_other_places():
+    maps, moved = small("mni152"), small("mni152").warped()
+    assert np.allclose(moved.shares.sum(axis=0)[moved.mask], 1.0, atol=1e-5)
+    assert moved.shares.sum(axis=(1, 2, 3)) == pytest.approx(maps.shares.sum(axis=(1, 2, 3)), rel=0.1)
+    assert dice(moved.mask, maps.mask) > 0.85
+    assert dice(moved.white > 0.5, maps.white > 0.5) < 0.75  # an atlas on it is as far off as on any patient
+
+
 @pytest.mark.parametrize("noise", [0.03, 0.07])
 def test_noise_is_rician_of_the_deviation_it_says(noise):
     maps = small("mni152")
@@ -105,9 +111,9 @@ def test_tight_mask_lacks_outer_csf_and_keeps_ventricles_and_tissue():
     depth = 2.0 * np.asarray(ndimage.distance_transform_edt(maps.mask))
     rim, deep = maps.mask & (depth <= 2.0), depth > 12.0
     is_csf = maps.mask & (maps.csf > 0.5)
-    assert (tight & rim & is_csf).sum() < 0.2 * (rim & is_csf).sum()
+    assert (tight & rim & is_csf).sum() < 0.3 * (rim & is_csf).sum()
     assert (tight & deep & is_csf).sum() > 0.99 * (deep & is_csf).sum()
-    assert (tight | (maps.csf > 0.5))[maps.mask].all()
+    assert (tight | (maps.csf >= 0.5))[maps.mask].all()
 
 
 @pytest.mark.parametrize("name", BRAINS)

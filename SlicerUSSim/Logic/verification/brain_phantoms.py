@@ -1,4 +1,4 @@
-"""MRI phantoms of brains whose tissues are known, and scores of a segmentation against them.
+"""MRI phantoms of brains whose tissues are known.
 
 An image is the sum of the share of every tissue in a voxel times the tissue's mean, as in the BrainWeb phantoms
 (Collins et al., IEEE TMI 17(3), 1998), times a smooth bias field, with Rician noise (Gudbjartsson and Patz, Magnetic
@@ -8,7 +8,6 @@ scan, 7 % a poor one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -77,6 +76,26 @@ class TissueMaps:
         to_fine = np.diag([factor, factor, factor, 1.0])
         to_fine[:3, 3] = 0.5 * (factor - 1)
         return TissueMaps(f"{self.name}, {factor} mm", shares, mask, self.ijk_to_ras @ to_fine)
+
+    def warped(self, millimetres: float = 4.0, seed: int = 1) -> TissueMaps:
+        """Another brain: turned by 8 degrees, and bent by cubic B-splines with random displacements of this deviation.
+
+        For methods that are led by an atlas: on the atlas's own brain they would know the truth.
+        """
+        import SimpleITK as sitk
+
+        rng = np.random.default_rng(seed)
+        images = [Volume(share, self.ijk_to_ras).to_sitk() for share in self.shares]
+        bend = sitk.BSplineTransformInitializer(images[0], [6, 6, 6])
+        bend.SetParameters(rng.normal(0.0, millimetres, len(bend.GetParameters())).tolist())
+        turn = sitk.Euler3DTransform()
+        turn.SetCenter(images[0].TransformContinuousIndexToPhysicalPoint([0.5 * n for n in images[0].GetSize()]))
+        turn.SetRotation(*np.radians(rng.permutation([8.0, -4.0, 3.0])).tolist())
+        both = sitk.CompositeTransform([bend, turn])
+        shares = np.stack([sitk.GetArrayFromImage(sitk.Resample(each, each, both, sitk.sitkLinear)) for each in images])
+        total = shares.sum(axis=0)
+        shares = np.where(total > 0.5, shares / np.maximum(total, 1e-6), 0.0).astype(np.float32)
+        return TissueMaps(f"{self.name}, warped", shares, total > 0.5, self.ijk_to_ras)
 
 
 def tissue_maps(name: str) -> TissueMaps | None:
@@ -238,53 +257,3 @@ def tight_mask(maps: TissueMaps) -> np.ndarray:
     tissue = sitk.GetImageFromArray(((maps.csf < 0.5) & maps.mask).astype(np.uint8))
     closed = sitk.BinaryFillhole(sitk.BinaryMorphologicalClosing(tissue, [reach] * 3, sitk.sitkBall))
     return (sitk.GetArrayFromImage(closed) > 0) & maps.mask
-
-
-# ---- scores ----------------------------------------------------------------------------------------------------------
-
-#: What other names of a segmentation's tissues are in the truth
-_SAME = {"leptomeninges": "csf", "tumour": "enhancing", "vessel": "enhancing", "blood vessel": "enhancing"}
-
-
-def dice(found: np.ndarray, truth: np.ndarray) -> float:
-    """Overlap 2 |A and B| / (|A| + |B|) of two masks; 1 if both are empty."""
-    total = int(found.sum()) + int(truth.sum())
-    return 2.0 * int((found & truth).sum()) / total if total else 1.0
-
-
-def scores(labels: np.ndarray, names: Mapping[int, str], case: BrainPhantom) -> dict[str, float]:
-    """Dice of every tissue that the truth contains and the names of labels can express, and "grey and white".
-
-    Voxels of necrosis and oedema count for none of the others, since no intensity class is wrong there by name.
-    """
-    truth = case.truth.array
-    judged = (truth > 0) & (truth <= 4)
-    tissue_of = {label: _SAME.get(name, name) for label, name in names.items()}
-    result = {}
-    for number, tissue in enumerate(TISSUES[:4], start=1):
-        mine = [label for label, name in tissue_of.items() if name == tissue]
-        if (truth == number).any():
-            result[tissue] = dice(np.isin(labels, mine) & judged, truth == number)
-    result["grey and white"] = 0.5 * (result["grey matter"] + result["white matter"])
-    return result
-
-
-def calibration(
-    posteriors: np.ndarray, names: Mapping[int, str], case: BrainPhantom, bins: int = 10
-) -> Iterator[tuple[float, float, int]]:
-    """(stated, right, voxels) for intervals of the largest posterior: its mean, and the share of voxels in which it is
-    the truth. Equal for calibrated posteriors.
-
-    posteriors : (classes, k, j, i), class n belongs to label n + 1.
-    """
-    truth = case.truth.array
-    judged = (truth > 0) & (truth <= 4)
-    number = {tissue: index for index, tissue in enumerate(TISSUES, start=1)}
-    of_class = np.array([number.get(_SAME.get(names[n + 1], names[n + 1]), 0) for n in range(len(posteriors))])
-    inside = posteriors[:, judged]
-    stated, right = inside.max(axis=0), of_class[inside.argmax(axis=0)] == truth[judged]
-    interval = np.clip((stated * bins).astype(int), 0, bins - 1)
-    for index in range(bins):
-        here = interval == index
-        if here.any():
-            yield float(stated[here].mean()), float(right[here].mean()), int(here.sum())
