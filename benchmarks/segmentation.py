@@ -94,6 +94,7 @@ def ours_smoothed(case: BrainPhantom, contrast: str):
 
 METHODS = {
     "true thresholds": true_thresholds,
+    "smoothed, true thresholds": lambda case, contrast: true_thresholds(case, contrast, smooth=0.6),
     "plain mixture": plain_mixture,
     "Atropos": atropos,
     "N4 + Atropos": lambda case, contrast: atropos(case, contrast, n4=True),
@@ -120,7 +121,7 @@ def measure_tissues(arguments: argparse.Namespace) -> list[dict]:
                 continue
             if method == "Atropos" and " 0% bias" not in name:
                 continue  # with a bias field it is only worse
-            if method == "true thresholds" and np.isnan(case.noise):
+            if "true thresholds" in method and np.isnan(case.noise):
                 continue  # nobody knows them in a scan
             known = [row for row in arguments.reuse if (row["data"], row["method"]) == (name, method)]
             if known and not method.startswith("segment_mri"):
@@ -138,6 +139,8 @@ def measure_tissues(arguments: argparse.Namespace) -> list[dict]:
             if posteriors:
                 row["calibration"] = list(calibration(posteriors[0], names, case))
             rows.append(row)
+            if arguments.json:
+                write_json(arguments.json, {"tissues": rows})  # a run of hours may be ended
             print(tissue_line(row), flush=True)
             pictures[method] = labels
         if arguments.pictures:

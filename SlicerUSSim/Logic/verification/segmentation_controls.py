@@ -17,12 +17,17 @@ from SlicerUSSim.Logic.verification.brain_phantoms import MEANS, TISSUES, BrainP
 NAMES: dict[int, str] = dict(enumerate(TISSUES[:3], start=1))
 
 
-def true_thresholds(case: BrainPhantom, contrast: str) -> tuple[np.ndarray, dict[int, str]]:
+def true_thresholds(case: BrainPhantom, contrast: str, smooth: float = 0.0) -> tuple[np.ndarray, dict[int, str]]:
     """Thresholds midway between the true means, on the image without its true bias field.
 
-    What no method reaches that looks at the intensity of one voxel alone, and has to find means and bias itself.
+    A bound of methods that look at the intensity of one voxel alone, and have to find means and bias themselves; with
+    a Gaussian of `smooth` voxels inside the mask, of those that smooth by as much.
     """
     image = case.mri.array / case.bias
+    if smooth:
+        inside = (case.mask.array > 0).astype(np.float32)
+        share = np.maximum(ndimage.gaussian_filter(inside, smooth), 1e-3)
+        image = ndimage.gaussian_filter(image * inside, smooth) / share
     means = np.array(MEANS[contrast][:3])
     order = np.argsort(means)
     thresholds = 0.5 * (means[order][1:] + means[order][:-1])
