@@ -114,8 +114,8 @@ def plane(path: Path) -> None:
     window = tuple(slice(int(where.min()), int(where.max()) + 1) for where in np.nonzero(seen))
     shown = ndimage.map_coordinates(mri.array.astype(np.float32), [k, j, i], order=1)[window]
     tissues = ndimage.map_coordinates(coloured(found.labels.array, found.tissue_names), [k, j, i], order=0)[window]
-    figure, axes = plt.subplots(1, 3, figsize=(11.0, 4.4), facecolor="white")
-    axes[0].imshow(shown, cmap="gray")
+    figure, axes = plt.subplots(1, 3, figsize=(11.0, 3.5), facecolor="white")
+    axes[0].imshow(shown, cmap="gray", vmin=0, vmax=np.percentile(shown, 99))
     axes[1].imshow(tissues, cmap=palette(), vmin=0, vmax=len(_NAMES), interpolation="nearest")
     axes[2].imshow(image[window], cmap="gray")
     for axis, title in zip(axes, ("MRI, T1 with contrast", "tissues", "ultrasound"), strict=True):
