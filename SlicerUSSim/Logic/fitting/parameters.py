@@ -182,7 +182,7 @@ def variance_db(tissue: Tissue) -> float:
     return 10.0 * log10(max(tissue.scatterer_variance, 1e-20))
 
 
-def value_of(attribute: str, owner: Tissue | DisplaySettings) -> float | None:
+def value_of(attribute: str, owner: Tissue | DisplaySettings):
     """The value of a parameter in its tissue or in the display."""
     if attribute == ECHOGENICITY.name:
         return variance_db(cast(Tissue, owner))
