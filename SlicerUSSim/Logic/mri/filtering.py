@@ -1,10 +1,35 @@
-"""The guided filter on the device: reduces noise and preserves edges."""
+"""Noise of an image, and the guided filter on the device, which reduces it and preserves edges."""
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
+
+#: Standard deviation in voxels of the Gaussian before the guided filter, which makes a calmer guide, and the filter's
+#: strength per noise that the Gaussian leaves; chosen on MNI152 phantoms at 3 and 7 % noise
+_GAUSSIAN, _EPSILON_PER_NOISE = 0.5, 1.0
+
+
+def denoised(
+    image: np.ndarray, mask: np.ndarray, radius: int, epsilon: float | None, device: DeviceChoice = None
+) -> tuple[np.ndarray, float, float]:
+    """((k, j, i) float32 image for classification, its noise before, epsilon): a light Gaussian, then guided_filter.
+
+    With the epsilon None it follows from the noise. A radius of 0 returns the image.
+    """
+    noise = estimate_noise(image, mask)
+    if radius == 0:
+        return guided_filter(image, mask, 0, 0.0), noise, noise**2 if epsilon is None else epsilon
+    weight = ndimage.gaussian_filter(mask.astype(np.float32), _GAUSSIAN)
+    smooth = ndimage.gaussian_filter(np.where(mask, image, 0).astype(np.float32), _GAUSSIAN)
+    smooth = np.where(mask, smooth / np.maximum(weight, 1e-6), 0.0).astype(np.float32)
+    if epsilon is None:
+        epsilon = (_EPSILON_PER_NOISE * estimate_noise(smooth, mask)) ** 2
+    return guided_filter(smooth, mask, radius, epsilon, device), noise, epsilon
 
 
 def guided_filter(
@@ -69,3 +94,18 @@ def guided_filter(
     device.run(kernels["apply_model"], whole, count, first, second, values, spare)
     filtered = device.download(spare, shape, np.float32)[..., :width]
     return np.where(mask, filtered + centre, 0).astype(np.float32)
+
+
+def estimate_noise(image: np.ndarray, mask: np.ndarray) -> float:
+    """Standard deviation of the noise inside the mask, in the unit of the image.
+
+    From the difference of every voxel to its six neighbours (Coupe et al., Medical Image Analysis 14(4) 2010), by the
+    median absolute deviation, which is robust against borders. Every other slice is used.
+    """
+    inner = cast(np.ndarray, ndimage.binary_erosion(mask[::2], np.ones((1, 3, 3))))
+    if inner.sum() < 1000:
+        return 0.0
+    image = image.astype(np.float32, copy=False)
+    around = sum(np.roll(image, shift, axis)[::2] for axis in (0, 1, 2) for shift in (-1, 1))
+    residual = np.sqrt(6.0 / 7.0) * (image[::2] - around / 6.0)[inner]
+    return float(1.4826 * np.median(np.abs(residual - np.median(residual))))

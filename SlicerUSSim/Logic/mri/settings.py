@@ -15,9 +15,9 @@ class SegmentationSettings(Declared):
         "t1", "Contrast", "Contrast of the MRI, which gives the order of the tissues by intensity",
         choices=("t1", "t1gd", "t2", "flair"), shown=True, option="contrast",
     )  # fmt: skip
-    classes: int = parameter(
-        3, "Classes", "Number of tissues to distinguish by intensity: 3, or 4 with t1gd and flair", bounds=(3, 4),
-        shown=Shown(3, 4), option="classes",
+    classes: int | None = parameter(
+        None, "Classes", "Number of tissues to distinguish by intensity: 3, or 4 with t1gd and flair; none: 3, and 4 "
+        "with t1gd", bounds=(3, 4), shown=Shown(2, 4, none_at=2), option="classes",
     )  # fmt: skip
     skull_strip: str = parameter(
         "auto", "Brain extraction", "How the brain is found in a whole head", option="skull-strip", shown=True,
@@ -28,9 +28,9 @@ class SegmentationSettings(Declared):
         "Label sulci too narrow to reach CSF intensity as leptomeninges, one voxel thick", shown=True,
         option="thin-sulci/no-thin-sulci", note="segment_mri itself has it off by default",
     )  # fmt: skip
-    bias_correction: bool = parameter(
-        False, "Correct the bias field", "Apply N4 first, for scans with an intensity gradient; takes some seconds",
-        shown=True, option="bias-correction/no-bias-correction",
+    bias_correction: bool | None = parameter(
+        None, "Correct the bias field", "Apply N4, for scans with an intensity gradient; takes some seconds; none: "
+        "decided from the image", shown=True, option="bias-correction/no-bias-correction",
     )  # fmt: skip
     filter_radius: int = parameter(
         1, "Filter radius", "Radius of the guided filter; 0: none", unit="voxels", bounds=(0, 64), option="radius"

@@ -1,0 +1,169 @@
+"""Classification of the voxels of a brain: the mixture's start, its fit, and which tissue every voxel is."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.declaration import parameter_of
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.mri.histogram import Histogram
+from SlicerUSSim.Logic.mri.mixture import TISSUES, Points, TissueMixture, fit_mixture
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+
+#: Tissues (indices in mixture.TISSUES) from dark to bright
+ORDERS = {"t1": (0, 1, 2), "t1gd": (0, 1, 2), "t2": (2, 1, 0), "flair": (0, 2, 1)}
+#: Name of what is brighter than all tissues, where it is a class of its own
+_BRIGHT_NAMES = {"t1gd": "enhancing", "flair": "tumour"}
+#: Contrasts from the one that tells grey from white matter best
+_PREFERENCE = ("t1", "t1gd", "flair", "t2")
+#: The spatial prior's exponent: the affine transform leaves the cortex some millimetres off
+_PRIOR_EXPONENT = 0.6
+_START_ITERATIONS = 12
+#: Smallest and largest share of CSF, grey and white matter in the starts, and in a result without a warning
+START_SHARES = ((0.05, 0.15, 0.3), (0.3, 0.45))
+EXPECTED_SHARES = ((0.02, 0.4), (0.3, 0.75), (0.2, 0.6))
+
+
+@dataclass(frozen=True, eq=False)
+class Classes:
+    """Which tissue every voxel is."""
+
+    #: (classes,) names, and (classes, voxels) float32 probabilities, which add up to 1
+    names: tuple[str, ...]
+    posteriors: np.ndarray
+    #: (classes, channels)
+    means: np.ndarray
+    standard_deviations: np.ndarray
+    mixture: TissueMixture
+
+    @property
+    def shares(self) -> np.ndarray:
+        """(classes,) share of the voxels in which each class is the most probable one."""
+        counts = np.bincount(self.posteriors.argmax(axis=0), minlength=len(self.names))
+        return counts / counts.sum()
+
+
+def class_names(contrasts: tuple[str, ...], classes: int | None) -> tuple[str, ...]:
+    """The names of the classes of one image, in order of intensity, or of several, in a fixed order.
+
+    With None they are four if contrast agent was given. Raises SimulationError for an unknown contrast, and for a
+    number of classes that does not go with the contrast.
+    """
+    entry = parameter_of(SegmentationSettings, "contrast")
+    contrasts = tuple(entry.checked("segmentation", contrast) for contrast in contrasts)
+    order = ORDERS[contrasts[0]] if len(contrasts) == 1 else range(len(TISSUES))
+    names = tuple(TISSUES[n] for n in order)
+    bright = next((_BRIGHT_NAMES[contrast] for contrast in contrasts if contrast in _BRIGHT_NAMES), None)
+    allowed = (3, 4) if bright else (3,)
+    require(
+        classes is None or (classes in allowed and not isinstance(classes, bool)),
+        f"classes is {classes!r}, expected {' or '.join(map(str, allowed))} for contrast {'+'.join(contrasts)}",
+    )
+    if classes is None:
+        classes = 4 if "t1gd" in contrasts else 3
+    return (*names, bright) if classes == 4 and bright else names
+
+
+def classify(
+    values: np.ndarray, contrasts: tuple[str, ...], names: tuple[str, ...], prior: np.ndarray | None
+) -> Classes:
+    """The classes of (channels, voxels) float32 intensities; `prior` (3, voxels) is the atlas's share of tissues."""
+    if prior is not None:
+        prior = prior**_PRIOR_EXPONENT
+        prior /= prior.sum(axis=0)
+    first = min(range(len(contrasts)), key=lambda n: _PREFERENCE.index(contrasts[n]))
+    histogram = Histogram.of(values[first : first + 1], contrasts[first : first + 1], prior)
+    mixture = _fit_one(histogram.points, contrasts[first])
+    if len(contrasts) > 1:
+        shares, outside = mixture.shares(histogram.points)
+        shares = (shares * (1.0 - outside))[:, histogram.point_of_voxel]
+        means = (shares @ values.T) / (shares.sum(axis=1, keepdims=True) + 1e-9)
+        deviation = np.sqrt(
+            [
+                float(np.average((y - means.T[n] @ shares) ** 2, weights=1.0 - outside[histogram.point_of_voxel]))
+                for n, y in enumerate(values)
+            ]
+        )
+        histogram = Histogram.of(values, contrasts, prior)
+        mixture = fit_mixture(histogram.points, means, 0.5 * deviation)
+    return _named(histogram, mixture, contrasts, names, values)
+
+
+def _fit_one(points: Points, contrast: str) -> TissueMixture:
+    """The fit of one channel: the most likely of several starts that leave tissues of plausible size."""
+    starts = [
+        fit_mixture(points, means, deviation, iterations=_START_ITERATIONS)
+        for means, deviation in _starts(points, contrast)
+    ]
+    order = ORDERS[contrast]
+    in_order = [fit for fit in starts if (np.diff(fit.means[list(order), 0]) > 0).all()] or starts
+    in_order.sort(key=lambda fit: (_excess(fit, points) > 0.1, -fit.log_likelihoods[-1]))
+    found = []
+    for fit in in_order[:2]:
+        whole = fit_mixture(points, fit.means, np.sqrt(np.diag(fit.covariance)))
+        found.append((_excess(whole, points) > 0.0, -whole.log_likelihoods[-1], whole))
+    return min(found, key=lambda entry: entry[:2])[2]
+
+
+def _excess(fit: TissueMixture, points: Points) -> float:
+    """By how much the shares of the tissues leave the expected range."""
+    shares, outside = fit.shares(points)
+    volumes = (shares * points.counts).sum(axis=1)
+    volumes = volumes / volumes.sum()
+    return float(sum(max(low - v, v - high, 0.0) for v, (low, high) in zip(volumes, EXPECTED_SHARES, strict=True)))
+
+
+def _starts(points: Points, contrast: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """((3, 1) means, (1,) standard deviation) from shares of CSF and white matter, in the contrast's order."""
+    values = points.values[:, 0]
+    order = np.argsort(values, kind="stable")
+    rank = np.cumsum(points.counts[order]) / points.counts.sum()
+
+    def at(share: float) -> float:
+        return float(values[order][min(np.searchsorted(rank, share), len(rank) - 1)])
+
+    result = []
+    for below in (0.0, 0.12) if contrast == "t2" else (0.0,):
+        for csf, white in itertools.product(*START_SHARES):
+            size = np.array([csf, 1.0 - csf - white, white]) * (1.0 - below)
+            means, start = np.empty((3, 1)), below
+            for tissue in ORDERS[contrast]:
+                means[tissue] = at(start + 0.5 * size[tissue])
+                start += size[tissue]
+            spread = max(at(0.98) - at(0.02), float(points.steps[0]))
+            result.append((means, np.array([0.08 * spread])))
+    return result
+
+
+def _named(
+    histogram: Histogram, mixture: TissueMixture, contrasts: tuple[str, ...], names: tuple[str, ...], values: np.ndarray
+) -> Classes:
+    """The mixture's tissues under their names, and outliers where they belong."""
+    points = histogram.points
+    shares, outside = mixture.shares(points)
+    deviation = np.sqrt(np.diag(mixture.covariance))
+    bright = np.zeros(len(points.counts), bool)
+    if len(names) > len(TISSUES):
+        channel = next(n for n, contrast in enumerate(contrasts) if contrast in _BRIGHT_NAMES)
+        brightest = mixture.means[:, channel].max()
+        bright = points.values[:, channel] > brightest + 2.0 * deviation[channel]
+    away = np.stack([((points.values - mean) ** 2 / deviation**2).sum(axis=1) for mean in mixture.means])
+    nearest = away.argmin(axis=0)
+    for tissue in range(len(TISSUES)):
+        shares[tissue] += np.where((nearest == tissue) & ~bright, outside, 0.0)
+    rows = [shares[TISSUES.index(name)] for name in names[: len(TISSUES)]]
+    means = [mixture.means[TISSUES.index(name)] for name in names[: len(TISSUES)]]
+    deviations = [deviation] * len(TISSUES)
+    if len(names) > len(TISSUES):
+        rows.append(np.where(bright, outside, 0.0))
+        weight = rows[-1] * points.counts
+        total = weight.sum()
+        mean = weight @ points.values / total if total > 0 else mixture.means.max(axis=0) + 3.0 * deviation
+        spread = np.sqrt(weight @ (points.values - mean) ** 2 / total) if total > 0 else deviation
+        means.append(mean)
+        deviations.append(np.maximum(spread, points.steps))
+    table = np.stack(rows).astype(np.float32)
+    return Classes(names, table[:, histogram.point_of_voxel], np.stack(means), np.stack(deviations), mixture)
