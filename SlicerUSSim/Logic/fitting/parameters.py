@@ -36,11 +36,13 @@ TISSUE_BOUNDS: dict[str, Bounds] = {name: (e.fit.low, e.fit.high) for name, e in
 SCATTERING = frozenset(("mu0", "mu1", "sigma0"))
 #: All tissues, each by what an image shows of it
 TISSUES = "tissues"
-#: Var of a tissue, by a common factor of mu0 and sigma0. The bounds contain those of mu0 and sigma0 about the presets.
+#: Var of a tissue, by a common factor of mu0 and sigma0. The bounds are relative to the table's value: gain and the level
+#: of all tissues together change an image alike but for interfaces, so wide bounds would let the sheets of the brain,
+#: the brightest of its tissues, become black.
 ECHOGENICITY = Declaration(
     name="echogenicity_db", type=float, label="Echogenicity", symbol="Var", unit="dB",
     tip="Level of a tissue's speckle, 10 log10 Var, by a common factor of its mu0 and sigma0",
-    fit=Fit(-40.0, 3.0, tolerance=1.5), source="Bounds of a fit: some 40 dB of echogenicity",
+    fit=Fit(-12.0, 12.0, tolerance=1.5), source="Bounds of a fit: 12 dB about the tissue table's value",
 )  # fmt: skip
 ATTENUATION = "attenuation_db_cm_mhz"
 
@@ -216,10 +218,9 @@ def _meant_by(name: str, tissues: TissueTable) -> list[tuple[str, Bounds]]:
         return list(DISPLAY_BOUNDS.items())
     if name in DISPLAY_BOUNDS:
         return [(name, DISPLAY_BOUNDS[name])]
-    level = cast(Fit, ECHOGENICITY.fit)
     if name == TISSUES:
-        both = {ECHOGENICITY.name: (level.low, level.high), ATTENUATION: TISSUE_BOUNDS[ATTENUATION]}
-        return [(f"{known}.{a}", bounds) for known in _scattering(tissues) for a, bounds in both.items()]
+        attributes = ECHOGENICITY.name, ATTENUATION
+        return [pair for one in _scattering(tissues) for a in attributes for pair in _meant_by(f"{one}.{a}", tissues)]
     tissue, _, attribute = name.rpartition(".")
     if attribute not in TISSUE_BOUNDS and attribute != ECHOGENICITY.name:
         tissue, attribute = name, ""
@@ -233,7 +234,8 @@ def _meant_by(name: str, tissues: TissueTable) -> list[tuple[str, Bounds]]:
         require(
             owner in _scattering(tissues), f"{name} cannot be free: {owner} has no scatterers, expected mu0 or sigma0"
         )
-        return [(f"{owner}.{attribute}", (level.low, level.high))]
+        level, range_db = variance_db(tissues.tissue(owner)), cast(Fit, ECHOGENICITY.fit)
+        return [(f"{owner}.{attribute}", (level + range_db.low, level + range_db.high))]
     return [(f"{owner}.{a}", bounds) for a, bounds in TISSUE_BOUNDS.items() if attribute in ("", a)]
 
 
