@@ -7,11 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import rigid
 
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.fitting.seen import parameters_seen, shares
 from SlicerUSSim.Logic.probe import PROBES, ImageGrid
+from tests.conftest import rigid
 
 PROBE = replace(PROBES["linear"], width_mm=30.0, depth_mm=40.0)
 

@@ -36,9 +36,8 @@ TISSUE_BOUNDS: dict[str, Bounds] = {name: (e.fit.low, e.fit.high) for name, e in
 SCATTERING = frozenset(("mu0", "mu1", "sigma0"))
 #: All tissues, each by what an image shows of it
 TISSUES = "tissues"
-#: Var of a tissue, by a common factor of mu0 and sigma0. The bounds are relative to the table's value: gain and the level
-#: of all tissues together change an image alike but for interfaces, so wide bounds would let the sheets of the brain,
-#: the brightest of its tissues, become black.
+#: Var of a tissue, by a common factor of mu0 and sigma0. The bounds are relative to the table's value: gain changes an
+#: image as all levels together do, but for interfaces, and with wide bounds sulci, the brightest, can end up black.
 ECHOGENICITY = Declaration(
     name="echogenicity_db", type=float, label="Echogenicity", symbol="Var", unit="dB",
     tip="Level of a tissue's speckle, 10 log10 Var, by a common factor of its mu0 and sigma0",
