@@ -21,9 +21,11 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
   STORE_PAIRS(sum_re, sum_im, iq + 2 * (line * samples + sample));
 }
 
-// Amplifier noise, time gain compensation, envelope, log compression, eight bits.
+// Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC rises by tgc_per_sample [dB] until
+// sample tgc_samples and stays there.
 __kernel void compress(__global const float *iq, int samples, float noise, uint noise_seed, float tgc_per_sample,
-                       float level_of_white_db, Display display, __global float *envelope, __global uchar *grey) {
+                       float tgc_samples, float level_of_white_db, Display display, __global float *envelope,
+                       __global uchar *grey) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int here = line * samples + sample;
   floatn re, im;
@@ -35,7 +37,7 @@ __kernel void compress(__global const float *iq, int samples, float noise, uint 
     im += noise * gaussian(hash_mixn(key + 0x9E3779B9u));
   }
   floatn power = re * re + im * im + 1e-30f;
-  const floatn tgc_db = TO_FLOATN(index) * tgc_per_sample;
+  const floatn tgc_db = fmin(TO_FLOATN(index), (floatn)(tgc_samples)) * tgc_per_sample;
   const floatn level_db = 3.01029996f * log2_fast(power) + tgc_db;
   STORE_LANES(sqrt(power) * exp2_fast(clamp(tgc_db * 0.166096405f, -100.0f, 100.0f)), envelope + here);
   STORE_GREY(grey_level(level_db, level_of_white_db, display.dynamic_range_db), grey + here);

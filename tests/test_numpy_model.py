@@ -69,7 +69,7 @@ def scene(membrane: bool = True):
 def test_the_kernels_draw_what_numpy_draws(kind, turn):
     labels, tissues = scene()
     simulator = UltrasoundSimulator(labels, tissues)
-    pose, display = rigid(turn, [1.0, -4.0, 0.5]), DisplaySettings(noise_db=-30.0, image_size=(240, 200))
+    pose, display = rigid(turn, [1.0, -4.0, 0.5]), DisplaySettings(noise_db=-30.0, tgc_reach=0.6, image_size=(240, 200))
     seed = seed_of_pose(pose)
     image = simulator.simulate(PROBES[kind], pose, display, noise_seed=seed).image
     model = NumpyModel(simulator)

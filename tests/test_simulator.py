@@ -115,6 +115,16 @@ def test_tgc_undoes_the_attenuation_it_is_set_to():
     assert seen[1] - seen[0] == pytest.approx(0, abs=0.7)
 
 
+@pytest.mark.parametrize("reach", [0.0, 0.4, 0.75, 1.0])
+def test_tgc_rises_down_to_its_reach_and_stays_there(solid, reach):
+    pose, probe = rigid(np.eye(3), [0, -25, 0]), PROBES["linear"]
+    display = DisplaySettings(tgc_db_cm_mhz=0.5, tgc_reach=reach, noise_db=None)
+    raised, plain = (solid.simulate(probe, pose, shown) for shown in (display, replace(display, tgc_db_cm_mhz=0.0)))
+    decibels = 20 * np.log10((raised.envelope / plain.envelope).mean(axis=0))
+    depth_cm = 0.1 * raised.sample_interval_mm * np.arange(decibels.size)
+    assert decibels == pytest.approx(2 * 0.5 * 5 * np.minimum(depth_cm, 0.1 * reach * probe.depth_mm), abs=0.02)
+
+
 def test_grey_levels_are_decibels_in_the_dynamic_range(solid):
     pose = rigid(np.eye(3), [0, -25, 0])
     frame = solid.simulate(PROBES["linear"], pose, replace(QUIET, dynamic_range_db=60.0))

@@ -31,8 +31,9 @@ _STATE_BYTES = 2**30
     "--free",
     multiple=True,
     metavar="NAME[=LOW:HIGH]",
-    help='Free parameters: "display", a tissue, or a parameter of either ("gain_db", "white matter.mu0"), optionally '
-    'with bounds; may be repeated (default: display and "white matter").',
+    help='Free parameters: "display", "tissues" (echogenicity and attenuation of each tissue that the images show), a '
+    'tissue, or a parameter ("gain_db", "white matter.mu0"), optionally with bounds; may be repeated (default: display '
+    "and tissues).",
 )
 @gathered(settings=FitSettings)
 @click.option("--report", type=click.Path(path_type=Path), help="Self-contained HTML report: .html")
@@ -79,7 +80,7 @@ def optimize(
         require_matplotlib()
     if save_transform and not settings.register:
         raise SimulationError("--save-transform needs --register")
-    names = dict(_free_parameter(text) for text in free) or dict.fromkeys(("display", "white matter"))
+    names = dict(_free_parameter(text) for text in free) or dict.fromkeys(settings.free_names)
     tracked = open_tracked(patient, recording, most=_MOST_IMAGES)
     simulator = tracked.examination.simulator
     with Curve("optimize") as curve:

@@ -81,15 +81,19 @@ class FitPresenter:
         self._panel.setValue(_FREE, ", ".join(names) or "none")  # an empty text means the default
 
     def _free(self) -> list[str]:
+        return list(dict.fromkeys(name for names in self._groups().values() for name in names))
+
+    def _groups(self) -> dict[str, list[str]]:
+        """{a name as chosen: the parameters that it stands for}."""
         names = [name.strip() for name in self._panel.value(_FREE).split(",") if name.strip()]
         tissues = self._panel.tissueTable()
-        known: list[str] = []
+        known: dict[str, list[str]] = {}
         for name in names:
             try:
-                known += FreeParameters.of([name], tissues, DisplaySettings()).names
+                known[name] = FreeParameters.of([name], tissues, DisplaySettings()).names
             except SimulationError:  # a tissue that these labels do not have
                 continue
-        return list(dict.fromkeys(known))
+        return known
 
     # ---- fit ---------------------------------------------------------------------------------------------------
 
@@ -105,7 +109,7 @@ class FitPresenter:
         panel, parameters = self._panel, self._parameters
         with panel.shown(), panel.working("Fit") as progress:
             require(parameters.real is not None, "no real images chosen, expected a sequence or a volume")
-            free = self._free()
+            free = list(self._groups())  # "tissues" as such: the fit looks which the images show
             require(bool(free), "nothing is free, tick at least one parameter")
             plot = CostPlot(panel.logic.scene)
             panel.view.showChart(plot.chart)

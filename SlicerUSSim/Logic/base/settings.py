@@ -126,6 +126,12 @@ class DisplaySettings(Declared):
         0.5, "TGC", "Time-gain compensation, as the one-way attenuation it compensates; 0: none", unit="dB/(cm MHz)",
         bounds=(0, 20), shown=Shown(0, 2, 0.01, is_slider=True), option="tgc", fit=Fit(0.0, 1.2, tolerance=0.1),
     )  # fmt: skip
+    tgc_reach: float = parameter(
+        1.0, "TGC reach",
+        "Part of the image depth over which TGC rises; from there on it stays, as an amplifier has a largest gain",
+        bounds=(0, 1), shown=Shown(0, 1, 0.01, is_slider=True), option="tgc-reach",
+        fit=Fit(0.1, 1.0, tolerance=0.1),
+    )  # fmt: skip
     noise_db: float | None = parameter(
         -80.0, "Noise",
         "Amplifier noise before TGC, relative to tissue of unit scatterer variance; panels: -150 for none",

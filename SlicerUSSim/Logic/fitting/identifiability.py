@@ -10,15 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from math import log10
 from typing import TypeAlias
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
-from SlicerUSSim.Logic.fitting.parameters import SCATTERING, FreeParameters
+from SlicerUSSim.Logic.fitting.parameters import SCATTERING, FreeParameters, value_of, variance_db
 from SlicerUSSim.Logic.tissue.table import TissueTable
-from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 State: TypeAlias = tuple[TissueTable, DisplaySettings]
 #: (parameters,) between 0 and 1 within the bounds
@@ -157,11 +155,6 @@ def equal_variance_draws(
     return draws[:count]
 
 
-def variance_db(tissue: Tissue) -> float:
-    """Echogenicity of developed speckle, 10 log10 Var; -200 dB for a tissue without scatterers."""
-    return 10.0 * log10(max(tissue.scatterer_variance, 1e-20))
-
-
 def quantities_of(parameters: FreeParameters, frequency_mhz: float, tissues: TissueTable) -> list[Quantity]:
     """The free parameters and their identifiable combinations (docs/optimization.md#identifiability)."""
     quantities = [
@@ -199,8 +192,8 @@ def _scattering(tissues: TissueTable) -> list[str]:
 
 def _reader(tissue: str | None, attribute: str):
     if tissue is None:
-        return lambda tissues, display: getattr(display, attribute)
-    return lambda tissues, display: getattr(tissues.tissue(tissue), attribute)
+        return lambda tissues, display: value_of(attribute, display)
+    return lambda tissues, display: value_of(attribute, tissues.tissue(tissue))
 
 
 def _fall(name: str, frequency_mhz: float):

@@ -1,14 +1,18 @@
 """Free parameters of an optimisation: names, physical bounds, conversion from numbers to tissues and display.
 
-A name is one of DISPLAY_BOUNDS ("gain_db") or a tissue and one of TISSUE_BOUNDS ("white matter.mu0"). "display" means
-all of DISPLAY_BOUNDS, a tissue's name all of its parameters in TISSUE_BOUNDS.
+A name is one of DISPLAY_BOUNDS ("gain_db"), or a tissue with one of TISSUE_BOUNDS ("white matter.mu0") or with
+"echogenicity_db". "display" means all of DISPLAY_BOUNDS, a tissue's name all of its parameters in TISSUE_BOUNDS, and
+"tissues" the echogenicity and attenuation of every tissue with scatterers.
+
+Speckle shows a tissue's Var = p (1 - p) mu0^2 + p sigma0^2 and not mu0, mu1 and sigma0 one by one. Echogenicity,
+10 log10 Var, varies with a common factor of mu0 and sigma0, so it replaces three parameters by the one that is seen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from math import exp, log
+from math import exp, log, log10
 from typing import cast
 
 import numpy as np
@@ -30,6 +34,16 @@ DISPLAY_BOUNDS: dict[str, Bounds] = {name: (e.fit.low, e.fit.high) for name, e i
 TISSUE_BOUNDS: dict[str, Bounds] = {name: (e.fit.low, e.fit.high) for name, e in TISSUE_PARAMETERS.items() if e.fit}
 #: The parameters of a tissue's scatterers.
 SCATTERING = frozenset(("mu0", "mu1", "sigma0"))
+#: All tissues, each by what an image shows of it
+TISSUES = "tissues"
+#: Var of a tissue, by a common factor of mu0 and sigma0. The bounds are relative to the table's value: gain changes an
+#: image as all levels together do, but for interfaces, and with wide bounds sulci, the brightest, can end up black.
+ECHOGENICITY = Declaration(
+    name="echogenicity_db", type=float, label="Echogenicity", symbol="Var", unit="dB",
+    tip="Level of a tissue's speckle, 10 log10 Var, by a common factor of its mu0 and sigma0",
+    fit=Fit(-12.0, 12.0, tolerance=1.5), source="Bounds of a fit: 12 dB about the tissue table's value",
+)  # fmt: skip
+ATTENUATION = "attenuation_db_cm_mhz"
 
 
 @dataclass(frozen=True)
@@ -60,6 +74,8 @@ class Parameter:
     @property
     def declaration(self) -> Declaration:
         """Its declaration, with the default bounds."""
+        if self.attribute == ECHOGENICITY.name:
+            return ECHOGENICITY
         return (TISSUE_PARAMETERS if self.tissue else DISPLAY_PARAMETERS)[self.attribute]
 
     @property
@@ -104,6 +120,14 @@ class FreeParameters(tuple):
             for full_name, default in _meant_by(name, tissues):
                 low, high = _pair(full_name, bounds) if bounds is not None else default
                 parameters[full_name] = Parameter(full_name, low, high)
+        for name in parameters:
+            tissue, _, attribute = name.rpartition(".")
+            same = [other for other in SCATTERING if f"{tissue}.{other}" in parameters]
+            require(
+                attribute != ECHOGENICITY.name or not same,
+                f"{name} is free together with {tissue}.{', .'.join(sorted(same))}, expected one or the other: it "
+                "changes them",
+            )
         require(bool(parameters), "no free parameter, expected at least one, such as gain_db or white matter.mu0")
         result = cls(parameters.values())
         for corner in (np.zeros(len(result)), np.ones(len(result))):
@@ -115,11 +139,14 @@ class FreeParameters(tuple):
         return [parameter.name for parameter in self]
 
     def varied(self) -> dict[str, set[str]]:
-        """{tissue name: its free parameters}."""
+        """{tissue name: its parameters that vary}."""
         varied: dict[str, set[str]] = {}
         for parameter in self:
             if parameter.tissue is not None:
-                varied.setdefault(parameter.tissue, set()).add(parameter.attribute)
+                is_level = parameter.attribute == ECHOGENICITY.name
+                varied.setdefault(parameter.tissue, set()).update(
+                    ("mu0", "sigma0") if is_level else [parameter.attribute]
+                )
         return varied
 
     def values(self, units: np.ndarray) -> np.ndarray:
@@ -133,7 +160,7 @@ class FreeParameters(tuple):
     def current(self, tissues: TissueTable, display: DisplaySettings) -> np.ndarray:
         """(parameters,) values in tissues and display."""
         known = {tissue.name: tissue for tissue in tissues.all_tissues()}
-        values = [getattr(known[p.tissue] if p.tissue else display, p.attribute) for p in self]
+        values = [value_of(p.attribute, known[p.tissue] if p.tissue else display) for p in self]
         # None, as for no noise, is the lowest value.
         return np.array([p.fit.low if value is None else value for p, value in zip(self, values, strict=True)], float)
 
@@ -147,14 +174,40 @@ class FreeParameters(tuple):
         display = replace(display, **changes.pop(None, {}))
         for tissue in tissues.all_tissues():
             if tissue.name in changes:
-                tissues = tissues.with_tissue(replace(tissue, **changes.pop(tissue.name)))
+                tissues = tissues.with_tissue(_changed(tissue, changes.pop(tissue.name)))
         return tissues, display
+
+
+def variance_db(tissue: Tissue) -> float:
+    """Echogenicity of developed speckle, 10 log10 Var; -200 dB for a tissue without scatterers."""
+    return 10.0 * log10(max(tissue.scatterer_variance, 1e-20))
+
+
+def value_of(attribute: str, owner: Tissue | DisplaySettings):
+    """The value of a parameter in its tissue or in the display."""
+    if attribute == ECHOGENICITY.name:
+        return variance_db(cast(Tissue, owner))
+    return getattr(owner, attribute)
+
+
+def _changed(tissue: Tissue, values: dict[str, float]) -> Tissue:
+    """The tissue with these values of its parameters."""
+    level = values.pop(ECHOGENICITY.name, None)
+    if level is not None:
+        factor = 10.0 ** ((level - variance_db(tissue)) / 20.0)
+        values.update(mu0=factor * tissue.mu0, sigma0=factor * tissue.sigma0)
+    return replace(tissue, **values)
 
 
 def all_names(tissues: TissueTable) -> list[str]:
     """All possible free parameters: of the display, then of every tissue with scatterers."""
-    scattering = dict.fromkeys(t.name for t in tissues.all_tissues() if t.scatterer_variance > 0.0)
-    return [*DISPLAY_BOUNDS, *(f"{tissue}.{attribute}" for tissue in scattering for attribute in TISSUE_BOUNDS)]
+    attributes = (ECHOGENICITY.name, *TISSUE_BOUNDS)
+    return [*DISPLAY_BOUNDS, *(f"{tissue}.{name}" for tissue in _scattering(tissues) for name in attributes)]
+
+
+def _scattering(tissues: TissueTable) -> list[str]:
+    """Names of the tissues with scatterers."""
+    return list(dict.fromkeys(t.name for t in tissues.all_tissues() if t.scatterer_variance > 0.0))
 
 
 def _meant_by(name: str, tissues: TissueTable) -> list[tuple[str, Bounds]]:
@@ -164,15 +217,24 @@ def _meant_by(name: str, tissues: TissueTable) -> list[tuple[str, Bounds]]:
         return list(DISPLAY_BOUNDS.items())
     if name in DISPLAY_BOUNDS:
         return [(name, DISPLAY_BOUNDS[name])]
+    if name == TISSUES:
+        attributes = ECHOGENICITY.name, ATTENUATION
+        return [pair for one in _scattering(tissues) for a in attributes for pair in _meant_by(f"{one}.{a}", tissues)]
     tissue, _, attribute = name.rpartition(".")
-    if attribute not in TISSUE_BOUNDS:
+    if attribute not in TISSUE_BOUNDS and attribute != ECHOGENICITY.name:
         tissue, attribute = name, ""
     owner = next((entry for entry in known if same_name(entry, tissue)), None)
     if owner is None:
         raise SimulationError(
-            f"no free parameter {name!r}, expected display, {', '.join(DISPLAY_BOUNDS)}, or a tissue "
-            f"({', '.join(known)}), alone or with .{', .'.join(TISSUE_BOUNDS)}"
+            f"no free parameter {name!r}, expected display, tissues, {', '.join(DISPLAY_BOUNDS)}, or a tissue "
+            f"({', '.join(known)}), alone or with .{', .'.join((ECHOGENICITY.name, *TISSUE_BOUNDS))}"
         )
+    if attribute == ECHOGENICITY.name:
+        require(
+            owner in _scattering(tissues), f"{name} cannot be free: {owner} has no scatterers, expected mu0 or sigma0"
+        )
+        level, range_db = variance_db(tissues.tissue(owner)), cast(Fit, ECHOGENICITY.fit)
+        return [(f"{owner}.{attribute}", (level + range_db.low, level + range_db.high))]
     return [(f"{owner}.{a}", bounds) for a, bounds in TISSUE_BOUNDS.items() if attribute in ("", a)]
 
 

@@ -15,8 +15,9 @@ class FitSettings(Declared):
         "", "Frames", "Images of the sequence, such as 0,5,10 or 0:20:5; empty: six, evenly spaced", shown=True
     )
     free: str = parameter(
-        "display, white matter", "Free parameters",
-        'Comma-separated: "display", a tissue, or a parameter of either (gain_db, white matter.mu0)',
+        "display, tissues", "Free parameters",
+        'Comma-separated: "display", "tissues" (what the images show of each), a tissue, or a parameter (gain_db, '
+        "white matter.mu0)",
     )  # fmt: skip
     estimate: bool = parameter(
         False, "Find the geometry in the images",
@@ -36,6 +37,11 @@ class FitSettings(Declared):
         2, "Restarts", "Additional searches with other starting points and speckle, to find equally good fits",
         bounds=(0, 100), option="restarts",
     )  # fmt: skip
+
+    @property
+    def free_names(self) -> list[str]:
+        """The free parameters one by one."""
+        return [name.strip() for name in self.free.split(",") if name.strip()]
 
     def _owner(self) -> str:
         return "fit"

@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.fitting.optimization import AppearanceResult, optimize_ap
 from SlicerUSSim.Logic.fitting.parameters import Bounds
 from SlicerUSSim.Logic.fitting.registration import Registration, register_poses
 from SlicerUSSim.Logic.fitting.search import Progress
+from SlicerUSSim.Logic.fitting.seen import parameters_seen
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -66,10 +67,12 @@ def fit(
     """Fit display and tissue parameters (optimization.optimize_appearance) and, with `register`, the poses.
 
     Registration requires similar images and the fit requires poses. Short fits and registrations therefore alternate,
-    followed by the complete fit at the resulting poses. `resume` and `checkpoint` are those of the complete fit.
+    followed by the complete fit at the resulting poses. Of the free parameters, "tissues" means those that the images
+    can show (seen.py). `resume` and `checkpoint` are those of the complete fit.
     Raises SimulationError as those do.
     """
     display = display or DisplaySettings()
+    free = parameters_seen(free, simulator, tracked)
     masks = [tracked.mask] * len(tracked.images)
     given = tracked
     appearance_at = partial(

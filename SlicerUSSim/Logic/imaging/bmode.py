@@ -76,6 +76,7 @@ class Compressor(Stage):
         frame.grey = self.workspace.get("grey", lines * samples)
         # Two-way path per sample, in cm.
         tgc = 2.0 * display.tgc_db_cm_mhz * float(acquisition["frequency_mhz"]) * float(acquisition["sample_mm"]) * 0.1
+        rising = display.tgc_reach * float(acquisition["depth_mm"]) / float(acquisition["sample_mm"])
         # Noise power is shared between the two quadrature components.
         noise = 0.0 if display.noise_db is None else 10.0 ** (display.noise_db / 20.0) / np.sqrt(2.0)
         self.device.run(
@@ -86,6 +87,7 @@ class Compressor(Stage):
             np.float32(noise),
             np.uint32(noise_key(acquisition, frame.noise_seed)),
             np.float32(tgc),
+            np.float32(rising),
             np.float32(FULL_SCALE_DB - display.gain_db),
             frame.display_record,
             frame.envelope,

@@ -393,7 +393,7 @@ class UltrasoundSceneLogic:
         *,
         probe_transform_node=None,
         frames: Sequence[int] | None = None,
-        free: Iterable[str] | Mapping[str, tuple[float, float] | None] = ("display", "white matter"),
+        free: Iterable[str] | Mapping[str, tuple[float, float] | None] = ("display", "tissues"),
         register: bool = False,
         estimate_geometry: bool = False,
         max_evaluations: int = FitSettings.evaluations,

@@ -92,7 +92,8 @@ def b_mode(frame: TwinFrame) -> None:
         iq = iq + noise * (gaussian(key) + 1j * gaussian(hash_mix(key + np.uint32(0x9E3779B9))))
     power = np.real(iq) ** 2 + np.imag(iq) ** 2 + f32(1e-30)
     # Two-way path, in cm
-    tgc_db = index * (2.0 * display.tgc_db_cm_mhz * float(record["frequency_mhz"]) * float(record["sample_mm"]) * 0.1)
+    rising = np.minimum(index, display.tgc_reach * float(record["depth_mm"]) / float(record["sample_mm"]))
+    tgc_db = rising * (2.0 * display.tgc_db_cm_mhz * float(record["frequency_mhz"]) * float(record["sample_mm"]) * 0.1)
     frame.envelope = (np.sqrt(power) * 10.0 ** (tgc_db / 20.0)).astype(np.float32)
     level_db = 10.0 * np.log10(power) + tgc_db
     value = 255.0 * (1.0 + (level_db - (FULL_SCALE_DB - display.gain_db)) / display.dynamic_range_db)
