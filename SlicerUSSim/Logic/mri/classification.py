@@ -10,7 +10,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.histogram import Histogram
-from SlicerUSSim.Logic.mri.mixture import TISSUES, Points, TissueMixture, fit_mixture
+from SlicerUSSim.Logic.mri.mixture import ANY, TISSUES, Points, TissueMixture, fit_mixture
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 #: Tissues (indices in mixture.TISSUES) from dark to bright
@@ -24,6 +24,8 @@ _PRIOR_EXPONENT = 0.3
 #: Noise of posteriors per that of the fit, for filtered images: filters leave more error at borders than within tissues
 FILTER_BLUR = 1.5
 _START_ITERATIONS = 12
+#: Distance of means, in standard deviations of the noise, below which two tissues are one
+_LEAST_GAP = 0.5
 #: Smallest and largest share of CSF, grey and white matter in the starts, and in a result without a warning
 START_SHARES = ((0.05, 0.15, 0.3), (0.3, 0.45))
 EXPECTED_SHARES = ((0.02, 0.4), (0.3, 0.75), (0.2, 0.6))
@@ -113,8 +115,22 @@ def _fit_one(points: Points, contrast: str) -> TissueMixture:
     found = []
     for fit in in_order[:2]:
         whole = fit_mixture(points, fit.means, np.sqrt(np.diag(fit.covariance)))
-        found.append((_excess(whole, points) > 0.0, -whole.log_likelihoods[-1], whole))
-    return min(found, key=lambda entry: entry[:2])[2]
+        found.append((_excess(whole, points) > 0.0 or _has_collapsed(whole), -whole.log_likelihoods[-1], whole))
+    best = min(found, key=lambda entry: entry[:2])[2]
+    if not _has_collapsed(best):
+        return best
+    # No borders, as in a synthetic image: the limits of the weights have forced two tissues into one.
+    free = [
+        fit_mixture(points, means, 0.5 * deviation, least_weights=ANY) for means, deviation in _starts(points, contrast)
+    ]
+    return min(free, key=lambda fit: (_has_collapsed(fit), -fit.log_likelihoods[-1]))
+
+
+def _has_collapsed(fit: TissueMixture) -> bool:
+    """Whether two tissues have the same mean in all channels."""
+    deviation = np.sqrt(np.diag(fit.covariance))
+    gaps = [np.abs(a - b) / deviation for a, b in itertools.combinations(fit.means, 2)]
+    return min(float(gap.max()) for gap in gaps) < _LEAST_GAP
 
 
 def _excess(fit: TissueMixture, points: Points) -> float:

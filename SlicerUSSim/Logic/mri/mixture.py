@@ -21,8 +21,9 @@ _INSIDE = len(TISSUES) + len(MIXED)
 _MIDDLE = 0.5
 #: Least weight of the pure classes, and of the mixed ones: at 1 mm every tissue has borders. Without these, wide pure
 #: classes replace the mixed ones, or one class takes grey and white matter where their contrast is low
-_LEAST_PURE = np.array([1e-4, 0.2, 0.12])
-_LEAST_MIXED = np.array([0.1, 0.15])
+ANATOMICAL = np.array([1e-4, 0.2, 0.12, 0.1, 0.15])
+#: The same without knowledge of a brain
+ANY = np.full(_INSIDE, 1e-4)
 _MAX_ITERATIONS, _LEAST_GAIN = 150, 1e-6
 
 
@@ -73,9 +74,16 @@ class TissueMixture:
 
 
 def fit_mixture(
-    points: Points, means: np.ndarray, deviation: np.ndarray, *, iterations: int = _MAX_ITERATIONS
+    points: Points,
+    means: np.ndarray,
+    deviation: np.ndarray,
+    *,
+    least_weights: np.ndarray = ANATOMICAL,
+    iterations: int = _MAX_ITERATIONS,
 ) -> TissueMixture:
     """The mixture by expectation maximisation from (3, channels) means and (channels,) standard deviations.
+
+    `least_weights` (5,) are lower limits of the weights of the pure classes and the mixed ones.
 
     Weights follow the spatial prior as in Ashburner and Friston, NeuroImage 26(3), 2005: a class's probability in a
     voxel is its weight times its prior there, normalised. No step lowers the likelihood.
@@ -83,7 +91,7 @@ def fit_mixture(
     values, counts = points.values, points.counts / points.counts.sum()
     scatter = (values * counts[:, None]).T @ values
     covariance = np.diag(deviation**2)
-    weights = _limited(np.concatenate([[0.2, 0.25, 0.25, 0.15, 0.15], 0.5 * points.limits]), points.limits)
+    weights = _limited(np.concatenate([[0.2, 0.25, 0.25, 0.15, 0.15], 0.5 * points.limits]), least_weights, points.limits)
     affinity = _affinity(points)
     least = np.diag(points.steps**2 / 12.0)
     likelihoods: list[float] = []
@@ -97,7 +105,7 @@ def fit_mixture(
             break
         belonging = joint * (counts / total)
         weights = belonging.sum(axis=1) / np.maximum(affinity @ (counts / around), 1e-12) + 1e-12
-        weights = _limited(weights, points.limits)
+        weights = _limited(weights, least_weights, points.limits)
         means, covariance = parts.update(belonging, means, scatter, least)
     return TissueMixture(means, covariance, weights, np.array(likelihoods))
 
@@ -178,10 +186,10 @@ def _content(along: np.ndarray, length: float, inside: np.ndarray) -> tuple[np.n
     return mean / length, square / length**2
 
 
-def _limited(weights: np.ndarray, limits: np.ndarray) -> np.ndarray:
+def _limited(weights: np.ndarray, least: np.ndarray, limits: np.ndarray) -> np.ndarray:
     """The weights within their limits, adding up to 1."""
     weights = weights / weights.sum()
-    low = np.concatenate([_LEAST_PURE, _LEAST_MIXED, np.full(len(limits), 1e-6)])
+    low = np.concatenate([least, np.full(len(limits), 1e-6)])
     high = np.concatenate([np.ones(_INSIDE), limits])
     bound = np.zeros(len(weights), bool)
     for _ in range(len(weights)):  # what a limit gives or takes is shared by the classes that are free
