@@ -120,7 +120,7 @@ def test_every_structure_of_the_programs_has_a_tissue():
         ("Optic-Chiasm", "white matter"), ("CC_Mid_Posterior", "white matter"), ("Left-vessel", "blood"),
         ("Left-choroid-plexus", "enhancing"), ("5th-Ventricle", "csf"), ("Left-Inf-Lat-Vent", "csf"),
         ("ctx-lh-insula", "grey matter"), ("wm-rh-insula", "white matter"), ("ctx_rh_G_insular_short", "grey matter"),
-        ("heart_ventricle_left", "blood"), ("heart", "heart"), ("kidney_cyst_left", "csf"), ("kidney_left", "kidney"),
+        ("heart_ventricle_left", "blood"), ("heart", "heart"), ("kidney_cyst_left", "cyst"), ("kidney_left", "kidney"),
         ("liver tumor", "tumour"), ("rib_left_7", "bone"), ("vertebrae_L5", "bone"), ("Left lungs", "lung"),
         ("portal_vein_and_splenic_vein", "blood"), ("spinal_cord", "white matter"), ("skull", "skull"),
     ],
@@ -271,7 +271,7 @@ def test_a_tumour_of_brats_is_no_patient(labels, title, tmp_path):
     tumour(labels).write(path)
     message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
     assert f"a tumour's labels (as {title}: necrotic core, oedema, enhancing tumour; 3 labels, 67 ml)" in message
-    assert f"not a patient's tissues; add it to a segmentation with --add tumour={path}" in message
+    assert f"not a patient's tissues; add it to a segmentation with --add brats={path}" in message
     assert not (tmp_path / "o.png").exists()
 
 

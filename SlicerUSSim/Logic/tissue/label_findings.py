@@ -66,8 +66,10 @@ class Findings:
             return
         of_file = _tissue_of_file(self.source) or "tumour"
         maps = " ".join(f"--map {label}={tissue or of_file}" for label, tissue in zip(self.names, known, strict=True))
-        remedy = self.advice.lesion.format(tissue=known[0] or of_file, source=self.source, maps=maps)
-        if self.scheme is not None and self.scheme.is_lesion and set(self.names) <= set(schemes()["ussim"].names):
+        is_brats = self.scheme is not None and self.scheme.is_lesion
+        tissue = "brats" if is_brats else known[0] or of_file
+        remedy = self.advice.lesion.format(tissue=tissue, source=self.source, maps=maps)
+        if self.scheme is not None and is_brats and set(self.names) <= set(schemes()["ussim"].names):
             remedy += f"; if it is a brain, {self.advice.ambiguous.format(key='ussim')}"
         raise SimulationError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
 
