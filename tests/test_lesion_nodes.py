@@ -169,7 +169,7 @@ def test_a_brats_map_is_three_segments_each_within_the_one_before():
     segmentation = bench.lesions.GetSegmentation()
     assert [segmentation.GetSegment(name).GetName() for name in ids] == ["oedema", "necrosis", "enhancing"]
     bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
-    assert {note.split(":")[0] for note in bench.logic.notes} == {"oedema", "necrosis", "enhancing"}
+    assert {"oedema", "necrosis", "enhancing"} <= {note.split(":")[0] for note in bench.logic.notes}
 
 
 # ---- labels that stay as they are ------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,9 @@ _PRIOR_SIGMA_MM, _PRIOR_FLOOR = 3.0, 0.02
 _LEAST_DICE = 0.85
 #: A whole brain's mask in millilitres
 WHOLE_BRAIN_ML = (700.0, 2300.0)
+#: Results of the last registrations, by content: a patient is segmented again and again, with other settings.
+_known: dict[bytes, tuple[np.ndarray, float]] = {}
+_MOST_KNOWN = 8
 #: Start rotations about the patient's axes in degrees, besides none
 _TURNS = ((25, 0, 0), (-25, 0, 0), (0, 25, 0), (0, -25, 0), (0, 0, 25), (0, 0, -25))
 
@@ -80,10 +84,32 @@ def register_atlas(
     `image` is any contrast, and `inside` (k, j, i) its brain mask. Started from the centres and sizes of the masks, in
     seven orientations. Takes about two seconds.
     """
+    fixed, fixed_mask = _coarse(image, inside)
+    content = _content(fixed, fixed_mask)
+    if content not in _known:
+        if len(_known) >= _MOST_KNOWN:
+            _known.pop(next(iter(_known)))
+        _known[content] = _registered(fixed, fixed_mask, atlas, progress or (lambda share: None))
+    return AtlasFit(*_known[content], atlas)
+
+
+def _content(*images: sitk.Image) -> bytes:
+    """A key that differs between images of different voxels or geometry."""
     import SimpleITK as sitk
 
-    report = progress or (lambda share: None)
-    fixed, fixed_mask = _coarse(image, inside)
+    content = hashlib.sha256()
+    for image in images:
+        content.update(repr((image.GetOrigin(), image.GetSpacing(), image.GetDirection())).encode())
+        content.update(sitk.GetArrayViewFromImage(image).tobytes())
+    return content.digest()
+
+
+def _registered(
+    fixed: sitk.Image, fixed_mask: sitk.Image, atlas: Atlas, report: Callable[[float], None]
+) -> tuple[np.ndarray, float]:
+    """((4, 4) patient_to_atlas in RAS, Dice of the masks)."""
+    import SimpleITK as sitk
+
     moving, moving_mask = _coarse(atlas.t1, atlas.t1.array > 0)
     centres = [_centroid(mask) for mask in (fixed_mask, moving_mask)]
     volumes = [float(sitk.GetArrayViewFromImage(mask).sum()) for mask in (fixed_mask, moving_mask)]
@@ -110,7 +136,7 @@ def register_atlas(
     warped = sitk.GetArrayViewFromImage(sitk.Resample(moving_mask, fixed_mask, found)) > 0.5
     mask = sitk.GetArrayViewFromImage(fixed_mask) > 0.5
     report(1.0)
-    return AtlasFit(_ras_matrix(found), 2.0 * float((warped & mask).sum()) / float(warped.sum() + mask.sum()), atlas)
+    return _ras_matrix(found), 2.0 * float((warped & mask).sum()) / float(warped.sum() + mask.sum())
 
 
 def _block_means(array: np.ndarray, shrink: np.ndarray) -> np.ndarray:

@@ -121,9 +121,11 @@ def _fit_one(points: Points, contrast: str) -> TissueMixture:
         return best
     # No borders, as in a synthetic image: the limits of the weights have forced two tissues into one.
     free = [
-        fit_mixture(points, means, 0.5 * deviation, least_weights=ANY) for means, deviation in _starts(points, contrast)
+        fit_mixture(points, means, 0.5 * deviation, least_weights=ANY, iterations=4 * _START_ITERATIONS)
+        for means, deviation in _starts(points, contrast)
     ]
-    return min(free, key=lambda fit: (_has_collapsed(fit), -fit.log_likelihoods[-1]))
+    start = min(free, key=lambda fit: (_has_collapsed(fit), -fit.log_likelihoods[-1]))
+    return fit_mixture(points, start.means, np.sqrt(np.diag(start.covariance)), least_weights=ANY)
 
 
 def _has_collapsed(fit: TissueMixture) -> bool:

@@ -91,7 +91,8 @@ def fit_mixture(
     values, counts = points.values, points.counts / points.counts.sum()
     scatter = (values * counts[:, None]).T @ values
     covariance = np.diag(deviation**2)
-    weights = _limited(np.concatenate([[0.2, 0.25, 0.25, 0.15, 0.15], 0.5 * points.limits]), least_weights, points.limits)
+    weights = np.concatenate([[0.2, 0.25, 0.25, 0.15, 0.15], 0.5 * points.limits])
+    weights = _limited(weights, least_weights, points.limits)
     affinity = _affinity(points)
     least = np.diag(points.steps**2 / 12.0)
     likelihoods: list[float] = []
