@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ class Atlas:
     white: Volume
 
 
+@cache
 def mni152() -> Atlas | None:
     """The MNI152 2009a template at 1 mm (Fonov et al., NeuroImage 54(1), 2011); None if nilearn is not installed."""
     package = importlib.util.find_spec("nilearn")
