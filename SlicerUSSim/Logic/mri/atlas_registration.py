@@ -39,7 +39,7 @@ class AtlasFit:
     patient_to_atlas: np.ndarray
     #: Overlap (Dice) of the atlas's brain with the patient's
     dice: float
-    _atlas: Atlas
+    atlas: Atlas
 
     @property
     def is_good(self) -> bool:
@@ -48,11 +48,11 @@ class AtlasFit:
 
     def prior(self, grid: Volume, inside: np.ndarray) -> np.ndarray:
         """(3, voxels) float32 share of CSF, grey and white matter to be expected in the voxels `inside` (k, j, i)."""
-        source = (self._atlas.grey.array, self._atlas.white.array)  # the rest is CSF, also around the atlas
-        spacing = self._atlas.t1.spacing_mm[::-1]
+        source = (self.atlas.grey.array, self.atlas.white.array)  # the rest is CSF, also around the atlas
+        spacing = self.atlas.t1.spacing_mm[::-1]
         shrink = np.maximum(np.rint(_MAPS_MM / spacing).astype(int), 1)
         stride = np.maximum(np.rint(_MAPS_MM / grid.spacing_mm[::-1]).astype(int), 1)
-        matrix = self._atlas.t1.ras_to_ijk @ self.patient_to_atlas @ grid.ijk_to_ras
+        matrix = self.atlas.t1.ras_to_ijk @ self.patient_to_atlas @ grid.ijk_to_ras
         # scipy wants the map from array indices (k, j, i) of the result to those of the input.
         linear = matrix[:3, :3][::-1, ::-1]
         offset = (matrix[:3, 3][::-1] + linear @ (0.5 * (stride - 1)) - 0.5 * (shrink - 1)) / shrink

@@ -1,42 +1,83 @@
-"""The bias field of an MRI: whether there is one, and its correction by N4."""
+"""The bias field of an MRI: whether there is one, and its correction."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
+from SlicerUSSim.Logic.mri.field import anatomy, estimate_field
 
 #: Millimetres of the grid on which the field is estimated
 _COARSE_MM = 4.0
-#: Ratio of the 95th to the 5th percentile of the field in the brain, less 1, from which it is corrected
-LEAST_FIELD = 0.05
+#: Ratio of the 95th to the 5th percentile of the field in the brain, less 1: below the first its estimate is no better
+#: than none; from the second, as of surface coils, it is too strong for the polynomial and N4 goes first
+LEAST_FIELD, STRONG_FIELD = 0.1, 0.6
 
 
-def field_strength(image: Volume, tissue: np.ndarray, expected: np.ndarray) -> float:
-    """How far a smooth field spreads: the ratio of its 95th to its 5th percentile in the brain, less 1.
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """An image without its bias field, and a line for the user."""
 
-    The field is a polynomial of second order, fitted to the logarithm of the intensity of the voxels `tissue` (k, j, i)
-    over that which their class has, `expected`, with three rounds that leave out what does not fit.
+    image: Volume
+    message: str
+
+
+def corrected(
+    image: Volume,
+    inside: np.ndarray,
+    contrast: str,
+    atlas: AtlasFit | None,
+    prior: np.ndarray | None,
+    wanted: bool | None,
+    report: Callable[[float], None],
+) -> Corrected:
+    """The image without bias field in the brain `inside` (k, j, i), if it has one or it is `wanted`.
+
+    Led by an atlas (its share of tissues is `prior`, (3, voxels)), the field is estimated together with the tissues,
+    which takes a second; N4 goes first where the field is strong, and instead where there is no atlas.
     """
-    step = tuple(slice(None, None, max(1, round(_COARSE_MM / mm))) for mm in image.spacing_mm[::-1])
-    inside = tissue[step] & (image.array[step] > 0)
-    if inside.sum() < 500:
-        return 0.0
-    ratio = np.log(image.array[step][inside] / expected[step][inside])
-    places = (np.argwhere(inside) / np.array(inside.shape) - 0.5) * 2.0
-    terms = [np.ones(len(places)), *places.T, *(places.T**2), *(places.T * np.roll(places.T, 1, axis=0))]
-    design = np.stack(terms, axis=1)
-    keep = np.ones(len(ratio), bool)
-    fitted = np.zeros(len(ratio))
-    for _ in range(3):
-        fitted = design @ np.linalg.lstsq(design[keep], ratio[keep], rcond=None)[0]
-        away = np.abs(ratio - fitted)
-        keep = away < 3.0 * np.median(away[keep]) + 1e-6
-    low, high = np.percentile(fitted, (5, 95))
-    return float(np.exp(high - low) - 1.0)
+    if atlas is None:
+        field = without_bias(image, inside, report)
+        ratio = np.where(inside, image.array, 1.0) / np.maximum(np.where(inside, field, 1.0), 1e-6)
+        strength = _strength(ratio, inside)
+        apply = bool(wanted) or strength > LEAST_FIELD
+        result = image.with_array(field) if apply else image
+        return Corrected(result, _about(contrast, strength, wanted, "N4 applied" if apply else ""))
+
+    def estimated(source: Volume) -> np.ndarray:
+        factor = estimate_field(source.array, inside, source.spacing_mm, contrast, prior, report).factor
+        return factor / anatomy(atlas, source, inside.shape) if contrast in ("t1", "t1gd") else factor
+
+    factor = estimated(image)
+    strength = _strength(factor, inside)
+    if not wanted and strength <= LEAST_FIELD:
+        return Corrected(image, _about(contrast, strength, wanted, ""))
+    how = "removed by a polynomial fitted with the tissues"
+    if wanted or strength > STRONG_FIELD:
+        image = image.with_array(without_bias(image, inside, report))
+        factor = estimated(image)
+        how = "removed by N4 and by a polynomial fitted with the tissues"
+    return Corrected(image.with_array(image.array / factor), _about(contrast, strength, wanted, how))
+
+
+def _strength(factor: np.ndarray, inside: np.ndarray) -> float:
+    step = (slice(None, None, 3),) * 3
+    low, high = np.percentile(factor[step][inside[step]], (5, 95))
+    return float(high / low - 1.0)
+
+
+def _about(contrast: str, strength: float, wanted: bool | None, how: str) -> str:
+    if not how:
+        return (
+            f"{contrast}: intensity varies by {strength:.0%} across the brain, below {LEAST_FIELD:.0%}: left as it is"
+        )
+    why = ", as asked for" if wanted else ""
+    return f"{contrast}: intensity varies by {strength:.0%} across the brain: {how}{why}"
 
 
 def without_bias(image: Volume, inside: np.ndarray, report: Callable[[float], None]) -> np.ndarray:

@@ -83,7 +83,7 @@ def classify(
         prior /= prior.sum(axis=0)
     first = _best_channel(contrasts)
     histogram = Histogram.of(values[first : first + 1], contrasts[first : first + 1], prior)
-    mixture = _fit_one(histogram.points, contrasts[first])
+    mixture = fit_one(histogram.points, contrasts[first])
     if len(contrasts) > 1:
         shares, outside = mixture.shares(histogram.points)
         shares = (shares * (1.0 - outside))[:, histogram.point_of_voxel]
@@ -103,7 +103,7 @@ def _best_channel(contrasts: tuple[str, ...]) -> int:
     return min(range(len(contrasts)), key=lambda n: _PREFERENCE.index(contrasts[n]))
 
 
-def _fit_one(points: Points, contrast: str) -> TissueMixture:
+def fit_one(points: Points, contrast: str) -> TissueMixture:
     """The fit of one channel: the most likely of several starts that leave tissues of plausible size."""
     starts = [
         fit_mixture(points, means, deviation, iterations=_START_ITERATIONS)

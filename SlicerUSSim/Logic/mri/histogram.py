@@ -28,10 +28,16 @@ class Histogram:
     point_of_voxel: np.ndarray
 
     @classmethod
-    def of(cls, values: np.ndarray, contrasts: tuple[str, ...], prior: np.ndarray | None = None) -> Histogram:
+    def of(
+        cls,
+        values: np.ndarray,
+        contrasts: tuple[str, ...],
+        prior: np.ndarray | None = None,
+        bins: int | None = None,
+    ) -> Histogram:
         """From (channels, voxels) intensities and, where there is one, the (3, voxels) prior share of every tissue."""
         channels, voxels = values.shape
-        bins = _BINS[min(channels, len(_BINS)) - 1]
+        bins = bins or _BINS[min(channels, len(_BINS)) - 1]
         code = np.zeros(voxels, np.int64)
         lows, steps = np.empty(channels), np.empty(channels)
         for n, channel in enumerate(values):

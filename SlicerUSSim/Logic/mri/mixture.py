@@ -72,6 +72,18 @@ class TissueMixture:
             result[second] += density[len(TISSUES) + n] * beyond
         return result, density[_INSIDE:].sum(axis=0)
 
+    def slope(self, points: Points) -> np.ndarray:
+        """(points,) derivative of the logarithm of the density by the intensity, for one channel."""
+        parts = _Parts(points, self.means, self.covariance)
+        density = parts.density * self.weights[:, None] * _affinity(points)
+        density /= density.sum(axis=0) + 1e-300
+        values, means = points.values[:, 0], self.means[:, 0]
+        result = density[: len(TISSUES)].T @ means - density[:_INSIDE].sum(axis=0) * values
+        for n, (first, second) in enumerate(MIXED):
+            content = parts.content(n)
+            result += density[len(TISSUES) + n] * ((1.0 - content) * means[first] + content * means[second])
+        return result / self.covariance[0, 0]
+
 
 def fit_mixture(
     points: Points,
@@ -140,6 +152,10 @@ class _Parts:
         along, length, inside = self._along[mixed]
         middle = _MIDDLE * length
         return np.clip(_inside(along - middle, length - middle) / np.maximum(inside, 1e-300), 0.0, 1.0)
+
+    def content(self, mixed: int) -> np.ndarray:
+        """(points,) expected share of the second tissue of a mixed class."""
+        return _content(*self._along[mixed])[0]
 
     def update(
         self, belonging: np.ndarray, means: np.ndarray, scatter: np.ndarray, least: np.ndarray

@@ -16,9 +16,9 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
-from SlicerUSSim.Logic.mri.bias import LEAST_FIELD, field_strength, without_bias
+from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
-from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, Classes, class_names, classify
+from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, classify
 from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.neighbours import smoothed_posteriors
@@ -125,7 +125,8 @@ def segment_mri(
     mask : foreground on the same grid (non-zero is inside); default: found by `skull_strip`.
     filter_radius : of the guided filter in voxels; 0 disables it.
     filter_epsilon : of the guided filter, squared intensity; default: from the noise estimated in the image.
-    bias_correction : run N4 (some seconds); default: where the image has an intensity gradient.
+    bias_correction : remove the bias field, with N4 (some seconds); default: where the image has one, with N4 only
+        where it is strong or there is no atlas; see bias.corrected.
     thin_sulci : also label the middle of sulci that are too narrow to reach CSF intensity, one voxel thick, as an extra
         tissue "leptomeninges" within the grey matter. Ultrasound shows these sulci, but intensity classes miss them.
     skull_strip : how the brain is found without a `mask`; see brain.find_brain.
@@ -184,39 +185,31 @@ def segment_mri(
         for name, image in zip(contrasts, part.images, strict=True):
             warnings += require_contrast(image, part.inside, prior, name)
 
-    def classified() -> tuple[Classes, list[tuple[np.ndarray, float, float]]]:
-        found = [
-            denoised(image.array, part.inside, settings.filter_radius, settings.filter_epsilon, device)
-            for image in part.images
-        ]
-        timed("filter")
-        values = np.stack([filtered[part.inside] for filtered, _, _ in found])
-        for name, channel in zip(contrasts, values, strict=True):
-            require(
-                float(channel.max()) > float(channel.min()),
-                f"MRI is constant ({channel[0]:g}) inside the foreground, expected tissues of different intensity"
-                + (f" in {name}" if others else ""),
-            )
-        result = classify(values, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0)
-        result = replace(result, posteriors=smoothed_posteriors(result.posteriors, part.inside))
-        timed("mixture")
-        return result, found
-
-    found, filtered = classified()
-    report(0.5)
     if bias_correction is not False:
-        corrected = False
-        for n, image in enumerate(part.images):
-            strength = _field_of(image, part.inside, found, n)
-            apply = bias_correction or strength > LEAST_FIELD
-            notes.append(_about_bias(contrasts[n], strength, bias_correction, apply))
-            if apply:
-                share = lambda done, n=n: report(0.5 + 0.4 * (n + done) / len(contrasts))  # noqa: E731
-                part.images[n] = image.with_array(without_bias(image, part.inside, share))
-                corrected = True
-        timed("bias correction")
-        if corrected:
-            found, filtered = classified()
+        for n, (name, image) in enumerate(zip(contrasts, part.images, strict=True)):
+            share = lambda done, n=n: report(0.4 + 0.3 * (n + done) / len(contrasts))  # noqa: E731
+            result = corrected(image, part.inside, name, atlas, prior, bias_correction, share)
+            part.images[n] = result.image
+            notes.append(result.message)
+        timed("bias field")
+    report(0.7)
+    filtered = [
+        denoised(image.array, part.inside, settings.filter_radius, settings.filter_epsilon, device)
+        for image in part.images
+    ]
+    timed("filter")
+    report(0.8)
+    values = np.stack([image[part.inside] for image, _, _ in filtered])
+    for name, channel in zip(contrasts, values, strict=True):
+        require(
+            float(channel.max()) > float(channel.min()),
+            f"MRI is constant ({channel[0]:g}) inside the foreground, expected tissues of different intensity"
+            + (f" in {name}" if others else ""),
+        )
+    found = classify(values, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0)
+    timed("mixture")
+    found = replace(found, posteriors=smoothed_posteriors(found.posteriors, part.inside))
+    timed("neighbours")
     report(0.9)
     warnings += implausible(found, part.images[0], part.inside, atlas, contrast)
 
@@ -295,24 +288,6 @@ def _atlas_of(part: _Part, report: Callable[[float], None]) -> tuple[AtlasFit | 
     if not fit.is_good:
         return None, f"without an atlas, since MNI152 covers the brain with a Dice of {fit.dice:.2f} only"
     return fit, f"led by the MNI152 atlas, whose brain covers this one with a Dice of {fit.dice:.2f}"
-
-
-def _field_of(image: Volume, inside: np.ndarray, found: Classes, channel: int) -> float:
-    """Strength of the bias field by grey and white matter."""
-    label = found.posteriors.argmax(axis=0)
-    solid = np.array([name in ("grey matter", "white matter") for name in found.names])
-    sure = found.posteriors.max(axis=0) > 0.7
-    tissue, expected = np.zeros(inside.shape, bool), np.zeros(inside.shape, np.float32)
-    tissue[inside] = solid[label] & sure
-    expected[inside] = found.means[label, channel]
-    return field_strength(image, tissue, expected)
-
-
-def _about_bias(contrast: str, strength: float, wanted: bool | None, applied: bool) -> str:
-    why = "as asked for" if wanted else f"{'from' if applied else 'below'} {LEAST_FIELD:.0%}"
-    return (
-        f"{contrast}: intensity varies by {strength:.0%} across the brain, {why}: N4 {'' if applied else 'not '}applied"
-    )
 
 
 class _StepTimes:
