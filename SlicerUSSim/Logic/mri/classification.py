@@ -26,6 +26,8 @@ FILTER_BLUR = 1.5
 _START_ITERATIONS = 12
 #: Distance of means, in standard deviations of the noise, below which two tissues are one
 _LEAST_GAP = 0.5
+#: Gain of the mean log-likelihood that the limits of the weights never cost in a brain, where it is below 0.02
+_MUCH_MORE_LIKELY = 0.1
 #: Smallest and largest share of CSF, grey and white matter in the starts, and in a result without a warning
 START_SHARES = ((0.05, 0.15, 0.3), (0.3, 0.45))
 EXPECTED_SHARES = ((0.02, 0.4), (0.3, 0.75), (0.2, 0.6))
@@ -116,16 +118,31 @@ def fit_one(points: Points, contrast: str) -> TissueMixture:
     for fit in in_order[:2]:
         whole = fit_mixture(points, fit.means, np.sqrt(np.diag(fit.covariance)))
         found.append((_excess(whole, points) > 0.0 or _has_collapsed(whole), -whole.log_likelihoods[-1], whole))
-    best = min(found, key=lambda entry: entry[:2])[2]
-    if not _has_collapsed(best):
+    is_doubtful, _, best = min(found, key=lambda entry: entry[:2])
+    if not is_doubtful:
         return best
-    # No borders, as in a synthetic image: the limits of the weights have forced two tissues into one.
-    free = [
-        fit_mixture(points, means, 0.5 * deviation, least_weights=ANY, iterations=4 * _START_ITERATIONS)
-        for means, deviation in _starts(points, contrast)
-    ]
-    start = min(free, key=lambda fit: (_has_collapsed(fit), -fit.log_likelihoods[-1]))
-    return fit_mixture(points, start.means, np.sqrt(np.diag(start.covariance)), least_weights=ANY)
+    # In an image without borders, such as a synthetic one, the limits of the weights force tissues together.
+    means, deviation = _otsu_start(points, contrast)
+    without = fit_mixture(points, means, deviation, least_weights=ANY)
+    gain = without.log_likelihoods[-1] - best.log_likelihoods[-1]
+    is_better = _has_collapsed(best) or gain > _MUCH_MORE_LIKELY
+    return without if is_better and not _has_collapsed(without) else best
+
+
+def _otsu_start(points: Points, contrast: str) -> tuple[np.ndarray, np.ndarray]:
+    """((3, 1) means, (1,) standard deviation) of the classes between Otsu's thresholds."""
+    from skimage.filters import threshold_multiotsu
+
+    values = points.values[:, 0]
+    counts, edges = np.histogram(values, 256, weights=points.counts)
+    centres = 0.5 * (edges[1:] + edges[:-1])
+    member = np.digitize(values, threshold_multiotsu(hist=(counts, centres), classes=len(TISSUES)))
+    means, variance = np.empty((len(TISSUES), 1)), 0.0
+    for n, tissue in enumerate(ORDERS[contrast]):
+        weights = points.counts * (member == n) + 1e-9
+        means[tissue] = np.average(values, weights=weights)
+        variance += float(weights @ (values - means[tissue]) ** 2)
+    return means, np.array([max(np.sqrt(variance / points.counts.sum()), float(points.steps[0]))])
 
 
 def _has_collapsed(fit: TissueMixture) -> bool:
