@@ -136,6 +136,19 @@ def test_a_phantom_is_no_brain(shape, monkeypatch):
         find_brain(phantom(shape))
 
 
+@needs_nilearn
+@pytest.mark.parametrize(
+    "axis, message",
+    [(0, "top is where the header says bottom and its face is where the header says front"),
+     (1, "top is where the header says top and its face is where the header says back")],
+)  # fmt: skip
+def test_a_stripped_brain_that_does_not_lie_as_its_header_says_is_refused(head, axis, message):
+    stripped = np.where(head[1], head[0].array, 0.0)
+    assert find_brain(head[0].with_array(stripped)).method == "stripped"
+    with pytest.raises(SimulationError, match=message):
+        find_brain(head[0].with_array(np.flip(stripped, axis).copy()))
+
+
 def test_a_tiny_object_is_too_small_for_a_head():
     mri = head_mri(3.0)
     with pytest.raises(SimulationError, match="too little for a head; check the voxel size"):
@@ -189,6 +202,30 @@ def test_a_cancelled_alignment_stops(head):
     with pytest.raises(Cancelled):
         find_brain(head[0], "atlas", progress=progress)
     assert time.perf_counter() - start < 20.0
+
+
+def on_other_voxels(mri, inside, spacing):
+    """The head and its brain resampled to spacing (i, j, k), stored as a scanner does: sagittal slices, from the left."""
+    import SimpleITK as sitk
+
+    image = mri.to_sitk()
+    size = [int(n * old / new) for n, old, new in zip(image.GetSize(), image.GetSpacing(), spacing, strict=True)]
+    results = []
+    for source in (image, mri.with_array(inside.astype(np.float32)).to_sitk()):
+        grid = (size, sitk.Transform(), sitk.sitkLinear, source.GetOrigin(), spacing, source.GetDirection())
+        results.append(Volume.from_sitk(sitk.DICOMOrient(sitk.Resample(source, *grid), "PIL"), "resampled"))
+    return results[0], results[1].array > 0.5
+
+
+@needs_nilearn
+@pytest.mark.parametrize(
+    "spacing", [(5.0, 1.2, 1.2), pytest.param((1.0, 0.5, 0.5), marks=pytest.mark.slow)], ids=["thick", "fine"]
+)
+def test_the_atlas_finds_the_brain_in_anisotropic_voxels_of_a_sagittal_stack(head, spacing):
+    mri, inside = on_other_voxels(*head, spacing)
+    result = find_brain(mri, "atlas")
+    assert result.mask.array.shape == mri.array.shape
+    assert dice(result.mask.array > 0, inside) > 0.94
 
 
 def fake_robex(folder, script):

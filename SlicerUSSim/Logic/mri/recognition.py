@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.orientation import how_it_lies, lies_otherwise
+from SlicerUSSim.Logic.mri.orientation import how_it_lies, lies_otherwise, stripped_lies_otherwise
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
 USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
@@ -90,6 +90,7 @@ def _on_constant_background(mri: Volume) -> np.ndarray | None:
     """(k, j, i) the brain of a skull-stripped image; None if it is not one.
 
     Its background has exactly one value, and its foreground the volume and the shape of a brain, without a skull.
+    Raises SimulationError if the brain does not lie as its header says.
     """
     values = mri.array
     border = np.concatenate([values[[0, -1]].ravel(), values[:, [0, -1]].ravel(), values[:, :, [0, -1]].ravel()])
@@ -105,7 +106,11 @@ def _on_constant_background(mri: Volume) -> np.ndarray | None:
     coarse = CoarseImage.of(mri.with_array(np.where(inside, 1.0, 0.0).astype(np.float32)))
     intensity = CoarseImage.of(mri.with_array(np.where(inside, values - values.min(), 0).astype(np.float32)))
     shape = coarse.array > 0.5
-    return inside if _is_brain_shaped(shape) and _has_tissues(intensity.array, shape) else None
+    if not (_is_brain_shaped(shape) and _has_tissues(intensity.array, shape)):
+        return None
+    wrong = stripped_lies_otherwise(intensity, shape, LEAST_AGREEMENT, _REMEDY) if mni152() is not None else None
+    require(wrong is None, wrong or "")
+    return inside
 
 
 def _is_brain_shaped(shape: np.ndarray) -> bool:
