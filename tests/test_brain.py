@@ -205,7 +205,7 @@ def test_a_cancelled_alignment_stops(head):
 
 
 def on_other_voxels(mri, inside, spacing):
-    """The head and its brain resampled to spacing (i, j, k), stored as a scanner does: sagittal slices, from the left."""
+    """The head and its brain with voxels of (i, j, k) mm, stored as sagittal slices with rows from the top."""
     import SimpleITK as sitk
 
     image = mri.to_sitk()
