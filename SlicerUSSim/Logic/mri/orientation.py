@@ -61,7 +61,7 @@ def how_it_lies(image: CoarseImage, alignment: Alignment, least: float, remedy: 
     """One line about an image that the atlas does not fit: where the head lies, or that there is none."""
     size = " x ".join(f"{n * image.spacing_mm:.0f}" for n in image.array.shape[::-1])
     message = lies_otherwise(image, alignment, least, remedy)
-    if message is None and alignment.agreement >= least:
+    if message is None and alignment.agreement >= 2.0 * least:
         message = (
             f"the atlas fits this {size} mm image only if turned by {alignment.turn_deg:.0f} degrees, "
             f"{alignment.size:.2f} times as large and stretched by a factor of {alignment.stretch:.2f}, more than any "
@@ -69,7 +69,7 @@ def how_it_lies(image: CoarseImage, alignment: Alignment, least: float, remedy: 
         )
     return message or (
         f"no head or brain is recognised in this {size} mm image (agreement with the atlas {alignment.agreement:.2f}, "
-        f"expected {least:g} or more{_cut_ends(image)}); {remedy}"
+        f"expected {least:g} or more in a usual position{_cut_ends(image)}); {remedy}"
     )
 
 
