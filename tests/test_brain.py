@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mri import brain as brain_module, extractors, orientation, recognition
-from SlicerUSSim.Logic.mri.alignment import Alignment, align_coarse
+from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain, left_out
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
@@ -198,6 +198,19 @@ def test_a_head_on_its_side_is_refused_with_where_its_top_is(head, monkeypatch):
 def test_none_takes_everything_brighter_than_the_background():
     result = find_brain(phantom("box"), "none")
     assert result.method == "none" and result.volume_ml == pytest.approx(1540, rel=0.1)
+
+
+@needs_nilearn
+def test_a_ct_head_whose_air_is_0_is_told_from_an_mri_by_its_brain_without_contrast(head, found):
+    mri, inside = head
+    rng = np.random.default_rng(0)
+    skull = ndimage.binary_dilation(inside, iterations=4) & ~ndimage.binary_dilation(inside, iterations=2)
+    array = np.where(mri.array > 30, 1024.0, 0.0) + 0.1 * np.where(inside, mri.array, 0.0)  # 20 HU between tissues
+    array[skull] = 2000.0
+    ct = mri.with_array((array + rng.normal(0, 8, array.shape)).astype(np.float32))
+    recognition._head(mri, CoarseImage.of(mri), found.alignment)  # the MRI is taken
+    with pytest.raises(SimulationError, match=r"brain in this head differ by \d%, as in CT, expected 10% or more"):
+        recognition._head(ct, CoarseImage.of(ct), found.alignment)
 
 
 # ---- extraction ------------------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import mni152
+from SlicerUSSim.Logic.mri.distances import distance_to
 
 #: Voxel sizes of the template and the patient in the search, and width of the template's dark ring, mm
 _TEMPLATE_MM, _PATIENT_MM, _RING_MM = 5, 4.0, 6.0
@@ -148,8 +149,8 @@ class _Template:
         t1 = required(mni152(), "the brain atlas needs nilearn; install it with: pip install nilearn").t1
         step = slice(None, None, _TEMPLATE_MM)
         brain = t1.array > 0
-        spacing = t1.spacing_mm[::-1]
-        outside, inside = (cast(np.ndarray, ndimage.distance_transform_edt(side, spacing)) for side in (~brain, brain))
+        # Its voxels are of 1 mm.
+        outside, inside = (np.maximum(distance_to(side), 0.0) for side in (brain, ~brain))
         self.distance = t1.with_array((outside - inside).astype(np.float32))
         smooth = ndimage.gaussian_filter(t1.array.astype(np.float32), _TEMPLATE_MM / 2.4)
         self.image, self.is_brain = smooth[step, step, step], brain[step, step, step]

@@ -24,6 +24,9 @@ LEAST_AGREEMENT = 0.16
 _MOST_TURN_DEG, _MOST_STRETCH, _SIZES = 48.0, 1.25, (0.74, 1.15)
 #: Share of the template's brain that must show tissue, and below which a user should look
 _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
+#: Between the 5th and 95th percentile of the inner brain, relative to its median. T1 and T2 had 0.46 to 0.82;
+#: CT whose air is stored as 0 has 0.01 to 0.05 (25 to 50 HU on 1000).
+_LEAST_CONTRAST = 0.1
 _REMEDY = "give a brain mask (--mask), or --skull-strip none to take everything brighter than the background"
 
 
@@ -168,6 +171,12 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
     require(
         shown >= _LEAST_SHOWN,
         f"image shows only {shown:.0%} of a brain, expected a whole one; use a series of the whole head, or {_REMEDY}",
+    )
+    low, middle, high = np.percentile(np.pad(image.array, pad)[distance < -8.0], (5, 50, 95))
+    require(
+        high - low >= _LEAST_CONTRAST * middle,
+        f"the tissues of the brain in this head differ by {(high - low) / max(middle, 1e-9):.0%}, as in CT, expected "
+        f"{_LEAST_CONTRAST:.0%} or more of an MRI; use an MRI",
     )
     warnings = ()
     if shown < _USUAL_SHOWN:
