@@ -31,7 +31,9 @@ def lies_otherwise(image: CoarseImage, alignment: Alignment, least: float, remed
         if other.agreement >= enough:
             axes = zip(factors, ("width", "length", "height"), strict=True)
             words = ", ".join(f"{axis} {factor:g} times" for factor, axis in axes if factor != 1)
-            return f"the head has a wrong size ({words} an adult's); check the voxel size in its header, or {remedy}"
+            cut = _cut_ends(image)
+            check = "check whether it is whole, and the voxel size" if cut else "check the voxel size"
+            return f"the head has a wrong size ({words} an adult's{cut}); {check} in its header, or {remedy}"
     return None
 
 
