@@ -5,6 +5,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -13,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
-from SlicerUSSim.Logic.mri import brain as brain_module, extractors, orientation
-from SlicerUSSim.Logic.mri.alignment import align_template
+from SlicerUSSim.Logic.mri import brain as brain_module, extractors, orientation, recognition
+from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.brain import find_brain, given_brain, left_out
+from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain, left_out
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.mask_check import cut_off
 from SlicerUSSim.Logic.mri.recognition import recognise
@@ -68,6 +69,15 @@ def whole_head(nod_deg=12.0, scale=0.93, spacing=2.0):
     return Volume(head.astype(np.float32), matrix), inside
 
 
+class Found(NamedTuple):
+    """A brain, where its mask is kept, what was reported, and how the atlas lies."""
+
+    result: BrainMask
+    place: Path
+    shares: list[float]
+    alignment: Alignment
+
+
 @pytest.fixture(scope="module")
 def head():
     return whole_head()
@@ -77,8 +87,17 @@ def head():
 def found(head, tmp_path_factory):
     """The brain in the synthetic head by the atlas, kept."""
     place = tmp_path_factory.mktemp("kept") / "head.brain-mask.nrrd"
-    shares = []
-    return find_brain(head[0], "atlas", keep_at=place, progress=shares.append), place, shares
+    shares, alignments = [], []
+
+    def recorded(*args, **options):
+        alignments.append(align_coarse(*args, **options))
+        return alignments[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recognition, "align_coarse", recorded)
+        result = find_brain(head[0], "atlas", keep_at=place, progress=shares.append)
+    (alignment,) = alignments
+    return Found(result, place, shares, alignment)
 
 
 # ---- recognition -----------------------------------------------------------------------------------------------------
@@ -128,12 +147,26 @@ def phantom(shape):
 
 
 @needs_nilearn
-@pytest.mark.parametrize("shape", ["box", "sphere"])
+@pytest.mark.parametrize("shape", [pytest.param("box", marks=pytest.mark.slow), "sphere"])
 def test_a_phantom_is_no_brain(shape, monkeypatch):
     monkeypatch.setattr(orientation, "_turns", lambda: [])
     monkeypatch.setattr(orientation, "_sizes", lambda: [])
     with pytest.raises(SimulationError, match=r"no head or brain is recognised.*--skull-strip none"):
         find_brain(phantom(shape))
+
+
+@needs_nilearn
+@pytest.mark.parametrize(
+    "axis, message",
+    [(0, "top is where the header says bottom and its face is where the header says front"),
+     pytest.param(1, "top is where the header says top and its face is where the header says back",
+                  marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_a_stripped_brain_that_does_not_lie_as_its_header_says_is_refused(head, axis, message):
+    stripped = np.where(head[1], head[0].array, 0.0)
+    assert find_brain(head[0].with_array(stripped)).method == "stripped"
+    with pytest.raises(SimulationError, match=message):
+        find_brain(head[0].with_array(np.flip(stripped, axis).copy()))
 
 
 def test_a_tiny_object_is_too_small_for_a_head():
@@ -167,12 +200,25 @@ def test_none_takes_everything_brighter_than_the_background():
     assert result.method == "none" and result.volume_ml == pytest.approx(1540, rel=0.1)
 
 
+@needs_nilearn
+def test_a_ct_head_whose_air_is_0_is_told_from_an_mri_by_its_brain_without_contrast(head, found):
+    mri, inside = head
+    rng = np.random.default_rng(0)
+    skull = ndimage.binary_dilation(inside, iterations=4) & ~ndimage.binary_dilation(inside, iterations=2)
+    array = np.where(mri.array > 30, 1024.0, 0.0) + 0.1 * np.where(inside, mri.array, 0.0)  # 20 HU between tissues
+    array[skull] = 2000.0
+    ct = mri.with_array((array + rng.normal(0, 8, array.shape)).astype(np.float32))
+    recognition._head(mri, CoarseImage.of(mri), found.alignment)  # the MRI is taken
+    with pytest.raises(SimulationError, match=r"brain in this head differ by \d%, as in CT, expected 10% or more"):
+        recognition._head(ct, CoarseImage.of(ct), found.alignment)
+
+
 # ---- extraction ------------------------------------------------------------------------------------------------------
 
 
 @needs_nilearn
 def test_the_atlas_finds_the_brain_of_a_nodding_head_and_says_how_sure_it_is(head, found):
-    result, _, shares = found
+    result, shares = found.result, found.shares
     assert result.method == "atlas"
     assert dice(result.mask.array > 0, head[1]) > 0.95
     assert result.message.startswith("whole head: brain extracted by the atlas in ") and "overlap" in result.message
@@ -189,6 +235,30 @@ def test_a_cancelled_alignment_stops(head):
     with pytest.raises(Cancelled):
         find_brain(head[0], "atlas", progress=progress)
     assert time.perf_counter() - start < 20.0
+
+
+def on_other_voxels(mri, inside, spacing):
+    """The head and its brain with voxels of (i, j, k) mm, stored as sagittal slices with rows from the top."""
+    import SimpleITK as sitk
+
+    image = mri.to_sitk()
+    size = [int(n * old / new) for n, old, new in zip(image.GetSize(), image.GetSpacing(), spacing, strict=True)]
+    results = []
+    for source in (image, mri.with_array(inside.astype(np.float32)).to_sitk()):
+        grid = (size, sitk.Transform(), sitk.sitkLinear, source.GetOrigin(), spacing, source.GetDirection())
+        results.append(Volume.from_sitk(sitk.DICOMOrient(sitk.Resample(source, *grid), "PIL"), "resampled"))
+    return results[0], results[1].array > 0.5
+
+
+@needs_nilearn
+@pytest.mark.parametrize(
+    "spacing", [(5.0, 1.2, 1.2), pytest.param((1.0, 0.5, 0.5), marks=pytest.mark.slow)], ids=["thick", "fine"]
+)
+def test_the_atlas_finds_the_brain_in_anisotropic_voxels_of_a_sagittal_stack(head, spacing):
+    mri, inside = on_other_voxels(*head, spacing)
+    result = find_brain(mri, "atlas")
+    assert result.mask.array.shape == mri.array.shape
+    assert dice(result.mask.array > 0, inside) > 0.94
 
 
 def fake_robex(folder, script):
@@ -261,7 +331,7 @@ def test_the_mask_has_the_name_of_its_mri(tmp_path, name, mask):
 
 @needs_nilearn
 def test_a_kept_mask_is_read_instead_of_extracted_again(head, found):
-    result, place, _ = found
+    result, place = found.result, found.place
     again = find_brain(head[0], keep_at=place)
     assert again.seconds == 0.0 and "kept in" in again.message
     assert np.array_equal(again.mask.array, result.mask.array)
@@ -271,7 +341,7 @@ def test_a_kept_mask_is_read_instead_of_extracted_again(head, found):
 def test_an_edited_kept_mask_is_used_and_said_and_never_overwritten(head, found, tmp_path):
     import SimpleITK as sitk
 
-    image = sitk.ReadImage(str(found[1]))
+    image = sitk.ReadImage(str(found.place))
     array = sitk.GetArrayFromImage(image)
     array[: array.shape[0] // 2] = 0
     edited = sitk.GetImageFromArray(array)
@@ -346,7 +416,7 @@ def test_the_share_of_a_lesion_outside_the_mask_is_found_on_another_grid():
 @needs_nilearn
 def test_a_mask_that_cuts_the_vertex_is_said_and_a_whole_one_is_not(head, found):
     mri = head[0]
-    whole = found[0].mask.array > 0
+    whole = found.result.mask.array > 0
     assert cut_off(mri, whole) == ()
     cut = whole.copy()
     top = np.flatnonzero(whole.any(axis=(1, 2))).max()
@@ -446,5 +516,6 @@ def test_colin_on_his_side_is_refused(order, top):
 
 
 @needs_nilearn
-def test_the_alignment_finds_the_size_of_the_brain(head):
-    assert align_template(head[0]).size == pytest.approx(0.93, abs=0.02)
+def test_the_alignment_finds_the_size_and_the_nod_of_the_brain(found):
+    assert found.alignment.size == pytest.approx(0.93, abs=0.02)
+    assert found.alignment.turn_deg == pytest.approx(12.6, abs=3.0)  # 12 and 4 degrees about two axes

@@ -19,6 +19,7 @@ from SlicerUSSim.Logic.base.errors import required
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import mni152
+from SlicerUSSim.Logic.mri.distances import distance_to
 
 #: Voxel sizes of the template and the patient in the search, and width of the template's dark ring, mm
 _TEMPLATE_MM, _PATIENT_MM, _RING_MM = 5, 4.0, 6.0
@@ -148,20 +149,32 @@ class _Template:
         t1 = required(mni152(), "the brain atlas needs nilearn; install it with: pip install nilearn").t1
         step = slice(None, None, _TEMPLATE_MM)
         brain = t1.array > 0
-        spacing = t1.spacing_mm[::-1]
-        outside, inside = (cast(np.ndarray, ndimage.distance_transform_edt(side, spacing)) for side in (~brain, brain))
+        # Its voxels are of 1 mm.
+        outside, inside = (np.maximum(distance_to(side), 0.0) for side in (brain, ~brain))
         self.distance = t1.with_array((outside - inside).astype(np.float32))
         smooth = ndimage.gaussian_filter(t1.array.astype(np.float32), _TEMPLATE_MM / 2.4)
         self.image, self.is_brain = smooth[step, step, step], brain[step, step, step]
         used = self.distance.array[step, step, step] <= _RING_MM
         k, j, i = np.indices(used.shape)
         grid = _TEMPLATE_MM * np.stack([i, j, k], axis=-1)
-        self.grid_xyz = grid @ t1.ijk_to_ras[:3, :3].T + t1.ijk_to_ras[:3, 3]
-        self.centre = self.grid_xyz[self.is_brain].mean(axis=0)
+        grid_xyz = grid @ t1.ijk_to_ras[:3, :3].T + t1.ijk_to_ras[:3, 3]
+        self.brain_xyz = grid_xyz[self.is_brain]
+        self.centre = self.brain_xyz.mean(axis=0)
+        self.model = np.where(self.is_brain, self.image / self.image.max(), 0.0).astype(np.float32)
+        self._weight = self._windows(self.is_brain.astype(np.float32))
+        mean = self.local_mean(self.model)
+        self.local = mean, self.local_mean(self.model**2) - mean**2
         borders = np.quantile(self.image[self.is_brain], np.arange(1, _TEMPLATE_BINS - 1) / (_TEMPLATE_BINS - 1))
         classes = np.where(self.is_brain, np.digitize(self.image, borders) + 1, 0)
         coarse = used & (k % 2 == 0) & (j % 2 == 0) & (i % 2 == 0)
-        self.fine, self.coarse = (_Points(self.grid_xyz[at], classes[at], self.centre) for at in (used, coarse))
+        self.fine, self.coarse = (_Points(grid_xyz[at], classes[at], self.centre) for at in (used, coarse))
+
+    def _windows(self, values: np.ndarray) -> np.ndarray:
+        return ndimage.gaussian_filter(values, 10.0 / _TEMPLATE_MM)[self.is_brain]
+
+    def local_mean(self, values: np.ndarray) -> np.ndarray:
+        """(points of the brain,) means in Gaussian windows of 10 mm deviation of (k, j, i) values, 0 outside it."""
+        return self._windows(values) / self._weight
 
     def distance_on(self, grid: Volume, template_to_ras: np.ndarray) -> np.ndarray:
         matrix = self.distance.ras_to_ijk @ np.linalg.inv(template_to_ras) @ grid.ijk_to_ras
@@ -220,6 +233,19 @@ def align_coarse(
     report(1.0)
     size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     return Alignment(matrix, _agreement(image, matrix), size)
+
+
+def agreement_by_moments(image: CoarseImage, inside: np.ndarray, turn: np.ndarray) -> float:
+    """Best agreement (0 to 1) of nodding templates turned by (3, 3) `turn`, at the centre and of the size of `inside`.
+
+    `inside` (k, j, i) is the brain of an image that shows nothing else.
+    """
+    template, search = _template(), _Search(image, turn)
+    centre = image.origin + image.spacing_mm * np.argwhere(inside).mean(axis=0)[::-1]
+    sizes = inside.sum() * image.spacing_mm**3, template.is_brain.sum() * float(_TEMPLATE_MM) ** 3
+    log_percent = 100.0 * np.log(sizes[0] / sizes[1]) / 3.0
+    places = (np.array([*centre, pitch, 0.0, 0.0, log_percent]) for pitch in _PITCHES[::2])
+    return max(_agreement(image, search.matrix(place)) for place in places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,17 +323,11 @@ def _agreement(image: CoarseImage, template_to_ras: np.ndarray) -> float:
     Local, so that neither a bias field nor the contrast matters: it asks whether borders are in the same places.
     """
     template = _template()
-    mask = template.is_brain.astype(np.float32)
-    points = template.grid_xyz.reshape(-1, 3) @ template_to_ras[:3, :3].T + template_to_ras[:3, 3]
-    patient = image.at(points).reshape(mask.shape)
-    model = template.image / template.image.max()
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return ndimage.gaussian_filter(values * mask, 10.0 / _TEMPLATE_MM)[template.is_brain] / weight
-
-    weight = 1.0
-    weight = mean(np.ones_like(mask))
-    mean_model, mean_patient = mean(model), mean(patient)
-    covariance = mean(model * patient) - mean_model * mean_patient
-    variances = (mean(model**2) - mean_model**2) * (mean(patient**2) - mean_patient**2)
+    points = template.brain_xyz @ template_to_ras[:3, :3].T + template_to_ras[:3, 3]
+    patient = np.zeros(template.is_brain.shape, np.float32)
+    patient[template.is_brain] = image.at(points)
+    mean_model, variance_model = template.local
+    mean_patient = template.local_mean(patient)
+    covariance = template.local_mean(template.model * patient) - mean_model * mean_patient
+    variances = variance_model * (template.local_mean(patient**2) - mean_patient**2)
     return float(np.mean(covariance**2 / np.maximum(variances, 1e-10)))

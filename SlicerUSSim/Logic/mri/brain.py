@@ -172,13 +172,13 @@ def _extracted(mri: Volume, shown: Shown, method: str, report: Report) -> _Extra
 
 
 def _candidates(method: str) -> list[str]:
-    """Methods to try. The atlas is first, as it was the best and quickest of the three (docs/brain.md)."""
+    """Methods to try, in the order of their measured quality (docs/brain.md)."""
     if method != "auto":
         return [method]
     available = {
         "atlas": mni152() is not None,
-        "robex": extractors.robex_folder() is not None,
         "deepbet": extractors.has_deepbet(),
+        "robex": extractors.robex_folder() is not None,
     }
     found = [name for name, is_available in available.items() if is_available]
     require(

@@ -13,7 +13,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.orientation import how_it_lies, lies_otherwise
+from SlicerUSSim.Logic.mri.orientation import how_it_lies, lies_otherwise, stripped_lies_otherwise
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
 USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
@@ -24,6 +24,9 @@ LEAST_AGREEMENT = 0.16
 _MOST_TURN_DEG, _MOST_STRETCH, _SIZES = 48.0, 1.25, (0.74, 1.15)
 #: Share of the template's brain that must show tissue, and below which a user should look
 _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
+#: Between the 5th and 95th percentile of the inner brain, relative to its median. T1 and T2 had 0.46 to 0.82;
+#: CT whose air is stored as 0 has 0.01 to 0.05 (25 to 50 HU on 1000).
+_LEAST_CONTRAST = 0.1
 _REMEDY = "give a brain mask (--mask), or --skull-strip none to take everything brighter than the background"
 
 
@@ -90,6 +93,7 @@ def _on_constant_background(mri: Volume) -> np.ndarray | None:
     """(k, j, i) the brain of a skull-stripped image; None if it is not one.
 
     Its background has exactly one value, and its foreground the volume and the shape of a brain, without a skull.
+    Raises SimulationError if the brain does not lie as its header says.
     """
     values = mri.array
     border = np.concatenate([values[[0, -1]].ravel(), values[:, [0, -1]].ravel(), values[:, :, [0, -1]].ravel()])
@@ -105,7 +109,11 @@ def _on_constant_background(mri: Volume) -> np.ndarray | None:
     coarse = CoarseImage.of(mri.with_array(np.where(inside, 1.0, 0.0).astype(np.float32)))
     intensity = CoarseImage.of(mri.with_array(np.where(inside, values - values.min(), 0).astype(np.float32)))
     shape = coarse.array > 0.5
-    return inside if _is_brain_shaped(shape) and _has_tissues(intensity.array, shape) else None
+    if not (_is_brain_shaped(shape) and _has_tissues(intensity.array, shape)):
+        return None
+    wrong = stripped_lies_otherwise(intensity, shape, LEAST_AGREEMENT, _REMEDY) if mni152() is not None else None
+    require(wrong is None, wrong or "")
+    return inside
 
 
 def _is_brain_shaped(shape: np.ndarray) -> bool:
@@ -163,6 +171,12 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
     require(
         shown >= _LEAST_SHOWN,
         f"image shows only {shown:.0%} of a brain, expected a whole one; use a series of the whole head, or {_REMEDY}",
+    )
+    low, middle, high = np.percentile(np.pad(image.array, pad)[distance < -8.0], (5, 50, 95))
+    require(
+        high - low >= _LEAST_CONTRAST * middle,
+        f"the tissues of the brain in this head differ by {(high - low) / max(middle, 1e-9):.0%}, as in CT, expected "
+        f"{_LEAST_CONTRAST:.0%} or more of an MRI; use an MRI",
     )
     warnings = ()
     if shown < _USUAL_SHOWN:

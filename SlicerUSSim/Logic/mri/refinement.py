@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import resampled_to_ras
+from SlicerUSSim.Logic.mri.distances import distance_to
 
 _SPACING_MM = 1.2
 #: Brightness, relative to the brain nearby, between tissue and the skull or CSF of a T1
@@ -111,8 +112,8 @@ def _closed(inside: np.ndarray, radius: float) -> np.ndarray:
     """Closing with a ball, by distances, which is quick for large balls."""
     n = int(radius) + 2
     padded = np.pad(inside, n)
-    grown = ndimage.distance_transform_edt(~padded) <= radius  # type: ignore[operator]
-    return (ndimage.distance_transform_edt(grown) > radius)[n:-n, n:-n, n:-n]  # type: ignore[operator]
+    grown = distance_to(padded) <= radius
+    return (distance_to(~grown) > radius)[n:-n, n:-n, n:-n]
 
 
 def _connected(inside: np.ndarray, core: np.ndarray) -> np.ndarray:
