@@ -25,7 +25,7 @@ _PRIOR_EXPONENT = 0.3
 FILTER_BLUR = 1.5
 _START_ITERATIONS = 12
 #: Smallest and largest share of CSF, grey and white matter in the starts, and in a result without a warning
-START_SHARES = ((0.05, 0.15, 0.3), (0.3, 0.45))
+START_SHARES = ((0.05, 0.15, 0.3), (0.3, 0.45, 0.65))
 EXPECTED_SHARES = ((0.02, 0.4), (0.3, 0.75), (0.2, 0.6))
 
 
