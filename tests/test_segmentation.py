@@ -8,7 +8,10 @@ from hypothesis import given, settings, strategies as st
 from scipy.ndimage import uniform_filter
 
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
+from SlicerUSSim.Logic.mri.atlas import mni152
+from SlicerUSSim.Logic.mri.atlas_registration import register_atlas
 from SlicerUSSim.Logic.mri.classification import class_names, classify
+from SlicerUSSim.Logic.mri.field import estimate_field
 from SlicerUSSim.Logic.mri.filtering import guided_filter
 from SlicerUSSim.Logic.mri.histogram import Histogram
 from SlicerUSSim.Logic.mri.mixture import fit_mixture
@@ -248,9 +251,32 @@ def test_bias_correction_saves_the_classes_of_a_shaded_image():
     shaded = head.with_array(head.array * shade)
     plain = (segment_mri(shaded, bias_correction=False).labels.array == reference)[reference > 0].mean()
     result = segment_mri(shaded)
-    assert any("N4 applied" in line for line in result.notes)
+    assert any("across the brain: removed" in line for line in result.notes)
     corrected = (result.labels.array == reference)[reference > 0].mean()
-    assert corrected > max(plain + 0.1, 0.8)
+    assert corrected > max(plain + 0.1, 0.95)
+
+
+def test_the_field_found_with_the_tissues_is_the_one_that_was_applied():
+    """Of a field that varies by a tenth of its mean less than a third remains in grey and white matter."""
+    head = head_mri(2.0)
+    inside = head.array > 0
+    k, j, i = (np.linspace(-1, 1, n) for n in head.array.shape)
+    log = 0.25 * k[:, None, None] * j[:, None] + 0.18 * i + 0.15 * (i**2 - 0.4)
+    shaded = np.where(inside, head.array * np.exp(log), 0).astype(np.float32)
+    atlas = mni152()
+    if atlas is None:
+        pytest.skip("needs nilearn's MNI152")
+    prior = register_atlas(head, inside, atlas).prior(head, inside)
+    found = estimate_field(shaded, inside, head.spacing_mm, "t1", prior)
+    tissue = inside & (head.array > 60)
+    left = np.log(found.factor[tissue]) - log[tissue]
+    assert log[tissue].std() > 0.08
+    assert left.std() < log[tissue].std() / 3
+
+
+def test_a_brain_of_which_two_thirds_are_white_matter_keeps_its_grey():
+    """Starts with less white matter once put both means into the one peak: 110 and 110 instead of 85 and 110."""
+    np.testing.assert_allclose(segment_mri(head_mri(2.0)).means, [40, 85, 110], atol=2)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ _LEAST_GAP = 0.5
 #: Gain of the mean log-likelihood that the limits of the weights never cost in a brain, where it is below 0.02
 _MUCH_MORE_LIKELY = 0.1
 #: Smallest and largest share of CSF, grey and white matter in the starts, and in a result without a warning
-START_SHARES = ((0.05, 0.15, 0.3), (0.3, 0.45))
+START_SHARES = ((0.05, 0.15, 0.3), (0.3, 0.45, 0.65))
 EXPECTED_SHARES = ((0.02, 0.4), (0.3, 0.75), (0.2, 0.6))
 
 

@@ -26,7 +26,7 @@ from SlicerUSSim.Logic.mri.mixture import fit_mixture
 #: degree. With degree 5 the field follows the tissues: on phantoms it leaves 4 % instead of 2 %
 _DEGREE, _EXPECTED = 3, 0.3
 #: Millimetres between the voxels that are used
-_STEP_MM = 3.0
+_STEP_MM = 4.0
 _MOST_STEPS, _EM_PER_STEP, _LEAST_CHANGE = 8, 4, 0.004
 #: Bins of the histogram, and deviation in voxels of the Gaussian against noise
 _BINS, _SIGMA = 160, 0.7

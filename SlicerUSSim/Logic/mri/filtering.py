@@ -11,7 +11,7 @@ from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 
 #: Standard deviation in voxels of the Gaussian before the guided filter, which makes a calmer guide, and the filter's
 #: strength per noise that the Gaussian leaves; chosen on MNI152 phantoms at 3 and 7 % noise
-_GAUSSIAN, _EPSILON_PER_NOISE = 0.5, 1.0
+_GAUSSIAN, _EPSILON_PER_NOISE = 0.4, 1.5
 
 
 def denoised(

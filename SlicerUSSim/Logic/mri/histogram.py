@@ -68,7 +68,7 @@ def _outliers(levels: np.ndarray, size: np.ndarray, contrasts: tuple[str, ...]) 
     Several channels: one class, uniform. One channel: one below and one above the middle of the range, since what may
     be an outlier depends on the side: CSF is the darkest tissue in T1, but bone and flowing blood are darker in T2.
     """
-    if len(contrasts) > 1:
+    if len(contrasts) != 1:
         return np.full((1, len(levels)), 1.0 / np.prod(size)), np.array([_OUTLIERS_OF_SEVERAL])
     low = levels.min()
     middle = low + 0.5 * float(size.sum())
