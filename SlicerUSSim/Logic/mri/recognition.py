@@ -13,15 +13,15 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.orientation import how_it_lies, lies_otherwise, stripped_lies_otherwise
+from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, how_it_lies, lies_otherwise, stripped_lies_otherwise
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
 USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
 #: Least agreement with the template (Alignment.agreement). Heads and brains that were tried had 0.19 (proton density)
 #: to 0.88; CT, bodies, phantoms, and heads that lie wrongly 0.00 to 0.14.
 LEAST_AGREEMENT = 0.16
-#: A patient in a scanner nods by up to 40 degrees; brains of adults differ by less than this in shape and size.
-_MOST_TURN_DEG, _MOST_STRETCH, _SIZES = 48.0, 1.25, (0.74, 1.15)
+#: Brains of adults differ by less than this in shape and size.
+_MOST_STRETCH, _SIZES = 1.25, (0.74, 1.15)
 #: Share of the template's brain that must show tissue, and below which a user should look
 _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
 #: Between the 5th and 95th percentile of the inner brain, relative to its median. T1 and T2 had 0.46 to 0.82;
@@ -54,7 +54,7 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     if mni152() is None:
         return Shown(None, warnings=("without nilearn it is not checked that the image shows a head",))
     alignment = align_coarse(image, progress=lambda share: report(0.1 + 0.9 * share))
-    is_plausible = alignment.turn_deg <= _MOST_TURN_DEG and alignment.stretch <= _MOST_STRETCH
+    is_plausible = alignment.turn_deg <= MOST_TURN_DEG and alignment.stretch <= _MOST_STRETCH
     is_plausible &= _SIZES[0] <= alignment.size <= _SIZES[1]
     if alignment.agreement < LEAST_AGREEMENT or not is_plausible:
         raise SimulationError(how_it_lies(image, alignment, LEAST_AGREEMENT, _REMEDY))
