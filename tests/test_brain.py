@@ -175,6 +175,17 @@ def test_a_tiny_object_is_too_small_for_a_head():
         find_brain(Volume(mri.array, mri.ijk_to_ras @ np.diag([0.3, 0.3, 0.3, 1.0])))
 
 
+def test_a_body_is_refused_at_once():
+    """Not searched for a brain, which takes longer the more there is."""
+    k, j, i = np.indices((40, 30, 44))
+    torso = ((i - 21.5) / 20.0) ** 2 + ((j - 14.5) / 13.0) ** 2 < 1
+    noise = np.random.default_rng(2).normal(0.0, 3.0, torso.shape)
+    image = np.abs(np.where(torso, 100.0 + 30.0 * np.sin(0.5 * k) * np.cos(0.4 * j), 0.0) + noise)
+    with pytest.raises(SimulationError, match=r"2\d litres of tissue in .* too much for a head, as a body has"):
+        find_brain(Volume(image.astype(np.float32), np.diag([9.0, 9.0, 9.0, 1.0])))
+
+
+
 @needs_nilearn
 def test_half_a_head_is_refused_with_where_it_is_cut(head, monkeypatch):
     monkeypatch.setattr(orientation, "_turns", lambda: [])

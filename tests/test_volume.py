@@ -165,3 +165,18 @@ def test_only_rotations_with_translation_pass_as_poses(matrix):
     pose[:3, :3] *= 1.1
     with pytest.raises(SimulationError, match="not rigid"):
         check_rigid("pose", pose)
+
+
+def test_voxels_that_are_no_numbers_are_told_before_they_are_read_as_zero(tmp_path, caplog):
+    """ITK replaces them without a word."""
+    nibabel = pytest.importorskip("nibabel")
+    values = np.ones((6, 7, 8), np.float32)
+    values[2, 3] = np.nan
+    nibabel.Nifti1Image(values, np.eye(4)).to_filename(tmp_path / "mri.nii.gz")
+    volume = Volume.read(tmp_path / "mri.nii.gz")
+    assert "8 of 336 voxels are not finite numbers; NaN is read as 0" in caplog.text
+    assert (volume.array == 0).sum() == 8
+    caplog.clear()
+    nibabel.Nifti1Image(np.ones((6, 7, 8), np.float32), np.eye(4)).to_filename(tmp_path / "good.nii.gz")
+    Volume.read(tmp_path / "good.nii.gz")
+    assert not caplog.text

@@ -85,3 +85,15 @@ def _distance_mm(one: np.ndarray, other: np.ndarray, size) -> float:
     """Largest distance between the positions of a corner of the volume under two (4, 4) maps."""
     corners = np.array([[*corner, 1] for corner in itertools.product(*((0, n - 1) for n in size[:3]))], float)
     return float(np.linalg.norm((corners @ (one - other).T)[:, :3], axis=1).max())
+
+
+def warn_of_nan(path: Path, image) -> None:
+    """Warn if a NIfTI file has voxels that are not numbers: ITK reads them as 0 without a word."""
+    if not (image.HasMetaDataKey("sform_code") and "float" in image.GetPixelIDTypeAsString()):
+        return
+    import nibabel
+
+    stored = np.asanyarray(nibabel.load(path).dataobj)  # type: ignore[attr-defined]
+    bad = int(stored.size - np.isfinite(stored).sum())
+    if bad:
+        _log.warning("%s: %d of %d voxels are not finite numbers; NaN is read as 0", path, bad, stored.size)

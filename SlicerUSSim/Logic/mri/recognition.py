@@ -156,6 +156,12 @@ def _check_size(image: CoarseImage) -> None:
         f"image shows {millilitres:.0f} ml of tissue in {size} mm, too little for a head; check the voxel size in its "
         f"header, or {_REMEDY}",
     )
+    # A head with neck has 4 to 6 litres. Nothing of a body is searched for a brain, which would take minutes.
+    require(
+        millilitres <= 9000.0,
+        f"image shows {millilitres / 1000.0:.0f} litres of tissue in {size} mm, too much for a head, as a body has; "
+        f"check the voxel size in its header, or {_REMEDY}",
+    )
 
 
 def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:

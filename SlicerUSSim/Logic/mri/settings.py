@@ -29,8 +29,8 @@ class SegmentationSettings(Declared):
         option="thin-sulci/no-thin-sulci", note="segment_mri itself has it off by default",
     )  # fmt: skip
     bias_correction: bool | None = parameter(
-        None, "Correct the bias field", "Apply N4, for scans with an intensity gradient; takes some seconds; none: "
-        "decided from the image", shown=True, option="bias-correction/no-bias-correction",
+        None, "Correct the bias field", "Remove the bias field, for scans with an intensity gradient; none: decided "
+        "from the image", shown=True, option="bias-correction/no-bias-correction",
     )  # fmt: skip
     filter_radius: int = parameter(
         1, "Filter radius", "Radius of the guided filter; 0: none", unit="voxels", bounds=(0, 64), option="radius"

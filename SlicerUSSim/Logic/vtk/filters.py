@@ -153,7 +153,7 @@ class SegmentationFilter(_ImageFilter):
         self._set("filter_epsilon", epsilon)
 
     def SetBiasCorrection(self, on: bool | None) -> None:
-        """Apply N4, for scans with an intensity gradient; None: decided from the image."""
+        """Remove the bias field, for scans with an intensity gradient; None: decided from the image."""
         self._set("bias_correction", None if on is None else bool(on))
 
     def SetThinSulci(self, on: bool) -> None:
