@@ -185,7 +185,6 @@ def test_a_body_is_refused_at_once():
         find_brain(Volume(image.astype(np.float32), np.diag([9.0, 9.0, 9.0, 1.0])))
 
 
-
 @needs_nilearn
 def test_half_a_head_is_refused_with_where_it_is_cut(head, monkeypatch):
     monkeypatch.setattr(orientation, "_turns", lambda: [])

@@ -103,7 +103,7 @@ def test_a_build_is_logged_with_its_options_and_the_next_use_as_known(log):
 def test_segmentation_says_what_it_found_and_how_long_it_took(log):
     segment_mri(head_mri(3.0), thin_sulci=True)
     found = "\n".join(messages(log, logging.INFO))
-    for part in ("skull-stripped brain, 1855 ml", "led by the MNI152 atlas", "N4 not applied", "thin sulci:"):
+    for part in ("skull-stripped brain, 1855 ml", "led by the MNI152 atlas", "left as it is", "thin sulci:"):
         assert part in found
     assert re.search(r"segmentation: brain \d+ ms, atlas \d+ ms, .*mixture \d+ ms", messages(log)[-1])
 
@@ -309,7 +309,7 @@ def test_files_that_were_asked_for_leave_stdout_empty(files, tmp_path):
 def test_segment_prints_its_tissues_alone(files, tmp_path):
     result = ussim("segment", files / "head.nii.gz", "-o", tmp_path / "labels.nii.gz", "-vv")
     lines = [line.split() for line in result.stdout.splitlines()]
-    assert [line[0] for line in lines] == ["label", "1", "2", "3"] and lines[1][1] == "csf"
+    assert [line[0] for line in lines] == ["label", "1", "2", "3", "4"] and lines[1][1] == "csf"
     assert "wrote" in result.stderr and "ussim: debug: segmentation: " in result.stderr
 
 

@@ -300,8 +300,8 @@ def test_the_parameter_node_has_the_declared_defaults_and_both_sides_read_what_t
     typed.contrast, typed.fit_evaluations, typed.show_in_slice = "flair", 70, False
     assert (parameters.contrast, parameters.fit.evaluations, parameters.show_in_slice) == ("flair", 70, False)
     assert session.ui.contrastComboBox.currentText() == "flair" and not session.ui.showInSliceCheckBox.isChecked()
-    parameters.classes, parameters.real = 4, session.head()
-    assert typed.classes == 4 and typed.real is parameters.real
+    parameters.filter_radius, parameters.real = 4, session.head()
+    assert typed.filter_radius == 4 and typed.real is parameters.real
 
 
 def test_the_modules_own_test_passes(module):
@@ -343,7 +343,9 @@ def test_every_declared_parameter_that_is_shown_is_in_the_panel_with_tip_unit_an
     for name, entry in shown.items():
         widget = controls[name][1]
         assert entry.tip in widget.toolTip(), name
-        if entry.type is bool:
+        if entry.type is bool and entry.can_be_none:
+            assert [widget.itemText(n) for n in range(widget.count())] == ["automatic", "on", "off"]
+        elif entry.type is bool:
             assert widget.text() == entry.label
         elif entry.shown is not True:
             assert (widget.property("minimum"), widget.property("maximum")) == (entry.shown.low, entry.shown.high), name
@@ -821,7 +823,8 @@ def test_closing_the_scene_and_leaving_the_module_is_survived(session):
     session.head()
     session.widget.enter()
     session.ui.segmentButton.click()
-    assert session.parameters.labels is not None and not session.app.errors
+    assert not session.app.errors
+    assert session.parameters.labels is not None
 
 
 def test_widgets_leave_the_scene_alone_while_another_module_is_open(session):

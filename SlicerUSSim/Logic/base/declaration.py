@@ -72,6 +72,8 @@ class Fit:
     tolerance: float
     #: Whether the search uses its logarithm, as for amplitudes
     is_logarithmic: bool = False
+    #: Whether it is free only by its own name, and not with the others of its owner
+    on_request: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

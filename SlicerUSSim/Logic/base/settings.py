@@ -130,7 +130,7 @@ class DisplaySettings(Declared):
         1.0, "TGC reach",
         "Part of the image depth over which TGC rises; from there on it stays, as an amplifier has a largest gain",
         bounds=(0, 1), shown=Shown(0, 1, 0.01, is_slider=True), option="tgc-reach",
-        fit=Fit(0.1, 1.0, tolerance=0.1),
+        fit=Fit(0.1, 1.0, tolerance=0.1, on_request=True),
     )  # fmt: skip
     noise_db: float | None = parameter(
         -80.0, "Noise",

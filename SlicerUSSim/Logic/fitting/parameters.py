@@ -1,8 +1,8 @@
 """Free parameters of an optimisation: names, physical bounds, conversion from numbers to tissues and display.
 
 A name is one of DISPLAY_BOUNDS ("gain_db"), or a tissue with one of TISSUE_BOUNDS ("white matter.mu0") or with
-"echogenicity_db". "display" means all of DISPLAY_BOUNDS, a tissue's name all of its parameters in TISSUE_BOUNDS, and
-"tissues" the echogenicity and attenuation of every tissue with scatterers.
+"echogenicity_db". "display" means all of DISPLAY_BOUNDS but those on request (Fit.on_request), a tissue's name all of
+its parameters in TISSUE_BOUNDS, and "tissues" the echogenicity and attenuation of every tissue with scatterers.
 
 Speckle shows a tissue's Var = p (1 - p) mu0^2 + p sigma0^2 and not mu0, mu1 and sigma0 one by one. Echogenicity,
 10 log10 Var, varies with a common factor of mu0 and sigma0, so it replaces three parameters by the one that is seen.
@@ -214,7 +214,8 @@ def _meant_by(name: str, tissues: TissueTable) -> list[tuple[str, Bounds]]:
     """(full name, default bounds) of every parameter that `name` includes."""
     known = list(dict.fromkeys(tissue.name for tissue in tissues.all_tissues()))
     if name == "display":
-        return list(DISPLAY_BOUNDS.items())
+        declared = {known: cast(Fit, entry.fit) for known, entry in DISPLAY_PARAMETERS.items() if entry.fit}
+        return [(known, DISPLAY_BOUNDS[known]) for known, search in declared.items() if not search.on_request]
     if name in DISPLAY_BOUNDS:
         return [(name, DISPLAY_BOUNDS[name])]
     if name == TISSUES:

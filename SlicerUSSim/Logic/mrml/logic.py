@@ -128,7 +128,7 @@ class UltrasoundSceneLogic:
         text = self.parameters.preset
         if text != self._preset[0]:
             try:
-                values = json.loads(text)
+                values = json.loads(text or "{}")
             except ValueError as error:
                 raise SimulationError(f"the scene's preset is not JSON ({error})") from None
             self._preset = (text, Preset.from_dict(values, "the scene's preset"))
