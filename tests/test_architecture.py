@@ -67,7 +67,7 @@ class Tree:
     def __init__(self, root: Path) -> None:
         folder = root / PACKAGE
         self.paths = {_module_name(path, root): path for path in sorted(folder.rglob("*.py"))}
-        self.sources = {name: ast.parse(path.read_text()) for name, path in self.paths.items()}
+        self.sources = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in self.paths.items()}
         #: {package: {name: module that defines it}}
         self.faces = {name: _exports(name, source) for name, source in self.sources.items() if _is_face(source)}
         self.imports = [found for name in self.paths for found in self.imports_of(name, self.sources[name])]
@@ -272,7 +272,7 @@ def test_examples_and_benchmarks_know_no_workstation_and_no_panel(tree):
     for path in [*(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]:
         if path.stem == "dragging":
             continue
-        found = tree.imports_of(f"{path.parent.name}.{path.stem}", ast.parse(path.read_text()))
+        found = tree.imports_of(f"{path.parent.name}.{path.stem}", ast.parse(path.read_text(encoding="utf-8")))
         rooms = {room_of(entry.imported) for entry in found if entry.imported in tree.paths}
         assert not rooms & {"Workstation", "Widget", "Command"}, path.name
 

@@ -455,3 +455,20 @@ def test_the_published_glioma_of_a_patient_lies_in_her_head():
     glioma = Volume.read(SHARED / "remind022" / "glioma.nii.gz")
     result = add_tissue(labels, ["brain"], glioma, "tumour", source="glioma.nii.gz")
     assert result.messages[0].startswith("tumour: 799 voxels, 0.8 ml, added over brain ")
+
+
+def test_segment_never_replaces_its_inputs_and_takes_no_labels_for_an_mri(tmp_path):
+    head = tmp_path / "head.nii.gz"
+    mri = head_mri(4.0)
+    mri.write(head)
+    before = head.read_bytes()
+    same = ussim("segment", head, "-o", head, "--overwrite")
+    assert same.exit_code == 2 and "which is an input" in same.output and head.read_bytes() == before
+    labels, mask = tmp_path / "labels.nii.gz", tmp_path / "tumour.nii.gz"
+    values = np.digitize(mri.array, [20, 62, 97])
+    mri.with_array(values.astype(np.uint8)).write(labels)
+    mri.with_array((values == 3).astype(np.uint8)).write(mask)
+    told = ussim("segment", labels, "-o", tmp_path / "out.nii.gz").output
+    assert "is a label map" in told and f"ussim simulate {labels}" in told
+    assert f"--add tumour={mask}" in ussim("segment", mask, "-o", tmp_path / "out.nii.gz").output
+    assert not (tmp_path / "out.nii.gz").exists()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,7 +13,11 @@ from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.mri_options import also_option, segmented_file, split_also
 from SlicerUSSim.Command.options import check_output, device_option, gathered, mask_option
 from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.base.volume import Volume
 
 
 @click.command()
@@ -42,15 +47,40 @@ def segment(
     from SlicerUSSim.Logic.tissue.table import TissueTable
 
     check_output(out)
+    _require_no_input(out, mri, mask, also, additions)
     if not overwrite:
         require_replaceable(out)
     split_also(also)
     masks = Additions.read(additions)
     volume = Volume.read(mri)
+    if mask is None and settings.skull_strip != "none":
+        _require_mri(mri, volume)
     start = perf_counter()
     result = segmented_file(mri, volume, asdict(settings), mask=mask, also=also, device=device, tell_all=True)
     seconds = perf_counter() - start
     added = masks.on(result.labels, result.tissue_names)
     beside = write_label_files(out, added.labels, TissueTable.brain(added.tissue_names))
-    click.echo(result.table())
+    click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")
+
+
+def _require_no_input(out: Path, mri: str, mask: str | None, also: tuple[str, ...], additions: tuple[str, ...]) -> None:
+    """Raise SimulationError if the output would replace one of the inputs, also with --overwrite."""
+    files = [mri, *([] if mask is None else [mask]), *(text.partition("=")[2] for text in (*also, *additions))]
+    for file in files:
+        require(
+            not (out.exists() and Path(file).exists() and out.samefile(file)),
+            f"-o is {out}, which is an input, expected another name",
+        )
+
+
+def _require_mri(path: str, volume: Volume) -> None:
+    """Raise SimulationError, saying what it is, for a label map or a mask."""
+    from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file
+
+    if is_label_file(Path(path), volume):
+        found = read_label_file(Path(path), volume)  # refuses a mask, and says how to add it
+        raise SimulationError(
+            f"{path}: is a label map ({found.message}), expected an MRI; use it as it is (ussim simulate {path} ...), "
+            "or segment it all the same with --skull-strip none"
+        )

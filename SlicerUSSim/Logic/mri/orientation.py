@@ -72,9 +72,16 @@ def how_it_lies(image: CoarseImage, alignment: Alignment, least: float, remedy: 
             f"{alignment.size:.2f} times as large and stretched by a factor of {alignment.stretch:.2f}, more than any "
             f"adult's head; check the orientation and the voxel size in its header, or {remedy}"
         )
+    if alignment.agreement < least:
+        fits = f"{alignment.agreement:.2f}, expected {least:g} or more"
+    else:
+        fits = (
+            f"{alignment.agreement:.2f}, but only if turned by {alignment.turn_deg:.0f} degrees, {alignment.size:.2f} "
+            f"times as large and stretched by a factor of {alignment.stretch:.2f}"
+        )
     return message or (
-        f"no head or brain is recognised in this {size} mm image (agreement with the atlas {alignment.agreement:.2f}, "
-        f"expected {least:g} or more in a usual position{_cut_ends(image)}); {remedy}"
+        f"no head or brain is recognised in this {size} mm image (agreement with the atlas {fits}{_cut_ends(image)}); "
+        f"{remedy}"
     )
 
 
