@@ -21,8 +21,8 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
   STORE_PAIRS(sum_re, sum_im, iq + 2 * (line * samples + sample));
 }
 
-// Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC rises by tgc_per_sample [dB] until
-// sample tgc_samples and stays there.
+// Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC rises by tgc_per_sample [dB]
+// until sample tgc_samples and stays there.
 __kernel void compress(__global const float *iq, int samples, float noise, uint noise_seed, float tgc_per_sample,
                        float tgc_samples, float level_of_white_db, Display display, __global float *envelope,
                        __global uchar *grey) {
