@@ -378,6 +378,17 @@ def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
     assert "was not written by ussim" in kept.text and place.read_bytes() == before
 
 
+def test_a_mask_edited_in_a_program_that_keeps_no_notes_is_the_users(head, found, tmp_path):
+    path = tmp_path / "head.brain-mask.nrrd"
+    edited = found.result.mask.array.copy()
+    edited[:, : edited.shape[1] // 2] = 0
+    head[0].with_array(edited).write(path)  # without the entries of `keep`
+    used = find_brain(head[0], keep_at=path)
+    assert np.array_equal(used.mask.array > 0, edited > 0) and "edited" in used.message
+    Volume(edited, np.eye(4)).write(path)
+    assert brain_module.read_kept(path, head[0], "auto") is None
+
+
 def test_a_mask_of_another_image_or_method_is_not_used(tmp_path):
     mri = head_mri(4.0)
     place = tmp_path / "head.brain-mask.nrrd"
