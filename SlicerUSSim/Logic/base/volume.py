@@ -77,6 +77,11 @@ class Volume:
         return np.linalg.norm(self.ijk_to_ras[:3, :3], axis=0)
 
     @property
+    def voxel_ml(self) -> float:
+        """Volume of a voxel in millilitres."""
+        return float(abs(np.linalg.det(self.ijk_to_ras[:3, :3])) / 1000.0)
+
+    @property
     def ras_to_ijk(self) -> np.ndarray:
         """(4, 4) inverse of ijk_to_ras."""
         return np.linalg.inv(self.ijk_to_ras)

@@ -94,12 +94,15 @@ class CoarseImage:
         """(k, j, i) True where it is brighter than air: the largest component, with its holes filled."""
         from skimage.filters import threshold_otsu
 
-        inside = self.array > 0.5 * threshold_otsu(self.array)
-        components, count = ndimage.label(inside)  # type: ignore[misc]
-        if count > 1:
-            inside = components == np.argmax(np.bincount(components.ravel())[1:]) + 1
+        inside = largest_component(self.array > 0.5 * threshold_otsu(self.array))
         closed = ndimage.binary_closing(np.pad(inside, 3), iterations=2)[3:-3, 3:-3, 3:-3]
         return ndimage.binary_fill_holes(closed | inside)  # type: ignore[return-value]
+
+
+def largest_component(inside: np.ndarray) -> np.ndarray:
+    """(k, j, i) the largest connected part of a mask."""
+    components, count = ndimage.label(inside)  # type: ignore[misc]
+    return inside if count < 2 else components == np.argmax(np.bincount(components.ravel())[1:]) + 1
 
 
 def resampled_to_ras(mri: Volume, spacing_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -134,10 +137,11 @@ class _Points:
         bins = np.minimum((values * (_PATIENT_BINS - 1) + 0.5).astype(np.int64), _PATIENT_BINS - 1)
         joint = np.bincount(self.classes * _PATIENT_BINS + bins, minlength=_TEMPLATE_BINS * _PATIENT_BINS)
         joint = joint.reshape(_TEMPLATE_BINS, _PATIENT_BINS) / len(values)
-        return _entropy(joint.sum(axis=0)) + _entropy(joint.sum(axis=1)) - _entropy(joint)
+        return entropy(joint.sum(axis=0)) + entropy(joint.sum(axis=1)) - entropy(joint)
 
 
-def _entropy(shares: np.ndarray) -> float:
+def entropy(shares: np.ndarray) -> float:
+    """Entropy in nats of shares that add up to 1."""
     shares = shares[shares > 0]
     return float(-(shares * np.log(shares)).sum())
 

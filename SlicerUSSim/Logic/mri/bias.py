@@ -68,7 +68,7 @@ def corrected(
 def _strength(factor: np.ndarray, inside: np.ndarray) -> float:
     step = (slice(None, None, 3),) * 3
     low, high = np.percentile(factor[step][inside[step]], (5, 95))
-    return float(high / low - 1.0)
+    return float(high / low - 1.0) if low > 0 else np.inf
 
 
 def _about(contrast: str, strength: float, wanted: bool | None, how: str) -> str:

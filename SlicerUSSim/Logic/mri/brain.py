@@ -232,4 +232,4 @@ def _volume_warnings(millilitres: float) -> tuple[str, ...]:
 
 
 def _millilitres(inside: np.ndarray, grid: Volume) -> float:
-    return float(inside.sum() * abs(np.linalg.det(grid.ijk_to_ras[:3, :3])) / 1000.0)
+    return float(inside.sum() * grid.voxel_ml)

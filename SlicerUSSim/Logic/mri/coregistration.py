@@ -8,6 +8,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.alignment import entropy
 
 #: Millimetres of the registration's grid
 _COARSE_MM = 3.0
@@ -88,11 +89,6 @@ def normalised_information(first: np.ndarray, second: np.ndarray, bins: int = 48
         return 1.0
     joint = np.histogram2d(*clipped, bins=edges)[0]
     joint /= joint.sum()
-
-    def entropy(share: np.ndarray) -> float:
-        share = share[share > 0]
-        return -float((share * np.log(share)).sum())
-
     return (entropy(joint.sum(axis=0)) + entropy(joint.sum(axis=1))) / entropy(joint.ravel())
 
 

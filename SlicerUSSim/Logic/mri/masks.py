@@ -43,7 +43,7 @@ class Masks:
     @property
     def volume_ml(self) -> float:
         """Of all tissues, on their own grid."""
-        return float(self.inside.sum() * abs(np.linalg.det(self.union.ijk_to_ras[:3, :3])) / 1000.0)
+        return float(self.inside.sum() * self.union.voxel_ml)
 
 
 def read_masks(volume: Volume, tissue: str, source: str) -> Masks:

@@ -66,22 +66,19 @@ def how_it_lies(image: CoarseImage, alignment: Alignment, least: float, remedy: 
     """One line about an image that the atlas does not fit: where the head lies, or that there is none."""
     size = " x ".join(f"{n * image.spacing_mm:.0f}" for n in image.array.shape[::-1])
     message = lies_otherwise(image, alignment, least, remedy)
+    position = (
+        f"only if turned by {alignment.turn_deg:.0f} degrees, {alignment.size:.2f} times as large and stretched by a "
+        f"factor of {alignment.stretch:.2f}"
+    )
     if message is None and alignment.agreement >= 2.0 * least:
         message = (
-            f"the atlas fits this {size} mm image only if turned by {alignment.turn_deg:.0f} degrees, "
-            f"{alignment.size:.2f} times as large and stretched by a factor of {alignment.stretch:.2f}, more than any "
-            f"adult's head; check the orientation and the voxel size in its header, or {remedy}"
+            f"the atlas fits this {size} mm image {position}, more than any adult's head; check the orientation and "
+            f"the voxel size in its header, or {remedy}"
         )
-    if alignment.agreement < least:
-        fits = f"{alignment.agreement:.2f}, expected {least:g} or more"
-    else:
-        fits = (
-            f"{alignment.agreement:.2f}, but only if turned by {alignment.turn_deg:.0f} degrees, {alignment.size:.2f} "
-            f"times as large and stretched by a factor of {alignment.stretch:.2f}"
-        )
+    expected = f"expected {least:g} or more" if alignment.agreement < least else f"but {position}"
     return message or (
-        f"no head or brain is recognised in this {size} mm image (agreement with the atlas {fits}{_cut_ends(image)}); "
-        f"{remedy}"
+        f"no head or brain is recognised in this {size} mm image (agreement with the atlas {alignment.agreement:.2f}, "
+        f"{expected}{_cut_ends(image)}); {remedy}"
     )
 
 

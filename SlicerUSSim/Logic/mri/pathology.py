@@ -161,7 +161,7 @@ def _added(labels: Volume, names: Sequence[str], masks: Masks) -> Added:
         f"{masks.source}: covers {100 * met / patient:.0f} % of the patient, expected a lesion in it; is it the mask "
         "of the brain (--mask)?",
     )
-    voxel_mm3 = abs(np.linalg.det(labels.ijk_to_ras[:3, :3]))
+    voxel_mm3 = 1000.0 * labels.voxel_ml
     require(
         covered.size > 0,
         f"{masks.source}: {masks.volume_ml * 1000:.2g} mm³ are too small for the voxels of the labels, "

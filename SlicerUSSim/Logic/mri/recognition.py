@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse
+from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse, largest_component
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, how_it_lies, lies_otherwise, stripped_lies_otherwise
 
@@ -101,9 +101,9 @@ def _on_constant_background(mri: Volume) -> np.ndarray | None:
     background = levels[counts.argmax()]
     if counts.max() < 0.5 * border.size or (values == background).mean() < 0.15:
         return None
-    inside = _largest(values != background)
+    inside = largest_component(values != background)
     inside = cast(np.ndarray, ndimage.binary_fill_holes(inside))
-    millilitres = inside.sum() * _voxel_ml(mri)
+    millilitres = inside.sum() * mri.voxel_ml
     if not POSSIBLE_ML[0] <= millilitres <= 2300.0:
         return None
     coarse = CoarseImage.of(mri.with_array(np.where(inside, 1.0, 0.0).astype(np.float32)))
@@ -200,16 +200,7 @@ def above_noise(mri: Volume) -> np.ndarray:
     from skimage.filters import threshold_otsu
 
     # Half: Otsu's threshold itself would exclude CSF in T1.
-    return ndimage.binary_fill_holes(_largest(mri.array > 0.5 * threshold_otsu(mri.array)))  # type: ignore[return-value]
-
-
-def _largest(inside: np.ndarray) -> np.ndarray:
-    components, count = ndimage.label(inside)  # type: ignore[misc]
-    return inside if count < 2 else components == np.argmax(np.bincount(components.ravel())[1:]) + 1
-
-
-def _voxel_ml(volume: Volume) -> float:
-    return float(abs(np.linalg.det(volume.ijk_to_ras[:3, :3])) / 1000.0)
+    return ndimage.binary_fill_holes(largest_component(mri.array > 0.5 * threshold_otsu(mri.array)))  # type: ignore[return-value]
 
 
 def _matrix(image: CoarseImage) -> np.ndarray:

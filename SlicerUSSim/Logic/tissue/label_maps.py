@@ -147,7 +147,7 @@ class _Reading:
         names = {label: self._names.get(label, scheme.names.get(label) if scheme else None) for label in self._present}
         found = {label: self._tissue(label, name) for label, name in names.items()}
         findings = Findings(
-            self._source, self._counts, abs(np.linalg.det(self._volume.ijk_to_ras[:3, :3])) / 1e3, names, found,
+            self._source, self._counts, self._volume.voxel_ml, names, found,
             scheme or scheme_with_names(self._names), self._mapping, self._tissues, self._advice,
         )  # fmt: skip
         findings.require_patient()

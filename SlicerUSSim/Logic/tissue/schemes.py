@@ -163,7 +163,7 @@ def _of_brain(labels: Volume, values: list[int]) -> Recognition:
     if 4 in values and 3 not in values:  # a brain without white matter, but with thin sulci, is none
         return Recognition(known["brats-2022"])
     filled = int(np.count_nonzero(labels.array))
-    volume_ml = filled * abs(np.linalg.det(labels.ijk_to_ras[:3, :3])) / 1e3
+    volume_ml = filled * labels.voxel_ml
     if volume_ml < _LARGEST_LESION_ML and filled < _LARGEST_LESION_SHARE * labels.array.size:
         return Recognition(known["brats"])
     return Recognition(known["ussim"] if {2, 3} <= set(values) and _is_grey_between(labels) else None)

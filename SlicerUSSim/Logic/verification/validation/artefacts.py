@@ -156,9 +156,11 @@ def reverberation(rotation: np.ndarray, device) -> Outcome:
         for n in range(1, len(echoes)):
             apart = echoes[n].shown_mm[1] - echoes[n - 1].shown_mm[1]
             fall = echoes[n].level_db - echoes[n - 1].level_db
+            with np.errstate(divide="ignore"):  # an echo that is not there at all is a finding too
+                found_fall = 20.0 * np.log10(found[n][2] / found[n - 1][2])
             rows += [
                 Row(f"distance to {echoes[n].name}, {name}", "mm", apart, found[n][1] - found[n - 1][1], tolerance),
-                Row(f"fall to {echoes[n].name}, {name}", "dB", fall, 20 * np.log10(found[n][2] / found[n - 1][2]), 0.5),
+                Row(f"fall to {echoes[n].name}, {name}", "dB", fall, found_fall, 0.5),
             ]
     view = View(phantom.name, phantom, probes["linear"], frames["linear"])
     return Outcome(tuple(rows), partial(draw_views, views=[view]))
