@@ -99,12 +99,16 @@ def estimate_field(
     log = np.zeros(len(raw), np.float32)
     for step in range(_MOST_STEPS):
         values = raw * np.exp(-log)
-        histogram = Histogram.of(values[None], (contrast,), prior, bins=_BINS)
+        histogram = Histogram.of(values[None], (contrast,), prior, bins=_BINS, voxel_mm=float(spacing_mm.mean()))
         if mixture is None:
             mixture = fit_one(histogram.points, contrast)
         else:
             mixture = fit_mixture(
-                histogram.points, mixture.means, np.sqrt(np.diag(mixture.covariance)), iterations=_EM_PER_STEP
+                histogram.points,
+                mixture.means,
+                np.sqrt(np.diag(mixture.covariance)),
+                iterations=_EM_PER_STEP,
+                spread=mixture.spread,
             )
         slope = -(mixture.slope(histogram.points) * histogram.points.values[:, 0])[histogram.point_of_voxel]
         slope = slope.astype(np.float32)

@@ -206,7 +206,8 @@ def segment_mri(
             f"MRI is constant ({channel[0]:g}) inside the foreground, expected tissues of different intensity"
             + (f" in {name}" if others else ""),
         )
-    found = classify(values, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0)
+    voxel_mm = float(mri.spacing_mm.mean())
+    found = classify(values, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0, voxel_mm)
     timed("mixture")
     found = replace(found, posteriors=smoothed_posteriors(found.posteriors, part.inside))
     timed("neighbours")
