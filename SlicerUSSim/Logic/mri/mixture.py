@@ -27,9 +27,10 @@ MOST_MIXED = np.array([0.25, 0.22])
 #: The same without knowledge of a brain
 ANY = np.full(_INSIDE, 1e-4)
 _MAX_ITERATIONS, _LEAST_GAIN = 150, 1e-6
-#: The tissue whose pure voxels differ among themselves, and their largest variance in units of the noise's. Grey matter
-#: does: cortex by its myelin, deep nuclei by their iron
-_WIDE, _WIDEST = 1, 4.0
+#: The tissue whose pure voxels differ among themselves, as cortex does by its myelin and deep nuclei by their iron; the
+#: largest variance of its voxels in units of the noise's, and the largest deviation of the tissue itself in units of the
+#: contrast of grey to white matter
+_WIDE, _WIDEST, _TISSUE_DEVIATION = 1, 4.0, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +200,18 @@ class _Parts:
         scatter = (values * used[:, None]).T @ values
         covariance = scatter - moment.T @ means - means.T @ moment + means.T @ normal @ means
         covariance = 0.5 * (covariance + covariance.T) / belonging[:_INSIDE].sum() + least
-        away = values - means[_WIDE]
-        own = belonging[_WIDE]
-        distance = np.einsum("pc,cd,pd->p", away, np.linalg.inv(covariance), away)
+        return means, covariance, self._spread_of(belonging[_WIDE], means, covariance)
+
+    def _spread_of(self, own: np.ndarray, means: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        """(K,) the most likely variance of the pure voxels of _WIDE, of which belong `own` (points,), in its limits."""
+        away = self._points.values - means[_WIDE]
+        inverse = np.linalg.inv(covariance)
+        distance = np.einsum("pc,cd,pd->p", away, inverse, away)
+        contrast = means[2] - means[1]
+        most = min(_WIDEST, 1.0 + _TISSUE_DEVIATION**2 * float(contrast @ inverse @ contrast))
         spread = np.ones(len(TISSUES))
-        spread[_WIDE] = np.clip(own @ distance / (own.sum() * values.shape[1] + 1e-12), 1.0, _WIDEST)
-        return means, covariance, spread
+        spread[_WIDE] = np.clip(own @ distance / (own.sum() * away.shape[1] + 1e-12), 1.0, most)
+        return spread
 
 
 def _inside(along: np.ndarray, length: float) -> np.ndarray:
