@@ -22,7 +22,7 @@ from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, class
 from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.neighbours import smoothed_posteriors
-from SlicerUSSim.Logic.mri.plausibility import implausible, is_whole_brain, require_contrast
+from SlicerUSSim.Logic.mri.plausibility import enhancement, implausible, is_whole_brain, require_contrast
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.sulci import sulcal_middles
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
@@ -213,6 +213,10 @@ def segment_mri(
     timed("neighbours")
     report(0.9)
     warnings += implausible(found, part.images[0], part.inside, atlas, contrast)
+    if contrasts == ("t1",):
+        grey, white = (float(found.means[names.index(name), 0]) for name in ("grey matter", "white matter"))
+        voxel_ml = float(np.prod(mri.spacing_mm)) / 1000.0
+        warnings += enhancement(filtered[0][0], part.inside, grey, white, voxel_ml)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
