@@ -26,8 +26,8 @@ FILTER_BLUR = 1.5
 _START_ITERATIONS = 12
 #: Distance of means, in standard deviations of the noise, below which two tissues are one
 _LEAST_GAP = 0.5
-#: Least contrast of CSF to grey matter by that of grey to white matter, in T1 and T2. CSF's relaxation times are three to
-#: four times those of grey matter, and these 1.3 to 1.6 times those of white matter (Wansapura et al., JMRI 9(4), 1999)
+#: Least contrast of CSF to grey matter by that of grey to white matter, in T1 and T2. CSF's T1 is about three times
+#: that of grey matter, which is 1.6 times that of white matter (Wansapura et al., JMRI 9(4), 1999); its T2 is further off
 _LEAST_CONTRAST = 1.0
 #: Gain of the mean log-likelihood that the limits of the weights never cost in a brain, where it is below 0.02
 _MUCH_MORE_LIKELY = 0.1
@@ -218,7 +218,7 @@ def _named(
         shares[tissue] += np.where((nearest == tissue) & ~bright, outside, 0.0)
     rows = [shares[TISSUES.index(name)] for name in names[: len(TISSUES)]]
     means = [mixture.means[TISSUES.index(name)] for name in names[: len(TISSUES)]]
-    deviations = [deviation] * len(TISSUES)
+    deviations = [deviation * np.sqrt(mixture.spread[TISSUES.index(name)]) for name in names[: len(TISSUES)]]
     if len(names) > len(TISSUES):
         rows.append(np.where(bright, outside, 0.0))
         weight = rows[-1] * points.counts

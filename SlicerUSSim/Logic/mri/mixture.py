@@ -1,10 +1,10 @@
-"""The mixture of tissues: three pure classes of one covariance, two mixed ones, and outliers; by EM.
+"""The mixture of tissues: three pure classes of nearly one covariance, two mixed ones, and outliers; by EM.
 
 A voxel of a pure class has the intensity of its tissue plus noise. A mixed voxel contains two neighbouring tissues in
 any proportion with equal probability, so its intensity lies on the line between their means (Laidlaw et al., IEEE TMI
 17(1), 1998; Shattuck et al., NeuroImage 13(5), 2001). Vessels, lesions and what the mask leaves of the skull are
 uniform outliers. The noise is the same everywhere, hence the common covariance: with free ones the widest class
-swallows its neighbours.
+swallows its neighbours. Grey matter alone may be a little wider, within limits: its tissue differs from place to place.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ MOST_MIXED = np.array([0.25, 0.22])
 ANY = np.full(_INSIDE, 1e-4)
 _MAX_ITERATIONS, _LEAST_GAIN = 150, 1e-6
 #: The tissue whose pure voxels differ among themselves, as cortex does by its myelin and deep nuclei by their iron; the
-#: largest variance of its voxels in units of the noise's, and the largest deviation of the tissue itself in units of the
-#: contrast of grey to white matter
+#: largest variance of its voxels in units of the noise's, and the largest deviation of the tissue itself in units of
+#: grey matter's contrast to white matter
 _WIDE, _WIDEST, _TISSUE_DEVIATION = 1, 4.0, 0.25
 
 
@@ -110,9 +110,10 @@ def fit_mixture(
     `least_weights` (5,) are lower limits of the weights of the pure classes and the mixed ones.
 
     Weights follow the spatial prior as in Ashburner and Friston, NeuroImage 26(3), 2005: a class's probability in a
-    voxel is its weight times its prior there, normalised. No step lowers the likelihood.
+    voxel is its weight times its prior there, normalised. No step lowers the likelihood, unless
+    the limit of grey matter's variance falls.
     """
-    values, counts = points.values, points.counts / points.counts.sum()
+    counts = points.counts / points.counts.sum()
     mixed = np.minimum(MOST_MIXED * max(points.voxel_mm, 1.0), 0.5)
     most = np.concatenate([np.ones(len(TISSUES)), mixed, points.limits])
     spread = np.ones(len(TISSUES)) if spread is None else spread

@@ -23,8 +23,9 @@ _LIKELY_CSF, _DEEP_MM = 0.3, 20.0
 #: Distance of grey and white matter's medians in the wrong order from which that is said, and from which it is refused,
 #: in units of the width of both together
 _APART, _FAR_APART = 0.25, 0.5
-#: Brightness above white matter in units of its contrast to grey matter, and least volume in one piece of what enhances.
-#: Largest pieces: 19.5 ml in a T1 with contrast agent (ReMIND-022), 0.65 ml in one with bright arteries, else 0.01 ml
+#: Brightness above white matter in units of its contrast to grey matter, and least volume in one piece of what
+#: enhances. Largest pieces: 19.5 ml in a T1 with contrast agent (ReMIND-022), 0.65 ml in one with bright arteries, and
+#: 0.01 ml in the others
 _ENHANCED, _ENHANCED_ML = 1.5, 2.0
 
 
