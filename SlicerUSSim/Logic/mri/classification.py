@@ -27,7 +27,7 @@ _START_ITERATIONS = 12
 #: Distance of means, in standard deviations of the noise, below which two tissues are one
 _LEAST_GAP = 0.5
 #: Least contrast of CSF to grey matter by that of grey to white matter, in T1 and T2. CSF's T1 is about three times
-#: that of grey matter, which is 1.6 times that of white matter (Wansapura et al., JMRI 9(4), 1999); its T2 is further off
+#: that of grey matter, which is 1.6 times that of white matter (Wansapura et al., JMRI 9(4), 1999); T2s differ more
 _LEAST_CONTRAST = 1.0
 #: Gain of the mean log-likelihood that the limits of the weights never cost in a brain, where it is below 0.02
 _MUCH_MORE_LIKELY = 0.1

@@ -241,6 +241,8 @@ def _limited(weights: np.ndarray, least: np.ndarray, most: np.ndarray) -> np.nda
     high = most
     bound = np.zeros(len(weights), bool)
     for _ in range(len(weights)):  # what a limit gives or takes is shared by the classes that are free
+        if bound.all():
+            return weights / weights.sum()
         free = (1.0 - weights[bound].sum()) / weights[~bound].sum()
         scaled = np.where(bound, weights, free * weights)
         outside = ~bound & ((scaled < low) | (scaled > high))
