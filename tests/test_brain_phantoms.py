@@ -199,15 +199,16 @@ def test_segmentation_is_better_than_a_plain_mixture_and_near_the_true_threshold
     product = found_by_product(case)["grey and white"]
     bound = scores(*true_thresholds(case, "t1"), case)["grey and white"]
     control = scores(*plain_mixture(case, "t1"), case)["grey and white"]
-    # On Colin27 at 2 mm without a bias field the plain mixture is better: .940, product .921, bound .947.
-    assert product > bound - 0.05 and (product > control or name == "colin27")
+    # On Colin27 at 2 mm without a bias field the plain mixture is better: .940, product .935, bound .947.
+    assert product > bound - 0.03 and (product > control or name == "colin27")
 
 
 #: Least mean Dice of grey and white matter: what is wanted, 0.955 at 3 % noise and 0.93 at 7 %, or just below what is
 #: reached where that is less (docs/segmentation.md).
 LEAST = {
-    ("mni152", 0.03, 0.0): 0.955, ("mni152", 0.03, 0.2): 0.948, ("mni152", 0.07, 0.2): 0.930,
-    ("colin27", 0.03, 0.0): 0.938, ("colin27", 0.03, 0.2): 0.933, ("colin27", 0.07, 0.2): 0.918,
+    ("mni152", 0.03, 0.0): 0.960, ("mni152", 0.03, 0.2): 0.955, ("mni152", 0.07, 0.2): 0.935,
+    ("colin27", 0.03, 0.0): 0.955, ("colin27", 0.03, 0.2): 0.951, ("colin27", 0.07, 0.2): 0.930,
+    ("mni152", 0.03, 0.1): 0.957, ("colin27", 0.03, 0.1): 0.951,
 }  # fmt: skip
 
 

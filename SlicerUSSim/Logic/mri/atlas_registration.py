@@ -125,14 +125,14 @@ def _registered(
         starts.append((_metric(fixed, moving, similarity), similarity))
     report(0.2)
     starts.sort(key=lambda start: start[0])
-    best = min((_optimised(fixed, moving, start, 40) for _, start in starts[:2]), key=lambda found: found[0])[1]
+    best = min((_optimised(fixed, moving, start, 40, (2,)) for _, start in starts[:2]), key=lambda found: found[0])[1]
     report(0.6)
     affine = sitk.AffineTransform(3)
     linear, shift = _matrix(best)
     affine.SetCenter(centres[0].tolist())
     affine.SetMatrix(linear.ravel().tolist())
     affine.SetTranslation((linear @ centres[0] + shift - centres[0]).tolist())
-    found = _optimised(fixed, moving, affine, 50)[1]
+    found = _optimised(fixed, moving, affine, 50, (2, 1))[1]
     warped = sitk.GetArrayViewFromImage(sitk.Resample(moving_mask, fixed_mask, found)) > 0.5
     mask = sitk.GetArrayViewFromImage(fixed_mask) > 0.5
     report(1.0)
@@ -194,11 +194,13 @@ def _metric(fixed: sitk.Image, moving: sitk.Image, transform: Any) -> float:
         return 0.0
 
 
-def _optimised(fixed: sitk.Image, moving: sitk.Image, start: Any, iterations: int) -> tuple[float, Any]:
+def _optimised(
+    fixed: sitk.Image, moving: sitk.Image, start: Any, iterations: int, shrink: tuple[int, ...]
+) -> tuple[float, Any]:
     """(negative mutual information, transform) after gradient descent; the start where that fails."""
     method = _method(moving)
-    method.SetShrinkFactorsPerLevel([2, 1])
-    method.SetSmoothingSigmasPerLevel([_COARSE_MM, 0.5 * _COARSE_MM])
+    method.SetShrinkFactorsPerLevel(shrink)
+    method.SetSmoothingSigmasPerLevel([0.5 * factor * _COARSE_MM for factor in shrink])
     method.SmoothingSigmasAreSpecifiedInPhysicalUnitsOn()
     method.SetOptimizerAsRegularStepGradientDescent(
         learningRate=1.0, minStep=0.02, numberOfIterations=iterations, gradientMagnitudeTolerance=1e-6

@@ -26,11 +26,14 @@ FILTER_BLUR = 1.5
 _START_ITERATIONS = 12
 #: Distance of means, in standard deviations of the noise, below which two tissues are one
 _LEAST_GAP = 0.5
+#: Least contrast of CSF to grey matter by that of grey to white matter, in T1 and T2. CSF's T1 is about three times
+#: that of grey matter, which is 1.6 times that of white matter (Wansapura et al., JMRI 9(4), 1999); T2s differ more
+_LEAST_CONTRAST = 1.0
 #: Gain of the mean log-likelihood that the limits of the weights never cost in a brain, where it is below 0.02
 _MUCH_MORE_LIKELY = 0.1
 #: Smallest and largest share of CSF, grey and white matter in the starts, and in a result without a warning
-START_SHARES = ((0.05, 0.15, 0.3), (0.3, 0.45, 0.65))
-EXPECTED_SHARES = ((0.02, 0.4), (0.3, 0.75), (0.2, 0.6))
+START_SHARES = ((0.01, 0.05, 0.15, 0.3), (0.3, 0.45, 0.65))
+EXPECTED_SHARES = ((0.005, 0.4), (0.3, 0.75), (0.2, 0.6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +77,12 @@ def class_names(contrasts: tuple[str, ...], classes: int | None) -> tuple[str, .
 
 
 def classify(
-    values: np.ndarray, contrasts: tuple[str, ...], names: tuple[str, ...], prior: np.ndarray | None, blur: float = 1.0
+    values: np.ndarray,
+    contrasts: tuple[str, ...],
+    names: tuple[str, ...],
+    prior: np.ndarray | None,
+    blur: float = 1.0,
+    voxel_mm: float = 1.0,
 ) -> Classes:
     """The classes of (channels, voxels) float32 intensities; `prior` (3, voxels) is the atlas's share of tissues.
 
@@ -84,7 +92,7 @@ def classify(
         prior = prior**_PRIOR_EXPONENT
         prior /= prior.sum(axis=0)
     first = _best_channel(contrasts)
-    histogram = Histogram.of(values[first : first + 1], contrasts[first : first + 1], prior)
+    histogram = Histogram.of(values[first : first + 1], contrasts[first : first + 1], prior, voxel_mm=voxel_mm)
     mixture = fit_one(histogram.points, contrasts[first])
     if len(contrasts) > 1:
         shares, outside = mixture.shares(histogram.points)
@@ -96,7 +104,7 @@ def classify(
                 for n, y in enumerate(values)
             ]
         )
-        histogram = Histogram.of(values, contrasts, prior)
+        histogram = Histogram.of(values, contrasts, prior, voxel_mm=voxel_mm)
         mixture = fit_mixture(histogram.points, means, 0.5 * deviation)
     return _named(histogram, mixture, contrasts, names, blur)
 
@@ -113,11 +121,12 @@ def fit_one(points: Points, contrast: str) -> TissueMixture:
     ]
     order = ORDERS[contrast]
     in_order = [fit for fit in starts if (np.diff(fit.means[list(order), 0]) > 0).all()] or starts
-    in_order.sort(key=lambda fit: (_excess(fit, points) > 0.1, -fit.log_likelihoods[-1]))
+    in_order.sort(key=lambda fit: (_csf_is_grey(fit, contrast), _excess(fit, points) > 0.1, -fit.log_likelihoods[-1]))
     found = []
     for fit in in_order[:2]:
-        whole = fit_mixture(points, fit.means, np.sqrt(np.diag(fit.covariance)))
-        found.append((_excess(whole, points) > 0.0 or _has_collapsed(whole), -whole.log_likelihoods[-1], whole))
+        whole = fit_mixture(points, fit.means, np.sqrt(np.diag(fit.covariance)), spread=fit.spread)
+        is_doubtful = _csf_is_grey(whole, contrast) or _excess(whole, points) > 0.0 or _has_collapsed(whole)
+        found.append((is_doubtful, -whole.log_likelihoods[-1], whole))
     is_doubtful, _, best = min(found, key=lambda entry: entry[:2])
     if not is_doubtful:
         return best
@@ -150,6 +159,13 @@ def _has_collapsed(fit: TissueMixture) -> bool:
     deviation = np.sqrt(np.diag(fit.covariance))
     gaps = [np.abs(a - b) / deviation for a, b in itertools.combinations(fit.means, 2)]
     return min(float(gap.max()) for gap in gaps) < _LEAST_GAP
+
+
+def _csf_is_grey(fit: TissueMixture, contrast: str) -> bool:
+    """Whether CSF is too close to grey matter, as where the mask holds little CSF and two classes share the cortex."""
+    csf, grey, white = fit.means[:, 0]
+    way = np.sign(white - csf)
+    return bool(contrast != "flair" and way * (grey - csf) < _LEAST_CONTRAST * way * (white - grey))
 
 
 def _excess(fit: TissueMixture, points: Points) -> float:
@@ -202,7 +218,7 @@ def _named(
         shares[tissue] += np.where((nearest == tissue) & ~bright, outside, 0.0)
     rows = [shares[TISSUES.index(name)] for name in names[: len(TISSUES)]]
     means = [mixture.means[TISSUES.index(name)] for name in names[: len(TISSUES)]]
-    deviations = [deviation] * len(TISSUES)
+    deviations = [deviation * np.sqrt(mixture.spread[TISSUES.index(name)]) for name in names[: len(TISSUES)]]
     if len(names) > len(TISSUES):
         rows.append(np.where(bright, outside, 0.0))
         weight = rows[-1] * points.counts

@@ -46,12 +46,13 @@ class Field:
     @cached_property
     def factor(self) -> np.ndarray:
         """(k, j, i) float32 factor by which the field multiplies the image."""
-        axes = [_legendre(np.linspace(-1.0, 1.0, n)) for n in self._shape]
-        table = np.zeros([_DEGREE + 1] * 3)
+        axes = [_legendre(np.linspace(-1.0, 1.0, n)).astype(np.float32) for n in self._shape]
+        table = np.zeros([_DEGREE + 1] * 3, np.float32)
         for value, orders in zip(self.coefficients, _TERMS, strict=True):
             table[orders] = value
         log = np.einsum("abc,ka,jb,ic->kji", table, *axes, optimize=True)
-        return np.exp(log - self.coefficients @ self._means).astype(np.float32)
+        log -= np.float32(self.coefficients @ self._means)
+        return np.exp(log, out=log)
 
 
 _TERMS = [orders for orders in itertools.product(range(_DEGREE + 1), repeat=3) if 0 < sum(orders) <= _DEGREE]
@@ -60,6 +61,14 @@ _TERMS = [orders for orders in itertools.product(range(_DEGREE + 1), repeat=3) i
 def _legendre(x: np.ndarray) -> np.ndarray:
     """(points, degree + 1) Legendre polynomials."""
     return np.polynomial.legendre.legvander(x, _DEGREE)
+
+
+def _smooth(array: np.ndarray, every: tuple[slice, ...]) -> np.ndarray:
+    """A Gaussian at `every` so-manieth voxel; the axes one after the other, so that little is computed in vain."""
+    for axis, part in enumerate(every):
+        array = ndimage.gaussian_filter1d(array, _SIGMA, axis, truncate=2.0)
+        array = array[(slice(None),) * axis + (part,)]
+    return array
 
 
 def estimate_field(
@@ -76,16 +85,16 @@ def estimate_field(
     """
     stride = np.maximum(np.rint(_STEP_MM / spacing_mm[::-1]).astype(int), 1)
     every = tuple(slice(None, None, int(n)) for n in stride)
-    weight = ndimage.gaussian_filter(inside.astype(np.float32), _SIGMA, truncate=2.0)[every]
-    smooth = ndimage.gaussian_filter(np.where(inside, image, 0).astype(np.float32), _SIGMA, truncate=2.0)[every]
+    weight = _smooth(inside.astype(np.float32), every)
+    smooth = _smooth(np.where(inside, image, 0).astype(np.float32), every)
     used = inside[every] & (smooth > 0)
     raw = smooth[used] / np.maximum(weight[used], 1e-6)
     low = np.percentile(raw, 0.1)
     raw = np.maximum(raw, max(low, 1e-3 * float(raw.mean())))
     if prior is not None:
-        whole = np.zeros((3, *inside.shape), np.float32)
-        whole[:, inside] = prior
-        prior = whole[(slice(None), *every)][:, used]
+        chosen = np.zeros(inside.shape, bool)
+        chosen[every] = used
+        prior = prior[:, chosen[inside]]
     places = np.argwhere(used) * stride
     axes = [_legendre(np.linspace(-1.0, 1.0, n)).astype(np.float32) for n in inside.shape]
     along = [axis[places[:, n]] for n, axis in enumerate(axes)]
@@ -99,12 +108,16 @@ def estimate_field(
     log = np.zeros(len(raw), np.float32)
     for step in range(_MOST_STEPS):
         values = raw * np.exp(-log)
-        histogram = Histogram.of(values[None], (contrast,), prior, bins=_BINS)
+        histogram = Histogram.of(values[None], (contrast,), prior, bins=_BINS, voxel_mm=float(spacing_mm.mean()))
         if mixture is None:
             mixture = fit_one(histogram.points, contrast)
         else:
             mixture = fit_mixture(
-                histogram.points, mixture.means, np.sqrt(np.diag(mixture.covariance)), iterations=_EM_PER_STEP
+                histogram.points,
+                mixture.means,
+                np.sqrt(np.diag(mixture.covariance)),
+                iterations=_EM_PER_STEP,
+                spread=mixture.spread,
             )
         slope = -(mixture.slope(histogram.points) * histogram.points.values[:, 0])[histogram.point_of_voxel]
         slope = slope.astype(np.float32)

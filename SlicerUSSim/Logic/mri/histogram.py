@@ -9,7 +9,7 @@ import numpy as np
 from SlicerUSSim.Logic.mri.mixture import Points
 
 #: Bins per channel for 1, 2, 3 and more channels
-_BINS = (512, 96, 40, 20)
+_BINS = (256, 96, 40, 20)
 #: Shares of the spatial prior are rounded to multiples of 1 / _LEVELS, which leaves (7 x 8) / 2 = 28 cells
 _LEVELS = 6
 #: Percentage of voxels beyond the box at either end
@@ -34,6 +34,7 @@ class Histogram:
         contrasts: tuple[str, ...],
         prior: np.ndarray | None = None,
         bins: int | None = None,
+        voxel_mm: float = 1.0,
     ) -> Histogram:
         """From (channels, voxels) intensities and, where there is one, the (3, voxels) prior share of every tissue."""
         channels, voxels = values.shape
@@ -58,7 +59,7 @@ class Histogram:
         index = np.stack(np.unravel_index(rest, (bins,) * channels), axis=1)
         levels = lows + steps * index
         outliers, limits = _outliers(levels, steps * bins, contrasts)
-        points = Points(levels, counts[occupied].astype(float), shares[cell], steps, outliers, limits)
+        points = Points(levels, counts[occupied].astype(float), shares[cell], steps, outliers, limits, voxel_mm)
         return cls(points, place[code])
 
 

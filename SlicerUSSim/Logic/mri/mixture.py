@@ -1,15 +1,15 @@
-"""The mixture of tissues: three pure classes of one covariance, two mixed ones, and outliers; by EM.
+"""The mixture of tissues: three pure classes of nearly one covariance, two mixed ones, and outliers; by EM.
 
 A voxel of a pure class has the intensity of its tissue plus noise. A mixed voxel contains two neighbouring tissues in
 any proportion with equal probability, so its intensity lies on the line between their means (Laidlaw et al., IEEE TMI
 17(1), 1998; Shattuck et al., NeuroImage 13(5), 2001). Vessels, lesions and what the mask leaves of the skull are
 uniform outliers. The noise is the same everywhere, hence the common covariance: with free ones the widest class
-swallows its neighbours.
+swallows its neighbours. Grey matter alone may be a little wider, within limits: its tissue differs from place to place.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,9 +22,15 @@ _MIDDLE = 0.5
 #: Least weight of the pure classes, and of the mixed ones: at 1 mm every tissue has borders. Without these, wide pure
 #: classes replace the mixed ones, or one class takes grey and white matter where their contrast is low
 ANATOMICAL = np.array([1e-4, 0.2, 0.12, 0.1, 0.15])
+#: Largest weights of the mixed classes in voxels of 1 mm: borders of 0.2 m^2 each, blurred over 1 to 1.5 mm
+MOST_MIXED = np.array([0.25, 0.22])
 #: The same without knowledge of a brain
 ANY = np.full(_INSIDE, 1e-4)
 _MAX_ITERATIONS, _LEAST_GAIN = 150, 1e-6
+#: The tissue whose pure voxels differ among themselves, as cortex does by its myelin and deep nuclei by their iron; the
+#: largest variance of its voxels in units of the noise's, and the largest deviation of the tissue itself in units of
+#: grey matter's contrast to white matter
+_WIDE, _WIDEST, _TISSUE_DEVIATION = 1, 4.0, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +48,8 @@ class Points:
     #: (outlier classes, points) density of each, which the fit leaves alone, and (outlier classes,) its largest weight
     outliers: np.ndarray
     limits: np.ndarray
+    #: Mean side of a voxel, on which the share of mixed voxels depends
+    voxel_mm: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +64,15 @@ class TissueMixture:
     weights: np.ndarray
     #: Mean log-likelihood of every iteration, which never decreases
     log_likelihoods: np.ndarray
+    #: (K,) variance of every pure class in units of the covariance
+    spread: np.ndarray = field(default_factory=lambda: np.ones(len(TISSUES)))
 
     def shares(self, points: Points, blur: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """((K, points) probability that each tissue fills most of the voxel, (points,) that it is an outlier).
 
         They add up to 1. The noise is taken to be `blur` times that of the fit.
         """
-        parts = _Parts(points, self.means, blur**2 * self.covariance)
+        parts = _Parts(points, self.means, blur**2 * self.covariance, np.maximum(self.spread / blur**2, 1.0))
         density = parts.density * self.weights[:, None] * _affinity(points)
         density /= density.sum(axis=0) + 1e-300
         result = density[: len(TISSUES)].copy()
@@ -74,11 +84,12 @@ class TissueMixture:
 
     def slope(self, points: Points) -> np.ndarray:
         """(points,) derivative of the logarithm of the density by the intensity, for one channel."""
-        parts = _Parts(points, self.means, self.covariance)
+        parts = _Parts(points, self.means, self.covariance, self.spread)
         density = parts.density * self.weights[:, None] * _affinity(points)
         density /= density.sum(axis=0) + 1e-300
         values, means = points.values[:, 0], self.means[:, 0]
-        result = density[: len(TISSUES)].T @ means - density[:_INSIDE].sum(axis=0) * values
+        pure = density[: len(TISSUES)] / self.spread[:, None]
+        result = pure.T @ means - (pure.sum(axis=0) + density[len(TISSUES) : _INSIDE].sum(axis=0)) * values
         for n, (first, second) in enumerate(MIXED):
             content = parts.content(n)
             result += density[len(TISSUES) + n] * ((1.0 - content) * means[first] + content * means[second])
@@ -92,24 +103,28 @@ def fit_mixture(
     *,
     least_weights: np.ndarray = ANATOMICAL,
     iterations: int = _MAX_ITERATIONS,
+    spread: np.ndarray | None = None,
 ) -> TissueMixture:
     """The mixture by expectation maximisation from (3, channels) means and (channels,) standard deviations.
 
     `least_weights` (5,) are lower limits of the weights of the pure classes and the mixed ones.
 
     Weights follow the spatial prior as in Ashburner and Friston, NeuroImage 26(3), 2005: a class's probability in a
-    voxel is its weight times its prior there, normalised. No step lowers the likelihood.
+    voxel is its weight times its prior there, normalised. No step lowers the likelihood, unless
+    the limit of grey matter's variance falls.
     """
-    values, counts = points.values, points.counts / points.counts.sum()
-    scatter = (values * counts[:, None]).T @ values
+    counts = points.counts / points.counts.sum()
+    mixed = np.minimum(MOST_MIXED * max(points.voxel_mm, 1.0), 0.5)
+    most = np.concatenate([np.ones(len(TISSUES)), mixed, points.limits])
+    spread = np.ones(len(TISSUES)) if spread is None else spread
     covariance = np.diag(deviation**2)
     weights = np.concatenate([[0.2, 0.25, 0.25, 0.15, 0.15], 0.5 * points.limits])
-    weights = _limited(weights, least_weights, points.limits)
+    weights = _limited(weights, least_weights, most)
     affinity = _affinity(points)
     least = np.diag(points.steps**2 / 12.0)
     likelihoods: list[float] = []
     for _ in range(iterations):
-        parts = _Parts(points, means, covariance)
+        parts = _Parts(points, means, covariance, spread)
         around = weights @ affinity
         joint = parts.density * (weights[:, None] * affinity / around)
         total = joint.sum(axis=0) + 1e-300
@@ -118,16 +133,16 @@ def fit_mixture(
             break
         belonging = joint * (counts / total)
         weights = belonging.sum(axis=1) / np.maximum(affinity @ (counts / around), 1e-12) + 1e-12
-        weights = _limited(weights, least_weights, points.limits)
-        means, covariance = parts.update(belonging, means, scatter, least)
-    return TissueMixture(means, covariance, weights, np.array(likelihoods))
+        weights = _limited(weights, least_weights, most)
+        means, covariance, spread = parts.update(belonging, means, least)
+    return TissueMixture(means, covariance, weights, np.array(likelihoods), spread)
 
 
 class _Parts:
     """Densities of the six components at points, in coordinates in which the covariance is the identity."""
 
-    def __init__(self, points: Points, means: np.ndarray, covariance: np.ndarray) -> None:
-        self._points = points
+    def __init__(self, points: Points, means: np.ndarray, covariance: np.ndarray, spread: np.ndarray) -> None:
+        self._points, self._spread = points, spread
         factor = np.linalg.cholesky(covariance)
         white = np.linalg.solve(factor, points.values.T).T
         centres = np.linalg.solve(factor, means.T).T
@@ -135,7 +150,8 @@ class _Parts:
         constant = (2.0 * np.pi) ** (-channels / 2.0) / np.prod(np.diag(factor))
         away = np.stack([((white - centre) ** 2).sum(axis=1) for centre in centres])
         self.density = np.empty((_INSIDE + len(points.limits), len(white)))
-        self.density[: len(TISSUES)] = constant * np.exp(-0.5 * away)
+        wide = spread[:, None]
+        self.density[: len(TISSUES)] = constant * np.exp(-0.5 * away / wide) / wide ** (0.5 * channels)
         self.density[_INSIDE:] = points.outliers
         self._along = []
         for n, (first, second) in enumerate(MIXED):
@@ -158,11 +174,14 @@ class _Parts:
         return _content(*self._along[mixed])[0]
 
     def update(
-        self, belonging: np.ndarray, means: np.ndarray, scatter: np.ndarray, least: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(means, covariance) that maximise the expected likelihood: least squares of the values on the contents."""
+        self, belonging: np.ndarray, means: np.ndarray, least: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(means, covariance, spread) that raise the expected likelihood, one after the other.
+
+        Means and covariance are by least squares of the values on the contents.
+        """
         values = self._points.values
-        pure = belonging[: len(TISSUES)]
+        pure = belonging[: len(TISSUES)] / self._spread[:, None]
         normal = np.diag(pure.sum(axis=1))
         moment = pure @ values
         for n, (first, second) in enumerate(MIXED):
@@ -178,10 +197,22 @@ class _Parts:
         # A class that has vanished keeps its mean.
         hold = 1e-6 * np.eye(len(TISSUES))
         means = np.linalg.solve(normal + hold, moment + hold @ means)
-        outside = (values * belonging[_INSIDE:].sum(axis=0)[:, None]).T @ values
-        inside = belonging[:_INSIDE].sum()
-        covariance = (scatter - outside - moment.T @ means - means.T @ moment + means.T @ normal @ means) / inside
-        return means, 0.5 * (covariance + covariance.T) + least
+        used = pure.sum(axis=0) + belonging[len(TISSUES) : _INSIDE].sum(axis=0)
+        scatter = (values * used[:, None]).T @ values
+        covariance = scatter - moment.T @ means - means.T @ moment + means.T @ normal @ means
+        covariance = 0.5 * (covariance + covariance.T) / belonging[:_INSIDE].sum() + least
+        return means, covariance, self._spread_of(belonging[_WIDE], means, covariance)
+
+    def _spread_of(self, own: np.ndarray, means: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        """(K,) the most likely variance of the pure voxels of _WIDE, of which belong `own` (points,), in its limits."""
+        away = self._points.values - means[_WIDE]
+        inverse = np.linalg.inv(covariance)
+        distance = np.einsum("pc,cd,pd->p", away, inverse, away)
+        contrast = means[2] - means[1]
+        most = min(_WIDEST, 1.0 + _TISSUE_DEVIATION**2 * float(contrast @ inverse @ contrast))
+        spread = np.ones(len(TISSUES))
+        spread[_WIDE] = np.clip(own @ distance / (own.sum() * away.shape[1] + 1e-12), 1.0, most)
+        return spread
 
 
 def _inside(along: np.ndarray, length: float) -> np.ndarray:
@@ -203,13 +234,15 @@ def _content(along: np.ndarray, length: float, inside: np.ndarray) -> tuple[np.n
     return mean / length, square / length**2
 
 
-def _limited(weights: np.ndarray, least: np.ndarray, limits: np.ndarray) -> np.ndarray:
+def _limited(weights: np.ndarray, least: np.ndarray, most: np.ndarray) -> np.ndarray:
     """The weights within their limits, adding up to 1."""
     weights = weights / weights.sum()
-    low = np.concatenate([least, np.full(len(limits), 1e-6)])
-    high = np.concatenate([np.ones(_INSIDE), limits])
+    low = np.concatenate([least, np.full(len(weights) - len(least), 1e-6)])
+    high = most
     bound = np.zeros(len(weights), bool)
     for _ in range(len(weights)):  # what a limit gives or takes is shared by the classes that are free
+        if bound.all():
+            return weights / weights.sum()
         free = (1.0 - weights[bound].sum()) / weights[~bound].sum()
         scaled = np.where(bound, weights, free * weights)
         outside = ~bound & ((scaled < low) | (scaled > high))

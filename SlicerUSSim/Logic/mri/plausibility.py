@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML, AtlasFit
 from SlicerUSSim.Logic.mri.classification import EXPECTED_SHARES, ORDERS, Classes
@@ -20,6 +20,13 @@ _LARGEST_ASYMMETRY = 0.05
 #: Prior share from which a voxel shows the atlas's tissue, and the least number of such voxels
 _SURE_SHARE, _LEAST_VOXELS = 0.7, 200
 _LIKELY_CSF, _DEEP_MM = 0.3, 20.0
+#: Distance of grey and white matter's medians in the wrong order from which that is said, and from which it is refused,
+#: in units of the width of both together
+_APART, _FAR_APART = 0.25, 0.5
+#: Brightness above white matter in units of its contrast to grey matter, and least volume in one piece of what
+#: enhances. Largest pieces: 19.5 ml in a T1 with contrast agent (ReMIND-022), 0.65 ml in one with bright arteries, and
+#: 0.01 ml in the others
+_ENHANCED, _ENHANCED_ML = 1.5, 2.0
 
 
 def is_whole_brain(image: Volume, inside: np.ndarray) -> str:
@@ -43,7 +50,7 @@ def require_contrast(image: Volume, inside: np.ndarray, prior: np.ndarray, contr
     """Warnings where the atlas's grey and white matter are in another order than the contrast's.
 
     `prior` (3, voxels) are the atlas's shares in the voxels `inside` (k, j, i). Raises SimulationError if ventricles
-    have CSF at the other end.
+    have CSF at the other end, or grey and white matter are far apart in the other order.
     """
     values = image.array[inside]
     sure = prior > _SURE_SHARE
@@ -53,23 +60,37 @@ def require_contrast(image: Volume, inside: np.ndarray, prior: np.ndarray, contr
     solid = np.concatenate([values[sure[1]], values[sure[2]]])
     # The atlas's ventricles also cover tissue, so the tails decide, not the median.
     likely = values[(prior[0] >= _LIKELY_CSF) & _deep(image, inside)]
-    if len(likely) < _LEAST_VOXELS:
-        return []
-    low, high = np.percentile(solid, (2.0, 98.0))
-    dark, bright = float((likely < low).mean()), float((likely > high).mean())
-    csf_is_bright = ORDERS[contrast][-1] == 0
-    if max(dark, bright) > 3.0 * min(dark, bright) and max(dark, bright) > 0.3 and (bright > dark) != csf_is_bright:
-        where, fits = ("brightest", "t2") if bright > dark else ("darkest", "t1 and flair")
-        raise SimulationError(
-            f"contrast is {contrast}, but CSF is {where}, as in {fits}: choose {' or '.join(fits.split(' and '))}"
-        )
+    if len(likely) >= _LEAST_VOXELS:
+        low, high = np.percentile(solid, (2.0, 98.0))
+        dark, bright = float((likely < low).mean()), float((likely > high).mean())
+        is_clear = max(dark, bright) > 3.0 * min(dark, bright) and max(dark, bright) > 0.3
+        if is_clear and (bright > dark) != (ORDERS[contrast][-1] == 0):
+            where, fits = ("brightest", "t2") if bright > dark else ("darkest", "t1 or flair")
+            raise SimulationError(f"contrast is {contrast}, but CSF is {where}, as in {fits}: choose {fits}")
     expected = ORDERS[contrast].index(2) > ORDERS[contrast].index(1)
     spread = float(np.percentile(solid, 84.0) - np.percentile(solid, 16.0))
-    if (white > grey) != expected and abs(white - grey) > 0.25 * spread:
-        fits = "t1 or t1gd" if white > grey else "flair or t2"
-        how = "brighter" if white > grey else "darker"
-        return [f"contrast is {contrast}, but white matter is {how} than grey matter, as in {fits}: check the contrast"]
-    return []
+    apart = abs(white - grey) / spread if spread > 0 else 0.0
+    if (white > grey) == expected or apart < _APART:
+        return []
+    fits, how = ("t1 or t1gd", "brighter") if white > grey else ("flair or t2", "darker")
+    found = f"contrast is {contrast}, but white matter is {how} than grey matter, as in {fits}"
+    require(apart < _FAR_APART, f"{found}: choose {fits}")
+    return [f"{found}: check the contrast"]
+
+
+def enhancement(image: np.ndarray, inside: np.ndarray, grey: float, white: float, voxel_ml: float) -> list[str]:
+    """A warning where a T1 has something that only contrast agent makes so bright: sinuses, plexus, a tumour's rim.
+
+    `image` and `inside` are (k, j, i); `grey` and `white` are the means of the tissues.
+    """
+    labels, count = cast(tuple[np.ndarray, int], ndimage.label((image > white + _ENHANCED * (white - grey)) & inside))
+    largest = float(np.bincount(labels.ravel())[1:].max()) * voxel_ml if count else 0.0
+    if largest < _ENHANCED_ML:
+        return []
+    return [
+        f"contrast is t1, but {largest:.1f} ml in one piece are far brighter than white matter, as vessels and tumour "
+        "rims after contrast agent: if it was given, choose t1gd (--contrast t1gd)"
+    ]
 
 
 def _deep(image: Volume, inside: np.ndarray) -> np.ndarray:

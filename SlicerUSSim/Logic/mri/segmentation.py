@@ -6,25 +6,28 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from time import perf_counter
-from typing import cast
 
 import numpy as np
-from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
-from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
 from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, classify
 from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.neighbours import smoothed_posteriors
-from SlicerUSSim.Logic.mri.plausibility import implausible, is_whole_brain, require_contrast
+from SlicerUSSim.Logic.mri.plausibility import require_contrast
+from SlicerUSSim.Logic.mri.segmentation_steps import (
+    BrainPart,
+    StepTimes,
+    atlas_of,
+    doubts,
+    finite,
+    narrow_sulci,
+    remove_fields,
+    require_different,
+)
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
-from SlicerUSSim.Logic.mri.sulci import sulcal_middles
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
 
@@ -39,7 +42,7 @@ class Segmentation:
     labels: Volume
     #: Name of label n + 1
     tissue_names: tuple[str, ...]
-    #: (classes,) in the unit of the MRI; the standard deviation is the same for CSF, grey and white matter
+    #: (classes,) in the unit of the MRI; CSF and white matter have the same standard deviation
     means: np.ndarray
     standard_deviations: np.ndarray
     #: (classes,) share of every class in the brain, summing to 1
@@ -155,8 +158,8 @@ def segment_mri(
     settings = SegmentationSettings(
         contrast, classes, skull_strip, thin_sulci, bias_correction, filter_radius, filter_epsilon
     )
-    timed = _StepTimes()
-    intensity = _finite(mri)
+    timed = StepTimes()
+    intensity = finite(mri)
     if mask is None:
         brain = find_brain(
             mri.with_array(intensity), settings.skull_strip, keep_at=keep_mask_at,
@@ -170,13 +173,13 @@ def segment_mri(
     notes, warnings = [brain.message], [*brain.warnings]
     images = [mri.with_array(intensity)]
     for name, other in others.items():
-        image, message = aligned(other.with_array(_finite(other)), images[0], foreground, name)
+        image, message = aligned(other.with_array(finite(other)), images[0], foreground, name)
         images.append(image)
         notes.append(message)
     if others:
         timed("registration")
-    part = _Part.of(images, foreground)
-    atlas, message = _atlas_of(part, report)
+    part = BrainPart.of(images, foreground)
+    atlas, message = atlas_of(part, report)
     notes.append(message)
     timed("atlas")
     report(0.4)
@@ -186,11 +189,8 @@ def segment_mri(
             warnings += require_contrast(image, part.inside, prior, name)
 
     if bias_correction is not False:
-        for n, (name, image) in enumerate(zip(contrasts, part.images, strict=True)):
-            share = lambda done, n=n: report(0.4 + 0.3 * (n + done) / len(contrasts))  # noqa: E731
-            result = corrected(image, part.inside, name, atlas, prior, bias_correction, share)
-            part.images[n] = result.image
-            notes.append(result.message)
+        share = lambda done: report(0.4 + 0.3 * done)  # noqa: E731
+        notes += remove_fields(part, contrasts, atlas, prior, bias_correction, share)
         timed("bias field")
     report(0.7)
     filtered = [
@@ -200,34 +200,24 @@ def segment_mri(
     timed("filter")
     report(0.8)
     values = np.stack([image[part.inside] for image, _, _ in filtered])
-    for name, channel in zip(contrasts, values, strict=True):
-        require(
-            float(channel.max()) > float(channel.min()),
-            f"MRI is constant ({channel[0]:g}) inside the foreground, expected tissues of different intensity"
-            + (f" in {name}" if others else ""),
-        )
-    found = classify(values, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0)
+    require_different(values, contrasts)
+    voxel_mm = float(mri.spacing_mm.mean())
+    found = classify(values, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0, voxel_mm)
     timed("mixture")
     found = replace(found, posteriors=smoothed_posteriors(found.posteriors, part.inside))
     timed("neighbours")
     report(0.9)
-    warnings += implausible(found, part.images[0], part.inside, atlas, contrast)
+    warnings += doubts(found, part, filtered[0][0], atlas, contrasts)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
-    means = found.means[:, 0]
+    tissue_names = names
     if thin_sulci:
-        csf, grey = names.index("csf"), names.index("grey matter")
-        middles = sulcal_middles(filtered[0][0], labels, grey + 1, means[csf], means[grey], filtered[0][1])
-        # CSF less than two voxels thick is such a sulcus too; as CSF it would form isolated droplets, each a lens.
-        is_csf = labels == csf + 1
-        middles |= is_csf & ~cast(np.ndarray, ndimage.binary_opening(is_csf, np.ones((2, 2, 2))))
+        middles = narrow_sulci(labels, found, filtered[0][0], filtered[0][1])
         labels[middles] = len(names) + 1
         tissue_names = (*names, "leptomeninges")
         timed("thin sulci")
         _log.info("thin sulci: %d voxels become leptomeninges", int(middles.sum()))
-    else:
-        tissue_names = names
     for line in notes:
         _log.info("%s", line)
     for line in warnings:
@@ -237,7 +227,7 @@ def segment_mri(
     return Segmentation(
         labels=mri.with_array(part.whole(labels)),
         tissue_names=tissue_names,
-        means=means,
+        means=found.means[:, 0],
         standard_deviations=found.standard_deviations[:, 0],
         weights=found.posteriors.mean(axis=1, dtype=float),
         log_likelihoods=found.mixture.log_likelihoods,
@@ -249,67 +239,3 @@ def segment_mri(
         _filtered=part.whole(filtered[0][0]),
         _shares=found.posteriors,
     )
-
-
-@dataclass(eq=False)
-class _Part:
-    """The images and the mask within the box of the brain."""
-
-    images: list[Volume]
-    inside: np.ndarray
-    _box: tuple[slice, ...]
-    _shape: tuple[int, ...]
-
-    @classmethod
-    def of(cls, images: list[Volume], inside: np.ndarray) -> _Part:
-        found = ndimage.find_objects(inside.astype(np.uint8))[0]
-        box = tuple(slice(max(side.start - 2, 0), side.stop + 2) for side in found)
-        matrix = images[0].ijk_to_ras.copy()
-        matrix[:3, 3] = (matrix @ [*(side.start for side in reversed(box)), 1.0])[:3]
-        parts = [Volume(np.ascontiguousarray(image.array[box], np.float32), matrix) for image in images]
-        return cls(parts, inside[box], box, inside.shape)
-
-    def whole(self, array: np.ndarray) -> np.ndarray:
-        """An array of the box on the whole grid, 0 elsewhere."""
-        result = np.zeros(self._shape, array.dtype)
-        result[self._box] = array
-        return result
-
-
-def _atlas_of(part: _Part, report: Callable[[float], None]) -> tuple[AtlasFit | None, str]:
-    """The registered atlas, or None where it is of no use; and a line that says why."""
-    reason = is_whole_brain(part.images[0], part.inside)
-    if reason:
-        return None, f"without an atlas, since {reason}"
-    atlas = mni152()
-    if atlas is None:
-        return None, 'without an atlas; install "SlicerUSSim[demo]" for one'
-    fit = register_atlas(part.images[0], part.inside, atlas, lambda share: report(0.2 + 0.2 * share))
-    if not fit.is_good:
-        return None, f"without an atlas, since MNI152 covers the brain with a Dice of {fit.dice:.2f} only"
-    return fit, f"led by the MNI152 atlas, whose brain covers this one with a Dice of {fit.dice:.2f}"
-
-
-class _StepTimes:
-    """Milliseconds of steps, for the log."""
-
-    def __init__(self) -> None:
-        self._last, self._steps = perf_counter(), []
-
-    def __call__(self, step: str) -> None:
-        """A step has ended."""
-        now = perf_counter()
-        self._steps.append(f"{step} {(now - self._last) * 1e3:.0f} ms")
-        self._last = now
-
-    def __str__(self) -> str:
-        return ", ".join(self._steps)
-
-
-def _finite(mri: Volume) -> np.ndarray:
-    intensity = mri.array.astype(np.float32)
-    bad = int(intensity.size - np.isfinite(intensity).sum())
-    require(bad == 0, f"MRI has {bad} voxels that are not finite numbers, expected none")
-    low, high = float(intensity.min()), float(intensity.max())
-    require(high > low, f"MRI is constant ({low:g}), expected different intensities")
-    return intensity

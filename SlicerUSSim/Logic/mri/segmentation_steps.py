@@ -1,0 +1,136 @@
+"""Parts of the segmentation of an MRI: the box of the brain, the atlas, the bias field, and thin sulci."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import cast
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.atlas import mni152
+from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
+from SlicerUSSim.Logic.mri.bias import corrected
+from SlicerUSSim.Logic.mri.classification import Classes
+from SlicerUSSim.Logic.mri.plausibility import enhancement, implausible, is_whole_brain
+from SlicerUSSim.Logic.mri.sulci import sulcal_middles
+
+
+@dataclass(eq=False)
+class BrainPart:
+    """The images and the mask within the box of the brain."""
+
+    images: list[Volume]
+    inside: np.ndarray
+    _box: tuple[slice, ...]
+    _shape: tuple[int, ...]
+
+    @classmethod
+    def of(cls, images: list[Volume], inside: np.ndarray) -> BrainPart:
+        found = ndimage.find_objects(inside.astype(np.uint8))[0]
+        box = tuple(slice(max(side.start - 2, 0), side.stop + 2) for side in found)
+        matrix = images[0].ijk_to_ras.copy()
+        matrix[:3, 3] = (matrix @ [*(side.start for side in reversed(box)), 1.0])[:3]
+        parts = [Volume(np.ascontiguousarray(image.array[box], np.float32), matrix) for image in images]
+        return cls(parts, inside[box], box, inside.shape)
+
+    def whole(self, array: np.ndarray) -> np.ndarray:
+        """An array of the box on the whole grid, 0 elsewhere."""
+        result = np.zeros(self._shape, array.dtype)
+        result[self._box] = array
+        return result
+
+
+def atlas_of(part: BrainPart, report: Callable[[float], None]) -> tuple[AtlasFit | None, str]:
+    """The registered atlas, or None where it is of no use; and a line that says why."""
+    reason = is_whole_brain(part.images[0], part.inside)
+    if reason:
+        return None, f"without an atlas, since {reason}"
+    atlas = mni152()
+    if atlas is None:
+        return None, 'without an atlas; install "SlicerUSSim[demo]" for one'
+    fit = register_atlas(part.images[0], part.inside, atlas, lambda share: report(0.2 + 0.2 * share))
+    if not fit.is_good:
+        return None, f"without an atlas, since MNI152 covers the brain with a Dice of {fit.dice:.2f} only"
+    return fit, f"led by the MNI152 atlas, whose brain covers this one with a Dice of {fit.dice:.2f}"
+
+
+class StepTimes:
+    """Milliseconds of steps, for the log."""
+
+    def __init__(self) -> None:
+        self._last, self._steps = perf_counter(), []
+
+    def __call__(self, step: str) -> None:
+        """A step has ended."""
+        now = perf_counter()
+        self._steps.append(f"{step} {(now - self._last) * 1e3:.0f} ms")
+        self._last = now
+
+    def __str__(self) -> str:
+        return ", ".join(self._steps)
+
+
+def finite(mri: Volume) -> np.ndarray:
+    """The voxels as float32. Raises SimulationError for voxels that are not finite, or all the same."""
+    intensity = mri.array.astype(np.float32)
+    bad = int(intensity.size - np.isfinite(intensity).sum())
+    require(bad == 0, f"MRI has {bad} voxels that are not finite numbers, expected none")
+    low, high = float(intensity.min()), float(intensity.max())
+    require(high > low, f"MRI is constant ({low:g}), expected different intensities")
+    return intensity
+
+
+def remove_fields(
+    part: BrainPart,
+    contrasts: tuple[str, ...],
+    atlas: AtlasFit | None,
+    prior: np.ndarray | None,
+    wanted: bool | None,
+    report: Callable[[float], None],
+) -> list[str]:
+    """Takes the bias field out of every image of the part, where there is one or it is wanted; a line for each."""
+    messages = []
+    for n, (name, image) in enumerate(zip(contrasts, part.images, strict=True)):
+        share = lambda done, n=n: report((n + done) / len(contrasts))  # noqa: E731
+        result = corrected(image, part.inside, name, atlas, prior, wanted, share)
+        part.images[n] = result.image
+        messages.append(result.message)
+    return messages
+
+
+def require_different(values: np.ndarray, contrasts: tuple[str, ...]) -> None:
+    """Raises SimulationError if one of the (channels, voxels) intensities is constant."""
+    for name, channel in zip(contrasts, values, strict=True):
+        require(
+            float(channel.max()) > float(channel.min()),
+            f"MRI is constant ({channel[0]:g}) inside the foreground, expected tissues of different intensity"
+            + (f" in {name}" if len(contrasts) > 1 else ""),
+        )
+
+
+def doubts(
+    found: Classes, part: BrainPart, filtered: np.ndarray, atlas: AtlasFit | None, contrasts: tuple[str, ...]
+) -> list[str]:
+    """What the user should check; `filtered` (k, j, i) is the first image after the filter."""
+    lines = implausible(found, part.images[0], part.inside, atlas, contrasts[0])
+    if contrasts == ("t1",):
+        grey, white = (float(found.means[found.names.index(name), 0]) for name in ("grey matter", "white matter"))
+        voxel_ml = float(np.prod(part.images[0].spacing_mm)) / 1000.0
+        lines += enhancement(filtered, part.inside, grey, white, voxel_ml)
+    return lines
+
+
+def narrow_sulci(labels: np.ndarray, found: Classes, filtered: np.ndarray, noise: float) -> np.ndarray:
+    """(k, j, i) bool: the middles of sulci too narrow for CSF, and CSF less than two voxels thick.
+
+    As CSF, the latter would form isolated droplets, each a lens.
+    """
+    csf, grey = found.names.index("csf"), found.names.index("grey matter")
+    middles = sulcal_middles(filtered, labels, grey + 1, found.means[csf, 0], found.means[grey, 0], noise)
+    is_csf = labels == csf + 1
+    return middles | (is_csf & ~cast(np.ndarray, ndimage.binary_opening(is_csf, np.ones((2, 2, 2)))))
