@@ -14,7 +14,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import CoarseImage
-from SlicerUSSim.Logic.mri.template import TEMPLATE_MM, Points, agreement, template
+from SlicerUSSim.Logic.mri.template import TEMPLATE_MM, Points, agreement, binned, template
 
 #: Nodding of the head in degrees and size of the brain in log percent of the template, at which the search starts
 _PITCHES, _SIZES = (-30.0, -15.0, 0.0, 15.0, 30.0), (-10.0, 4.0)
@@ -99,10 +99,10 @@ def align_turned(
     """
     brain, report = template(), progress or (lambda share: None)
     searches = [_Search(image, turn) for turn in turns]
-    smooth = image.smoothed(4.0)
+    smooth = image.smoothed(4.0)  # one for all: it remembers its foreground
     starts: list[tuple[float, int, np.ndarray]] = []
     for number, search in enumerate(searches):
-        found = search.of(smooth).starts(_PITCHES, _TURNED_SIZES, 20.0, 5, every=3)
+        found = search.of(smooth).starts(_PITCHES, _TURNED_SIZES, 18.0, 5)
         starts += [(score, number, start) for score, start in found]
         report(0.6 * (number + 1) / len(searches))
     starts.sort(key=lambda start: -start[0])
@@ -177,26 +177,32 @@ class _Search:
         )  # fmt: skip
         return start + result.x * unit, float(result.fun)
 
-    def starts(self, pitches, sizes, step_mm: float, most: int, every: int = 1) -> list[tuple[float, np.ndarray]]:
-        """(information, parameters) of the best and different ones of a grid of places, nods and sizes.
-
-        `every` : which of the template's points are used.
-        """
-        points, image, nearest = template().coarse.some(every), self.image, self.image.nearest()
+    def starts(self, pitches, sizes, step_mm: float, most: int) -> list[tuple[float, np.ndarray]]:
+        """(information, parameters) of the best and different ones of a grid of places, nods and sizes."""
+        points, image = template().coarse, self.image
         k, j, i = np.nonzero(image.foreground())
         inside = image.spacing_mm * np.stack([i, j, k], axis=1) + image.origin
         low, high = np.percentile(inside, (1, 99), axis=0)
         middle = 0.5 * (low + high)
         lines = [
-            np.arange(a, b + 1, step_mm)
-            for a, b in zip(np.minimum(low + 50, middle), np.maximum(high - 50, middle), strict=True)
+            np.rint((np.arange(a, b + 1, step_mm) - first) / image.spacing_mm).astype(int)
+            for a, b, first in zip(
+                np.minimum(low + 50, middle), np.maximum(high - 50, middle), image.origin, strict=True
+            )
         ]
         scored = []
         for pitch, size in itertools.product(pitches, sizes):
             place = np.array([0.0, 0.0, 0.0, pitch, 0.0, 0.0, size])
-            turned = points.from_centre @ self.linear(place).T
-            for where in itertools.product(*lines):
-                scored.append((points.information(nearest(turned + where)), np.array([*where, *place[3:]])))
+            turned = np.rint(points.from_centre @ self.linear(place).T / image.spacing_mm).astype(int)
+            # Places are voxels: one addition moves all points, in an image with so much air around it that none leaves.
+            margin = int(np.abs(turned).max()) + 1
+            padded = np.pad(binned(image.array), margin)
+            flat, steps = padded.ravel(), np.array([1, padded.shape[2], padded.shape[1] * padded.shape[2]])
+            first = turned @ steps
+            for voxel in itertools.product(*lines):
+                score = points.information_of(flat[first + (np.array(voxel) + margin) @ steps])
+                where = image.origin + image.spacing_mm * np.array(voxel)
+                scored.append((score, np.array([*where, *place[3:]])))
         scored.sort(key=lambda pair: -pair[0])
         chosen: list[tuple[float, np.ndarray]] = []
         for score, start in scored:

@@ -13,8 +13,8 @@ from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
 _LEAST_SIDE, _PARALLEL_SIDE, _OPENING_DEG = 0.165, 0.12, (25.0, 130.0)
 #: Deviation from a straight side, as a share of the perimeter
 _STRAIGHT = 0.006
-#: Share of the inner object that varies by less than 5 % within 20 mm. Heads had 0.000 to 0.001, phantoms 0.08 to 0.39.
-_UNIFORM_SHARE, _UNIFORM = 0.03, 0.05
+#: Share of the inner object that varies by less than 3 % within 20 mm
+_UNIFORM_SHARE, _UNIFORM = 0.03, 0.03
 #: Cross-section at an end of the image, relative to the largest, from which the object is cut there. The neck is cut in
 #: most images of a head, so that the bottom has to be cut through the head itself.
 _CUT, _CUT_AT_BOTTOM = 0.5, 0.85
@@ -42,8 +42,9 @@ def uniform_share(image: CoarseImage) -> float:
     if deep.sum() < 100:
         return 0.0
     window = 10.0 / image.spacing_mm
-    mean = ndimage.gaussian_filter(image.array, window)
-    variance = ndimage.gaussian_filter(image.array**2, window) - mean**2
+    smooth = ndimage.gaussian_filter(image.array, 1.0)  # noise is not structure
+    mean = ndimage.gaussian_filter(smooth, window)
+    variance = ndimage.gaussian_filter(smooth**2, window) - mean**2
     return float((variance[deep] < (_UNIFORM * mean[deep]) ** 2).mean())
 
 
@@ -60,7 +61,7 @@ def cut_ends(mri: Volume) -> tuple[str, ...]:
     values = ndimage.gaussian_filter(mri.array[step].astype(np.float32), 0.7)
     values -= np.percentile(values, 0.5)
     inside = largest_component(values > 0.5 * threshold_otsu(values))
-    inside = np.stack([ndimage.binary_fill_holes(part) for part in inside])
+    inside = np.stack([np.asarray(ndimage.binary_fill_holes(part)) for part in inside])
     ends = []
     for axis in range(3):
         areas = inside.sum(axis=tuple(other for other in range(3) if other != axis))
@@ -89,11 +90,11 @@ def _straight_sides(outline: np.ndarray) -> list[tuple[float, float, bool]]:
     """(share of the perimeter, direction in degrees, whether at the image's edge) of the hull's longest sides."""
     from scipy.spatial import ConvexHull
 
-    outline = ndimage.binary_opening(outline, iterations=2)
+    outline = np.asarray(ndimage.binary_opening(outline, iterations=2))
     if outline.sum() < 100:
         return []
     outline = largest_component(outline)
-    border = np.argwhere(outline & ~ndimage.binary_erosion(outline))
+    border = np.argwhere(outline & ~np.asarray(ndimage.binary_erosion(outline)))
     hull = ConvexHull(border)
     if outline.sum() < 0.9 * hull.volume:
         return []

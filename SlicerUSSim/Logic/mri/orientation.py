@@ -43,16 +43,17 @@ def lies_otherwise(
             f"the head does not lie as its header says: {_described(turns[number])} (agreement with the atlas "
             f"{other.agreement:.2f}, in the header's orientation {alignment.agreement:.2f}); {_TURN_IT}"
         )
-    ends = [end for end in cut_ends(mri) if end != "bottom" or alignment.agreement < least]
-    if ends and alignment.agreement < least:
-        return f"the image ends in the middle of the object, at its {' and '.join(ends)}; {_WHOLE}"
-    if ends:
-        return None
+    ends = cut_ends(mri)
+    is_cut = set(ends) - {"bottom"}  # where the neck leaves the image
+    upside_down = " (if that is the neck, the head is upside down)" if is_cut == {"top"} else ""
+    where = f"the image ends in the middle of the object, at its {' and '.join(ends)}{upside_down}; {_WHOLE}"
+    if is_cut:
+        return where if alignment.agreement < least else None
     sizes = _sizes()
     later = lambda share: report(0.7 + 0.3 * share)  # noqa: E731
     number, other = align_turned(image, [np.diag(factors) for factors in sizes], later)
     if other.agreement < enough:
-        return None
+        return where if ends and alignment.agreement < least else None
     axes = zip(sizes[number], ("width", "length", "height"), strict=True)
     words = ", ".join(f"{axis} {factor:g} times" for factor, axis in axes if factor != 1)
     return f"the head has a wrong size ({words} an adult's); correct the voxel size in its header"
@@ -110,7 +111,7 @@ def why_refused(
     expected = f"expected {least:g} or more" if alignment.agreement < least else f"but {position}"
     return (
         f"no head or brain is recognised in this {size} mm image (agreement with the atlas {alignment.agreement:.2f}, "
-        f"{expected}); use a T1, T2 or FLAIR of the whole head, check the orientation and the voxel size in its header, "
+        f"{expected}); use a T1, T2 or FLAIR of the whole head, check the orientation and voxel size in its header, "
         "or give a brain mask (--mask)"
     )
 

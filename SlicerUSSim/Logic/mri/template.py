@@ -25,16 +25,20 @@ class Points:
     def __init__(self, xyz: np.ndarray, classes: np.ndarray, centre: np.ndarray) -> None:
         self.from_centre, self.classes = xyz - centre, classes
 
-    def some(self, every: int) -> Points:
-        """Every `every`-th of the points."""
-        return self if every == 1 else Points(self.from_centre[::every], self.classes[::every], np.zeros(3))
-
     def information(self, values: np.ndarray) -> float:
         """Mutual information, in nats, of the classes and (n,) values from 0 to 1."""
-        bins = np.minimum((values * (_PATIENT_BINS - 1) + 0.5).astype(np.int64), _PATIENT_BINS - 1)
+        return self.information_of(binned(values))
+
+    def information_of(self, bins: np.ndarray) -> float:
+        """The same of (n,) values that are binned."""
         joint = np.bincount(self.classes * _PATIENT_BINS + bins, minlength=_TEMPLATE_BINS * _PATIENT_BINS)
-        joint = joint.reshape(_TEMPLATE_BINS, _PATIENT_BINS) / len(values)
+        joint = joint.reshape(_TEMPLATE_BINS, _PATIENT_BINS) / len(bins)
         return entropy(joint.sum(axis=0)) + entropy(joint.sum(axis=1)) - entropy(joint)
+
+
+def binned(values: np.ndarray) -> np.ndarray:
+    """Numbers of the histogram's bins of values from 0 to 1."""
+    return np.minimum((values * (_PATIENT_BINS - 1) + 0.5).astype(np.int64), _PATIENT_BINS - 1)
 
 
 def entropy(shares: np.ndarray) -> float:
