@@ -143,7 +143,7 @@ def phantom(shape):
     k, j, i = (np.indices(grid.array.shape).T * 3.0 - np.array(grid.array.shape) * 1.5).T
     inside = {"box": (abs(i) < 55) & (abs(j) < 70) & (abs(k) < 50), "sphere": i**2 + j**2 + k**2 < 70**2}[shape]
     rng = np.random.default_rng(1)
-    array = np.where(inside, 100.0 + rng.normal(0, 10, inside.shape), 0.0)
+    array = np.where(inside, 100.0 + rng.normal(0, 3, inside.shape), 0.0)
     array[(i - 20) ** 2 + j**2 + k**2 < 25**2] *= 1.5
     return Volume(array.astype(np.float32), grid.ijk_to_ras)
 
@@ -219,7 +219,8 @@ def test_where_a_head_is_cut_is_found_also_with_its_axes_stored_in_another_order
 @needs_nilearn
 @pytest.mark.parametrize(
     "axis, message",
-    [(0, "top is where the header says bottom and its face is where the header says front"),
+    [pytest.param(0, "top is where the header says bottom and its face is where the header says front",
+                  marks=pytest.mark.slow),
      pytest.param(1, "top is where the header says top and its face is where the header says back",
                   marks=pytest.mark.slow)],
 )  # fmt: skip
@@ -332,7 +333,9 @@ def on_other_voxels(mri, inside, spacing):
 
 @needs_nilearn
 @pytest.mark.parametrize(
-    "spacing", [(5.0, 1.2, 1.2), pytest.param((1.0, 0.5, 0.5), marks=pytest.mark.slow)], ids=["thick", "fine"]
+    "spacing",
+    [pytest.param((5.0, 1.2, 1.2), marks=pytest.mark.slow), pytest.param((1.0, 0.5, 0.5), marks=pytest.mark.slow)],
+    ids=["thick", "fine"],
 )
 def test_the_atlas_finds_the_brain_in_anisotropic_voxels_of_a_sagittal_stack(head, spacing):
     mri, inside = on_other_voxels(*head, spacing)

@@ -84,13 +84,25 @@ def check_position(mri: Volume, alignment: Alignment) -> None:
     require(message is None, message or "")
 
 
-def _check_values(mri: Volume) -> None:
+def check_finite(mri: Volume) -> None:
+    """Raise SimulationError if voxels are not finite, naming how many and the first (i, j, k), or all are equal."""
     values = mri.array
     if np.issubdtype(values.dtype, np.floating):
-        bad = int(values.size - np.isfinite(values).sum())
-        require(bad == 0, f"MRI has {bad} voxels that are not finite numbers, expected none")
+        is_bad = ~np.isfinite(values)
+        if is_bad.any():
+            first = tuple(int(n) for n in np.unravel_index(int(is_bad.argmax()), values.shape)[::-1])
+            raise SimulationError(
+                f"MRI has {int(is_bad.sum())} voxels that are not finite numbers, the first at (i, j, k) = {first}, "
+                "expected none; replace them, for example by 0 outside the head"
+            )
     low, high = float(values.min()), float(values.max())
     require(high > low, f"MRI is constant ({low:g}), expected different intensities")
+
+
+def _check_values(mri: Volume) -> None:
+    check_finite(mri)
+    values = mri.array
+    low, high = float(values.min()), float(values.max())
     sample = np.unique(values[::3, ::3, ::3])
     require(
         len(sample) > 12,

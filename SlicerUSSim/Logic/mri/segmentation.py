@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.neighbours import smoothed_posteriors
 from SlicerUSSim.Logic.mri.plausibility import implausible, is_whole_brain, require_contrast
+from SlicerUSSim.Logic.mri.recognition import check_finite
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.mri.sulci import sulcal_middles
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
@@ -307,9 +308,5 @@ class _StepTimes:
 
 
 def _finite(mri: Volume) -> np.ndarray:
-    intensity = mri.array.astype(np.float32)
-    bad = int(intensity.size - np.isfinite(intensity).sum())
-    require(bad == 0, f"MRI has {bad} voxels that are not finite numbers, expected none")
-    low, high = float(intensity.min()), float(intensity.max())
-    require(high > low, f"MRI is constant ({low:g}), expected different intensities")
-    return intensity
+    check_finite(mri)
+    return mri.array.astype(np.float32)
