@@ -95,7 +95,7 @@ def _straight_sides(outline: np.ndarray) -> list[tuple[float, float, bool]]:
     if outline.sum() < 100:
         return []
     outline = largest_component(outline)
-    border = np.argwhere(outline & ~np.asarray(ndimage.binary_erosion(outline)))
+    border = np.argwhere(outline & np.logical_not(ndimage.binary_erosion(outline)))
     hull = ConvexHull(border)
     if outline.sum() < 0.9 * hull.volume:
         return []
