@@ -14,12 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
-from SlicerUSSim.Logic.mri import brain as brain_module, extractors, orientation, recognition
-from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse
+from SlicerUSSim.Logic.mri import brain as brain_module, extractors, recognition
+from SlicerUSSim.Logic.mri.alignment import Alignment, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain, left_out
+from SlicerUSSim.Logic.mri.coarse import CoarseImage
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.mask_check import cut_off
+from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_ultrasound
 from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri
 from tests.conftest import SHARED, needs_shared
@@ -141,24 +143,84 @@ def phantom(shape):
     k, j, i = (np.indices(grid.array.shape).T * 3.0 - np.array(grid.array.shape) * 1.5).T
     inside = {"box": (abs(i) < 55) & (abs(j) < 70) & (abs(k) < 50), "sphere": i**2 + j**2 + k**2 < 70**2}[shape]
     rng = np.random.default_rng(1)
-    array = np.where(inside, 100.0 + rng.normal(0, 10, inside.shape), 0.0)
+    array = np.where(inside, 100.0 + rng.normal(0, 3, inside.shape), 0.0)
     array[(i - 20) ** 2 + j**2 + k**2 < 25**2] *= 1.5
     return Volume(array.astype(np.float32), grid.ijk_to_ras)
 
 
 @needs_nilearn
 @pytest.mark.parametrize("shape", [pytest.param("box", marks=pytest.mark.slow), "sphere"])
-def test_a_phantom_is_no_brain(shape, monkeypatch):
-    monkeypatch.setattr(orientation, "_turns", lambda: [])
-    monkeypatch.setattr(orientation, "_sizes", lambda: [])
-    with pytest.raises(SimulationError, match=r"no head or brain is recognised.*--skull-strip none"):
+def test_a_phantom_is_refused_as_one(shape):
+    with pytest.raises(SimulationError, match=r"large uniform parts, as a phantom has.*--skull-strip none"):
         find_brain(phantom(shape))
+
+
+def test_a_head_is_no_phantom_no_ultrasound_and_is_cut_nowhere(head):
+    assert not is_phantom(CoarseImage.of(head[0])) and not is_ultrasound(head[0]) and cut_ends(head[0]) == ()
+    assert not is_ultrasound(head_mri(3.0))
+
+
+def fan(opening_deg, background=0.0):
+    """A volume of speckle in a fan, as a swept curved array records it."""
+    k, _, i = np.indices((90, 30, 120)).astype(float)
+    x, depth = i - 60.0, k + 20.0
+    inside = (np.abs(np.degrees(np.arctan2(x, depth))) < opening_deg / 2) & (np.hypot(x, depth) < 100) & (k > 2)
+    rng = np.random.default_rng(0)
+    speckle = np.hypot(*(ndimage.gaussian_filter(rng.normal(size=x.shape), 1.0) for _ in range(2)))
+    return Volume(np.where(inside, 50.0 + 300.0 * speckle, background).astype(np.float32), np.eye(4))
+
+
+@pytest.mark.parametrize("opening_deg", [45.0, 60.0, 85.0])
+def test_an_ultrasound_volume_is_refused_as_one_at_once(opening_deg):
+    with pytest.raises(SimulationError, match="a fan on a constant background, as ultrasound does"):
+        find_brain(fan(opening_deg, background=3.0))
+
+
+@needs_shared
+@pytest.mark.parametrize("name", ["brain_sweep", "liver_sweep"])
+def test_a_real_ultrasound_sweep_is_refused_as_one(name):
+    with pytest.raises(SimulationError, match="as ultrasound does, expected an MRI"):
+        find_brain(Volume.read(SHARED / name / f"{name}.igs.mha"))
+
+
+def test_an_image_resampled_along_other_axes_is_no_fan(head):
+    """Its corners are empty, and the border between is straight, but of a box."""
+    shown = np.ones((60, 60, 60), np.float32) * np.random.default_rng(0).uniform(1, 9, (60, 60, 60)).astype(np.float32)
+    turned = ndimage.rotate(np.pad(shown, 20), 25.0, axes=(1, 2), reshape=False, order=0)
+    assert (turned == 0).mean() > 0.4
+    assert not is_ultrasound(Volume(turned, np.eye(4)))
+
+
+@needs_nilearn
+def test_a_limb_is_refused_as_going_through_the_image():
+    _, j, i = np.indices((50, 54, 54)) * 3.0
+    x, y = i - 80.0, j - 80.0
+    rng = np.random.default_rng(0)
+    texture = 150.0 * ndimage.gaussian_filter(rng.normal(size=x.shape), 2.0) / 0.05
+    limb = np.where(x**2 + y**2 < 70**2, 400.0 + 0.3 * texture, 0.0)
+    limb[x**2 + y**2 < 15**2] = 900.0
+    image = np.abs(limb + rng.normal(0, 20, limb.shape)).astype(np.float32)
+    with pytest.raises(SimulationError, match="from the bottom to the top, as a limb or a body does"):
+        find_brain(Volume(image, np.diag([3.0, 3.0, 3.0, 1.0])))
+
+
+@pytest.mark.parametrize("axis, half, end", [(1, 0, "front"), (1, 1, "back"), (2, 0, "right"), (0, 0, "top")])
+def test_where_a_head_is_cut_is_found_also_with_its_axes_stored_in_another_order(head, axis, half, end):
+    import SimpleITK as sitk
+
+    mri = head[0]
+    n = mri.array.shape[axis] // 2
+    part = np.take(mri.array, np.arange(n) if half == 0 else np.arange(n, mri.array.shape[axis]), axis)
+    cut = Volume(part, mri.ijk_to_ras)
+    assert cut_ends(cut) == (end,)
+    assert cut_ends(Volume.from_sitk(sitk.DICOMOrient(cut.to_sitk(), "PIR"), "turned")) == (end,)
 
 
 @needs_nilearn
 @pytest.mark.parametrize(
     "axis, message",
-    [(0, "top is where the header says bottom and its face is where the header says front"),
+    [pytest.param(0, "top is where the header says bottom and its face is where the header says front",
+                  marks=pytest.mark.slow),
      pytest.param(1, "top is where the header says top and its face is where the header says back",
                   marks=pytest.mark.slow)],
 )  # fmt: skip
@@ -171,7 +233,7 @@ def test_a_stripped_brain_that_does_not_lie_as_its_header_says_is_refused(head, 
 
 def test_a_tiny_object_is_too_small_for_a_head():
     mri = head_mri(3.0)
-    with pytest.raises(SimulationError, match="too little for a head; check the voxel size"):
+    with pytest.raises(SimulationError, match="too little for a head; correct the voxel size"):
         find_brain(Volume(mri.array, mri.ijk_to_ras @ np.diag([0.3, 0.3, 0.3, 1.0])))
 
 
@@ -186,23 +248,32 @@ def test_a_body_is_refused_at_once():
 
 
 @needs_nilearn
-def test_half_a_head_is_refused_with_where_it_is_cut(head, monkeypatch):
-    monkeypatch.setattr(orientation, "_turns", lambda: [])
-    monkeypatch.setattr(orientation, "_sizes", lambda: [])
+def test_half_a_head_is_refused_with_the_part_that_is_missing(head):
     mri = head[0]
-    half = Volume(mri.array[:, : mri.array.shape[1] // 2], mri.ijk_to_ras)
-    with pytest.raises(SimulationError, match=r"only \d+% of a brain|cut off at the front of the image"):
+    half = Volume(mri.array[:, :, : mri.array.shape[2] // 2], mri.ijk_to_ras)
+    with pytest.raises(SimulationError, match=r"only \d+% of a brain, its right half is cut off|object, at its right;"):
         find_brain(half)
 
 
-@pytest.mark.slow
 @needs_nilearn
-def test_a_head_on_its_side_is_refused_with_where_its_top_is(head, monkeypatch):
-    swapped = Volume(np.ascontiguousarray(np.swapaxes(head[0].array, 0, 1)), head[0].ijk_to_ras)
-    turns = [t for t in orientation._turns() if abs(t[1, 2]) == 1 and abs(t[0, 0]) == 1]
-    monkeypatch.setattr(orientation, "_turns", lambda: turns)
-    with pytest.raises(SimulationError, match="its top is where the header says front"):
-        find_brain(swapped)
+def test_a_head_without_its_neck_on_a_constant_background_is_not_taken_for_a_stripped_brain(head):
+    mri = head[0]
+    levels = np.where(mri.array > 25, mri.array, 0.0)[int(0.33 * mri.array.shape[0]) :]
+    assert recognition._on_constant_background(Volume(levels, mri.ijk_to_ras)) is None
+
+
+@needs_nilearn
+@pytest.mark.parametrize(
+    "change, message",
+    [(lambda a: np.flip(a, 0), "its top is where the header says bottom and its face is where the header says front"),
+     pytest.param(lambda a: np.flip(a, 1), "top and its face is where the header says back", marks=pytest.mark.slow),
+     pytest.param(lambda a: np.swapaxes(a, 0, 1), "its top is where the header says front", marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_a_turned_head_is_refused_with_where_its_top_is_and_how_to_turn_it(head, change, message):
+    turned = Volume(np.ascontiguousarray(change(head[0].array)), head[0].ijk_to_ras)
+    with pytest.raises(SimulationError, match=message + ".*correct the orientation in its header") as caught:
+        find_brain(turned)
+    assert "--skull-strip none" not in str(caught.value)
 
 
 def test_none_takes_everything_brighter_than_the_background():
@@ -262,7 +333,9 @@ def on_other_voxels(mri, inside, spacing):
 
 @needs_nilearn
 @pytest.mark.parametrize(
-    "spacing", [(5.0, 1.2, 1.2), pytest.param((1.0, 0.5, 0.5), marks=pytest.mark.slow)], ids=["thick", "fine"]
+    "spacing",
+    [pytest.param((5.0, 1.2, 1.2), marks=pytest.mark.slow), pytest.param((1.0, 0.5, 0.5), marks=pytest.mark.slow)],
+    ids=["thick", "fine"],
 )
 def test_the_atlas_finds_the_brain_in_anisotropic_voxels_of_a_sagittal_stack(head, spacing):
     mri, inside = on_other_voxels(*head, spacing)

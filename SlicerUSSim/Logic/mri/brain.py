@@ -194,7 +194,7 @@ def _by(name: str, mri: Volume, alignment: Alignment | None, report: Report) -> 
     if name == "atlas":
         if alignment is None:
             require(mni152() is not None, "the brain atlas needs nilearn; install it with: pip install nilearn")
-            alignment = align_template(mri, progress=lambda share: report(0.5 * share))
+            alignment = align_template(mri, lambda share: report(0.5 * share))
         report(0.5)
         return refined(mri, alignment.brain_on(mri), core_mm=8.0, reach_mm=12.0, keep_mm=3.0), alignment
     program = extractors.robex if name == "robex" else extractors.deepbet

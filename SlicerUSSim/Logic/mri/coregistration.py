@@ -8,7 +8,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.alignment import entropy
+from SlicerUSSim.Logic.mri.template import entropy
 
 #: Millimetres of the registration's grid
 _COARSE_MM = 3.0

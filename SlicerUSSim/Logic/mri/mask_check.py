@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.alignment import resampled_to_ras
+from SlicerUSSim.Logic.mri.coarse import resampled_to_ras
 from SlicerUSSim.Logic.mri.refinement import brightness_near, on_grid
 
 _SPACING_MM = 2.0

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 
-from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, agreement_by_moments, align_coarse
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.alignment import Alignment, agreement_by_moments, align_coarse, align_turned
+from SlicerUSSim.Logic.mri.coarse import CoarseImage
+from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom
 
 _ENDS = ("RL", "AP", "SI")
 #: Agreement with the atlas, put at the centre of a stripped brain with its size. T1 that lie as their header says had
@@ -14,33 +18,48 @@ _ENDS = ("RL", "AP", "SI")
 _SURELY_RIGHT = 0.3
 #: A patient in a scanner nods by up to 40 degrees.
 MOST_TURN_DEG = 48.0
+_TURN_IT = (
+    "correct the orientation in its header, for example in 3D Slicer: turn it in the module Transforms, "
+    "harden the transform and save it"
+)
+_WHOLE = "use a series of the whole head, or give a brain mask (--mask)"
 _NAMES = {"R": "right", "L": "left", "A": "front", "P": "back", "S": "top", "I": "bottom"}
 
 
-def lies_otherwise(image: CoarseImage, alignment: Alignment, least: float, remedy: str) -> str | None:
-    """One line if the head fits the atlas better in another orientation or size than its header's; None if not."""
+def lies_otherwise(
+    mri: Volume, image: CoarseImage, alignment: Alignment, least: float, progress: Callable[[float], None] | None = None
+) -> str | None:
+    """One line if the head fits the atlas better in another orientation or size than its header's; None if not.
+
+    It takes 3 s.
+    """
+    report = progress or (lambda share: None)
     # A fit in the header's orientation has to be beaten clearly; one that turned the head is a finding itself.
     enough = max(least, (1.3 if alignment.turn_deg < MOST_TURN_DEG else 0.9) * alignment.agreement)
-    best, turn = 0.0, np.eye(3)
-    for candidate in _turns():
-        other = align_coarse(image, turn=candidate, quick=True)
-        if other.turn_from(candidate) < 45.0 and other.agreement > best:
-            best, turn = other.agreement, candidate
-    fits = f"agreement with the atlas {best:.2f}, in the header's orientation {alignment.agreement:.2f}"
-    if best >= enough:
-        return f"the head does not lie as its header says: {_described(turn)} ({fits}); correct the header, or {remedy}"
-    for factors in _sizes():
-        other = align_coarse(image, turn=np.diag(factors), quick=True)
-        if other.agreement >= enough:
-            axes = zip(factors, ("width", "length", "height"), strict=True)
-            words = ", ".join(f"{axis} {factor:g} times" for factor, axis in axes if factor != 1)
-            cut = _cut_ends(image)
-            check = "check whether it is whole, and the voxel size" if cut else "check the voxel size"
-            return f"the head has a wrong size ({words} an adult's{cut}); {check} in its header, or {remedy}"
-    return None
+    turns = _turns()
+    number, other = align_turned(image, turns, lambda share: report(0.7 * share))
+    if other.agreement >= enough and other.turn_from(turns[number]) < 45.0:
+        return (
+            f"the head does not lie as its header says: {_described(turns[number])} (agreement with the atlas "
+            f"{other.agreement:.2f}, in the header's orientation {alignment.agreement:.2f}); {_TURN_IT}"
+        )
+    ends = cut_ends(mri)
+    is_cut = set(ends) - {"bottom"}  # where the neck leaves the image
+    upside_down = " (if that is the neck, the head is upside down)" if is_cut == {"top"} else ""
+    where = f"the image ends in the middle of the object, at its {' and '.join(ends)}{upside_down}; {_WHOLE}"
+    if is_cut:
+        return where if alignment.agreement < least else None
+    sizes = _sizes()
+    later = lambda share: report(0.7 + 0.3 * share)  # noqa: E731
+    number, other = align_turned(image, [np.diag(factors) for factors in sizes], later)
+    if other.agreement < enough:
+        return where if ends and alignment.agreement < least else None
+    axes = zip(sizes[number], ("width", "length", "height"), strict=True)
+    words = ", ".join(f"{axis} {factor:g} times" for factor, axis in axes if factor != 1)
+    return f"the head has a wrong size ({words} an adult's); correct the voxel size in its header"
 
 
-def stripped_lies_otherwise(image: CoarseImage, inside: np.ndarray, least: float, remedy: str) -> str | None:
+def stripped_lies_otherwise(image: CoarseImage, inside: np.ndarray, least: float) -> str | None:
     """One line if a skull-stripped brain, which is `inside`, fits the atlas in another orientation only; else None.
 
     Its place and size are known from the mask, so that this takes 0.1 s for most that lie as their header says, and 2 s
@@ -58,40 +77,43 @@ def stripped_lies_otherwise(image: CoarseImage, inside: np.ndarray, least: float
         return None
     return (
         f"the brain does not lie as its header says: {_described(_turns()[number])} (agreement with the atlas "
-        f"{best:.2f}, in the header's orientation {upright:.2f}); correct the header, or {remedy}"
+        f"{best:.2f}, in the header's orientation {upright:.2f}); {_TURN_IT}"
     )
 
 
-def how_it_lies(image: CoarseImage, alignment: Alignment, least: float, remedy: str) -> str:
-    """One line about an image that the atlas does not fit: where the head lies, or that there is none."""
+def why_refused(
+    mri: Volume, image: CoarseImage, alignment: Alignment, least: float, progress: Callable[[float], None] | None = None
+) -> str:
+    """One line about an image that the atlas does not fit: what it shows instead, and what to do."""
     size = " x ".join(f"{n * image.spacing_mm:.0f}" for n in image.array.shape[::-1])
-    message = lies_otherwise(image, alignment, least, remedy)
+    if is_phantom(image):
+        return (
+            f"this {size} mm image has large uniform parts, as a phantom has and no head; "
+            "use an MRI of a head, or --skull-strip none to take everything brighter than the background"
+        )
+    if {"bottom", "top"} <= set(cut_ends(mri)):
+        return (
+            f"the object in this {size} mm image goes through it from the bottom to the top, as a limb or a body does, "
+            f"expected a head; {_WHOLE}"
+        )
+    message = lies_otherwise(mri, image, alignment, least, progress)
+    if message is not None:
+        return message
     position = (
         f"only if turned by {alignment.turn_deg:.0f} degrees, {alignment.size:.2f} times as large and stretched by a "
         f"factor of {alignment.stretch:.2f}"
     )
-    if message is None and alignment.agreement >= 2.0 * least:
-        message = (
-            f"the atlas fits this {size} mm image {position}, more than any adult's head; check the orientation and "
-            f"the voxel size in its header, or {remedy}"
+    if alignment.agreement >= 2.0 * least:
+        return (
+            f"the atlas fits this {size} mm image {position}, more than any adult's head; correct the orientation or "
+            "the voxel size in its header"
         )
     expected = f"expected {least:g} or more" if alignment.agreement < least else f"but {position}"
-    return message or (
+    return (
         f"no head or brain is recognised in this {size} mm image (agreement with the atlas {alignment.agreement:.2f}, "
-        f"{expected}{_cut_ends(image)}); {remedy}"
+        f"{expected}); use a T1, T2 or FLAIR of the whole head, check the orientation and voxel size in its header, "
+        "or give a brain mask (--mask)"
     )
-
-
-def _cut_ends(image: CoarseImage) -> str:
-    """Where the image ends in the middle of the object, but for its bottom (the neck): of half a head, perhaps."""
-    inside = image.foreground()
-    ends = []
-    for axis, (first, last) in enumerate((("bottom", "top"), ("back", "front"), ("left", "right"))):
-        areas = inside.sum(axis=tuple(other for other in range(3) if other != axis))
-        for area, name in ((areas[1], first), (areas[-2], last)):
-            if area > 0.5 * areas.max() and name != "bottom":
-                ends.append(name)
-    return f"; the object is cut off at the {' and '.join(ends)} of the image" if ends else ""
 
 
 def _turns() -> list[np.ndarray]:

@@ -11,15 +11,20 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.alignment import Alignment, CoarseImage, align_coarse, largest_component
+from SlicerUSSim.Logic.mri.alignment import Alignment, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
-from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, how_it_lies, lies_otherwise, stripped_lies_otherwise
+from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
+from SlicerUSSim.Logic.mri.not_a_head import is_ultrasound
+from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, lies_otherwise, stripped_lies_otherwise, why_refused
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
 USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
 #: Least agreement with the template (Alignment.agreement). Heads and brains that were tried had 0.19 (proton density)
 #: to 0.88; CT, bodies, phantoms, and heads that lie wrongly 0.00 to 0.14.
 LEAST_AGREEMENT = 0.16
+#: Up to this agreement it is asked whether the head fits better in another orientation: back to front, a T1 had 0.23,
+#: and 0.31 with twice its height.
+_DOUBTFUL_AGREEMENT = 0.4
 #: Brains of adults differ by less than this in shape and size.
 _MOST_STRETCH, _SIZES = 1.25, (0.74, 1.15)
 #: Share of the template's brain that must show tissue, and below which a user should look
@@ -27,7 +32,6 @@ _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
 #: Between the 5th and 95th percentile of the inner brain, relative to its median. T1 and T2 had 0.46 to 0.82;
 #: CT whose air is stored as 0 has 0.01 to 0.05 (25 to 50 HU on 1000).
 _LEAST_CONTRAST = 0.1
-_REMEDY = "give a brain mask (--mask), or --skull-strip none to take everything brighter than the background"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +49,11 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     """What the image shows. Raises SimulationError, saying what was found, if it is neither a brain nor a head."""
     report = progress or (lambda share: None)
     _check_values(mri)
+    require(
+        not is_ultrasound(mri),
+        "image shows a fan on a constant background, as ultrasound does, expected an MRI; "
+        "use the MRI of this patient (the command sweep takes tracked ultrasound as --sequence)",
+    )
     brain = _on_constant_background(mri)
     report(0.1)
     if brain is not None:
@@ -53,30 +62,47 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     _check_size(image)
     if mni152() is None:
         return Shown(None, warnings=("without nilearn it is not checked that the image shows a head",))
-    alignment = align_coarse(image, progress=lambda share: report(0.1 + 0.9 * share))
+    alignment = align_coarse(image, lambda share: report(0.1 + 0.6 * share))
     is_plausible = alignment.turn_deg <= MOST_TURN_DEG and alignment.stretch <= _MOST_STRETCH
     is_plausible &= _SIZES[0] <= alignment.size <= _SIZES[1]
+    later = lambda share: report(0.7 + 0.3 * share)  # noqa: E731
     if alignment.agreement < LEAST_AGREEMENT or not is_plausible:
-        raise SimulationError(how_it_lies(image, alignment, LEAST_AGREEMENT, _REMEDY))
+        raise SimulationError(why_refused(mri, image, alignment, LEAST_AGREEMENT, later))
+    if alignment.agreement < _DOUBTFUL_AGREEMENT:
+        message = lies_otherwise(mri, image, alignment, LEAST_AGREEMENT, later)
+        require(message is None, message or "")
+    report(1.0)
     return _head(mri, image, alignment)
 
 
 def check_position(mri: Volume, alignment: Alignment) -> None:
     """Raise SimulationError if the head fits the atlas better in another orientation or size than its header's.
 
-    It takes some ten seconds, so that it is asked only about a doubtful result.
+    It takes 3 s, so that it is asked only about a doubtful result.
     """
-    message = lies_otherwise(CoarseImage.of(mri), alignment, LEAST_AGREEMENT, _REMEDY)
+    message = lies_otherwise(mri, CoarseImage.of(mri), alignment, LEAST_AGREEMENT)
     require(message is None, message or "")
 
 
-def _check_values(mri: Volume) -> None:
+def check_finite(mri: Volume) -> None:
+    """Raise SimulationError if voxels are not finite, naming how many and the first (i, j, k), or all are equal."""
     values = mri.array
     if np.issubdtype(values.dtype, np.floating):
-        bad = int(values.size - np.isfinite(values).sum())
-        require(bad == 0, f"MRI has {bad} voxels that are not finite numbers, expected none")
+        is_bad = ~np.isfinite(values)
+        if is_bad.any():
+            first = tuple(int(n) for n in np.unravel_index(int(is_bad.argmax()), values.shape)[::-1])
+            raise SimulationError(
+                f"MRI has {int(is_bad.sum())} voxels that are not finite numbers, the first at (i, j, k) = {first}, "
+                "expected none; replace them, for example by 0 outside the head"
+            )
     low, high = float(values.min()), float(values.max())
     require(high > low, f"MRI is constant ({low:g}), expected different intensities")
+
+
+def _check_values(mri: Volume) -> None:
+    check_finite(mri)
+    values = mri.array
+    low, high = float(values.min()), float(values.max())
     sample = np.unique(values[::3, ::3, ::3])
     require(
         len(sample) > 12,
@@ -102,6 +128,8 @@ def _on_constant_background(mri: Volume) -> np.ndarray | None:
     if counts.max() < 0.5 * border.size or (values == background).mean() < 0.15:
         return None
     inside = largest_component(values != background)
+    if _is_cut(inside):
+        return None
     inside = cast(np.ndarray, ndimage.binary_fill_holes(inside))
     millilitres = inside.sum() * mri.voxel_ml
     if not POSSIBLE_ML[0] <= millilitres <= 2300.0:
@@ -111,9 +139,18 @@ def _on_constant_background(mri: Volume) -> np.ndarray | None:
     shape = coarse.array > 0.5
     if not (_is_brain_shaped(shape) and _has_tissues(intensity.array, shape)):
         return None
-    wrong = stripped_lies_otherwise(intensity, shape, LEAST_AGREEMENT, _REMEDY) if mni152() is not None else None
+    wrong = stripped_lies_otherwise(intensity, shape, LEAST_AGREEMENT) if mni152() is not None else None
     require(wrong is None, wrong or "")
     return inside
+
+
+def _is_cut(inside: np.ndarray) -> bool:
+    """Whether a mask ends at a face of the image with more than a tangent: a head without its neck looks so."""
+    for axis in range(3):
+        areas = inside.sum(axis=tuple(other for other in range(3) if other != axis))
+        if max(areas[0], areas[-1]) > 0.3 * areas.max():
+            return True
+    return False
 
 
 def _is_brain_shaped(shape: np.ndarray) -> bool:
@@ -153,14 +190,14 @@ def _check_size(image: CoarseImage) -> None:
     size = " x ".join(f"{mm:.0f}" for mm in extent)
     require(
         millilitres >= 900.0 and extent.max() >= 110.0,
-        f"image shows {millilitres:.0f} ml of tissue in {size} mm, too little for a head; check the voxel size in its "
-        f"header, or {_REMEDY}",
+        f"image shows {millilitres:.0f} ml of tissue in {size} mm, too little for a head; "
+        "correct the voxel size in its header, or use an image of the whole head",
     )
     # A head with neck has 4 to 6 litres. Nothing of a body is searched for a brain, which would take minutes.
     require(
         millilitres <= 9000.0,
         f"image shows {millilitres / 1000.0:.0f} litres of tissue in {size} mm, too much for a head, as a body has; "
-        f"check the voxel size in its header, or {_REMEDY}",
+        "use an MRI of the head, or correct the voxel size in its header",
     )
 
 
@@ -174,9 +211,11 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
     tissue = np.pad(image.foreground(), pad)
     brain = distance < -4.0
     shown = float(tissue[brain].mean())
+    missing = _missing(brain, tissue) if shown < _USUAL_SHOWN else ""
     require(
         shown >= _LEAST_SHOWN,
-        f"image shows only {shown:.0%} of a brain, expected a whole one; use a series of the whole head, or {_REMEDY}",
+        f"image shows only {shown:.0%} of a brain, its {missing} is cut off, expected a whole one; "
+        "use a series of the whole head, or give a brain mask (--mask)",
     )
     low, middle, high = np.percentile(np.pad(image.array, pad)[distance < -8.0], (5, 50, 95))
     require(
@@ -186,13 +225,21 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
     )
     warnings = ()
     if shown < _USUAL_SHOWN:
-        warnings = (f"the image shows only {shown:.0%} of the brain; the rest is outside its field of view",)
+        warnings = (f"the image shows only {shown:.0%} of the brain; its {missing} is cut off",)
     # In a head, scalp and muscle lie around the brain. The foreground of a stripped brain ends with it.
     around = (distance > 8.0) & (distance < 24.0)
     bright = float((np.pad(image.array, pad)[around] > 0.25 * np.median(np.pad(image.array, pad)[brain])).mean())
     if bright < 0.06:
         return Shown(above_noise(mri), alignment, warnings)
     return Shown(None, alignment, warnings)
+
+
+def _missing(brain: np.ndarray, tissue: np.ndarray) -> str:
+    """Which part of the brain is outside the image, such as "front"."""
+    points = np.argwhere(brain)
+    away = (np.argwhere(brain & ~tissue).mean(axis=0) - points.mean(axis=0)) / np.ptp(points, axis=0)
+    axis = int(np.abs(away).argmax())
+    return (("bottom", "top"), ("back", "front"), ("left half", "right half"))[axis][int(away[axis] > 0)]
 
 
 def above_noise(mri: Volume) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.alignment import resampled_to_ras
+from SlicerUSSim.Logic.mri.coarse import resampled_to_ras
 from SlicerUSSim.Logic.mri.distances import distance_to
 
 _SPACING_MM = 1.2

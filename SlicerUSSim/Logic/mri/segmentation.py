@@ -47,7 +47,7 @@ class Segmentation:
     standard_deviations: np.ndarray
     #: (classes,) share of every class in the brain, summing to 1
     weights: np.ndarray
-    #: One per EM iteration, never decreasing
+    #: One per EM iteration
     log_likelihoods: np.ndarray
     #: Standard deviation of the estimated noise, and the filter's epsilon
     noise: float

@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import enhancement, implausible, is_whole_brain
+from SlicerUSSim.Logic.mri.recognition import check_finite
 from SlicerUSSim.Logic.mri.sulci import sulcal_middles
 
 
@@ -77,12 +78,8 @@ class StepTimes:
 
 def finite(mri: Volume) -> np.ndarray:
     """The voxels as float32. Raises SimulationError for voxels that are not finite, or all the same."""
-    intensity = mri.array.astype(np.float32)
-    bad = int(intensity.size - np.isfinite(intensity).sum())
-    require(bad == 0, f"MRI has {bad} voxels that are not finite numbers, expected none")
-    low, high = float(intensity.min()), float(intensity.max())
-    require(high > low, f"MRI is constant ({low:g}), expected different intensities")
-    return intensity
+    check_finite(mri)
+    return mri.array.astype(np.float32)
 
 
 def remove_fields(

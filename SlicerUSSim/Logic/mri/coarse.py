@@ -1,0 +1,83 @@
+"""A patient's image on a coarse grid along R, A and S, on which heads are recognised."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
+from SlicerUSSim.Logic.base.volume import Volume
+
+_SPACING_MM = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseImage:
+    """A patient on a grid along R, A and S, smoothed to its voxel size, with intensities from 0 (air) to 1."""
+
+    array: np.ndarray
+    origin: np.ndarray
+    spacing_mm: float
+
+    @classmethod
+    def of(cls, mri: Volume, spacing_mm: float = _SPACING_MM) -> CoarseImage:
+        """The bright fat of the scalp is clamped at the 99th percentile of the foreground."""
+        array, origin = resampled_to_ras(mri, spacing_mm)
+        low, high = np.percentile(array, (0.5, 99.5))
+        bright = array[array > low + 0.05 * (high - low)]
+        high = float(np.percentile(bright, 99.0)) if bright.size else high
+        return cls(np.clip((array - low) / max(high - low, 1e-12), 0.0, 1.0).astype(np.float32), origin, spacing_mm)
+
+    def smoothed(self, deviation_mm: float) -> CoarseImage:
+        """The image after a Gaussian filter."""
+        return CoarseImage(
+            ndimage.gaussian_filter(self.array, deviation_mm / self.spacing_mm), self.origin, self.spacing_mm
+        )
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """Values at (n, 3) RAS points by linear interpolation; 0 outside."""
+        index = (points - self.origin) / self.spacing_mm
+        return ndimage.map_coordinates(self.array, index[:, ::-1].T, order=1, mode="constant", cval=0.0)
+
+    def foreground(self) -> np.ndarray:
+        """(k, j, i) True where it is brighter than air: the largest component, with its holes filled."""
+        return self._foreground
+
+    @cached_property
+    def _foreground(self) -> np.ndarray:
+        from skimage.filters import threshold_otsu
+
+        inside = largest_component(self.array > 0.5 * threshold_otsu(self.array))
+        closed = ndimage.binary_closing(np.pad(inside, 3), iterations=2)[3:-3, 3:-3, 3:-3]
+        return ndimage.binary_fill_holes(closed | inside)  # type: ignore[return-value]
+
+
+def largest_component(inside: np.ndarray) -> np.ndarray:
+    """(k, j, i) the largest connected part of a mask."""
+    components, count = ndimage.label(inside)  # type: ignore[misc]
+    return inside if count < 2 else components == np.argmax(np.bincount(components.ravel())[1:]) + 1
+
+
+def resampled_to_ras(mri: Volume, spacing_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """((k, j, i) float32 on axes R, A, S, (3,) RAS of its first voxel): averaged over blocks, then interpolated."""
+    import SimpleITK as sitk
+
+    image = sitk.Cast(mri.to_sitk(), sitk.sitkFloat32)
+    air = float(np.percentile(mri.array[::4, ::4, ::4], 0.5))
+    factors = [max(1, int(spacing_mm / size + 0.25)) for size in image.GetSpacing()]
+    image = sitk.BinShrink(image, [min(n, size) for n, size in zip(factors, image.GetSize(), strict=True)])
+    counts = np.array(mri.array.shape[::-1])
+    corners = np.array(list(itertools.product(*((0, n - 1) for n in counts))))
+    corners = corners @ mri.ijk_to_ras[:3, :3].T + mri.ijk_to_ras[:3, 3]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    size = (np.ceil((high - low) / spacing_mm) + 1).astype(int)
+    direction = np.diag(np.diag(LPS_TO_RAS)[:3]).ravel().tolist()
+    origin = (LPS_TO_RAS @ [*low, 1.0])[:3].tolist()
+    resampled = sitk.Resample(
+        image, size.tolist(), sitk.Transform(), sitk.sitkLinear, origin, [spacing_mm] * 3, direction, air
+    )
+    return sitk.GetArrayFromImage(resampled), low
