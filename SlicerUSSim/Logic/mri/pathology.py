@@ -7,6 +7,7 @@ the images can.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -16,7 +17,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.masks import Masks, read_masks, resampled
-from SlicerUSSim.Logic.tissue.names import same_name, tissue_named
+from SlicerUSSim.Logic.tissue.names import same_name, similar_tissues, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
@@ -62,16 +63,19 @@ def tissue_to_add(name: str, tissue_names: Iterable[str] = ()) -> str:
     >>> tissue_to_add("Edema")
     'oedema'
     """
+    tissue_names = tuple(tissue_names)
     known = next((mine for mine in tissue_names if mine and same_name(mine, name)), None)
     if known is not None:
         return known
     try:
         return tissue_named(name).name
     except SimulationError:
+        similar = similar_tissues(name, tissue_names)
         mine = [own for own in dict.fromkeys(tissue_names) if own and own not in TISSUES]
-        raise SimulationError(
-            f"no tissue is called {name!r}, expected one of: {', '.join([*mine, *TISSUES])}"
-        ) from None
+        expected = f"one of: {', '.join([*mine, *TISSUES])}"
+        if similar:
+            expected = " or ".join([", ".join(similar[:-1]), similar[-1]][len(similar) == 1 :])
+        raise SimulationError(f"no tissue is called {name!r}, expected {expected}") from None
 
 
 def add_tissue(
@@ -124,8 +128,8 @@ def add_tissues(
 
 
 def mask_tissue(name: str, tissue_names: Iterable[str] = ()) -> str:
-    """As tissue_to_add; "brats" is itself."""
-    return "brats" if name.strip().lower() == "brats" else tissue_to_add(name, tissue_names)
+    """As tissue_to_add; "brats", also with a year, is itself."""
+    return "brats" if re.fullmatch(r"brats\W*(20\d\d)?", name.strip().lower()) else tissue_to_add(name, tissue_names)
 
 
 def texture_below(texture: Texture, mri: Volume, before: Volume, after: Volume) -> Texture:
