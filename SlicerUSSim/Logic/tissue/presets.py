@@ -74,9 +74,9 @@ TISSUES: dict[str, Tissue] = {
                 0.60, 0.0, 0.30, _level("echogenic skin and fat")),
         _tissue("blood", 1584.0, _SZABO, 1.679, f"1060 kg/m3, {_SZABO}", 0.14, _SZABO, 0.03, 0.0, 0.02,
                 _level("flowing, some 20 dB below tissue at 5 MHz")),
-        _tissue("haematoma", 1618.0, "34 m/s above flowing blood: Shung et al., J. Clin. Ultrasound 12 (1984), not checked",
-                1.715,
-                "1060 kg/m3, as blood, x speed of sound", 0.43, f"slope at 3 to 8 MHz, {_SHUNG}", 0.75, 0.0, 0.32,
+        _tissue("haematoma", 1618.0, "34 m/s above flowing blood: Shung et al., J. Clin. Ultrasound 12 (1984), "
+                "not checked", 1.715, "1060 kg/m3, as blood, x speed of sound", 0.43, f"slope at 3 to 8 MHz, {_SHUNG}",
+                0.75, 0.0, 0.32,
                 _level("7 dB above white matter: brighter than brain within minutes (canine model), fading after "
                        f"days; at least 18 dB above flowing blood ({_SHUNG})")),
         _tissue("water", 1524.0, "37 degrees C, " + _DUCK, 1.514, "993 kg/m3, " + _DUCK, 0.002, _DUCK),
