@@ -19,6 +19,7 @@ from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.opener import Files, Opener
 from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 
@@ -93,16 +94,18 @@ class Loading:
         # A mask that Segment extracted is found again by the same options.
         mask = None if self._logic.isOwnBrain(parameters.mask) else parameters.mask
         inputs = parameters.mri, mask, asdict(parameters.segmentation)
-        lesions = self._opener.lesion_files(parameters.lesions)
+        contrast = parameters.panel.second_contrast
+        others = {} if parameters.second_mri is None or contrast == "none" else {contrast: parameters.second_mri}
+        lesions = parameters.lesions
         if self._changed(self._presenter.segment):
-            has_second = parameters.second_mri is not None and parameters.panel.second_contrast != "none"
-            self._opener.segmented(parameters.labels, *inputs, None if has_second else lesions)
+            self._opener.segmented(parameters.labels, *inputs, others, lesions)
             self._labels_ready()
 
     def add_tissues(self) -> None:
         """Lay the lesions over the tissues."""
+        source = self._opener.known_source(self._logic.parameters.labels)
         if self._changed(self._presenter.addTissues):
-            self._labels_ready()
+            self._laid(source)
 
     def place_probe(self) -> None:
         """Place the probe at a typical craniotomy."""
@@ -114,7 +117,7 @@ class Loading:
     def _lay(self, mask: Volume, tissue: str, name: str) -> None:
         """Add a mask to the lesions, and lay them over the tissues, if there are any; otherwise Segment does so."""
         parameters: Any = self._logic.parameters
-        before = parameters.lesions
+        before, source = parameters.lesions, self._opener.known_source(parameters.labels)
         node, undo = self._opener.add_lesion(before, mask, tissue, name)
         parameters.lesions = node
         try:
@@ -125,7 +128,13 @@ class Loading:
             parameters.lesions = before
             raise
         if parameters.labels is not None:
-            self._labels_ready()
+            self._laid(source)
+
+    def _laid(self, source: LabelSource | None) -> None:
+        """The lesions now lie over labels of this source."""
+        parameters = self._logic.parameters
+        self._opener.added(source, parameters.labels, parameters.lesions)
+        self._labels_ready()
 
     def _changed(self, action: Callable[[], None]) -> bool:
         """Whether an action has written labels."""
