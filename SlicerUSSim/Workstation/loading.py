@@ -162,6 +162,8 @@ class Loading:
         node = self._opener.mri(path)
         self._logic.stopLiveUpdate()  # until the new MRI is segmented
         parameters.mri, parameters.labels, parameters.mask = node, None, None
+        parameters.second_mri = parameters.lesions = None  # of the patient before
+        self._presenter.clearNotes()
         self._take_volume(node)
 
     def _take_volume(self, node: Any) -> None:
