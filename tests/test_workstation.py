@@ -86,6 +86,7 @@ def files(tmp_path_factory) -> Path:
     to_probe = ImageGrid.for_probe(probe, None).image_to_probe
     transforms = tuple({"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in poses)
     TrackedSequence(np.stack(images), transforms, 0.1 * np.arange(6)).write(folder / "sweep.igs.mha")
+    Volume(np.ones((4, 4, 4), np.uint8), np.diag([5.0, 5, 5, 1]) + 300 * np.eye(4, k=3)).write(folder / "far.nii.gz")
     (folder / "broken.nii.gz").write_bytes(b"this is no image")
     return folder
 
@@ -855,6 +856,7 @@ def test_another_mri_takes_the_place_of_the_first(page, files):
     assert not errors(page) and shown(page, "liveCheckBox") and pixels(page).mean() > 5
     assert page.locator("#mriSelector option:checked").inner_text().strip() == "again.nii.gz"
     assert page.locator("#labelsSelector option:checked").inner_text().strip() == "again.nii.gz tissues"
+    assert shown(page, "lesionsSelector") is None  # of the patient before
 
 
 # ---- who may come in, and how it is started --------------------------------------------------------------------------
@@ -911,10 +913,16 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
         (["--sequence", "{broken}"], "broken.nii.gz"),
         (["--host", "203.0.113.7"], "cannot listen at 203.0.113.7"),
         (["--device", "no such device"], "no such device"),
+        (["{head}", "--also", "t2"], "--also is 't2', expected CONTRAST=FILE"),
+        (["{head}", "--also", "t2={head}", "--also", "flair={head}"], "--also is given 2 times, expected one"),
+        (["{head}", "--add", "tumuor={head}"], "no tissue is called 'tumuor', expected tumour"),
+        (["{head}", "--add", "tumour={far}"], "far.nii.gz: lies "),
+        (["{head}", "--map", "24=csf"], "--map is for a label map, expected --labels too"),
     ],
 )
 def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):
-    arguments = [text.format(broken=files / "broken.nii.gz") for text in arguments]
+    names = {name: files / f"{name}.nii.gz" for name in ("broken", "head", "far")}
+    arguments = [text.format(**names) for text in arguments]
     done = subprocess.run(
         [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", *arguments],
         capture_output=True,
