@@ -449,7 +449,7 @@ def seen_along_z(actor, pose: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def test_another_mri_is_registered_and_classified_with_the_first():
     from SlicerUSSim.Logic import segment_mri
-    from SlicerUSSim.Logic.mri import head_mri
+    from SlicerUSSim.Logic.mri import SegmentationSettings, head_mri
     from SlicerUSSim.Logic.vtk import SegmentationFilter
 
     t1 = head_mri(4.0)
@@ -461,7 +461,7 @@ def test_another_mri_is_registered_and_classified_with_the_first():
     algorithm.SetOtherData("t2", t2.to_vtk())
     algorithm.Update()
     assert not algorithm.GetErrorMessage() and any(line.startswith("t2: registered") for line in algorithm.GetNotes())
-    expected = segment_mri(t1, others={"t2": t2}).labels.array
+    expected = segment_mri(t1, others={"t2": t2}, thin_sulci=SegmentationSettings.thin_sulci).labels.array
     np.testing.assert_array_equal(Volume.from_vtk(algorithm.GetOutput()).array, expected)
     algorithm.SetOtherData("t2", None)
     algorithm.Update()
