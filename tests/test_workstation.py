@@ -857,6 +857,12 @@ def test_another_mri_takes_the_place_of_the_first(page, files):
     assert page.locator("#mriSelector option:checked").inner_text().strip() == "again.nii.gz"
     assert page.locator("#labelsSelector option:checked").inner_text().strip() == "again.nii.gz tissues"
     assert shown(page, "lesionsSelector") is None  # of the patient before
+    elsewhere = Volume.read(files / "head.nii.gz")
+    Volume(elsewhere.array, elsewhere.ijk_to_ras + 400.0 * np.eye(4, k=3)).write(files / "elsewhere.nii.gz")
+    with new_image(page):
+        page.set_input_files("#open-file", files / "elsewhere.nii.gz")
+    settled(page)
+    assert not errors(page) and pixels(page).mean() > 5  # the probe is placed on the patient in another frame
 
 
 # ---- who may come in, and how it is started --------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import asdict, replace
 from typing import Any
 
+import numpy as np
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError
@@ -13,6 +14,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import node_to_world
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
@@ -22,6 +24,9 @@ from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
+
+#: Farther from the volume of another patient's tissues, a probe is placed anew
+_FAR_MM = 50.0
 
 
 class Loading:
@@ -42,6 +47,7 @@ class Loading:
         self._shared, self._scene, self._logic, self._tasks = shared, app.scene, logic, tasks
         self._opener, self._presenter = opener, presenter
         self._views, self._probe, self._comparison = views, probe, comparison
+        self._is_new = False  # an MRI was opened, and has no tissues yet
 
     def begin(self, files: Files) -> None:
         """Load the files with which the workstation was started, and show the first image."""
@@ -164,6 +170,7 @@ class Loading:
         parameters.mri, parameters.labels, parameters.mask = node, None, None
         parameters.second_mri = parameters.lesions = None  # of the patient before
         self._presenter.clearNotes()
+        self._is_new = True
         self._take_volume(node)
 
     def _take_volume(self, node: Any) -> None:
@@ -178,9 +185,19 @@ class Loading:
         self._logic.parameters.real = images
         self._comparison.take(tracked, browser)
 
+    def _probe_is_far(self) -> bool:
+        """Whether the probe lies outside the tissues' volume, as that of a patient in another frame does."""
+        parameters: Any = self._logic.parameters
+        bounds = np.zeros(6)
+        parameters.labels.GetRASBounds(bounds)
+        low, high = bounds[::2] - _FAR_MM, bounds[1::2] + _FAR_MM
+        face = node_to_world(parameters.probe_transform)[:3, 3]
+        return bool(((face < low) | (face > high)).any())
+
     def _labels_ready(self) -> None:
-        if self._logic.parameters.probe_transform is None:
+        if self._logic.parameters.probe_transform is None or (self._is_new and self._probe_is_far()):
             self._presenter.placeProbe()
+        self._is_new = False
         if not self._logic.isLive:
             self._presenter.setLive(True)
         self._probe.update_surface()  # after the start of live images, which do not need it

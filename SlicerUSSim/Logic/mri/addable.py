@@ -59,7 +59,7 @@ def require_addable(
     ...     require_addable(mri, [("tumour", Volume(ball.array, moved), "ball.nii.gz")])
     ... except SimulationError as error:
     ...     print(str(error)[:48])
-    ball.nii.gz: lies 126 mm outside the patient, ex
+    ball.nii.gz: lies 128 mm outside the patient, ex
     """
     patient = None
     for name, volume, source in masks:
