@@ -34,6 +34,7 @@ from SlicerUSSim.Logic import (
 from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mri import add_tissues
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.probe.arrays import PROBES
@@ -462,6 +463,44 @@ def test_the_script_of_an_mri_has_its_mask_and_options_and_the_texture_if_it_is_
     assert "texture=segmentation.texture()" in python_script(source, hybrid, np.eye(4))
     for text in (plain, python_script(LabelSource(""), hybrid, np.eye(4))):
         compile(text, "script", "exec")
+
+
+def test_the_script_of_labels_with_lesions_of_a_page_simulates_the_same_image_beside_their_file(head, tmp_path):
+    """Of a mask that a page has sent, only the name is known."""
+    labels, mask = tmp_path / "labels.nii.gz", "it's a cyst.nii.gz"
+    head.labels.write(labels)
+    middle = [n // 2 for n in head.labels.array.shape]
+    lesion = np.zeros_like(head.labels.array)
+    lesion[middle[0] : middle[0] + 16, middle[1] - 8 : middle[1] + 8, middle[2] - 8 : middle[2] + 8] = 1
+    head.labels.with_array(lesion).write(tmp_path / mask)
+    added = add_tissues(head.labels, head.tissue_names, [("cyst", head.labels.with_array(lesion), mask)])
+    probe = PhasedProbe(60.0, 90.0, scan_lines=48)
+    preset = Preset(probe=probe, tissues=TissueTable.brain(added.tissue_names))
+    pose = craniotomy_pose(head.labels, probe)
+    source = LabelSource(str(labels), True, tissue_names=head.tissue_names, additions=(("cyst", mask),))
+    script = python_script(source, preset, pose)
+    assert f"# Opened in a page; give its path below, or run this beside it: {mask!r}" in script
+    frame = UltrasoundSimulator(added.labels, preset.tissues).simulate(
+        probe, pose, preset.display, noise_seed=seed_of_pose(pose)
+    )
+    assert np.array_equal(run_again(script, tmp_path), frame.image)
+    without = UltrasoundSimulator(head.labels, preset.tissues).simulate(
+        probe, pose, preset.display, noise_seed=seed_of_pose(pose)
+    )
+    assert not np.array_equal(without.image, frame.image)
+
+
+def test_the_script_of_an_mri_has_its_second_mri_and_says_which_files_have_no_path():
+    source = LabelSource(
+        "/data/t1.nii.gz", options={"contrast": "t1"}, others={"t2": "t2.nii.gz"},
+        additions=(("my tissue", "/data/x.nrrd"), ("brats", "seg.nii.gz")),
+    )  # fmt: skip
+    tissues = Preset().tissues.with_tissue(Tissue("my tissue", 1540.0, 1.6, 0.5))
+    script = python_script(source, replace(Preset(), tissues=tissues), np.eye(4))
+    compile(script, "script", "exec")
+    assert "others={'t2': Volume.read('t2.nii.gz')}" in script and "also=['my tissue']" in script
+    assert source.missing == ("t2.nii.gz", "seg.nii.gz") and script.count("# Opened in a page") == 2
+    assert "# Opened in a page" not in python_script(LabelSource("/data/t1.nii.gz"), Preset(), np.eye(4))
 
 
 # ---- sequences as nodes ----------------------------------------------------------------------------------------------

@@ -408,8 +408,12 @@ CSV = "LabelValue,Name,Color_R,Color_G,Color_B\n5,Left kidney,255,0,0\n12,Liver 
 
 
 @pytest.mark.parametrize(
-    ("suffix", "text"), [(".txt", SNAP), (".label", SNAP), (".ctbl", CTBL), (".txt", LUT), (".tsv", TSV), (".csv", CSV)]
-)
+    ("suffix", "text"),
+    [
+        (".txt", SNAP), (".label", SNAP), (".ctbl", CTBL), (".txt", LUT), (".tsv", TSV), (".csv", CSV),
+        ("_ColorTable.csv", CSV), ("_ColorTable.ctbl", CTBL),
+    ],
+)  # fmt: skip
 def test_tables_of_names_of_every_program_are_read(suffix, text, tmp_path):
     path = tmp_path / "seg.nii.gz"
     volume = tumour((5, 12, 12))

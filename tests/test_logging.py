@@ -356,3 +356,21 @@ def test_bench_prints_json_where_it_is_asked_for(monkeypatch, tmp_path):
     assert json.loads(ussim("bench", "--json", "-", "-v").stdout)["wrong"] == []
     assert ussim("bench", "--json", "numbers.json").stdout == "a table\n"
     assert [path.name for path in tmp_path.iterdir()] == ["numbers.json"]
+
+
+def test_where_there_is_no_terminal_what_takes_long_is_told_in_few_lines(monkeypatch, capsys):
+    from SlicerUSSim.Command import progress
+
+    now = [0.0]
+    monkeypatch.setattr(progress, "perf_counter", lambda: now[0])
+    with progress.Share("segment") as bar:
+        for second in range(601):
+            now[0] = float(second)
+            bar(second / 600)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["segment: 0% done in 2 s", "segment: 1% done in 4 s"] and len(lines) == 9
+    now[0] = 0.0
+    with progress.Share("segment") as bar:  # what is quick is not told
+        bar(0.5)
+        bar(1.0)
+    assert capsys.readouterr().err == ""

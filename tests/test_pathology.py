@@ -20,8 +20,8 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.base.volume import read_array
-from SlicerUSSim.Logic.mri import add_tissue, add_tissues
-from SlicerUSSim.Logic.mri.pathology import texture_below
+from SlicerUSSim.Logic.mri import add_tissue, add_tissues, require_addable
+from SlicerUSSim.Logic.mri.pathology import mask_tissue, texture_below
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import pose_looking_at
 from SlicerUSSim.Logic.tissue.names import tissue_named
@@ -216,6 +216,86 @@ def test_what_is_no_lesion_of_this_patient_is_refused_in_one_line(mask, tissue, 
     assert tissue == "cheese" or str(caught.value).startswith("lesion.nii.gz: ")
 
 
+def _head_in_noise() -> Volume:
+    """A shell of scalp around a brain, and noise in the air."""
+    grid = empty((4.0, 4.0, 4.0), half_mm=110.0)
+    r, noise = distances(grid, [0, 0, 0]), np.random.default_rng(0).rayleigh(4.0, grid.array.shape)
+    return grid.with_array((np.select([r < 68, r < 74, r < 84], [100.0, 10.0, 150.0]) + noise).astype(np.float32))
+
+
+HEAD = _head_in_noise()
+
+
+@pytest.mark.parametrize(
+    ("mask", "tissue", "message"),
+    [
+        (HEAD.with_array(np.zeros_like(HEAD.array)), "tumour", "lesion.nii.gz: is empty"),
+        (moved(ball(empty((2.0, 2.0, 2.0))), 300, 0, 0), "tumour", "lesion.nii.gz: lies 2[01][0-9] mm outside the pat"),
+        (ball(HEAD, 8.0, [70, 70, 70]), "tumour", "lesion.nii.gz: lies (29|3[0-2]) mm outside the patient"),
+        (ball(HEAD, 67.0, [0, 0, 0]), "tumour", "has 12[0-9]{2} ml, as a whole brain has, .* is it the mask of the br"),
+        (ball(HEAD, 84.0, [0, 0, 0]), "tumour", "lesion.nii.gz: covers 9[0-9] % of the patient"),
+        (ball(HEAD), "cheese", "no tissue is called 'cheese', expected one of"),
+        (ball(empty((0.2, 0.2, 0.2), half_mm=2), 1.0, [2, 2, 2]), "tumour", "are too small for the voxels of the MRI"),
+    ],
+)
+def test_what_could_not_be_added_is_refused_before_a_segmentation(mask, tissue, message):
+    with pytest.raises(SimulationError, match=message):
+        require_addable(HEAD, [(tissue, mask, "lesion.nii.gz")])
+
+
+def test_a_lesion_in_or_at_a_head_passes_before_the_segmentation_also_where_it_is_black():
+    dark = HEAD.with_array(np.where(distances(HEAD) < 12, 2.0, HEAD.array))  # a cyst in FLAIR
+    for radius, centre in ((8.0, CENTRE), (20.0, [40, 0, 20]), (6.0, [0, 0, 70]), (5.0, [0, 0, 86])):
+        require_addable(dark, [("tumour", ball(empty((1.5, 1.5, 2.0), half_mm=100), radius, centre), "lesion.nii.gz")])
+    brain = HEAD.with_array((distances(HEAD, [0, 0, 0]) < 68).astype(np.uint8))
+    cap = ball(HEAD, 6.0, [0, 0, 82])
+    require_addable(HEAD, [("tumour", cap, "lesion.nii.gz")])
+    with pytest.raises(SimulationError, match="outside the patient"):  # a given mask is the patient
+        require_addable(HEAD, [("tumour", cap, "lesion.nii.gz")], mask=brain)
+
+
+def test_every_door_refuses_a_lesion_elsewhere_without_segmenting(monkeypatch, tmp_path):
+    def segmented(*arguments, **options):
+        raise AssertionError("it was segmented")
+
+    far = moved(ball(BRAIN), 300, 0, 0)
+    head_mri(4.0).write(tmp_path / "head.nii.gz")
+    far.write(tmp_path / "far.nii.gz")
+    monkeypatch.setattr("SlicerUSSim.Logic.mri.segmentation.segment_mri", segmented)
+    monkeypatch.setattr("SlicerUSSim.Command.whole_line.segment_mri", segmented)
+    adding = ("--add", f"tumour={tmp_path / 'far.nii.gz'}")
+    for arguments in (
+        ("segment", tmp_path / "head.nii.gz", "-o", tmp_path / "l.nii.gz"),
+        ("simulate", tmp_path / "head.nii.gz", "--pose", "auto", "-o", tmp_path / "x.png"),
+        ("demo", "--mri", tmp_path / "head.nii.gz", "--out", tmp_path / "demo"),
+    ):
+        result = ussim(*arguments, *adding)
+        assert result.exit_code == 2 and "far.nii.gz: lies " in result.stderr, result.output
+        assert "mm outside the patient" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "tissue"),
+    [("gray", "grey matter"), ("White", "white matter"), ("GTV", "tumour"), ("bleeding", "haematoma"),
+     ("NCR", "necrosis"), ("ED", "oedema"), ("BraTS 2021", "brats"), ("brats-2023", "brats")],
+)  # fmt: skip
+def test_usual_names_of_lesions_are_understood(name, tissue):
+    assert mask_tissue(name) == tissue
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("lesion", "expected tumour, oedema, necrosis, cyst, haematoma or cavity"),
+        ("tumuor", "expected tumour"), ("odema", "expected oedema"), ("hematom", "expected haematoma"),
+        ("cheese", "expected one of: coupling, csf, "),
+    ],
+)  # fmt: skip
+def test_for_a_name_that_is_not_understood_a_similar_one_is_proposed(name, expected):
+    with pytest.raises(SimulationError, match=f"no tissue is called '{name}', {expected}"):
+        mask_tissue(name)
+
+
 def test_what_the_brain_mask_leaves_out_is_added_and_said():
     mask = ball(BRAIN, 8.0, [22, 0, 0])
     result = added(mask)
@@ -357,6 +437,8 @@ def test_segment_writes_added_tissues_and_says_what_it_added(files, tmp_path):
     assert table.names() == ["coupling", "csf", "grey matter", "white matter", "leptomeninges", "tumour", "cyst"]
     volume_ml = (labels.array == cyst).sum() * 0.027
     assert volume_ml == pytest.approx(4 / 3 * np.pi * 0.5**3, rel=0.2)
+    edema = ussim("segment", files / "head.nii.gz", "-o", out, "--add", f"edema={files / 'cyst.nrrd'}")
+    assert "--add edema: oedema" in edema.stderr and "oedema" in TissueTable.read(tmp_path / "labels.json").names()
     again = ussim("segment", files / "head.nii.gz", "-o", out)  # its own and not edited
     assert again.exit_code == 0 and "tumour" not in TissueTable.read(tmp_path / "labels.json").names()
 

@@ -26,6 +26,7 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 pytest.importorskip("PySide6", reason="the panel is tested on Qt for Python: pip install PySide6-Essentials")
 
 from tests import slicer_stand_in as stand_in  # noqa: E402
+from tests.conftest import SHARED, needs_shared  # noqa: E402
 from tests.slicer_factory import load_source_as_module  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
@@ -637,6 +638,37 @@ def test_cancel_stops_the_segmentation_and_leaves_nothing(session):
     assert session.parameters.labels is None and session.scene.GetNumberOfNodesByClass("vtkMRMLSegmentationNode") == 0
     assert not session.app.errors  # the user knows
     assert session.ui.segmentButton.isEnabled() and not session.ui.progressWidget.isVisibleTo(session.parent)
+
+
+@pytest.mark.slow  # two segmentations and the extraction of a brain
+@needs_shared
+def test_the_brain_of_a_whole_head_is_a_mask_node_and_cancel_stops_its_extraction(session):
+    """ReMIND-022's T1 with the skull, at 3 mm (../shared/data)."""
+    volume = session.logic_module("base.volume").Volume
+    whole = volume.read(SHARED / "remind022" / "t1_contrast.nii.gz")
+    coarse = volume(np.ascontiguousarray(whole.array[::3, ::3, ::3]), whole.ijk_to_ras @ np.diag([3.0, 3.0, 3.0, 1.0]))
+    node = session.add("ScalarVolume", "Whole")
+    session.logic_module("mrml.nodes").write_volume(node, coarse)
+    session.parameters.mri = node
+    begun = []
+
+    def press_cancel():
+        begun.append(time.monotonic())
+        session.ui.cancelButton.click()
+
+    stand_in.QtCore.QTimer.singleShot(1500, press_cancel)
+    session.ui.segmentButton.click()
+    assert begun and time.monotonic() - begun[0] < 20.0
+    assert session.parameters.labels is None and session.parameters.mask is None and not session.app.errors
+    assert session.scene.GetNumberOfNodesByClass("vtkMRMLLabelMapVolumeNode") == 0
+    session.ui.segmentButton.click()
+    assert not session.app.errors
+    brain = session.parameters.mask
+    assert brain.GetName() == "Whole brain" and "whole head: brain extracted" in session.ui.notesLabel.text()
+    inside = session.logic_module("mrml.nodes").read_volume(brain).array > 0
+    assert 1000 < inside.sum() * 0.027 < 1700
+    session.ui.segmentButton.click()  # with the mask, which nobody has edited
+    assert session.parameters.mask is brain and "brain mask as given" in session.ui.notesLabel.text()
 
 
 def test_errors_of_every_button_are_one_line(session):

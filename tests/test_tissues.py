@@ -191,3 +191,19 @@ def test_a_tissue_replaces_all_of_its_name_and_a_new_one_gets_a_free_label():
     more = changed.with_tissue(TISSUES["tumour"])
     assert more[3].name == "tumour" and more.membrane == changed.membrane and len(more) == len(changed) + 1
     assert TissueTable({}).all_tissues() == [TISSUES["coupling"]]
+
+
+def test_fluids_of_the_membrane_are_tissues_in_their_own_spelling():
+    from SlicerUSSim.Command.set_option import Changes
+
+    table = TissueTable.brain()
+    changes = Changes.of(["membrane.fluids=CSF, Cyst"])
+    assert changes.to_tissues(table).membrane.fluids == ("csf", "cyst")
+    for text, message in (
+        ("csf,nonsense", "--set: membrane.fluids: no tissue 'nonsense', expected coupling, csf, "),
+        ("csf,cavitiy", "--set: membrane.fluids: no tissue 'cavitiy', expected cavity"),
+    ):
+        wrong = Changes.of([f"membrane.fluids={text}"])
+        for check in (lambda: wrong.to_tissues(table), lambda: wrong.check_tissues(table.names())):  # noqa: B023
+            with pytest.raises(SimulationError, match=message):
+                check()

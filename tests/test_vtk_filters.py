@@ -445,3 +445,28 @@ def seen_along_z(actor, pose: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     grab.Update()
     scalars = grab.GetOutput().GetPointData().GetScalars()
     return vtk_to_numpy(scalars).reshape(size[1], size[0], 3)[::-1, :, 0]
+
+
+def test_another_mri_is_registered_and_classified_with_the_first():
+    from SlicerUSSim.Logic import segment_mri
+    from SlicerUSSim.Logic.mri import SegmentationSettings, head_mri
+    from SlicerUSSim.Logic.vtk import SegmentationFilter
+
+    t1 = head_mri(4.0)
+    noise = np.random.default_rng(1).normal(0.0, 4.0, t1.array.shape)
+    inverse = np.where(t1.array > 0, 160.0 - t1.array + noise, 0.0).astype(np.float32)
+    t2 = Volume(inverse, rigid(np.eye(3), [3.0, -2.0, 1.0]) @ t1.ijk_to_ras)
+    algorithm = SegmentationFilter()
+    algorithm.SetInputData(t1.to_vtk())
+    algorithm.SetOtherData("t2", t2.to_vtk())
+    algorithm.Update()
+    assert not algorithm.GetErrorMessage() and any(line.startswith("t2: registered") for line in algorithm.GetNotes())
+    expected = segment_mri(t1, others={"t2": t2}, thin_sulci=SegmentationSettings.thin_sulci).labels.array
+    np.testing.assert_array_equal(Volume.from_vtk(algorithm.GetOutput()).array, expected)
+    algorithm.SetOtherData("t2", None)
+    algorithm.Update()
+    assert not any("registered" in line for line in algorithm.GetNotes())
+    algorithm.SetOtherData("t1", t2.to_vtk())
+    algorithm.AddObserver("ErrorEvent", lambda *_: None)
+    algorithm.Update()
+    assert "second volume of contrast t1" in algorithm.GetErrorMessage()

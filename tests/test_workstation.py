@@ -86,6 +86,7 @@ def files(tmp_path_factory) -> Path:
     to_probe = ImageGrid.for_probe(probe, None).image_to_probe
     transforms = tuple({"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in poses)
     TrackedSequence(np.stack(images), transforms, 0.1 * np.arange(6)).write(folder / "sweep.igs.mha")
+    Volume(np.ones((4, 4, 4), np.uint8), np.diag([5.0, 5, 5, 1]) + 300 * np.eye(4, k=3)).write(folder / "far.nii.gz")
     (folder / "broken.nii.gz").write_bytes(b"this is no image")
     return folder
 
@@ -304,6 +305,23 @@ def download(page: Page, kind: str) -> Path:
     with page.expect_download() as waiting:
         click(page, f"#export-{kind}")
     return Path(waiting.value.path())
+
+
+def script_of(page: Page) -> str:
+    """The text of Copy as Python."""
+    click(page, "#export")
+    click(page, "#export-python")
+    text = page.locator("#ussim-script").input_value()
+    page.get_by_role("button", name="Close", exact=True).click()
+    return text
+
+
+def run_again(script: str, folder: Path) -> np.ndarray:
+    """The (rows, columns) image that a script writes in a folder."""
+    (folder / "again.py").write_text(script)
+    done = subprocess.run([sys.executable, "again.py"], cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert done.returncode == 0, done.stderr
+    return read_array(folder / "image.nrrd")[0][0]
 
 
 def open_section(page: Page, title: str) -> None:
@@ -684,13 +702,7 @@ def test_images_are_exported_as_they_are_seen_with_their_place(page):
 
 def test_the_script_gives_the_same_image_pixel_by_pixel(page, tmp_path):
     expected = np.asarray(Image.open(download(page, "png")))
-    click(page, "#export")
-    click(page, "#export-python")
-    text = page.locator("#ussim-script").input_value()
-    (tmp_path / "again.py").write_text(text)
-    subprocess.run([sys.executable, "again.py"], cwd=tmp_path, check=True, capture_output=True, timeout=PATIENCE_S)
-    assert np.array_equal(read_array(tmp_path / "image.nrrd")[0][0], expected)
-    page.get_by_role("button", name="Close", exact=True).click()
+    assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
 
 def test_the_cine_is_a_gif_that_moves(page):
@@ -818,6 +830,10 @@ def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_say
     assert "cyst: " in page.locator("#notesLabel").inner_text() and not errors(page)
     assert "cyst" in {row["name"] for row in state(page, NAMES.panel.tissues)}
     assert shown(page, "labelsSelector") == labels and shown(page, "lesionsSelector") is not None
+    page.wait_for_timeout(500)
+    expected = np.asarray(Image.open(download(page, "png")))
+    assert "# Opened in a page; give its path below, or run this beside it: 'mask.nii.gz'" in script_of(page)
+    assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
 
 def test_latency_is_measured_on_request(page):
@@ -840,6 +856,13 @@ def test_another_mri_takes_the_place_of_the_first(page, files):
     assert not errors(page) and shown(page, "liveCheckBox") and pixels(page).mean() > 5
     assert page.locator("#mriSelector option:checked").inner_text().strip() == "again.nii.gz"
     assert page.locator("#labelsSelector option:checked").inner_text().strip() == "again.nii.gz tissues"
+    assert shown(page, "lesionsSelector") is None  # of the patient before
+    elsewhere = Volume.read(files / "head.nii.gz")
+    Volume(elsewhere.array, elsewhere.ijk_to_ras + 400.0 * np.eye(4, k=3)).write(files / "elsewhere.nii.gz")
+    with new_image(page):
+        page.set_input_files("#open-file", files / "elsewhere.nii.gz")
+    settled(page)
+    assert not errors(page) and pixels(page).mean() > 5  # the probe is placed on the patient in another frame
 
 
 # ---- who may come in, and how it is started --------------------------------------------------------------------------
@@ -896,10 +919,16 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
         (["--sequence", "{broken}"], "broken.nii.gz"),
         (["--host", "203.0.113.7"], "cannot listen at 203.0.113.7"),
         (["--device", "no such device"], "no such device"),
+        (["{head}", "--also", "t2"], "--also is 't2', expected CONTRAST=FILE"),
+        (["{head}", "--also", "t2={head}", "--also", "flair={head}"], "--also is given 2 times, expected one"),
+        (["{head}", "--add", "tumuor={head}"], "no tissue is called 'tumuor', expected tumour"),
+        (["{head}", "--add", "tumour={far}"], "far.nii.gz: lies "),
+        (["{head}", "--map", "24=csf"], "--map is for a label map, expected --labels too"),
     ],
 )
 def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):
-    arguments = [text.format(broken=files / "broken.nii.gz") for text in arguments]
+    names = {name: files / f"{name}.nii.gz" for name in ("broken", "head", "far")}
+    arguments = [text.format(**names) for text in arguments]
     done = subprocess.run(
         [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", *arguments],
         capture_output=True,

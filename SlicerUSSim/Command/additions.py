@@ -51,24 +51,38 @@ class Additions:
         Raises SimulationError, before anything slow is done, for a value that is not TISSUE=FILE, for an unknown
         tissue, and for a file that is not a mask.
         """
-        parts = split_additions(texts)
+        parts, own = split_additions(texts), tuple(own_tissues)
         if not parts:
             return cls()
         from SlicerUSSim.Logic.base.volume import Volume  # imported here to keep --help fast
+        from SlicerUSSim.Logic.mri.pathology import mask_tissue
 
-        return cls.of(((name, Volume.read(file), file) for name, file in parts), own_tissues)
+        for name, _ in parts:  # before a file is read
+            mask_tissue(name, own)
+        return cls.of(((name, Volume.read(file), file) for name, file in parts), own)
 
     @classmethod
     def of(cls, parts: Iterable[tuple[str, Volume, str]], own_tissues: Iterable[str] = ()) -> Additions:
-        """From (tissue, mask, its file); errors as in read()."""
+        """From (tissue, mask, its file); errors as in read(). Says which tissue a synonym is."""
         from SlicerUSSim.Logic.mri.masks import read_masks
         from SlicerUSSim.Logic.mri.pathology import mask_tissue
+        from SlicerUSSim.Logic.tissue.names import same_name
 
-        own = tuple(own_tissues)
-        masks = tuple((mask_tissue(name, own), mask, Path(file).name) for name, mask, file in parts)
-        for tissue, mask, file in masks:
-            read_masks(mask, tissue, file)
-        return cls(masks, own)
+        own, masks = tuple(own_tissues), []
+        for name, mask, file in parts:
+            tissue = mask_tissue(name, own)
+            if not same_name(name, tissue):
+                note(f"--add {name}: {tissue}")
+            read_masks(mask, tissue, Path(file).name)
+            masks.append((tissue, mask, Path(file).name))
+        return cls(tuple(masks), own)
+
+    def require_addable(self, mri: Volume, mask: Volume | None, skull_strip: str) -> None:
+        """Raise SimulationError for what could not be added after a segmentation of `mri`, which is slow."""
+        if self.masks:
+            from SlicerUSSim.Logic.mri.addable import require_addable
+
+            require_addable(mri, self.masks, mask=mask, skull_strip=skull_strip, also=self.own_tissues)
 
     def with_presets(self, tissues: TissueTable) -> TissueTable:
         """A table with the presets of those tissues that it lacks."""

@@ -13,6 +13,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 if TYPE_CHECKING:
+    from SlicerUSSim.Command.additions import Additions
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import Segmentation
 
@@ -50,20 +51,25 @@ def segmented_file(
     mask: str | None = None,
     also: Iterable[str] = (),
     device: str | None = None,
+    additions: Additions | None = None,
     tell_all: bool = False,
 ) -> Segmentation:
     """Segment the MRI of a file; its brain mask is kept beside it.
 
     Says how the brain was found, with `tell_all` also what else; what should be checked is logged as warnings.
+    Raises SimulationError before the segmentation for `additions` that could not be added after it.
     """
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
 
     others = read_also(also)
+    brain = Volume.read(mask) if mask else None
+    if additions is not None:
+        additions.require_addable(mri, brain, settings["skull_strip"])
     with Share("segment") as progress:
         result = segment_mri(
-            mri, **settings, others=others, mask=Volume.read(mask) if mask else None, keep_mask_at=mask_beside(path),
+            mri, **settings, others=others, mask=brain, keep_mask_at=mask_beside(path),
             device=device, progress=progress,
         )  # fmt: skip
     for line in result.notes if tell_all else (result.brain.message,):

@@ -175,8 +175,9 @@ def open_examination(patient: PatientOptions) -> Examination:
     else:
         changes.to_tissues(additions.with_presets(tissues))
     segmentation = segmented_file(
-        patient.mri_or_labels, volume, patient.segmentation, mask=patient.mask, also=patient.also, device=patient.device
-    )
+        patient.mri_or_labels, volume, patient.segmentation, mask=patient.mask, also=patient.also,
+        device=patient.device, additions=additions,
+    )  # fmt: skip
     names = segmentation.tissue_names if table is None else tissues.names_by_label()
     added = additions.on(segmentation.labels, names)
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)

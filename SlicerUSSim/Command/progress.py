@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from time import perf_counter
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,9 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from SlicerUSSim.Logic.fitting import Progress
+
+#: Seconds until the first line about something slow where there is no terminal
+_FIRST_LINE_S = 2.0
 
 
 def note(text: str) -> None:
@@ -25,13 +29,23 @@ def note(text: str) -> None:
 
 
 class _Bar:
-    """A progress bar that is shown during its `with` block if stderr is a terminal."""
+    """A progress bar during its `with` block, if stderr is a terminal.
+
+    In a file or a pipe, what takes long is told in a line after 2 s, 4 s, 8 s and so on: eight lines in ten minutes.
+    """
 
     def __init__(self, total: int, name: str = "") -> None:
         from tqdm import tqdm
 
         self.bar = tqdm(total=total, bar_format="|{bar:24}| {desc}", file=sys.stderr, leave=False, disable=None)
-        self.bar.set_description_str(name)
+        self.name = name
+        self._start, self._next_s = perf_counter(), _FIRST_LINE_S
+        self._show(name)
+
+    def _show(self, name: str) -> None:
+        """Change the text beside the bar."""
+        self.name = name
+        self.bar.set_description_str(name, refresh=False)
 
     def __enter__(self) -> Self:
         return self
@@ -43,7 +57,13 @@ class _Bar:
 
     def _reach(self, share: float) -> None:
         """Show the fraction done, 0 to 1."""
-        self.bar.update(int((self.bar.total or 0) * share) - self.bar.n)
+        if not self.bar.disable:
+            self.bar.update(int((self.bar.total or 0) * share) - self.bar.n)
+            return
+        seconds = perf_counter() - self._start
+        if seconds >= self._next_s and share < 1.0:
+            self._next_s = 2.0 * seconds
+            note(f"{self.name}: {share:.0%} done in {seconds:.0f} s")
 
 
 class Steps(_Bar):
@@ -54,9 +74,12 @@ class Steps(_Bar):
         self.begun = 0
 
     def __call__(self, name: str) -> None:
-        self.bar.set_description_str(name, refresh=False)
-        self.bar.update(1 if self.begun else 0)
-        self.bar.refresh()
+        self._show(name)
+        if self.bar.disable:
+            note(f"{name} ...")
+        else:
+            self.bar.update(1 if self.begun else 0)
+            self.bar.refresh()
         self.begun += 1
 
 
@@ -77,5 +100,5 @@ class Curve(_Bar):
         super().__init__(100, name)
 
     def __call__(self, progress: Progress) -> None:
-        self.bar.set_description_str(f"{progress.stage}: cost {progress.best_cost:.4f}", refresh=False)
+        self._show(f"{progress.stage}: cost {progress.best_cost:.4f}")
         self._reach(progress.share)

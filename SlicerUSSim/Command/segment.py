@@ -56,7 +56,9 @@ def segment(
     if mask is None and settings.skull_strip != "none":
         _require_mri(mri, volume)
     start = perf_counter()
-    result = segmented_file(mri, volume, asdict(settings), mask=mask, also=also, device=device, tell_all=True)
+    result = segmented_file(
+        mri, volume, asdict(settings), mask=mask, also=also, device=device, additions=masks, tell_all=True
+    )
     seconds = perf_counter() - start
     added = masks.on(result.labels, result.tissue_names)
     beside = write_label_files(out, added.labels, TissueTable.brain(added.tissue_names))

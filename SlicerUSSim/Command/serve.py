@@ -108,8 +108,10 @@ def serve(
 
     choose_device(device)
     volumes = {file: Volume.read(file) for file in files}
-    checked = Additions.of((tissue, volumes[file], file) for tissue, file in added).masks
-    masks = tuple((tissue, file) for (tissue, _, _), (_, file) in zip(checked, added, strict=True))
+    checked = Additions.of((tissue, volumes[file], file) for tissue, file in added)
+    if mri is not None and labels is None:
+        checked.require_addable(volumes[mri], None if mask is None else volumes[mask], skull_strip)
+    masks = tuple((tissue, file) for (tissue, _, _), (_, file) in zip(checked.masks, added, strict=True))
     chosen_preset = Preset.read(preset) if preset else None
     tracked = read_sequence(sequence, calibration) if sequence else None
     to_ras = read_to_mri(to_mri) if to_mri else None

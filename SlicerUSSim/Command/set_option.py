@@ -90,7 +90,8 @@ class Changes:
             tissues = tissues.replace(_owner(written, (tissue.name for tissue in tissues.all_tissues())), **values)
         if self.membrane:
             require(tissues.membrane is not None, "--set membrane: the tissue table has no membrane")
-            tissues = tissues.with_membrane(replace(tissues.membrane, **self.membrane))  # type: ignore[type-var]
+            values = self._membrane_of([tissue.name for tissue in tissues.all_tissues()])
+            tissues = tissues.with_membrane(replace(tissues.membrane, **values))  # type: ignore[type-var]
         return tissues
 
     def check_tissues(self, known: Iterable[str]) -> None:
@@ -98,10 +99,20 @@ class Changes:
         known = list(known)
         for written in self.tissues:
             _owner(written, known)
+        self._membrane_of(known)
+
+    def _membrane_of(self, known: list[str]) -> dict[str, Any]:
+        """The membrane's values; fluids are among these tissues and the presets, in their spelling."""
+        from SlicerUSSim.Logic.tissue.presets import TISSUES
+
+        if "fluids" not in self.membrane:
+            return self.membrane
+        fluids = [_owner(written, (*known, *TISSUES), "membrane.fluids: ") for written in self.membrane["fluids"]]
+        return {**self.membrane, "fluids": tuple(dict.fromkeys(fluids))}
 
 
-def _owner(written: str, known: Iterable[str]) -> str:
-    """The known tissue with this name, in other spelling if necessary."""
+def _owner(written: str, known: Iterable[str], where: str = "") -> str:
+    """The known tissue with this name, in other spelling if necessary; `where` is for the message."""
     from SlicerUSSim.Logic.tissue.names import same_name
 
     known = list(dict.fromkeys(known))
@@ -109,7 +120,7 @@ def _owner(written: str, known: Iterable[str]) -> str:
         if same_name(name, written):
             return name
     near = get_close_matches(written, known, n=3)
-    raise SimulationError(f"--set: no tissue {written!r}, expected {_either(near or known)}")
+    raise SimulationError(f"--set: {where}no tissue {written!r}, expected {_either(near or known)}")
 
 
 def _hint(name: str, section: str, of_preset: dict[str, Parameter], of_tissue: dict[str, Parameter]) -> str:

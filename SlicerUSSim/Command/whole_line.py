@@ -19,6 +19,7 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.brain import BrainMask
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, slice_under_probe
 from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
@@ -53,13 +54,16 @@ def run_whole_line(
 
     progress("segment the MRI")
     start = perf_counter()
-    segmentation = segment_mri(mri, thin_sulci=True, device=device, **(segmentation_options or {}))
+    options = dict(segmentation_options or {})
+    additions = additions or Additions()
+    additions.require_addable(mri, options.get("mask"), options.get("skull_strip", SegmentationSettings.skull_strip))
+    segmentation = segment_mri(mri, thin_sulci=True, device=device, **options)
     found(segmentation.brain)
     timings["segmentation"] = (perf_counter() - start) * 1e3
 
     progress("build the acoustic medium")
     start = perf_counter()
-    added = (additions or Additions()).on(segmentation.labels, segmentation.tissue_names)
+    added = additions.on(segmentation.labels, segmentation.tissue_names)
     labels, names = added.labels, added.tissue_names
     tissues = TissueTable.brain(names)
     simulator = UltrasoundSimulator(labels, tissues, settings, device)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import asdict, replace
 from typing import Any
 
+import numpy as np
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError
@@ -13,14 +14,19 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+from SlicerUSSim.Logic.mrml.nodes import node_to_world
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.opener import Files, Opener
 from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
+
+#: Farther from the volume of another patient's tissues, a probe is placed anew
+_FAR_MM = 50.0
 
 
 class Loading:
@@ -41,6 +47,7 @@ class Loading:
         self._shared, self._scene, self._logic, self._tasks = shared, app.scene, logic, tasks
         self._opener, self._presenter = opener, presenter
         self._views, self._probe, self._comparison = views, probe, comparison
+        self._is_new = False  # an MRI was opened, and has no tissues yet
 
     def begin(self, files: Files) -> None:
         """Load the files with which the workstation was started, and show the first image."""
@@ -93,16 +100,18 @@ class Loading:
         # A mask that Segment extracted is found again by the same options.
         mask = None if self._logic.isOwnBrain(parameters.mask) else parameters.mask
         inputs = parameters.mri, mask, asdict(parameters.segmentation)
-        lesions = self._opener.lesion_files(parameters.lesions)
+        contrast = parameters.panel.second_contrast
+        others = {} if parameters.second_mri is None or contrast == "none" else {contrast: parameters.second_mri}
+        lesions = parameters.lesions
         if self._changed(self._presenter.segment):
-            has_second = parameters.second_mri is not None and parameters.panel.second_contrast != "none"
-            self._opener.segmented(parameters.labels, *inputs, None if has_second else lesions)
+            self._opener.segmented(parameters.labels, *inputs, others, lesions)
             self._labels_ready()
 
     def add_tissues(self) -> None:
         """Lay the lesions over the tissues."""
+        source = self._opener.known_source(self._logic.parameters.labels)
         if self._changed(self._presenter.addTissues):
-            self._labels_ready()
+            self._laid(source)
 
     def place_probe(self) -> None:
         """Place the probe at a typical craniotomy."""
@@ -114,7 +123,7 @@ class Loading:
     def _lay(self, mask: Volume, tissue: str, name: str) -> None:
         """Add a mask to the lesions, and lay them over the tissues, if there are any; otherwise Segment does so."""
         parameters: Any = self._logic.parameters
-        before = parameters.lesions
+        before, source = parameters.lesions, self._opener.known_source(parameters.labels)
         node, undo = self._opener.add_lesion(before, mask, tissue, name)
         parameters.lesions = node
         try:
@@ -125,7 +134,13 @@ class Loading:
             parameters.lesions = before
             raise
         if parameters.labels is not None:
-            self._labels_ready()
+            self._laid(source)
+
+    def _laid(self, source: LabelSource | None) -> None:
+        """The lesions now lie over labels of this source."""
+        parameters = self._logic.parameters
+        self._opener.added(source, parameters.labels, parameters.lesions)
+        self._labels_ready()
 
     def _changed(self, action: Callable[[], None]) -> bool:
         """Whether an action has written labels."""
@@ -153,6 +168,9 @@ class Loading:
         node = self._opener.mri(path)
         self._logic.stopLiveUpdate()  # until the new MRI is segmented
         parameters.mri, parameters.labels, parameters.mask = node, None, None
+        parameters.second_mri = parameters.lesions = None  # of the patient before
+        self._presenter.clearNotes()
+        self._is_new = True
         self._take_volume(node)
 
     def _take_volume(self, node: Any) -> None:
@@ -167,9 +185,19 @@ class Loading:
         self._logic.parameters.real = images
         self._comparison.take(tracked, browser)
 
+    def _probe_is_far(self) -> bool:
+        """Whether the probe lies outside the tissues' volume, as that of a patient in another frame does."""
+        parameters: Any = self._logic.parameters
+        bounds = np.zeros(6)
+        parameters.labels.GetRASBounds(bounds)
+        low, high = bounds[::2] - _FAR_MM, bounds[1::2] + _FAR_MM
+        face = node_to_world(parameters.probe_transform)[:3, 3]
+        return bool(((face < low) | (face > high)).any())
+
     def _labels_ready(self) -> None:
-        if self._logic.parameters.probe_transform is None:
+        if self._logic.parameters.probe_transform is None or (self._is_new and self._probe_is_far()):
             self._presenter.placeProbe()
+        self._is_new = False
         if not self._logic.isLive:
             self._presenter.setLive(True)
         self._probe.update_surface()  # after the start of live images, which do not need it

@@ -34,7 +34,7 @@ from SlicerUSSim.Workstation.tasks import Tasks
 
 _log = logging.getLogger(__name__)
 
-#: Attribute of a node: the file from which it was read; "" for the demo brain.
+#: Attribute of a node: the file from which it was read; "" for the demo brain, the name alone for one sent by a page.
 FILE = "SlicerUSSim.file"
 
 
@@ -75,6 +75,8 @@ class Opener:
         #: {segments of a node: (tissue, file) of each}
         self._lesion_files: dict[tuple, tuple[tuple[str, str], ...]] = {}
         self._volumes = dict(files.volumes)  # read, but not yet used
+        #: {temporary path: name} of the file that a page has sent
+        self._uploads: dict[str, str] = {}
 
     def mri(self, path: str | None):
         """A volume node with the MRI of a file, or with the demo brain."""
@@ -82,7 +84,7 @@ class Opener:
         name = "MNI152 brain" if path is None else Path(path).name
         node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
         write_volume(node, volume)
-        node.SetAttribute(FILE, "" if path is None else os.path.abspath(path))
+        node.SetAttribute(FILE, "" if path is None else self._place(path))
         display = display_of(node)
         display.SetAutoWindowLevel(False)  # the automatic window saturates bright tissue
         inside = volume.array[volume.array > 0]
@@ -98,7 +100,7 @@ class Opener:
         """A volume node with a further MRI of the patient."""
         node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", Path(path).name)
         write_volume(node, self._volume(path))
-        node.SetAttribute(FILE, os.path.abspath(path))
+        node.SetAttribute(FILE, self._place(path))
         return node
 
     def mask(self, path: str):
@@ -127,20 +129,21 @@ class Opener:
         node = self._label_map(found.labels, path, found.names)
         order = read_labels(node, self._logic.preset.tissues).names
         relabelled = {old: order.index(found.names[new - 1]) + 1 if new else 0 for old, new in found.relabelled.items()}
-        self._sources = {_voxels_of(node): LabelSource(os.path.abspath(path), True, relabelled=relabelled)}
+        source = LabelSource(self._place(path), True, relabelled=relabelled, tissue_names=tuple(order))
+        self._sources = {_voxels_of(node): source}
         return node, found
 
     def lesion_of_file(self, lesions_node, tissue: str, path: str):
         """The segmentation node with the lesions, with a mask of a file; made if it is None."""
-        mask = self._volume(path)
-        files = self.lesion_files(lesions_node)
-        node, _ = self.add_lesion(lesions_node, mask, tissue, Path(path).name)
-        if files is not None and tissue != "brats":  # whose segments overlap
-            self._lesion_files[_segments_of(node)] = (*files, (tissue, os.path.abspath(path)))
+        node, _ = self.add_lesion(lesions_node, self._volume(path), tissue, Path(path).name, os.path.abspath(path))
         return node
 
-    def add_lesion(self, lesions_node, mask: Volume, tissue: str, name: str):
-        """(segmentation node with the lesions, function that takes the mask out of it again)."""
+    def add_lesion(self, lesions_node, mask: Volume, tissue: str, name: str, file: str | None = None):
+        """(segmentation node with the lesions, function that takes the mask out of it again).
+
+        `file` is that of the mask; default: it has no path, since a page has sent it.
+        """
+        files = self.lesion_files(lesions_node)
         made = lesions_node is None
         node = self._scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions") if made else lesions_node
 
@@ -155,6 +158,8 @@ class Opener:
         except SimulationError:
             undo()
             raise
+        if files is not None:
+            self._lesion_files[_segments_of(node)] = (*files, (tissue, file or name))
         return node, lambda: undo(ids)
 
     def lesion_files(self, lesions_node) -> tuple[tuple[str, str], ...] | None:
@@ -164,18 +169,30 @@ class Opener:
         return self._lesion_files.get(_segments_of(lesions_node))
 
     def segmented(
-        self, labels_node, mri_node, mask_node, options: dict, additions: tuple[tuple[str, str], ...] | None = ()
+        self, labels_node, mri_node, mask_node, options: dict, others: Mapping[str, Any], lesions_node
     ) -> None:
-        """Record the source of labels; `additions` are (tissue, file), or None if they are not of files."""
-        file, mask = mri_node.GetAttribute(FILE), None if mask_node is None else mask_node.GetAttribute(FILE)
+        """Record the source of labels that Segment made, from these nodes and {contrast: node}, with the lesions."""
+        file, mask = mri_node.GetAttribute(FILE), None if mask_node is None else _file_of(mask_node)
         self._sources = {}
-        if file is not None and (mask_node is None or mask is not None) and additions is not None:
-            source = LabelSource(file, mask=mask, options=options, additions=additions)
+        additions = self.lesion_files(lesions_node)
+        if file is not None and additions is not None:
+            files = {contrast: _file_of(node) for contrast, node in others.items()}
+            source = LabelSource(file, mask=mask, options=options, others=files, additions=additions)
             self._sources[_voxels_of(labels_node)] = source
+
+    def added(self, source: LabelSource | None, labels_node, lesions_node) -> None:
+        """Record the source of labels that are those of `source` with the lesions on top."""
+        additions = self.lesion_files(lesions_node)
+        if source is not None and additions is not None:
+            self._sources[_voxels_of(labels_node)] = replace(source, additions=additions)
+
+    def known_source(self, labels_node) -> LabelSource | None:
+        """The source of labels; None if it is unknown, or there are no labels."""
+        return None if labels_node is None else self._sources.get(_voxels_of(labels_node))
 
     def source_of(self, labels_node) -> LabelSource:
         """The source of labels. Raises SimulationError if they were not made from files."""
-        source = self._sources.get(_voxels_of(labels_node))
+        source = self.known_source(labels_node)
         if source is None:
             name = labels_node.GetName()
             raise SimulationError(f"{name!r} has no source file, expected labels of a file (save, open with --labels)")
@@ -214,6 +231,7 @@ class Opener:
         with TemporaryDirectory() as folder:
             path = Path(folder) / name
             path.write_bytes(content)
+            self._uploads = {str(path): name}
             try:
                 if name.lower().endswith(".json"):
                     kind = "preset"
@@ -227,6 +245,10 @@ class Opener:
             except SimulationError as error:  # without the temporary folder: the user chose only the file name
                 raise SimulationError(str(error).replace(folder + os.sep, "")) from None
 
+    def _place(self, path: str) -> str:
+        """The path of a file; its name alone if a page has sent it."""
+        return self._uploads.get(path) or os.path.abspath(path)
+
     def _volume(self, path: str) -> Volume:
         """The volume of a file, read once."""
         return self._volumes.pop(path, None) or self._tasks.do(lambda: Volume.read(path))
@@ -234,9 +256,14 @@ class Opener:
     def _label_map(self, volume: Volume, path: str, names):
         volume = as_whole(volume, path)
         node = self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", Path(path).name)
-        node.SetAttribute(FILE, os.path.abspath(path))
+        node.SetAttribute(FILE, self._place(path))
         write_labels(node, volume.with_array(volume.array.astype(np.uint8)), names, node)
         return node
+
+
+def _file_of(node) -> str:
+    """The file of a node; for a node without one, that in which a user would save it."""
+    return node.GetAttribute(FILE) or f"{node.GetName()}.nrrd"
 
 
 def _segments_of(lesions_node) -> tuple:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pprint import pformat
@@ -11,9 +12,10 @@ from textwrap import indent
 import numpy as np
 
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.tissue.presets import TISSUES
 
 _TEMPLATE = '''"""Reproduces an image of a SlicerUSSim workstation."""
-
+{missing}
 import numpy as np
 
 from SlicerUSSim.Logic import {imports}
@@ -36,7 +38,8 @@ print(frame.image.shape, "pixels, mean", frame.image.mean())
 class LabelSource:
     """Source of labels: a label file, or the segmentation of an MRI."""
 
-    #: File of the MRI or of the labels; "" is the demo brain
+    #: File of the MRI or of the labels; "" is the demo brain. Of files without a path, which were opened in a page, the
+    #: name
     path: str
     is_labels: bool = False
     #: File of the mask, if one was used
@@ -45,8 +48,18 @@ class LabelSource:
     options: dict = field(default_factory=dict)
     #: {label in the file: the simulator's number}
     relabelled: Mapping[int, int] = field(default_factory=dict)
+    #: Of labels 1, 2, ... in a label file, in the simulator's numbers
+    tissue_names: tuple[str, ...] = ()
+    #: {contrast: file} of further MRIs
+    others: Mapping[str, str] = field(default_factory=dict)
     #: (tissue, file) of the masks added on top
     additions: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """The files whose place is not known."""
+        files = (self.path, self.mask, *self.others.values(), *(file for _, file in self.additions))
+        return tuple(dict.fromkeys(file for file in files if file and not os.path.isabs(file)))
 
 
 def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray) -> str:
@@ -72,18 +85,30 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         if source.mask is not None:
             imports.append("Volume")
             options.append(f"mask=Volume.read({source.mask!r})")
+        if source.others:
+            imports.append("Volume")
+            others = ", ".join(f"{name!r}: Volume.read({path!r})" for name, path in source.others.items())
+            options.append(f"others={{{others}}}")
         lines += [f"segmentation = segment_mri({', '.join(['mri', *options])})", "labels = segmentation.labels"]
     texture = "segmentation.texture()"
     if source.additions:
         imports.append("Volume")
         more += "from SlicerUSSim.Logic.mri import add_tissues\n"
         masks = ", ".join(f"({name!r}, Volume.read({path!r}), {path!r})" for name, path in source.additions)
-        lines.append(f"labels = add_tissues(labels, segmentation.tissue_names, [{masks}]).labels")
+        names = repr(list(source.tissue_names)) if source.is_labels else "segmentation.tissue_names"
+        own = [tissue.name for tissue in preset.tissues.all_tissues()]
+        also = [name for name, _ in source.additions if name in own and name not in TISSUES]
+        if any(name == "brats" for name, _ in source.additions):
+            lines.append("# The page has one segment for each tissue of a BraTS map; borders may differ by a voxel.")
+        lines.append(f"labels = add_tissues(labels, {names}, [{masks}]{f', also={also!r}' if also else ''}).labels")
         texture = f"texture_below({texture}, mri, segmentation.labels, labels)"
     needs_texture = preset.settings.needs_texture and not source.is_labels
     if needs_texture and source.additions:
         more += "from SlicerUSSim.Logic.mri.pathology import texture_below\n"
     return _TEMPLATE.format(
+        missing="".join(
+            f"# Opened in a page; give its path below, or run this beside it: {name!r}\n" for name in source.missing
+        ),
         imports=", ".join(sorted(set(imports))),
         more_imports=more,
         labels="\n".join(lines),

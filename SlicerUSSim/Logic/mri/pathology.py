@@ -7,6 +7,7 @@ the images can.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -16,7 +17,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.masks import Masks, read_masks, resampled
-from SlicerUSSim.Logic.tissue.names import same_name, tissue_named
+from SlicerUSSim.Logic.tissue.names import same_name, similar_tissues, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
@@ -26,9 +27,9 @@ _log = logging.getLogger(__name__)
 #: Tissues that are usually added, for choices; "brats" is a map of several.
 LESIONS = ("tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity", "enhancing", "blood", "brats")
 #: A mask of more than this share of the patient is not a lesion.
-_LARGEST_SHARE = 0.6
+LARGEST_SHARE = 0.6
 #: A mask without a voxel in the patient may lie this far from it: a meningioma that brain extraction has cut off.
-_FARTHEST_MM = 5.0
+FARTHEST_MM = 5.0
 #: Shares below these are not mentioned.
 _LEAST_LEFT_OUT, _LEAST_OVER, _LEAST_LOST = 0.02, 0.01, 0.2
 
@@ -62,16 +63,19 @@ def tissue_to_add(name: str, tissue_names: Iterable[str] = ()) -> str:
     >>> tissue_to_add("Edema")
     'oedema'
     """
+    tissue_names = tuple(tissue_names)
     known = next((mine for mine in tissue_names if mine and same_name(mine, name)), None)
     if known is not None:
         return known
     try:
         return tissue_named(name).name
     except SimulationError:
+        similar = similar_tissues(name, tissue_names)
         mine = [own for own in dict.fromkeys(tissue_names) if own and own not in TISSUES]
-        raise SimulationError(
-            f"no tissue is called {name!r}, expected one of: {', '.join([*mine, *TISSUES])}"
-        ) from None
+        expected = f"one of: {', '.join([*mine, *TISSUES])}"
+        if similar:
+            expected = " or ".join([", ".join(similar[:-1]), similar[-1]][len(similar) == 1 :])
+        raise SimulationError(f"no tissue is called {name!r}, expected {expected}") from None
 
 
 def add_tissue(
@@ -124,8 +128,8 @@ def add_tissues(
 
 
 def mask_tissue(name: str, tissue_names: Iterable[str] = ()) -> str:
-    """As tissue_to_add; "brats" is itself."""
-    return "brats" if name.strip().lower() == "brats" else tissue_to_add(name, tissue_names)
+    """As tissue_to_add; "brats", also with a year, is itself."""
+    return "brats" if re.fullmatch(r"brats\W*(20\d\d)?", name.strip().lower()) else tissue_to_add(name, tissue_names)
 
 
 def texture_below(texture: Texture, mri: Volume, before: Volume, after: Volume) -> Texture:
@@ -155,12 +159,8 @@ def _added(labels: Volume, names: Sequence[str], masks: Masks) -> Added:
     covered = below[numbers > 0]
     met = int((covered > 0).sum())
     if not met:
-        _check_place(labels, masks, where, numbers > 0)
-    require(
-        met <= _LARGEST_SHARE * patient,
-        f"{masks.source}: covers {100 * met / patient:.0f} % of the patient, expected a lesion in it; is it the mask "
-        "of the brain (--mask)?",
-    )
+        require_in_patient(masks, float(mm_outside(array > 0, labels, masks).min()))
+    require_size(masks, met / patient)
     voxel_mm3 = 1000.0 * labels.voxel_ml
     require(
         covered.size > 0,
@@ -195,20 +195,33 @@ def _label_of(tissue: str, array: np.ndarray, names: Sequence[str]) -> tuple[int
     return free[0], tuple(longer)
 
 
-def _check_place(labels: Volume, masks: Masks, where: tuple[slice, ...], inside: np.ndarray) -> None:
-    """Raise SimulationError for masks without a voxel in the patient, unless they are just beside it."""
-    if inside.any():
-        distance = ndimage.distance_transform_edt(labels.array == 0, sampling=labels.spacing_mm[::-1].tolist())
-        assert isinstance(distance, np.ndarray)
-        apart = float(distance[where][inside].min())
-    else:  # outside of the grid: between the bounding boxes
-        low, high = box_ras(labels.array > 0, labels)
-        mask_low, mask_high = box_ras(masks.inside, masks.union)
-        apart = float(np.linalg.norm(np.maximum(np.maximum(mask_low - high, low - mask_high), 0.0)))
+def mm_outside(patient: np.ndarray, grid: Volume, masks: Masks) -> np.ndarray:
+    """(voxels,) distance of each voxel inside the masks from the patient, 0 within it; bool (k, j, i) on a grid."""
+    distance = ndimage.distance_transform_edt(~patient, sampling=grid.spacing_mm[::-1].tolist())
+    assert isinstance(distance, np.ndarray)
+    to_grid = grid.ras_to_ijk @ masks.union.ijk_to_ras
+    index = to_grid[:3, :3] @ np.argwhere(masks.inside)[:, ::-1].T + to_grid[:3, 3:]
+    nearest = np.clip(np.rint(index), 0, np.array(patient.shape[::-1])[:, None] - 1)
+    beyond = np.maximum(np.abs(index - nearest) - 0.5, 0.0) * grid.spacing_mm[:, None]  # 0 within the grid
+    i, j, k = nearest.astype(int)
+    return distance[k, j, i] + np.linalg.norm(beyond, axis=0)
+
+
+def require_in_patient(masks: Masks, apart_mm: float, farthest_mm: float = FARTHEST_MM) -> None:
+    """Raise SimulationError for masks that lie farther than this from the patient."""
     require(
-        apart <= _FARTHEST_MM,
-        f"{masks.source}: lies {apart:.0f} mm outside the patient, expected a mask in the frame of the MRI; is it of "
-        "another patient, or not registered?",
+        apart_mm <= farthest_mm,
+        f"{masks.source}: lies {apart_mm:.0f} mm outside the patient, expected a mask in the frame of the MRI; is it "
+        "of another patient, or not registered?",
+    )
+
+
+def require_size(masks: Masks, share: float) -> None:
+    """Raise SimulationError for masks that cover too large a share of the patient for a lesion."""
+    require(
+        share <= LARGEST_SHARE,
+        f"{masks.source}: covers {100 * share:.0f} % of the patient, expected a lesion in it; is it the mask "
+        "of the brain (--mask)?",
     )
 
 

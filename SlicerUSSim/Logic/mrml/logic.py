@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.mri.addable import require_addable
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
@@ -187,6 +188,8 @@ class UltrasoundSceneLogic:
         )
         volumes = {contrast: _in_frame_of(node, mri_node) for contrast, node in (others or {}).items()}
         lesions, skipped = ([], []) if lesions_node is None else self._lesions(lesions_node, mri_node)
+        own = [tissue.name for tissue in self.preset.tissues.all_tissues()]
+        self._work.do(lambda: require_addable(mri, lesions, mask=mask, skull_strip=skull_strip, also=own))
         result = self._work.do(
             lambda: segment_mri(
                 mri, classes=classes, contrast=contrast, others=volumes, mask=mask, filter_radius=filter_radius,

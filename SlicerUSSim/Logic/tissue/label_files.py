@@ -38,7 +38,8 @@ def names_of_file(path: Path) -> tuple[dict[int, str], str]:
         if suffix and stem.lower().endswith(suffix.lower()):
             stem = stem[: -len(suffix)]
             break
-    for suffix in TABLE_SUFFIXES:
+    # 3D Slicer exports a label map as NAME.nii.gz and NAME_ColorTable.csv, or .ctbl.
+    for suffix in (*TABLE_SUFFIXES, "_ColorTable.csv", "_ColorTable.ctbl"):
         beside = path.with_name(stem + suffix)
         if beside.is_file():
             names = read_names(beside)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from difflib import get_close_matches
 from functools import cache
 
 from SlicerUSSim.Logic.base.errors import require
@@ -13,8 +15,10 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 _ALIASES = {
     "background": "coupling", "cerebrospinal fluid": "csf", "ventricles": "csf", "edema": "oedema",
     "hematoma": "haematoma", "clot": "haematoma",
-    "gray matter": "grey matter",
-    "gm": "grey matter", "wm": "white matter", "tumor": "tumour", "dura": "falx", "skin": "scalp", "vessels": "blood",
+    "gray matter": "grey matter", "grey": "grey matter", "gray": "grey matter", "white": "white matter",
+    "gm": "grey matter", "wm": "white matter", "gtv": "tumour", "gbm": "tumour",
+    "ncr": "necrosis", "ed": "oedema", "et": "enhancing",  # of BraTS
+    "tumor": "tumour", "dura": "falx", "skin": "scalp", "vessels": "blood",
     "vessel": "blood", "cortical bone": "bone", "choroid plexus": "enhancing",
 }  # fmt: skip
 
@@ -27,9 +31,9 @@ _WORDS: tuple[tuple[str, str], ...] = (
     ("oedema", "oedema, edema"),
     ("cyst", "cyst, cystic"),
     ("cavity", "resection, surgical cavity"),
-    ("tumour", "tumor, tumour, glioma, metastasis, meningioma, cancer"),
+    ("tumour", "tumor, tumour, glioma, glioblastoma, astrocytoma, metastasis, metastases, meningioma, cancer"),
     ("blood", "heart atrium, heart ventricle, atrial appendage, left atrium, right atrium"),
-    ("haematoma", "haematoma, hematoma, haemorrhage, hemorrhage, clot"),
+    ("haematoma", "haematoma, hematoma, haemorrhage, hemorrhage, bleeding, clot"),
     ("enhancing", "choroid plexus"),
     ("grey matter", "non wm, cortical dysplasia, hippocampal fissure"),
     ("white matter", "white matter, whitematter, wm, wmsa, corpus callosum, corpuscallosum, cc, cbmwm"),
@@ -92,6 +96,16 @@ def tissue_named(name: str) -> Tissue:
     found = _by_words(name, _WORDS)
     require(found is not None, f"no preset for tissue {name!r}, expected one of: {', '.join(TISSUES)}")
     return TISSUES[str(found)]
+
+
+def similar_tissues(name: str, tissue_names: Iterable[str] = ()) -> list[str]:
+    """Tissues that an unknown name may mean, for messages: a misspelt one, or the pathologies for "lesion"."""
+    key = plain_name(name)
+    if re.search(r"\b(lesion|pathology|mass|mask|roi|segment|label)s?\b", key):
+        return ["tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity"]
+    spellings = {plain_name(known): known for known in (*tissue_names, *TISSUES) if known} | _ALIASES
+    near = get_close_matches(key, spellings, n=3, cutoff=0.7)
+    return list(dict.fromkeys(spellings[word] for word in near))
 
 
 def nearest_tissue(name: str) -> str | None:

@@ -6,11 +6,13 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 _ITIS = "IT'IS Foundation tissue properties database v4"
 _SZABO = "Szabo, Diagnostic Ultrasound Imaging (2004), table B.1"
+_UNCHECKED = f"{_SZABO}, not checked against the book"
 _DUCK = "Duck, Physical Properties of Tissue (1990)"
 _SHUNG = "Shung, Fei and Ballard, J. Clin. Ultrasound 14 (1986), on clots"
 _SELBEKK = "saline, which images the brain behind it too bright: Selbekk et al., Acta Neurochir. 155 (2013)"
 _MCGAHAN = "McGahan et al., Radiology 159 (1986)"
-_DUNN = "Dunn and Fry, Ultrasonic absorption and reflection by lung tissue, Phys. Med. Biol. 5 (1961)"
+#: Table 3, with ranges from Goss et al. (J. Acoust. Soc. Am. 64, 1978 and 68, 1980), Mast (ARLO 1, 2000) and others
+_RANGES = "ranges in Mech. Mater. 44 (2012) 174-188, table 3"
 _PAPER = "Salehi et al., MICCAI 2015, table 1 (mean after optimisation, rounded)"
 _PAPER_BEFORE = "Salehi et al., MICCAI 2015, table 1 (before optimisation)"
 
@@ -28,10 +30,13 @@ def _tissue(name, c, c_source, z, z_source, alpha, alpha_source, mu0=0.0, mu1=0.
 _DENSITY = f"density ({_ITIS}) x speed of sound"
 
 
-#: White matter, 70 % water, contains 5 to 8 % more around gliomas (microgravimetry of 17 patients); CSF is 99 % water.
-_WETTER = _level("white matter, a fifth of the way to CSF, as its water content")
-_DEAD = _level("white matter, two fifths of the way to cyst")
-_LIQUID = _level("CSF with protein, a third of its way to plasma, 1535 m/s")
+# No measurement of the acoustic properties of these was found; they are estimates from what was measured. White matter,
+# 70 % water, has 5 to 8 % more around glioblastomas ("Microgravimetric analysis of human brain tissue: correlation with
+# computerized tomography scanning", 11 of 17 patients), 10 to 12 % at most (Ito et al., Acta Neurochir. 81 (1986)
+# 53-60); CSF is 99 % water. Plasma: 1535 to 1549 m/s.
+_WETTER = _level("estimate: white matter, a fifth of the way to CSF, as its water content")
+_DEAD = _level("estimate: white matter, two fifths of the way to cyst")
+_LIQUID = _level("estimate: CSF with protein, a quarter to a third of its way to plasma")
 
 # Grey and white matter share Szabo's speed of sound for brain and one impedance: published differences between them are
 # smaller than those between publications, and would refract rays at a border that is not a sharp interface.
@@ -69,8 +74,9 @@ TISSUES: dict[str, Tissue] = {
                 0.60, 0.0, 0.30, _level("echogenic skin and fat")),
         _tissue("blood", 1584.0, _SZABO, 1.679, f"1060 kg/m3, {_SZABO}", 0.14, _SZABO, 0.03, 0.0, 0.02,
                 _level("flowing, some 20 dB below tissue at 5 MHz")),
-        _tissue("haematoma", 1618.0, "34 m/s above flowing blood: Shung et al., J. Clin. Ultrasound 12 (1984)", 1.715,
-                "1060 kg/m3, as blood, x speed of sound", 0.43, _SHUNG, 0.75, 0.0, 0.32,
+        _tissue("haematoma", 1618.0, "34 m/s above flowing blood: Shung et al., J. Clin. Ultrasound 12 (1984), "
+                "not checked", 1.715, "1060 kg/m3, as blood, x speed of sound", 0.43, f"slope at 3 to 8 MHz, {_SHUNG}",
+                0.75, 0.0, 0.32,
                 _level("7 dB above white matter: brighter than brain within minutes (canine model), fading after "
                        f"days; at least 18 dB above flowing blood ({_SHUNG})")),
         _tissue("water", 1524.0, "37 degrees C, " + _DUCK, 1.514, "993 kg/m3, " + _DUCK, 0.002, _DUCK),
@@ -84,12 +90,16 @@ TISSUES: dict[str, Tissue] = {
                 _level("reference for the abdomen")),
         _tissue("kidney", 1560.0, _SZABO, 1.638, f"1050 kg/m3, {_SZABO}", 1.0, f"kidney, {_DUCK}", 0.28, 0.0, 0.13,
                 _level("cortex slightly below liver")),
-        _tissue("spleen", 1567.0, _SZABO, 1.651, f"1054 kg/m3, {_SZABO}", 0.40, _SZABO, 0.42, 0.0, 0.21,
+        _tissue("spleen", 1567.0, f"{_SZABO}; 1567.6 in {_ITIS}, 1537 to 1597 in the {_RANGES}", 1.651,
+                f"1054 kg/m3, {_SZABO} and {_RANGES}; 1089 in {_ITIS}", 0.40,
+                f"{_UNCHECKED}; 0.29 at 0.5 MHz in {_ITIS}", 0.42, 0.0, 0.21,
                 _level("slightly above liver")),
-        _tissue("heart", 1554.0, f"heart muscle, {_SZABO}", 1.647, f"1060 kg/m3, {_SZABO}", 0.52, _SZABO, 0.28, 0.0,
-                0.14, _level("as muscle")),
-        _tissue("lung", 658.0, f"inflated, {_DUNN}", 0.263, f"inflated, 400 kg/m3, {_DUNN}", 40.0,
-                f"inflated, 41 dB/cm at 1 MHz, {_DUNN}", 0.50, 0.0, 0.30, _level("masked by its own surface echo")),
+        _tissue("heart", 1554.0, f"heart muscle, {_SZABO}; 1561.3 in {_ITIS}, 1526 to 1623 in the {_RANGES}", 1.647,
+                f"1060 kg/m3, {_SZABO} and {_RANGES}; 1081 in {_ITIS}", 0.52,
+                f"{_UNCHECKED}; 0.28 at 0.5 MHz in {_ITIS}", 0.28, 0.0, 0.14, _level("as muscle")),
+        _tissue("lung", 949.3, f"inflated, {_ITIS}", 0.374, f"inflated, 394 kg/m3 {_DENSITY}", 20.1,
+                f"inflated, 115.5 Np/m at 0.5 MHz, {_ITIS}; measurements disagree (Ultrasound Med. Biol. 28 (2002) "
+                "1209-1216)", 0.50, 0.0, 0.30, _level("masked by its own surface echo")),
         _tissue("bone", 3198.0, _SZABO, 6.364, f"1990 kg/m3, {_SZABO}", 3.54, _SZABO, 0.50, 0.0, 0.30,
                 _level("masked by its own surface echo")),
     )

@@ -34,6 +34,7 @@ from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
+from SlicerUSSim.Logic.mri.addable import require_addable
 from SlicerUSSim.Logic.mri.pathology import add_tissues
 from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
@@ -222,9 +223,10 @@ class SegmentationFilter(_ImageFilter):
         mri = vtkImageData.GetData(inInfo[0])
         masked = inInfo[1].GetNumberOfInformationObjects() > 0
         masks = [(tissue, Volume.from_vtk(image), f"the mask of {tissue}") for tissue, image in self._added]
+        image, mask = Volume.from_vtk(mri), Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None
+        require_addable(image, masks, mask=mask, skull_strip=self._values["skull_strip"])
         found = segment_mri(
-            Volume.from_vtk(mri), others={name: Volume.from_vtk(image) for name, image in self._others.items()},
-            mask=Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None,
+            image, others={name: Volume.from_vtk(other) for name, other in self._others.items()}, mask=mask,
             **self._values, device=self._device, progress=self._report,
         )  # fmt: skip
         output = vtkImageData.GetData(outInfo)
