@@ -167,16 +167,28 @@ def test_only_rotations_with_translation_pass_as_poses(matrix):
         check_rigid("pose", pose)
 
 
-def test_voxels_that_are_no_numbers_are_told_before_they_are_read_as_zero(tmp_path, caplog):
-    """ITK replaces them without a word."""
+def test_nan_around_the_head_is_read_as_zero_and_told(tmp_path, caplog):
+    """ITK replaces it without a word; SPM writes it outside the brain."""
     nibabel = pytest.importorskip("nibabel")
     values = np.ones((6, 7, 8), np.float32)
     values[2, 3] = np.nan
     nibabel.Nifti1Image(values, np.eye(4)).to_filename(tmp_path / "mri.nii.gz")
     volume = Volume.read(tmp_path / "mri.nii.gz")
-    assert "8 of 336 voxels are not finite numbers; NaN is read as 0" in caplog.text
+    assert "8 of 336 voxels, at the border of the volume, are NaN: they are read as 0" in caplog.text
     assert (volume.array == 0).sum() == 8
     caplog.clear()
     nibabel.Nifti1Image(np.ones((6, 7, 8), np.float32), np.eye(4)).to_filename(tmp_path / "good.nii.gz")
     Volume.read(tmp_path / "good.nii.gz")
     assert not caplog.text
+
+
+@pytest.mark.parametrize(("place", "value"), [((2, 3, 4), np.nan), ((0, 0, 0), np.inf)])
+def test_voxels_within_the_head_that_are_no_numbers_are_refused(tmp_path, place, value):
+    nibabel = pytest.importorskip("nibabel")
+    values = np.ones((6, 7, 8), np.float32)
+    values[5] = np.nan
+    values[place] = value
+    nibabel.Nifti1Image(values, np.eye(4)).to_filename(tmp_path / "mri.nii.gz")
+    message = rf"1 of 336 voxels are not finite numbers, the first at \(i, j, k\) = \({', '.join(map(str, place))}\)"
+    with pytest.raises(SimulationError, match=message):
+        Volume.read(tmp_path / "mri.nii.gz")

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.errors import SimulationError
+
 _log = logging.getLogger(__name__)
 
 #: Millimetres per unit and name of the lower three bits of xyzt_units (nifti1.h)
@@ -88,13 +90,33 @@ def _distance_mm(one: np.ndarray, other: np.ndarray, size) -> float:
     return float(np.linalg.norm((corners @ (one - other).T)[:, :3], axis=1).max())
 
 
-def warn_of_nan(path: Path, image) -> None:
-    """Warn if a NIfTI file has voxels that are not numbers: ITK reads them as 0 without a word."""
+def check_numbers(path: Path, image) -> None:
+    """Look for voxels of a NIfTI file that are not numbers: ITK reads them as 0 without a word.
+
+    NaN that reaches the border of the volume is how SPM and others write "outside the head": it is read as 0, with a
+    warning. Raises SimulationError for NaN within and for infinite voxels.
+    """
     if not (image.HasMetaDataKey("sform_code") and "float" in image.GetPixelIDTypeAsString()):
         return
     import nibabel
+    from scipy import ndimage
 
     stored = np.asanyarray(nibabel.load(path).dataobj)  # type: ignore[attr-defined]
-    bad = int(stored.size - np.isfinite(stored).sum())
-    if bad:
-        _log.warning("%s: %d of %d voxels are not finite numbers; NaN is read as 0", path, bad, stored.size)
+    stored = stored.reshape(stored.shape[:3]) if stored.ndim > 3 and max(stored.shape[3:]) == 1 else stored
+    bad = ~np.isfinite(stored)
+    count = int(bad.sum())
+    if not count:
+        return
+    background = np.zeros_like(bad)
+    if bad.ndim == 3:
+        at_the_border = np.pad(bad, 1, constant_values=True)
+        parts, _ = ndimage.label(at_the_border)  # type: ignore[misc]
+        background = (parts == parts[0, 0, 0])[1:-1, 1:-1, 1:-1] & np.isnan(stored)
+    within = bad & ~background
+    if within.any():
+        first = tuple(int(n) for n in np.argwhere(within)[0])
+        raise SimulationError(
+            f"{path}: {int(within.sum())} of {bad.size} voxels are not finite numbers, the first at (i, j, k) = "
+            f"{first}; expected numbers, or NaN around the head alone; replace them and try again"
+        )
+    _log.warning("%s: %d of %d voxels, at the border of the volume, are NaN: they are read as 0", path, count, bad.size)

@@ -12,7 +12,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
 from SlicerUSSim.Logic.base.files import written_whole
-from SlicerUSSim.Logic.base.nifti import log_nifti_geometry, warn_of_nan
+from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
 
 _log = logging.getLogger(__name__)
@@ -140,7 +140,7 @@ class Volume:
             image = read_itk_image(path)
             volume = cls.from_sitk(image, name=str(path))
             log_nifti_geometry(image, volume.ijk_to_ras, str(path))
-            warn_of_nan(path, image)
+            check_numbers(path, image)
         else:
             array, ijk_to_ras = _read_minc1(path)
             _require_volume(array.shape[::-1], str(path))
