@@ -14,13 +14,10 @@ import pytest
 
 from SlicerUSSim.Logic import LinearProbe, SimulationSettings, Tissue, TissueTable, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.tissue.presets import TISSUES
+from tests.shared_data import SHARED as SHARED, needs_shared as needs_shared
 
 hypothesis.settings.register_profile("ussim", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("ussim")
-
-#: Real sequences, if the checkout has them next to it.
-SHARED = Path(__file__).parents[2] / "shared" / "data"
-needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="the real sequences of ../shared/data are not here")
 
 #: Speckle without attenuation, so that statistics do not change with depth; and fluids without scatterers.
 SPECKLE = replace(TISSUES["white matter"], name="speckle", attenuation_db_cm_mhz=0.0)

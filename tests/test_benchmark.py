@@ -84,7 +84,9 @@ def test_two_results_are_compared_row_by_row():
 @pytest.fixture(scope="module")
 def brief(tmp_path_factory):
     path = tmp_path_factory.mktemp("bench") / "bench.json"
-    outcome = CliRunner().invoke(main, ["bench", "--brief", "--device", choose_device()[0].index, "--json", str(path)])
+    outcome = CliRunner().invoke(
+        main, ["bench", "--brief", "--repeat", "2", "--device", choose_device()[0].index, "--json", str(path)]
+    )
     return outcome, path
 
 

@@ -261,8 +261,8 @@ def test_every_door_refuses_a_lesion_elsewhere_without_segmenting(monkeypatch, t
     far = moved(ball(BRAIN), 300, 0, 0)
     head_mri(4.0).write(tmp_path / "head.nii.gz")
     far.write(tmp_path / "far.nii.gz")
-    monkeypatch.setattr("SlicerUSSim.Logic.mri.segmentation.segment_mri", segmented)
-    monkeypatch.setattr("SlicerUSSim.Command.whole_line.segment_mri", segmented)
+    # What segment_mri calls first; modules that are first imported now would keep another segment_mri.
+    monkeypatch.setattr("SlicerUSSim.Logic.mri.segmentation.find_brain", segmented)
     adding = ("--add", f"tumour={tmp_path / 'far.nii.gz'}")
     for arguments in (
         ("segment", tmp_path / "head.nii.gz", "-o", tmp_path / "l.nii.gz"),

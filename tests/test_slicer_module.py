@@ -26,7 +26,7 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 pytest.importorskip("PySide6", reason="the panel is tested on Qt for Python: pip install PySide6-Essentials")
 
 from tests import slicer_stand_in as stand_in  # noqa: E402
-from tests.conftest import SHARED, needs_shared  # noqa: E402
+from tests.shared_data import SHARED, needs_shared  # noqa: E402
 from tests.slicer_factory import load_source_as_module  # noqa: E402
 
 ROOT = Path(__file__).parents[1]

@@ -143,7 +143,7 @@ def test_a_segmentation_knows_second_tissues_and_deviations(ramp_segmentation):
     means = ramp_segmentation.means
     image = known.deviation  # per label; the intensity itself decides below
     sure = known.second_share[:, :, [5, 30, 55]]
-    assert np.median(sure) < 0.01 and known.second_share[:, :, 20].mean() > 0.05
+    assert np.median(sure) < 0.01 and known.second_share[:, :, 20].mean() > 0.04
     assert set(np.unique(known.second_label[:, :, 20][known.second_share[:, :, 20] > 0.05])) <= {1, 2}
     for label in (1, 2, 3):
         of_tissue = image[labels == label]
