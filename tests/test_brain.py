@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
-from SlicerUSSim.Logic.mri import brain as brain_module, extractors, recognition
+from SlicerUSSim.Logic.mri import brain as brain_module, extractors, recognition, refinement
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain, left_out
@@ -519,6 +519,35 @@ def test_a_mask_that_cuts_the_vertex_is_said_and_a_whole_one_is_not(head, found)
     assert "at the top; check the cortex there" in warning
 
 
+def atrophied_vertex(spacing=1.5):
+    """(MRI, distance to a first mask, gyri, dura): dark gyri of 9 mm that stand in wide CSF on a sphere."""
+    grid, radius = ellipsoid((60, 60, 60), spacing, 12.0)
+    radius = 60.0 * radius
+    k, _, i = (np.indices(radius.shape).T * spacing - (np.array(radius.shape) - 1) * spacing / 2).T
+    is_top = k > 0.6 * radius
+    gyri = is_top & (radius > 36) & (radius <= 48) & (np.abs((i + 9) % 18 - 9) < 4.5)
+    dura = (radius > 54) & (radius <= 56)
+    image = np.select(
+        [radius <= 36, gyri, is_top & (radius <= 54), radius <= 46, dura, radius <= 62, radius <= 70],
+        [100.0, 50.0, 20.0, 70.0, 60.0, 5.0, 180.0],
+    )
+    image = np.abs(image + np.random.default_rng(0).normal(0, 2.0, image.shape))
+    return grid.with_array(image.astype(np.float32)), (radius - 40.0).astype(np.float32), gyri, dura
+
+
+def test_dark_gyri_in_wide_csf_stay_in_the_mask(monkeypatch):
+    mri, distance, gyri, dura = atrophied_vertex()
+
+    def shares():
+        inside = refinement.refined(mri, distance, core_mm=8.0, reach_mm=12.0, keep_mm=3.0)
+        return inside[gyri].mean(), inside[dura].mean()
+
+    kept, membrane = shares()
+    assert kept > 0.6 and membrane < 0.01
+    monkeypatch.setattr(refinement, "_WIDE", 2.0)  # no CSF is wide: one border of tissue everywhere
+    assert shares()[0] < 0.3
+
+
 # ---- DICOM -----------------------------------------------------------------------------------------------------------
 
 
@@ -597,6 +626,26 @@ def test_the_brain_of_a_patient_is_found_with_her_tumour(name):
     result = find_brain(Volume.read(folder / f"{name}.nii.gz"), "atlas")
     assert 1200 < result.volume_ml < 1700
     assert left_out(result.mask, Volume.read(folder / "glioma.nii.gz")) == 0.0
+
+
+@pytest.mark.slow
+@needs_shared
+@needs_nilearn
+def test_the_gyri_of_the_vertex_that_the_t2_shows_are_in_the_mask_of_the_t1():
+    """In the T2 tissue is dark between bright CSF and dark bone; both images lie in one frame."""
+    t1, t2 = (Volume.read(SHARED / f"remind022/{name}.nii.gz") for name in ("t1_contrast", "t2"))
+    first, second = find_brain(t1), find_brain(t2, "atlas")
+    assert first.method == "atlas"  # sure enough of it
+    values, within = refinement.on_grid(t2, t1), refinement.on_grid(second.mask, t1) > 0.5
+    relative = values / np.median(values[ndimage.binary_erosion(within, iterations=10)])
+    depth = ndimage.distance_transform_edt(within, t1.spacing_mm[::-1])
+    tissue = ndimage.binary_opening((depth > 3.0) & (relative > 0.7) & (relative < 1.25))
+    points = np.argwhere(within) @ t1.ijk_to_ras[:3, :3][:, ::-1].T
+    height = (np.indices(within.shape).T @ t1.ijk_to_ras[:3, :3][:, ::-1].T)[..., 2].T
+    at_top = tissue & (height > points[:, 2].max() - 30.0)
+    millilitres = t1.voxel_ml * float((at_top & (first.mask.array == 0)).sum())
+    assert at_top.sum() * t1.voxel_ml > 15.0
+    assert millilitres < 1.5  # 3.9 ml with one border of tissue everywhere
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ Report = Callable[[float], None]
 _NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
 #: Overlap with the registered atlas above which a mask is taken without asking another method, and below which it is
 #: refused
-_SURE, _LEAST_SURE = 0.92, 0.85
+_SURE, _LEAST_SURE = 0.915, 0.85
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,9 @@ from SlicerUSSim.Logic.mri.distances import distance_to
 _SPACING_MM = 1.2
 #: Brightness, relative to the brain nearby, between tissue and the skull or CSF of a T1
 _TISSUE = 0.6
+#: Brightness of what is surely CSF and surely tissue, lowest border between them, Gaussian windows in mm in which both
+#: are measured, and share of CSF in these from which their space is wide
+_FLUID, _SOLID, _LEAST_TISSUE, _WINDOW_MM, _WIDE = 0.4, 0.5, 0.4, 5.0, 0.2
 
 
 def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: float, keep_mm: float) -> np.ndarray:
@@ -22,8 +25,9 @@ def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: floa
     `distance` is the signed distance to a first mask in mm on the MRI's grid, negative inside. What is deeper than
     `core_mm` is brain, what is further out than `reach_mm` is not. Between them a watershed on the brightness, after
     division by that of the brain nearby (bias field), puts the border into the darkest valley (Hahn and Peitgen, MICCAI
-    2000); darker tissue than grey matter is then taken off outside, and sulci are closed. What is deeper in
-    the first mask than `keep_mm` stays if it is on this side of the valley.
+    2000); darker tissue than grey matter is then taken off outside, and sulci are closed. Where much CSF is outside the
+    cortex (the vertex of an older patient), gyri that a bias field makes dark are told from it by its own brightness.
+    What is deeper in the first mask than `keep_mm` stays if it is on this side of the valley.
     """
     from skimage.segmentation import watershed
 
@@ -39,7 +43,7 @@ def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: floa
     brightness = ndimage.gaussian_filter(brightness_near(image, core, mm), 0.5)
     markers = np.where(core, 1, np.where(far > reach_mm, 2, 0)).astype(np.int32)
     region = watershed(-brightness, markers, mask=far <= reach_mm + 3.0) == 1
-    bright = region & (brightness > _TISSUE)
+    bright = region & (brightness > _tissue_from(brightness, region))
     ball = _ball(2.0 / mm)
     # Casts: the return types of scipy's functions depend on their arguments, without type annotations for that.
     opened = _connected(cast(np.ndarray, ndimage.binary_erosion(bright, ball)) | core, core)
@@ -66,10 +70,35 @@ def brightness_near(image: np.ndarray, core: np.ndarray, spacing_mm: float) -> n
     near = ndimage.gaussian_filter(weight, deviation, truncate=6.0)
     level = ndimage.gaussian_filter(weight * some, deviation, truncate=6.0) / np.maximum(near, 1e-9)
     level = np.where(near > 1e-6, level, tissue)
-    wide = ndimage.zoom(level, step, order=1, grid_mode=True, mode="nearest")
-    padding = [(0, max(0, n - m)) for n, m in zip(values.shape, wide.shape, strict=True)]
-    wide = np.pad(wide, padding, mode="edge")[tuple(slice(n) for n in values.shape)]
+    wide = _widened(level, step, values.shape)
     return np.clip(values / np.maximum(wide, max(0.2 * tissue, 1e-6)), 0.0, 1.3).astype(np.float32)
+
+
+def _tissue_from(brightness: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """(k, j, i) brightness from which it is tissue: _TISSUE, or less in wide CSF, half-way between both nearby.
+
+    Only there: where the cortex touches the dura, a lower border would take that in.
+    """
+    step = 2
+    deviation = _WINDOW_MM / _SPACING_MM / step
+    some, inside = (values[::step, ::step, ::step] for values in (brightness, region))
+
+    def amount(values: np.ndarray) -> np.ndarray:
+        return np.maximum(ndimage.gaussian_filter(values.astype(np.float32), deviation), 1e-3)
+
+    is_fluid, is_solid = inside & (some < _FLUID), inside & (some > _SOLID)
+    fluid, solid = (amount(np.where(part, some, 0.0)) / amount(part) for part in (is_fluid, is_solid))
+    between = np.clip((fluid + solid) / 2.0, _LEAST_TISSUE, _TISSUE)
+    share = amount(is_fluid) / amount(inside)
+    wide = _widened(share, step, brightness.shape) > _WIDE
+    return np.where(wide, _widened(between, step, brightness.shape), _TISSUE)
+
+
+def _widened(values: np.ndarray, step: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Values at every `step`-th voxel, interpolated to `shape`."""
+    wide = ndimage.zoom(values, step, order=1, grid_mode=True, mode="nearest")
+    padding = [(0, max(0, n - m)) for n, m in zip(shape, wide.shape, strict=True)]
+    return np.pad(wide, padding, mode="edge")[tuple(slice(n) for n in shape)]
 
 
 def on_grid(volume: Volume, grid: Volume, outside: float = 0.0) -> np.ndarray:

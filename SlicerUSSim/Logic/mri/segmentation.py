@@ -177,6 +177,11 @@ def segment_mri(
         images.append(image)
         notes.append(message)
     if others:
+        if brain.method != "given":
+            notes.append(
+                f"the brain mask is of the {contrast} image alone: tissue outside it stays out, also where "
+                f"{' and '.join(others)} shows it"
+            )
         timed("registration")
     part = BrainPart.of(images, foreground)
     atlas, message = atlas_of(part, report)
