@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from SlicerUSSim.Logic import SimulationError, segment_mri
-from SlicerUSSim.Logic.mri.plausibility import enhancement
+from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
+from SlicerUSSim.Logic.mri.brain import given_brain
+from SlicerUSSim.Logic.mri.classification import Classes
+from SlicerUSSim.Logic.mri.plausibility import enhancement, faint, require_order, require_several_tissues
 from SlicerUSSim.Logic.verification.brain_phantoms import TissueMaps, phantom, tissue_maps, with_ring_tumour
 from SlicerUSSim.Logic.verification.brain_scores import scores
 
@@ -62,3 +64,45 @@ def test_cortex_does_not_become_csf_where_the_mask_leaves_only_the_ventricles():
     share = float((found.labels.array == found.tissue_names.index("csf") + 1).sum() / kept.sum())
     assert 0.3 * true < share < 2.0 * true
     assert scores(found.labels.array, dict(enumerate(found.tissue_names, 1)), case)["grey and white"] > 0.9
+
+
+def classes_of(means, posteriors=None, names=("csf", "grey matter", "white matter")):
+    posteriors = np.eye(len(names)) if posteriors is None else np.asarray(posteriors, float)
+    means = np.array(means, float)[:, None]
+    return Classes(names, posteriors, means, np.ones_like(means), None)
+
+
+def test_tissues_in_the_order_of_another_contrast_are_refused_with_an_atlas_and_said_without():
+    t2_as_t1 = classes_of([10.6, 277.5, 130.4])
+    with pytest.raises(SimulationError, match=r"grey matter 277.5, white matter 130.4\): choose t2 or flair"):
+        require_order(t2_as_t1, "t1", True)
+    assert len(require_order(t2_as_t1, "t1", False)) == 1
+    assert require_order(classes_of([10.6, 130.4, 277.5]), "t1", True) == []
+
+
+def test_one_tissue_alone_is_no_brain():
+    posteriors = np.zeros((3, 1000))
+    posteriors[1] = 1.0
+    posteriors[:, :12] = [[1.0], [0.0], [0.0]]
+    with pytest.raises(SimulationError, match=r"98.8% of the voxels are grey matter, expected several tissues"):
+        require_several_tissues(classes_of([1, 2, 3], posteriors))
+    require_several_tissues(classes_of([1, 2, 3]))
+
+
+def test_grey_and_white_matter_that_noise_hides_are_said():
+    (line,) = faint(classes_of([10, 136, 125]), noise=10.0)
+    assert "differ by 1.1 times the noise" in line
+    assert faint(classes_of([10, 160, 220]), noise=10.0) == []
+
+
+def test_a_mask_says_why_it_does_not_fit():
+    mri = Volume(np.random.default_rng(0).integers(0, 500, (40, 40, 40)).astype(np.int16), np.eye(4))
+    inside = np.zeros((40, 40, 40), np.uint8)
+    inside[10:30, 10:30, 10:30] = 1
+    shifted = np.eye(4)
+    shifted[0, 3] = 12.0
+    with pytest.raises(SimulationError, match=r"mask lies up to 12.0 mm from the MRI's voxels"):
+        given_brain(Volume(inside, shifted), mri)
+    with pytest.raises(SimulationError, match="different values, expected 0 outside and one value inside: is it an"):
+        given_brain(mri, mri)
+    assert given_brain(Volume(inside, np.eye(4)), mri).method == "given"

@@ -25,6 +25,8 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 _log = logging.getLogger(__name__)
 
 Report = Callable[[float], None]
+#: Labels of a segmentation count as inside too; an image has more values
+_MOST_MASK_VALUES = 128
 _NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
 #: Overlap with the registered atlas above which a mask is taken without asking another method, and below which it is
 #: refused
@@ -101,8 +103,20 @@ def find_brain(
 def given_brain(mask: Volume, mri: Volume) -> BrainMask:
     """The mask that a user gives. Raises SimulationError if it is empty, on another grid, or covers everything."""
     require(
-        mask.array.shape == mri.array.shape and np.allclose(mask.ijk_to_ras, mri.ijk_to_ras, atol=1e-3),
+        mask.array.shape == mri.array.shape,
         f"mask has shape {mask.array.shape} and the MRI {mri.array.shape}, expected the same grid; resample the mask",
+    )
+    corners = np.array([[0, 0, 0, 1], [*(np.array(mri.array.shape[::-1]) - 1), 1]]).T
+    apart = float(np.linalg.norm((mask.ijk_to_ras - mri.ijk_to_ras) @ corners, axis=0).max())
+    require(
+        np.allclose(mask.ijk_to_ras, mri.ijk_to_ras, atol=1e-3),
+        f"mask lies up to {apart:.1f} mm from the MRI's voxels, expected the same origin, spacing and directions; "
+        "resample the mask",
+    )
+    values = np.unique(mask.array[:: max(mask.array.shape[0] // 16, 1)])
+    require(
+        len(values) <= _MOST_MASK_VALUES,
+        f"mask has {len(values)} or more different values, expected 0 outside and one value inside: is it an image?",
     )
     inside = mask.array > 0
     require(bool(inside.any()), "mask is empty, expected at least one voxel inside")
@@ -215,6 +229,10 @@ def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
     millilitres = _millilitres(kept.inside, mri)
     if kept.is_edited:
         message = f"whole head: brain mask as edited in {kept.path}, {millilitres:.0f} ml"
+        if method not in ("auto", "none"):
+            message += (
+                f"; --skull-strip {method} was not followed: delete or rename that file to extract the brain again"
+            )
     else:
         by = _NAMES.get(kept.method, kept.method)
         message = f"whole head: brain mask kept in {kept.path}, by {by} in {kept.seconds:.0f} s, {millilitres:.0f} ml"

@@ -46,7 +46,10 @@ def lies_otherwise(
     ends = cut_ends(mri)
     is_cut = set(ends) - {"bottom"}  # where the neck leaves the image
     upside_down = " (if that is the neck, the head is upside down)" if is_cut == {"top"} else ""
-    where = f"the image ends in the middle of the object, at its {' and '.join(ends)}{upside_down}; {_WHOLE}"
+    where = (
+        f"the image ends in the middle of the object, at its {' and '.join(ends)}{upside_down}; {_WHOLE}, or correct "
+        "the orientation in its header if it is whole"
+    )
     if is_cut:
         return where if alignment.agreement < least else None
     sizes = _sizes()
@@ -56,7 +59,10 @@ def lies_otherwise(
         return where if ends and alignment.agreement < least else None
     axes = zip(sizes[number], ("width", "length", "height"), strict=True)
     words = ", ".join(f"{axis} {factor:g} times" for factor, axis in axes if factor != 1)
-    return f"the head has a wrong size ({words} an adult's); correct the voxel size in its header"
+    return (
+        f"the head has a wrong size ({words} an adult's), or does not lie as its header says; correct the voxel size "
+        "or the orientation in its header"
+    )
 
 
 def stripped_lies_otherwise(image: CoarseImage, inside: np.ndarray, least: float) -> str | None:

@@ -26,7 +26,11 @@ _APART, _FAR_APART = 0.25, 0.5
 #: Brightness above white matter in units of its contrast to grey matter, and least volume in one piece of what
 #: enhances. Largest pieces: 19.5 ml in a T1 with contrast agent (ReMIND-022), 0.65 ml in one with bright arteries, and
 #: 0.01 ml in the others
-_ENHANCED, _ENHANCED_ML = 1.5, 2.0
+_ENHANCED, _ENHANCED_ML, _LARGEST_ENHANCED_ML = 1.5, 2.0, 300.0
+#: Share of one tissue from which the rest is noise
+_ONE_TISSUE = 0.97
+#: Contrast of grey and white matter in units of the noise: 1.1 in a T2 whose labels are blobs, 3 and more in T1s
+_LEAST_CONTRAST = 2.0
 
 
 def is_whole_brain(image: Volume, inside: np.ndarray) -> str:
@@ -78,6 +82,47 @@ def require_contrast(image: Volume, inside: np.ndarray, prior: np.ndarray, contr
     return [f"{found}: check the contrast"]
 
 
+def require_order(found: Classes, contrast: str, is_led: bool) -> list[str]:
+    """A warning where the tissues found are not in the order of the contrast; with an atlas that is refused.
+
+    Raises SimulationError then, naming the contrasts in which grey and white matter have this order.
+    """
+    count = len(ORDERS[contrast])
+    order = [found.names.index(TISSUES[tissue]) for tissue in ORDERS[contrast]]
+    means = found.means[order, 0]
+    if count < 2 or (np.diff(means) > 0).all():
+        return []
+    grey, white = (float(found.means[found.names.index(name), 0]) for name in ("grey matter", "white matter"))
+    reversed_ = (white > grey) != (ORDERS[contrast].index(2) > ORDERS[contrast].index(1))
+    names = ", ".join(f"{TISSUES[tissue]} {mean:.4g}" for tissue, mean in zip(ORDERS[contrast], means, strict=True))
+    what = f"choose {'t1 or t1gd' if white > grey else 't2 or flair'}" if reversed_ else "check the brain mask"
+    message = f"contrast is {contrast}, but its tissues are not in that order of brightness ({names}): {what}"
+    require(not is_led, message)
+    return [message]
+
+
+def require_several_tissues(found: Classes) -> None:
+    """Raise SimulationError if all but a few voxels are one tissue, as in a phantom or a liver."""
+    largest = int(found.shares.argmax())
+    share = float(found.shares[largest])
+    require(
+        share < _ONE_TISSUE,
+        f"{share:.1%} of the voxels are {found.names[largest]}, expected several tissues: no brain, or a wrong mask "
+        "or contrast",
+    )
+
+
+def faint(found: Classes, noise: float) -> list[str]:
+    """A warning where noise hides the difference between grey and white matter."""
+    grey, white = (float(found.means[found.names.index(name), 0]) for name in ("grey matter", "white matter"))
+    if abs(white - grey) >= _LEAST_CONTRAST * noise:
+        return []
+    return [
+        f"grey matter ({grey:.4g}) and white matter ({white:.4g}) differ by {abs(white - grey) / noise:.1f} times the "
+        f"noise, expected {_LEAST_CONTRAST:g} or more: look at the labels, or add a T1 of the patient"
+    ]
+
+
 def enhancement(image: np.ndarray, inside: np.ndarray, grey: float, white: float, voxel_ml: float) -> list[str]:
     """A warning where a T1 has something that only contrast agent makes so bright: sinuses, plexus, a tumour's rim.
 
@@ -85,7 +130,7 @@ def enhancement(image: np.ndarray, inside: np.ndarray, grey: float, white: float
     """
     labels, count = cast(tuple[np.ndarray, int], ndimage.label((image > white + _ENHANCED * (white - grey)) & inside))
     largest = float(np.bincount(labels.ravel())[1:].max()) * voxel_ml if count else 0.0
-    if largest < _ENHANCED_ML:
+    if not _ENHANCED_ML <= largest <= _LARGEST_ENHANCED_ML or white <= grey:
         return []
     return [
         f"contrast is t1, but {largest:.1f} ml in one piece are far brighter than white matter, as vessels and tumour "

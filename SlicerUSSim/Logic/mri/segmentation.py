@@ -151,7 +151,8 @@ def segment_mri(
     report = progress or (lambda share: None)
     others = dict(others or {})
     require(
-        contrast not in others, f"others has a second volume of contrast {contrast}, expected one volume per contrast"
+        contrast not in others,
+        f"there are two volumes of contrast {contrast}, expected one: choose another contrast for the second",
     )
     contrasts = (contrast, *others)
     names = class_names(contrasts, classes)
@@ -212,7 +213,7 @@ def segment_mri(
     found = replace(found, posteriors=smoothed_posteriors(found.posteriors, part.inside))
     timed("neighbours")
     report(0.9)
-    warnings += doubts(found, part, filtered[0][0], atlas, contrasts)
+    warnings += doubts(found, part, filtered[0][0], filtered[0][1], atlas, contrasts)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1

@@ -16,7 +16,14 @@ from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.classification import Classes
-from SlicerUSSim.Logic.mri.plausibility import enhancement, implausible, is_whole_brain
+from SlicerUSSim.Logic.mri.plausibility import (
+    enhancement,
+    faint,
+    implausible,
+    is_whole_brain,
+    require_order,
+    require_several_tissues,
+)
 from SlicerUSSim.Logic.mri.recognition import check_finite
 from SlicerUSSim.Logic.mri.sulci import sulcal_middles
 
@@ -111,10 +118,22 @@ def require_different(values: np.ndarray, contrasts: tuple[str, ...]) -> None:
 
 
 def doubts(
-    found: Classes, part: BrainPart, filtered: np.ndarray, atlas: AtlasFit | None, contrasts: tuple[str, ...]
+    found: Classes,
+    part: BrainPart,
+    filtered: np.ndarray,
+    noise: float,
+    atlas: AtlasFit | None,
+    contrasts: tuple[str, ...],
 ) -> list[str]:
-    """What the user should check; `filtered` (k, j, i) is the first image after the filter."""
-    lines = implausible(found, part.images[0], part.inside, atlas, contrasts[0])
+    """What the user should check; `filtered` (k, j, i) is the first image after the filter, `noise` before it.
+
+    Raises SimulationError where the result is none: one tissue only, or tissues in the order of another contrast.
+    """
+    require_several_tissues(found)
+    lines = require_order(found, contrasts[0], atlas is not None) if len(contrasts) == 1 else []
+    lines += implausible(found, part.images[0], part.inside, atlas, contrasts[0])
+    if len(contrasts) == 1:
+        lines += faint(found, noise)
     if contrasts == ("t1",):
         grey, white = (float(found.means[found.names.index(name), 0]) for name in ("grey matter", "white matter"))
         voxel_ml = float(np.prod(part.images[0].spacing_mm)) / 1000.0

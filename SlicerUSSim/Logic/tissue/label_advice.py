@@ -12,7 +12,9 @@ class Advice:
     #: About labels without a tissue, before the list of tissues; {label} is one of them
     unknown: str = "map them with --map {label}=TISSUE (0 removes a label), a .json file or a table of names, to one of"
     #: About a mask or lesion without a patient; {tissue}, {source} and {maps} are for this label map
-    lesion: str = "add it to a segmentation with --add {tissue}={source}, or allow it with {maps}"
+    lesion: str = (
+        "add it to a segmentation with --add {tissue}={source}, or simulate it alone with {maps} (ussim simulate)"
+    )
     #: About numbers that several programs use; {key} is one of them
     ambiguous: str = "say which with --map {key}"
     #: About voxels without a label between organs
