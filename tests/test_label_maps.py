@@ -281,7 +281,7 @@ def test_a_binary_mask_is_no_patient_unless_the_user_says_what_it_is(tmp_path):
     mask.write(path)
     message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
     assert f"{path}: a binary mask (1 label, 67 ml), not a patient's tissues" in message
-    assert f"--add tumour={path}, or allow it with --map 255=tumour" in message
+    assert f"--add tumour={path}, or simulate it alone with --map 255=tumour (ussim simulate)" in message
     for tissue in ("liver", "tumour"):
         result = ussim("simulate", path, "--map", f"255={tissue}", "--pose", "auto", "-o", tmp_path / f"{tissue}.png")
         assert result.exit_code == 0 and "glioma.nii.gz: mapped: 1 label to 1 tissue" in result.stderr, result.output

@@ -471,4 +471,4 @@ def test_another_mri_is_registered_and_classified_with_the_first():
     algorithm.SetOtherData("t1", t2.to_vtk())
     algorithm.AddObserver("ErrorEvent", lambda *_: None)
     algorithm.Update()
-    assert "second volume of contrast t1" in algorithm.GetErrorMessage()
+    assert "two volumes of contrast t1" in algorithm.GetErrorMessage()
