@@ -14,8 +14,8 @@ _LEAST_SIDE, _PARALLEL_SIDE, _OPENING_DEG = 0.165, 0.12, (25.0, 130.0)
 #: Deviation from a straight side, as a share of the perimeter
 _STRAIGHT = 0.006
 #: Share of the inner object that varies by less than 3 % within 20 mm: heads 0.00 to 0.01 (proton density), phantoms
-#: 0.03 to 0.32
-_UNIFORM_SHARE, _UNIFORM = 0.02, 0.03
+#: 0.01 (a noisy box) to 0.32
+_UNIFORM_SHARE, _UNIFORM_SHARE_OF_NO_HEAD, _UNIFORM = 0.02, 0.005, 0.03
 #: Cross-section at an end of the image, relative to the largest, from which the object is cut there. The neck is cut in
 #: most images of a head, so that the bottom has to be cut through the head itself.
 _CUT, _CUT_AT_BOTTOM = 0.5, 0.85
@@ -49,9 +49,9 @@ def uniform_share(image: CoarseImage) -> float:
     return float((variance[deep] < (_UNIFORM * mean[deep]) ** 2).mean())
 
 
-def is_phantom(image: CoarseImage) -> bool:
-    """Whether large parts of the object are uniform, as no tissue of a head is."""
-    return uniform_share(image) > _UNIFORM_SHARE
+def is_phantom(image: CoarseImage, looks_like_a_head: bool = True) -> bool:
+    """Whether large parts of the object are uniform, as no tissue of a head is; fewer, where nothing speaks for one."""
+    return uniform_share(image) > (_UNIFORM_SHARE if looks_like_a_head else _UNIFORM_SHARE_OF_NO_HEAD)
 
 
 def cut_ends(mri: Volume) -> tuple[str, ...]:

@@ -92,7 +92,7 @@ def why_refused(
 ) -> str:
     """One line about an image that the atlas does not fit: what it shows instead, and what to do."""
     size = " x ".join(f"{n * image.spacing_mm:.0f}" for n in image.array.shape[::-1])
-    if is_phantom(image):
+    if is_phantom(image, looks_like_a_head=alignment.agreement > 0.75 * least):
         return (
             f"this {size} mm image has large uniform parts, as a phantom has and no head; "
             "use an MRI of a head, or --skull-strip none to take everything brighter than the background"
