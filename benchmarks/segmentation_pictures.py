@@ -48,7 +48,7 @@ def anatomical(volume: Volume, array: np.ndarray) -> np.ndarray:
     axis_of = [int(np.abs(matrix[row]).argmax()) for row in range(3)]  # voxel axis (i, j, k) nearest R, A, S
     turned = np.transpose(array, [2 - axis_of[row] for row in (2, 1, 0)])
     falling = [2 - row for row in range(3) if matrix[row, axis_of[row]] < 0]
-    return np.flip(turned, falling)
+    return np.flip(turned, tuple(falling))
 
 
 def draw(path: Path, rows: list[tuple[str, Volume, Segmentation]]) -> None:

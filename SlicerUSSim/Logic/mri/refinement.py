@@ -96,7 +96,7 @@ def _tissue_from(brightness: np.ndarray, region: np.ndarray) -> np.ndarray:
 
 def _widened(values: np.ndarray, step: int, shape: tuple[int, ...]) -> np.ndarray:
     """Values at every `step`-th voxel, interpolated to `shape`."""
-    wide = ndimage.zoom(values, step, order=1, grid_mode=True, mode="nearest")
+    wide = cast(np.ndarray, ndimage.zoom(values, step, order=1, grid_mode=True, mode="nearest"))
     padding = [(0, max(0, n - m)) for n, m in zip(shape, wide.shape, strict=True)]
     return np.pad(wide, padding, mode="edge")[tuple(slice(n) for n in shape)]
 
