@@ -49,6 +49,12 @@ class Classes:
     mixture: TissueMixture
 
     @property
+    def grey_and_white(self) -> tuple[float, float]:
+        """Means of grey and white matter in the first channel."""
+        grey, white = (float(self.means[self.names.index(name), 0]) for name in ("grey matter", "white matter"))
+        return grey, white
+
+    @property
     def shares(self) -> np.ndarray:
         """(classes,) share of the voxels in which each class is the most probable one."""
         counts = np.bincount(self.posteriors.argmax(axis=0), minlength=len(self.names))

@@ -87,12 +87,11 @@ def require_order(found: Classes, contrast: str, is_led: bool) -> list[str]:
 
     Raises SimulationError then, naming the contrasts in which grey and white matter have this order.
     """
-    count = len(ORDERS[contrast])
     order = [found.names.index(TISSUES[tissue]) for tissue in ORDERS[contrast]]
     means = found.means[order, 0]
-    if count < 2 or (np.diff(means) > 0).all():
+    if (np.diff(means) > 0).all():
         return []
-    grey, white = (float(found.means[found.names.index(name), 0]) for name in ("grey matter", "white matter"))
+    grey, white = found.grey_and_white
     reversed_ = (white > grey) != (ORDERS[contrast].index(2) > ORDERS[contrast].index(1))
     names = ", ".join(f"{TISSUES[tissue]} {mean:.4g}" for tissue, mean in zip(ORDERS[contrast], means, strict=True))
     what = f"choose {'t1 or t1gd' if white > grey else 't2 or flair'}" if reversed_ else "check the brain mask"
@@ -114,7 +113,7 @@ def require_several_tissues(found: Classes) -> None:
 
 def faint(found: Classes, noise: float) -> list[str]:
     """A warning where noise hides the difference between grey and white matter."""
-    grey, white = (float(found.means[found.names.index(name), 0]) for name in ("grey matter", "white matter"))
+    grey, white = found.grey_and_white
     if abs(white - grey) >= _LEAST_CONTRAST * noise:
         return []
     return [

@@ -135,9 +135,7 @@ def doubts(
     if len(contrasts) == 1:
         lines += faint(found, noise)
     if contrasts == ("t1",):
-        grey, white = (float(found.means[found.names.index(name), 0]) for name in ("grey matter", "white matter"))
-        voxel_ml = float(np.prod(part.images[0].spacing_mm)) / 1000.0
-        lines += enhancement(filtered, part.inside, grey, white, voxel_ml)
+        lines += enhancement(filtered, part.inside, *found.grey_and_white, part.images[0].voxel_ml)
     return lines
 
 
