@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.base.declaration import Parameter
@@ -120,7 +120,7 @@ def _owner(written: str, known: Iterable[str], where: str = "") -> str:
         if same_name(name, written):
             return name
     near = get_close_matches(written, known, n=3)
-    raise SimulationError(f"--set: {where}no tissue {written!r}, expected {_either(near or known)}")
+    raise SimulationError(f"--set: {where}no tissue {written!r}, expected {either(near or known)}")
 
 
 def _hint(name: str, section: str, of_preset: dict[str, Parameter], of_tissue: dict[str, Parameter]) -> str:
@@ -133,14 +133,10 @@ def _hint(name: str, section: str, of_preset: dict[str, Parameter], of_tissue: d
     attribute = name.rpartition(".")[2]
     if own:
         attributes = [known.partition(".")[2] for known in own]
-        return _either([f"{section}.{known}" for known in get_close_matches(attribute, attributes, n=3) or attributes])
+        return either([f"{section}.{known}" for known in get_close_matches(attribute, attributes, n=3) or attributes])
     everything = [*of_preset, *by_tissue]
     same = [known for known in everything if known.rpartition(".")[2] == attribute]
     near = same[:3] or get_close_matches(name, everything, n=3)
     if near:
-        return _either(near)
-    return f"{_either([*sections, 'a tissue'])}, a dot and one of its parameters, such as display.gain_db"
-
-
-def _either(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
+        return either(near)
+    return f"{either([*sections, 'a tissue'])}, a dot and one of its parameters, such as display.gain_db"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -25,6 +25,11 @@ class SimulationError(Exception):
     ...     print(error)
     volume has 2 dimensions (20, 30), expected 3
     """
+
+
+def either(names: Sequence[str]) -> str:
+    """Names as a choice in a message: "a", "a or b", "a, b or c"."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
 class Cancelled(SimulationError):  # noqa: N818, what the user wanted is no error

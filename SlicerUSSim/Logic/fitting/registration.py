@@ -26,9 +26,10 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 NAMES = ("x_mm", "y_mm", "z_mm", "about_x_deg", "about_y_deg", "about_z_deg")
 #: Name in nlopt. A simplex is robust against the ripple of the cost due to speckle; quadratic models are not.
 _ALGORITHM = "LN_NELDERMEAD"
-#: Fraction of coarse evaluations; initial steps of the simplices, in units of the range.
-_COARSE_SHARE = 0.75
-_STEPS, _FINE_STEP = (0.12, 0.25, 0.12, 0.2, 0.12, 0.06), 0.03
+#: Fraction of coarse evaluations; initial steps of the simplices, in units of the range. The best place of the coarse
+#: cost is off by up to one degree, so that the simplices of the full cost have to start as wide as that.
+_COARSE_SHARE = 0.6
+_STEPS, _FINE_STEPS = (0.12, 0.25, 0.12, 0.2, 0.12, 0.06), (0.08, 0.06, 0.04)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +138,10 @@ def register_poses(
         if len(search.history) >= coarse_budget:
             break
     search.cost = full
-    best = search.minimise(_ALGORITHM, "fine", best, max_evaluations - len(search.history), step=_FINE_STEP)
+    for number, step in enumerate(_FINE_STEPS, 1):
+        left = max_evaluations - len(search.history)
+        search.minimise(_ALGORITHM, "fine", best, left * number // len(_FINE_STEPS), step=step)
+        best = np.array(search.best("fine").units)
     after = search.best_cost("fine")
     if after > before:  # no improvement on the start
         best, after = here, before

@@ -180,7 +180,7 @@ class _Search:
     def starts(self, pitches, sizes, step_mm: float, most: int) -> list[tuple[float, np.ndarray]]:
         """(information, parameters) of the best and different ones of a grid of places, nods and sizes."""
         points, image = template().coarse, self.image
-        k, j, i = np.nonzero(image.foreground())
+        k, j, i = np.nonzero(image.foreground)
         inside = image.spacing_mm * np.stack([i, j, k], axis=1) + image.origin
         low, high = np.percentile(inside, (1, 99), axis=0)
         middle = 0.5 * (low + high)

@@ -43,12 +43,9 @@ class CoarseImage:
         index = (points - self.origin) / self.spacing_mm
         return ndimage.map_coordinates(self.array, index[:, ::-1].T, order=1, mode="constant", cval=0.0)
 
+    @cached_property
     def foreground(self) -> np.ndarray:
         """(k, j, i) True where it is brighter than air: the largest component, with its holes filled."""
-        return self._foreground
-
-    @cached_property
-    def _foreground(self) -> np.ndarray:
         from skimage.filters import threshold_otsu
 
         inside = largest_component(self.array > 0.5 * threshold_otsu(self.array))

@@ -238,15 +238,14 @@ def _limited(weights: np.ndarray, least: np.ndarray, most: np.ndarray) -> np.nda
     """The weights within their limits, adding up to 1."""
     weights = weights / weights.sum()
     low = np.concatenate([least, np.full(len(weights) - len(least), 1e-6)])
-    high = most
     bound = np.zeros(len(weights), bool)
     for _ in range(len(weights)):  # what a limit gives or takes is shared by the classes that are free
         if bound.all():
             return weights / weights.sum()
         free = (1.0 - weights[bound].sum()) / weights[~bound].sum()
         scaled = np.where(bound, weights, free * weights)
-        outside = ~bound & ((scaled < low) | (scaled > high))
-        weights = np.where(outside, np.clip(scaled, low, high), scaled)
+        outside = ~bound & ((scaled < low) | (scaled > most))
+        weights = np.where(outside, np.clip(scaled, low, most), scaled)
         if not outside.any():
             break
         bound |= outside

@@ -38,7 +38,7 @@ def is_ultrasound(mri: Volume) -> bool:
 
 def uniform_share(image: CoarseImage) -> float:
     """Share of the object, deeper than 12 mm, in which intensities hardly vary within 20 mm: phantoms, not tissue."""
-    inside = np.pad(image.foreground(), 1)
+    inside = np.pad(image.foreground, 1)
     deep = (image.spacing_mm * ndimage.distance_transform_edt(inside))[1:-1, 1:-1, 1:-1] > 12.0  # type: ignore
     if deep.sum() < 100:
         return 0.0

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.masks import Masks, read_masks, resampled
 from SlicerUSSim.Logic.tissue.names import same_name, similar_tissues, tissue_named
@@ -74,7 +74,7 @@ def tissue_to_add(name: str, tissue_names: Iterable[str] = ()) -> str:
         mine = [own for own in dict.fromkeys(tissue_names) if own and own not in TISSUES]
         expected = f"one of: {', '.join([*mine, *TISSUES])}"
         if similar:
-            expected = " or ".join([", ".join(similar[:-1]), similar[-1]][len(similar) == 1 :])
+            expected = either(similar)
         raise SimulationError(f"no tissue is called {name!r}, expected {expected}") from None
 
 

@@ -35,7 +35,7 @@ _LEAST_CONTRAST = 2.0
 
 def is_whole_brain(image: Volume, inside: np.ndarray) -> str:
     """Empty for a mask (k, j, i) of the size of a whole brain, otherwise what is wrong with it."""
-    millilitres = float(inside.sum() * np.prod(image.spacing_mm)) / 1000.0
+    millilitres = float(inside.sum() * image.voxel_ml)
     if not WHOLE_BRAIN_ML[0] <= millilitres <= WHOLE_BRAIN_ML[1]:
         low, high = WHOLE_BRAIN_ML
         return f"the brain has {millilitres:.0f} ml, expected {low:.0f} to {high:.0f}"

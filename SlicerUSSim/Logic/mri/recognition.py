@@ -184,7 +184,7 @@ def _has_tissues(intensity: np.ndarray, shape: np.ndarray) -> bool:
 
 
 def _check_size(image: CoarseImage) -> None:
-    inside = image.foreground()
+    inside = image.foreground
     millilitres = inside.sum() * image.spacing_mm**3 / 1000.0
     extent = np.ptp(np.argwhere(inside), axis=0)[::-1] * image.spacing_mm
     size = " x ".join(f"{mm:.0f}" for mm in extent)
@@ -208,7 +208,7 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
     pad = 40
     wide = Volume(np.zeros([n + 2 * pad for n in counts], np.uint8), grid.ijk_to_ras @ _shift(-pad))
     distance = alignment.brain_on(wide)
-    tissue = np.pad(image.foreground(), pad)
+    tissue = np.pad(image.foreground, pad)
     brain = distance < -4.0
     shown = float(tissue[brain].mean())
     missing = _missing(brain, tissue) if shown < _USUAL_SHOWN else ""

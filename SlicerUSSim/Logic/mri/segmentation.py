@@ -88,7 +88,7 @@ class Segmentation:
     def table(self) -> str:
         """Share, volume, mean intensity and standard deviation of every label, one per line."""
         counts = np.bincount(self.labels.array.ravel(), minlength=len(self.tissue_names) + 1)[1:]
-        millilitres = counts * float(np.prod(self.labels.spacing_mm)) / 1000.0
+        millilitres = counts * self.labels.voxel_ml
         lines = [f"{'label':>5}  {'tissue':14} {'share':>6} {'ml':>7} {'mean':>9} {'sd':>8}"]
         for n, name in enumerate(self.tissue_names):
             numbers = ""
