@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
@@ -537,6 +538,22 @@ def test_an_mri_scaled_to_one_is_an_mri(mni):
     assert not is_label_file(Path("t1.nii.gz"), scaled)
     assert not is_label_file(Path("c1_t1.nii.gz"), scaled)  # called as SPM's maps are
     assert not is_label_file(Path("t1.nii.gz"), t1)
+
+
+def test_a_label_map_resampled_with_interpolation_is_said(mni, caplog):
+    from SlicerUSSim.Logic.tissue.label_sources import is_label_file
+
+    _, grey, white = mni
+    labels = np.where(white.array > 0.5, 41, np.where(grey.array > 0.5, 42, 0)).astype(np.float32)
+    bent = mni[0].with_array(ndimage.shift(labels, (0.4, 0.3, 0.2), order=1))
+    with caplog.at_level("WARNING"):
+        assert not is_label_file(Path("aseg.nii.gz"), bent)
+    assert "aseg.nii.gz: is mostly uniform regions of whole numbers with fractions between them" in caplog.text
+    caplog.clear()
+    halved = mni[0].with_array(ndimage.shift(mni[0].array.astype(np.float32), (0, 0, 0.5), order=1))
+    with caplog.at_level("WARNING"):
+        assert not is_label_file(Path("t1.nii.gz"), halved)  # half of its voxels are whole numbers
+    assert not caplog.text
 
 
 # ---- label map or MRI ------------------------------------------------------------------------------------------------

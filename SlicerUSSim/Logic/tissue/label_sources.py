@@ -19,13 +19,35 @@ from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 
 _log = logging.getLogger(__name__)
 
+#: Share of whole numbers in an interpolated label map, and of equal neighbours among them
+_MOSTLY, _UNIFORM = 0.5, 0.8
+
 
 def is_label_file(path: Path, volume: Volume) -> bool:
     """Whether a file is a label map or a tissue probability map, and no MRI.
 
     Raises SimulationError for a probability map whose companions are missing.
     """
-    return volume.looks_like_labels() or combined_probability_maps(path, volume) is not None
+    if volume.looks_like_labels() or combined_probability_maps(path, volume) is not None:
+        return True
+    if _is_interpolated(volume.array):
+        _log.warning(
+            "%s: is mostly uniform regions of whole numbers with fractions between them; if it is a label map that was "
+            "resampled with interpolation, resample it with nearest neighbours, since it is taken for an MRI now", path,
+        )  # fmt: skip
+    return False
+
+
+def _is_interpolated(array: np.ndarray) -> bool:
+    """Whether most voxels have whole numbers, in uniform regions, and others fractions. An MRI is noisy everywhere."""
+    inside = array != 0
+    if not np.issubdtype(array.dtype, np.floating) or not inside.any():
+        return False
+    is_whole = inside & (array == np.rint(array))
+    if is_whole.sum() < _MOSTLY * inside.sum() or is_whole.sum() == inside.sum():
+        return False
+    pairs = is_whole[..., 1:] & inside[..., :-1]
+    return bool((array[..., 1:] == array[..., :-1])[pairs].mean() > _UNIFORM) if pairs.any() else False
 
 
 def read_label_file(
