@@ -550,9 +550,9 @@ def test_a_label_map_resampled_with_interpolation_is_said(mni, caplog):
         assert not is_label_file(Path("aseg.nii.gz"), bent)
     assert "aseg.nii.gz: is mostly uniform regions of whole numbers with fractions between them" in caplog.text
     caplog.clear()
-    halved = mni[0].with_array(ndimage.shift(mni[0].array.astype(np.float32), (0, 0, 0.5), order=1))
+    shifted = mni[0].with_array(ndimage.shift(mni[0].array.astype(np.float32), (0, 0, 0.5), order=1))
     with caplog.at_level("WARNING"):
-        assert not is_label_file(Path("t1.nii.gz"), halved)  # half of its voxels are whole numbers
+        assert not is_label_file(Path("t1.nii.gz"), shifted)  # half of its voxels are whole numbers
     assert not caplog.text
 
 

@@ -33,7 +33,7 @@ PROBE = PhasedProbe(75.0, 60.0, scan_lines=96)
 def twin(mni):
     segmentation = segment_mri(mni[0])
     tissues = TissueTable.brain(segmentation.tissue_names)
-    # Five images each way: with three, speckle leaves up to 1.3 degrees, depending on the patient.
+    # Five images each way: with three, speckle leaves up to 2.4 degrees, depending on the patient.
     return make_twin(segmentation.labels, tissues, 2, probe=PROBE, crossing=True, frames=5)
 
 

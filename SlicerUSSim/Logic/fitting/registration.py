@@ -139,9 +139,10 @@ def register_poses(
             break
     search.cost = full
     for number, step in enumerate(_FINE_STEPS, 1):
-        left = max_evaluations - len(search.history)
-        search.minimise(_ALGORITHM, "fine", best, left * number // len(_FINE_STEPS), step=step)
-        best = np.array(search.best("fine").units)
+        budget = (max_evaluations - len(search.history)) * number // len(_FINE_STEPS)
+        if budget > 0 or number == 1:  # the full cost is needed once
+            search.minimise(_ALGORITHM, "fine", best, budget, step=step)
+            best = np.array(search.best("fine").units)
     after = search.best_cost("fine")
     if after > before:  # no improvement on the start
         best, after = here, before

@@ -44,10 +44,10 @@ def _is_interpolated(array: np.ndarray) -> bool:
     if not np.issubdtype(array.dtype, np.floating) or not inside.any():
         return False
     is_whole = inside & (array == np.rint(array))
-    if is_whole.sum() < _MOSTLY * inside.sum() or is_whole.sum() == inside.sum():
+    if not _MOSTLY <= is_whole.sum() / inside.sum() < 1.0:
         return False
     pairs = is_whole[..., 1:] & inside[..., :-1]
-    return bool((array[..., 1:] == array[..., :-1])[pairs].mean() > _UNIFORM) if pairs.any() else False
+    return bool(pairs.any() and (array[..., 1:] == array[..., :-1])[pairs].mean() > _UNIFORM)
 
 
 def read_label_file(
