@@ -42,7 +42,8 @@ def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: floa
     core = far < -core_mm
     brightness = ndimage.gaussian_filter(brightness_near(image, core, mm), 0.5)
     markers = np.where(core, 1, np.where(far > reach_mm, 2, 0)).astype(np.int32)
-    region = watershed(-brightness, markers, mask=far <= reach_mm + 3.0) == 1
+    undecided = (far >= -core_mm - 3.0) & (far <= reach_mm + 3.0)  # and 3 mm of the markers on either side
+    region = core | (watershed(-brightness, markers, mask=undecided) == 1)
     bright = region & (brightness > _tissue_from(brightness, region))
     ball = _ball(2.0 / mm)
     # Casts: the return types of scipy's functions depend on their arguments, without type annotations for that.
@@ -117,9 +118,8 @@ def signed_distance(inside: np.ndarray, spacing_mm: np.ndarray, most_mm: float) 
     box = _box(inside, [int(np.ceil(most_mm / size)) + 1 for size in spacing_mm[::-1]])
     result = np.full(inside.shape, most_mm, np.float32)
     part = inside[box]
-    outer = ndimage.distance_transform_edt(~part, spacing_mm[::-1])
-    inner = ndimage.distance_transform_edt(part, spacing_mm[::-1])
-    result[box] = np.minimum(outer - inner, most_mm)  # type: ignore[operator]
+    outer, inner = (np.maximum(distance_to(side, spacing_mm), 0.0) for side in (part, ~part))
+    result[box] = np.minimum(outer - inner, most_mm)
     return result
 
 
