@@ -458,6 +458,7 @@ def test_a_mask_edited_in_a_program_that_keeps_no_notes_is_the_users(head, found
     head[0].with_array(edited).write(path)  # without the entries of `keep`
     used = find_brain(head[0], keep_at=path)
     assert np.array_equal(used.mask.array > 0, edited > 0) and "edited" in used.message
+    assert any("expected a brain of 1000 to 1900 ml" in line for line in used.warnings)  # half of it is gone
     Volume(edited, np.eye(4)).write(path)
     assert brain_module.read_kept(path, head[0], "auto") is None
 
@@ -517,6 +518,20 @@ def test_a_mask_that_cuts_the_vertex_is_said_and_a_whole_one_is_not(head, found)
     cut[top - 6 :] = False
     (warning,) = cut_off(mri, cut)
     assert "at the top; check the cortex there" in warning
+    assert given_brain(mri.with_array(cut.astype(np.uint8)), mri).warnings == (warning,)
+    cut = whole.copy()
+    cut[: (top + np.flatnonzero(whole.any(axis=(1, 2))).min()) // 2] = False
+    (warning,) = cut_off(mri, cut)
+    assert "at the bottom; check the cortex there" in warning
+
+
+def test_a_lesion_given_as_the_brain_is_said():
+    mri = head_mri(4.0)
+    lesion = np.zeros(mri.array.shape, np.uint8)
+    middle = tuple(n // 2 for n in lesion.shape)
+    lesion[tuple(slice(n - 2, n + 2) for n in middle)] = 1
+    (warning,) = given_brain(mri.with_array(lesion), mri).warnings
+    assert "the mask has 4.1 ml, expected a brain of 1000 to 1900 ml" in warning and "--add" in warning
 
 
 def atrophied_vertex(spacing=1.5):

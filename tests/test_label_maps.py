@@ -253,6 +253,7 @@ def test_a_brain_in_our_numbers_is_read_and_one_in_other_numbers_is_not():
         numbers = dict(zip(("csf", "grey matter", "white matter"), others, strict=True))
         assert "no program's numbers are recognised" in str(refusal_of(brain(numbers)))
         texts = [f"{number}={name}" for name, number in numbers.items()]
+        assert LabelMapping.of({number: name for name, number in numbers.items()}) == LabelMapping.of(texts)
         found = read_label_map(brain(numbers), mapping=LabelMapping.of(texts))
         assert found.message == "mapped: 3 labels to 3 tissues"
 
@@ -318,6 +319,7 @@ def test_unknown_labels_are_listed_with_volumes_and_a_remedy_that_works(tmp_path
 
 def test_a_mapping_goes_before_names_and_numbers_and_removes_labels():
     volume = freesurfer(ASEG)
+    assert LabelMapping.of("77=tumour") == LabelMapping.of(["77=tumour"])
     mapping = LabelMapping.of(["77=tumour", "Left-Cerebral-White-Matter=liver", "24=background", "0=fat", "9999=csf"])
     found = read_label_map(volume, mapping=mapping)
     tissue = {label: (found.names[new - 1] if new else None) for label, new in found.relabelled.items()}

@@ -546,6 +546,8 @@ def test_segment_never_replaces_its_inputs_and_takes_no_labels_for_an_mri(tmp_pa
     before = head.read_bytes()
     same = ussim("segment", head, "-o", head, "--overwrite")
     assert same.exit_code == 2 and "which is an input" in same.output and head.read_bytes() == before
+    kept = ussim("segment", head, "-o", tmp_path / "head.brain-mask.nrrd", "--overwrite")
+    assert kept.exit_code == 2 and f"where the brain mask of {head} is kept" in kept.output
     labels, mask = tmp_path / "labels.nii.gz", tmp_path / "tumour.nii.gz"
     values = np.digitize(mri.array, [20, 62, 97])
     mri.with_array(values.astype(np.uint8)).write(labels)

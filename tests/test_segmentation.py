@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import register_atlas
+from SlicerUSSim.Logic.mri.block_matching import share_in_place
 from SlicerUSSim.Logic.mri.classification import class_names, classify
 from SlicerUSSim.Logic.mri.field import estimate_field
 from SlicerUSSim.Logic.mri.filtering import guided_filter
@@ -17,6 +20,8 @@ from SlicerUSSim.Logic.mri.histogram import Histogram
 from SlicerUSSim.Logic.mri.mixture import fit_mixture
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import estimate_noise
+
+COLIN27 = Path("/usr/share/mricron/templates/ch2bet.nii.gz")
 
 
 def with_rician_noise(volume: Volume, share: float, seed: int = 0) -> Volume:
@@ -303,3 +308,38 @@ def test_images_without_tissue_are_refused():
         segment_mri(grid.with_array(np.full_like(grid.array, 7)))
     with pytest.raises(SimulationError, match="mask is empty"):
         segment_mri(grid, mask=grid.with_array(np.zeros_like(grid.array)))
+
+
+def textured(seed: int) -> Volume:
+    """A brain-sized volume at 2 mm with structures of about 8 mm, as gyri are."""
+    noise = np.random.default_rng(seed).normal(size=(70, 80, 60))
+    smooth = gaussian_filter(noise, 2.0)
+    return Volume((smooth / smooth.std()).astype(np.float32), np.diag([2.0, 2.0, 2.0, 1.0]))
+
+
+def test_the_parts_of_one_brain_lie_in_the_same_places_in_any_contrast_and_those_of_two_do_not():
+    first, other = textured(0), textured(1)
+    inside = np.zeros(first.array.shape, bool)
+    inside[6:-6, 6:-6, 6:-6] = True
+    rng = np.random.default_rng(2)
+    contrast = np.abs(first.array + 0.4) + rng.normal(0.0, 0.3, first.array.shape)  # as in FLAIR: not monotonic
+    assert share_in_place(first, first.with_array(contrast.astype(np.float32)), inside) > 0.95
+    moved = np.roll(contrast, (1, 1, 0), axis=(0, 1, 2))  # registered to 3 mm
+    assert share_in_place(first, first.with_array(moved.astype(np.float32)), inside) > 0.95
+    assert share_in_place(first, other, inside) < 0.2
+    flat = first.with_array(np.zeros_like(first.array))
+    assert share_in_place(first, flat, inside) is None
+
+
+@pytest.mark.skipif(not COLIN27.exists(), reason="Debian's mricron-data is not installed")
+def test_the_brain_of_another_patient_is_refused_as_second_mri(mni):
+    """Both are skull-stripped, in one space, and alike as wholes."""
+    with pytest.raises(SimulationError, match=r"t1gd: \d+% of the brain's parts lie where the first volume has them"):
+        segment_mri(mni[0], contrast="t1", others={"t1gd": Volume.read(COLIN27)})
+
+
+def test_a_label_map_is_refused_as_second_mri(mni):
+    t1 = mni[0]
+    labels = t1.with_array(np.digitize(t1.array, [20, 60, 90]).astype(np.uint8))
+    with pytest.raises(SimulationError, match="t2 has only 4 different values, as a mask or label map has"):
+        segment_mri(t1, contrast="t1", others={"t2": labels})

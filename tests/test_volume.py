@@ -176,6 +176,13 @@ def test_nan_around_the_head_is_read_as_zero_and_told(tmp_path, caplog):
     volume = Volume.read(tmp_path / "mri.nii.gz")
     assert "8 of 336 voxels, at the border of the volume, are NaN: they are read as 0" in caplog.text
     assert (volume.array == 0).sum() == 8
+    values[:, :, 4:6] = np.nan
+    nibabel.Nifti1Image(values, np.eye(4)).to_filename(tmp_path / "gap.nii.gz")
+    with pytest.raises(SimulationError, match="2 slices are NaN between slices with values, the first at k = 4"):
+        Volume.read(tmp_path / "gap.nii.gz")
+    nibabel.Nifti1Image(np.full_like(values, np.nan), np.eye(4)).to_filename(tmp_path / "nothing.nii.gz")
+    with pytest.raises(SimulationError, match="no voxel is a finite number"):
+        Volume.read(tmp_path / "nothing.nii.gz")
     caplog.clear()
     nibabel.Nifti1Image(np.ones((6, 7, 8), np.float32), np.eye(4)).to_filename(tmp_path / "good.nii.gz")
     Volume.read(tmp_path / "good.nii.gz")

@@ -14,6 +14,7 @@ from SlicerUSSim.Command.mri_options import also_option, segmented_file, split_a
 from SlicerUSSim.Command.options import check_output, device_option, gathered, mask_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 if TYPE_CHECKING:
@@ -74,6 +75,10 @@ def _require_no_input(out: Path, mri: str, mask: str | None, also: tuple[str, ..
             not (out.exists() and Path(file).exists() and out.samefile(file)),
             f"-o is {out}, which is an input, expected another name",
         )
+    require(
+        out.absolute() != mask_beside(mri).absolute(),
+        f"-o is {out}, where the brain mask of {mri} is kept, expected another name",
+    )
 
 
 def _require_mri(path: str, volume: Volume) -> None:

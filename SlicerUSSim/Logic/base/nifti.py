@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 _log = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ def check_numbers(path: Path, image) -> None:
     """Look for voxels of a NIfTI file that are not numbers: ITK reads them as 0 without a word.
 
     NaN that reaches the border of the volume is how SPM and others write "outside the head": it is read as 0, with a
-    warning. Raises SimulationError for NaN within and for infinite voxels.
+    warning. Raises SimulationError for NaN within, for slices of NaN between others, and for infinite voxels.
     """
     if not (image.HasMetaDataKey("sform_code") and "float" in image.GetPixelIDTypeAsString()):
         return
@@ -107,6 +107,7 @@ def check_numbers(path: Path, image) -> None:
     count = int(bad.sum())
     if not count:
         return
+    require(count < bad.size, f"{path}: no voxel is a finite number, expected an image")
     background = np.zeros_like(bad)
     if bad.ndim == 3:
         at_the_border = np.pad(bad, 1, constant_values=True)
@@ -119,4 +120,13 @@ def check_numbers(path: Path, image) -> None:
             f"{path}: {int(within.sum())} of {bad.size} voxels are not finite numbers, the first at (i, j, k) = "
             f"{first}; expected numbers, or NaN around the head alone; replace them and try again"
         )
+    for axis, name in enumerate("ijk"[: bad.ndim]):
+        is_gap = bad.all(axis=tuple(other for other in range(bad.ndim) if other != axis))
+        first, last = np.flatnonzero(~is_gap)[[0, -1]]
+        gaps = first + np.flatnonzero(is_gap[first:last])
+        if gaps.size:
+            raise SimulationError(
+                f"{path}: {gaps.size} slices are NaN between slices with values, the first at {name} = {gaps[0]}; "
+                "expected numbers, or NaN around the head alone"
+            )
     _log.warning("%s: %d of %d voxels, at the border of the volume, are NaN: they are read as 0", path, count, bad.size)

@@ -72,12 +72,11 @@ def _strength(factor: np.ndarray, inside: np.ndarray) -> float:
 
 
 def _about(contrast: str, strength: float, wanted: bool | None, how: str) -> str:
+    amount = f"{strength:.0%}" if strength < 10.0 else "more than a factor of ten"
+    found = f"{contrast}: intensity varies by {amount} across the brain"
     if not how:
-        return (
-            f"{contrast}: intensity varies by {strength:.0%} across the brain, below {LEAST_FIELD:.0%}: left as it is"
-        )
-    why = ", as asked for" if wanted else ""
-    return f"{contrast}: intensity varies by {strength:.0%} across the brain: {how}{why}"
+        return f"{found}, below {LEAST_FIELD:.0%}: left as it is"
+    return f"{found}: {how}{', as asked for' if wanted else ''}"
 
 
 def without_bias(image: Volume, inside: np.ndarray, report: Callable[[float], None]) -> np.ndarray:

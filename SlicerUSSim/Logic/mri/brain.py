@@ -101,7 +101,11 @@ def find_brain(
 
 
 def given_brain(mask: Volume, mri: Volume) -> BrainMask:
-    """The mask that a user gives. Raises SimulationError if it is empty, on another grid, or covers everything."""
+    """The mask that a user gives. Raises SimulationError if it is empty, on another grid, or covers everything.
+
+    What looks like no whole brain, and tissue that it cuts off, are warnings: it may be what the user wants.
+    """
+    require(isinstance(mask, Volume), f"mask is a {type(mask).__name__}, expected a Volume (Volume.read reads a file)")
     require(
         mask.array.shape == mri.array.shape,
         f"mask has shape {mask.array.shape} and the MRI {mri.array.shape}, expected the same grid; resample the mask",
@@ -126,11 +130,21 @@ def given_brain(mask: Volume, mri: Volume) -> BrainMask:
         f"mask covers {share:.0%} of the image, {millilitres:.0f} ml, expected the brain only; "
         "to use the whole image, give --skull-strip none and no mask",
     )
-    warnings = ()
-    if millilitres > POSSIBLE_ML[1]:
-        warnings = (f"the mask has {millilitres:.0f} ml, more than any brain; check that it is one",)
     found = mri.with_array(inside.astype(np.uint8))
-    return BrainMask(found, "given", f"brain mask as given, {millilitres:.0f} ml", warnings)
+    return BrainMask(found, "given", f"brain mask as given, {millilitres:.0f} ml", _doubts(mri, inside))
+
+
+def _doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
+    """Warnings about a mask that a user made."""
+    millilitres = _millilitres(inside, mri)
+    if millilitres > POSSIBLE_ML[1]:
+        return (f"the mask has {millilitres:.0f} ml, more than any brain; check that it is one",)
+    if millilitres < POSSIBLE_ML[0]:
+        return (
+            f"the mask has {millilitres:.3g} ml, expected a brain of {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml or a "
+            "large part of one; what is outside it has no tissue (a lesion is added with --add tumour=FILE)",
+        )
+    return cut_off(mri, inside)
 
 
 def left_out(mask: Volume, lesion: Volume) -> float:
@@ -237,7 +251,8 @@ def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
         by = _NAMES.get(kept.method, kept.method)
         message = f"whole head: brain mask kept in {kept.path}, by {by} in {kept.seconds:.0f} s, {millilitres:.0f} ml"
     mask = mri.with_array(kept.inside.astype(np.uint8))
-    return BrainMask(mask, "given" if kept.is_edited else kept.method, message, kept.warnings, 0.0)
+    warnings = _doubts(mri, kept.inside) if kept.is_edited else kept.warnings
+    return BrainMask(mask, "given" if kept.is_edited else kept.method, message, warnings, 0.0)
 
 
 def _volume_warnings(millilitres: float) -> tuple[str, ...]:

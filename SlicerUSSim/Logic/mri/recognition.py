@@ -32,6 +32,8 @@ _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
 #: Between the 5th and 95th percentile of the inner brain, relative to its median. T1 and T2 had 0.46 to 0.82;
 #: CT whose air is stored as 0 has 0.01 to 0.05 (25 to 50 HU on 1000).
 _LEAST_CONTRAST = 0.1
+#: More different values are an image.
+_MOST_LABELS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,15 +101,21 @@ def check_finite(mri: Volume) -> None:
     require(high > low, f"MRI is constant ({low:g}), expected different intensities")
 
 
+def check_intensities(mri: Volume, name: str = "MRI") -> None:
+    """Raise SimulationError if the image `name` has as few different values as a mask or a label map."""
+    sample = np.unique(mri.array[::3, ::3, ::3])
+    require(
+        len(sample) > _MOST_LABELS,
+        f"{name} has only {len(sample)} different values, as a mask or label map has, expected the intensities of an "
+        "MRI",
+    )
+
+
 def _check_values(mri: Volume) -> None:
     check_finite(mri)
+    check_intensities(mri)
     values = mri.array
     low, high = float(values.min()), float(values.max())
-    sample = np.unique(values[::3, ::3, ::3])
-    require(
-        len(sample) > 12,
-        f"MRI has only {len(sample)} different values, as a mask or label map has, expected the intensities of an MRI",
-    )
     air = float(np.percentile(values[::3, ::3, ::3], 5.0))
     require(
         not (low <= -900.0 and air < -500.0),

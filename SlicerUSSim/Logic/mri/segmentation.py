@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.neighbours import smoothed_posteriors
 from SlicerUSSim.Logic.mri.plausibility import require_contrast
+from SlicerUSSim.Logic.mri.recognition import check_intensities
 from SlicerUSSim.Logic.mri.segmentation_steps import (
     BrainPart,
     StepTimes,
@@ -174,9 +175,11 @@ def segment_mri(
     notes, warnings = [brain.message], [*brain.warnings]
     images = [mri.with_array(intensity)]
     for name, other in others.items():
-        image, message = aligned(other.with_array(finite(other)), images[0], foreground, name)
+        check_intensities(other, name)
+        image, message, doubts_of_it = aligned(other.with_array(finite(other)), images[0], foreground, name)
         images.append(image)
         notes.append(message)
+        warnings += doubts_of_it
     if others:
         if brain.method != "given":
             notes.append(

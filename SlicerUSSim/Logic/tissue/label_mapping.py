@@ -45,17 +45,20 @@ class LabelMapping:
     scheme: str | None = None
 
     @classmethod
-    def of(cls, texts: Iterable[str], tissues: TissueTable | None = None) -> LabelMapping:
-        """From texts "24=csf", "Left-Lesion=tumour", files and keys of schemes.
+    def of(cls, texts: Iterable[str] | Mapping[object, str], tissues: TissueTable | None = None) -> LabelMapping:
+        """From texts "24=csf", "Left-Lesion=tumour", files and keys of schemes, or from a mapping {24: "csf"}.
 
-        Of several texts for one label the last counts. `tissues` are known by their names in addition to the presets.
+        One text alone may be given without a list. Of several texts for one label the last counts. `tissues` are known
+        by their names in addition to the presets.
         Raises SimulationError for texts that are none of these, and for unknown tissues.
         """
+        if isinstance(texts, Mapping):
+            texts = [f"{label}={tissue}" for label, tissue in texts.items()]
         by_label: dict[int, str] = {}
         by_name: dict[str, str] = {}
         names: dict[int, str] = {}
         scheme = None
-        for text in texts:
+        for text in [texts] if isinstance(texts, str) else texts:
             key, equals, value = text.partition("=")
             path = Path(text)
             if text.strip().lower() in schemes():
