@@ -14,7 +14,6 @@ from SlicerUSSim.Command.mri_options import also_option, segmented_file, split_a
 from SlicerUSSim.Command.options import check_output, device_option, gathered, mask_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 if TYPE_CHECKING:
@@ -69,6 +68,8 @@ def segment(
 
 def _require_no_input(out: Path, mri: str, mask: str | None, also: tuple[str, ...], additions: tuple[str, ...]) -> None:
     """Raise SimulationError if the output would replace one of the inputs, also with --overwrite."""
+    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+
     files = [mri, *([] if mask is None else [mask]), *(text.partition("=")[2] for text in (*also, *additions))]
     for file in files:
         require(
