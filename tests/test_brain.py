@@ -530,6 +530,9 @@ def test_a_lesion_given_as_the_brain_is_said():
     lesion = np.zeros(mri.array.shape, np.uint8)
     middle = tuple(n // 2 for n in lesion.shape)
     lesion[tuple(slice(n - 2, n + 2) for n in middle)] = 1
+    half = mri.with_array((mri.array > 20).astype(np.uint8))
+    half.array[..., half.array.shape[2] // 2 :] = 0
+    assert any("expected" in line for line in given_brain(half, mri).warnings)
     (warning,) = given_brain(mri.with_array(lesion), mri).warnings
     assert "the mask has 4.1 ml, expected a brain of 1000 to 1900 ml" in warning and "--add" in warning
 

@@ -8,18 +8,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import register_atlas
 from SlicerUSSim.Logic.mri.block_matching import share_in_place
 from SlicerUSSim.Logic.mri.classification import class_names, classify
+from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.field import estimate_field
 from SlicerUSSim.Logic.mri.filtering import guided_filter
 from SlicerUSSim.Logic.mri.histogram import Histogram
 from SlicerUSSim.Logic.mri.mixture import fit_mixture
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import estimate_noise
+from tests.conftest import rigid
 
 COLIN27 = Path("/usr/share/mricron/templates/ch2bet.nii.gz")
 
@@ -347,3 +350,22 @@ def test_a_label_map_is_refused_as_second_mri(mni):
     labels = t1.with_array(np.digitize(t1.array, [20, 60, 90]).astype(np.uint8))
     with pytest.raises(SimulationError, match="t2 has only 4 different values, as a mask or label map has"):
         segment_mri(t1, contrast="t1", others={"t2": labels})
+    parts = t1.with_array((labels.array * (1 + np.indices(t1.array.shape)[2] // 25)).astype(np.uint8))  # many labels
+    with pytest.raises(SimulationError, match="t2 is a label map"):
+        segment_mri(t1, contrast="t1", others={"t2": parts})
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_thick_slices_of_a_turned_head_are_registered(mni, axis):
+    """A T2 of 5 mm slices, turned by 10 degrees: a smoothed first level led 30 mm away."""
+    t1 = mni[0]
+    inside = t1.array > 20
+    noise = np.random.default_rng(3).normal(0.0, 4.0, t1.array.shape)
+    thick = np.where(inside, 160.0 - t1.array, 0.0) + noise
+    thick = thick[: thick.shape[0] // 5 * 5].reshape(-1, 5, *thick.shape[1:]).mean(axis=1)
+    matrix = t1.ijk_to_ras @ np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 5, 2], [0, 0, 0, 1.0]])
+    turned = rigid(Rotation.from_rotvec(10.0 * np.eye(3)[axis], degrees=True).as_matrix(), [6.0, -4.0, 9.0])
+    moved, line, warnings = aligned(Volume(thick.astype(np.float32), turned @ matrix), t1, inside, "t2")
+    angle = float(line.split("turned by ")[1].split()[0])
+    assert angle == pytest.approx(10.0, abs=0.6) and not warnings
+    assert np.corrcoef(moved.array[inside], t1.array[inside])[0, 1] < -0.75

@@ -77,7 +77,7 @@ def _require_no_input(out: Path, mri: str, mask: str | None, also: tuple[str, ..
             f"-o is {out}, which is an input, expected another name",
         )
     require(
-        out.absolute() != mask_beside(mri).absolute(),
+        out.resolve() != mask_beside(mri).resolve(),
         f"-o is {out}, where the brain mask of {mri} is kept, expected another name",
     )
 

@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.kept_mask import keep, read_kept
 from SlicerUSSim.Logic.mri.mask_check import cut_off
+from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML, Shown, above_noise, check_position, recognise
 from SlicerUSSim.Logic.mri.refinement import on_grid, refined, signed_distance
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
@@ -144,7 +145,11 @@ def _doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
             f"the mask has {millilitres:.3g} ml, expected a brain of {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml or a "
             "large part of one; what is outside it has no tissue (a lesion is added with --add tumour=FILE)",
         )
-    return cut_off(mri, inside)
+    reason = is_whole_brain(mri, inside)
+    warnings = _volume_warnings(millilitres)
+    if reason and not warnings:
+        warnings = (f"the mask is not that of a whole brain: {reason}",)
+    return (*warnings, *cut_off(mri, inside))
 
 
 def left_out(mask: Volume, lesion: Volume) -> float:

@@ -103,6 +103,7 @@ def check_finite(mri: Volume) -> None:
 
 def check_intensities(mri: Volume, name: str = "MRI") -> None:
     """Raise SimulationError if the image `name` has as few different values as a mask or a label map."""
+    require(isinstance(mri, Volume), f"{name} is a {type(mri).__name__}, expected a Volume (Volume.read reads a file)")
     sample = np.unique(mri.array[::3, ::3, ::3])
     require(
         len(sample) > _MOST_LABELS,

@@ -176,6 +176,7 @@ def segment_mri(
     images = [mri.with_array(intensity)]
     for name, other in others.items():
         check_intensities(other, name)
+        require(not other.looks_like_labels(), f"{name} is a label map, expected the intensities of an MRI")
         image, message, doubts_of_it = aligned(other.with_array(finite(other)), images[0], foreground, name)
         images.append(image)
         notes.append(message)
