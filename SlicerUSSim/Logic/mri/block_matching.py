@@ -6,6 +6,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.coarse import resampled_to_ras
 
 _SPACING_MM = 2.0
 #: Edge of a block, largest shift along an axis (voxels), and share of the block that has to be in the brain
@@ -25,29 +26,16 @@ def share_in_place(first: Volume, second: Volume, inside: np.ndarray) -> float |
     away along each axis are tried. `second` is on the grid of `first`, `inside` (k, j, i) is the brain there. None
     where fewer than ten blocks can tell.
     """
-    one, other, mask = (_resampled(volume) for volume in (first, second, first.with_array(inside.astype(np.float32))))
-    one, other, brain = (np.pad(array, _REACH) for array in (one, other, mask > 0.5))
+    volumes = (first, second, first.with_array(inside.astype(np.float32)))
+    one, other, mask = (np.pad(resampled_to_ras(volume, _SPACING_MM)[0], _REACH) for volume in volumes)
     ranges = [range(_REACH, size - _REACH - _BLOCK, _BLOCK) for size in one.shape]
     corners = [(k, j, i) for k in ranges[0] for j in ranges[1] for i in ranges[2]]
-    corners = [at for at in corners if brain[_block(at)].mean() >= _INSIDE]
+    corners = [at for at in corners if (mask[_block(at)] > 0.5).mean() >= _INSIDE]
     step = max(1, -(-len(corners) // _MOST_BLOCKS))
     found = [shift for at in corners[::step] if (shift := _shift_mm(one, other, at)) is not None]
     if len(found) < _LEAST_BLOCKS:
         return None
     return float(np.mean(np.array(found) <= _NEAR_MM))
-
-
-def _resampled(volume: Volume) -> np.ndarray:
-    """(k, j, i) float32 means over about 2 mm."""
-    import SimpleITK as sitk
-
-    image = sitk.Cast(volume.to_sitk(), sitk.sitkFloat32)
-    image = sitk.BinShrink(image, [max(1, round(0.99 * _SPACING_MM / mm)) for mm in image.GetSpacing()])
-    size = [max(1, int(n * mm / _SPACING_MM)) for n, mm in zip(image.GetSize(), image.GetSpacing(), strict=True)]
-    spacing = [_SPACING_MM] * 3
-    return sitk.GetArrayFromImage(
-        sitk.Resample(image, size, sitk.Transform(), sitk.sitkLinear, image.GetOrigin(), spacing, image.GetDirection())
-    )
 
 
 def _block(at: tuple[int, int, int], more: int = 0) -> tuple[slice, ...]:

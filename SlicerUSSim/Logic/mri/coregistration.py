@@ -52,7 +52,7 @@ def aligned(other: Volume, reference: Volume, inside: np.ndarray, name: str) -> 
     method.SetSmoothingSigmasPerLevel([0.0])
     method.SetOptimizerAsRegularStepGradientDescent(1.0, 0.01, 60, gradientMagnitudeTolerance=1e-6)
     method.SetOptimizerScalesFromPhysicalShift()
-    _, best = _registered(method, fixed, moving)
+    best = _registered(method, fixed, moving)
     resampled = sitk.Resample(other.with_array(other.array.astype(np.float32)).to_sitk(), reference.to_sitk(), best)
     array = sitk.GetArrayFromImage(resampled)
     covered = sitk.Resample(
@@ -110,8 +110,8 @@ def _starts(fixed: Any, moving: Any) -> list[Any]:
     return starts
 
 
-def _registered(method: Any, fixed: Any, moving: Any) -> tuple[float, Any]:
-    """(negative mutual information, transform) from where the files place the images, and else from the best starts."""
+def _registered(method: Any, fixed: Any, moving: Any) -> Any:
+    """The transform, searched from where the files place the images, and else from the best starts."""
     first, *others = _starts(fixed, moving)
     value, best = _optimised(method, fixed, moving, first)
     if value >= -_FOUND:
@@ -122,7 +122,7 @@ def _registered(method: Any, fixed: Any, moving: Any) -> tuple[float, Any]:
         found = _optimised(method, fixed, moving, start)
         if found[0] < value:
             value, best = found
-    return value, best
+    return best
 
 
 def _value(method: Any, fixed: Any, moving: Any, transform: Any) -> float:
