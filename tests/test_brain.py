@@ -525,6 +525,15 @@ def test_a_mask_that_cuts_the_vertex_is_said_and_a_whole_one_is_not(head, found)
     assert "at the bottom; check the cortex there" in warning
 
 
+def test_a_slab_given_as_the_brain_is_said():
+    values = np.random.default_rng(0).normal(100.0, 10.0, (20, 130, 130)).astype(np.float32)
+    mri = Volume(values, np.diag([2.0, 2.0, 2.0, 1.0]))
+    mask = np.zeros(values.shape, np.uint8)
+    mask[7:13, 3:-3, 3:-3] = 1
+    (warning,) = given_brain(mri.with_array(mask), mri).warnings
+    assert "the brain has 738 ml, expected 1000 to 1900 ml" in warning
+
+
 def test_a_lesion_given_as_the_brain_is_said():
     mri = head_mri(4.0)
     lesion = np.zeros(mri.array.shape, np.uint8)

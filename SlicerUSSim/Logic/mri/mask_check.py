@@ -29,7 +29,10 @@ def cut_off(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
     mask = on_grid(mri.with_array(inside), grid) > 0.5
     is_shown = on_grid(mri.with_array(np.ones(inside.shape, bool)), grid) > 0.99
     depth = _SPACING_MM * (ndimage.distance_transform_edt(mask) - ndimage.distance_transform_edt(~mask))  # type: ignore
-    bright = brightness_near(image, depth > 8.0, _SPACING_MM)
+    core = depth > 8.0
+    if not core.any():  # a slab of a brain, with nothing deep to compare with
+        return ()
+    bright = brightness_near(image, core, _SPACING_MM)
     tissue = (bright > _TISSUE[0]) & (bright < _TISSUE[1]) & is_shown
     # The border is cut where tissue goes on without a gap from below it to well above it.
     above = (depth < 0.0) & (depth >= -_ABOVE_MM) & tissue
