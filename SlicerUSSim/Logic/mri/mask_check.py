@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import resampled_to_ras
-from SlicerUSSim.Logic.mri.refinement import brightness_near, on_grid
+from SlicerUSSim.Logic.mri.refinement import brightness_near, on_grid, signed_distance
 
 _SPACING_MM = 2.0
 #: Tissue as bright as the brain, relative to it nearby: darker is CSF or skull in T1, brighter CSF in T2 and fat
@@ -28,7 +28,7 @@ def cut_off(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
     grid = Volume(image, matrix)
     mask = on_grid(mri.with_array(inside), grid) > 0.5
     is_shown = on_grid(mri.with_array(np.ones(inside.shape, bool)), grid) > 0.99
-    depth = _SPACING_MM * (ndimage.distance_transform_edt(mask) - ndimage.distance_transform_edt(~mask))  # type: ignore
+    depth = -signed_distance(mask, np.full(3, _SPACING_MM), 2.0 * _ABOVE_MM)
     core = depth > 8.0
     if not core.any():  # a slab of a brain, with nothing deep to compare with
         return ()
