@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 from scipy import ndimage
 
@@ -37,7 +39,8 @@ def cut_off(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
     # The border is cut where tissue goes on without a gap from below it to well above it.
     above = (depth < 0.0) & (depth >= -_ABOVE_MM) & tissue
     below = (depth > 0.0) & (depth <= _BELOW_MM) & tissue
-    across = ndimage.binary_dilation(below, iterations=2) & above & ndimage.binary_opening(tissue, np.ones((2, 2, 2)))
+    solid = cast(np.ndarray, ndimage.binary_opening(tissue, np.ones((2, 2, 2))))
+    across = cast(np.ndarray, ndimage.binary_dilation(below, iterations=2)) & above & solid
     points = np.argwhere(mask)
     centre = points.mean(axis=0)
     base = int(centre[0] + 10.0 / _SPACING_MM)
