@@ -387,6 +387,22 @@ def test_a_cancelled_program_is_ended_and_leaves_nothing(tmp_path, monkeypatch):
     assert not list(temporary.iterdir())
 
 
+def test_robex_works_while_the_image_is_recognised_and_ends_with_its_refusal(tmp_path, monkeypatch):
+    script = f"import os, time\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\ntime.sleep(600)"
+    monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, script))
+
+    def refused(mri, report):
+        while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
+            time.sleep(0.01)
+        raise SimulationError("shows an abdomen")
+
+    monkeypatch.setattr(brain_module, "recognise", refused)
+    with pytest.raises(SimulationError, match="shows an abdomen"):
+        find_brain(head_mri(4.0), "robex")
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
+
+
 def test_a_program_that_fails_is_named_with_its_last_line(tmp_path, monkeypatch):
     script = "import sys; print('no model'); sys.exit(3)"
     monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, script))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -68,6 +69,22 @@ class AtlasFit:
         shares[0] = 1.0 - shares[1] - shares[2]
         shares = np.maximum(shares, _PRIOR_FLOOR)
         return shares / shares.sum(axis=0)
+
+    def warped(self, array: np.ndarray, grid: Volume, inside: np.ndarray) -> np.ndarray:
+        """(voxels,) float32 values of an `array` on the atlas's grid in the voxels `inside` (k, j, i)."""
+        matrix = self.atlas.t1.ras_to_ijk @ self.patient_to_atlas @ grid.ijk_to_ras
+        corners = np.argwhere(array > 0)
+        corners = np.stack([corners.min(axis=0), corners.max(axis=0)])[:, ::-1]
+        ends = np.array([[*corner, 1.0] for corner in itertools.product(*corners.T.tolist())]) @ np.linalg.inv(matrix).T
+        low, high = np.floor(ends[:, 2::-1].min(axis=0)) - 1, np.ceil(ends[:, 2::-1].max(axis=0)) + 2
+        first, last = (np.clip(end, 0, inside.shape).astype(int) for end in (low, high))
+        box = tuple(map(slice, first, last))
+        # scipy wants the map from array indices (k, j, i) of the result to those of the input.
+        linear = matrix[:3, :3][::-1, ::-1]
+        offset = matrix[:3, 3][::-1] + linear @ first
+        result = np.zeros(inside.shape, np.float32)
+        result[box] = ndimage.affine_transform(array, linear, offset, tuple(last - first), order=1)  # pyright: ignore[reportArgumentType]
+        return result[inside]
 
     def is_left(self, grid: Volume, inside: np.ndarray) -> np.ndarray:
         """(voxels,) whether each voxel `inside` (k, j, i) is left of the atlas's midline."""

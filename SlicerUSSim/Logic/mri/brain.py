@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri import extractors
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
+from SlicerUSSim.Logic.mri.extractors import Program, Report
 from SlicerUSSim.Logic.mri.kept_mask import keep, read_kept
 from SlicerUSSim.Logic.mri.mask_check import cut_off
 from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
@@ -25,7 +26,6 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 _log = logging.getLogger(__name__)
 
-Report = Callable[[float], None]
 #: Labels of a segmentation count as inside too; an image has more values
 _MOST_MASK_VALUES = 128
 _NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
@@ -79,14 +79,18 @@ def find_brain(
     kept = _kept(keep_at, mri, method) if keep_at is not None else None
     if kept is not None:
         return kept
-    shown = recognise(mri, lambda share: report(0.15 * share))
-    if shown.stripped is not None:
-        mask = mri.with_array(shown.stripped.astype(np.uint8))
-        millilitres = _millilitres(shown.stripped, mri)
-        warnings = (*shown.warnings, *_volume_warnings(millilitres))
-        message = f"skull-stripped brain, {millilitres:.0f} ml"
-        return BrainMask(mask, "stripped", message, warnings, perf_counter() - start)
-    found = _extracted(mri, shown, method, lambda share: report(0.15 + 0.8 * share))
+    with ExitStack() as ahead:
+        robex = extractors.robex
+        if method == "robex":  # takes more than a minute, on one core: the image is recognised meanwhile
+            robex = ahead.enter_context(extractors.Ahead(robex, mri))
+        shown = recognise(mri, lambda share: report(0.15 * share))
+        if shown.stripped is not None:
+            mask = mri.with_array(shown.stripped.astype(np.uint8))
+            millilitres = _millilitres(shown.stripped, mri)
+            warnings = (*shown.warnings, *_volume_warnings(millilitres))
+            message = f"skull-stripped brain, {millilitres:.0f} ml"
+            return BrainMask(mask, "stripped", message, warnings, perf_counter() - start)
+        found = _extracted(mri, shown, method, robex, lambda share: report(0.15 + 0.8 * share))
     inside, millilitres = found.inside, _millilitres(found.inside, mri)
     warnings = (*shown.warnings, *found.warnings, *_volume_warnings(millilitres), *cut_off(mri, inside))
     seconds = perf_counter() - start
@@ -171,13 +175,13 @@ class _Extracted:
     warnings: tuple[str, ...] = ()
 
 
-def _extracted(mri: Volume, shown: Shown, method: str, report: Report) -> _Extracted:
+def _extracted(mri: Volume, shown: Shown, method: str, robex: Program, report: Report) -> _Extracted:
     """The brain by `method`, or by the first of the available ones whose result is plausible."""
     failures: list[str] = []
     unsure: list[_Extracted] = []
     for name in _candidates(method):
         try:
-            inside, alignment = _by(name, mri, shown.alignment, report)
+            inside, alignment = _by(name, mri, shown.alignment, robex, report)
         except Cancelled:
             raise
         except SimulationError as error:
@@ -222,7 +226,9 @@ def _candidates(method: str) -> list[str]:
     return found
 
 
-def _by(name: str, mri: Volume, alignment: Alignment | None, report: Report) -> tuple[np.ndarray, Alignment | None]:
+def _by(
+    name: str, mri: Volume, alignment: Alignment | None, robex: Program, report: Report
+) -> tuple[np.ndarray, Alignment | None]:
     """The brain by one method, with its border moved to the dark valley outside the cortex."""
     if name == "atlas":
         if alignment is None:
@@ -230,7 +236,7 @@ def _by(name: str, mri: Volume, alignment: Alignment | None, report: Report) -> 
             alignment = align_template(mri, lambda share: report(0.5 * share))
         report(0.5)
         return refined(mri, alignment.brain_on(mri), core_mm=8.0, reach_mm=12.0, keep_mm=3.0), alignment
-    program = extractors.robex if name == "robex" else extractors.deepbet
+    program = robex if name == "robex" else extractors.deepbet
     inside = program(mri, lambda share: report(0.9 * share))
     require(bool(inside.any()), f"{_NAMES[name]} found no brain")
     distance = signed_distance(inside, mri.spacing_mm, 20.0)

@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, class
 from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.neighbours import smoothed_posteriors
+from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.plausibility import require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities
 from SlicerUSSim.Logic.mri.segmentation_steps import (
@@ -214,6 +215,9 @@ def segment_mri(
     voxel_mm = float(mri.spacing_mm.mean())
     found = classify(values, contrasts, names, prior, FILTER_BLUR if settings.filter_radius else 1.0, voxel_mm)
     timed("mixture")
+    if atlas:
+        found = with_nuclei(found, values, atlas, part.images[0], part.inside)
+        timed("nuclei")
     found = replace(found, posteriors=smoothed_posteriors(found.posteriors, part.inside))
     timed("neighbours")
     report(0.9)
