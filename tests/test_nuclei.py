@@ -25,7 +25,7 @@ def bright_nuclei() -> tuple[TissueMaps, np.ndarray, np.ndarray]:
     maps = tissue_maps("mni152")
     if maps is None:
         pytest.skip("nilearn is not installed")
-    nuclei = (sum(nuclear_maps(mni152())) > 0.6).astype(np.float32)
+    nuclei = (np.sum(nuclear_maps(mni152()), axis=0) > 0.6).astype(np.float32)
     # In the frontal white matter, as large as a thalamus and as far from the midline as the putamen
     k, j, i = np.ogrid[tuple(map(slice, nuclei.shape))]
     x, y, z = (row[0] * i + row[1] * j + row[2] * k + row[3] for row in maps.ijk_to_ras[:3])
@@ -66,7 +66,7 @@ def test_white_matter_beside_a_nucleus_stays_white():
 
 def sum_around(inside: np.ndarray) -> np.ndarray:
     """Number of voxels of a mask that lie within two voxels along an axis."""
-    return sum(np.roll(inside, step, axis).astype(int) for axis in range(3) for step in (-2, -1, 1, 2))
+    return np.sum([np.roll(inside, step, axis) for axis in range(3) for step in (-2, -1, 1, 2)], axis=0)
 
 
 @pytest.mark.slow

@@ -82,7 +82,7 @@ def nuclear_maps(atlas: Atlas) -> tuple[np.ndarray, ...]:
         across, forward, up = (p - c for p, c in zip((np.abs(x), y, z), nucleus.centre, strict=True))
         cosine, sine = np.cos(np.radians(nucleus.degrees)), np.sin(np.radians(nucleus.degrees))
         turned = (cosine * across + sine * forward, cosine * forward - sine * across, up)
-        ellipsoid = sum((p / axis) ** 2 for p, axis in zip(turned, nucleus.half_axes, strict=True)) < 1.0
+        ellipsoid = np.hypot.reduce([p / axis for p, axis in zip(turned, nucleus.half_axes, strict=True)]) < 1.0
         body = ndimage.binary_opening(ellipsoid & (image > _DARKEST) & (image < nucleus.brightest))
         body = ellipsoid & ndimage.binary_closing(body, iterations=2)
         maps.append(_MOST * ndimage.gaussian_filter(body.astype(np.float32), _SIGMA_MM / spacing))
