@@ -4,7 +4,8 @@ A voxel of a pure class has the intensity of its tissue plus noise. A mixed voxe
 any proportion with equal probability, so its intensity lies on the line between their means (Laidlaw et al., IEEE TMI
 17(1), 1998; Shattuck et al., NeuroImage 13(5), 2001). Vessels, lesions and what the mask leaves of the skull are
 uniform outliers. The noise is the same everywhere, hence the common covariance: with free ones the widest class
-swallows its neighbours. Grey matter alone may be a little wider, within limits: its tissue differs from place to place.
+swallows its neighbours. Grey matter may be a little wider, within limits: its tissue differs from place to place. With
+several sequences CSF may, too.
 """
 
 from __future__ import annotations
@@ -27,10 +28,13 @@ MOST_MIXED = np.array([0.25, 0.22])
 #: The same without knowledge of a brain
 ANY = np.full(_INSIDE, 1e-4)
 _MAX_ITERATIONS, _LEAST_GAIN = 150, 1e-6
-#: The tissue whose pure voxels differ among themselves, as cortex does by its myelin and deep nuclei by their iron; the
-#: largest variance of its voxels in units of the noise's, and the largest deviation of the tissue itself in units of
-#: grey matter's contrast to white matter
-_WIDE, _WIDEST, _TISSUE_DEVIATION = 1, 4.0, 0.25
+#: Grey matter's pure voxels differ among themselves, as cortex does by its myelin and deep nuclei by their iron: the
+#: largest variance in units of the noise's, and the largest deviation of the tissue itself in units of its contrast to
+#: white matter
+_GREY, _WIDEST, _TISSUE_DEVIATION = 1, 4.0, 0.25
+#: The largest variance of CSF where there are several sequences: it flows and pulses, and shows otherwise in each. With
+#: the noise's, the noise of all tissues comes out twice as large, and cortex is lost
+_CSF, _WIDEST_CSF = 0, 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,17 +205,20 @@ class _Parts:
         scatter = (values * used[:, None]).T @ values
         covariance = scatter - moment.T @ means - means.T @ moment + means.T @ normal @ means
         covariance = 0.5 * (covariance + covariance.T) / belonging[:_INSIDE].sum() + least
-        return means, covariance, self._spread_of(belonging[_WIDE], means, covariance)
+        return means, covariance, self._spread_of(belonging, means, covariance)
 
-    def _spread_of(self, own: np.ndarray, means: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-        """(K,) the most likely variance of the pure voxels of _WIDE, of which belong `own` (points,), in its limits."""
-        away = self._points.values - means[_WIDE]
+    def _spread_of(self, belonging: np.ndarray, means: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        """(K,) the most likely variance of the pure voxels, of which belong `belonging` (K, points), in its limits."""
         inverse = np.linalg.inv(covariance)
-        distance = np.einsum("pc,cd,pd->p", away, inverse, away)
         contrast = means[2] - means[1]
-        most = min(_WIDEST, 1.0 + _TISSUE_DEVIATION**2 * float(contrast @ inverse @ contrast))
+        most = {_GREY: min(_WIDEST, 1.0 + _TISSUE_DEVIATION**2 * float(contrast @ inverse @ contrast))}
+        if means.shape[1] > 1:
+            most[_CSF] = _WIDEST_CSF
         spread = np.ones(len(TISSUES))
-        spread[_WIDE] = np.clip(own @ distance / (own.sum() * away.shape[1] + 1e-12), 1.0, most)
+        for tissue, limit in most.items():
+            away, own = self._points.values - means[tissue], belonging[tissue]
+            distance = np.einsum("pc,cd,pd->p", away, inverse, away)
+            spread[tissue] = np.clip(own @ distance / (own.sum() * away.shape[1] + 1e-12), 1.0, limit)
         return spread
 
 
