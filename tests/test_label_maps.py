@@ -542,20 +542,39 @@ def test_an_mri_scaled_to_one_is_an_mri(mni):
     assert not is_label_file(Path("t1.nii.gz"), t1)
 
 
-def test_a_label_map_resampled_with_interpolation_is_said(mni, caplog):
+def test_a_label_map_resampled_with_interpolation_is_refused(mni):
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file
 
     _, grey, white = mni
     labels = np.where(white.array > 0.5, 41, np.where(grey.array > 0.5, 42, 0)).astype(np.float32)
     bent = mni[0].with_array(ndimage.shift(labels, (0.4, 0.3, 0.2), order=1))
-    with caplog.at_level("WARNING"):
-        assert not is_label_file(Path("aseg.nii.gz"), bent)
-    assert "aseg.nii.gz: is mostly uniform regions of whole numbers with fractions between them" in caplog.text
-    caplog.clear()
+    with pytest.raises(SimulationError, match=r"aseg\.nii\.gz: is mostly uniform regions of whole"):
+        is_label_file(Path("aseg.nii.gz"), bent)
     shifted = mni[0].with_array(ndimage.shift(mni[0].array.astype(np.float32), (0, 0, 0.5), order=1))
-    with caplog.at_level("WARNING"):
-        assert not is_label_file(Path("t1.nii.gz"), shifted)  # half of its voxels are whole numbers
-    assert not caplog.text
+    assert not is_label_file(Path("t1.nii.gz"), shifted)  # half of its voxels are whole numbers
+
+
+def test_labels_with_rounding_errors_are_labels(mni):
+    _, grey, white = mni
+    labels = np.where(white.array > 0.5, 41, np.where(grey.array > 0.5, 42, 0))
+    rounded = mni[0].with_array((labels + 1e-4).astype(np.float32))
+    assert rounded.looks_like_labels()
+    mapping = LabelMapping.of({41: "white matter", 42: "grey matter"})
+    found, exact = (read_label_map(each, mapping=mapping) for each in (rounded, mni[0].with_array(labels)))
+    assert np.array_equal(found.labels.array, exact.labels.array)
+    faint = mni[0].with_array((mni[0].array * 1e-6).astype(np.float32))  # an MRI in other units
+    assert not faint.looks_like_labels()
+
+
+def test_a_label_map_with_a_negative_label_is_no_mri(mni):
+    _, grey, white = mni
+    labels = np.where(white.array > 0.5, 41, np.where(grey.array > 0.5, 42, 0)).astype(np.int16)
+    labels[:2] = -5
+    assert mni[0].with_array(labels).looks_like_labels()
+    with pytest.raises(SimulationError, match="values from -5 to 42, expected labels"):
+        read_label_map(mni[0].with_array(labels))
+    offset = mni[0].array.astype(np.int16) - 100  # an MRI whose background is negative
+    assert not mni[0].with_array(offset).looks_like_labels()
 
 
 # ---- label map or MRI ------------------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from SlicerUSSim.Logic import (
 )
 from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.mri import add_tissue, add_tissues, require_addable
+from SlicerUSSim.Logic.mri.kept_mask import keep
 from SlicerUSSim.Logic.mri.pathology import mask_tissue, texture_below
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import pose_looking_at
@@ -548,6 +549,13 @@ def test_segment_never_replaces_its_inputs_and_takes_no_labels_for_an_mri(tmp_pa
     assert same.exit_code == 2 and "which is an input" in same.output and head.read_bytes() == before
     kept = ussim("segment", head, "-o", tmp_path / "head.brain-mask.nrrd", "--overwrite")
     assert kept.exit_code == 2 and f"where the brain mask of {head} is kept" in kept.output
+    other = tmp_path / "other.brain-mask.nrrd"
+    keep(other, mri, mri.array > 20, "atlas", 1.0, ())
+    before = other.read_bytes()
+    taken = ussim("segment", head, "-o", other, "--overwrite")
+    assert (
+        taken.exit_code == 2 and "the kept brain mask of another MRI" in taken.output and other.read_bytes() == before
+    )
     labels, mask = tmp_path / "labels.nii.gz", tmp_path / "tumour.nii.gz"
     values = np.digitize(mri.array, [20, 62, 97])
     mri.with_array(values.astype(np.uint8)).write(labels)

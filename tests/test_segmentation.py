@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy import ndimage
 from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import Rotation
 
@@ -353,6 +354,16 @@ def test_a_label_map_is_refused_as_second_mri(mni):
     parts = t1.with_array((labels.array * (1 + np.indices(t1.array.shape)[2] // 25)).astype(np.uint8))  # many labels
     with pytest.raises(SimulationError, match="t2 is a label map"):
         segment_mri(t1, contrast="t1", others={"t2": parts})
+
+
+def test_the_map_of_one_tissue_is_refused_as_second_mri(mni):
+    t1 = mni[0]
+    grey = t1.with_array(np.clip(1.0 - np.abs(t1.array - 60.0) / 30.0, 0.0, 1.0).astype(np.float32))
+    with pytest.raises(SimulationError, match=r"t2: is 0 in \d+% of the brain, as the map of one tissue is"):
+        segment_mri(t1, contrast="t1", others={"t2": grey})
+    bent = t1.with_array(ndimage.shift(np.digitize(t1.array, [20, 60, 90]).astype(np.float32), (0.4, 0.3, 0), order=1))
+    with pytest.raises(SimulationError, match="t2 is a label map"):
+        segment_mri(t1, contrast="t1", others={"t2": bent})
 
 
 @pytest.mark.parametrize("axis", [0, 2])

@@ -5,6 +5,8 @@ Slow imports are inside the subcommands, so that --help is immediate.
 
 from __future__ import annotations
 
+import signal
+import threading
 import warnings
 from typing import Any
 
@@ -45,6 +47,15 @@ class _Commands(click.Group):
 def main() -> None:
     """B-mode ultrasound simulated from a patient's MRI."""
     warnings.showwarning = _show_warning
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), _end)
+
+
+def _end(number: int, _: Any) -> None:
+    """End as at Ctrl-C: programs that were started end, too, and temporary files go."""
+    raise SystemExit(128 + number)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:

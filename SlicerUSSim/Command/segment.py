@@ -68,7 +68,7 @@ def segment(
 
 def _require_no_input(out: Path, mri: str, mask: str | None, also: tuple[str, ...], additions: tuple[str, ...]) -> None:
     """Raise SimulationError if the output would replace one of the inputs, also with --overwrite."""
-    from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+    from SlicerUSSim.Logic.mri.kept_mask import is_kept_mask, mask_beside
 
     files = [mri, *([] if mask is None else [mask]), *(text.partition("=")[2] for text in (*also, *additions))]
     for file in files:
@@ -80,6 +80,7 @@ def _require_no_input(out: Path, mri: str, mask: str | None, also: tuple[str, ..
         out.resolve() != mask_beside(mri).resolve(),
         f"-o is {out}, where the brain mask of {mri} is kept, expected another name",
     )
+    require(not is_kept_mask(out), f"-o is {out}, the kept brain mask of another MRI, expected another name")
 
 
 def _require_mri(path: str, volume: Volume) -> None:

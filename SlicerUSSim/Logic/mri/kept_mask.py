@@ -52,6 +52,14 @@ def mask_beside(mri_path: str | Path) -> Path:
     return path.with_name(f"{name[: len(name) - len(suffix)]}.brain-mask.nrrd")
 
 
+def is_kept_mask(path: Path) -> bool:
+    """Whether a file is a brain mask that `keep` has written, also if it was edited since."""
+    try:
+        return path.is_file() and read_itk_image(path).HasMetaDataKey(f"{_PREFIX}mask")
+    except SimulationError:
+        return False
+
+
 def read_kept(path: Path, mri: Volume, method: str) -> KeptMask | None:
     """The mask kept for this MRI and method; None if there is none, or it belongs to another image or method."""
     fingerprint = fingerprint_of(mri)

@@ -15,6 +15,8 @@ from SlicerUSSim.Logic.mri.mixture import TISSUES
 
 #: Smallest extent of a whole brain along any axis of the image, mm
 _LEAST_EXTENT_MM = 90.0
+#: Smallest part of a brain that should have all tissues, as half of one
+_LEAST_PART_ML = 400.0
 #: Largest difference of a tissue's share between the hemispheres
 _LARGEST_ASYMMETRY = 0.05
 #: Prior share from which a voxel shows the atlas's tissue, and the least number of such voxels
@@ -149,8 +151,8 @@ def _deep(image: Volume, inside: np.ndarray) -> np.ndarray:
 
 
 def implausible(found: Classes, image: Volume, inside: np.ndarray, atlas: AtlasFit | None, contrast: str) -> list[str]:
-    """One line for each share that a healthy brain does not have; only where the whole brain is there."""
-    if is_whole_brain(image, inside):
+    """One line for each share that a healthy brain does not have, or a part of a brain of _LEAST_PART_ML."""
+    if is_whole_brain(image, inside) and inside.sum() * image.voxel_ml < _LEAST_PART_ML:
         return []
     lines = []
     check = f"check the contrast ({contrast}) and the brain mask"

@@ -31,6 +31,7 @@ from SlicerUSSim.Logic.mri.segmentation_steps import (
 )
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
+from SlicerUSSim.Logic.tissue.label_sources import is_interpolated
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
 
 _log = logging.getLogger(__name__)
@@ -177,7 +178,8 @@ def segment_mri(
     images = [mri.with_array(intensity)]
     for name, other in others.items():
         check_intensities(other, name)
-        require(not other.looks_like_labels(), f"{name} is a label map, expected the intensities of an MRI")
+        is_labels = other.looks_like_labels() or is_interpolated(other.array)
+        require(not is_labels, f"{name} is a label map, expected the intensities of an MRI")
         image, message, doubts_of_it = aligned(other.with_array(finite(other)), images[0], foreground, name)
         images.append(image)
         notes.append(message)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.volume import Volume, whole_numbers
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_findings import Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
@@ -109,10 +109,9 @@ def as_whole(volume: Volume, source: str = "label map") -> Volume:
         bool(np.isfinite(low) and np.isfinite(high)) and low >= 0 and high <= LARGEST_LABEL,
         f"{source}: has values from {low:g} to {high:g}, expected labels, whole numbers from 0 to {LARGEST_LABEL}",
     )
-    whole = array.astype(np.int32)
-    if not np.issubdtype(array.dtype, np.integer) and not np.array_equal(whole, array):
-        raise SimulationError(f"{source}: has fractions, expected labels, whole numbers; segment an MRI first")
-    return volume.with_array(whole)
+    whole = whole_numbers(array)
+    require(whole is not None, f"{source}: has fractions, expected labels, whole numbers; segment an MRI first")
+    return volume.with_array(np.asarray(whole).astype(np.int32))
 
 
 class _Reading:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
@@ -26,19 +27,20 @@ _MOSTLY, _UNIFORM = 0.5, 0.8
 def is_label_file(path: Path, volume: Volume) -> bool:
     """Whether a file is a label map or a tissue probability map, and no MRI.
 
-    Raises SimulationError for a probability map whose companions are missing.
+    Raises SimulationError for a probability map whose companions are missing, and for a label map that was resampled
+    with interpolation.
     """
     if volume.looks_like_labels() or combined_probability_maps(path, volume) is not None:
         return True
-    if _is_interpolated(volume.array):
-        _log.warning(
-            "%s: is mostly uniform regions of whole numbers with fractions between them; if it is a label map that was "
-            "resampled with interpolation, resample it with nearest neighbours, since it is taken for an MRI now", path,
-        )  # fmt: skip
+    require(
+        not is_interpolated(volume.array),
+        f"{path}: is mostly uniform regions of whole numbers with fractions between them, as a label map that was "
+        "resampled with interpolation, expected an MRI or labels; resample the label map with nearest neighbours",
+    )
     return False
 
 
-def _is_interpolated(array: np.ndarray) -> bool:
+def is_interpolated(array: np.ndarray) -> bool:
     """Whether most voxels have whole numbers, in uniform regions, and others fractions. An MRI is noisy everywhere."""
     inside = array != 0
     if not np.issubdtype(array.dtype, np.floating) or not inside.any():
