@@ -78,11 +78,13 @@ class AtlasFit:
         ends = np.array([[*corner, 1.0] for corner in itertools.product(*corners.T.tolist())]) @ np.linalg.inv(matrix).T
         low, high = np.floor(ends[:, 2::-1].min(axis=0)) - 1, np.ceil(ends[:, 2::-1].max(axis=0)) + 2
         first, last = (np.clip(end, 0, inside.shape).astype(int) for end in (low, high))
+        result = np.zeros(inside.shape, np.float32)
+        if not (last > first).all():
+            return result[inside]
         box = tuple(map(slice, first, last))
         # scipy wants the map from array indices (k, j, i) of the result to those of the input.
         linear = matrix[:3, :3][::-1, ::-1]
         offset = matrix[:3, 3][::-1] + linear @ first
-        result = np.zeros(inside.shape, np.float32)
         result[box] = ndimage.affine_transform(array, linear, offset, tuple(last - first), order=1)  # pyright: ignore[reportArgumentType]
         return result[inside]
 

@@ -117,7 +117,7 @@ def _belonging(line: np.ndarray, place: np.ndarray, noise: float) -> np.ndarray:
     for _ in range(_ITERATIONS):
         joint = place * normal(mean, deviation)
         belonging = joint / (joint + around + 1e-12)
-        total = belonging.sum()
+        total = belonging.sum() + 1e-12
         mean = float(np.clip(belonging @ line / total, 0.0, _BRIGHTEST))
         deviation = float(np.clip(np.sqrt(belonging @ (line - mean) ** 2 / total), noise, widest))
     return belonging
