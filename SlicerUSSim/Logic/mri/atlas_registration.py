@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import Atlas
+from SlicerUSSim.Logic.mri.refinement import on_grid
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
@@ -72,20 +73,19 @@ class AtlasFit:
 
     def warped(self, array: np.ndarray, grid: Volume, inside: np.ndarray) -> np.ndarray:
         """(voxels,) float32 values of an `array` on the atlas's grid in the voxels `inside` (k, j, i)."""
-        matrix = self.atlas.t1.ras_to_ijk @ self.patient_to_atlas @ grid.ijk_to_ras
+        atlas_to_ras = np.linalg.inv(self.patient_to_atlas) @ self.atlas.t1.ijk_to_ras
         corners = np.argwhere(array > 0)
         corners = np.stack([corners.min(axis=0), corners.max(axis=0)])[:, ::-1]
-        ends = np.array([[*corner, 1.0] for corner in itertools.product(*corners.T.tolist())]) @ np.linalg.inv(matrix).T
-        low, high = np.floor(ends[:, 2::-1].min(axis=0)) - 1, np.ceil(ends[:, 2::-1].max(axis=0)) + 2
+        ends = np.array([[*corner, 1.0] for corner in itertools.product(*corners.T.tolist())])
+        ends = (ends @ (grid.ras_to_ijk @ atlas_to_ras).T)[:, 2::-1]
+        low, high = np.floor(ends.min(axis=0)) - 1, np.ceil(ends.max(axis=0)) + 2
         first, last = (np.clip(end, 0, inside.shape).astype(int) for end in (low, high))
         result = np.zeros(inside.shape, np.float32)
-        if not (last > first).all():
-            return result[inside]
-        box = tuple(map(slice, first, last))
-        # scipy wants the map from array indices (k, j, i) of the result to those of the input.
-        linear = matrix[:3, :3][::-1, ::-1]
-        offset = matrix[:3, 3][::-1] + linear @ first
-        result[box] = ndimage.affine_transform(array, linear, offset, tuple(last - first), order=1)  # pyright: ignore[reportArgumentType]
+        if (last > first).all():
+            box = tuple(map(slice, first, last))
+            box_to_ras = grid.ijk_to_ras.copy()
+            box_to_ras[:3, 3] = (grid.ijk_to_ras @ [*first[::-1], 1.0])[:3]
+            result[box] = on_grid(Volume(array, atlas_to_ras), Volume(inside[box], box_to_ras))
         return result[inside]
 
     def is_left(self, grid: Volume, inside: np.ndarray) -> np.ndarray:
