@@ -1,36 +1,135 @@
-// interface_echoes: adds the echoes of tissue interfaces to the traced lines (docs/physics.md#3-rays; eq. 2 of
-// the paper).
+// The echoes of tissue interfaces, added to the scan lines (docs/physics.md#3-rays; eq. 2 of the paper).
 //
-// One work-item computes one traced line: every hit of its elevational rays is an impulse at its travel time. The rays
-// sample quantiles of the elevational profile, so their sum has the beam's elevational width; beam.cl applies the
-// lateral profile.
+// Near a hit the interface is a plane of known tilt: its depth changes by `slope` per millimetre of offset, and its
+// echo is an integral over the cycles of the carrier along this slope. A sum of impulses at the hits would be wrong
+// wherever neighbouring hits differ by whole cycles, at which they add up again. So each hit stands for a Gaussian
+// patch of the plane, about as wide as the distance to its neighbours, with the phase along it. The integral of patch
+// times beam is a Gaussian of the distance to the scan line; its centre of phase is moved from the hit towards the line
+// by the part `carried`, and the phase over the patch lowers it. For a plane the sum over the patches is that over the
+// whole beam, whatever their number; small targets keep the width of the beam.
 //
-// Buffers: hits, hit_counts (raytracing.cl); re, im float [2 traced line + side][stride]: complex baseband impulses,
-// half on either side of the line (scattering.cl).
+// Buffers: hits, hit_counts (raytracing.cl); walls Wall [traced line][elevational ray * MAX_HITS] with wall_counts, and
+// wall_reach int [traced line], the largest `reach` of a line's walls; re, im float [scan line][stride]: complex
+// baseband impulses (beam.cl).
 
 #include "common.clh"
 
-__kernel void interface_echoes(__constant const Acquisition *acquisition, __global const Hit *hits,
-                               __global const int *hit_counts, __global float *re, __global float *im, int stride) {
-  int line = get_global_id(0), rays = acquisition->elevational_rays;
-  __global float *left_re = re + 2 * line * stride + LINE_PAD, *left_im = im + 2 * line * stride + LINE_PAD;
+// Echo of a plane over which a beam of standard deviation sigma has the phase k sigma, relative to a perpendicular one:
+// the peak of the Gaussian exp(-(k sigma f/f0)^2 / 2) times the pulse's spectrum of relative deviation `width`. With
+// increasing tilt it moves to lower frequencies. `phase2` is (k sigma)^2.
+inline float plane_echo(float phase2, float width) {
+  const float spread = 1.0f + phase2 * width * width;
+  return exp_fast(-0.5f * phase2 / spread) / sqrt(spread);
+}
+
+// Factor of the echo of a patch. Of the squared phase over the beam (`phase2`) the sum over the patches has what is not
+// `inside` them. Both parts are Gaussian, but for a pulse the product of their peaks is not the peak of their product,
+// which matters as long as the echo of a plane can be seen: up to three radians, -30 dB.
+inline float patch_echo(float phase2, float inside2, float width) {
+  const float seen = fmin(1.0f, 9.0f / fmax(phase2, 1e-6f)), seen2 = seen * phase2, seen_inside2 = seen * inside2;
+  return plane_echo(inside2, width) * plane_echo(seen2, width) /
+         (plane_echo(seen_inside2, width) * plane_echo(seen2 - seen_inside2, width));
+}
+
+// Squared phase inside a patch of this variance along one axis, across which the depth changes by `slope` per
+// millimetre and bends by `bend` per squared millimetre. A bent patch is seen where it is square to the beam: its
+// `depth` moves towards that point, and the phase within the Fresnel zone around that is smaller.
+inline float bent_patch(float per_mm, float slope, float bend, float variance, float *depth) {
+  const float turning = per_mm * bend * variance, zones = 1.0f + turning * turning, phase = per_mm * slope;
+  *depth -= 0.5f * phase * slope * turning * variance / zones;
+  return phase * phase * variance / zones;
+}
+
+// One work-item computes the walls of one traced line.
+__kernel void find_walls(__constant const Acquisition *acquisition, __global const Hit *hits,
+                         __global const int *hit_counts, __global Wall *walls, __global int *wall_counts,
+                         __global int *wall_reach) {
+  const int line = get_global_id(0), rays = acquisition->elevational_rays;
+  const float pulse = acquisition->fractional_bandwidth * 0.42466090f;  // 1 / (2 sqrt(2 ln 2))
+  const float per_mm = TWO_PI * acquisition->cycles_per_mm;
+  __global Wall *my_walls = walls + line * rays * MAX_HITS;
+  int walls_found = 0;
+  float farthest = 0.0f;
   for (int ray = 0; ray < rays; ray++) {
-    int slot = line * rays + ray, count = min(hit_counts[slot], MAX_HITS);
-    __global const Hit *ray_hits = hits + slot * MAX_HITS;
+    const int slot = line * rays + ray, count = min(hit_counts[slot], MAX_HITS);
     for (int h = 0; h < count; h++) {
-      float depth = ray_hits[h].depth_mm, echo = 0.5f * ray_hits[h].echo;
-      float place = depth / acquisition->sample_mm;
-      int bin = (int)floor(place);
-      if (bin < 0 || bin + 1 >= acquisition->samples) continue;
-      float part = place - bin, c, s;
+      __global const Hit *hit = hits + slot * MAX_HITS + h;
+      const float2 sigma = beam_sigma(acquisition, hit->path_mm);
+      // Near the apex of a phased array all lines are within the beam, and every second, fourth ... is enough.
+      float step = line_distance(acquisition, hit->path_mm);
+      int every = 1;
+      for (; 8.0f * step < sigma.x && every < 64; every *= 2) step *= 2.0f;
+      if (line % every) continue;
+      // A patch has a deviation of 0.45 steps: aliases of planes are then below -35 dB. The beam times the patch would
+      // be wider than the beam; this width gives a row of hits, each a strip one step wide, the beam's own.
+      const float sigma2 = sigma.x * sigma.x, width2 = sigma2 + step * step / 12.0f;
+      const float carried = fmin(0.2025f * step * step / width2, 1.0f);
+      const float inside = fmax(1.0f - (1.0f - carried) * (1.0f - carried) * width2 / sigma2, 0.0f);
+      // The strata of the elevational rays are 2.5 / rays deviations wide in the middle and 7 / rays outside.
+      const float carried_aside = fmin(10.0f / (rays * rays), 1.0f);
+      const float inside_aside = 1.0f - (1.0f - carried_aside) * (1.0f - carried_aside);
+      const float across = per_mm * hit->lateral_slope, aside = per_mm * hit->elevational_slope;
+      const float phase2 = across * across * sigma2 + aside * aside * sigma.y * sigma.y;
+      const float stretch = fmin(1.0f + hit->lateral_slope * hit->lateral_slope, 10.0f);
+      const float bend = hit->curvature * stretch * sqrt(stretch);
+      Wall wall;
+      wall.echo = hit->echo;
+      wall.depth_mm = hit->depth_mm - carried_aside * hit->elevational_slope * hit->elevational_mm;
+      const float inside2 =
+          bent_patch(per_mm, hit->lateral_slope, bend, inside * sigma2, &wall.depth_mm) +
+          bent_patch(per_mm, hit->elevational_slope, bend, inside_aside * sigma.y * sigma.y, &wall.depth_mm);
+      // Of a bent patch only the Fresnel zone contributes. The mean curvature says nothing of its direction; laterally,
+      // where patches are wide, this is within 2 dB of theory for spheres and for cylinders along and across the plane.
+      const float zones = per_mm * bend * inside * sigma2;
+      wall.echo *= rsqrt(sqrt(1.0f + zones * zones));
+      const float share = patch_echo(phase2, inside2, pulse);
+      if (share < 1e-4f) continue;
+      const float lines = step * rsqrt(width2), per_line = lines / every;
+      wall.depth_per_line = carried * hit->lateral_slope * step / every;
+      wall.echo *= share * 0.39894228f * lines;  // 1 / sqrt(2 pi): unit sum over the lines
+      wall.fall = -0.5f * LOG2_E * per_line * per_line;
+      // Walls are far brighter than speckle: cut off as early as that they would visibly end.
+      wall.reach = 1.35f * acquisition->beam_cutoff / per_line;
+      farthest = fmax(farthest, wall.reach);
+      my_walls[walls_found++] = wall;
+    }
+  }
+  wall_counts[line] = walls_found;
+  wall_reach[line] = (int)fmin(farthest, 1e6f);
+}
+
+// One work-item computes the samples of one slice of one scan line; global size (slices, scan lines).
+__kernel void interface_echoes(__constant const Acquisition *acquisition, __global const Wall *walls,
+                               __global const int *wall_counts, __global const int *wall_reach, __global float *re,
+                               __global float *im, int stride) {
+  const int slice = get_global_id(0), slices = get_global_size(0), line = get_global_id(1);
+  const int first = slice * acquisition->samples / slices, last = (slice + 1) * acquisition->samples / slices;
+  const int centre = acquisition->guard_lines + line * acquisition->lateral_rays;
+  const int most = acquisition->elevational_rays * MAX_HITS;
+  __global float *my_re = re + line * stride + LINE_PAD, *my_im = im + line * stride + LINE_PAD;
+  for (int from = 0; from < acquisition->traced_lines; from++) {
+    const int away = centre - from;
+    if (abs(away) > wall_reach[from]) continue;
+    __global const Wall *its_walls = walls + from * most;
+    const int count = wall_counts[from];
+    for (int w = 0; w < count; w++) {
+      if (fabs((float)away) > its_walls[w].reach) continue;
+      const float depth = its_walls[w].depth_mm + away * its_walls[w].depth_per_line;
+      const float place = depth / acquisition->sample_mm;
+      const int bin = (int)floor(place);
+      if (bin < first - 1 || bin >= last || bin < 0 || bin + 1 >= acquisition->samples) continue;
+      const float part = place - bin;
+      const float echo = its_walls[w].echo * exp2_scalar(fmax(its_walls[w].fall * away * away, -100.0f));
+      float c, s;
       turn(depth * acquisition->cycles_per_mm, &c, &s);
       c *= echo, s *= -echo;
-      for (int side = 0; side < 2; side++) {
-        int at = side * stride + bin;
-        left_re[at] += c * (1.0f - part);
-        left_im[at] += s * (1.0f - part);
-        left_re[at + 1] += c * part;
-        left_im[at + 1] += s * part;
+      if (bin >= first) {
+        my_re[bin] += c * (1.0f - part);
+        my_im[bin] += s * (1.0f - part);
+      }
+      if (bin + 1 < last) {
+        my_re[bin + 1] += c * part;
+        my_im[bin + 1] += s * part;
       }
     }
   }

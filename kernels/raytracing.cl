@@ -6,12 +6,16 @@
 //   echo has the beam's elevational width. The lateral width comes from the neighbouring lines (beam.cl).
 // Traced lines are at least as dense as scan lines (lateral_rays per scan line), with a few beyond the edges.
 //
+// With aperture_beams, rays go straight through soft borders (is_soft), and up to the first strong one a line follows
+// the beam: its axis consists of pieces between the depths of aperture.cl, deflected as the beam is. Delay and
+// attenuation are those of the ray itself, corrected linearly over each piece so that at its ends they are the beam's.
+//
 // Buffers: voxels ushort [k][j][i], groups uchar [k][j][i] and smooth ushort [group][k][j][i] (medium.py); tissues
-// Tissue [label]; roots float4 [traced line], origin and direction (x, y) in the probe frame; quantiles float [traced
-// line][elevational ray], offsets in units of the elevational sigma; segments Segment [traced line][MAX_SEGMENTS] with
-// segment_counts; hits Hit [traced line][elevational ray][MAX_HITS] with hit_counts; cut float [traced line][1 +
-// elevational ray], the weight of the branches that were not followed; overflown int [1], the number of traced lines
-// with more than MAX_SEGMENTS segments.
+// Tissue [label]; roots float4 [traced line], origin and direction (x, y) in the probe frame; screens as in
+// aperture.cl; quantiles float [traced line][elevational ray], offsets in units of the elevational sigma; segments
+// Segment [traced line][MAX_SEGMENTS] with segment_counts; hits Hit [traced line][elevational ray][MAX_HITS] with
+// hit_counts; cut float [traced line][1 + elevational ray], the weight of the branches that were not followed;
+// overflown int [1], the number of traced lines with more than MAX_SEGMENTS segments.
 
 #include "borders.clh"
 
@@ -28,6 +32,8 @@ typedef struct {
   float blind_until;  // path length before which crossings are ignored: a reflected ray must leave its interface
   int reflections;
   int label;
+  int piece;      // of the beam, that starts at path piece x screen_step; -1 where the line is a ray
+  int piece_has;  // number of segments or hits written before this piece
 } Ray;
 
 // The label at fraction f of the cell of voxels at index `here`: the acoustic group with the largest trilinear weight,
@@ -239,6 +245,11 @@ inline Interface interface_between(Tissue here, Tissue behind, float3 direction,
   return result;
 }
 
+inline float square_reflectance(Tissue here, Tissue behind) {
+  const float r = (behind.impedance_mrayl - here.impedance_mrayl) / (behind.impedance_mrayl + here.impedance_mrayl);
+  return r * r;
+}
+
 // The root of a traced line: the beam frame at the probe face, transformed from the probe frame to RAS.
 // `origin_and_direction` are (x, y) each.
 inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_direction) {
@@ -256,19 +267,85 @@ inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_
   root.blind_until = -1.0f;
   root.reflections = 0;
   root.label = -1;  // looked up at its start
+  root.piece = -1;
+  root.piece_has = 0;
   return root;
 }
 
-// Loss of coherence of an echo from a surface that is tilted in the elevation direction. A ray represents a stratum of
-// the beam, over which the range changes by slope x width, and the integral over these cycles of the carrier is smaller
-// than the sum of magnitudes. Without this factor, oblique walls would appear as one thin line per ray.
-inline float stratum_coherence(__constant const Acquisition *acquisition, Ray ray, float3 normal, float quantile,
-                               float path, float depth_per_mm) {
-  const float density = 0.39894228f * exp_fast(-0.5f * quantile * quantile);  // of N(0, 1)
-  const float width = elevation_sigma(acquisition, path) / (acquisition->elevational_rays * density);
-  const float slope = dot3(normal, ray.elevational) / fmin(dot3(normal, ray.direction), -0.05f);
-  const float turns = acquisition->cycles_per_mm * depth_per_mm * width * slope;
-  return exp_fast(-1.6449341f * turns * turns);  // the main lobe of sin(pi t) / (pi t), to second order
+// The beam of a traced line at the end `number` of a piece, as in aperture.cl; 0 at the face. Where neighbouring axes
+// come together, scatterers between them count for several, which must not create energy: amplitude^2 is lowered by
+// the ratio of distances.
+inline float4 beam_at(__constant const Acquisition *acquisition, __global const float *screens, int line, int number) {
+  if (number == 0) return (float4)(0.0f);
+  const float per_line = (acquisition->screen_lines - 1.0f) / (acquisition->traced_lines - 1);
+  const float place = line * per_line;
+  const int before = min((int)place, acquisition->screen_lines - 2), depths = acquisition->screen_depths;
+  const float4 left = vload4(before * depths + number - 1, screens);
+  const float4 right = vload4((before + 1) * depths + number - 1, screens);
+  float4 beam = left + (place - before) * (right - left);
+  const float apart = line_distance(acquisition, number * acquisition->screen_step) / per_line;
+  beam.x -= 0.5f * log_fast(clamp(1.0f + (right.z - left.z) / apart, 0.25f, 1.0f));
+  return beam;
+}
+
+// Set a ray to the start of piece `number` of its line; behind the last one it goes straight on.
+inline void start_piece(__constant const Acquisition *acquisition, __global const float *screens, Ray root, int line,
+                        int number, int count, Ray *ray) {
+  ray->piece = number < acquisition->screen_depths ? number : -1;
+  ray->piece_has = count;
+  const float4 here = beam_at(acquisition, screens, line, number);
+  const float path = number * acquisition->screen_step;
+  ray->axis = root.axis + path * root.direction + here.z * root.lateral + here.w * root.elevational;
+  if (ray->piece < 0) return;
+  const float4 next = beam_at(acquisition, screens, line, number + 1);
+  const float3 along = acquisition->screen_step * root.direction + (next.z - here.z) * root.lateral +
+                       (next.w - here.w) * root.elevational;
+  ray->direction = unit3(along);
+  ray->lateral = carry(root.lateral, root.direction, ray->direction);
+  ray->elevational = carry(root.elevational, root.direction, ray->direction);
+}
+
+// The changes of depth and of the logarithm of amplitude per mm, by which a ray agrees with its beam at the end of the
+// piece. The ray is at `path`; from there on it is continued with these rates of depth and decay.
+inline float2 correction(__constant const Acquisition *acquisition, __global const float *screens, int line, int piece,
+                         float path, float depth, float log_attenuation, float depth_per_mm, float decay) {
+  const float4 beam = beam_at(acquisition, screens, line, piece + 1);
+  const float end = (piece + 1) * acquisition->screen_step, rest = end - path;
+  return (float2)(end + beam.y - (depth + rest * depth_per_mm), -beam.x - (log_attenuation - rest * decay)) /
+         acquisition->screen_step;
+}
+
+// Correct what a ray has written since the start of its piece.
+inline void correct_segments(__global Segment *segments, int count, float2 per_mm, float start) {
+  for (int n = 0; n < count; n++) {
+    const float along = segments[n].path_mm - start;
+    segments[n].depth_mm += per_mm.x * along;
+    segments[n].depth_per_mm += per_mm.x;
+    segments[n].attenuation *= exp_fast(per_mm.y * along);
+    segments[n].decay_per_mm -= per_mm.y;
+  }
+}
+
+inline void correct_hits(__global Hit *hits, int count, float2 per_mm, float start) {
+  for (int n = 0; n < count; n++) {
+    const float along = hits[n].path_mm - start, factor = exp_fast(per_mm.y * along);
+    hits[n].depth_mm += per_mm.x * along;
+    hits[n].attenuation *= factor;
+    hits[n].echo *= factor;
+  }
+}
+
+// Length along the ray per millimetre of its offset at which a surface lies beside the ray, by the surface's normal.
+inline float slope_along(float3 offset, float3 direction, float3 normal) {
+  return -dot3(normal, offset) / fmin(dot3(normal, direction), -0.05f);
+}
+
+// Coherent part of the echo of a border that carries the membrane, a surface of random heights: the mean of
+// exp(i 2 k h cos i) over normal heights h (Ogilvy 1991, eq. 4.12). Its scatterers return the rest.
+inline float membrane_coherence(__constant const Acquisition *acquisition, Tissue here, Tissue behind, float cos_in) {
+  if (acquisition->membrane_reach < 0.0f || here.is_fluid == behind.is_fluid) return 1.0f;
+  const float phase = acquisition->membrane_phase * cos_in;
+  return exp_fast(-0.5f * phase * phase);
 }
 
 #ifdef NO_IMPLICIT_VECTORS
@@ -276,9 +353,9 @@ __attribute__((intel_vec_len_hint(1)))
 #endif
 __kernel void trace(__constant const Acquisition *acquisition, __global const ushort *voxels,
                     __global const uchar *groups, __global const ushort *smooth, __constant const Tissue *tissues,
-                    __global const float *roots, __global const float *quantiles, __global Segment *segments,
-                    __global int *segment_counts, __global Hit *hits, __global int *hit_counts, __global float *cut,
-                    __global int *overflown) {
+                    __global const float *roots, __global const float *quantiles, __global const float *screens,
+                    __global Segment *segments, __global int *segment_counts, __global Hit *hits,
+                    __global int *hit_counts, __global float *cut, __global int *overflown) {
   const int line = get_global_id(0), ray_of_line = get_global_id(1), rays = acquisition->elevational_rays;
   const int on_axis = ray_of_line == 0;
   const int slot = line * rays + ray_of_line - 1;
@@ -289,8 +366,10 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
   int count = 0;  // of segments or hits; a value above `room` means that some are missing
   float cut_weight = 0.0f;
 
+  const Ray root = root_of(acquisition, vload4(line, roots));
   Ray stack[MAX_STACK];
-  stack[0] = root_of(acquisition, vload4(line, roots));
+  stack[0] = root;
+  if (acquisition->aperture_beams) start_piece(acquisition, screens, root, line, 0, 0, stack);
   int waiting = 1;
   while (waiting > 0) {
     Ray ray = stack[--waiting];
@@ -308,23 +387,26 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       Tissue here = tissues[ray.label], behind = here;
       const float depth_per_mm = acquisition->reference_speed_m_s / here.speed_of_sound_m_s;
       const float to_depth = (acquisition->depth_mm - ray.depth) / depth_per_mm;
+      const float piece_start = ray.piece * acquisition->screen_step;
+      const float to_piece = ray.piece < 0 ? 2.0f * to_depth : piece_start + acquisition->screen_step - ray.path;
       const float2 span =
           volume_span(acquisition, &course, 3.0f + fabs(quantile) * 4.0f / acquisition->voxel_mm, to_depth);
 
       // Tissues of one group have no interface between them: only attenuation changes there and the node continues.
       // `since` is the start of the current tissue, `spent` the attenuation exponent up to there; a segment is open
       // from `open`, with `spent_open`.
-      float since = 0.0f, spent = 0.0f, open = 0.0f, spent_open = 0.0f, inside = span.x, border;
-      int other = ray.label, is_silenced;
+      float since = 0.0f, spent = 0.0f, open = 0.0f, spent_open = 0.0f, inside = span.x, border, until;
+      int other = ray.label, is_silenced, piece_ends;
       while (1) {
         const float decay = decay_in(acquisition, here);
         const float reserve = log_fast(ray.weight / acquisition->intensity_threshold) + ray.log_attenuation - spent;
         const float to_silence = since + fmax(reserve, 0.0f) / fmax(decay, 1e-9f);
-        is_silenced = to_silence < to_depth;
-        const float longest = fmin(to_depth, to_silence);
+        const float longest = fmin(fmin(to_depth, to_silence), to_piece);
+        piece_ends = ray.piece >= 0 && longest == to_piece;
+        is_silenced = to_silence < to_depth && !piece_ends;
         border = next_border(voxels, groups, acquisition, tissues, &course, ray.label, &inside, fmin(span.y, longest),
                              ray.blind_until, &other);
-        const float until = border < 0.0f ? longest : border;
+        until = border < 0.0f ? longest : border;
         const float spent_until = spent + decay * (until - since);
         if (border >= 0.0f) behind = tissues[other];
         const int node_ends = border < 0.0f || behind.group != here.group;
@@ -351,14 +433,32 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         inside = border;
       }
       if (border < 0.0f) {
-        if (is_silenced) cut_weight += ray.weight;
-        break;
+        float2 per_mm = (float2)(0.0f);
+        if (ray.piece >= 0)
+          per_mm = correction(acquisition, screens, line, ray.piece, ray.path + until, ray.depth + until * depth_per_mm,
+                              ray.log_attenuation - spent, depth_per_mm, decay_in(acquisition, here));
+        if (ray.piece >= 0 && on_axis)
+          correct_segments(my_segments + ray.piece_has, min(count, room) - ray.piece_has, per_mm, piece_start);
+        if (ray.piece >= 0 && !on_axis)
+          correct_hits(my_hits + ray.piece_has, min(count, room) - ray.piece_has, per_mm, piece_start);
+        if (!piece_ends) {
+          if (is_silenced) cut_weight += ray.weight;
+          break;
+        }
+        ray.path += until;
+        ray.depth += until * depth_per_mm + per_mm.x * acquisition->screen_step;
+        ray.log_attenuation += per_mm.y * acquisition->screen_step - spent;
+        start_piece(acquisition, screens, root, line, ray.piece + 1, count, &ray);
+        continue;
       }
 
-      float overshoot;
-      const float3 normal = interface_normal(groups, smooth, acquisition, course_at(acquisition, &course, border),
-                                             here.group, behind.group, ray.direction, course.step, &overshoot);
-      overshoot = fmin(overshoot, border - since);
+      float overshoot, curvature;
+      const float3 normal =
+          interface_normal(groups, smooth, acquisition, course_at(acquisition, &course, border), here.group,
+                           behind.group, ray.direction, course.step, &overshoot, &curvature);
+      // Not back beyond the last border; but beyond the start of a piece, where there is none.
+      const int is_continued = ray.piece > 0 && since == 0.0f;
+      overshoot = fmin(overshoot, border - since + (is_continued ? acquisition->voxel_mm : 0.0f));
       float back = overshoot;
       if (overshoot == 0.0f) {  // only the labels give the position
         float beyond = border;
@@ -368,10 +468,26 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       }
       border -= back;
       spent -= back * decay_in(acquisition, here);
-      if (on_axis && count > 0 && count <= room) my_segments[count - 1].length_mm -= back;
-      const float path = ray.path + border, depth = ray.depth + border * depth_per_mm;
-      if (depth >= acquisition->depth_mm) break;  // without the overshoot, the border lies beyond the field: a leaf
-      const float log_attenuation = ray.log_attenuation - spent, attenuation = exp_fast(log_attenuation);
+      if (on_axis && count > 0 && count <= room)
+        my_segments[count - 1].length_mm = fmax(my_segments[count - 1].length_mm - back, 0.0f);
+      const int is_straight = acquisition->aperture_beams && is_soft(here.speed_of_sound_m_s, here.impedance_mrayl,
+                                                                     behind.speed_of_sound_m_s, behind.impedance_mrayl);
+      const float path = ray.path + border;
+      float depth = ray.depth + border * depth_per_mm, log_attenuation = ray.log_attenuation - spent;
+      const int leaves = depth >= acquisition->depth_mm;
+      if (ray.piece >= 0 && (leaves || !is_straight)) {  // the beam ends here
+        const float2 per_mm = correction(acquisition, screens, line, ray.piece, path, depth, log_attenuation,
+                                         depth_per_mm, decay_in(acquisition, here));
+        if (on_axis)
+          correct_segments(my_segments + ray.piece_has, min(count, room) - ray.piece_has, per_mm, piece_start);
+        else
+          correct_hits(my_hits + ray.piece_has, min(count, room) - ray.piece_has, per_mm, piece_start);
+        depth += per_mm.x * (path - piece_start);
+        log_attenuation += per_mm.y * (path - piece_start);
+        ray.piece = -1;
+      }
+      if (leaves) break;  // without the overshoot, the border lies beyond the field
+      const float attenuation = exp_fast(log_attenuation);
       const float3 aside = quantile * elevation_sigma(acquisition, path) * ray.elevational;
       const float3 hit_point = ray.axis + border * ray.direction + aside;
       const float4 tube = tube_after(ray.tube, border);
@@ -389,17 +505,36 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
           hit.attenuation = attenuation;
           hit.cos_incidence = surface.cos_in;
           hit.reflectance = reflectance;
-          hit.echo = ray.weight * attenuation *
-                     (acquisition->interface_is_energy ? reflectance : fabs(surface.pressure)) *
+          hit.lateral_slope = depth_per_mm * tube.x * slope_along(ray.lateral, ray.direction, normal);
+          hit.elevational_slope = depth_per_mm * tube.z * slope_along(ray.elevational, ray.direction, normal);
+          hit.curvature = curvature;
+          hit.elevational_mm = quantile * elevation_sigma(acquisition, path);
+          hit.echo = ray.weight * attenuation * (acquisition->interface_is_energy ? reflectance : surface.pressure) *
                      exp2_scalar(max(acquisition->specular_exponent * log2_scalar(surface.cos_in), -100.0f)) *
                      acquisition->interface_gain / (rays * tube.x * tube.z) *
-                     stratum_coherence(acquisition, ray, normal, quantile, path, depth_per_mm);
+                     membrane_coherence(acquisition, here, behind, surface.cos_in);
           hit.reflections = ray.reflections;
           hit.label_before = ray.label;
           hit.label_behind = other;
           my_hits[count] = hit;
         }
         count++;
+      }
+
+      if (is_straight) {
+        // What is lost is what a square border reflects: grazing ones are a matter of the whole aperture.
+        const float lost = ray.weight * square_reflectance(here, behind);
+        cut_weight += lost;
+        ray.weight -= lost;
+        ray.axis = hit_point - aside;
+        ray.tube = tube;
+        ray.path = path;
+        ray.depth = depth;
+        ray.log_attenuation = log_attenuation;
+        ray.label = other;
+        ray.blind_until = overshoot > 0.0f ? path + overshoot + 0.5f * acquisition->voxel_mm : path;
+        if (count > room) break;
+        continue;
       }
 
       // The reflected child is pushed onto the stack; weak ones and those beyond the tree's depth are cut.

@@ -71,9 +71,11 @@ inline void add_echo(float4 *sum, int bin, float between, float right, float str
 }
 
 // The label of a scatterer at fraction (fx, fy, fz) of the cell of voxels at `corner`, which contains a border or the
-// membrane; `random` are random bits of the scatterer. With TEXTURE, also its gain.
+// membrane, and its gain; `random` are random bits of the scatterer. A scatterer of the membrane is the brighter the
+// more squarely the beam meets the sheet.
 inline int drawn_label(__constant const Acquisition *acquisition, __global const ushort *corner,
-                       __global const uint *texture, float fx, float fy, float fz, uint random, float *gain) {
+                       __global const uint *texture, const Piece *piece, float fx, float fy, float fz, uint random,
+                       float *gain) {
   const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
   // Partial volume without blending: the scatterer takes the label of one corner, drawn with that corner's trilinear
   // weight. The border is soft on average and fixed in the patient.
@@ -87,13 +89,18 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
   if ((hash_mix(random) & 255u) < ((known >> 8) & 255u)) label = known & LABEL_MASK;
 #endif
   if (corner[0] & NO_MEMBRANE) return label;
-  const float near_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
-                             blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
-  corner += nxy;
-  const float far_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
-                            blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
+  // Fluid distance and its gradient, from lines of two voxels along i: first those of the near plane, then of the far.
+  const float4 from = (float4)(corner[0] >> 8, corner[nx] >> 8, corner[nxy] >> 8, corner[nxy + nx] >> 8);
+  const float4 to = (float4)(corner[1] >> 8, corner[nx + 1] >> 8, corner[nxy + 1] >> 8, corner[nxy + nx + 1] >> 8);
+  const float4 lines = from + fx * (to - from), rise = to - from;
+  const float near_z = blend(lines.x, lines.y, fy), far_z = blend(lines.z, lines.w, fy);
   if (fabs(blend(near_z, far_z, fz) - 127.5f) >= acquisition->membrane_reach) return label;
-  *gain = 1.0f;
+  const float gx = blend(blend(rise.x, rise.y, fy), blend(rise.z, rise.w, fy), fz);
+  const float gy = blend(lines.y - lines.x, lines.w - lines.z, fz), gz = far_z - near_z;
+  const float3 normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
+  const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
+  *gain = acquisition->membrane_gain *
+          exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
   return MEMBRANE_LABEL;
 }
 
@@ -169,11 +176,13 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   }
 
   uchar label_[BATCH];
+  float gain_[BATCH];
   ushort mixed[BATCH + 1];
   int several = 0;
   for (int i = 0; i < n; i++) {
     const int word = voxels[voxel_[chosen[i]]];
     label_[i] = word & LABEL_MASK;
+    gain_[i] = 1.0f;
     mixed[several] = i;
 #ifdef TEXTURE
     several++;  // texture also varies within tissues
@@ -181,25 +190,15 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     several += (word & PLAIN_CELL) != PLAIN_CELL;
 #endif
   }
-#ifdef TEXTURE
-  float gain_[BATCH];
-#endif
   for (int k = 0; k < several; k++) {
     const int i = mixed[k], j = chosen[i], here = voxel_[j];
-    float gain = 1.0f;
-    label_[i] = drawn_label(acquisition, voxels + here, texture + here, fx_[j], fy_[j], fz_[j], random_[j], &gain);
-#ifdef TEXTURE
-    gain_[i] = gain;
-#endif
+    label_[i] =
+        drawn_label(acquisition, voxels + here, texture + here, piece, fx_[j], fy_[j], fz_[j], random_[j], gain_ + i);
   }
 
   for (int i = 0; i < n; i++) {
     const int j = chosen[i], b = bin_[j], label = label_[i];
-#ifdef TEXTURE
     const float gain = gain_[i];
-#else
-    const float gain = 1.0f;
-#endif
 #ifdef VARIED
     if (role[label] == ROLE_SILENT) continue;
     if (role[label] == ROLE_VARIED) {

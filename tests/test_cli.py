@@ -227,6 +227,24 @@ def test_a_mistake_is_one_line_and_writes_nothing(number, head, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.parametrize("command", ["simulate", "volume", "sweep", "optimize"])
+def test_no_command_replaces_a_file_that_it_reads(command, labels, tmp_path):
+    """`simulate` wrote its image over the label map, `sweep` over the recording."""
+    own = tmp_path / "labels.igs.mha"
+    Volume.read(labels).write(own)
+    before = own.read_bytes()
+    more = {"simulate": ["--pose", "auto"], "volume": ["--pose", "auto", "--tilt", 20]}.get(
+        command, ["--sequence", own]
+    )
+    for link in (own, tmp_path / "." / own.name):
+        result = ussim(command, own if command in ("simulate", "volume") else labels, *more, "-o", link)
+        assert result.exit_code == 2 and f"{link} is an input, which it would replace" in result.stderr
+    table = tmp_path / "tumour.nii.gz"
+    Volume.read(labels).write(table)
+    result = ussim(command, labels, *more, "--add", f"tumour={table}", "-o", table)
+    assert result.exit_code == 2 and own.read_bytes() == before
+
+
 def test_a_device_that_fails_is_one_line_too(labels, tmp_path, monkeypatch):
     import pyopencl
 

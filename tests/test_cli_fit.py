@@ -238,12 +238,14 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
         (["--register", "--save-transform", "there.tfm"], "there.tfm, expected a name ending in .json"),
         (["--state", "result.json"], "given for 2 outputs, expected a separate file for each"),
         (["--report", "/nowhere/report.html"], "the folder /nowhere does not exist"),
-        (["--state", "probe.json"], "the state to resume is invalid"),
+        (["--state", "probe.json"], "probe.json is an input, which it would replace"),
+        (["--state", "wrong.json"], "the state to resume is invalid"),
     ],
 )
 def test_mistakes_are_one_line_and_write_nothing(folder, options, message, monkeypatch):
     monkeypatch.chdir(folder)
     (folder / "result.json").unlink(missing_ok=True)
+    (folder / "wrong.json").write_text("{}")
     before = sorted(path.name for path in folder.iterdir())
     done = optimize(folder, "--evaluations", 5, *options)
     assert done.exit_code == 2

@@ -6,8 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from SlicerUSSim.Logic import DisplaySettings, LinearProbe, Tissue
+from SlicerUSSim.Logic import ConvexProbe, DisplaySettings, LinearProbe, SimulationSettings, Tissue, UltrasoundSimulator
+from SlicerUSSim.Logic.imaging.borders import gaussian_taps
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.verification.phantoms import folds
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
 
 PROBE = LinearProbe(30, 60, scan_lines=121, focus_mm=30, elevation_focus_mm=30)
@@ -40,3 +44,79 @@ def test_fluid_is_black_and_its_walls_are_bright():
     for wall in (15.0, 35.0):
         near = line[int((wall - 1) / frame.sample_interval_mm) : int((wall + 1) / frame.sample_interval_mm)]
         assert near.max() > before.mean() + 40
+
+
+WALL = Tissue("wall", 1540.0, 1.8, 0.0)
+
+
+def peaks_of_lines(sim, scan_lines: int, angle_deg: float = 0.0, x_mm: float = 0.0) -> np.ndarray:
+    """The largest echo around 20 mm on every line of a probe tilted in the image plane about (x, 20) mm."""
+    angle = np.radians(angle_deg)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    probe = replace(PROBE, scan_lines=scan_lines, frequency_mhz=4.0, focus_mm=20, elevation_focus_mm=20)
+    frame = sim.simulate(probe, rigid(turn, [x_mm, -20, 0]))
+    near = slice(*(int(depth / frame.sample_interval_mm) for depth in (17.0, 23.0)))
+    return np.abs(frame.iq[:, near]).max(axis=1)
+
+
+def peak(sim, scan_lines: int, angle_deg: float) -> float:
+    """That on the middle line."""
+    return float(peaks_of_lines(sim, scan_lines, angle_deg)[scan_lines // 2])
+
+
+@pytest.mark.parametrize("angle_deg", [5.0, 10.0])
+def test_an_oblique_wall_does_not_depend_on_line_density(angle_deg):
+    sim = simulator(block(lambda x, y, z: y > 0), WALL, scattering=False)
+    peaks = [peak(sim, lines, angle_deg) for lines in (41, 61, 121, 241)]
+    np.testing.assert_allclose(peaks, peaks[-1], rtol=0.1)
+    assert peaks[-1] < 0.8 * peak(sim, 121, 0.0)
+
+
+def test_a_steep_wall_returns_nothing():
+    sim = simulator(block(lambda x, y, z: y > 0), WALL, scattering=False)
+    square = peak(sim, 61, 0.0)
+    for angle_deg in (25.0, 35.0):
+        assert peak(sim, 61, angle_deg) < 10 ** (-30 / 20) * square
+
+
+def test_a_ball_is_seen_on_and_between_the_lines():
+    """Smaller than the distance between lines, it is square to the beam at one point only."""
+    ball = block(lambda x, y, z: x**2 + y**2 + z**2 < 0.6**2, half_mm=(3, 3, 3), spacing_mm=0.1)
+    sim = simulator(ball, WALL, scattering=False, reflections=False)
+    levels = [20 * np.log10(peaks_of_lines(sim, 51, x_mm=x).max()) for x in np.linspace(0.0, 0.6, 7)]
+    assert np.ptp(levels) < 6.0
+
+
+def test_the_two_borders_of_a_slab_have_opposite_signs():
+    sim = simulator(block(lambda x, y, z: abs(y) < 3), WALL, scattering=False, reflections=False)
+    hits = sim.trace(PROBE, rigid(np.eye(3), [0, -20, 0])).hits
+    front = hits["label_behind"] == 1
+    assert front.any() and (~front).any()
+    assert (hits["echo"][front] > 0).all() and (hits["echo"][~front] < 0).all()
+    np.testing.assert_allclose(hits["curvature"], 0.0, atol=1e-3)
+
+
+def test_the_variances_of_the_smoothing_are_those_of_its_taps():
+    variances = []
+    for sigma in (CONSTANTS["WIDE_SIGMA"], CONSTANTS["HALVED_SIGMA"]):
+        taps = gaussian_taps(sigma).astype(float)
+        variances.append(float(taps @ (np.arange(len(taps)) - len(taps) // 2) ** 2))
+    assert CONSTANTS["WIDE_VARIANCE"] == pytest.approx(variances[0], abs=1e-3)
+    # Pairs of voxels have a variance of 1/4 of a squared voxel; the unit of the half resolution is four of these.
+    assert CONSTANTS["WIDEST_VARIANCE"] == pytest.approx(variances[1] + (variances[0] + 0.25) / 4.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("beam", ["aperture", "ray"])
+def test_every_hit_is_at_a_border_of_the_labels(beam):
+    """Between the walls of thin folds the smoothed indicators are flat, and their border could be centimetres away."""
+    phantom = folds()
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, SimulationSettings(beam=beam, reflections=False))
+    for probe in (ConvexProbe(40, 60, 50), LinearProbe(40, 50)):
+        tree = simulator.trace(probe, phantom.probe_to_ras)
+        labels = phantom.labels.array
+        is_border = ndimage.maximum_filter(labels, 3) != ndimage.minimum_filter(labels, 3)
+        away = ndimage.distance_transform_edt(~is_border)
+        places = (phantom.labels.ras_to_ijk @ np.c_[tree.hits["position"], np.ones(len(tree.hits))].T)[2::-1]
+        inside = ((places > 2) & (places < np.array(labels.shape)[:, None] - 3)).all(axis=0)
+        found = ndimage.map_coordinates(away, places[:, inside], order=1)
+        assert inside.sum() > 1000 and found.max() < 1.0

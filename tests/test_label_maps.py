@@ -48,6 +48,8 @@ def height_cm(name: str) -> float:
         return 95 + 62 / 25 * (above - int(number[1:]) + (number[0] == "S"))
     if part.startswith("rib"):
         return 146 - 2.5 * int(number)
+    if name == "Brain-Stem" or "Cerebell" in name:
+        return 80  # far below the cerebrum
     return next((cm for word, cm in HEIGHTS.items() if name.startswith(word)), 120)
 
 
@@ -251,7 +253,7 @@ def test_a_brain_in_our_numbers_is_read_and_one_in_other_numbers_is_not():
     assert ours.names == ("csf", "grey matter", "white matter") and "ussim segment and FSL FAST" in ours.message
     for others in ((3, 1, 2), (3, 2, 1), (2, 1, 3)):  # fMRIPrep (1 grey, 2 white, 3 fluid), and white matter first
         numbers = dict(zip(("csf", "grey matter", "white matter"), others, strict=True))
-        assert "no program's numbers are recognised" in str(refusal_of(brain(numbers)))
+        assert "in no known program's order" in str(refusal_of(brain(numbers)))
         texts = [f"{number}={name}" for name, number in numbers.items()]
         assert LabelMapping.of({number: name for name, number in numbers.items()}) == LabelMapping.of(texts)
         found = read_label_map(brain(numbers), mapping=LabelMapping.of(texts))
@@ -284,6 +286,12 @@ def test_a_binary_mask_is_no_patient_unless_the_user_says_what_it_is(tmp_path):
     message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
     assert f"{path}: a binary mask (1 label, 67 ml), not a patient's tissues" in message
     assert f"--add tumour={path}, or simulate it alone with --map 255=tumour (ussim simulate)" in message
+    assert "--mask" not in message
+    brain = tmp_path / "brain.nii.gz"
+    mask.with_array(mask.array > -1).write(brain)  # everything
+    message = refused("simulate", brain, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert f"if it is the mask of a brain, give it with that brain's MRI as --mask {brain}" in message
+    assert "--add" not in message
     for tissue in ("liver", "tumour"):
         result = ussim("simulate", path, "--map", f"255={tissue}", "--pose", "auto", "-o", tmp_path / f"{tissue}.png")
         assert result.exit_code == 0 and "glioma.nii.gz: mapped: 1 label to 1 tissue" in result.stderr, result.output
@@ -455,6 +463,51 @@ def test_segments_of_slicer_and_totalsegmentators_header_name_the_labels(tmp_pat
     assert read_label_file(path, volume).names == ("liver", "blood")
 
 
+def layered(path, values: tuple[int, ...]) -> Volume:
+    """Segments of 3D Slicer of which the last, a tumour in a layer of its own, overlaps the others."""
+    import SimpleITK as sitk
+
+    base = brain({"csf": values[0], "grey matter": values[1], "white matter": values[2]})
+    z, y, x = np.indices(base.array.shape) - np.array([25, 25, 38])[:, None, None, None]
+    tumour = np.where(x**2 + y**2 + z**2 < 5**2, values[3], 0).astype(np.uint8)
+    image = sitk.GetImageFromArray(np.stack([base.array, tumour], axis=-1), isVector=True)
+    image.CopyInformation(base.to_sitk())
+    for place, (name, value) in enumerate(zip(("CSF", "Grey matter", "White matter", "Tumor"), values, strict=True)):
+        for key, text in (("Name", name), ("Layer", place // 3), ("LabelValue", value), ("ID", f"Segment_{place}")):
+            image.SetMetaData(f"Segment{place}_{key}", str(text))
+    sitk.WriteImage(image, str(path), True)
+    return base.with_array(np.where(tumour > 0, 4, np.where(base.array > 0, 1, 0)))
+
+
+@pytest.mark.parametrize("values", [(1, 2, 3, 1), (1, 2, 3, 4), (7, 2, 9, 2)])
+def test_overlapping_segments_of_slicer_are_one_label_map_with_the_last_on_top(values, tmp_path):
+    path = tmp_path / "head.seg.nrrd"
+    truth = layered(path, values)
+    volume = Volume.read(path)
+    found = read_label_file(path, volume)
+    assert sorted(found.names) == ["csf", "grey matter", "tumour", "white matter"]
+    tumour = found.labels.array == found.names.index("tumour") + 1
+    assert np.array_equal(tumour, truth.array == 4) and np.array_equal(found.labels.array > 0, truth.array > 0)
+    result = ussim("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
+    covered = np.count_nonzero(truth.array == 4) * truth.voxel_ml
+    assert f"segments overlap, the last is taken: 'Tumor' covers {covered:.3g} ml of those before it" in result.stderr
+    assert result.exit_code == 0 and "labels with names: 4 labels to 4 tissues, named in its header" in result.stderr
+
+
+def test_several_components_without_segments_are_refused_with_a_remedy(tmp_path):
+    import SimpleITK as sitk
+
+    image = sitk.GetImageFromArray(np.zeros((10, 10, 10, 2), np.uint8), isVector=True)
+    sitk.WriteImage(image, str(tmp_path / "two.nrrd"))
+    message = refused("simulate", tmp_path / "two.nrrd", "--pose", "auto", "-o", tmp_path / "o.png")
+    assert "has 2 components per voxel, expected 1; save one of them, or a label map" in message
+    image.SetMetaData("Segment0_Name", "Tumor")
+    image.SetMetaData("Segment0_Layer", "5")
+    sitk.WriteImage(image, str(tmp_path / "two.seg.nrrd"))
+    message = refused("simulate", tmp_path / "two.seg.nrrd", "--pose", "auto", "-o", tmp_path / "o.png")
+    assert "segment 'Tumor' is in layer 5, expected less than 2" in message
+
+
 def test_a_header_that_expands_without_limit_is_not_read(tmp_path):
     import nibabel
 
@@ -571,10 +624,34 @@ def test_a_label_map_with_a_negative_label_is_no_mri(mni):
     labels = np.where(white.array > 0.5, 41, np.where(grey.array > 0.5, 42, 0)).astype(np.int16)
     labels[:2] = -5
     assert mni[0].with_array(labels).looks_like_labels()
-    with pytest.raises(SimulationError, match="values from -5 to 42, expected labels"):
+    with pytest.raises(SimulationError, match="a label map with negative labels, has values from -5 to 42, expected"):
         read_label_map(mni[0].with_array(labels))
-    offset = mni[0].array.astype(np.int16) - 100  # an MRI whose background is negative
-    assert not mni[0].with_array(offset).looks_like_labels()
+    for offset in (100, 1):  # an MRI whose background is negative
+        assert not mni[0].with_array(mni[0].array.astype(np.int16) - offset).looks_like_labels()
+
+
+def test_a_label_map_whose_background_is_negative_is_refused_as_one(tmp_path):
+    path = tmp_path / "aseg.nii.gz"
+    volume = head()
+    volume.with_array((volume.array - 1).astype(np.int16)).write(path)  # eight labels, all one too low
+    message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert "aseg.nii.gz: a label map with negative labels, has values from -1 to" in message
+    assert message.endswith("set its background to 0, or add 1 if all labels are one too low")
+
+
+def test_labels_stored_as_bytes_with_a_scale_are_rounded_and_said(mni, tmp_path):
+    path = tmp_path / "aseg.nii.gz"
+    exact, scale = freesurfer(SYNTHSEG), 60 / 255  # as nibabel stores floats of 0 to 60 in bytes
+    stored = np.rint(exact.array / scale).astype(np.float32) * np.float32(scale)
+    assert 0.05 < np.abs(stored - exact.array).max() < scale / 2 + 1e-4
+    exact.with_array(stored).write(path)
+    volume = Volume.read(path)
+    assert volume.looks_like_labels()
+    found, truth = read_label_file(path, volume), read_label_map(exact)
+    assert found.message == truth.message and np.array_equal(found.labels.array, truth.labels.array)
+    assert "was stored with a scale; labels are rounded by up to 0.1" in found.warnings[-1] and not truth.warnings
+    for scale in (0.1, 0.2118, 1.01, 2.5):  # an MRI that is stored so
+        assert not mni[0].with_array(mni[0].array.astype(np.float32) * np.float32(scale)).looks_like_labels()
 
 
 # ---- label map or MRI ------------------------------------------------------------------------------------------------

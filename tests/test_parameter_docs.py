@@ -48,7 +48,7 @@ SECTIONS: list[tuple[str, type[Declared], str]] = [
     ("Tissues", Tissue, "`tissues` in a preset, one object for each label. [physics.md](physics.md#5-scatterers) "
      "describes the model; [presets.py](../SlicerUSSim/Logic/tissue/presets.py) has the presets and the source of "
      "every value."),
-    ("Membrane", Membrane, "A thin scattering layer along the border between fluid and brain; `membrane` in a preset. "
+    ("Membrane", Membrane, "A thin rough sheet along the border between fluid and brain; `membrane` in a preset. "
      "Its `tissue` is an object as in [Tissues](#tissues)."),
     ("Segmentation", SegmentationSettings, "Segmentation of an MRI into tissues, by `ussim segment`, `segment_mri` "
      "and the VTK filter."),

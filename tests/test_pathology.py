@@ -20,7 +20,7 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.base.volume import read_array
-from SlicerUSSim.Logic.mri import add_tissue, add_tissues, require_addable
+from SlicerUSSim.Logic.mri import add_tissue, add_tissues, read_mask, require_addable
 from SlicerUSSim.Logic.mri.kept_mask import keep
 from SlicerUSSim.Logic.mri.pathology import mask_tissue, texture_below
 from SlicerUSSim.Logic.mri.samples import head_mri
@@ -62,8 +62,8 @@ def ball(volume: Volume, radius=RADIUS, centre=CENTRE) -> Volume:
     return volume.with_array((distances(volume, centre) < radius).astype(np.uint8))
 
 
-def added(mask: Volume, tissue="tumour", labels=BRAIN, names=("white matter",), source="lesion.nii.gz"):
-    return add_tissue(labels, names, mask, tissue, source=source)
+def added(mask: Volume, tissue="tumour", labels=BRAIN, names=("white matter",), source="lesion.nii.gz", **options):
+    return add_tissue(labels, names, mask, tissue, source=source, **options)
 
 
 def dice(a: np.ndarray, b: np.ndarray) -> float:
@@ -184,6 +184,62 @@ def test_a_brats_map_becomes_its_tissues_without_gaps_between_them():
         assert any("label 4 is read as enhancing" in warning for warning in result.warnings) == (enhancing == 4)
     values = np.select([r < 5, r < 8, r < 14], [4, 3, 2], 0)
     assert added(grid.with_array(values), "brats").tissue_names[1:] == ("oedema", "enhancing", "cavity")
+    values = grid.with_array(np.select([r < 8, r < 14], [4, 2], 0))
+    for year, tissue in (("brats-2021", "enhancing"), ("brats 2024", "cavity")):
+        result = added(values, year)
+        assert result.tissue_names[1:] == ("oedema", tissue) and not result.warnings
+
+
+def test_rounded_labels_are_those_of_every_other_door():
+    r = distances(BRAIN)
+    values = np.select([r < 5, r < 8, r < 14], [1.000015, 3.99997, 2.00003], 0).astype(np.float32)
+    found, exact = added(BRAIN.with_array(values), "brats"), added(BRAIN.with_array(np.rint(values)), "brats")
+    assert np.array_equal(found.labels.array, exact.labels.array) and found.tissue_names == exact.tissue_names
+    assert np.array_equal(added(BRAIN.with_array(values)).labels.array > 1, values > 0)
+
+
+# ---- labels with names -----------------------------------------------------------------------------------------------
+
+
+def segments(path, names: dict[int, str]):
+    """A file of 3D Slicer with a ball in a ball, labels 2 and 1, in the frame of BRAIN."""
+    import SimpleITK as sitk
+
+    r = distances(BRAIN)
+    image = BRAIN.with_array(np.select([r < 5, r < 10], [2, 1], 0).astype(np.uint8)).to_sitk()
+    for place, (label, name) in enumerate(names.items()):
+        for key, value in (("Name", name), ("LabelValue", label), ("Layer", 0), ("ID", f"Segment_{place + 1}")):
+            image.SetMetaData(f"Segment{place}_{key}", str(value))
+    sitk.WriteImage(image, str(path), True)
+    return path
+
+
+def test_names_of_segments_decide_what_brats_adds_and_not_their_numbers(tmp_path):
+    path = segments(tmp_path / "l.seg.nrrd", {1: "Edema", 2: "Necrosis"})  # BraTS has them the other way round
+    result = added(read_mask(path), "brats")
+    assert result.tissue_names == ("white matter", "oedema", "necrosis")
+    assert (result.labels.array[distances(BRAIN) < 5] == 3).all()
+    assert result.warnings == (
+        "lesion.nii.gz: labels are added by their names, 'Edema' as oedema, 'Necrosis' as necrosis",
+    )
+    BRAIN.write(tmp_path / "labels.nii.gz")
+    options = ("--map", "1=white", "--pose", "auto", "-o", tmp_path / "o.png")
+    said = ussim("simulate", tmp_path / "labels.nii.gz", *options, "--add", f"brats={path}")
+    assert said.exit_code == 0 and "'Edema' as oedema, 'Necrosis' as necrosis" in said.stderr, said.output
+    said = ussim("simulate", tmp_path / "labels.nii.gz", *options, "--add", f"tumour={path}")
+    assert "holds the labels 1 'Edema', 2 'Necrosis'; all of them are added as tumour" in said.stderr
+    assert "(brats=FILE adds each by its name, as oedema, necrosis)" in said.stderr
+    alone = ussim("simulate", path, *options[2:])
+    assert alone.exit_code == 2 and f"--add brats={path}" in alone.stderr
+
+
+def test_a_segment_called_like_no_tissue_is_not_added_by_its_number(tmp_path):
+    path = segments(tmp_path / "l.seg.nrrd", {1: "Edema", 2: "Ball"})
+    with pytest.raises(SimulationError, match=r"holds the labels 1 'Edema', 2 'Ball', and 'Ball' is called like no ti"):
+        added(read_mask(path), "brats")
+    assert "brats=FILE" not in added(read_mask(path)).warnings[0]
+    unnamed = segments(tmp_path / "u.seg.nrrd", {1: "Segment_1", 2: "Segment_2"})
+    assert added(read_mask(unnamed), "brats").tissue_names[1:] == ("oedema", "necrosis")  # as BraTS numbers them
 
 
 # ---- what is refused or said -----------------------------------------------------------------------------------------
@@ -206,6 +262,8 @@ def moved(volume: Volume, *mm) -> Volume:
         (BRAIN.with_array(ball(BRAIN).array * 0.4), "tumour", r"no probability is above 0.5 \(the largest is 0.4\)"),
         (ball(BRAIN), "cheese", "no tissue is called 'cheese', expected one of: coupling, csf, .*oedema, necrosis"),
         (BRAIN.with_array(ball(BRAIN).array * 5), "brats", "holds the labels 5, expected those of BraTS: 1 necrosis"),
+        (ball(BRAIN), "brats", "the label 1 alone, as the mask of a whole tumour does, .*: tumour=FILE, or necrosis="),
+        (BRAIN.with_array(ball(BRAIN).array * 3), "brats-2022", "1 necrosis, 2 oedema, 4 enhancing$"),
         (BRAIN.with_array(ball(BRAIN).array * 0.7), "brats", "holds numbers from 0 to 0.7, expected a mask"),
         (ball(empty((0.1, 0.1, 0.1), half_mm=1), 0.3, [0, 0, 0]), "tumour", "mm³ are too small for the voxels"),
     ],
@@ -278,7 +336,8 @@ def test_every_door_refuses_a_lesion_elsewhere_without_segmenting(monkeypatch, t
 @pytest.mark.parametrize(
     ("name", "tissue"),
     [("gray", "grey matter"), ("White", "white matter"), ("GTV", "tumour"), ("bleeding", "haematoma"),
-     ("NCR", "necrosis"), ("ED", "oedema"), ("BraTS 2021", "brats"), ("brats-2023", "brats")],
+     ("NCR", "necrosis"), ("ED", "oedema"), ("BraTS 2021", "brats-2022"), ("brats-2024", "brats-2023"),
+     ("BraTS", "brats"), ("enhancing tumour", "enhancing"), ("non-enhancing tumor", "tumour")],
 )  # fmt: skip
 def test_usual_names_of_lesions_are_understood(name, tissue):
     assert mask_tissue(name) == tissue
@@ -299,14 +358,26 @@ def test_for_a_name_that_is_not_understood_a_similar_one_is_proposed(name, expec
 
 def test_what_the_brain_mask_leaves_out_is_added_and_said():
     mask = ball(BRAIN, 8.0, [22, 0, 0])
-    result = added(mask)
+    result = added(mask, has_brain_mask=True)
     left_out = float((BRAIN.array[mask.array > 0] == 0).mean())
     assert 0.2 < left_out < 0.6 and ((result.labels.array == 2) == (mask.array > 0)).all()
     percent = f"{100 * left_out:.0f}"
     assert result.warnings == (f"the brain mask leaves out {percent} % of lesion.nii.gz; those voxels are added",)
     assert f"voxels outside {percent} %" in result.messages[0]
-    beside = added(ball(BRAIN, 3.0, [27.9, 0, 0]))  # a meningioma that the brain mask cuts off wholly
+    meningioma = ball(BRAIN, 3.0, [27.9, 0, 0])
+    beside = added(meningioma, has_brain_mask=True)  # which the brain mask cuts off wholly
     assert "leaves out 100 %" in beside.warnings[0]
+    assert f"{percent} % of lesion.nii.gz lie where the labels have no tissue" in added(mask).warnings[0]
+    with pytest.raises(SimulationError, match="lies 2 mm outside the patient, expected a mask in the frame of"):
+        added(meningioma)  # labels of others have no brain mask that could have cut it off
+    assert added(meningioma, "skull").messages  # is around the brain and not in it
+
+
+def test_an_addition_larger_than_a_lesion_is_said_but_skin_and_skull_are_not():
+    patient = block(lambda x, y, z: 1, spacing_mm=4.0, half_mm=(60, 60, 60))
+    for radius, tissue, is_said in ((44.0, "tumour", False), (48.0, "tumour", True), (48.0, "fat", False)):
+        found = added(ball(patient, radius, [0, 0, 0]), tissue, labels=patient)
+        assert any("ml, expected a lesion of up to 400 ml" in line for line in found.warnings) == is_said
 
 
 def test_labels_given_as_a_mask_are_all_added_and_said():
@@ -468,7 +539,8 @@ def test_every_command_that_simulates_takes_additions_for_an_mri_and_for_labels(
         ("tumour=none.nrrd", "none.nrrd: no such file"),
         ("cheese={cyst.nrrd}", "no tissue is called 'cheese', expected one of: coupling"),
         ("tumour={head.nii.gz}", "head.nii.gz: holds numbers from"),
-        ("brats={far.nrrd}", "far.nrrd: lies 2"),
+        ("tumour={far.nrrd}", "far.nrrd: lies 2"),
+        ("brats={far.nrrd}", "far.nrrd: holds the label 1 alone"),
     ],
 )
 def test_a_mistake_in_an_addition_is_one_line_and_writes_nothing(files, tmp_path, value, message):
@@ -546,7 +618,7 @@ def test_segment_never_replaces_its_inputs_and_takes_no_labels_for_an_mri(tmp_pa
     mri.write(head)
     before = head.read_bytes()
     same = ussim("segment", head, "-o", head, "--overwrite")
-    assert same.exit_code == 2 and "which is an input" in same.output and head.read_bytes() == before
+    assert same.exit_code == 2 and "is an input, which it would replace" in same.output and head.read_bytes() == before
     kept = ussim("segment", head, "-o", tmp_path / "head.brain-mask.nrrd", "--overwrite")
     assert kept.exit_code == 2 and f"where the brain mask of {head} is kept" in kept.output
     other = tmp_path / "other.brain-mask.nrrd"
@@ -559,7 +631,9 @@ def test_segment_never_replaces_its_inputs_and_takes_no_labels_for_an_mri(tmp_pa
     labels, mask = tmp_path / "labels.nii.gz", tmp_path / "tumour.nii.gz"
     values = np.digitize(mri.array, [20, 62, 97])
     mri.with_array(values.astype(np.uint8)).write(labels)
-    mri.with_array((values == 3).astype(np.uint8)).write(mask)
+    part = values == 3
+    part[..., part.shape[2] // 3 :] = False
+    mri.with_array(part.astype(np.uint8)).write(mask)
     told = ussim("segment", labels, "-o", tmp_path / "out.nii.gz").output
     assert "is a label map" in told and f"ussim simulate {labels}" in told
     assert f"--add tumour={mask}" in ussim("segment", mask, "-o", tmp_path / "out.nii.gz").output

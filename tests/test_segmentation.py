@@ -223,6 +223,17 @@ def test_the_table_has_a_line_per_label_whose_shares_and_millilitres_add_up():
     assert millilitres == pytest.approx(total, abs=0.5)
 
 
+@pytest.mark.parametrize("unit", [1.0, 0.01, 1e-6])
+def test_the_table_has_means_and_deviations_in_every_unit(unit):
+    head = head_mri(2.0)
+    result = segment_mri(head.with_array((head.array * np.float64(unit)).astype(np.float32)))
+    lines = result.table().splitlines()[1:]
+    assert len(lines) == len(result.means) == 3 and len(set(map(len, lines))) == 1
+    for line, mean, deviation in zip(lines, result.means, result.standard_deviations, strict=True):
+        numbers = [float(text) for text in line.split()[-2:]]
+        assert numbers == pytest.approx([mean, deviation], rel=0.006, abs=0.006 * unit)
+
+
 def test_posteriors_sum_to_one_inside_and_agree_with_the_labels():
     result = segment_mri(head_mri(2.0))
     posteriors = result.posteriors

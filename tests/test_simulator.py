@@ -19,6 +19,7 @@ from SlicerUSSim.Logic import (
     Membrane,
     PhasedProbe,
     SimulationError,
+    SimulationSettings,
     Tissue,
     TissueTable,
     UltrasoundSimulator,
@@ -228,12 +229,10 @@ def test_the_membrane_is_as_thick_as_it_is_set(thickness):
     half = block(lambda x, y, z: np.where(y > 0, 2, 1), half_mm=(25, 25, 25))
     bright = Tissue("bright", 1540.0, 1.54, 0.0, mu0=1.0, sigma0=0.5)
     silent, csf = Tissue("silent", 1540.0, 1.54, 0.0), Tissue("csf", 1540.0, 1.54, 0.0)
-    table = TissueTable({0: FLUID, 1: silent, 2: csf}, Membrane(bright, thickness, fluids=("csf",)))
+    table = TissueTable({0: FLUID, 1: silent, 2: csf}, Membrane(bright, thickness, ("csf",), diffuse_db=0.0))
     probe = LinearProbe(30, 40, scan_lines=121, focus_mm=20, elevation_focus_mm=20)
     powers = []
     for seed in range(6):
-        from SlicerUSSim.Logic import SimulationSettings
-
         iq = (
             UltrasoundSimulator(half, table, SimulationSettings(seed=seed))
             .simulate(probe, rigid(np.eye(3), [0, -20, 0]))
@@ -243,6 +242,45 @@ def test_the_membrane_is_as_thick_as_it_is_set(thickness):
         powers.append((np.abs(iq) ** 2).sum(axis=1).mean() * dz)
     # Mean square times depth: unit energy of the pulse makes it variance x thickness.
     assert np.mean(powers) / bright.scatterer_variance == pytest.approx(thickness, rel=0.15)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 2.0])
+@pytest.mark.parametrize("spacing_mm", [0.5, 1.0])
+def test_the_membrane_fades_where_the_beam_meets_it_obliquely(spacing_mm, exponent):
+    """A line crosses 1 / cos i of the thickness, and the power of its scatterers falls with cos^2n i."""
+    bright = Tissue("bright", 1540.0, 1.54, 0.0, mu0=1.0, sigma0=0.5)
+    silent, csf = Tissue("silent", 1540.0, 1.54, 0.0), Tissue("csf", 1540.0, 1.54, 0.0)
+    half = block(lambda x, y, z: np.where(y > 0, 2, 1), (25, 25, 25), spacing_mm)
+    table = TissueTable({0: FLUID, 1: silent, 2: csf}, Membrane(bright, 0.6, ("csf",), diffuse_exponent=exponent))
+    probe = LinearProbe(24, 40, scan_lines=97, focus_mm=20, elevation_focus_mm=20)
+    powers = []
+    for tilt in (0.0, 50.0):
+        pose = rigid(Rotation.from_euler("z", tilt, degrees=True).as_matrix(), [0, -20, 0])
+        power = 0.0
+        for seed in range(4):
+            iq = UltrasoundSimulator(half, table, SimulationSettings(seed=seed)).simulate(probe, pose).iq
+            power += float((np.abs(iq) ** 2).sum(axis=1)[24:-24].mean())
+        powers.append(power)
+    cosine = np.cos(np.radians(50.0))
+    assert 10 * np.log10(powers[1] / powers[0]) == pytest.approx(10 * np.log10(cosine ** (2 * exponent - 1)), abs=1.0)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 35.0])
+def test_roughness_of_the_membrane_takes_the_coherent_echo_of_its_border_only(tilt_deg):
+    """exp(-(2 k s cos i)^2 / 2) at the border of the fluid, nothing at the border between two other tissues."""
+    fluid, brain, bone = (Tissue(name, 1540.0, z, 0.0) for name, z in (("csf", 1.5), ("brain", 1.6), ("bone", 4.0)))
+    slabs = block(lambda x, y, z: np.where(y < 0, 1, np.where(y < 8, 2, 3)))
+    pose = rigid(Rotation.from_euler("z", tilt_deg, degrees=True).as_matrix(), [0, -15, 0])
+    probe = LinearProbe(4, 40, scan_lines=9, frequency_mhz=5.0)
+    echoes = []
+    for roughness in (0.0, 0.03):
+        table = TissueTable({0: fluid, 1: fluid, 2: brain, 3: bone}, Membrane(brain, 0.5, ("csf",), roughness))
+        tree = UltrasoundSimulator(slabs, table, SimulationSettings(reflections=False)).trace(probe, pose)
+        behind = tree.hits["label_behind"]
+        echoes.append([tree.hits["echo"][behind == label].mean() for label in (2, 3)])
+    at_fluid, inside = np.divide(echoes[1], echoes[0])
+    phase = 2 * (2 * np.pi * 5.0 / 1.54) * 0.03 * np.cos(np.radians(tilt_deg))
+    assert at_fluid == pytest.approx(np.exp(-0.5 * phase**2), rel=0.03) and inside == pytest.approx(1.0, rel=1e-4)
 
 
 def test_a_probe_that_looks_past_the_volume_gives_a_black_image_and_a_warning(solid):

@@ -53,10 +53,11 @@ def test_the_simulator_runs_the_stages_of_the_list_in_its_order():
     names = [stage.name for stage in ALL_STAGES]
     assert list(frame.timings_ms) == ["upload", *names, "download"]
     assert [name for name in names if name in TWINS] == [
+        "aperture",
         "ray tree",
         "scatterers",
-        "interfaces",
         "beam",
+        "interfaces",
         "pulse",
         "B-mode",
         "scan conversion",

@@ -13,7 +13,13 @@ from scipy import ndimage
 from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.brain import given_brain
 from SlicerUSSim.Logic.mri.classification import Classes
-from SlicerUSSim.Logic.mri.plausibility import enhancement, faint, require_order, require_several_tissues
+from SlicerUSSim.Logic.mri.plausibility import (
+    csf_is_doubtful,
+    enhancement,
+    faint,
+    require_order,
+    require_several_tissues,
+)
 from SlicerUSSim.Logic.verification.brain_phantoms import TissueMaps, phantom, tissue_maps, with_ring_tumour
 from SlicerUSSim.Logic.verification.brain_scores import scores
 
@@ -106,3 +112,28 @@ def test_a_mask_says_why_it_does_not_fit():
     with pytest.raises(SimulationError, match="different values, expected 0 outside and one value inside: is it an"):
         given_brain(mri, mri)
     assert given_brain(Volume(inside, np.eye(4)), mri).method == "given"
+
+
+def test_an_mri_as_z_scores_gets_the_labels_of_the_mri():
+    """The usual preparation for neural networks: the field, which multiplies, was fitted to negative intensities."""
+    maps = brain()
+    shown = phantom(maps, "t1", noise=0.03, bias=0.3)
+    inside = shown.mask.array > 0
+    values = shown.mri.array[inside]
+    scored_values = np.where(inside, (shown.mri.array - values.mean()) / values.std(), 0.0).astype(np.float32)
+    raw = segment_mri(shown.mri, mask=shown.mask)
+    scored = segment_mri(shown.mri.with_array(scored_values), mask=shown.mask)
+    for found in (raw, scored):  # which value no signal has is lost, so that the labels are not quite the same
+        names = dict(enumerate(found.tissue_names, 1))
+        assert scores(found.labels.array, names, shown)["grey and white"] > 0.9
+    assert scored.warnings == raw.warnings == ()
+    assert any("values below 0 in the brain" in line for line in scored.notes)
+    assert not any("below 0" in line for line in raw.notes)
+    assert scored.means[0] < 0.0 < scored.means[2]  # in the unit of the image
+
+
+def test_csf_that_is_nearly_as_bright_as_grey_matter_is_said():
+    near, far = classes_of([124.0, 142.0, 176.0]), classes_of([27.0, 136.0, 174.0])
+    (line,) = csf_is_doubtful(near, "t1gd")
+    assert line.startswith("csf (124) is nearer to grey matter (142) than that to white matter (176)")
+    assert csf_is_doubtful(far, "t1gd") == []

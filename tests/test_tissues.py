@@ -58,11 +58,26 @@ def test_echogenicity_follows_the_formula():
 
 
 @given(
-    st.dictionaries(st.integers(0, 62), tissues, max_size=6), st.none() | st.builds(Membrane, tissues, st.floats(0, 5))
+    st.dictionaries(st.integers(0, 62), tissues, max_size=6),
+    st.none() | st.builds(Membrane, tissues, st.floats(0, 5), diffuse_db=st.floats(-9, 9)),
 )
 def test_tables_survive_json(members, membrane):
     table = TissueTable(members, membrane)
     assert TissueTable.from_dict(json.loads(json.dumps(table.to_dict()))) == table
+
+
+def test_a_table_from_before_sheets_were_rough_keeps_its_even_layer():
+    old = TissueTable.brain().to_dict()
+    for name in ("roughness_mm", "diffuse_db", "diffuse_exponent"):
+        del old["membrane"][name]
+    old["membrane"]["thickness_mm"] = 0.8
+    read = TissueTable.from_dict(old).membrane
+    assert read is not None and read.thickness_mm == 0.8
+    assert (read.roughness_mm, read.diffuse_db, read.diffuse_exponent) == (0.0, 0.0, 0.0)
+    del old["membrane"]["thickness_mm"]
+    assert TissueTable.from_dict(old).membrane.thickness_mm == 1.0
+    old["membrane"]["roughness_mm"] = 0.05
+    assert TissueTable.from_dict(old).membrane == replace(TissueTable.brain().membrane, roughness_mm=0.05)
 
 
 def test_replace_changes_one_tissue_and_the_membrane_by_name():

@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.verification.phantoms import Echo
 from SlicerUSSim.Logic.verification.validation import ORIENTATIONS, PROBES, Outcome, Row, all_checks, run, validate
 
 #: Checks that take long: of these the suite has one orientation
-_LONG = ("compounding", "curved mirrors", "slice thickness", "speckle statistics")
+_LONG = ("compounding", "curved mirrors", "oblique walls", "slice thickness", "speckle statistics")
 #: All of them; of the two oblique orientations the suite takes one, and the slow tests the other.
 CASES = [
     pytest.param(

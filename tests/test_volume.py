@@ -126,7 +126,8 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
     [
         (np.zeros((2, 2)), np.eye(4), "2 dimensions"),
         (np.zeros((2, 0, 2)), np.eye(4), "empty"),
-        (np.array([[["a"]]]), np.eye(4), "expected numbers"),
+        (np.array([[["a"]]]), np.eye(4), "expected real numbers"),
+        (np.zeros((2, 2, 2), complex), np.eye(4), "complex128, expected real numbers"),
         (np.zeros((2, 2, 2)), np.eye(3), "shape"),
         (np.zeros((2, 2, 2)), np.diag([1.0, 0, 1, 1]), "singular"),
         (np.zeros((2, 2, 2)), np.diag([1.0, np.nan, 1, 1]), "not finite, expected a 4x4 affine matrix"),

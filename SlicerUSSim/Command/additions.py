@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 add_option = click.option(
     "--add", "additions", multiple=True, metavar="TISSUE=FILE",
     help="Lay a tissue over the labels where the mask in FILE is not 0 (any grid) or above 0.5: tumour, oedema, "
-    "necrosis, cyst, haematoma, cavity or another of the presets; brats=FILE for the tissues of a BraTS map; may be "
-    "repeated, the last is on top.",
+    "necrosis, cyst, haematoma, cavity or another of the presets; brats=FILE for labels with names, or the tissues "
+    "of a BraTS map; may be repeated, the last is on top.",
 )  # fmt: skip
 
 
@@ -54,12 +54,12 @@ class Additions:
         parts, own = split_additions(texts), tuple(own_tissues)
         if not parts:
             return cls()
-        from SlicerUSSim.Logic.base.volume import Volume  # imported here to keep --help fast
+        from SlicerUSSim.Logic.mri.masks import read_mask  # imported here to keep --help fast
         from SlicerUSSim.Logic.mri.pathology import mask_tissue
 
         for name, _ in parts:  # before a file is read
             mask_tissue(name, own)
-        return cls.of(((name, Volume.read(file), file) for name, file in parts), own)
+        return cls.of(((name, read_mask(file), file) for name, file in parts), own)
 
     @classmethod
     def of(cls, parts: Iterable[tuple[str, Volume, str]], own_tissues: Iterable[str] = ()) -> Additions:
@@ -94,11 +94,16 @@ class Additions:
                 tissues = tissues.with_tissue(TISSUES[tissue])
         return tissues
 
-    def on(self, labels: Volume, tissue_names: Iterable[str]) -> Added:
-        """The labels with these tissues on top, after notes of what was done; warnings are logged."""
+    def on(self, labels: Volume, tissue_names: Iterable[str], *, has_brain_mask: bool) -> Added:
+        """The labels with these tissues on top, after notes of what was done; warnings are logged.
+
+        `has_brain_mask` as in add_tissues: whether the labels are a segmentation.
+        """
         from SlicerUSSim.Logic.mri.pathology import add_tissues
 
-        added = add_tissues(labels, tuple(tissue_names), self.masks, also=self.own_tissues)
+        added = add_tissues(
+            labels, tuple(tissue_names), self.masks, also=self.own_tissues, has_brain_mask=has_brain_mask
+        )
         for message in added.messages:
             note(message)
         return added

@@ -34,6 +34,9 @@ class _Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt:
+            click.echo("ussim: interrupted", err=True)
+            ctx.exit(128 + signal.SIGINT)
         except Exception as error:
             message = user_message(error)
             if message is None:

@@ -56,7 +56,7 @@ def demo(
     settings = SimulationSettings(seed=seed)
     masks = Additions.read(additions)
     volume, source = (Volume.read(mri), os.path.abspath(mri)) if mri else demo_mri()
-    note(f"MRI: {source}, {'x'.join(map(str, volume.array.shape[::-1]))} voxels")
+    note(f"MRI: {source}, {volume.size_text} voxels")
     brain = {
         "contrast": contrast, "skull_strip": skull_strip, "mask": Volume.read(mask) if mask else None,
         "others": read_also(also), "keep_mask_at": mask_beside(mri) if mri else None,

@@ -59,6 +59,7 @@ def segmented_file(
     Says how the brain was found, with `tell_all` also what else; what should be checked is logged as warnings.
     Raises SimulationError before the segmentation for `additions` that could not be added after it.
     """
+    from SlicerUSSim.Logic.base.errors import about_file
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
@@ -67,7 +68,7 @@ def segmented_file(
     brain = Volume.read(mask) if mask else None
     if additions is not None:
         additions.require_addable(mri, brain, settings["skull_strip"])
-    with Share("segment") as progress:
+    with Share("segment") as progress, about_file(path):
         result = segment_mri(
             mri, **settings, others=others, mask=brain, keep_mask_at=mask_beside(path),
             device=device, progress=progress,

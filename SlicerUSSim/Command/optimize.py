@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from SlicerUSSim.Command.options import gathered
+from SlicerUSSim.Command.options import gathered, require_no_input
 from SlicerUSSim.Command.patient_options import PatientOptions
 from SlicerUSSim.Command.progress import Curve, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
@@ -69,6 +69,7 @@ def optimize(
     from SlicerUSSim.Logic.tracked.pose_files import write_pose
 
     places = [place for place in (out, report, save_preset, save_transform, state) if place]
+    require_no_input(*places, recording.field)
     for place in places:
         require_place(place)
         same = [other for other in places if other.resolve() == place.resolve()]

@@ -15,6 +15,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter_of, parameters_of
+from SlicerUSSim.Logic.base.errors import require
 
 Command = Callable[..., None]
 Decorator = Callable[[Command], Command]
@@ -179,10 +180,28 @@ def _value(entry: Field, given: dict[str, Any]) -> Any:
     return {name: value for name, value in values.items() if value is not (None if name in flags else _NOT_GIVEN)}
 
 
+def require_no_input(*outputs: Path | None) -> None:
+    """Raise SimulationError if an output of the running command would replace a file that it reads.
+
+    Files that a command reads are the values of its options and arguments that are text (outputs are Path objects),
+    also behind a name, as in tumour=FILE.
+    """
+    given = click.get_current_context().params.values()
+    texts = [text for value in given for text in (value if isinstance(value, tuple) else (value,))]
+    files = [Path(part) for text in texts if isinstance(text, str) for part in (text, text.partition("=")[2]) if part]
+    for out in outputs:
+        if out is not None and out.exists():
+            require(
+                not any(file.exists() and out.samefile(file) for file in files),
+                f"{out} is an input, which it would replace, expected another name",
+            )
+
+
 def check_output(out: Path, png: bool = False) -> None:
-    """Raise SimulationError before the computation if an output cannot be written."""
+    """Raise SimulationError before the computation if an output cannot be written, or is an input."""
     from SlicerUSSim.Logic.base.files import require_place
     from SlicerUSSim.Logic.base.volume import require_image_name
 
     require_image_name(out, also=(".png",) if png else ())
     require_place(out)
+    require_no_input(out)

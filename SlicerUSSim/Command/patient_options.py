@@ -31,7 +31,7 @@ map_option = click.option(
     "--map", "maps", multiple=True, metavar="LABEL=TISSUE",
     help="Tissue of a label of the label map, by its number or its name: 24=csf; 0 removes a label. Or a .json file "
     'with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: freesurfer, totalsegmentator, '
-    "totalsegmentator-v1, totalsegmentator-mr, ussim, brats. May be repeated.",
+    "totalsegmentator-v1, totalsegmentator-mr, totalsegmentator-tissues, ussim, brats. May be repeated.",
 )  # fmt: skip
 
 pose_option = click.option(
@@ -163,7 +163,9 @@ def open_examination(patient: PatientOptions) -> Examination:
     table = TissueTable.read(patient.tissues) if patient.tissues else None
     if is_labels:
         labels, tissues = _labelled(volume, patient, table, preset.tissues)
-        added = Additions.read(patient.additions, tissues.names()).on(labels, tissues.names_by_label())
+        added = Additions.read(patient.additions, tissues.names()).on(
+            labels, tissues.names_by_label(), has_brain_mask=False
+        )
         tissues = changes.to_tissues(added.table(tissues))
         simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device)
         return Examination(simulator, preset.probe, preset.display, is_labels)
@@ -179,7 +181,7 @@ def open_examination(patient: PatientOptions) -> Examination:
         device=patient.device, additions=additions,
     )  # fmt: skip
     names = segmentation.tissue_names if table is None else tissues.names_by_label()
-    added = additions.on(segmentation.labels, names)
+    added = additions.on(segmentation.labels, names, has_brain_mask=True)
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
     texture = None
     if preset.settings.needs_texture:

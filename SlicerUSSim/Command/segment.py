@@ -47,7 +47,7 @@ def segment(
     from SlicerUSSim.Logic.tissue.table import TissueTable
 
     check_output(out)
-    _require_no_input(out, mri, mask, also, additions)
+    _require_no_kept_mask(out, mri)
     if not overwrite:
         require_replaceable(out)
     split_also(also)
@@ -60,22 +60,16 @@ def segment(
         mri, volume, asdict(settings), mask=mask, also=also, device=device, additions=masks, tell_all=True
     )
     seconds = perf_counter() - start
-    added = masks.on(result.labels, result.tissue_names)
+    added = masks.on(result.labels, result.tissue_names, has_brain_mask=True)
     beside = write_label_files(out, added.labels, TissueTable.brain(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")
 
 
-def _require_no_input(out: Path, mri: str, mask: str | None, also: tuple[str, ...], additions: tuple[str, ...]) -> None:
-    """Raise SimulationError if the output would replace one of the inputs, also with --overwrite."""
+def _require_no_kept_mask(out: Path, mri: str) -> None:
+    """Raise SimulationError if the output would replace a kept brain mask, also with --overwrite."""
     from SlicerUSSim.Logic.mri.kept_mask import is_kept_mask, mask_beside
 
-    files = [mri, *([] if mask is None else [mask]), *(text.partition("=")[2] for text in (*also, *additions))]
-    for file in files:
-        require(
-            not (out.exists() and Path(file).exists() and out.samefile(file)),
-            f"-o is {out}, which is an input, expected another name",
-        )
     require(
         out.resolve() != mask_beside(mri).resolve(),
         f"-o is {out}, where the brain mask of {mri} is kept, expected another name",

@@ -104,11 +104,12 @@ def serve(
 
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.preset import Preset
+    from SlicerUSSim.Logic.mri.masks import with_label_names
     from SlicerUSSim.Logic.opencl.devices import choose_device
 
     choose_device(device)
     volumes = {file: Volume.read(file) for file in files}
-    checked = Additions.of((tissue, volumes[file], file) for tissue, file in added)
+    checked = Additions.of((tissue, with_label_names(volumes[file], file), file) for tissue, file in added)
     if mri is not None and labels is None:
         checked.require_addable(volumes[mri], None if mask is None else volumes[mask], skull_strip)
     masks = tuple((tissue, file) for (tissue, _, _), (_, file) in zip(checked.masks, added, strict=True))

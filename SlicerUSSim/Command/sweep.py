@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from SlicerUSSim.Command.options import gathered
+from SlicerUSSim.Command.options import gathered, require_no_input
 from SlicerUSSim.Command.patient_options import PatientOptions
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
@@ -26,6 +26,7 @@ def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> Non
 
     require_sequence_name(out)
     require_place(out)
+    require_no_input(out, recording.field)
     tracked = open_tracked(patient, recording)
     simulator, display = tracked.examination.simulator, tracked.examination.display
     real = tracked.images

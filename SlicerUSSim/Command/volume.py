@@ -46,4 +46,4 @@ def volume(
             progress=lambda done: progress(done / frames),
         )  # fmt: skip
     result.write(out)
-    note(f"wrote {out} ({'x'.join(map(str, result.array.shape[::-1]))} voxels from {frames} images)")
+    note(f"wrote {out} ({result.size_text} voxels from {frames} images)")

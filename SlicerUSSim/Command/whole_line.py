@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from SlicerUSSim.Command.additions import Additions
+from SlicerUSSim.Logic.base.errors import about_file
 from SlicerUSSim.Logic.base.files import make_folder, write_json
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
@@ -57,13 +58,14 @@ def run_whole_line(
     options = dict(segmentation_options or {})
     additions = additions or Additions()
     additions.require_addable(mri, options.get("mask"), options.get("skull_strip", SegmentationSettings.skull_strip))
-    segmentation = segment_mri(mri, thin_sulci=True, device=device, **options)
+    with about_file(mri.name):
+        segmentation = segment_mri(mri, thin_sulci=True, device=device, **options)
     found(segmentation.brain)
     timings["segmentation"] = (perf_counter() - start) * 1e3
 
     progress("build the acoustic medium")
     start = perf_counter()
-    added = additions.on(segmentation.labels, segmentation.tissue_names)
+    added = additions.on(segmentation.labels, segmentation.tissue_names, has_brain_mask=True)
     labels, names = added.labels, added.tissue_names
     tissues = TissueTable.brain(names)
     simulator = UltrasoundSimulator(labels, tissues, settings, device)

@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
+from SlicerUSSim.Logic.mri.masks import with_label_names
 from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
@@ -135,7 +136,7 @@ class Opener:
 
     def lesion_of_file(self, lesions_node, tissue: str, path: str):
         """The segmentation node with the lesions, with a mask of a file; made if it is None."""
-        node, _ = self.add_lesion(lesions_node, self._volume(path), tissue, Path(path).name, os.path.abspath(path))
+        node, _ = self.add_lesion(lesions_node, self._mask(path), tissue, Path(path).name, os.path.abspath(path))
         return node
 
     def add_lesion(self, lesions_node, mask: Volume, tissue: str, name: str, file: str | None = None):
@@ -220,7 +221,7 @@ class Opener:
             path = Path(folder) / name
             path.write_bytes(content)
             try:
-                volume = self._volume(str(path))
+                volume = self._mask(str(path))
             except SimulationError as error:  # without the temporary folder, as below
                 raise SimulationError(str(error).replace(folder + os.sep, "")) from None
         yield volume
@@ -252,6 +253,10 @@ class Opener:
     def _volume(self, path: str) -> Volume:
         """The volume of a file, read once."""
         return self._volumes.pop(path, None) or self._tasks.do(lambda: Volume.read(path))
+
+    def _mask(self, path: str) -> Volume:
+        """The same of a mask, with the names of its labels."""
+        return with_label_names(self._volume(path), path)
 
     def _label_map(self, volume: Volume, path: str, names):
         volume = as_whole(volume, path)

@@ -39,7 +39,7 @@ _IN_PAGE = {
     "savePresetButton": "window.ussim.save('json')",
     "loadPresetButton": "window.document.getElementById('open-file').click()",
 }
-_LESION_TEXTS = {"brats": "BraTS map (necrosis, oedema, enhancing)"}
+_LESION_TEXTS = {"brats": "labels by their names, or a BraTS map"}
 #: Colours of the marks beside the slice views' planes.
 _STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
 

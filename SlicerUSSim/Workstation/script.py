@@ -12,6 +12,7 @@ from textwrap import indent
 import numpy as np
 
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mri.masks import SEVERAL
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 
 _TEMPLATE = '''"""Reproduces an image of a SlicerUSSim workstation."""
@@ -92,15 +93,15 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         lines += [f"segmentation = segment_mri({', '.join(['mri', *options])})", "labels = segmentation.labels"]
     texture = "segmentation.texture()"
     if source.additions:
-        imports.append("Volume")
-        more += "from SlicerUSSim.Logic.mri import add_tissues\n"
-        masks = ", ".join(f"({name!r}, Volume.read({path!r}), {path!r})" for name, path in source.additions)
+        more += "from SlicerUSSim.Logic.mri import add_tissues, read_mask\n"
+        masks = ", ".join(f"({name!r}, read_mask({path!r}), {path!r})" for name, path in source.additions)
         names = repr(list(source.tissue_names)) if source.is_labels else "segmentation.tissue_names"
         own = [tissue.name for tissue in preset.tissues.all_tissues()]
         also = [name for name, _ in source.additions if name in own and name not in TISSUES]
-        if any(name == "brats" for name, _ in source.additions):
+        if any(name in SEVERAL for name, _ in source.additions):
             lines.append("# The page has one segment for each tissue of a BraTS map; borders may differ by a voxel.")
-        lines.append(f"labels = add_tissues(labels, {names}, [{masks}]{f', also={also!r}' if also else ''}).labels")
+        more_options = (f", also={also!r}" if also else "") + ("" if source.is_labels else ", has_brain_mask=True")
+        lines.append(f"labels = add_tissues(labels, {names}, [{masks}]{more_options}).labels")
         texture = f"texture_below({texture}, mri, segmentation.labels, labels)"
     needs_texture = preset.settings.needs_texture and not source.is_labels
     if needs_texture and source.additions:

@@ -142,8 +142,8 @@ def _check_slices(series: Series, name: str) -> None:
     if len(wide):
         at = int(wide[0])
         raise SimulationError(
-            f"{name}: slices are missing or unevenly spaced at {len(wide)} places, first {steps[at]:.4g} mm after "
-            f"slice {at + 1} of {len(along)}, expected {usual:.4g} mm; export the series again"
+            f"{name}: slices are missing or unevenly spaced at {len(wide)} place{'s' * (len(wide) > 1)}, first "
+            f"{steps[at]:.4g} mm after slice {at + 1} of {len(along)}, expected {usual:.4g} mm; export the series again"
         )
     first, last = positions[np.argmin(positions @ normal)], positions[np.argmax(positions @ normal)]
     direction = last - first

@@ -80,6 +80,17 @@ def user_message(error: Exception) -> str | None:
     return None
 
 
+@contextmanager
+def about_file(path: str) -> Iterator[None]:
+    """Within the block the message of a SimulationError begins with the file that it is about."""
+    try:
+        yield
+    except Cancelled:
+        raise
+    except SimulationError as error:
+        raise SimulationError(f"{path}: {error}") from error
+
+
 def is_our_warning(category: type[Warning]) -> bool:
     """Whether a warning is for the user, and not for developers of a library."""
     return category.__module__.startswith("SlicerUSSim")

@@ -19,6 +19,7 @@ def require_place(path: Path) -> None:
     """Raise SimulationError unless `path` can be a file in an existing folder."""
     require(path.parent.is_dir(), f"{path}: the folder {path.parent} does not exist")
     require(not path.is_dir(), f"{path}: is a folder, expected a file name")
+    require(os.access(path.parent, os.W_OK), f"{path}: cannot be written (no permission in {path.parent})")
 
 
 def make_folder(path: str | os.PathLike) -> Path:

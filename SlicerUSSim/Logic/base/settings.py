@@ -43,6 +43,14 @@ class SimulationSettings(Declared):
         1540.0, "Scanner's speed of sound", "Speed of sound that the scanner assumes", unit="m/s", bounds=(300, 6000),
         shown=Shown(1000, 2000),
     )  # fmt: skip
+    beam: str = parameter(
+        "aperture", "Beam",
+        "What soft tissue does to the beam: aperture averages over the aperture, ray refracts its axis",
+        choices=("aperture", "ray"),
+        note="Bone, air and metal reflect and refract rays with both. A single ray meets borders that a real beam, as "
+        "wide as its aperture, hardly notices: black radial streaks",
+        source="ray is the paper's",
+    )  # fmt: skip
     reflections: bool = parameter(
         True, "Reflected rays", "Simulate mirror images and reverberation by following reflected rays", shown=True
     )
@@ -83,11 +91,10 @@ class SimulationSettings(Declared):
         44.0, "Interface gain",
         "Level of a flat perpendicular perfect reflector, relative to tissue of unit scatterer variance", unit="dB",
         bounds=(-100, 100),
-        note="Interfaces reconstructed from voxels deviate by a fraction of a wavelength, which lowers their echoes by "
-        "some 20 dB; the default compensates for this",
+        note="The default was chosen by how far walls stand out from speckle in images of brains",
     )  # fmt: skip
     interface_reflection: str = parameter(
-        "pressure", "Interface reflection", "Echo amplitude: |r| with pressure, r² with energy",
+        "pressure", "Interface reflection", "Echo amplitude: r with pressure, r² with energy",
         choices=("pressure", "energy"), source="energy is equation 2 of the paper",
     )  # fmt: skip
     specular_exponent: float = parameter(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,26 +13,15 @@ import numpy as np
 from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
 from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.label_numbers import numbers_of
 from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry
+from SlicerUSSim.Logic.base.segments import flattened, segments_of
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
 
 _log = logging.getLogger(__name__)
 
 #: A larger side of a volume indicates a wrong unit.
 _SMALLEST_MM, _LARGEST_MM = 5.0, 2500.0
-#: Numbers from here on are not labels.
-_TOO_LARGE = 100_000
-#: Share of negative voxels, by positive ones, up to which they may be slips in a label map, which then is no MRI either
-_FEW_NEGATIVE = 0.05
-#: What formats and resampling leave of whole numbers
-_ROUNDING = 1e-3
-#: Label maps of up to this many labels are not examined further. Above, at least this share of neighbours has to be
-#: equal; a label map of a brain has 0.65 (voxels of 5 mm) to 0.95, an MRI 0.05 to 0.35.
-_FEW, _EQUAL_NEIGHBOURS = 8, 0.6
-#: An MRI of few grey levels has more equal neighbours, but evenly spaced levels, and the others are the next level.
-_FEW_LEVELS, _EQUAL_NEIGHBOURS_OF_LEVELS, _NEXT_LEVEL = 32, 0.8, 0.5
-#: Voxels along each side of the part of a volume that is examined
-_EXAMINED = 128
 WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
 
 
@@ -43,6 +33,8 @@ class Volume:
     ----------
     array : (k, j, i) numbers; i varies fastest in memory, as in ITK and VTK.
     ijk_to_ras : (4, 4) from homogeneous voxel indices (i, j, k, 1) of voxel *centres* to RAS millimetres.
+    name : of its file or node, for messages.
+    label_names : {label: name} of masks and label maps, where their file gives them; see mri.read_mask.
 
     Raises SimulationError for an array that is not 3D or not numeric, and for a singular or non-affine matrix.
 
@@ -60,14 +52,16 @@ class Volume:
 
     array: np.ndarray
     ijk_to_ras: np.ndarray
+    name: str = field(default="", compare=False)  # of no meaning for the image
+    label_names: Mapping[int, str] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         array = np.asarray(self.array)
         require(array.ndim == 3, f"volume has {array.ndim} dimensions {array.shape}, expected 3")
         require(array.size > 0, f"volume is empty (shape {array.shape})")
         require(
-            np.issubdtype(array.dtype, np.number) or array.dtype == bool,
-            f"volume holds {array.dtype}, expected numbers",
+            (np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)) or array.dtype == bool,
+            f"volume holds {array.dtype}, expected real numbers",
         )
         matrix = check_affine("ijk_to_ras", self.ijk_to_ras)
         require(not is_singular(matrix), f"ijk_to_ras is singular: {matrix.tolist()}")
@@ -79,6 +73,11 @@ class Volume:
     def spacing_mm(self) -> np.ndarray:
         """(3,) voxel size along i, j, k in millimetres."""
         return np.linalg.norm(self.ijk_to_ras[:3, :3], axis=0)
+
+    @property
+    def size_text(self) -> str:
+        """Its numbers of voxels along i, j, k, for messages: "181x217x181"."""
+        return "x".join(map(str, self.array.shape[::-1]))
 
     @property
     def voxel_ml(self) -> float:
@@ -96,24 +95,12 @@ class Volume:
         return Volume(array, self.ijk_to_ras)
 
     def looks_like_labels(self) -> bool:
-        """Whether the image has regions of equal whole numbers, hardly any of them negative, as a label map has.
+        """Whether the image has regions of equal whole numbers, as a label map has.
 
-        Also as floating point, and with numbers up to 99999. An MRI with few grey levels differs from a label map:
-        its neighbours differ everywhere, and mostly by one level.
+        Also as floating point, with numbers up to 99999, and with a negative background. An MRI with few grey levels
+        differs from a label map: its neighbours differ everywhere, and mostly by one level.
         """
-        low, high = self.array.min(), self.array.max()
-        array = whole_numbers(self.array) if np.isfinite(low) and np.isfinite(high) else None
-        if array is None:
-            found, is_labels = f"{self.array.dtype} numbers", False
-        elif low < 0 and (high < 1 or float((array < 0).sum()) > _FEW_NEGATIVE * float((array > 0).sum())):
-            found, is_labels = f"negative numbers (down to {low:g})", False
-        else:
-            array = np.maximum(array, 0)
-            values = (
-                np.flatnonzero(np.bincount(array.ravel().astype(np.int64))) if high < _TOO_LARGE else np.unique(array)
-            )
-            found = f"{len(values)} whole numbers from {values[0]:g} to {values[-1]:g}"
-            is_labels = high < _TOO_LARGE and (len(values) <= _FEW or _has_regions(array, values))
+        found, is_labels = numbers_of(self.array)
         _log.info("the volume contains %s, as %s does", found, "a label map" if is_labels else "an MRI")
         return is_labels
 
@@ -147,20 +134,30 @@ class Volume:
             _require_volume(array.shape[::-1], str(path))
             volume = cls(array, ijk_to_ras)
         _log_size(volume, path)
-        return volume
+        return replace(volume, name=str(path))
 
     @classmethod
     def from_sitk(cls, image, name: str = "image") -> Volume:
-        """From a SimpleITK image (LPS). Raises SimulationError if it is not 3D and scalar."""
+        """From a SimpleITK image (LPS); overlapping segments of 3D Slicer become one label map, the last on top.
+
+        Raises SimulationError if it is not 3D and scalar.
+        """
         import SimpleITK as sitk
 
         if image.GetDimension() == 4 and image.GetSize()[3] == 1:
             image = image[..., 0]  # NIfTI files often carry a time axis of length one
             _log.info("%s: has a time axis of length one, which is ignored", name)
         _require_volume(image.GetSize(), name)
-        channels = image.GetNumberOfComponentsPerPixel()
-        require(channels == 1, f"{name}: has {channels} components per voxel, expected 1")
-        return cls(sitk.GetArrayFromImage(image), _itk_ijk_to_ras(image))
+        channels, ijk_to_ras = image.GetNumberOfComponentsPerPixel(), _itk_ijk_to_ras(image)
+        array = sitk.GetArrayFromImage(image)
+        if channels > 1:
+            segments = segments_of({key: image.GetMetaData(key) for key in image.GetMetaDataKeys()}, name)
+            require(
+                segments,
+                f"{name}: has {channels} components per voxel, expected 1; save one of them, or a label map",
+            )
+            array = flattened(array, segments, float(abs(np.linalg.det(ijk_to_ras[:3, :3])) / 1000.0), name)
+        return cls(array, ijk_to_ras)
 
     def to_sitk(self):
         """A SimpleITK image (LPS). Raises SimulationError if the axes are not perpendicular (ITK cannot store that)."""
@@ -256,38 +253,11 @@ class Volume:
         require(writer.Write() == 1, f"{path}: cannot be written")
 
 
-def whole_numbers(array: np.ndarray) -> np.ndarray | None:
-    """The array, rounded where it is of floats; None if it contains fractions, or nothing but fractions of 1."""
-    if not np.issubdtype(array.dtype, np.floating):
-        return array
-    rounded = np.rint(array)
-    is_whole = np.allclose(array, rounded, rtol=0.0, atol=_ROUNDING) and (rounded.any() or not array.any())
-    return rounded if is_whole else None
-
-
-def _has_regions(array: np.ndarray, values: np.ndarray) -> bool:
-    """Whether neighbours that are not 0 have mostly equal `values`, as in a label map; see the constants above."""
-    middle = tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)
-    part = np.searchsorted(values, array[middle]) + (values[0] > 0)  # ranks; 0 is 0
-    total = equal = following = 0
-    for axis in range(3):
-        first, second = np.moveaxis(part, axis, 0)[:-1], np.moveaxis(part, axis, 0)[1:]
-        steps = np.abs(first - second)[(first > 0) & (second > 0)]
-        total += steps.size
-        equal += int(np.count_nonzero(steps == 0))
-        following += int(np.count_nonzero(steps == 1))
-    if equal < _EQUAL_NEIGHBOURS * total:
-        return False
-    spacing = np.diff(values[values > 0])
-    is_graded = len(values) <= _FEW_LEVELS and len(spacing) > 0 and spacing.max() <= 2 * spacing.min()
-    return not (is_graded and equal < _EQUAL_NEIGHBOURS_OF_LEVELS * total and following > _NEXT_LEVEL * (total - equal))
-
-
 def _log_size(volume: Volume, path: Path) -> None:
     """Log the volume, and warn if its size in millimetres is implausible."""
     size = volume.spacing_mm * volume.array.shape[::-1]
     _log.info(
-        "%s: %s voxels of %s mm, %s, i, j, k towards %s", path, "x".join(map(str, volume.array.shape[::-1])),
+        "%s: %s voxels of %s mm, %s, i, j, k towards %s", path, volume.size_text,
         "x".join(f"{round(mm, 3):g}" for mm in volume.spacing_mm), volume.array.dtype, axis_letters(volume.ijk_to_ras),
     )  # fmt: skip
     if not _SMALLEST_MM <= size.max() <= _LARGEST_MM:

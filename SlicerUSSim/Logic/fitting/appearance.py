@@ -189,7 +189,7 @@ class AppearanceModel:
     def _compute_bases(self, number: int) -> None:
         """Trace, compute the scatterers tissue by tissue, and apply beam and pulse to the parts of the bases."""
         device, frame = self.device, self._frames[number]
-        self.simulator.tracer.run(frame)
+        self.simulator.trace_rays(frame)
         lines, (_, samples) = 2 * int(frame.acquisition["traced_lines"]), frame.line_shape
         self._parts.prepare(CONSTANTS["PARTS"] * lines, samples)
         self._mixed.prepare(lines, samples)
@@ -220,10 +220,9 @@ class AppearanceModel:
                 np.int32(values), mixed,
             )  # fmt: skip
         frame.traced = self._mixed
-        if with_interfaces:
-            self._interfaces.run(frame)
         for stage in self.simulator.linear_stages:
-            stage.run(frame)
+            if with_interfaces or stage is not self._interfaces:
+                stage.run(frame)
         lines, samples = frame.line_shape
         nbytes = lines * samples * 8
         device.copy(frame.iq, self._buffer("bases", number), nbytes, base * nbytes)
@@ -297,7 +296,7 @@ class AppearanceModel:
         one = self._workspace.get("path", nbytes)
         for place, name in enumerate(self.attenuating):
             with simulator.with_tissues(_only_attenuating(self.tissues, name, self._probing_db_cm_mhz)):
-                simulator.tracer.run(frame)
+                simulator.trace_rays(frame, with_level=False)
             device.run(
                 self._direct_path,
                 (lines,),

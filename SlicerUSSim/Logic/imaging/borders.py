@@ -16,42 +16,70 @@ _SLAB = 48  # planes at a time, to limit the memory between the passes
 
 
 def smoothed_indicators(device: Device, group_buffer: Buffer, dims, present: set[int], fields: int) -> Buffer:
-    """Device buffer ushort [field][k][j][i]: indicators of the first `fields` groups, smoothed by a Gaussian.
+    """Device buffer ushort: indicators of the first `fields` groups, smoothed by Gaussians, at two resolutions.
 
-    `group_buffer` has uint8 groups with flags, `dims` (i, j, k) voxels, `present` the groups that occur. Fields of
-    groups that do not occur are 0, and all fields if there is only one group, which has no border. 65535 means 1.
+    First [field][k][j][i] with WIDE_SIGMA voxels, then the same at half the resolution, rounded up, smoothed as widely
+    in voxels of that grid. `group_buffer` has uint8 groups with flags, `dims` (i, j, k) voxels, `present` the groups
+    that occur. Fields of other groups are 0, and all fields if there is only one group, which has no border.
+    65535 means 1.
     """
-    columns, rows, planes = (int(n) for n in dims)
-    voxels = columns * rows * planes
-    smooth = device.zeros(-(-2 * fields * voxels // 4) * 4)
+    dims = np.asarray(dims)
+    voxels, halved = int(dims.prod()), int(((dims + 1) // 2).prod())
+    smooth = device.zeros(-(-2 * fields * (voxels + halved) // 4) * 4)
     if len(present) < 2:
         return smooth
+    *all_but_last, last = sorted(present)
+    workspace = Workspace(device)
+    for group in all_but_last[:fields]:
+        _smooth(device, workspace, group_buffer, dims, group, smooth)
+        _smooth_halved(device, workspace, dims, group * voxels, fields * voxels + group * halved, smooth)
+    if last < fields:
+        rest = device.kernels("smoothing.cl")["smooth_rest"]
+        for count, offset in ((voxels, 0), (halved, fields * voxels)):
+            device.run(rest, (count,), smooth, np.uint64(offset), np.int32(last), np.int32(fields))
+    return smooth
+
+
+def _smooth(device: Device, workspace: Workspace, group_buffer: Buffer, dims, group: int, smooth: Buffer) -> None:
+    """The indicator of one group, from the groups of voxels."""
+    columns, rows, planes = (int(n) for n in dims)
     lanes = device.lanes if columns >= device.lanes else 1
     kernels = device.kernels("smoothing.cl", lanes)
     taps = gaussian_taps(CONSTANTS["WIDE_SIGMA"])
     reach, tap_buffer = np.int32(len(taps) // 2), device.upload(taps)
-    workspace, slab = Workspace(device), min(_SLAB, planes)
+    slab = min(_SLAB, planes)
     partial = [workspace.get(name, 4 * columns * rows * (slab + 2 * int(reach))) for name in ("rows", "columns")]
     across, shape = -(-columns // lanes), (np.int32(columns), np.int32(rows))
-    *all_but_last, last = sorted(present)
-    for group in all_but_last[:fields]:
-        for first in range(0, planes, slab):
-            count = min(slab, planes - first)
-            around = count + 2 * int(reach)
-            device.run(
-                kernels["smooth_rows"], (across, rows, around), group_buffer, np.int32(group), tap_buffer, reach,
-                *shape, np.int32(planes), np.int32(first - reach), partial[0],
-            )  # fmt: skip
-            device.run(
-                kernels["smooth_columns"], (across, rows, around), partial[0], tap_buffer, reach, *shape, partial[1]
-            )
-            device.run(
-                kernels["smooth_planes"], (across, rows, count), partial[1], tap_buffer, reach, *shape, np.int32(first),
-                np.uint64(group * voxels), smooth,
-            )  # fmt: skip
-    if last < fields:
-        device.run(kernels["smooth_rest"], (voxels,), smooth, np.int32(last), np.int32(fields))
-    return smooth
+    for first in range(0, planes, slab):
+        count = min(slab, planes - first)
+        around = count + 2 * int(reach)
+        device.run(
+            kernels["smooth_rows"], (across, rows, around), group_buffer, np.int32(group), tap_buffer, reach,
+            *shape, np.int32(planes), np.int32(first - reach), partial[0],
+        )  # fmt: skip
+        device.run(kernels["smooth_columns"], (across, rows, around), partial[0], tap_buffer, reach, *shape, partial[1])
+        device.run(
+            kernels["smooth_planes"], (across, rows, count), partial[1], tap_buffer, reach, *shape, np.int32(first),
+            np.uint64(group * columns * rows * planes), smooth,
+        )  # fmt: skip
+
+
+def _smooth_halved(device: Device, workspace: Workspace, dims, offset: int, to_offset: int, smooth: Buffer) -> None:
+    """One indicator at half the resolution, from that at full resolution; both at offsets, in values, of `smooth`."""
+    columns, rows, planes = (-(-int(n) // 2) for n in dims)
+    kernels = device.kernels("smoothing.cl")
+    taps = gaussian_taps(CONSTANTS["HALVED_SIGMA"])
+    reach, tap_buffer = np.int32(len(taps) // 2), device.upload(taps)
+    around, shape = planes + 2 * int(reach), (np.int32(columns), np.int32(rows))
+    partial = [workspace.get(name, 4 * columns * rows * around) for name in ("halved", "halved rows")]
+    size = columns, rows, around
+    device.run(kernels["halve"], size, smooth, np.uint64(offset), *(np.int32(n) for n in dims), -reach, partial[0])
+    device.run(kernels["smooth_halved_rows"], size, partial[0], tap_buffer, reach, *shape, partial[1])
+    device.run(kernels["smooth_columns"], size, partial[1], tap_buffer, reach, *shape, partial[0])
+    device.run(
+        kernels["smooth_planes"], (columns, rows, planes), partial[0], tap_buffer, reach, *shape, np.int32(0),
+        np.uint64(to_offset), smooth,
+    )  # fmt: skip
 
 
 def gaussian_taps(sigma: float) -> np.ndarray:

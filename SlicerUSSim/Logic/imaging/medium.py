@@ -33,7 +33,7 @@ _FARTHEST_SIGMAS = 2.2  # limit of the stored distance
 # Smoothed indicators need two bytes per voxel and group. Limits of groups and of all values; at least two groups.
 _MOST_SMOOTHED_GROUPS = 6
 _SMOOTHED_VOXELS = 100_000_000
-_TISSUE_ATTRIBUTES = tuple(name for name in TISSUE.names or () if name != "group")
+_TISSUE_ATTRIBUTES = tuple(name for name in TISSUE.names or () if name not in ("group", "is_fluid"))
 _PAD = 1  # one voxel of coupling medium around the volume, for clamped look-ups outside
 
 
@@ -136,6 +136,8 @@ class Medium:
             for name in _TISSUE_ATTRIBUTES:
                 rows[label][name] = getattr(tissue, name)
             rows[label]["group"] = groups.setdefault(acoustics, len(groups))
+        if tissues.membrane is not None:
+            rows["is_fluid"][list(_fluid_labels(tissues, tissues.membrane))] = 1
         return rows
 
     def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:

@@ -73,6 +73,7 @@ class RayTracer(Stage):
             medium.tissue_buffer,
             self._roots,
             self._quantiles,
+            frame.screens,
             tree.segments,
             tree.segment_counts,
             tree.hits,

@@ -9,8 +9,8 @@ from scipy.integrate import trapezoid
 
 from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
-from SlicerUSSim.Logic.opencl.device import Device
-from SlicerUSSim.Logic.opencl.layout import HIT
+from SlicerUSSim.Logic.opencl.device import Device, Workspace
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS, HIT, WALL
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 # Operations counted in the kernels
 _PER_CELL = 180  # per examined lattice cell: three hashes, position, pulse phase, amplitude
 _PER_SCATTERER = 40  # per contributing scatterer: label, amplitude, four impulses
-_PER_HIT = 40
+_PER_HIT = 80
+_PER_ECHO = 40  # of a hit on a scan line
 _PER_EDGE_PAIR = 16  # for the lateral beam, per sample
+_SLICES = 16  # of a scan line for the interfaces on GPUs, which have more work-items than scan lines
 
 
 class Scatterers(Stage):
@@ -72,31 +74,46 @@ class Scatterers(Stage):
 
 
 class InterfaceEchoes(Stage):
-    """Adds the echoes of interfaces at the hits of the elevational rays."""
+    """Adds the echoes of interfaces to the scan lines, from the hits of the elevational rays near each."""
 
     name = "interfaces"
 
     def __init__(self, device: Device) -> None:
         super().__init__(device)
-        self.kernel = device.kernels("interfaces.cl")["interface_echoes"]
+        kernels = device.kernels("interfaces.cl")
+        self._find, self._add = kernels["find_walls"], kernels["interface_echoes"]
+        self.workspace = Workspace(device)
 
     def run(self, frame: DeviceFrame) -> None:
-        """Enqueue the interface echoes of one frame, unless they are off; they are added to `traced`."""
+        """Enqueue the interface echoes of one frame, unless they are off; they are added to `scanned`."""
         if not frame.settings.interfaces:
             return
+        traced, rays = (int(frame.acquisition[name]) for name in ("traced_lines", "elevational_rays"))
+        get = self.workspace.get
+        walls = get("walls", traced * rays * CONSTANTS["MAX_HITS"] * WALL.itemsize), get("counts", 4 * traced)
+        reach = get("reach", 4 * traced)
+        tree, scanned = frame.tree, frame.scanned
+        self.device.run(self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, *walls, reach)
         self.device.run(
-            self.kernel,
-            (int(frame.acquisition["traced_lines"]),),
+            self._add,
+            (_SLICES if self.device.info.kind == "GPU" else 1, frame.line_shape[0]),
             frame.acquisition_buffer,
-            frame.tree.hits,
-            frame.tree.hit_counts,
-            frame.traced.re,
-            frame.traced.im,
-            np.int32(frame.traced.stride),
+            *walls,
+            reach,
+            scanned.re,
+            scanned.im,
+            np.int32(scanned.stride),
         )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
-        return Work((HIT.itemsize + 8 * SAMPLE_BYTES) * len(tree.hits), _PER_HIT * len(tree.hits))
+        acquisition, probe, hits = frame.acquisition, frame.probe, tree.hits
+        path = hits["path_mm"].astype(float)
+        near = 2.7 * frame.settings.beam_cutoff * probe.beam_sigma_mm(path)[0] / probe.line_distance_mm(path)
+        echoes = float(np.minimum(near, int(acquisition["scan_lines"])).sum())
+        return Work(
+            (HIT.itemsize + 2 * WALL.itemsize) * len(hits) + 2 * SAMPLE_BYTES * float(np.prod(frame.line_shape)),
+            _PER_HIT * len(hits) + _PER_ECHO * echoes,
+        )
 
 
 class LateralBeam(Stage):

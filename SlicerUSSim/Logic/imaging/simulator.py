@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging import stages
+from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
@@ -205,8 +206,13 @@ class UltrasoundSimulator:
     def trace(self, probe: Probe, probe_to_ras: np.ndarray) -> RayTree:
         """The ray tree, on the host: segments along the beam axes and interface hits."""
         pose = check_rigid("probe_to_ras", probe_to_ras)
-        self.tracer.run(self.device_frame(probe, pose, buffer=self._acquisition_buffer))
+        self.trace_rays(self.device_frame(probe, pose, buffer=self._acquisition_buffer))
         return self.tracer.download()
+
+    def trace_rays(self, frame: DeviceFrame, with_level: bool = True) -> None:
+        """Enqueue the stages up to the ray tree of `frame`; `with_level` as in Aperture.run."""
+        self.stage(Aperture).run(frame, with_level)
+        self.tracer.run(frame)
 
     def sweep(
         self,
@@ -336,6 +342,12 @@ class UltrasoundSimulator:
         acquisition["voxel_mm"] = medium.labels.spacing_mm.min()
         acquisition["smooth_groups"] = medium.smooth_groups
         acquisition["membrane_reach"] = medium.membrane_reach
+        membrane = medium.tissues.membrane
+        if membrane is not None:
+            acquisition["membrane_gain"] = 10.0 ** (membrane.diffuse_db / 20.0)
+            acquisition["membrane_exponent"] = membrane.diffuse_exponent
+            # 2 k s of the range's deviation s: the carrier has 2 k / 2 pi cycles per millimetre of depth.
+            acquisition["membrane_phase"] = 2.0 * np.pi * self._cycles_per_mm(probe) * membrane.roughness_mm
         acquisition["probe_to_ras"] = pose[:3].ravel()
         acquisition["linear"] = probe.is_linear
         acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
@@ -351,7 +363,10 @@ class UltrasoundSimulator:
         acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
         lateral, guard = _traced_lines_for(probe, settings)
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard
-        acquisition["traced_lines"] = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
+        traced = acquisition["traced_lines"] = (probe.scan_lines - 1) * lateral + 1 + 2 * guard
+        voxel_mm = float(acquisition["voxel_mm"])
+        for name, value in aperture_fields(probe, settings, voxel_mm, traced, guard, lateral).items():
+            acquisition[name] = value
         acquisition["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
         acquisition["interface_is_energy"] = settings.interface_reflection == "energy"
         acquisition["cell_mm"] = settings.scatterers_per_mm3 ** (-1.0 / 3.0)

@@ -76,6 +76,8 @@ class DeviceFrame(FrameInputs):
 
     acquisition_buffer: Buffer
     medium: Medium
+    #: What soft tissue does to the beam: float4 [screen line][depth] of aperture.cl
+    screens: Buffer = field(init=False)
     #: Of the ray tree
     tree: TreeBuffers = field(init=False)
     #: Impulses on the left and right edges of every traced line's strip
@@ -139,7 +141,7 @@ class Stage(ABC):
     def on_host(self, frame: HostFrame) -> None:
         """The same in plain numpy, written from the equations and not from `run`, as a reference for tests of `run`.
 
-        Not defined for the first seven stages: theirs are in verification/numpy_model.
+        Not defined for the first eight stages: theirs are in verification/numpy_model.
         """
         raise NotImplementedError(f"stage {self.name!r} has no twin in numpy")
 

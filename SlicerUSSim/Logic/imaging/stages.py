@@ -5,6 +5,7 @@ How to add one is in docs/architecture.md#adding-a-stage.
 
 from __future__ import annotations
 
+from SlicerUSSim.Logic.imaging.aperture import Aperture
 from SlicerUSSim.Logic.imaging.bmode import Compressor, PulseFilter
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
@@ -12,8 +13,9 @@ from SlicerUSSim.Logic.imaging.scattering import InterfaceEchoes, LateralBeam, S
 from SlicerUSSim.Logic.imaging.stage import Stage
 
 #: From the acquisition to impulses along the traced lines
-IMPULSE_STAGES: tuple[type[Stage], ...] = (RayTracer, Scatterers, InterfaceEchoes)
-#: From there to the baseband signal. They are linear, so the appearance model applies them to each of its bases
-LINEAR_STAGES: tuple[type[Stage], ...] = (LateralBeam, PulseFilter)
+IMPULSE_STAGES: tuple[type[Stage], ...] = (Aperture, RayTracer, Scatterers)
+#: From there to the baseband signal. They are linear, so the appearance model applies them to each of its bases, and
+#: adds the interfaces to the one of the fixed tissues
+LINEAR_STAGES: tuple[type[Stage], ...] = (LateralBeam, InterfaceEchoes, PulseFilter)
 #: From the baseband signal to pixels
 DISPLAY_STAGES: tuple[type[Stage], ...] = (Compressor, ScanConverter)

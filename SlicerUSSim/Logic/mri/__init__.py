@@ -10,6 +10,7 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 if TYPE_CHECKING:
     from .addable import require_addable as require_addable
     from .filtering import guided_filter as guided_filter
+    from .masks import read_mask as read_mask
     from .pathology import Added as Added, add_tissue as add_tissue, add_tissues as add_tissues
     from .samples import demo_mri as demo_mri, head_mri as head_mri
     from .segmentation import Segmentation as Segmentation, segment_mri as segment_mri

@@ -6,6 +6,7 @@ import hashlib
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import Atlas
-from SlicerUSSim.Logic.mri.refinement import on_grid
+from SlicerUSSim.Logic.mri.refinement import box_around, on_grid
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
@@ -50,9 +51,7 @@ class AtlasFit:
 
     def prior(self, grid: Volume, inside: np.ndarray) -> np.ndarray:
         """(3, voxels) float32 share of CSF, grey and white matter to be expected in the voxels `inside` (k, j, i)."""
-        source = (self.atlas.grey.array, self.atlas.white.array)  # the rest is CSF, also around the atlas
-        spacing = self.atlas.t1.spacing_mm[::-1]
-        shrink = np.maximum(np.rint(_MAPS_MM / spacing).astype(int), 1)
+        shrink, maps = _smooth_maps(self.atlas)
         stride = np.maximum(np.rint(_MAPS_MM / grid.spacing_mm[::-1]).astype(int), 1)
         matrix = self.atlas.t1.ras_to_ijk @ self.patient_to_atlas @ grid.ijk_to_ras
         # scipy wants the map from array indices (k, j, i) of the result to those of the input.
@@ -61,8 +60,7 @@ class AtlasFit:
         linear = linear * stride / shrink[:, None]
         coarse = tuple(-(-n // step) for n, step in zip(inside.shape, stride, strict=True))
         shares = np.empty((3, int(inside.sum())), np.float32)
-        for n, array in enumerate(source):
-            smooth = ndimage.gaussian_filter(_block_means(array, shrink), _PRIOR_SIGMA_MM / (spacing * shrink))
+        for n, smooth in enumerate(maps):
             warped = ndimage.affine_transform(smooth, linear, offset, coarse, order=1)  # pyright: ignore[reportArgumentType]
             for axis, step in enumerate(stride):
                 warped = warped.repeat(step, axis)
@@ -76,15 +74,12 @@ class AtlasFit:
         atlas_to_ras = np.linalg.inv(self.patient_to_atlas) @ self.atlas.t1.ijk_to_ras
         corners = np.argwhere(array > 0)
         corners = np.stack([corners.min(axis=0), corners.max(axis=0)])[:, ::-1]
-        ends = np.array([[*corner, 1.0] for corner in itertools.product(*corners.T.tolist())])
-        ends = (ends @ (grid.ras_to_ijk @ atlas_to_ras).T)[:, 2::-1]
-        low, high = np.floor(ends.min(axis=0)) - 1, np.ceil(ends.max(axis=0)) + 2
-        first, last = (np.clip(end, 0, inside.shape).astype(int) for end in (low, high))
+        ends = np.array(list(itertools.product(*corners.T.tolist())))
+        box = box_around(ends @ atlas_to_ras[:3, :3].T + atlas_to_ras[:3, 3], grid)
         result = np.zeros(inside.shape, np.float32)
-        if (last > first).all():
-            box = tuple(map(slice, first, last))
+        if result[box].size:
             box_to_ras = grid.ijk_to_ras.copy()
-            box_to_ras[:3, 3] = (grid.ijk_to_ras @ [*first[::-1], 1.0])[:3]
+            box_to_ras[:3, 3] = (grid.ijk_to_ras @ [*(part.start for part in box[::-1]), 1.0])[:3]
             result[box] = on_grid(Volume(array, atlas_to_ras), Volume(inside[box], box_to_ras))
         return result[inside]
 
@@ -156,6 +151,16 @@ def _registered(
     mask = sitk.GetArrayViewFromImage(fixed_mask) > 0.5
     report(1.0)
     return _ras_matrix(found), 2.0 * float((warped & mask).sum()) / float(warped.sum() + mask.sum())
+
+
+@cache
+def _smooth_maps(atlas: Atlas) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """((3,) k, j, i voxels of the atlas in one of the maps, smooth maps of grey and white matter); the rest is CSF."""
+    spacing = atlas.t1.spacing_mm[::-1]
+    shrink = np.maximum(np.rint(_MAPS_MM / spacing).astype(int), 1)
+    deviation = _PRIOR_SIGMA_MM / (spacing * shrink)
+    sources = (atlas.grey.array, atlas.white.array)
+    return shrink, tuple(ndimage.gaussian_filter(_block_means(array, shrink), deviation) for array in sources)
 
 
 def _block_means(array: np.ndarray, shrink: np.ndarray) -> np.ndarray:

@@ -14,20 +14,26 @@ from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri import extractors
-from SlicerUSSim.Logic.mri.alignment import Alignment, align_template
+from SlicerUSSim.Logic.mri.alignment import align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.extractors import Program, Report
+from SlicerUSSim.Logic.mri.given_mask import checked_mask, label_doubts, mask_doubts, volume_warnings
 from SlicerUSSim.Logic.mri.kept_mask import keep, read_kept
-from SlicerUSSim.Logic.mri.mask_check import cut_off
-from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
-from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML, Shown, above_noise, check_position, recognise
+from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
+from SlicerUSSim.Logic.mri.recognition import (
+    POSSIBLE_ML,
+    USUAL_ML,
+    Shown,
+    above_noise,
+    check_position,
+    recognise,
+    stripped_brain,
+)
 from SlicerUSSim.Logic.mri.refinement import on_grid, refined, signed_distance
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 _log = logging.getLogger(__name__)
 
-#: Labels of a segmentation count as inside too; an image has more values
-_MOST_MASK_VALUES = 128
 _NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
 #: Overlap with the registered atlas above which a mask is taken without asking another method, and below which it is
 #: refused
@@ -71,31 +77,36 @@ def find_brain(
     Raises SimulationError if the image shows neither a head nor a brain, or if no method is available or succeeds.
     """
     method = parameter_of(SegmentationSettings, "skull_strip").checked("segmentation", method)
-    start, report = perf_counter(), progress or (lambda share: None)
+    start, report = perf_counter(), _forwards(progress)
     if method == "none":
         inside = above_noise(mri)
-        mask = mri.with_array(inside.astype(np.uint8))
-        return BrainMask(mask, "none", "everything brighter than the background", (), perf_counter() - start)
+        mask, millilitres = mri.with_array(inside.astype(np.uint8)), _millilitres(inside, mri)
+        message = f"everything brighter than the background, {millilitres:.0f} ml"
+        return BrainMask(mask, "none", message, _head_warnings(millilitres), perf_counter() - start)
     kept = _kept(keep_at, mri, method) if keep_at is not None else None
     if kept is not None:
         return kept
     with ExitStack() as ahead:
         robex = extractors.robex
-        if method == "deepbet":
-            extractors.require_deepbet()  # before the seconds that follow
-        elif method == "robex":  # takes more than a minute, on one core: the image is recognised meanwhile
-            extractors.require_robex()
+        _require_program(method, mri)
+        if method == "robex":  # takes more than a minute, on one core: the image is recognised meanwhile
             robex = ahead.enter_context(extractors.Ahead(robex, mri))
         shown = recognise(mri, lambda share: report(0.15 * share))
         if shown.stripped is not None:
             mask = mri.with_array(shown.stripped.astype(np.uint8))
             millilitres = _millilitres(shown.stripped, mri)
-            warnings = (*shown.warnings, *_volume_warnings(millilitres))
+            warnings = (*shown.warnings, *volume_warnings(millilitres))
             message = f"skull-stripped brain, {millilitres:.0f} ml"
             return BrainMask(mask, "stripped", message, warnings, perf_counter() - start)
         found = _extracted(mri, shown, method, robex, lambda share: report(0.15 + 0.8 * share))
     inside, millilitres = found.inside, _millilitres(found.inside, mri)
-    warnings = (*shown.warnings, *found.warnings, *_volume_warnings(millilitres), *cut_off(mri, inside))
+    warnings = (
+        *shown.warnings,
+        *found.warnings,
+        *volume_warnings(millilitres),
+        *ends_at_edge(mri, inside),
+        *cut_off(mri, inside),
+    )
     seconds = perf_counter() - start
     message = f"whole head: brain extracted by {_NAMES[found.method]} in {seconds:.0f} s, {millilitres:.0f} ml"
     if found.sureness is not None:
@@ -113,52 +124,11 @@ def given_brain(mask: Volume, mri: Volume) -> BrainMask:
 
     What looks like no whole brain, and tissue that it cuts off, are warnings: it may be what the user wants.
     """
-    require(isinstance(mask, Volume), f"mask is a {type(mask).__name__}, expected a Volume (Volume.read reads a file)")
-    require(
-        mask.array.shape == mri.array.shape,
-        f"mask has shape {mask.array.shape} and the MRI {mri.array.shape}, expected the same grid; resample the mask",
-    )
-    corners = np.array([[0, 0, 0, 1], [*(np.array(mri.array.shape[::-1]) - 1), 1]]).T
-    apart = float(np.linalg.norm((mask.ijk_to_ras - mri.ijk_to_ras) @ corners, axis=0).max())
-    require(
-        np.allclose(mask.ijk_to_ras, mri.ijk_to_ras, atol=1e-3),
-        f"mask lies up to {apart:.1f} mm from the MRI's voxels, expected the same origin, spacing and directions; "
-        "resample the mask",
-    )
-    values = np.unique(mask.array[:: max(mask.array.shape[0] // 16, 1)])
-    require(
-        len(values) <= _MOST_MASK_VALUES,
-        f"mask has {len(values)} or more different values, expected 0 outside and one value inside: is it an image?",
-    )
-    inside = mask.array > 0
-    require(bool(inside.any()), "mask is empty, expected at least one voxel inside")
-    millilitres, share = _millilitres(inside, mri), float(inside.mean())
-    require(
-        share < 0.98 or millilitres <= POSSIBLE_ML[1],
-        f"mask covers {share:.0%} of the image, {millilitres:.0f} ml, expected the brain only; "
-        "to use the whole image, give --skull-strip none and no mask",
-    )
-    require(
-        millilitres <= POSSIBLE_ML[1],
-        f"mask has {millilitres:.0f} ml, expected a brain ({USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml) or a part of one",
-    )
-    found = mri.with_array(inside.astype(np.uint8))
-    return BrainMask(found, "given", f"brain mask as given, {millilitres:.0f} ml", _doubts(mri, inside))
-
-
-def _doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
-    """Warnings about a mask that a user made."""
+    inside = checked_mask(mask, mri)
     millilitres = _millilitres(inside, mri)
-    if millilitres < POSSIBLE_ML[0]:
-        return (
-            f"the mask has {millilitres:.3g} ml, expected a brain of {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml or a "
-            "large part of one; what is outside it has no tissue (a lesion is added with --add tumour=FILE)",
-        )
-    reason = is_whole_brain(mri, inside)
-    warnings = _volume_warnings(millilitres)
-    if reason and not warnings:
-        warnings = (f"the mask is not that of a whole brain: {reason}",)
-    return (*warnings, *cut_off(mri, inside))
+    found = mri.with_array(inside.astype(np.uint8))
+    warnings = (*label_doubts(mask), *mask_doubts(mri, inside))
+    return BrainMask(found, "given", f"brain mask as given, {millilitres:.0f} ml", warnings)
 
 
 def left_out(mask: Volume, lesion: Volume) -> float:
@@ -184,9 +154,16 @@ def _extracted(mri: Volume, shown: Shown, method: str, robex: Program, report: R
     """The brain by `method`, or by the first of the available ones whose result is plausible."""
     failures: list[str] = []
     unsure: list[_Extracted] = []
-    for name in _candidates(method):
+    alignment = shown.alignment
+    expected = None if alignment is None else alignment.brain_on(mri)
+    candidates = _candidates(method)
+    for name in candidates:
         try:
-            inside, alignment = _by(name, mri, shown.alignment, robex, report)
+            if name == "atlas" and expected is None:
+                require(mni152() is not None, "the brain atlas needs nilearn; install it with: pip install nilearn")
+                alignment = align_template(mri, lambda share: report(0.5 * share))
+                expected = alignment.brain_on(mri)
+            inside = _by(name, mri, expected, robex, report)
         except Cancelled:
             raise
         except SimulationError as error:
@@ -195,7 +172,7 @@ def _extracted(mri: Volume, shown: Shown, method: str, robex: Program, report: R
             failures.append(str(error))
             continue
         millilitres = _millilitres(inside, mri)
-        sureness = None if alignment is None else _dice(inside, alignment.brain_on(mri) < 0.0)
+        sureness = None if expected is None else _dice(inside, expected < 0.0)
         found = _Extracted(inside, name, sureness)
         if not POSSIBLE_ML[0] <= millilitres <= POSSIBLE_ML[1]:
             usual = f"{USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml"
@@ -207,10 +184,26 @@ def _extracted(mri: Volume, shown: Shown, method: str, robex: Program, report: R
                 check_position(mri, alignment)
             unsure.append(found)
             failures.append(f"the mask by {_NAMES[name]} agrees with the atlas by {sureness:.2f} only; check it")
+        if name != candidates[-1]:
+            following = candidates[candidates.index(name) + 1]
+            _log.warning("%s; %s is asked, which takes up to two minutes", failures[-1], _NAMES[following])
     best = max(unsure, key=lambda found: found.sureness or 0.0, default=None)
     if best is not None and (best.sureness or 0.0) >= _LEAST_SURE:
         return replace(best, warnings=tuple(failures))
     raise SimulationError(f"no brain was found in this head: {'; '.join(failures)}; give a brain mask (--mask)")
+
+
+def _forwards(progress: Report | None) -> Report:
+    """A progress that never goes back, when another method starts."""
+    reached = 0.0
+
+    def report(share: float) -> None:
+        nonlocal reached
+        reached = max(reached, share)
+        if progress is not None:
+            progress(reached)
+
+    return report
 
 
 def _candidates(method: str) -> list[str]:
@@ -231,21 +224,31 @@ def _candidates(method: str) -> list[str]:
     return found
 
 
-def _by(
-    name: str, mri: Volume, alignment: Alignment | None, robex: Program, report: Report
-) -> tuple[np.ndarray, Alignment | None]:
-    """The brain by one method, with its border moved to the dark valley outside the cortex."""
-    if name == "atlas":
-        if alignment is None:
-            require(mni152() is not None, "the brain atlas needs nilearn; install it with: pip install nilearn")
-            alignment = align_template(mri, lambda share: report(0.5 * share))
+def _by(name: str, mri: Volume, expected: np.ndarray | None, robex: Program, report: Report) -> np.ndarray:
+    """(k, j, i) the brain by one method, with its border moved to the dark valley outside the cortex.
+
+    `expected` (k, j, i) is the distance to the aligned template's brain, which the atlas needs.
+    """
+    if name == "atlas" and expected is not None:
         report(0.5)
-        return refined(mri, alignment.brain_on(mri), core_mm=8.0, reach_mm=12.0, keep_mm=3.0), alignment
+        return refined(mri, expected, core_mm=8.0, reach_mm=12.0, keep_mm=3.0)
     program = robex if name == "robex" else extractors.deepbet
     inside = program(mri, lambda share: report(0.9 * share))
     require(bool(inside.any()), f"{_NAMES[name]} found no brain")
     distance = signed_distance(inside, mri.spacing_mm, 20.0)
-    return refined(mri, distance, core_mm=6.0, reach_mm=12.0, keep_mm=2.0), alignment
+    return refined(mri, distance, core_mm=6.0, reach_mm=12.0, keep_mm=2.0)
+
+
+def _require_program(method: str, mri: Volume) -> None:
+    """Raise SimulationError for a program that is not installed, before the seconds of recognising the image.
+
+    A skull-stripped brain does not need one.
+    """
+    is_missing = (method == "deepbet" and not extractors.has_deepbet()) or (
+        method == "robex" and extractors.robex_folder() is None
+    )
+    if is_missing and stripped_brain(mri) is None:
+        extractors.require_deepbet() if method == "deepbet" else extractors.require_robex()
 
 
 def _dice(one: np.ndarray, other: np.ndarray) -> float:
@@ -267,16 +270,16 @@ def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
         by = _NAMES.get(kept.method, kept.method)
         message = f"whole head: brain mask kept in {kept.path}, by {by} in {kept.seconds:.0f} s, {millilitres:.0f} ml"
     mask = mri.with_array(kept.inside.astype(np.uint8))
-    warnings = _doubts(mri, kept.inside) if kept.is_edited else kept.warnings
+    warnings = mask_doubts(mri, kept.inside) if kept.is_edited else kept.warnings
     return BrainMask(mask, "given" if kept.is_edited else kept.method, message, warnings, 0.0)
 
 
-def _volume_warnings(millilitres: float) -> tuple[str, ...]:
-    if USUAL_ML[0] <= millilitres <= USUAL_ML[1]:
+def _head_warnings(millilitres: float) -> tuple[str, ...]:
+    if millilitres <= USUAL_ML[1]:
         return ()
     return (
-        f"the brain has {millilitres:.0f} ml, expected {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml of an adult; "
-        "check the mask",
+        f"{millilitres:.0f} ml are segmented, more than a brain has ({USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml): if "
+        "this is a whole head, its skull and scalp become brain tissues; --skull-strip auto finds the brain",
     )
 
 

@@ -170,6 +170,11 @@ def _has_collapsed(fit: TissueMixture) -> bool:
 def _csf_is_grey(fit: TissueMixture, contrast: str) -> bool:
     """Whether CSF is too close to grey matter, as where the mask holds little CSF and two classes share the cortex."""
     csf, grey, white = fit.means[:, 0]
+    return is_csf_near_grey(csf, grey, white, contrast)
+
+
+def is_csf_near_grey(csf: float, grey: float, white: float, contrast: str) -> bool:
+    """Whether these intensities are closer to each other in CSF and grey matter than in grey and white matter."""
     way = np.sign(white - csf)
     return bool(contrast != "flair" and way * (grey - csf) < _LEAST_CONTRAST * way * (white - grey))
 

@@ -78,3 +78,14 @@ def resampled_to_ras(mri: Volume, spacing_mm: float) -> tuple[np.ndarray, np.nda
         image, size.tolist(), sitk.Transform(), sitk.sitkLinear, origin, [spacing_mm] * 3, direction, air
     )
     return sitk.GetArrayFromImage(resampled), low
+
+
+def widened(values: np.ndarray, step: int, shape: tuple[int, ...]) -> np.ndarray:
+    """(k, j, i) float32 of `shape` from values at every `step`-th voxel, interpolated linearly; the last go on."""
+    for axis, count in enumerate(shape):
+        places = np.arange(count) / step
+        low = np.minimum(places.astype(int), values.shape[axis] - 1)
+        high = np.minimum(low + 1, values.shape[axis] - 1)
+        part = (places - low).astype(np.float32).reshape([-1 if n == axis else 1 for n in range(3)])
+        values = values.take(low, axis) * (1.0 - part) + values.take(high, axis) * part
+    return values

@@ -19,6 +19,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import Atlas
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.classification import fit_one
+from SlicerUSSim.Logic.mri.coarse import widened
 from SlicerUSSim.Logic.mri.histogram import Histogram
 from SlicerUSSim.Logic.mri.mixture import fit_mixture
 
@@ -121,11 +122,12 @@ def estimate_field(
             )
         slope = -(mixture.slope(histogram.points) * histogram.points.values[:, 0])[histogram.point_of_voxel]
         slope = slope.astype(np.float32)
-        normal = (design * (slope**2)[:, None]).T @ design + np.diag(penalty)
-        gradient = design.T @ slope - penalty * found
+        # einsum and not BLAS, whose threads wait for each other while another process works
+        normal = np.einsum("na,nb->ab", design * (slope**2)[:, None], design) + np.diag(penalty)
+        gradient = np.einsum("na,n->a", design, slope) - penalty * found
         change = np.linalg.solve(normal, gradient)
         found = found + change
-        moved = design @ change.astype(np.float32)
+        moved = np.einsum("na,a->n", design, change.astype(np.float32))
         log += moved
         report((step + 1) / _MOST_STEPS)
         if float(moved.std()) < _LEAST_CHANGE:
@@ -140,13 +142,7 @@ def anatomy(fit: AtlasFit, grid: Volume, shape: tuple[int, ...]) -> np.ndarray:
     stride = 4
     coarse = tuple(-(-n // stride) for n in shape)
     field = ndimage.affine_transform(_of_atlas(fit.atlas), linear * stride, offset, coarse, order=1, mode="nearest")  # pyright: ignore[reportArgumentType]
-    fine = [np.arange(n) / stride for n in shape]
-    for axis, places in enumerate(fine):
-        low = np.minimum(places.astype(int), coarse[axis] - 1)
-        high = np.minimum(low + 1, coarse[axis] - 1)
-        part = (places - low).astype(np.float32).reshape([-1 if n == axis else 1 for n in range(3)])
-        field = field.take(low, axis) * (1.0 - part) + field.take(high, axis) * part
-    return field ** np.float32(_ANATOMY)
+    return widened(field, stride, shape) ** np.float32(_ANATOMY)
 
 
 @cache

@@ -1,7 +1,8 @@
-"""What a brain mask cuts off."""
+"""What a brain mask cuts off, and what it takes in."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -9,13 +10,109 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import resampled_to_ras
-from SlicerUSSim.Logic.mri.refinement import brightness_near, on_grid, signed_distance
+from SlicerUSSim.Logic.mri.refinement import brightness_near, closed, on_grid, signed_distance
 
 _SPACING_MM = 2.0
+#: Depth from which a voxel is surely brain, to compare with
+_CORE_MM = 8.0
 #: Tissue as bright as the brain, relative to it nearby: darker is CSF or skull in T1, brighter CSF in T2 and fat
 _TISSUE = (0.75, 1.25)
 #: Depth below and height above the mask's border at which tissue is looked for, and the areas worth a word, cm2
 _BELOW_MM, _ABOVE_MM, _WORTH_CM2, _WORTH_AT_BASE_CM2 = 3.0, 4.0, 6.0, 20.0
+#: Voxels across the border are counted in a layer of _ABOVE_MM.
+_CM2_OF_VOXEL = _SPACING_MM**3 / _ABOVE_MM / 100.0
+#: Directions of a sector, by axis (k, j, i) and sign; from how many on it is said that the border is so all around
+_SECTORS, _ALL_AROUND = (("bottom", "top"), ("back", "front"), ("left", "right")), 4
+#: Depths of the profile through the upper half's border, from the core outwards, and sulci closed before, mm
+_DEPTHS_MM, _SULCI_MM = np.arange(14.0, -4.1, -0.5), 6.0
+#: How far a mask may reach beyond the brain's surface. Of masks of four heads it was -2.5 to 2.5 mm, and with the CSF
+#: of a T2, which is bright, less; masks 8 mm too wide had 8 to 9 mm, and 4.5 with bright CSF.
+_BEYOND_MM, _BEYOND_BRIGHT_CSF_MM, _BRIGHT_CSF = 5.5, 3.5, 1.1
+#: Depth below the surface, and volume, from which what a mask leaves out is said
+_HOLE_DEPTH_MM, _HOLE_ML = 24.0, 3.0
+#: Share of voxels with the value of the first one, from which they are a background that was set
+_STRIPPED = 0.15
+#: Brightness, relative to the brain, of what is surely outside it
+_DARK = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class _Checked:
+    """An image and its mask on a grid along the axes of the patient, arrays (k, j, i)."""
+
+    mask: np.ndarray
+    #: Relative to the brain nearby
+    brightness: np.ndarray
+    #: Depth below the mask's border, mm, negative outside
+    depth: np.ndarray
+    #: Whether the image shows the voxel
+    is_shown: np.ndarray
+
+    @classmethod
+    def of(cls, mri: Volume, inside: np.ndarray) -> _Checked | None:
+        """None for a slab of a brain, with nothing deep to compare with."""
+        values = mri.array
+        background = values == values[0, 0, 0]
+        if float(background.mean()) > _STRIPPED:  # around z-scores of a brain it is 0, as bright as the brain
+            values = np.where(background, values.min(), values)
+        image, origin = resampled_to_ras(mri.with_array(values), _SPACING_MM)
+        matrix = np.diag([_SPACING_MM] * 3 + [1.0])
+        matrix[:3, 3] = origin
+        grid = Volume(image, matrix)
+        mask = on_grid(mri.with_array(inside), grid) > 0.5
+        is_shown = on_grid(mri.with_array(np.ones(inside.shape, bool)), grid) > 0.99
+        depth = _depth(mask)
+        core = depth > _CORE_MM
+        return cls(mask, brightness_near(image, core, _SPACING_MM), depth, is_shown) if core.any() else None
+
+
+def _depth(mask: np.ndarray) -> np.ndarray:
+    return -signed_distance(mask, np.full(3, _SPACING_MM), 2.0 * _ABOVE_MM)
+
+
+def border_doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
+    """One line if a mask that was made by others reaches beyond the brain, or cuts it off; see cut_off."""
+    checked = _Checked.of(mri, inside)
+    if checked is None:
+        return ()
+    smooth = closed(checked.mask, _SULCI_MM / _SPACING_MM)
+    # A mask that ends in the scalp ends in bright tissue, too; that it cuts the cortex off would be the wrong word.
+    return (*_holes(checked, smooth), *(_taken_in(checked, smooth) or _cut_off(checked)))
+
+
+def _holes(checked: _Checked, smooth: np.ndarray) -> tuple[str, ...]:
+    """One line if the mask leaves out something deep in the brain, as one of grey and white matter does.
+
+    `smooth` (k, j, i) is the mask without sulci.
+    """
+    whole = cast(np.ndarray, ndimage.binary_fill_holes(smooth))
+    deep = cast(np.ndarray, ndimage.binary_erosion(whole, iterations=round(_HOLE_DEPTH_MM / _SPACING_MM)))
+    millilitres = float((deep & ~checked.mask).sum()) * _SPACING_MM**3 / 1000.0
+    if millilitres < _HOLE_ML:
+        return ()
+    return (
+        f"the mask leaves out {millilitres:.0f} ml deep in the brain, of ventricles, cisterns or fissures: "
+        "nothing there becomes tissue; a brain mask includes the CSF",
+    )
+
+
+def ends_at_edge(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
+    """One line for each edge of the image that cuts the brain (k, j, i) off; at the bottom only over a larger area.
+
+    A whole brain does not reach the edge but for the stem, however little of scalp and skull is shown.
+    """
+    lines = []
+    for axis in range(3):
+        others = [other for other in range(3) if other != axis]
+        cm2 = float(np.linalg.norm(np.cross(*mri.ijk_to_ras[:3, others].T))) / 100.0
+        for end in (0, -1):
+            area = float(inside.take(end, 2 - axis).sum()) * cm2
+            outwards = mri.ijk_to_ras[:3, axis] * (1 if end else -1)
+            main = int(np.abs(outwards).argmax())
+            name = _SECTORS[2 - main][int(outwards[main] > 0)]
+            if area >= (_WORTH_AT_BASE_CM2 if name == "bottom" else _WORTH_CM2):
+                lines.append(f"the brain reaches the {name} edge of the image over {area:.0f} cm2: it is cut off there")
+    return tuple(lines)
 
 
 def cut_off(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
@@ -24,43 +121,79 @@ def cut_off(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
     Not at the edge of the image, and at the skull base, where nerves, vessels and the spinal cord leave, only over a
     larger area: whole masks of four heads had up to 5 cm2 there, without the lower 25 to 60 mm 25 to 155 cm2.
     """
-    image, origin = resampled_to_ras(mri, _SPACING_MM)
-    matrix = np.diag([_SPACING_MM] * 3 + [1.0])
-    matrix[:3, 3] = origin
-    grid = Volume(image, matrix)
-    mask = on_grid(mri.with_array(inside), grid) > 0.5
-    is_shown = on_grid(mri.with_array(np.ones(inside.shape, bool)), grid) > 0.99
-    depth = -signed_distance(mask, np.full(3, _SPACING_MM), 2.0 * _ABOVE_MM)
-    core = depth > 8.0
-    if not core.any():  # a slab of a brain, with nothing deep to compare with
-        return ()
-    bright = brightness_near(image, core, _SPACING_MM)
-    tissue = (bright > _TISSUE[0]) & (bright < _TISSUE[1]) & is_shown
+    checked = _Checked.of(mri, inside)
+    return () if checked is None else _cut_off(checked)
+
+
+def _cut_off(checked: _Checked) -> tuple[str, ...]:
+    depth, bright = checked.depth, checked.brightness
+    tissue = (bright > _TISSUE[0]) & (bright < _TISSUE[1]) & checked.is_shown
     # The border is cut where tissue goes on without a gap from below it to well above it.
     above = (depth < 0.0) & (depth >= -_ABOVE_MM) & tissue
     below = (depth > 0.0) & (depth <= _BELOW_MM) & tissue
     solid = cast(np.ndarray, ndimage.binary_opening(tissue, np.ones((2, 2, 2))))
     across = cast(np.ndarray, ndimage.binary_dilation(below, iterations=2)) & above & solid
-    points = np.argwhere(mask)
-    centre = points.mean(axis=0)
+    points = np.argwhere(checked.mask)
+    centre, extent = points.mean(axis=0), np.ptp(points, axis=0)
     base = int(centre[0] + 10.0 / _SPACING_MM)
-    found = [(*_largest(across, slice(base, None)), _WORTH_CM2), (*_largest(across, slice(base)), _WORTH_AT_BASE_CM2)]
-    area, place, worth = max(found, key=lambda part: part[0] / part[2])
-    if area < worth:
+    found = np.vstack(
+        [_pieces(across, slice(base, None), _WORTH_CM2), _pieces(across, slice(base), _WORTH_AT_BASE_CM2)]
+    )
+    if len(found) == 0:
         return ()
-    away = place - centre
-    words = ("top" if away[0] > 0 else "bottom", "front" if away[1] > 0 else "back", "right" if away[2] > 0 else "left")
-    where = words[int(np.abs(away / np.ptp(points, axis=0)).argmax())]
+    away = (found - centre) / extent
+    axes = np.abs(away).argmax(axis=1)
+    sectors = 2 * axes + (np.take_along_axis(away, axes[:, None], 1)[:, 0] > 0)
+    areas = np.bincount(sectors, minlength=6) * _CM2_OF_VOXEL
+    names = [name for pair in _SECTORS for name in pair]
+    worth = [n for n in np.argsort(-areas) if areas[n] >= _WORTH_CM2] or [int(areas.argmax())]
+    places = [names[n] for n in worth]
+    where = "at the " + " and ".join([", ".join(places[:-1]), places[-1]] if len(places) > 1 else places)
+    if len(places) >= _ALL_AROUND:
+        where = "all around"
     return (
-        f"the mask ends in tissue as bright as the brain over {area:.0f} cm2 at the {where}; check the cortex there",
+        f"the mask ends in tissue as bright as the brain over {areas.sum():.0f} cm2 {where}; check the cortex there",
     )
 
 
-def _largest(across: np.ndarray, slices: slice) -> tuple[float, np.ndarray]:
-    """(area in cm2, centre (k, j, i)) of the largest piece within these slices."""
-    parts, count = ndimage.label(across[slices], np.ones((3, 3, 3)))  # type: ignore[misc]
-    if count == 0:
-        return 0.0, np.zeros(3)
-    sizes = np.bincount(parts.ravel())[1:]
-    place = np.argwhere(parts == sizes.argmax() + 1).mean(axis=0) + [slices.start or 0, 0, 0]
-    return float(sizes.max()) * _SPACING_MM**3 / _ABOVE_MM / 100.0, place
+def _pieces(across: np.ndarray, slices: slice, worth_cm2: float) -> np.ndarray:
+    """(voxels, 3) k, j, i of the connected pieces within these slices that are as large as `worth_cm2`."""
+    parts, _ = cast(tuple[np.ndarray, int], ndimage.label(across[slices], np.ones((3, 3, 3))))
+    sizes = np.bincount(parts.ravel()) * _CM2_OF_VOXEL
+    sizes[0] = 0.0
+    return np.argwhere((sizes >= worth_cm2)[parts]) + [slices.start or 0, 0, 0]
+
+
+def _taken_in(checked: _Checked, smooth: np.ndarray) -> tuple[str, ...]:
+    """One line if the mask reaches beyond the brain's surface nearly everywhere, into skull or scalp.
+
+    The surface is where the median brightness along the normals of the border falls half-way from the brain to the
+    dark outside it: CSF and skull in T1 and FLAIR, the skull in T2. In the upper half of the head, where nothing but
+    skull and scalp lies outside.
+    """
+    depth = _depth(smooth)
+    border = (depth > 0.0) & (depth <= 1.01 * _SPACING_MM)
+    border[: int(np.argwhere(smooth)[:, 0].mean())] = False
+    # Not where the image ends
+    border &= cast(np.ndarray, ndimage.binary_erosion(checked.is_shown, iterations=3))
+    points = np.argwhere(border)
+    if len(points) < 100:
+        return ()
+    depth = ndimage.gaussian_filter(depth, 1.0)
+    outwards = -np.stack([np.asarray(slope)[border] for slope in np.gradient(depth, _SPACING_MM)])
+    outwards /= np.maximum(np.linalg.norm(outwards, axis=0), 1e-6)
+    steps = (depth[border] - _DEPTHS_MM[:, None]) / _SPACING_MM  # (depths, points) voxels outwards
+    places = points.T[:, None] + outwards[:, None] * steps
+    profile = np.median(ndimage.map_coordinates(checked.brightness, places, order=1, mode="nearest"), axis=1)
+    brain = float(profile[_DEPTHS_MM > 11.0].max())
+    if profile.min() > _DARK * brain:  # within the brain: see cut_off
+        return ()
+    is_outside = profile < (brain + profile.min()) / 2.0
+    beyond = float(_DEPTHS_MM[is_outside.argmax()])
+    bright_csf = profile[: is_outside.argmax()].max(initial=0.0) > _BRIGHT_CSF * brain
+    if beyond < (_BEYOND_BRIGHT_CSF_MM if bright_csf else _BEYOND_MM):
+        return ()
+    return (
+        f"the mask reaches {beyond:.0f} mm beyond the surface of the brain over most of it; check that it takes in no "
+        "skull or scalp",
+    )

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tissue.label_files import names_of_file
+from SlicerUSSim.Logic.tissue.names import tissue_named
 
 #: Tissues of BraTS maps, from outside to inside: 1 is the necrotic core with tumour that does not enhance. Enhancing
 #: tumour is 4 until 2022 and 3 since, when 4 is a resection cavity (Menze et al., IEEE TMI 34(10), 2015; BraTS 2023).
-_BRATS_2022 = {"oedema": 2, "necrosis": 1, "enhancing": 4}
-_BRATS = {"oedema": 2, "necrosis": 1, "enhancing": 3, "cavity": 4}
+_BRATS = {
+    "brats-2022": {"oedema": 2, "necrosis": 1, "enhancing": 4},
+    "brats-2023": {"oedema": 2, "necrosis": 1, "enhancing": 3, "cavity": 4},
+}
+#: What several tissues are added as: by the names of their labels, or else as BraTS numbers them; without a year, by
+#: whether a label 3 occurs
+SEVERAL = ("brats", *_BRATS)
 #: More different whole numbers are an image and not a label map.
 _MOST_LABELS = 32
 #: Smallest and largest share at which a voxel becomes inside.
@@ -46,39 +57,68 @@ class Masks:
         return float(self.inside.sum() * self.union.voxel_ml)
 
 
-def read_masks(volume: Volume, tissue: str, source: str) -> Masks:
-    """What a volume holds: `tissue`, or with "brats" the tissues of a BraTS map.
+def read_mask(path: str | os.PathLike) -> Volume:
+    """A mask's file with the names of its labels: segments of a .seg.nrrd, a table beside it.
 
-    Raises SimulationError for an empty mask, and for an image that is neither a mask, nor a label map, nor
-    probabilities.
+    Raises SimulationError as Volume.read.
     """
+    return with_label_names(Volume.read(path), path)
+
+
+def with_label_names(volume: Volume, path: str | os.PathLike) -> Volume:
+    """The volume of a file with the names of its labels. Raises SimulationError for a table that cannot be read."""
+    return replace(volume, label_names=names_of_file(Path(path))[0])
+
+
+def read_masks(volume: Volume, tissue: str, source: str) -> Masks:
+    """What a volume holds: `tissue`, or with one of SEVERAL the tissues of its labels.
+
+    Raises SimulationError for an empty mask, for labels that have no tissue, and for an image that is neither a mask,
+    nor a label map, nor probabilities.
+    """
+    is_several = tissue in SEVERAL
     array = volume.array
     bad = int(array.size - np.isfinite(array).sum())
     require(bad == 0, f"{source}: has {bad} voxels that are not finite numbers, expected none")
-    values = _whole_numbers(array)
+    whole = _whole_numbers(array)
     low, high = float(array.min()), float(array.max())
-    if values is None:
+    if whole is None:
         require(
-            tissue != "brats" and low >= 0.0 and high <= 1.0,
+            not is_several and low >= 0.0 and high <= 1.0,
             f"{source}: holds numbers from {low:g} to {high:g}, expected a mask (0 and not 0), a label map"
-            + ("" if tissue == "brats" else ", or probabilities from 0 to 1"),
+            + ("" if is_several else ", or probabilities from 0 to 1"),
         )
         require(high > 0.5, f"{source}: no probability is above 0.5 (the largest is {high:g}); nothing would be added")
         return _masks(volume, {tissue: array}, source)
+    values = np.unique(whole).astype(int)
     require(
-        low >= 0 and len(values) <= _MOST_LABELS,
+        values[0] >= 0 and len(values) <= _MOST_LABELS,
         f"{source}: holds {_listed(values)}, as an image does, expected a mask: 0 outside and another number inside",
     )
-    require(high > 0, f"{source}: is empty, expected voxels that are not 0")
-    if tissue == "brats":
-        return _brats(volume, values, source)
+    labels = values[values > 0]
+    require(labels.size > 0, f"{source}: is empty, expected voxels that are not 0")
+    names = {int(label): volume.label_names[label] for label in labels if label in volume.label_names}
+    labelled = volume.with_array(whole)
+    if is_several:
+        return _by_name(labelled, labels, names, source) if names else _brats(labelled, labels, tissue, source)
     warnings = ()
-    if len(values) > 2:
+    if len(labels) > 1:
         warnings = (
-            f"{source} holds the labels {_listed(values[values > 0])}; all of them are added as {tissue}"
-            + (" (brats=FILE adds the tissues of a BraTS map)" if set(values.tolist()) <= {0, 1, 2, 3, 4} else ""),
+            f"{source} holds the labels {_called(labels, names)}; all of them are added as {tissue}"
+            f"{_alternative(labels, names)}",
         )
-    return _masks(volume, {tissue: array != 0}, source, warnings)
+    return _masks(volume, {tissue: whole != 0}, source, warnings)
+
+
+def _alternative(labels: np.ndarray, names: Mapping[int, str]) -> str:
+    """How several labels could be added as tissues of their own, in brackets; empty if it is not known."""
+    if not names:
+        return " (brats=FILE adds the tissues of a BraTS map)" if set(labels.tolist()) <= {1, 2, 3, 4} else ""
+    try:
+        tissues = [tissue_named(names[label]).name for label in labels.tolist()]
+    except (KeyError, SimulationError):
+        return ""
+    return f" (brats=FILE adds each by its name, as {', '.join(dict.fromkeys(tissues))})"
 
 
 def _masks(volume: Volume, shares: dict[str, np.ndarray], source: str, warnings: tuple[str, ...] = ()) -> Masks:
@@ -86,27 +126,63 @@ def _masks(volume: Volume, shares: dict[str, np.ndarray], source: str, warnings:
     return Masks(source, tuple(shares), stacked, volume.with_array(stacked.sum(axis=0)), warnings)
 
 
-def _brats(volume: Volume, values: np.ndarray, source: str) -> Masks:
-    there = set(values.tolist())
-    require(
-        there <= {0, 1, 2, 3, 4},
-        f"{source}: holds the labels {_listed(values[values > 0])}, expected those of BraTS: 1 necrosis, 2 oedema, 3 "
-        "enhancing and 4 cavity, or without 3: 4 enhancing",
+def _by_name(labelled: Volume, labels: np.ndarray, names: Mapping[int, str], source: str) -> Masks:
+    """The tissues that the names of the labels mean, whatever their numbers are."""
+    found: dict[str, list[int]] = {}
+    for label in labels.tolist():
+        name = names.get(label)
+        try:
+            tissue = None if name is None else tissue_named(name).name
+        except SimulationError:
+            tissue = None
+        require(
+            tissue is not None,
+            f"{source}: holds the labels {_called(labels, names)}, and {name or f'label {label}'!r} is called like no "
+            "tissue; rename it (tumour, oedema, necrosis, enhancing, cyst, cavity), or add every label from a file of "
+            "its own with its tissue",
+        )
+        found.setdefault(str(tissue), []).append(label)
+    masks = {tissue: np.isin(labelled.array, of_it) for tissue, of_it in found.items()}
+    pairs = ", ".join(
+        f"{' and '.join(repr(names[label]) for label in of_it)} as {tissue}" for tissue, of_it in found.items()
     )
-    is_old = 4 in there and 3 not in there
-    tissues = _BRATS_2022 if is_old else _BRATS
+    return _masks(labelled, masks, source, (f"{source}: labels are added by their names, {pairs}",))
+
+
+def _brats(labelled: Volume, labels: np.ndarray, year: str, source: str) -> Masks:
+    """The tissues of BraTS's numbers; `year` is one of SEVERAL."""
+    there = set(labels.tolist())
+    is_guessed = year == "brats" and 4 in there and 3 not in there
+    numbers = _BRATS["brats-2022" if is_guessed or year == "brats-2022" else "brats-2023"]
+    expected = ", ".join(f"{label} {name}" for name, label in sorted(numbers.items(), key=lambda item: item[1]))
+    if year == "brats":
+        expected += ", or without 3: 4 enhancing"
+    require(
+        there <= {*numbers.values()},
+        f"{source}: holds the labels {_listed(labels)}, expected those of BraTS: {expected}",
+    )
+    require(
+        there != {1},
+        f"{source}: holds the label 1 alone, as the mask of a whole tumour does, expected several labels of BraTS; add "
+        "it as what it is: tumour=FILE, or necrosis=FILE if it is BraTS's label 1",
+    )
     warnings = (f"{source}: label 4 is read as enhancing, as until 2022, and not as a cavity, without a label 3",)
-    masks = {name: volume.array == label for name, label in tissues.items() if label in there}
-    return _masks(volume, masks, source, warnings if is_old else ())
+    masks = {name: labelled.array == label for name, label in numbers.items() if label in there}
+    return _masks(labelled, masks, source, warnings if is_guessed else ())
 
 
 def _whole_numbers(array: np.ndarray) -> np.ndarray | None:
-    """The different values, if all are whole numbers, also when they are stored as float."""
-    if array.dtype == bool or np.issubdtype(array.dtype, np.integer):
-        return np.unique(array).astype(int)
-    if not np.array_equal(array, np.rint(array)) or np.abs(array).max() > 2**31:
-        return None
-    return np.unique(array).astype(int)
+    """The array, rounded, if it holds whole numbers, also when they are stored as float."""
+    if array.dtype == bool:
+        return array.astype(np.uint8)
+    return None if float(np.abs(array).max()) > 2**31 else whole_numbers(array)
+
+
+def _called(labels: np.ndarray, names: Mapping[int, str]) -> str:
+    """1 'Edema', 2 'Necrosis'"""
+    if not names:
+        return _listed(labels)
+    return ", ".join(f"{label} {names[label]!r}" if label in names else str(label) for label in labels.tolist())
 
 
 def _listed(values: np.ndarray) -> str:

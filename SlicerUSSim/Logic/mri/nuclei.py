@@ -7,6 +7,7 @@ it is. Only white matter becomes grey by it; CSF, vessels and lesions stay.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -18,6 +19,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import Atlas
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.classification import Classes
+from SlicerUSSim.Logic.mri.refinement import box_around
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ NUCLEI = (
 _DARKEST = 140.0
 #: Gaussians against the template's noise, and of the maps, which an affine transform leaves some millimetres off
 _TEMPLATE_SIGMA_MM, _SIGMA_MM = 0.7, 1.5
+#: Around the ellipsoids, for these
+_MARGIN_MM = 8.0
 #: Probability of a nucleus where its place leaves no doubt, and below which it is not looked for
 _MOST, _LEAST = 0.95, 0.02
 #: Shares of white matter, grey matter and voxels that are part of both in what surrounds a nucleus
@@ -74,19 +78,31 @@ def with_nuclei(found: Classes, values: np.ndarray, fit: AtlasFit, grid: Volume,
 def nuclear_maps(atlas: Atlas) -> tuple[np.ndarray, ...]:
     """(k, j, i) float32 probability of every one of NUCLEI, of both sides, on the grid of the template."""
     template, spacing = atlas.t1, atlas.t1.spacing_mm[::-1]
-    image = ndimage.gaussian_filter(template.array.astype(np.float32), _TEMPLATE_SIGMA_MM / spacing)
-    k, j, i = np.ogrid[tuple(map(slice, image.shape))]
-    x, y, z = (row[0] * i + row[1] * j + row[2] * k + row[3] for row in template.ijk_to_ras[:3])
     maps = []
     for nucleus in NUCLEI:
+        box, (x, y, z) = _around(nucleus, template)
+        image = ndimage.gaussian_filter(template.array[box].astype(np.float32), _TEMPLATE_SIGMA_MM / spacing)
         across, forward, up = (p - c for p, c in zip((np.abs(x), y, z), nucleus.centre, strict=True))
         cosine, sine = np.cos(np.radians(nucleus.degrees)), np.sin(np.radians(nucleus.degrees))
         turned = (cosine * across + sine * forward, cosine * forward - sine * across, up)
         ellipsoid = np.hypot.reduce([p / axis for p, axis in zip(turned, nucleus.half_axes, strict=True)]) < 1.0
         body = ndimage.binary_opening(ellipsoid & (image > _DARKEST) & (image < nucleus.brightest))
         body = ellipsoid & ndimage.binary_closing(body, iterations=2)
-        maps.append(_MOST * ndimage.gaussian_filter(body.astype(np.float32), _SIGMA_MM / spacing))
+        maps.append(np.zeros(template.array.shape, np.float32))
+        maps[-1][box] = _MOST * ndimage.gaussian_filter(body.astype(np.float32), _SIGMA_MM / spacing)
     return tuple(maps)
+
+
+def _around(nucleus: Nucleus, template: Volume) -> tuple[tuple[slice, ...], list[np.ndarray]]:
+    """((k, j, i) part of the template with both sides of a nucleus, x, y and z there in float32 RAS mm)."""
+    reach = max(nucleus.half_axes[:2]) + _MARGIN_MM, nucleus.half_axes[2] + _MARGIN_MM
+    x, y, z = nucleus.centre
+    corners = itertools.product(
+        (-x - reach[0], x + reach[0]), (y - reach[0], y + reach[0]), (z - reach[1], z + reach[1])
+    )
+    box = box_around(np.array(list(corners)), template)
+    k, j, i = np.ogrid[box]
+    return box, [(row[0] * i + row[1] * j + row[2] * k + row[3]).astype(np.float32) for row in template.ijk_to_ras[:3]]
 
 
 def _grey_to_white(found: Classes, values: np.ndarray) -> tuple[np.ndarray, float]:
@@ -118,6 +134,7 @@ def _belonging(line: np.ndarray, place: np.ndarray, noise: float) -> np.ndarray:
         joint = place * normal(mean, deviation)
         belonging = joint / (joint + around + 1e-12)
         total = belonging.sum() + 1e-12
-        mean = float(np.clip(belonging @ line / total, 0.0, _BRIGHTEST))
-        deviation = float(np.clip(np.sqrt(belonging @ (line - mean) ** 2 / total), noise, widest))
+        # Not by BLAS, whose threads wait for each other while another process works.
+        mean = float(np.clip((belonging * line).sum() / total, 0.0, _BRIGHTEST))
+        deviation = float(np.clip(np.sqrt((belonging * (line - mean) ** 2).sum() / total), noise, widest))
     return belonging

@@ -30,6 +30,10 @@ LESIONS = ("tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity", "enhan
 LARGEST_SHARE = 0.6
 #: A mask without a voxel in the patient may lie this far from it: a meningioma that brain extraction has cut off.
 FARTHEST_MM = 5.0
+#: Tissues that are part of a patient only as a lesion, which may be up to this large; gliomas with their oedema have up
+#: to 300 ml, a hemisphere 500 and more
+_LESIONS_ONLY = frozenset(LESIONS) - {"blood", "brats"}
+_LARGEST_LESION_ML = 400.0
 #: Shares below these are not mentioned.
 _LEAST_LEFT_OUT, _LEAST_OVER, _LEAST_LOST = 0.02, 0.01, 0.2
 
@@ -79,7 +83,13 @@ def tissue_to_add(name: str, tissue_names: Iterable[str] = ()) -> str:
 
 
 def add_tissue(
-    labels: Volume, tissue_names: Sequence[str], mask: Volume, tissue: str, *, source: str = "the mask"
+    labels: Volume,
+    tissue_names: Sequence[str],
+    mask: Volume,
+    tissue: str,
+    *,
+    source: str = "the mask",
+    has_brain_mask: bool = False,
 ) -> Added:
     """Lay a tissue over a label map, where a mask on any grid is inside.
 
@@ -90,8 +100,11 @@ def add_tissue(
     mask : not zero inside; or probabilities from 0 to 1, inside above 0.5. It is interpolated linearly at the voxels of
         `labels`, or averaged over them where they are larger.
     tissue : a name of `tissue_names` or of the presets: "tumour", "oedema", "necrosis", "cyst", "haematoma", "cavity";
-        "brats" adds the tissues of a BraTS map: 1 necrosis, 2 oedema, 3 enhancing, 4 cavity (4 enhancing without 3).
+        "brats" adds every label by its name in `mask.label_names`, or as a BraTS map: 1 necrosis, 2 oedema,
+        3 enhancing, 4 cavity (4 enhancing without 3; "brats-2022" and "brats-2023" say which).
     source : of the mask, for messages.
+    has_brain_mask : whether the labels are a segmentation within a brain mask, which may have cut a lesion off;
+        otherwise a lesion has to meet the patient.
 
     Voxels outside the patient are labelled too, with a warning. Raises SimulationError for an unknown tissue, a mask
     that is empty or no mask, one that does not meet the patient (other patient, other frame), and one that covers more
@@ -109,27 +122,35 @@ def add_tissue(
     >>> added.tissue_names
     ('white matter', 'tumour')
     """
-    return _added(labels, tissue_names, read_masks(mask, mask_tissue(tissue, tissue_names), source))
+    return _added(labels, tissue_names, read_masks(mask, mask_tissue(tissue, tissue_names), source), has_brain_mask)
 
 
 def add_tissues(
-    labels: Volume, tissue_names: Sequence[str], masks: Iterable[tuple[str, Volume, str]], *, also: Iterable[str] = ()
+    labels: Volume,
+    tissue_names: Sequence[str],
+    masks: Iterable[tuple[str, Volume, str]],
+    *,
+    also: Iterable[str] = (),
+    has_brain_mask: bool = False,
 ) -> Added:
     """Lay several tissues over a label map, the last on top; each is (tissue, mask, source) as in add_tissue.
 
-    `also` are names of tissues besides those of the labels and the presets.
+    `also` are names of tissues besides those of the labels and the presets; `has_brain_mask` as in add_tissue.
     """
     result = Added(labels, tuple(tissue_names))
     for name, mask, source in masks:
         tissue = mask_tissue(name, (*result.tissue_names, *also))
-        more = _added(result.labels, result.tissue_names, read_masks(mask, tissue, source))
+        more = _added(result.labels, result.tissue_names, read_masks(mask, tissue, source), has_brain_mask)
         result = replace(more, messages=result.messages + more.messages, warnings=result.warnings + more.warnings)
     return result
 
 
 def mask_tissue(name: str, tissue_names: Iterable[str] = ()) -> str:
-    """As tissue_to_add; "brats", also with a year, is itself."""
-    return "brats" if re.fullmatch(r"brats\W*(20\d\d)?", name.strip().lower()) else tissue_to_add(name, tissue_names)
+    """As tissue_to_add; "brats" is itself, and with a year "brats-2022" (until then) or "brats-2023" (since)."""
+    brats = re.fullmatch(r"brats\W*(20\d\d)?", name.strip().lower())
+    if brats is None:
+        return tissue_to_add(name, tissue_names)
+    return "brats" if not brats[1] else "brats-2022" if int(brats[1]) <= 2022 else "brats-2023"
 
 
 def texture_below(texture: Texture, mri: Volume, before: Volume, after: Volume) -> Texture:
@@ -147,7 +168,7 @@ def texture_below(texture: Texture, mri: Volume, before: Volume, after: Volume) 
     )
 
 
-def _added(labels: Volume, names: Sequence[str], masks: Masks) -> Added:
+def _added(labels: Volume, names: Sequence[str], masks: Masks, has_brain_mask: bool) -> Added:
     array, names = labels.array, tuple(names)
     require(
         bool(np.issubdtype(array.dtype, np.integer)), f"the labels hold {array.dtype} numbers, expected whole numbers"
@@ -159,7 +180,9 @@ def _added(labels: Volume, names: Sequence[str], masks: Masks) -> Added:
     covered = below[numbers > 0]
     met = int((covered > 0).sum())
     if not met:
-        require_in_patient(masks, float(mm_outside(array > 0, labels, masks).min()))
+        is_cut = has_brain_mask or not _is_lesion(masks)  # or is bone and skin around a brain
+        farthest_mm = FARTHEST_MM if is_cut else 0.0
+        require_in_patient(masks, float(mm_outside(array > 0, labels, masks).min()), farthest_mm)
     require_size(masks, met / patient)
     voxel_mm3 = 1000.0 * labels.voxel_ml
     require(
@@ -174,7 +197,7 @@ def _added(labels: Volume, names: Sequence[str], masks: Masks) -> Added:
             label, names = _label_of(tissue, array, names)
             result[where][numbers == number] = label
             messages.append(_message(tissue, over, names, voxel_mm3))
-    warnings = (*masks.warnings, *_warnings(masks, covered, lost, covered.size * voxel_mm3 / 1000.0))
+    warnings = (*masks.warnings, *_warnings(masks, covered, lost, covered.size * voxel_mm3 / 1000.0, has_brain_mask))
     for line in messages:
         _log.info("%s", line)
     for line in warnings:
@@ -211,8 +234,8 @@ def require_in_patient(masks: Masks, apart_mm: float, farthest_mm: float = FARTH
     """Raise SimulationError for masks that lie farther than this from the patient."""
     require(
         apart_mm <= farthest_mm,
-        f"{masks.source}: lies {apart_mm:.0f} mm outside the patient, expected a mask in the frame of the MRI; is it "
-        "of another patient, or not registered?",
+        f"{masks.source}: lies {max(apart_mm, 1.0):.0f} mm outside the patient, expected a mask in the frame of "
+        "the MRI or labels; is it of another patient, or not registered?",
     )
 
 
@@ -241,13 +264,27 @@ def _message(tissue: str, before: np.ndarray, names: Sequence[str], voxel_mm3: f
         name = names[label - 1] if 0 < label <= len(names) and names[label - 1] else f"label {label}"
         if share >= _LEAST_OVER:
             over.append(f"{name if label else 'voxels outside'} {100 * share:.0f} %")
-    return f"{tissue}: {before.size} voxels, {before.size * voxel_mm3 / 1000:.1f} ml, added over {', '.join(over)}"
+    cubic_mm = before.size * voxel_mm3
+    volume = f"{cubic_mm / 1000:.1f} ml" if cubic_mm >= 50.0 else f"{cubic_mm:.2g} mm³"
+    return f"{tissue}: {before.size} voxel{'s' * (before.size > 1)}, {volume}, added over {', '.join(over)}"
 
 
-def _warnings(masks: Masks, covered: np.ndarray, lost: float, volume_ml: float) -> Iterable[str]:
+def _is_lesion(masks: Masks) -> bool:
+    return all(tissue in _LESIONS_ONLY for tissue in masks.tissues)
+
+
+def _warnings(masks: Masks, covered: np.ndarray, lost: float, volume_ml: float, has_brain_mask: bool) -> Iterable[str]:
+    if _is_lesion(masks) and masks.volume_ml > _LARGEST_LESION_ML:
+        yield (
+            f"{masks.source}: has {masks.volume_ml:.0f} ml, expected a lesion of up to {_LARGEST_LESION_ML:.0f} ml; is "
+            "it the map of a tissue, or a part of the brain?"
+        )
     left_out = float((covered == 0).mean())
     if left_out >= _LEAST_LEFT_OUT:
-        yield f"the brain mask leaves out {left_out * 100:.0f} % of {masks.source}; those voxels are added"
+        where = f"the brain mask leaves out {left_out * 100:.0f} % of {masks.source}"
+        if not has_brain_mask:
+            where = f"{left_out * 100:.0f} % of {masks.source} lie where the labels have no tissue"
+        yield f"{where}; those voxels are added"
     if lost >= _LEAST_LEFT_OUT:
         yield f"{lost * 100:.0f} % of {masks.source} lie outside the volume of the labels and are not added"
     elif abs(volume_ml - masks.volume_ml) > _LEAST_LOST * masks.volume_ml:

@@ -10,7 +10,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML, AtlasFit
-from SlicerUSSim.Logic.mri.classification import EXPECTED_SHARES, ORDERS, Classes
+from SlicerUSSim.Logic.mri.classification import EXPECTED_SHARES, ORDERS, Classes, is_csf_near_grey
 from SlicerUSSim.Logic.mri.mixture import TISSUES
 
 #: Smallest extent of a whole brain along any axis of the image, mm
@@ -111,6 +111,18 @@ def require_several_tissues(found: Classes) -> None:
         f"{share:.1%} of the voxels are {found.names[largest]}, expected several tissues: no brain, or a wrong mask "
         "or contrast",
     )
+
+
+def csf_is_doubtful(found: Classes, contrast: str) -> list[str]:
+    """A warning where what was found as CSF is nearly as bright as grey matter, as without CSF in the mask."""
+    grey, white = found.grey_and_white
+    csf = float(found.means[found.names.index("csf"), 0])
+    if not is_csf_near_grey(csf, grey, white, contrast):
+        return []
+    return [
+        f"csf ({csf:.4g}) is nearer to grey matter ({grey:.4g}) than that to white matter ({white:.4g}) and may be "
+        "grey matter: check the labels, and that the brain mask includes the CSF"
+    ]
 
 
 def faint(found: Classes, noise: float) -> list[str]:

@@ -56,7 +56,7 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
         "image shows a fan on a constant background, as ultrasound does, expected an MRI; "
         "use the MRI of this patient (the command sweep takes tracked ultrasound as --sequence)",
     )
-    brain = _on_constant_background(mri)
+    brain = stripped_brain(mri)
     report(0.1)
     if brain is not None:
         return Shown(brain)
@@ -120,11 +120,21 @@ def _check_values(mri: Volume) -> None:
     air = float(np.percentile(values[::3, ::3, ::3], 5.0))
     require(
         not (low <= -900.0 and air < -500.0),
-        f"image has values from {low:g} to {high:g}, as CT has (Hounsfield units; air is -1000), expected an MRI",
+        f"image has values from {low:g} to {high:g}, as CT has (Hounsfield units; air is -1000), expected an MRI; if "
+        "it is one, set its background to 0",
+    )
+    border = np.concatenate(
+        [np.ravel(face[::3, ::3]) for n in range(3) for face in (values.take(m, n) for m in (0, -1))]
+    )
+    around, bright = float(np.median(border)), float(np.percentile(values[::3, ::3, ::3], 99.0))
+    require(
+        not (around >= bright and around > low),
+        f"the background ({around:g}) is as bright as the brightest tissue ({bright:g}): the intensities are inverted, "
+        "expected an MRI with a dark background",
     )
 
 
-def _on_constant_background(mri: Volume) -> np.ndarray | None:
+def stripped_brain(mri: Volume) -> np.ndarray | None:
     """(k, j, i) the brain of a skull-stripped image; None if it is not one.
 
     Its background has exactly one value, and its foreground the volume and the shape of a brain, without a skull.

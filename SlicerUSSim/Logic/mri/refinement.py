@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.coarse import resampled_to_ras
+from SlicerUSSim.Logic.mri.coarse import resampled_to_ras, widened
 from SlicerUSSim.Logic.mri.distances import distance_to
 
 _SPACING_MM = 1.2
@@ -50,7 +50,7 @@ def refined(mri: Volume, distance: np.ndarray, *, core_mm: float, reach_mm: floa
     opened = _connected(cast(np.ndarray, ndimage.binary_erosion(bright, ball)) | core, core)
     brain = cast(np.ndarray, ndimage.binary_dilation(opened, _ball(3.0 / mm))) & bright
     brain |= region & (far <= -keep_mm)
-    brain = _closed(brain | core, 5.0 / mm) & region
+    brain = closed(brain | core, 5.0 / mm) & region
     brain = cast(np.ndarray, ndimage.binary_fill_holes(brain))
     smooth = ndimage.gaussian_filter(brain.astype(np.float32), 0.8)
     matrix[:3, 3] += mm * np.array([part.start for part in box][::-1])
@@ -71,7 +71,7 @@ def brightness_near(image: np.ndarray, core: np.ndarray, spacing_mm: float) -> n
     near = ndimage.gaussian_filter(weight, deviation, truncate=6.0)
     level = ndimage.gaussian_filter(weight * some, deviation, truncate=6.0) / np.maximum(near, 1e-9)
     level = np.where(near > 1e-6, level, tissue)
-    wide = _widened(level, step, values.shape)
+    wide = widened(level, step, values.shape)
     return np.clip(values / np.maximum(wide, max(0.2 * tissue, 1e-6)), 0.0, 1.3).astype(np.float32)
 
 
@@ -91,15 +91,8 @@ def _tissue_from(brightness: np.ndarray, region: np.ndarray) -> np.ndarray:
     fluid, solid = (amount(np.where(part, some, 0.0)) / amount(part) for part in (is_fluid, is_solid))
     between = np.clip((fluid + solid) / 2.0, _LEAST_TISSUE, _TISSUE)
     share = amount(is_fluid) / amount(inside)
-    wide = _widened(share, step, brightness.shape) > _WIDE
-    return np.where(wide, _widened(between, step, brightness.shape), _TISSUE)
-
-
-def _widened(values: np.ndarray, step: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Values at every `step`-th voxel, interpolated to `shape`."""
-    wide = cast(np.ndarray, ndimage.zoom(values, step, order=1, grid_mode=True, mode="nearest"))
-    padding = [(0, max(0, n - m)) for n, m in zip(shape, wide.shape, strict=True)]
-    return np.pad(wide, padding, mode="edge")[tuple(slice(n) for n in shape)]
+    wide = widened(share, step, brightness.shape) > _WIDE
+    return np.where(wide, widened(between, step, brightness.shape), _TISSUE)
 
 
 def on_grid(volume: Volume, grid: Volume, outside: float = 0.0) -> np.ndarray:
@@ -111,6 +104,14 @@ def on_grid(volume: Volume, grid: Volume, outside: float = 0.0) -> np.ndarray:
         output=np.float32, order=1, mode="constant",
  cval=outside,
     )  # fmt: skip
+
+
+def box_around(points: np.ndarray, grid: Volume) -> tuple[slice, ...]:
+    """(k, j, i) part of a grid that holds (n, 3) RAS points, with a voxel more on every side."""
+    places = (points @ grid.ras_to_ijk[:3, :3].T + grid.ras_to_ijk[:3, 3])[:, ::-1]
+    ends = np.floor(places.min(axis=0)) - 1, np.ceil(places.max(axis=0)) + 2
+    first, last = (np.clip(end, 0, grid.array.shape).astype(int) for end in ends)
+    return tuple(map(slice, first, np.maximum(first, last)))
 
 
 def signed_distance(inside: np.ndarray, spacing_mm: np.ndarray, most_mm: float) -> np.ndarray:
@@ -137,7 +138,7 @@ def _ball(radius: float) -> np.ndarray:
     return x * x + y * y + z * z <= radius * radius
 
 
-def _closed(inside: np.ndarray, radius: float) -> np.ndarray:
+def closed(inside: np.ndarray, radius: float) -> np.ndarray:
     """Closing with a ball, by distances, which is quick for large balls."""
     n = int(radius) + 2
     padded = np.pad(inside, n)

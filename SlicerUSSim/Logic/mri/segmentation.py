@@ -36,6 +36,9 @@ from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
 
 _log = logging.getLogger(__name__)
 
+#: Means from which on the table has two decimals, and three digits below
+_LARGE = 10.0
+
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
@@ -92,11 +95,12 @@ class Segmentation:
         """Share, volume, mean intensity and standard deviation of every label, one per line."""
         counts = np.bincount(self.labels.array.ravel(), minlength=len(self.tissue_names) + 1)[1:]
         millilitres = counts * self.labels.voxel_ml
+        digits = ".2f" if np.abs(self.means).max() >= _LARGE else ".3g"  # of images from 0 to 1, or 1e-6
         lines = [f"{'label':>5}  {'tissue':14} {'share':>6} {'ml':>7} {'mean':>9} {'sd':>8}"]
         for n, name in enumerate(self.tissue_names):
             numbers = ""
             if n < len(self.means):
-                numbers = f" {self.means[n]:9.2f} {self.standard_deviations[n]:8.2f}"
+                numbers = f" {self.means[n]:9{digits}} {self.standard_deviations[n]:8{digits}}"
             lines.append(
                 f"{n + 1:5d}  {name:14} {counts[n] / max(counts.sum(), 1):6.1%} {millilitres[n]:7.1f}{numbers}"
             )
@@ -177,9 +181,10 @@ def segment_mri(
     notes, warnings = [brain.message], [*brain.warnings]
     images = [mri.with_array(intensity)]
     for name, other in others.items():
-        check_intensities(other, name)
+        named = f"{name} ({other.name})" if isinstance(other, Volume) and other.name else name
+        check_intensities(other, named)
         is_labels = other.looks_like_labels() or is_interpolated(other.array)
-        require(not is_labels, f"{name} is a label map, expected the intensities of an MRI")
+        require(not is_labels, f"{named} is a label map, expected the intensities of an MRI")
         image, message, doubts_of_it = aligned(other.with_array(finite(other)), images[0], foreground, name)
         images.append(image)
         notes.append(message)
@@ -192,6 +197,8 @@ def segment_mri(
             )
         timed("registration")
     part = BrainPart.of(images, foreground)
+    raised, above = part.raised(contrasts)
+    notes += raised
     atlas, message = atlas_of(part, report)
     notes.append(message)
     timed("atlas")
@@ -243,7 +250,7 @@ def segment_mri(
     return Segmentation(
         labels=mri.with_array(part.whole(labels)),
         tissue_names=tissue_names,
-        means=found.means[:, 0],
+        means=found.means[:, 0] + above,
         standard_deviations=found.standard_deviations[:, 0],
         weights=found.posteriors.mean(axis=1, dtype=float),
         log_likelihoods=found.mixture.log_likelihoods,

@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit, register_atlas
 from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import (
+    csf_is_doubtful,
     enhancement,
     faint,
     implausible,
@@ -26,6 +27,9 @@ from SlicerUSSim.Logic.mri.plausibility import (
 )
 from SlicerUSSim.Logic.mri.recognition import check_finite
 from SlicerUSSim.Logic.mri.sulci import sulcal_middles
+
+#: Percentile of the brain that is taken for 0 where it has more than this share of negative values
+_DARKEST, _FEW_NEGATIVE = 0.1, 0.01
 
 
 @dataclass(eq=False)
@@ -45,6 +49,22 @@ class BrainPart:
         matrix[:3, 3] = (matrix @ [*(side.start for side in reversed(box)), 1.0])[:3]
         parts = [Volume(np.ascontiguousarray(image.array[box], np.float32), matrix) for image in images]
         return cls(parts, inside[box], box, inside.shape)
+
+    def raised(self, contrasts: tuple[str, ...]) -> tuple[list[str], float]:
+        """(a line for each image that was raised, by how much the first was) where the brain has negative values.
+
+        Z-scores have them: a bias field multiplies, and what is multiplied has to be positive.
+        """
+        lines, above = [], 0.0
+        for n, (name, image) in enumerate(zip(contrasts, self.images, strict=True)):
+            values = image.array[self.inside]
+            low = float(np.percentile(values, _DARKEST))
+            if low >= 0.0 or float((values < 0.0).mean()) < _FEW_NEGATIVE:
+                continue
+            self.images[n] = image.with_array(np.maximum(image.array - np.float32(low), 0.0))
+            lines.append(f"{name}: has values below 0 in the brain, as z-scores have; counted from {low:.3g} on")
+            above = low if n == 0 else above
+        return lines, above
 
     def whole(self, array: np.ndarray) -> np.ndarray:
         """An array of the box on the whole grid, 0 elsewhere."""
@@ -133,6 +153,7 @@ def doubts(
     lines = require_order(found, contrasts[0], atlas is not None) if len(contrasts) == 1 else []
     lines += implausible(found, part.images[0], part.inside, atlas, contrasts[0])
     if len(contrasts) == 1:
+        lines += csf_is_doubtful(found, contrasts[0])
         lines += faint(found, noise)
     if contrasts == ("t1",):
         lines += enhancement(filtered, part.inside, *found.grey_and_white, part.images[0].voxel_ml)

@@ -198,7 +198,7 @@ class UltrasoundSceneLogic:
             )
         )  # fmt: skip
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
-        added = self._with_lesions(result.labels, result.tissue_names, lesions)
+        added = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=True)
         write_labels(labels_node, added.labels, added.tissue_names, mri_node)
         mark_as_made(labels_node)
         self._segmented = _Segmented(
@@ -264,7 +264,7 @@ class UltrasoundSceneLogic:
         lesions, skipped = self._lesions(lesions_node, labels_node)
         if labels_node.IsA("vtkMRMLSegmentationNode"):
             labels = padded_for(lesions, labels)  # it is cropped to what it holds
-        added = self._with_lesions(labels, names, lesions)
+        added = self._with_lesions(labels, names, lesions, has_brain_mask=was is not None)
         write_labels(output, added.labels, added.tissue_names, labels_node)
         mark_as_made(output)
         if was is not None and labels is was.labels:
@@ -528,9 +528,11 @@ class UltrasoundSceneLogic:
     def _lesions(self, lesions_node, to_frame_of) -> tuple[list[tuple[str, Volume, str]], list[str]]:
         return read_lesions(lesions_node, to_frame_of, self.preset.tissues)
 
-    def _with_lesions(self, labels: Volume, names: Sequence[str], lesions: list[tuple[str, Volume, str]]) -> Added:
+    def _with_lesions(
+        self, labels: Volume, names: Sequence[str], lesions: list[tuple[str, Volume, str]], *, has_brain_mask: bool
+    ) -> Added:
         own = [tissue.name for tissue in self.preset.tissues.all_tissues()]
-        return self._work.do(lambda: add_tissues(labels, names, lesions, also=own))
+        return self._work.do(lambda: add_tissues(labels, names, lesions, also=own, has_brain_mask=has_brain_mask))
 
     def _check_output(self, labels_node, output_node) -> None:
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")

@@ -5,6 +5,8 @@ Uses only nodes, and nothing of the `slicer` namespace.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
@@ -119,7 +121,7 @@ def read_volume(volume_node, use: str = "volume") -> Volume:
     image = volume_node.GetImageData()
     require(image is not None and image.GetNumberOfPoints() > 0, f"{use} {named(volume_node)} has no image data")
     try:
-        return Volume.from_vtk(image, ijk_to_ras(volume_node))
+        return replace(Volume.from_vtk(image, ijk_to_ras(volume_node)), name=volume_node.GetName() or "")
     except SimulationError as error:
         raise SimulationError(f"{use} {named(volume_node)}: {error}") from None
 

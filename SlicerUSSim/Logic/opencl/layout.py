@@ -20,10 +20,18 @@ CONSTANTS = {
     "SAME_GROUP": 0x80,  # added to the acoustic group of a voxel: all eight voxels of this cell have the same group
     "MEMBRANE_LABEL": 63,
     "MAX_TISSUES": 64,
-    "WIDE_SIGMA": 3.0,  # of the Gaussian that smooths the indicators of acoustic groups (medium.py), voxels
+    # Of the Gaussians that smooth the indicators of acoustic groups (borders.py), in voxels: at full resolution, and
+    # after that at half the resolution; with the variances of
+    # the Gaussians as cut off, the second together with the first
+    "WIDE_SIGMA": 3.0,
+    "WIDE_VARIANCE": 8.639,
+    "HALVED_SIGMA": 2.6,
+    "WIDEST_VARIANCE": 8.747,
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
+    "SOFT_SPEED": 0.105,  # largest relative difference of speed of sound at a soft border (common.clh), ...
+    "SOFT_REFLECTION": 0.12,  # ... and largest reflection coefficient at normal incidence
     "MAX_STACK": 24,  # reflected rays waiting to be followed
     "BLOCK": 64,  # samples over which beam widths and gains are assumed linear; lines are whole blocks long
     "BANDS": 4,  # of T1, into which a tissue's scatterers are divided when mu1 is varied (appearance.py)
@@ -46,6 +54,9 @@ ACQUISITION = np.dtype(
         ("voxel_mm", _FLOAT),  # smallest spacing
         ("smooth_groups", _INT),  # acoustic groups with a smoothed indicator
         ("membrane_reach", _FLOAT),  # half the membrane in units of the fluid distance (0..255); negative: none
+        ("membrane_gain", _FLOAT),  # of the amplitude of its scatterers at normal incidence
+        ("membrane_exponent", _FLOAT),  # of the cosine of incidence by which it falls
+        ("membrane_phase", _FLOAT),  # deviation of the echo's phase by its roughness, radians at normal incidence
         # probe and pose
         ("probe_to_ras", _FLOAT, 12),
         ("linear", _INT),
@@ -56,6 +67,7 @@ ACQUISITION = np.dtype(
         ("depth_mm", _FLOAT),
         # wave and beam (Probe.beam_sigma_mm)
         ("frequency_mhz", _FLOAT),
+        ("fractional_bandwidth", _FLOAT),
         ("reference_speed_m_s", _FLOAT),
         ("cycles_per_mm", _FLOAT),
         ("sample_mm", _FLOAT),
@@ -68,6 +80,21 @@ ACQUISITION = np.dtype(
         ("elevation_sigma", _FLOAT),
         ("elevation_focus", _FLOAT),
         ("elevation_rayleigh", _FLOAT),
+        # beams from an aperture (aperture.cl)
+        ("aperture_beams", _INT),
+        ("aperture_mm", _FLOAT),
+        ("receive_f_number", _FLOAT),
+        ("screen_lines", _INT),
+        ("screen_depths", _INT),
+        ("screen_step", _FLOAT),  # millimetres of path
+        ("fan_points", _INT),
+        ("fan_first", _FLOAT),  # place of the first point along the face, mm
+        ("fan_pitch", _FLOAT),
+        ("fan_angles", _INT),
+        ("fan_first_angle", _FLOAT),  # to the normal of the face, radians
+        ("fan_angle_step", _FLOAT),
+        ("fan_depths", _INT),  # from 0 on
+        ("fan_step", _FLOAT),  # between them, mm
         # ray tree
         ("max_ray_depth", _INT),
         ("intensity_threshold", _FLOAT),
@@ -88,7 +115,7 @@ ACQUISITION = np.dtype(
     ]
 )
 
-#: All but the group are attributes of a Tissue, by which the medium fills them.
+#: All but the last two are attributes of a Tissue, by which the medium fills them.
 TISSUE = np.dtype(
     [
         ("speed_of_sound_m_s", _FLOAT),
@@ -98,6 +125,7 @@ TISSUE = np.dtype(
         ("sigma0", _FLOAT),
         ("scatterer_share", _FLOAT),  # p = 1 - Phi(mu1)
         ("group", _INT),  # tissues of one speed and impedance: no interface between them
+        ("is_fluid", _INT),  # of the membrane's fluids
     ]
 )
 
@@ -132,10 +160,28 @@ HIT = np.dtype(
         ("attenuation", _FLOAT),
         ("cos_incidence", _FLOAT),
         ("reflectance", _FLOAT),  # R = r^2
-        ("echo", _FLOAT),  # amplitude written into the line, before the lateral beam profile
+        (
+            "lateral_slope",
+            _FLOAT,
+        ),  # depth (displayed) per mm of lateral offset along the interface, in the unfolded beam
+        ("elevational_slope", _FLOAT),  # the same for elevational offset
+        ("curvature", _FLOAT),  # mean curvature of the interface in 1/mm, positive where convex against the ray
+        ("elevational_mm", _FLOAT),  # the ray's offset from the beam axis
+        ("echo", _FLOAT),  # amplitude of a perpendicular interface over the whole beam, signed as r
         ("reflections", _INT),
         ("label_before", _INT),
         ("label_behind", _INT),
+    ]
+)
+
+#: The part of an interface echo near one hit, along the traced line and beside it (interfaces.cl).
+WALL = np.dtype(
+    [
+        ("depth_mm", _FLOAT),  # on the traced line
+        ("depth_per_line", _FLOAT),  # its change per traced line of distance to the scan line
+        ("echo", _FLOAT),  # amplitude on the traced line, ...
+        ("fall", _FLOAT),  # ... and its exponent of two per squared traced line
+        ("reach", _FLOAT),  # traced lines up to the cut-off of the beam
     ]
 )
 
@@ -156,5 +202,12 @@ def _c_struct(name: str, dtype: np.dtype) -> str:
 def shared_source() -> str:
     """C source of all constants and structs above; Device.kernels prepends it to a kernel file."""
     constants = [f"#define {name} {value}{'f' * isinstance(value, float)}" for name, value in CONSTANTS.items()]
-    dtypes = {"Acquisition": ACQUISITION, "Display": DISPLAY, "Tissue": TISSUE, "Segment": SEGMENT, "Hit": HIT}
+    dtypes = {
+        "Acquisition": ACQUISITION,
+        "Display": DISPLAY,
+        "Tissue": TISSUE,
+        "Segment": SEGMENT,
+        "Hit": HIT,
+        "Wall": WALL,
+    }
     return "\n".join(constants + [_c_struct(name, dtype) for name, dtype in dtypes.items()])

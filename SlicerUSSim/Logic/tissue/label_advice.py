@@ -11,12 +11,21 @@ class Advice:
 
     #: About labels without a tissue, before the list of tissues; {label} is one of them
     unknown: str = "map them with --map {label}=TISSUE (0 removes a label), a .json file or a table of names, to one of"
+    #: About several labels without a tissue
+    leave_out: str = "leave them out with {maps}"
     #: About a mask or lesion without a patient; {tissue}, {source} and {maps} are for this label map
     lesion: str = (
         "add it to a segmentation with --add {tissue}={source}, or simulate it alone with {maps} (ussim simulate)"
     )
+    #: The same about one as large as a brain
+    brain_mask: str = (
+        "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or simulate it alone with "
+        "{maps} (ussim simulate)"
+    )
     #: About numbers that several programs use; {key} is one of them
     ambiguous: str = "say which with --map {key}"
+    #: About numbers whose tissues are likely, but not certain; {maps} are options
+    likely: str = "if that is right, say so with {maps}"
     #: About voxels without a label between organs
     between: str = "--map 0=fat gives it a tissue"
     #: Whether the volumes of unknown labels are listed
@@ -27,15 +36,24 @@ COMMAND = Advice()
 #: The page of the workstation
 PAGE = replace(
     COMMAND,
+    leave_out="",
     unknown="name them in a table beside it (.txt), or start ussim serve --labels with --map {label}=TISSUE, one of",
     lesion="add it to a segmentation, or start ussim serve --labels {source} {maps}",
+    brain_mask=(
+        "if it is the mask of a brain, start ussim serve MRI --mask {source} with that brain's MRI, or ussim serve "
+        "--labels {source} {maps}"
+    ),
     ambiguous="start ussim serve --labels with --map {key}",
+    likely="if that is right, start ussim serve --labels with {maps}",
 )
 #: 3D Slicer
 SCENE = Advice(
-    "rename to one of",
-    "add it to a segmentation as a segment",
-    "give the label map colours with the names of its structures",
-    "a segment around them gives it a tissue",
+    unknown="rename to one of",
+    leave_out="",
+    lesion="add it to a segmentation as a segment",
+    brain_mask="if it is the mask of a brain, choose it as the brain mask of that brain's MRI",
+    ambiguous="give the label map colours with the names of its structures",
+    likely="if that is right, give the label map colours with these names",
+    between="a segment around them gives it a tissue",
     gives_sizes=False,
 )

@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.segments import segments_of
 
 _log = logging.getLogger(__name__)
 
@@ -103,14 +104,8 @@ def _header_names(path: Path) -> dict[int, str]:
 def _nrrd_names(path: Path) -> dict[int, str]:
     import nrrd
 
-    header = nrrd.read_header(str(path))
-    names = {}
-    for key, value in header.items():
-        found = re.fullmatch(r"Segment(\d+)_Name", key)
-        if found:
-            label = header.get(f"Segment{found[1]}_LabelValue", int(found[1]) + 1)
-            names[int(label)] = str(value)
-    return {label: name for label, name in names.items() if is_meaningful(name)}
+    found = {segment.label: segment.name for segment in segments_of(nrrd.read_header(str(path)), str(path))}
+    return {label: name for label, name in found.items() if is_meaningful(name)}
 
 
 def _nifti_names(path: Path) -> dict[int, str]:

@@ -9,6 +9,7 @@ from pathlib import PurePath
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.tissue.freesurfer import missing_structures
 from SlicerUSSim.Logic.tissue.label_advice import Advice
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, same_name, tissue_named
@@ -20,6 +21,8 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 _LONGEST_LIST = 12
 #: Tissues of a lesion, which alone are no patient
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
+#: A larger binary mask is that of a brain or a head.
+_LARGEST_LESION_ML = 500.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +70,10 @@ class Findings:
         of_file = _tissue_of_file(self.source) or "tumour"
         maps = " ".join(f"--map {label}={tissue or of_file}" for label, tissue in zip(self.names, known, strict=True))
         is_brats = self.scheme is not None and self.scheme.is_lesion
-        tissue = "brats" if is_brats else known[0] or of_file
-        remedy = self.advice.lesion.format(tissue=tissue, source=self.source, maps=maps)
+        tissue = "brats" if is_brats or len(set(known)) > 1 else known[0] or of_file
+        is_large = len(known) == 1 and self._millilitres(self.names) > _LARGEST_LESION_ML
+        advice = self.advice.brain_mask if is_large else self.advice.lesion
+        remedy = advice.format(tissue=tissue, source=self.source, maps=maps)
         if self.scheme is not None and is_brats and set(self.names) <= set(schemes()["ussim"].names):
             remedy += f"; if it is a brain, {self.advice.ambiguous.format(key='ussim')}"
         raise SimulationError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
@@ -80,6 +85,8 @@ class Findings:
             return
         remedy = self.advice.unknown.format(label=unknown[0])
         nothing = "no program's numbers are recognised, and " if len(unknown) == len(self.names) else ""
+        if len(unknown) > 1 and self.advice.leave_out:
+            remedy = f"{self.advice.leave_out.format(maps=' '.join(f'--map {n}=0' for n in unknown))}; or {remedy}"
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
         raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}; {remedy}: {known}")
@@ -99,6 +106,13 @@ class Findings:
         unused = self.mapping.unused(self.names)
         if unused:
             doubts.append(f"{self.source}: has no label {listed(unused)}, which --map mentions")
+        if self.scheme is not None and self.scheme.key == "freesurfer":
+            missing = missing_structures([name for name in self.names.values() if name is not None])
+            if missing:
+                doubts.append(
+                    f"{self.source}: a part of a brain, without {', '.join(missing)}: they are the coupling medium; "
+                    "a whole one is in aseg and aparc+aseg"
+                )
         is_body = self.scheme is not None and self.scheme.key.startswith("totalsegmentator")
         if is_body and 0 not in self.mapping.by_label and self.counts[0]:
             share = self.counts[0] / self.counts.sum()
@@ -115,8 +129,11 @@ class Findings:
             return repr(name or f"label {label}")
         return f"{name!r} ({label}, {self._size([label])})" if name else f"label {label} ({self._size([label])})"
 
+    def _millilitres(self, labels: Iterable[int]) -> float:
+        return float(self.counts[list(labels)].sum() * self.voxel_ml)
+
     def _size(self, labels: Iterable[int]) -> str:
-        size_ml = float(self.counts[list(labels)].sum() * self.voxel_ml)
+        size_ml = self._millilitres(labels)
         return f"{size_ml:.0f} ml" if size_ml >= 10 else f"{size_ml:.2g} ml"
 
 

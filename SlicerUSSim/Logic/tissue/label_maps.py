@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.volume import Volume, whole_numbers
+from SlicerUSSim.Logic.base.label_numbers import whole_numbers
+from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_findings import Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
@@ -22,10 +23,13 @@ from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised, scheme_with_names, schemes, title_of
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
+from SlicerUSSim.Logic.tissue.upright import wrong_way_up
 
 _log = logging.getLogger(__name__)
 
 LARGEST_LABEL = 99_999
+#: Smallest distance of a label from a whole number that is said
+_WORTH_ROUNDING = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +82,7 @@ def read_label_map(
     advice : remedies in messages.
 
     Raises SimulationError for numbers that are no labels, labels without a tissue, which it lists, numbers that fit
-    several programs, and for a mask or lesion without a patient.
+    several programs, a head that is upside down, and for a mask or lesion without a patient.
 
     >>> import numpy as np
     >>> from SlicerUSSim.Logic import Volume
@@ -95,6 +99,10 @@ def read_label_map(
         tissues or by_number or TissueTable.brain(), by_number, advice,
     )  # fmt: skip
     found = (None if renumber else reading.unchanged()) or reading.by_tissue()
+    off = 0.0 if np.issubdtype(volume.array.dtype, np.integer) else _largest_fraction(volume.array)
+    if off > _WORTH_ROUNDING:
+        line = f"{source}: was stored with a scale; labels are rounded by up to {off:.2g} to whole numbers"
+        found = replace(found, warnings=(*found.warnings, line))
     _log.info("%s: %s: %s", source, found.message, ", ".join(name for name in found.names if name))
     return found
 
@@ -105,13 +113,20 @@ def as_whole(volume: Volume, source: str = "label map") -> Volume:
     if array.dtype == np.uint8:
         return volume
     low, high = array.min(), array.max()
+    what = "a label map with negative labels, " if low < 0 else ""
+    remedy = "; set its background to 0, or add 1 if all labels are one too low" if low == -1 else ""
     require(
         bool(np.isfinite(low) and np.isfinite(high)) and low >= 0 and high <= LARGEST_LABEL,
-        f"{source}: has values from {low:g} to {high:g}, expected labels, whole numbers from 0 to {LARGEST_LABEL}",
+        f"{source}: {what}has values from {low:g} to {high:g}, expected labels, whole numbers from 0 to "
+        f"{LARGEST_LABEL}{remedy}",
     )
     whole = whole_numbers(array)
     require(whole is not None, f"{source}: has fractions, expected labels, whole numbers; segment an MRI first")
     return volume.with_array(np.asarray(whole).astype(np.int32))
+
+
+def _largest_fraction(array: np.ndarray) -> float:
+    return float(np.abs(array - np.rint(array)).max())
 
 
 class _Reading:
@@ -151,6 +166,7 @@ class _Reading:
         )  # fmt: skip
         findings.require_patient()
         findings.require_known()
+        self._require_upright(names)
         coupling = (self._by_number or self._tissues)[0]
         order: list[Tissue] = []
         relabelled = {0: 0}
@@ -177,6 +193,16 @@ class _Reading:
         message = f"{self._title(findings)}: {findings.labels()} to {tissues}"
         return LabelledTissues(labels, table, relabelled, message, (*self._warnings, *findings.doubts()))
 
+    def _require_upright(self, names: Mapping[int, str | None]) -> None:
+        """Raise SimulationError for a head that is upside down by what its labels are called."""
+        own = {label: name for label, name in names.items() if self._mapping.tissue_of(label, name) is None}
+        wrong = wrong_way_up(self._volume, own)
+        require(
+            wrong is None,
+            f"{self._source}: by its header, {wrong}; correct the orientation in its header, or export it again with "
+            "that of its MRI",
+        )
+
     # ---- what it is --------------------------------------------------------------------------------------------
 
     def _scheme(self) -> Scheme | None:
@@ -195,7 +221,25 @@ class _Reading:
             titles = " and ".join(scheme.title for scheme in recognition.candidates)
             remedy = self._advice.ambiguous.format(key=recognition.candidates[0].key)
             raise SimulationError(f"{self._source}: labels {listed(self._present)} fit {titles}; {remedy}")
+        if recognition.possible is not None:
+            remedy = self._advice.ambiguous.format(key=recognition.possible.key)
+            raise SimulationError(
+                f"{self._source}: labels {listed(self._present)} are all in {recognition.possible.title}'s table, but "
+                f"{recognition.doubt}; if they are {recognition.possible.title}'s, {remedy}"
+            )
+        if recognition.order:
+            raise SimulationError(f"{self._source}: {self._likely(recognition.order)}")
         return recognition.scheme
+
+    def _likely(self, order: Mapping[int, str]) -> str:
+        """What three labels of a brain probably are, and how to say so."""
+        total = self._counts[list(order)].sum()
+        parts = [f"{label} {tissue} ({self._counts[label] / total:.0%})" for label, tissue in sorted(order.items())]
+        maps = " ".join(f"--map {label}={tissue.split()[0]}" for label, tissue in sorted(order.items()))
+        return (
+            f"labels {listed(sorted(order))} are in no known program's order; by their amounts and places they are "
+            f"{listed(parts)}; {self._advice.likely.format(maps=maps)}"
+        )
 
     def _tissue(self, label: int, name: str | None) -> Tissue | None:
         given = self._mapping.tissue_of(label, name)

@@ -15,7 +15,8 @@ from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_files import names_of_file
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole, read_label_map
-from SlicerUSSim.Logic.tissue.probability_maps import combined_probability_maps
+from SlicerUSSim.Logic.tissue.partial_volume_maps import is_as_cat12_writes, partial_volume_labels
+from SlicerUSSim.Logic.tissue.probability_maps import CombinedMaps, combined_probability_maps
 from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 
 _log = logging.getLogger(__name__)
@@ -30,7 +31,7 @@ def is_label_file(path: Path, volume: Volume) -> bool:
     Raises SimulationError for a probability map whose companions are missing, and for a label map that was resampled
     with interpolation.
     """
-    if volume.looks_like_labels() or combined_probability_maps(path, volume) is not None:
+    if volume.looks_like_labels() or _without_labels(path, volume) is not None:
         return True
     require(
         not is_interpolated(volume.array),
@@ -38,6 +39,14 @@ def is_label_file(path: Path, volume: Volume) -> bool:
         "resampled with interpolation, expected an MRI or labels; resample the label map with nearest neighbours",
     )
     return False
+
+
+def _without_labels(path: Path, volume: Volume) -> CombinedMaps | None:
+    """The label map of what holds probabilities or partial volumes, and no labels; None if it is neither."""
+    maps = combined_probability_maps(path, volume)
+    if maps is not None or (is_interpolated(volume.array) and not is_as_cat12_writes(path, volume.array)):
+        return maps
+    return partial_volume_labels(path, volume)
 
 
 def is_interpolated(array: np.ndarray) -> bool:
@@ -76,8 +85,10 @@ def read_label_file(
     Raises SimulationError as read_label_map does.
     """
     mapping = mapping or LabelMapping()
-    maps = combined_probability_maps(path, volume)
+    maps = _without_labels(path, volume)
     if maps is not None:
+        if not any(mapping.tissue_of(label, name) for label, name in maps.names.items()):
+            maps.require_order(str(path), advice)
         found = read_label_map(
             maps.labels, maps.names, mapping, source=str(path), tissues=table or preset or default, advice=advice
         )
@@ -86,15 +97,14 @@ def read_label_file(
     if own is None and preset is None:
         own = table_beside(path)
     names, where = names_of_file(path)
-    whole = as_whole(volume, str(path))
-    present = np.flatnonzero(np.bincount(whole.array.ravel())).tolist()
+    present = np.flatnonzero(np.bincount(as_whole(volume, str(path)).array.ravel())).tolist()
     by_number = own
     if own is not None and all(label in own for label in present if label not in mapping.by_label):
         names = {}
     elif own is None and not names and preset is not None and all(label in preset for label in present if label):
         by_number = preset
     found = read_label_map(
-        whole, names, mapping, source=str(path), tissues=own or preset or default, by_number=by_number, advice=advice
+        volume, names, mapping, source=str(path), tissues=own or preset or default, by_number=by_number, advice=advice
     )
     return replace(found, message=f"{found.message}, named in {where}") if names else found
 

@@ -31,6 +31,8 @@ _WORDS: tuple[tuple[str, str], ...] = (
     ("oedema", "oedema, edema"),
     ("cyst", "cyst, cystic"),
     ("cavity", "resection, surgical cavity"),
+    ("tumour", "non enhancing, nonenhancing"),
+    ("enhancing", "enhancing, enhancement"),
     ("tumour", "tumor, tumour, glioma, glioblastoma, astrocytoma, metastasis, metastases, meningioma, cancer"),
     ("blood", "heart atrium, heart ventricle, atrial appendage, left atrium, right atrium"),
     ("haematoma", "haematoma, hematoma, haemorrhage, hemorrhage, bleeding, clot"),

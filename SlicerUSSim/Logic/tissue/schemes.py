@@ -15,7 +15,9 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue import freesurfer, totalsegmentator
+from SlicerUSSim.Logic.tissue.brain_orders import BrainLabels
 from SlicerUSSim.Logic.tissue.names import same_name
+from SlicerUSSim.Logic.tissue.thinning import thinning
 
 #: At least this share of the positions of structures has to agree with a scheme, and this number of them.
 _AGREEING, _FEWEST = 0.85, 3
@@ -25,13 +27,13 @@ _KNOWN = 0.85
 _KNOWN_IF_SURE = 0.6
 #: Pairs of left and right that leave no doubt about FreeSurfer's numbers; or regions of the cortex
 _SURE = 8
-#: Share of a volume that has to be outside a brain to tell how deep its tissues are
-_OUTSIDE = 0.2
-#: Voxels for the centres of structures; a larger volume is thinned out.
-_VOXELS = 2_000_000
 #: A label map of a tumour alone is smaller than this, and fills less of its box; a labelled brain is larger, and a part
 #: of one fills its box.
 _LARGEST_LESION_ML, _LARGEST_LESION_SHARE = 400.0, 0.25
+#: A brain with the fluid around it has up to 2 litres.
+_LARGEST_BRAIN_ML = 3000.0
+#: Depth of what is around others, by that of the others
+_SHALLOW = 0.7
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,12 @@ class Recognition:
     candidates: tuple[Scheme, ...] = ()
     #: Whether what is labelled left is on the right
     is_mirrored: bool = False
+    #: A scheme that has all labels, but whose places cannot be compared to be sure; then `scheme` is None
+    possible: Scheme | None = None
+    #: Why not
+    doubt: str = ""
+    #: {label: tissue} of the only order of CSF, grey and white matter that fits three labels of a brain, and no scheme
+    order: Mapping[int, str] = field(default_factory=dict)
 
 
 @cache
@@ -76,6 +84,9 @@ def schemes() -> dict[str, Scheme]:
     ):
         order = totalsegmentator.anatomical_order(names)
         entries.append(Scheme(key, title, totalsegmentator.numbered(names), order))
+    # Its task tissue_types: https://github.com/wasserth/TotalSegmentator, "Subtasks"
+    layers = {1: "subcutaneous_fat", 2: "torso_fat", 3: "skeletal_muscle"}
+    entries.append(Scheme("totalsegmentator-tissues", "TotalSegmentator tissue_types", layers))
     # FSL's FAST (<name>_seg, <name>_pveseg of a T1) numbers alike: https://fsl.fmrib.ox.ac.uk/fsl/docs/structural/fast
     fluid_first = {1: "csf", 2: "grey matter", 3: "white matter", 4: "leptomeninges"}
     entries.append(Scheme("ussim", "numbers of ussim segment and FSL FAST, with grey around white matter", fluid_first))
@@ -96,6 +107,7 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
     labels : (k, j, i) whole numbers.
     """
     centres = _centres(labels)
+    possible = None
     fits: list[tuple[int, Scheme]] = []
     for scheme in schemes().values():
         known = np.mean([value in scheme.names for value in values])
@@ -106,10 +118,14 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
             recognition = _freesurfer(scheme, values, float(known), holds, reverse, count)
             if recognition is not None:
                 return recognition
+            usual = np.mean([freesurfer.is_usual(value) for value in values])
+            if len(values) > 1 and min(known, usual) == 1 and holds >= _AGREEING * count:
+                possible = Recognition(None, possible=scheme, doubt="structures of both sides are too few to be sure")
         elif known >= _KNOWN and count >= _FEWEST and holds >= _AGREEING * count:
             fits.append((holds, scheme))
     if not fits:
-        return _of_brain(labels, values)
+        brain = _of_brain(labels, values)
+        return possible if possible and brain.scheme is None else brain
     most = max(holds for holds, _ in fits)
     best = [scheme for holds, scheme in fits if holds == most]
     if len({tuple(scheme.names.get(value) for value in values) for scheme in best}) > 1:
@@ -156,41 +172,40 @@ def scheme_with_names(names: Mapping[int, str]) -> Scheme | None:
 
 
 def _of_brain(labels: Volume, values: list[int]) -> Recognition:
-    """A brain as `ussim segment` numbers it, or a tumour as BraTS does: both have labels from 1 to 4."""
+    """A brain as `ussim segment` numbers it or in another order, or a tumour as BraTS does, with labels from 1 to 4."""
     known = schemes()
-    if not set(values) <= set(known["brats"].names) or len(values) < 2:
+    has_few = set(values) <= set(known["brats"].names)
+    if len(values) < 2 or (not has_few and len(values) != 3):
         return Recognition(None)
-    if 4 in values and 3 not in values:  # a brain without white matter, but with thin sulci, is none
+    if has_few and 4 in values and 3 not in values:  # a brain without white matter, but with thin sulci, is none
         return Recognition(known["brats-2022"])
     filled = int(np.count_nonzero(labels.array))
     volume_ml = filled * labels.voxel_ml
     if volume_ml < _LARGEST_LESION_ML and filled < _LARGEST_LESION_SHARE * labels.array.size:
-        return Recognition(known["brats"])
-    return Recognition(known["ussim"] if {2, 3} <= set(values) and _is_grey_between(labels) else None)
+        return Recognition(known["brats"] if has_few else None)
+    if volume_ml > _LARGEST_BRAIN_ML:
+        if set(values) == set(known["totalsegmentator-tissues"].names) and _is_outermost(labels, 1):
+            doubt = f"only amounts and places tell: {volume_ml / 1000:.1f} litres, label 1 around the others"
+            return Recognition(None, possible=known["totalsegmentator-tissues"], doubt=doubt)
+        return Recognition(None)
+    tissues = BrainLabels.of(labels, tuple(value for value in values if value < 4 or not has_few))
+    if has_few and {2, 3} <= set(values) and tissues.fits(1, 2, 3):
+        return Recognition(known["ussim"])
+    orders = tissues.orders() if len(values) == 3 else []
+    return Recognition(None, order=orders[0] if len(orders) == 1 else {})
 
 
-def _is_grey_between(labels: Volume) -> bool:
-    """Whether label 3 touches label 2 more than label 1, as white matter touches the grey more than the fluid.
-
-    And whether it is farther from the outside, so that programs that number white matter first, or the fluid last, are
-    not taken for this one.
-    """
+def _is_outermost(labels: Volume, label: int) -> bool:
+    """Whether a label is around the others, which may have holes."""
     from scipy import ndimage
 
-    array = labels.array.astype(np.uint8)
-    contacts = np.zeros(64, np.int64)
-    for axis in range(3):
-        first = np.moveaxis(array, axis, 0)
-        contacts += np.bincount((first[:-1] * np.uint8(8) + first[1:]).ravel(), minlength=64)
-    contacts = contacts.reshape(8, 8)
-    if (contacts + contacts.T)[3, 2] < (contacts + contacts.T)[3, 1]:
-        return False
-    step = max(1, int(np.ceil((array.size / _VOXELS) ** (1 / 3))))
-    thin = array[::step, ::step, ::step]
-    if np.mean(thin == 0) < _OUTSIDE:
-        return True  # a part of a brain
-    depth = np.asarray(ndimage.distance_transform_edt(thin > 0))
-    return float(depth[thin == 3].mean()) > float(depth[thin == 2].mean())
+    step = thinning(labels.array)
+    array = labels.array[::step, ::step, ::step]
+    solid = np.stack(
+        [np.asarray(ndimage.binary_fill_holes(one)) for one in array > 0]
+    )  # by slice: holes are open at the ends
+    depth = np.asarray(ndimage.distance_transform_edt(solid))
+    return bool(depth[array == label].mean() < _SHALLOW * depth[(array > 0) & (array != label)].mean())
 
 
 def _agreement(order: list[tuple[int, list[int]]], centres: Mapping[int, np.ndarray]) -> tuple[int, int, int]:
@@ -208,7 +223,7 @@ def _agreement(order: list[tuple[int, list[int]]], centres: Mapping[int, np.ndar
 
 def _centres(labels: Volume) -> dict[int, np.ndarray]:
     """{label: its centre in RAS mm}."""
-    step = max(1, int(np.ceil((labels.array.size / _VOXELS) ** (1 / 3))))
+    step = thinning(labels.array)
     array = labels.array[::step, ::step, ::step]
     where = np.nonzero(array)
     values, inverse, counts = np.unique(array[where], return_inverse=True, return_counts=True)

@@ -53,8 +53,8 @@ class Texture:
         """
         require(
             mri.array.shape == labels.array.shape and np.allclose(mri.ijk_to_ras, labels.ijk_to_ras, atol=1e-3),
-            f"the MRI ({'x'.join(map(str, mri.array.shape[::-1]))}) and the labels "
-            f"({'x'.join(map(str, labels.array.shape[::-1]))}) lie on different grids; resample one of them",
+            f"the MRI ({mri.size_text}) and the labels "
+            f"({labels.size_text}) lie on different grids; resample one of them",
         )
         require(bool(np.isfinite(mri.array).all()), "the MRI has values that are not finite, expected none")
         nothing = np.zeros(labels.array.shape, np.uint8)

@@ -276,6 +276,46 @@ def curved_mirror(
     return _phantom("curved mirror", label, tissues, rotation, 0.4, expected)
 
 
+# ---- soft tissue -----------------------------------------------------------------------------------------------------
+
+
+def folds(rotation: np.ndarray | None = None, *, spacing_mm: float = 0.5) -> Phantom[LevelChange]:
+    """Brain with sulci of 1.2 to 2 mm, nearly along the beam, down to 26 mm; `baseline` has one speed of sound."""
+    brain = Tissue("brain", REFERENCE_SPEED_M_S, 1.607, 0.0, mu0=0.33, sigma0=0.15)
+    fluid = Tissue("csf", 1504.5, 1.515, 0.0)
+    # (lateral position at the top, inclination, half-width, place of the bend) in millimetres
+    sulci = [
+        (-23.0, 0.1, 0.9, 3.0), (-15.0, -0.18, 0.7, 11.0), (-8.0, 0.15, 1.0, 7.0), (-2.5, 0.02, 0.6, 0.0),
+        (4.0, -0.12, 0.8, 5.0), (10.5, 0.2, 0.7, 9.0), (17.0, -0.05, 1.0, 2.0), (24.0, -0.2, 0.8, 6.0),
+    ]  # fmt: skip
+
+    def label(x, y, z):
+        labels = np.ones(np.broadcast_shapes(x.shape, y.shape, z.shape), np.uint8)
+        for start, inclination, half_width, bend in sulci:
+            middle = start + inclination * y + 1.2 * np.sin((y - bend) / 5.0)
+            labels[(np.abs(x - middle) < half_width) & (y > 2.0) & (y < 26.0 - 0.2 * bend)] = 2
+        return labels
+
+    tissues = TissueTable({0: brain, 1: brain, 2: fluid})
+    baseline = tissues.replace("csf", speed_of_sound_m_s=REFERENCE_SPEED_M_S)
+    return _phantom("folds", label, tissues, rotation, spacing_mm, lambda probe: (), baseline, _Box(half_width=32.0))
+
+
+def speed_cyst(
+    speed_m_s: float = 1440.0, rotation: np.ndarray | None = None, *, radius_mm: float = 4.0
+) -> Phantom[LevelChange]:
+    """An echo-free cylinder of another speed of sound at 20 mm, in speckle without attenuation."""
+    plain = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
+    fluid = replace(plain, name="cyst", speed_of_sound_m_s=speed_m_s, mu0=0.0, sigma0=0.0)
+    tissues = TissueTable({0: plain, 1: plain, 2: fluid})
+    baseline = tissues.replace("cyst", speed_of_sound_m_s=REFERENCE_SPEED_M_S)
+
+    def label(x, y, z):
+        return np.where(_in_cylinder(x, y, (0.0, 20.0), radius_mm), 2, 1)
+
+    return _phantom("speed cyst", label, tissues, rotation, 0.5, lambda probe: (), baseline)
+
+
 # ---- resolution and speckle -----------------------------------------------------------------------------------------
 
 
@@ -356,6 +396,7 @@ def layered(
     tilt_deg: float = 0.0,
     spacing_mm: float = 0.5,
     half_width_mm: float = 50.0,
+    half_thickness_mm: float = _Box().half_thickness,
 ) -> Phantom[Echo]:
     """Plane layers of labels 1, 2, ... with interfaces at the given depths on the axis, tilted about z."""
     require(
@@ -381,7 +422,7 @@ def layered(
 
     table = TissueTable(dict(enumerate(tissues, 1)))
     # In a fast layer the field extends beyond its nominal depth.
-    box = _Box(half_width=half_width_mm, bottom=60.0)
+    box = _Box(half_width=half_width_mm, bottom=60.0, half_thickness=half_thickness_mm)
     return _phantom("layers", label, table, rotation, spacing_mm, expected, box=box)
 
 
@@ -451,6 +492,17 @@ def voxel_sheet(
         _facing(depth_mm - 0.5 * thickness),
         box=_Box(half_width=50.0),
     )
+
+
+def thin_slab(thickness_mm: float, rotation: np.ndarray | None = None, *, depth_mm: float = 15.0) -> Phantom[Echo]:
+    """A slab across the beam, thinner than a pulse, in voxels of 0.05 mm; 6 mm wide, more than a narrow beam."""
+
+    def label(x, y, z):
+        return np.where((y > depth_mm) & (y < depth_mm + thickness_mm), 1, 0)
+
+    tissues = TissueTable({0: FLUID, 1: replace(FLUID, name="slab", impedance_mrayl=1.9)})
+    box = _Box(3.0, depth_mm - 1.0, depth_mm + 1.0 + thickness_mm, 3.0)
+    return _phantom("thin slab", label, tissues, rotation, 0.05, _facing(depth_mm), box=box)
 
 
 def _facing(depth_mm: float) -> Callable[[Probe], tuple[Echo, ...]]:

@@ -231,7 +231,7 @@ class SegmentationFilter(_ImageFilter):
         )  # fmt: skip
         output = vtkImageData.GetData(outInfo)
         output.CopyStructure(mri)
-        added = add_tissues(found.labels, found.tissue_names, masks)
+        added = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=True)
         set_scalars(output, added.labels.array)
         set_tissue_names(output, added.tissue_names)
         self._segmentation = found

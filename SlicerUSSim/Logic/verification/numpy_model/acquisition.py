@@ -28,7 +28,9 @@ def acquisition_record(
     record = np.zeros((), ACQUISITION)
     first, spacing, radius = _geometry(probe)
     lateral, guard = _traced_lines(probe, settings)
+    traced = 2 * guard + 1 + lateral * (probe.scan_lines - 1)
     samples = int(np.ceil(probe.depth_mm / sample_mm(probe, settings)))
+    membrane = medium.tissues.membrane
     transmit = _one_way_sigma(probe, probe.focus_mm / probe.aperture_mm)
     elevational = _one_way_sigma(probe, probe.elevation_focus_mm / probe.elevation_aperture_mm)
     values = {
@@ -37,6 +39,9 @@ def acquisition_record(
         "voxel_mm": medium.voxel_mm,
         "smooth_groups": medium.smooth_groups,
         "membrane_reach": medium.membrane_reach,
+        "membrane_gain": np.exp(membrane.diffuse_db * np.log(10.0) / 20.0) if membrane else 0.0,
+        "membrane_exponent": membrane.diffuse_exponent if membrane else 0.0,
+        "membrane_phase": 2.0 * np.pi * _cycles_per_mm(probe, settings) * membrane.roughness_mm if membrane else 0.0,
         "probe_to_ras": np.asarray(probe_to_ras, float)[:3].ravel(),
         "linear": isinstance(probe, LinearProbe),
         "apex_radius_mm": radius,
@@ -45,6 +50,7 @@ def acquisition_record(
         "scan_lines": probe.scan_lines,
         "depth_mm": probe.depth_mm,
         "frequency_mhz": probe.frequency_mhz,
+        "fractional_bandwidth": probe.fractional_bandwidth,
         "reference_speed_m_s": settings.reference_speed_m_s,
         "cycles_per_mm": _cycles_per_mm(probe, settings),
         "sample_mm": sample_mm(probe, settings),
@@ -57,6 +63,11 @@ def acquisition_record(
         "elevation_sigma": elevational / np.sqrt(2.0),
         "elevation_focus": probe.elevation_focus_mm,
         "elevation_rayleigh": _rayleigh_mm(probe, elevational),
+        "aperture_beams": settings.beam == "aperture",
+        "aperture_mm": probe.aperture_mm,
+        "receive_f_number": probe.receive_f_number,
+        "screen_lines": max(2, int(np.ceil(traced / 3))),
+        **_fans(probe, medium.voxel_mm, 0.5 * (traced - 1) * spacing / lateral),
         "max_ray_depth": settings.max_ray_depth if settings.reflections else 0,
         "intensity_threshold": settings.intensity_threshold,
         "reflection_threshold": settings.reflection_threshold,
@@ -64,7 +75,7 @@ def acquisition_record(
         "elevational_rays": settings.elevational_rays,
         "lateral_rays": lateral,
         "guard_lines": guard,
-        "traced_lines": 2 * guard + 1 + lateral * (probe.scan_lines - 1),
+        "traced_lines": traced,
         "interface_gain": np.exp(settings.interface_gain_db * np.log(10.0) / 20.0),
         "interface_is_energy": settings.interface_reflection == "energy",
         "specular_exponent": settings.specular_exponent,
@@ -123,6 +134,39 @@ def noise_key(acquisition: np.ndarray, noise_seed: int) -> np.uint32:
     """Initial value of the noise's hash."""
     seed, draw = np.array([acquisition["seed"]], np.uint32), np.array([noise_seed], np.uint32)
     return (seed * np.uint32(0x9E3779B1) + np.uint32(0x7F4A7C15) + hash_mix(draw))[0]
+
+
+def _fans(probe: Probe, voxel_mm: float, edge: float) -> dict[str, float]:
+    """Fans and screens of beams, for lines traced between -edge and edge (radians about the apex, or millimetres)."""
+    _, _, radius = _geometry(probe)
+    longest = 1.06 * probe.depth_mm  # paths in the fastest soft tissue
+    screens = min(max(int(np.ceil(longest / 5.0)), 8), 24)
+    # By the triangle inequality, no point of the aperture is further from a target than the axis and half of it.
+    reach = longest + 0.5 * probe.aperture_mm
+    depths = min(int(np.ceil(reach / min(max(voxel_mm, 0.25), 1.0))) + 1, 192)
+    # The aperture's edges are seen under 1 / (2 f-number); from a curved array, also under its own angle.
+    half_angle, length, pitch = 0.5 / probe.receive_f_number, probe.aperture_mm, probe.aperture_mm / 12.0
+    if isinstance(probe, PhasedProbe):
+        half_angle += edge
+    else:
+        length += 2.0 * edge * (radius if isinstance(probe, ConvexProbe) else 1.0)
+        pitch = max(pitch, length / 95.0)
+        if isinstance(probe, ConvexProbe):
+            half_angle += 0.5 * (probe.aperture_mm + pitch) / radius
+    half_angle = min(half_angle, 1.5)
+    points, angles = round(length / pitch) + 1, int(np.ceil(2.0 * half_angle / 0.035)) + 1
+    return {
+        "screen_depths": screens,
+        "screen_step": longest / screens,
+        "fan_points": points,
+        "fan_first": 0.5 * pitch * (1 - points),
+        "fan_pitch": pitch,
+        "fan_angles": angles,
+        "fan_first_angle": -half_angle,
+        "fan_angle_step": 2.0 * half_angle / (angles - 1),
+        "fan_depths": depths,
+        "fan_step": reach / (depths - 1),
+    }
 
 
 def _geometry(probe: Probe) -> tuple[float, float, float]:

@@ -9,6 +9,7 @@ from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     LOG2_E,
     affine_point,
+    exp,
     exp2,
     f32,
     gaussian,
@@ -103,13 +104,14 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     at = affine_point(acquisition["ras_to_voxel"], segment["start"])
     rows = acquisition["ras_to_voxel"].reshape(3, 4)[:, order]
     voxel = np.stack([at[n] + p[0] * r[0] + p[1] * r[1] + p[2] * r[2] for n, r in enumerate(rows)], axis=-1)
-    tissue = tissues[drawn_labels(acquisition, labels, voxel, key2)]
+    label, of_sheet = drawn_labels(acquisition, labels, voxel, key2, segment["direction"])
+    tissue = tissues[label]
     share = tissue["scatterer_share"]
     exists = ((key2 >> np.uint32(16)).astype(np.float32) + f32(0.5) < share * f32(65536)).astype(np.float32)
     strength = tissue["mu0"] * (exists - share) + tissue["sigma0"] * gaussian(key1) * exists
     amplitude = exp2(np.clip(gain[0] + t * (gain[1] - gain[0]) - r2, f32(-100), f32(100)))
     cosine, sine = turn(depth * acquisition["cycles_per_mm"])
-    echo = strength * amplitude * (cosine - 1j * sine)
+    echo = of_sheet * strength * amplitude * (cosine - 1j * sine)
     for edge, of_edge in enumerate((f32(1) - right, right)):
         for ahead, of_sample in enumerate((f32(1) - part, part)):
             here = bins + ahead
@@ -128,32 +130,103 @@ def _cells_of_box(acquisition, start, d, side, e, low, high, radius_l, sigma_e) 
     return np.stack(np.meshgrid(*map(np.arange, first, last + 1), indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def drawn_labels(acquisition, labels: Labels, voxel: np.ndarray, random: np.ndarray) -> np.ndarray:
-    """The labels of scatterers at (n, 3) voxel positions: that of a random corner by weight, or the membrane."""
+def drawn_labels(
+    acquisition, labels: Labels, voxel: np.ndarray, random: np.ndarray, direction: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(labels, gains) of scatterers at (n, 3) voxel positions: that of a random corner by weight, or the membrane.
+
+    The gain of the membrane's falls with the angle between the beam's `direction` (RAS) and the sheet.
+    """
     here, f = labels.cells(voxel)
     threshold = ((random[:, None] >> np.array([0, 5, 10], np.uint32)) & np.uint32(31)).astype(np.float32) + f32(0.5)
     corner = here + (f * f32(32) > threshold) @ labels.steps
     label = labels.label[corner].astype(int)
+    gain = np.ones(len(label), np.float32)
     if labels.distance is None:
-        return label
-    distance = labels.distance[here[:, None] + labels.corner_steps].astype(np.float32)
-    for axis in range(3):  # x first
-        distance = distance[:, ::2] + f[:, axis : axis + 1] * (distance[:, 1::2] - distance[:, ::2])
-    label[np.abs(distance[:, 0] - f32(127.5)) < acquisition["membrane_reach"]] = CONSTANTS["MEMBRANE_LABEL"]
-    return label
+        return label, gain
+    corners = labels.distance[here[:, None] + labels.corner_steps].astype(np.float32)
+
+    def derived(along: int | None) -> np.ndarray:
+        """The trilinear distance, or its derivative along one axis."""
+        rest = corners
+        for axis in range(3):  # x first
+            near, rise = rest[:, ::2], rest[:, 1::2] - rest[:, ::2]
+            rest = rise if axis == along else near + f[:, axis : axis + 1] * rise
+        return rest[:, 0]
+
+    thin = np.abs(derived(None) - f32(127.5)) < acquisition["membrane_reach"]
+    label[thin] = CONSTANTS["MEMBRANE_LABEL"]
+    to_voxel = acquisition["ras_to_voxel"].reshape(3, 4)[:, :3]
+    normal = np.stack([derived(axis)[thin] for axis in range(3)], axis=-1) @ to_voxel
+    size = np.maximum(np.sqrt((normal**2).sum(axis=1)), f32(1e-6))
+    cosine = np.maximum(np.abs(normal @ direction) / size, f32(1e-6))
+    gain[thin] = acquisition["membrane_gain"] * cosine ** acquisition["membrane_exponent"]
+    return label, gain
 
 
-def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndarray, lines: np.ndarray) -> None:
-    """Add every hit as an impulse at its time, half on either side of its line."""
-    place = hits["depth_mm"] / acquisition["sample_mm"]
-    bins = np.floor(place).astype(int)
-    fits = (bins >= 0) & (bins + 1 < int(acquisition["samples"]))
-    hits, hit_lines, bins, part = hits[fits], hit_lines[fits], bins[fits], (place - np.floor(place))[fits]
-    cosine, sine = turn(hits["depth_mm"] * acquisition["cycles_per_mm"])
-    echo = f32(0.5) * hits["echo"] * (cosine - 1j * sine)
-    for side in (0, 1):
-        np.add.at(lines, (2 * hit_lines + side, bins), echo * (f32(1) - part))
-        np.add.at(lines, (2 * hit_lines + side, bins + 1), echo * part)
+def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndarray, scanned: np.ndarray) -> None:
+    """Add every hit to the scan lines near it, as a Gaussian patch of a plane (docs/physics.md#3-rays)."""
+    beam, rays = Beam(acquisition), acquisition["elevational_rays"].astype(np.float32)
+    # Of lines much closer than the beam is wide, only some: at least four, at most eight per standard deviation
+    crowd = np.floor(np.log2(beam.lateral_sigma(hits["path_mm"]) / beam.line_distance(hits["path_mm"]) / f32(4)))
+    crowd = 2 ** np.clip(crowd, 0, 6).astype(int)
+    hits, hit_lines, crowd = (values[hit_lines % crowd == 0] for values in (hits, hit_lines, crowd))
+    step = beam.line_distance(hits["path_mm"]) * f32(crowd)
+    lateral, elevational = beam.lateral_sigma(hits["path_mm"]), beam.elevation_sigma(hits["path_mm"])
+    width = np.sqrt(lateral * lateral + step * step / f32(12))
+    # How far the centre of phase moves towards the scan line, and the fraction of the squared phase inside a patch
+    carried = [np.minimum((f32(0.45) * step / width) ** 2, f32(1)), np.minimum(f32(10) / (rays * rays), f32(1))]
+    within = [
+        np.maximum(f32(1) - ((f32(1) - carried[0]) * width / lateral) ** 2, f32(0)),
+        f32(1) - (f32(1) - carried[1]) ** 2,
+    ]
+    per_slope = f32(2 * np.pi) * acquisition["cycles_per_mm"]
+    stretch = np.minimum(f32(1) + hits["lateral_slope"] ** 2, f32(10))
+    bend = hits["curvature"] * stretch * np.sqrt(stretch)
+    depth = hits["depth_mm"] - carried[1] * hits["elevational_slope"] * hits["elevational_mm"]
+    whole, inside, zones = f32(0), f32(0), []
+    for part, sigma, axis in zip(within, (lateral, elevational), ("lateral", "elevational"), strict=True):
+        slope, variance = hits[f"{axis}_slope"], part * sigma * sigma
+        turning = per_slope * bend * variance
+        zones.append(f32(1) + turning * turning)
+        whole = whole + (per_slope * slope * sigma) ** 2
+        inside = inside + (per_slope * slope) ** 2 * variance / zones[-1]
+        depth = depth - f32(0.5) * per_slope * slope * slope * turning * variance / zones[-1]
+    share = _patch_echo(acquisition, whole, inside)
+    depth_per_line = carried[0] * hits["lateral_slope"] * step
+    strength = hits["echo"] * zones[0] ** f32(-0.25) * share * step / width * f32(1 / np.sqrt(2 * np.pi))
+    reach = f32(1.35) * acquisition["beam_cutoff"] * width / step
+    for line, sums in enumerate(scanned):
+        away = f32(int(acquisition["guard_lines"]) + line * int(acquisition["lateral_rays"]) - hit_lines)
+        away = away / f32(crowd)
+        at = depth + away * depth_per_line
+        place = at / acquisition["sample_mm"]
+        bins = np.floor(place).astype(int)
+        near = (np.abs(away) <= reach) & (share >= f32(1e-4)) & (bins >= 0) & (bins + 1 < len(sums))
+        part = (place - np.floor(place))[near]
+        cosine, sine = turn((at * acquisition["cycles_per_mm"])[near])
+        profile = exp2(np.maximum(f32(-0.5) * LOG2_E * (away * step / width)[near] ** 2, f32(-100)))
+        echo = strength[near] * profile * (cosine - 1j * sine)
+        np.add.at(sums, bins[near], echo * (f32(1) - part))
+        np.add.at(sums, bins[near] + 1, echo * part)
+
+
+def _patch_echo(acquisition: np.ndarray, phase2: np.ndarray, inside2: np.ndarray) -> np.ndarray:
+    """Factor of a patch that has `inside2` of the squared phase; exact for planes down to -30 dB."""
+    seen = np.minimum(f32(1), f32(9) / np.maximum(phase2, f32(1e-6)))
+    whole, inside = (_plane_echo(acquisition, seen * part) for part in (phase2, inside2))
+    between = _plane_echo(acquisition, seen * (phase2 - inside2))
+    return _plane_echo(acquisition, inside2) * whole / (inside * between)
+
+
+def _plane_echo(acquisition: np.ndarray, phase2: np.ndarray) -> np.ndarray:
+    """Peak echo of an oblique plane re a perpendicular one, by the squared phase over the beam's sigma.
+
+    Both the beam's fall with the phase and the pulse's spectrum are Gaussian in the frequency.
+    """
+    relative_bandwidth = acquisition["fractional_bandwidth"] / f32(np.sqrt(8.0 * np.log(2.0)))
+    spread = f32(1) + phase2 * relative_bandwidth * relative_bandwidth
+    return exp(f32(-0.5) * phase2 / spread) / np.sqrt(spread)
 
 
 def lateral_beam(acquisition: np.ndarray, lines: np.ndarray) -> np.ndarray:

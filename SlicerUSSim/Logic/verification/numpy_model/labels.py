@@ -5,8 +5,19 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.verification.numpy_model.elementary import LOG2_E, dot, exp, exp2, f32, length, log, ramp, sum8
-from SlicerUSSim.Logic.verification.numpy_model.medium import WIDE_SIGMA, HostMedium
+from SlicerUSSim.Logic.verification.numpy_model.elementary import (
+    LOG2_E,
+    dot,
+    exp,
+    exp2,
+    f32,
+    length,
+    log,
+    ramp,
+    sum8,
+    unit,
+)
+from SlicerUSSim.Logic.verification.numpy_model.medium import HALVED_SIGMA, WIDE_SIGMA, HostMedium
 
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])  # (x, y, z) of the corners of a cell
 _FINE_SIGMA = f32(1.5)
@@ -28,7 +39,11 @@ class Labels:
         # Rows of eight voxels are read at once, including the last one.
         self.groups = np.pad(medium.group.ravel(), (0, 8))
         self.smooth_groups = medium.smooth_groups
-        self.smooth = medium.smooth.reshape(self.smooth_groups, -1)
+        # Smoothed indicators with the variance of the Gaussians of which they are the result, in their voxels; pairs of
+        # voxels have 1/4
+        first, second = (_variance_of_taps(sigma) for sigma in (WIDE_SIGMA, HALVED_SIGMA))
+        self.wide = SmoothGrid(medium.smooth, first, 0.94, 1.0)
+        self.widest = SmoothGrid(medium.smoother, second + (first + 0.25) / 4.0, 0.98, 0.5)
         self.distance = None if medium.distance is None else medium.distance.ravel()
 
     def cells(self, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,15 +76,22 @@ class Labels:
             labels[several] = self.label[chosen]
         return labels
 
-    def borders(self, voxel, before, behind) -> tuple[np.ndarray, np.ndarray]:
-        """(towards (n, 3), overshoot (n,)) of the border between groups near (n, 3) voxel positions."""
-        towards, overshoot, confidence = self._wide(voxel, before, behind)
-        doubtful = confidence < 1
-        fine_towards, fine_overshoot, fine_confidence = self._fine(voxel[doubtful], before[doubtful], behind[doubtful])
-        wide, start = confidence[doubtful], fine_confidence * fine_overshoot
-        overshoot[doubtful] = start + wide * (overshoot[doubtful] - start)
-        towards[doubtful] = fine_towards + wide[:, None] * (towards[doubtful] - fine_towards)
-        return towards, overshoot
+    def borders(self, voxel, before, behind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(towards (n, 3), overshoot (n,), curvature (n,)) of the border between groups near (n, 3) voxel positions."""
+        towards, overshoot, curvature, confidence = self.widest.border((voxel - f32(0.5)) / f32(2), before, behind)
+        overshoot, curvature = f32(2) * overshoot, curvature / f32(2)
+        less = np.flatnonzero(confidence < 1)
+        voxel, before, behind = voxel[less], before[less], behind[less]
+        wide = self.wide.border(voxel, before, behind)
+        some = np.flatnonzero(wide[3] < 1)
+        fine = self._fine(voxel[some], before[some], behind[some])
+        for values, better in zip(wide[:3], _refined(fine, [values[some] for values in wide]), strict=True):
+            values[some] = better
+        wide[3][:] = 1
+        wider = [values[less] for values in (towards, overshoot, curvature, confidence)]
+        for values, better in zip((towards, overshoot, curvature), _refined(wide, wider), strict=True):
+            values[less] = better
+        return towards, overshoot, curvature
 
     def _fine(self, voxel, before, behind):
         """From the labels within 3.5 voxels, smoothed here."""
@@ -104,29 +126,52 @@ class Labels:
         steepness = np.maximum(length(gradient), f32(1e-9))
         towards = np.where((steepness < f32(1e-3) * total)[:, None], f32(0), gradient / steepness[:, None])
         share = f32(0.5) - f32(0.5) * total_d / (sum8(wx * either) + f32(1e-6))
-        overshoot = _border_distance(_FINE_SIGMA, share, (square - total_square / total * total_d) / steepness)
-        return towards, overshoot, f32(np.abs(overshoot) < 0.5)
+        overshoot, curvature = _border_place(_FINE_SIGMA, share, (square - total_square / total * total_d) / steepness)
+        return towards, overshoot, curvature, f32(np.abs(overshoot) < 0.5)
 
-    def _wide(self, voxel, before, behind):
-        """From the indicators smoothed in advance; confidence 0 if they do not determine the border."""
-        towards, overshoot, confidence = np.zeros_like(voxel), *np.zeros((2, len(voxel)), np.float32)
+
+class SmoothGrid:
+    """Indicators of acoustic groups, smoothed in advance: uint16 (groups, k, j, i), 65535 for 1.
+
+    `variance` of the smoothing in squared voxels; `least` steepness, re that of a plane, that determines a border;
+    `farthest` voxels at which it may be.
+    """
+
+    def __init__(self, smooth: np.ndarray, variance: float, least: float, farthest: float) -> None:
+        self.groups, shape = smooth.shape[0], smooth.shape[1:]
+        self.dims, self.variance, self.least = np.array(shape[::-1], np.int64), f32(variance), least
+        self.farthest = f32(farthest)
+        self.steps = np.array([1, self.dims[0], self.dims[0] * self.dims[1]])
+        self.smooth = smooth.reshape(self.groups, -1)
+
+    def border(self, voxel, before, behind) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(towards (n, 3), overshoot, curvature, confidence (n,)) in voxels; confidence 0: they do not determine it."""
+        towards, overshoot, curvature, confidence = np.zeros_like(voxel), *np.zeros((3, len(voxel)), np.float32)
         if self.dims.min() < 4:
-            return towards, overshoot, confidence
-        known = np.flatnonzero((before < self.smooth_groups) & (behind < self.smooth_groups))
+            return towards, overshoot, curvature, confidence
+        known = np.flatnonzero((before < self.groups) & (behind < self.groups))
         difference, both, up, down = self._stencil(voxel[known], before[known], behind[known])
         fits = (both >= f32(0.97)) & (np.abs(difference) <= f32(0.5))
         known, difference, both, up, down = known[fits], difference[fits], both[fits], up[fits], down[fits]
         slope, bends = f32(0.5) * (up - down), up + down - (f32(2) * difference)[:, None]
-        laplacian = bends[:, 0] + bends[:, 1] + bends[:, 2]
-        wide = f32(WIDE_SIGMA)
-        variance = wide * wide + f32(1) / f32(6)
-        steepness, sigma = np.maximum(length(slope), f32(1e-6)), np.sqrt(variance)
+        steepness = np.maximum(length(slope), f32(1e-6))
+        normal = slope / steepness[:, None]
+        # Linear interpolation adds f (1 - f) to the variance along each axis; a central difference sees 1/3 more.
+        clipped = np.clip(voxel[known], f32(0), f32(self.dims) - f32(1.001))
+        f = clipped - f32(np.clip(clipped.astype(np.int32), 1, self.dims - 3))
+        variance = self.variance + dot(normal * normal, f * (f32(1) - f))
+        sigma = np.sqrt(variance)
         share = f32(0.5) - f32(0.5) * difference / both
-        distance = _border_distance(sigma, share, variance * laplacian / steepness)
+        laplacian = bends[:, 0] + bends[:, 1] + bends[:, 2]
+        distance, curvature[known] = _border_place(sigma, share, variance * laplacian / steepness)
         of_plane = f32(0.79788456) / sigma * exp(f32(-0.5) * distance * distance / variance)
-        towards[known], overshoot[known] = slope / steepness[:, None], distance
-        confidence[known] = ramp(0.95, 0.99, steepness / of_plane)
-        return towards, overshoot, confidence
+        of_plane = of_plane * (f32(1) - dot(normal * normal, normal * normal) / (f32(6) * variance))
+        towards[known] = unit(normal * (f32(1) + normal * normal / (f32(6) * variance[:, None])))
+        overshoot[known] = distance
+        with np.errstate(divide="ignore"):
+            confidence[known] = ramp(self.least, 0.5 + 0.5 * self.least, steepness / of_plane)
+        confidence[known] *= np.abs(distance) <= self.farthest
+        return towards, overshoot, curvature, confidence
 
     def _stencil(self, voxel, before, behind):
         """(D, [before] + [behind]) of the smoothed indicators at voxel positions, and D a voxel up and down each axis.
@@ -168,9 +213,28 @@ class Labels:
         return difference * unit, both * unit, up, down
 
 
-def _border_distance(sigma, share, bend):
+def _refined(narrow, wider) -> list[np.ndarray]:
+    """(towards, overshoot, curvature) from two scales, each with its confidence at the end."""
+    towards, overshoot, curvature, sure = narrow
+    return [
+        start + wider[3].reshape((-1,) + (1,) * (start.ndim - 1)) * (end - start)
+        for start, end in zip((towards, sure * overshoot, curvature), wider[:3], strict=True)
+    ]
+
+
+def _variance_of_taps(sigma: float) -> float:
+    """Of a Gaussian cut off at 2.5 standard deviations."""
+    reach = int(2.5 * sigma + 0.5)
+    at = np.arange(-reach, reach + 1)
+    taps = np.exp(-0.5 * (at / sigma) ** 2)
+    return float((taps * at**2).sum() / taps.sum())
+
+
+def _border_place(sigma, share, bend):
+    """(distance, mean curvature): the mean of the two estimates and their difference."""
     share = np.clip(share, f32(0.01), f32(0.99))
-    return f32(0.5) * (sigma / f32(1.702) * log(share / (f32(1) - share)) + bend)
+    by_share = sigma / f32(1.5957691) * log(share / (f32(1) - share))
+    return f32(0.5) * (by_share + bend), f32(0.5) * (bend - by_share) / (sigma * sigma)
 
 
 def border_normals(ras_to_voxel: np.ndarray, towards: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 
-WIDE_SIGMA = 3.0  # of the Gaussian for smoothing the indicators, voxels
+WIDE_SIGMA, HALVED_SIGMA = 3.0, 2.6  # of the Gaussians for smoothing the indicators, voxels of their grids
 _FARTHEST = 2.2  # limit of the fluid distance in standard deviations; it has eight bits
 _SHARES = 4095  # quantisation steps of the smoothed indicator for the fluid distance
 _MOST_GROUPS, _MOST_VALUES = 6, 100_000_000  # of the smoothed indicators of acoustic groups
@@ -44,14 +44,21 @@ class HostMedium:
         self.group = self.rows["group"].astype(np.uint8)[self.label]
         groups = np.unique(self.group)
         self.smooth_groups = int(min(groups.max() + 1, _MOST_GROUPS, max(_MOST_VALUES // self.label.size, 2)))
-        #: (groups, k, j, i) uint16, 65535 for 1
+        #: (groups, k, j, i) uint16, 65535 for 1; and at half the resolution
         self.smooth = np.zeros((self.smooth_groups, *self.label.shape), np.uint16)
+        self.smoother = np.zeros((self.smooth_groups, *((n + 1) // 2 for n in self.label.shape)), np.uint16)
         if len(groups) > 1:
             for number in groups[groups < self.smooth_groups]:
                 share = ndimage.gaussian_filter(
                     (self.group == number).astype(np.float32), WIDE_SIGMA, mode="nearest", truncate=2.5
                 )
                 self.smooth[number] = np.rint(65535.0 * np.clip(share, 0.0, 1.0))
+                half = np.pad(self.smooth[number], [(0, n % 2) for n in self.label.shape], mode="edge") / 65535.0
+                for axis in range(3):
+                    even, odd = (half.take(range(start, half.shape[axis], 2), axis) for start in (0, 1))
+                    half = 0.5 * (even + odd)
+                share = ndimage.gaussian_filter(half.astype(np.float32), HALVED_SIGMA, mode="nearest", truncate=2.5)
+                self.smoother[number] = np.rint(65535.0 * np.clip(share, 0.0, 1.0))
         #: (k, j, i) uint8 about 127.5, and half the membrane in its unit; None and -1 without a membrane
         self.distance, self.membrane_reach = self._fluid_distance(spacing)
 
@@ -78,8 +85,10 @@ def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
     """Tissues of equal speed and impedance form a group; groups are numbered by decreasing frequency of labels."""
     members = {label: tissues[label] for label in present}
     members.update((label, tissue) for label, tissue in tissues.items() if label not in members)
+    fluids: tuple[str, ...] = ()
     if tissues.membrane is not None:
         members[CONSTANTS["MEMBRANE_LABEL"]] = tissues.membrane.tissue
+        fluids = tissues.membrane.fluids
     rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
     known: list[tuple[float, float]] = []
     for label, tissue in members.items():
@@ -91,4 +100,5 @@ def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
             if parameter.name in (TISSUE.names or ()):
                 row[parameter.name] = getattr(tissue, parameter.name)
         row["scatterer_share"], row["group"] = special.ndtr(-tissue.mu1), known.index(acoustics)
+        row["is_fluid"] = label in tissues and tissue.name in fluids
     return rows

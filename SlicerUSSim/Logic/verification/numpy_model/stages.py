@@ -19,6 +19,7 @@ from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
     noise_key,
     pulse_taps,
 )
+from SlicerUSSim.Logic.verification.numpy_model.aperture import Screens
 from SlicerUSSim.Logic.verification.numpy_model.echoes import add_interfaces, lateral_beam, scatterer_lines
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, gaussian, hash_mix
 from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
@@ -32,6 +33,8 @@ class TwinFrame(HostFrame):
     labels: Labels
     #: layout.TISSUE per label
     tissues: np.ndarray
+    #: (screen lines, depths, 4) float32 of aperture.Screens.run
+    screens: np.ndarray = field(init=False)
     #: layout.SEGMENT and layout.HIT with their traced lines
     segments: np.ndarray = field(init=False)
     segment_lines: np.ndarray = field(init=False)
@@ -42,10 +45,15 @@ class TwinFrame(HostFrame):
     scanned: np.ndarray = field(init=False)
 
 
+def aperture(frame: TwinFrame) -> None:
+    """What soft tissue does to the beams."""
+    frame.screens = Screens(frame.acquisition, frame.labels, frame.tissues).run()
+
+
 def ray_tree(frame: TwinFrame) -> None:
     """Segments along the axes, hits of the elevational rays."""
     record = frame.acquisition
-    tracer = Tracer(record, frame.labels, frame.tissues)
+    tracer = Tracer(record, frame.labels, frame.tissues, frame.screens)
     quantiles = elevational_quantiles(int(record["traced_lines"]), int(record["elevational_rays"]))
     frame.segments, frame.segment_lines, frame.hits, frame.hit_lines = tracer.run(line_roots(record), quantiles)
 
@@ -62,7 +70,7 @@ def scatterers(frame: TwinFrame) -> None:
 def interfaces(frame: TwinFrame) -> None:
     """Impulses of the interfaces, added to those of speckle."""
     if frame.settings.interfaces:
-        add_interfaces(frame.acquisition, frame.hits, frame.hit_lines, frame.traced)
+        add_interfaces(frame.acquisition, frame.hits, frame.hit_lines, frame.scanned)
 
 
 def beam(frame: TwinFrame) -> None:
@@ -134,10 +142,11 @@ def scan_conversion(frame: TwinFrame) -> None:
 
 
 TWINS: dict[str, Callable[[TwinFrame], None]] = {
+    "aperture": aperture,
     "ray tree": ray_tree,
     "scatterers": scatterers,
-    "interfaces": interfaces,
     "beam": beam,
+    "interfaces": interfaces,
     "pulse": pulse,
     "B-mode": b_mode,
     "scan conversion": scan_conversion,

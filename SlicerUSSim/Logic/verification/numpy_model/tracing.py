@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from SlicerUSSim.Logic.opencl.layout import HIT, SEGMENT
+from SlicerUSSim.Logic.verification.numpy_model.aperture import is_soft
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     LN10_OVER_20,
@@ -45,12 +46,14 @@ class Rays:
     blind_until: np.ndarray
     reflections: np.ndarray
     label: np.ndarray
+    piece: np.ndarray  # of the beam, from path piece x screen_step on; -1 where the line is a ray
     # The node, set by Tracer._begin: course in voxels, its end, state since its start
     start: np.ndarray = field(init=False)
     step: np.ndarray = field(init=False)
     aside: np.ndarray = field(init=False)
     depth_per_mm: np.ndarray = field(init=False)
     to_depth: np.ndarray = field(init=False)
+    to_piece: np.ndarray = field(init=False)
     leave: np.ndarray = field(init=False)
     inside: np.ndarray = field(init=False)
     since: np.ndarray = field(init=False)
@@ -79,8 +82,8 @@ class Rays:
 class Tracer:
     """Traces an acquisition; `segments` and `hits` are layout records, with arrays of their lines and rays."""
 
-    def __init__(self, acquisition: np.ndarray, labels: Labels, tissues: np.ndarray) -> None:
-        self.acquisition, self.labels, self.tissues = acquisition, labels, tissues
+    def __init__(self, acquisition: np.ndarray, labels: Labels, tissues: np.ndarray, screens: np.ndarray) -> None:
+        self.acquisition, self.labels, self.tissues, self.screens = acquisition, labels, tissues, screens
         self.elevation_sigma = Beam(acquisition).elevation_sigma
         self.to_voxel = acquisition["ras_to_voxel"]
         self.voxel_mm = acquisition["voxel_mm"]
@@ -89,9 +92,12 @@ class Tracer:
     def run(self, roots: np.ndarray, quantiles: np.ndarray):
         """(segments, their lines, hits, their lines) for roots (lines, 4) and quantiles (lines, rays)."""
         self._segments, self._segment_lines, self._hits, self._hit_lines = [], [], [], []
-        rays = self._begin(self._roots(roots, quantiles))
+        self._segment_pieces, self._hit_pieces, self._corrections = [], [], []
+        self._root = self._roots(roots, quantiles)
+        rays = self._begin(self._start_pieces(self._root, self._root.piece))
         while len(rays):
             rays = self._advance(rays)
+        self._correct()
         order = np.argsort(np.concatenate(self._segment_lines), kind="stable")
         lines = np.concatenate(self._segment_lines)[order]
         hits = np.concatenate(self._hits) if self._hits else np.zeros(0, HIT)
@@ -112,7 +118,91 @@ class Tracer:
             elevational=unit(affine_vector(m, np.stack([zero, zero, one], -1))),
             tube=np.stack([one, zero, one, zero], -1), path=zero, depth=zero, log_attenuation=zero, weight=one,
             blind_until=-one, reflections=np.zeros(count, int), label=np.full(count, -1),
+            piece=np.full(count, 0 if self.acquisition["aperture_beams"] else -1),
         )  # fmt: skip
+
+    # ---- pieces of a beam ------------------------------------------------------------------------------------------
+
+    def _beams_at(self, line: np.ndarray, number: np.ndarray) -> np.ndarray:
+        """(n, 4) beams of traced lines at the ends `number` of pieces, as in aperture.Screens."""
+        acquisition, count = self.acquisition, len(self.screens)
+        per_line = f32(count - 1) / f32(acquisition["traced_lines"] - 1)
+        place = line.astype(np.float32) * per_line
+        before = np.minimum(place.astype(int), count - 2)
+        left, right = (self.screens[before + n, np.maximum(number - 1, 0)] for n in (0, 1))
+        beam = left + (place - before.astype(np.float32))[:, None] * (right - left)
+        apart = Beam(acquisition).line_distance(f32(number) * acquisition["screen_step"]) / per_line
+        # No energy is created where axes come together.
+        beam[:, 0] -= f32(0.5) * log(np.clip(f32(1) + (right - left)[:, 2] / apart, f32(0.25), f32(1)))
+        return np.where(number[:, None] == 0, f32(0), beam)
+
+    def _start_pieces(self, rays: Rays, number: np.ndarray) -> Rays:
+        """The rays at the start of the pieces `number` of their lines; behind the last one they go straight on."""
+        rays = rays.of(np.arange(len(rays)))
+        at = np.flatnonzero(number >= 0)
+        if not len(at):
+            return rays
+        step, depths = self.acquisition["screen_step"], self.screens.shape[1]
+        root = self._root.of(rays.line[at] * (1 + int(self.acquisition["elevational_rays"])) + rays.ray[at])
+        number = number[at]
+        beam = self._beams_at(rays.line[at], number)
+        path = f32(number) * step
+        rays.axis[at] = (
+            root.axis + path[:, None] * root.direction + beam[:, 2:3] * root.lateral + beam[:, 3:] * root.elevational
+        )
+        rays.piece[at] = np.where(number < depths, number, -1)
+        has_next = number < depths
+        at, root, beam = at[has_next], root.of(has_next), beam[has_next]
+        turn = self._beams_at(rays.line[at], number[has_next] + 1) - beam
+        direction = unit(step * root.direction + turn[:, 2:3] * root.lateral + turn[:, 3:] * root.elevational)
+        rays.direction[at] = direction
+        rays.lateral[at] = _carried(root.lateral, root.direction, direction)
+        rays.elevational[at] = _carried(root.elevational, root.direction, direction)
+        return rays
+
+    def _correction(self, rays: Rays, path, depth, log_attenuation) -> np.ndarray:
+        """(n, 2) changes of depth and of log amplitude per mm by which rays agree with their beams at a piece's end.
+
+        They are kept for what was written in the piece; 0 where a line is a ray.
+        """
+        step = self.acquisition["screen_step"]
+        beam = self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))
+        end = f32(rays.piece + 1) * step
+        rest = end - path
+        depth_left = end + beam[:, 1] - (depth + rest * rays.depth_per_mm)
+        log_left = -beam[:, 0] - (log_attenuation - rest * self.decay[rays.label])
+        per_mm = np.where((rays.piece >= 0)[:, None], np.stack([depth_left, log_left], -1) / step, f32(0))
+        self._corrections.append((self._piece_keys(rays), per_mm))
+        return per_mm
+
+    def _piece_keys(self, rays: Rays) -> np.ndarray:
+        """Numbers of line, ray and piece; -1 where a line is a ray."""
+        ray = rays.line * (1 + int(self.acquisition["elevational_rays"])) + rays.ray
+        return np.where(rays.piece >= 0, ray * self.screens.shape[1] + rays.piece, -1)
+
+    def _correct(self) -> None:
+        """Apply the corrections to the segments and hits of the pieces."""
+        if not self.acquisition["aperture_beams"]:
+            return
+        keys, per_mm = (np.concatenate(parts) for parts in zip(*self._corrections, strict=True))
+        rays = len(self._root) * self.screens.shape[1]
+        table = np.zeros((rays + 1, 2), np.float32)
+        table[keys[keys >= 0]] = per_mm[keys >= 0]
+        for records, pieces in ((self._segments, self._segment_pieces), (self._hits, self._hit_pieces)):
+            for record, key in zip(records, pieces, strict=True):
+                depth, log_amplitude = table[key].T
+                start = f32(np.maximum(key, 0) % self.screens.shape[1]) * self.acquisition["screen_step"]
+                along = record["path_mm"] - start
+                factor = exp(log_amplitude * along)
+                record["depth_mm"] += depth * along
+                record["attenuation"] *= factor
+                if "echo" in (record.dtype.names or ()):
+                    record["echo"] *= factor
+                else:
+                    record["depth_per_mm"] += depth
+                    record["decay_per_mm"] -= log_amplitude
+
+    # ---- nodes -----------------------------------------------------------------------------------------------------
 
     def _begin(self, rays: Rays) -> Rays:
         """Set every ray to the start of a node."""
@@ -127,6 +217,8 @@ class Tracer:
             rays.label[unknown] = self.labels.at(self._place(some, zero[unknown]))
         rays.depth_per_mm = acquisition["reference_speed_m_s"] / self.tissues["speed_of_sound_m_s"][rays.label]
         rays.to_depth = (acquisition["depth_mm"] - rays.depth) / rays.depth_per_mm
+        to_piece = f32(rays.piece) * acquisition["screen_step"] + acquisition["screen_step"] - rays.path
+        rays.to_piece = np.where(rays.piece < 0, f32(np.inf), to_piece)
         margin = f32(3) + np.abs(rays.quantile) * f32(4) / self.voxel_mm
         enter, leave = zero, rays.to_depth
         for a in range(3):
@@ -189,7 +281,7 @@ class Tracer:
         decay = self.decay[rays.label]
         reserve = log(rays.weight / acquisition["intensity_threshold"]) + rays.log_attenuation - rays.spent
         to_silence = rays.since + np.maximum(reserve, f32(0)) / np.maximum(decay, f32(1e-9))
-        longest = np.minimum(rays.to_depth, to_silence)
+        longest = np.minimum(np.minimum(rays.to_depth, to_silence), rays.to_piece)
         rays.inside, border, other = self._next_border(rays, np.minimum(rays.leave, longest))
         until = np.where(border < 0, longest, border)
         spent_until = rays.spent + decay * (until - rays.since)
@@ -202,7 +294,19 @@ class Tracer:
         met = ends & (border >= 0)
         rays.spent = spent_until
         branches = self._branch(rays.of(met), border[met], other[met], written[met])
-        return Rays.joined([on, *branches])
+        left = ends & (border < 0) & (rays.piece >= 0)
+        return Rays.joined([on, *branches, self._next_pieces(rays.of(left), until[left])])
+
+    def _next_pieces(self, rays: Rays, until: np.ndarray) -> Rays:
+        """End the pieces of rays that met no more border; returns those that go on to another piece."""
+        path, depth = rays.path + until, rays.depth + until * rays.depth_per_mm
+        per_mm = self._correction(rays, path, depth, rays.log_attenuation - rays.spent)
+        goes_on = until == rays.to_piece
+        per_mm = per_mm[goes_on] * self.acquisition["screen_step"]
+        rays, path, depth = rays.of(goes_on), path[goes_on], depth[goes_on]
+        rays.path, rays.depth = path, depth + per_mm[:, 0]
+        rays.log_attenuation = rays.log_attenuation + per_mm[:, 1] - rays.spent
+        return self._begin(self._start_pieces(rays, rays.piece + 1))
 
     def _write_segments(self, rays: Rays, decay, until, spent_until, ends) -> np.ndarray:
         """Write the segments of the axis rays; returns the index of each ray's last segment (-1: none)."""
@@ -234,24 +338,38 @@ class Tracer:
         segment["decay_per_mm"] = (spent_end - spent_begin) / (end - begin)
         segment["reflections"], segment["label"] = some.reflections, some.label
         self._segments.append(segment)
+        self._segment_pieces.append(self._piece_keys(some))
         self._segment_lines.append(some.line)
 
     def _branch(self, rays: Rays, border, other, written) -> list[Rays]:
         """Write the hits at the borders; returns the reflected and the refracted children."""
         acquisition, tissues = self.acquisition, self.tissues
         before, behind = tissues["group"][rays.label], tissues["group"][other]
-        normal, overshoot = self._normals(rays, border, before, behind)
-        overshoot = np.minimum(overshoot, border - rays.since)
+        normal, overshoot, curvature = self._normals(rays, border, before, behind)
+        continued = (rays.piece > 0) & (rays.since == 0)
+        overshoot = np.minimum(overshoot, border - rays.since + np.where(continued, self.voxel_mm, f32(0)))
         beyond = border.copy()
         self._bisect(rays, np.flatnonzero(overshoot == 0), 3, rays.inside, beyond, other)
         back = np.where(overshoot == 0, border - beyond, overshoot)
         border = border - back
         rays.spent = rays.spent - back * self.decay[rays.label]
         shortened = written >= 0
-        self._segments[-1]["length_mm"][written[shortened]] -= back[shortened]
+        lengths = self._segments[-1]["length_mm"]
+        lengths[written[shortened]] = np.maximum(lengths[written[shortened]] - back[shortened], f32(0))
         keep = rays.depth + border * rays.depth_per_mm < acquisition["depth_mm"]
+        soft = is_soft(tissues[rays.label], tissues[other]) & bool(acquisition["aperture_beams"])
+        # A beam ends at a strong border, and where it leaves the field. Its soft borders may be in the same piece.
+        ends = np.flatnonzero((rays.piece >= 0) & ~(soft & keep))
+        some, length = rays.of(ends), border[ends]
+        depth_there, log_there = some.depth + length * some.depth_per_mm, some.log_attenuation - some.spent
+        per_mm = self._correction(some, some.path + length, depth_there, log_there)
+        since = (some.path + length - f32(some.piece) * acquisition["screen_step"])[:, None] * per_mm
+        rays.depth[ends] += since[:, 0]
+        rays.log_attenuation[ends] += since[:, 1]
+        rays.piece[ends] = -1
+        soft = soft[keep]
         rays, border, other, normal, overshoot = rays.of(keep), border[keep], other[keep], normal[keep], overshoot[keep]
-        before, behind = before[keep], behind[keep]
+        before, behind, curvature = before[keep], behind[keep], curvature[keep]
 
         path, depth = rays.path + border, rays.depth + border * rays.depth_per_mm
         log_attenuation = rays.log_attenuation - rays.spent
@@ -267,15 +385,18 @@ class Tracer:
         z_in, z_out = tissues["impedance_mrayl"][rays.label] * cos_out, tissues["impedance_mrayl"][other] * cos_in
         pressure = np.where(is_total, f32(1), (z_out - z_in) / (z_out + z_in))
         reflectance = pressure * pressure
-        self._write_hits(rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube)
+        self._write_hits(rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature)
 
         reflected_weight, refracted_weight = rays.weight * reflectance, rays.weight * (f32(1) - reflectance)
         reflects = np.flatnonzero(
             (rays.reflections < acquisition["max_ray_depth"])
             & (reflected_weight >= acquisition["reflection_threshold"])
             & (reflected_weight * attenuation >= acquisition["intensity_threshold"])
+            & ~soft
         )
-        refracts = np.flatnonzero(~is_total & (refracted_weight * attenuation >= acquisition["intensity_threshold"]))
+        refracts = np.flatnonzero(
+            ~is_total & ~soft & (refracted_weight * attenuation >= acquisition["intensity_threshold"])
+        )
         child = rays.of(reflects)
         if acquisition["reflection_spreading"]:
             spread = (tube[reflects], child, point[reflects], normal[reflects], before[reflects], behind[reflects])
@@ -289,6 +410,7 @@ class Tracer:
         child.path, child.depth, child.log_attenuation = path[reflects], depth[reflects], log_attenuation[reflects]
 
         bent = rays.of(refracts)
+        path_of_all = path
         n, ratio, path = normal[refracts], ratio[refracts], path[refracts]
         towards = unit(ratio[:, None] * bent.direction + (ratio * cos_in[refracts] - cos_out[refracts])[:, None] * n)
         bent.lateral = _carried(bent.lateral, bent.direction, towards)
@@ -300,18 +422,27 @@ class Tracer:
         bent.label = other[refracts]
         over = overshoot[refracts]
         bent.blind_until = np.where(over > 0, path + over + f32(0.5) * self.voxel_mm, path)
-        return [self._begin(child), self._begin(bent)]
 
-    def _normals(self, rays: Rays, border, before, behind) -> tuple[np.ndarray, np.ndarray]:
-        """(unit normals in RAS against the rays, lengths by which the rays are beyond the border)."""
-        towards, overshoot = self.labels.borders(self._place(rays, border), before, behind)
+        on = rays.of(soft)
+        on.axis = point[soft] - aside[soft]
+        on.tube, on.path, on.depth, on.label = tube[soft], path_of_all[soft], depth[soft], other[soft]
+        z_in, z_out = (tissues["impedance_mrayl"][label[soft]] for label in (rays.label, other))
+        square = (z_out - z_in) / (z_out + z_in)
+        on.weight = on.weight - on.weight * (square * square)
+        on.log_attenuation, over = log_attenuation[soft], overshoot[soft]
+        on.blind_until = np.where(over > 0, on.path + over + f32(0.5) * self.voxel_mm, on.path)
+        return [self._begin(child), self._begin(bent), self._begin(on)]
+
+    def _normals(self, rays: Rays, border, before, behind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(unit normals in RAS against the rays, lengths that the rays are beyond the border, curvatures in 1/mm)."""
+        towards, overshoot, curvature = self.labels.borders(self._place(rays, border), before, behind)
         across = -dot(rays.step, towards)
         with np.errstate(divide="ignore", invalid="ignore"):
             overshoot = np.where(across * self.voxel_mm > f32(0.2), overshoot / across, f32(0))
         normal = border_normals(self.to_voxel, towards)
         normal = np.where((dot(normal, rays.direction) > 0)[:, None], -normal, normal)
         nowhere = dot(normal, normal) == 0
-        return np.where(nowhere[:, None], -rays.direction, normal), overshoot
+        return np.where(nowhere[:, None], -rays.direction, normal), overshoot, curvature / self.voxel_mm
 
     def _tube_reflected(self, tube, rays: Rays, point, normal, before, behind) -> np.ndarray:
         tube = tube.copy()
@@ -330,24 +461,31 @@ class Tracer:
             tube[:, width + 1] += f32(2) * np.maximum(curvature, f32(0)) * longer * tube[:, width]
         return tube
 
-    def _write_hits(self, rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube) -> None:
+    def _write_hits(
+        self, rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature
+    ) -> None:
         acquisition, beside = self.acquisition, rays.ray > 0
         count = acquisition["elevational_rays"].astype(np.float32)
-        density = f32(0.39894228) * exp(f32(-0.5) * rays.quantile * rays.quantile)
-        width = self.elevation_sigma(path) / (count * density)
-        slope = dot(normal, rays.elevational) / np.minimum(dot(normal, rays.direction), f32(-0.05))
-        turns = acquisition["cycles_per_mm"] * rays.depth_per_mm * width * slope
-        coherence = exp(f32(-1.6449341) * turns * turns)
+        towards_ray = np.minimum(dot(normal, rays.direction), f32(-0.05))
+        coherence = np.ones(len(rays), np.float32)
+        if acquisition["membrane_reach"] >= 0:
+            fluid, rough = self.tissues["is_fluid"], acquisition["membrane_phase"] * cos_in
+            coherence = np.where(fluid[rays.label] != fluid[other], exp(f32(-0.5) * rough * rough), coherence)
         specular = exp2(np.maximum(acquisition["specular_exponent"] * log2(cos_in), f32(-100)))
-        strength = pressure * pressure if acquisition["interface_is_energy"] else np.abs(pressure)
+        strength = pressure * pressure if acquisition["interface_is_energy"] else pressure
         hit = np.zeros(len(rays), HIT)
         hit["position"], hit["normal"], hit["path_mm"], hit["depth_mm"] = point, normal, path, depth
         hit["weight"], hit["attenuation"], hit["cos_incidence"] = rays.weight, attenuation, cos_in
         hit["reflectance"], hit["reflections"] = pressure * pressure, rays.reflections
         hit["label_before"], hit["label_behind"] = rays.label, other
+        for name, width, offset in (("lateral", 0, rays.lateral), ("elevational", 2, rays.elevational)):
+            hit[f"{name}_slope"] = -rays.depth_per_mm * tube[:, width] * dot(normal, offset) / towards_ray
+        hit["curvature"] = curvature
+        hit["elevational_mm"] = rays.quantile * self.elevation_sigma(path)
         gain = acquisition["interface_gain"] / (count * tube[:, 0] * tube[:, 2])
         hit["echo"] = rays.weight * attenuation * strength * specular * gain * coherence
         self._hits.append(hit[beside])
+        self._hit_pieces.append(self._piece_keys(rays)[beside])
         self._hit_lines.append(rays.line[beside])
 
 

@@ -83,9 +83,10 @@ class Report:
 
 def all_checks() -> tuple[Check, ...]:
     """Every check, in the order of the physics: rays, speckle, artefacts, space."""
-    from SlicerUSSim.Logic.verification.validation import artefacts, beams, rays, speckle
+    from SlicerUSSim.Logic.verification.validation import aberration, artefacts, beams, rays, speckle, walls
 
-    return (*rays.CHECKS, *speckle.CHECKS, *artefacts.CHECKS, *beams.CHECKS)
+    groups = (rays, speckle, artefacts, beams, walls, aberration)
+    return tuple(check for group in groups for check in group.CHECKS)
 
 
 def validate(

@@ -1,0 +1,117 @@
+"""Host code of kernels/aperture.cl: what soft tissue does to beams, over the whole aperture."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.settings import SimulationSettings
+from SlicerUSSim.Logic.imaging.signals import RayTree
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, FrameInputs, Stage, Work
+from SlicerUSSim.Logic.opencl.device import Device, Workspace
+from SlicerUSSim.Logic.probe.arrays import Probe
+
+ROWS = 3  # of points across the elevational aperture
+
+_POINTS = 12  # intervals of points across one aperture
+_MOST_POINTS = 96  # along the whole face
+_LONGEST = 1.06  # of paths, in image depths: the fastest soft tissue
+_SCREEN_STEP_MM, _SCREEN_DEPTHS = 5.0, (8, 24)
+_LINES_PER_SCREEN = 3
+_FAN_STEP_MM, _MOST_DEPTHS = (0.25, 1.0), 192  # limits of the length of a look-up; else a voxel
+_ANGLE_STEP, _WIDEST = 0.035, 1.5  # radians
+
+_NEPERS_PER_DB = np.log(10.0) / 20.0
+_PER_LOOK_UP, _PER_SUM = 60, 60  # operations counted in the kernels
+
+
+class Aperture(Stage):
+    """Delay, deflection, level and attenuation of every line's beam in soft tissue, at several depths."""
+
+    name = "aperture"
+
+    def __init__(self, device: Device) -> None:
+        super().__init__(device)
+        kernels = device.kernels("aperture.cl")
+        self._fans, self._screens = kernels["fans"], kernels["screens"]
+        self.workspace = Workspace(device)
+
+    def run(self, frame: DeviceFrame, with_level: bool = True) -> None:
+        """Enqueue the beams of one frame: its `screens`, which are empty if beams are single rays.
+
+        Without `with_level` they have attenuation alone, and not what is lost because a beam is no longer focused.
+        """
+        fields, get = frame.acquisition, self.workspace.get
+        lines, depths = int(fields["screen_lines"]), int(fields["screen_depths"])
+        fan = int(fields["fan_angles"]), int(fields["fan_points"]), ROWS
+        frame.screens = get("screens", lines * depths * 16)
+        if not fields["aperture_beams"]:
+            return
+        acoustics = get("acoustics", len(frame.medium.rows) * 16)
+        self.device.write(acoustics, acoustic_rows(frame.medium.rows, fields))
+        sums = get("sums", int(np.prod(fan)) * int(fields["fan_depths"]) * 16)
+        self.device.run(self._fans, fan, frame.acquisition_buffer, frame.medium.voxel_buffer, acoustics, sums)
+        self.device.run(
+            self._screens, (depths, lines), frame.acquisition_buffer, sums, np.int32(with_level), frame.screens
+        )
+
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        fields = frame.acquisition
+        if not fields["aperture_beams"]:
+            return Work(1, 0)
+        rays = int(fields["fan_angles"]) * int(fields["fan_points"]) * ROWS
+        looked_up = rays * int(fields["fan_depths"])
+        sums = int(fields["screen_lines"]) * int(fields["screen_depths"]) * _POINTS * ROWS
+        return Work(14 * looked_up, _PER_LOOK_UP * looked_up + _PER_SUM * sums)
+
+
+def acoustic_rows(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
+    """(labels, 4) float32 of layout.TISSUE records: extra path per mm, nepers per mm both ways, m/s, MRayl.
+
+    The extra path is what a length adds to the displayed depth beyond itself, c_ref / c - 1.
+    """
+    speed = tissues["speed_of_sound_m_s"]
+    with np.errstate(divide="ignore"):
+        extra = np.where(speed > 0.0, acquisition["reference_speed_m_s"] / speed - 1.0, 0.0)
+    nepers = tissues["attenuation_db_cm_mhz"] * acquisition["frequency_mhz"] * 0.2 * _NEPERS_PER_DB
+    return np.stack([extra, nepers, speed, tissues["impedance_mrayl"]], axis=1).astype(np.float32)
+
+
+def aperture_fields(
+    probe: Probe, settings: SimulationSettings, voxel_mm: float, traced_lines: int, guard_lines: int, lateral_rays: int
+) -> dict[str, float]:
+    """The fields of layout.ACQUISITION for beams from an aperture.
+
+    Points are a twelfth of the aperture apart, along all of the face and as far beyond it as lines are traced.
+    """
+    depth = _LONGEST * probe.depth_mm
+    screens = int(np.clip(np.ceil(depth / _SCREEN_STEP_MM), *_SCREEN_DEPTHS))
+    widest = 0.5 / probe.receive_f_number  # of the directions from which a depth is reached, to the line
+    reach = -probe.first_line + guard_lines / lateral_rays * probe.line_spacing  # of traced lines
+    if probe.is_linear or probe.apex_radius_mm > 0.0:
+        along = reach if probe.is_linear else reach * probe.apex_radius_mm
+        span = 2.0 * along + probe.aperture_mm
+        pitch = max(probe.aperture_mm / _POINTS, span / (_MOST_POINTS - 1))
+        if not probe.is_linear:
+            widest += 0.5 * (probe.aperture_mm + pitch) / probe.apex_radius_mm
+    else:
+        span, pitch = probe.aperture_mm, probe.aperture_mm / _POINTS
+        widest += reach
+    points = round(span / pitch) + 1
+    widest = min(widest, _WIDEST)
+    angles = int(np.ceil(2.0 * widest / _ANGLE_STEP)) + 1
+    fan = depth + 0.5 * probe.aperture_mm  # from the edge of the aperture
+    depths = int(min(np.ceil(fan / float(np.clip(voxel_mm, *_FAN_STEP_MM))) + 1, _MOST_DEPTHS))
+    return {
+        "aperture_beams": settings.beam == "aperture",
+        "screen_lines": max(2, -(-traced_lines // _LINES_PER_SCREEN)),
+        "screen_depths": screens,
+        "screen_step": depth / screens,
+        "fan_points": points,
+        "fan_first": -0.5 * pitch * (points - 1),
+        "fan_pitch": pitch,
+        "fan_angles": angles,
+        "fan_first_angle": -widest,
+        "fan_angle_step": 2.0 * widest / (angles - 1),
+        "fan_depths": depths,
+        "fan_step": fan / (depths - 1),
+    }

@@ -1,0 +1,133 @@
+"""Checks of beams in soft tissue against wave propagation (docs/physics.md#beams-from-an-aperture)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache, partial
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.settings import SimulationSettings
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.verification.phantoms import REFERENCE_SPEED_M_S, Phantom, folds, speed_cyst
+from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
+from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_plots
+from SlicerUSSim.Logic.verification.wave import speckle_power
+
+_DEPTHS_MM = np.array([32.0, 38.0, 44.0, 50.0])
+_CYST_SPEEDS_M_S = (1440.0, 1500.0, 1640.0)
+#: Phantoms by name, for any rotation
+_SCENES: dict[str, Callable[..., Phantom]] = {
+    "folds": folds,
+    **{f"{speed:.0f} m/s": partial(speed_cyst, speed) for speed in _CYST_SPEEDS_M_S},
+}
+_LINES = slice(12, 150, 4)  # around those beyond, the phantoms end
+_SEEDS = 5  # of scatterers, over which speckle averages
+_DARK_DB = -12.0
+
+
+def beams_in_folds(rotation: np.ndarray, device) -> Outcome:
+    """The level of every line behind sulci, against wave propagation; and of single rays, as a control."""
+    rows, plots = [], []
+    levels: dict[str, list[np.ndarray]] = {"aperture": [], "ray": [], "wave": []}
+    for name, probe in PROBES.items():
+        wave = _wave_levels_db("folds", name)
+        level, ray = (_levels_db("folds", name, beam, rotation, device) for beam in ("aperture", "ray"))
+        for kind, values in (("aperture", level), ("ray", ray), ("wave", wave)):
+            levels[kind].append(values)
+        rows += [
+            Row(f"difference RMS, {name}", "dB", 0.0, float(np.sqrt(np.mean((level - wave) ** 2))), 2.0, "at most"),
+            Row(f"mean step between lines, {name}", "dB", 0.0, float(np.abs(np.diff(level)).mean()), 1.5, "at most"),
+            Row(f"lines darker than 12 dB, {name}", "", 0.0, float((level < _DARK_DB).mean()), 0.02, "at most"),
+        ]
+        place = probe.line_positions()[_LINES]
+        curves = [Curve("aperture", place, level, place, wave), Curve("single rays", place, ray, place, wave)]
+        plots.append(Plot(f"level behind sulci, {name}", "line [mm or radians]", "dB", curves))
+    aperture, ray, wave = (np.concatenate(values) for values in levels.values())
+    rows += [
+        Row("correlation with waves", "", 1.0, float(np.corrcoef(aperture, wave)[0, 1]), 0.15, "at least"),
+        Row("control, single rays: correlation", "", 0.5, float(np.corrcoef(ray, wave)[0, 1]), 0.0, "at most"),
+    ]
+    return Outcome(tuple(rows), partial(draw_plots, plots=plots))
+
+
+def beams_behind_cysts(rotation: np.ndarray, device) -> Outcome:
+    """Mean power and edge shadow behind cysts of other speeds of sound, against wave propagation."""
+    rows, plots = [], []
+    place = PROBES["linear"].line_positions()[_LINES]
+    behind = np.abs(place) < 8.0
+    for scene in list(_SCENES)[1:]:
+        wave = _wave_levels_db(scene, "linear")
+        level = _levels_db(scene, "linear", "aperture", rotation, device)
+        means = [float(10 * np.log10(np.mean(10 ** (values[behind] / 10)))) for values in (wave, level)]
+        edges = [float(values[np.abs(np.abs(place) - 4.0) < 1.2].mean()) for values in (wave, level)]
+        rows += [
+            Row(f"mean power behind, {scene}", "dB", means[0], means[1], 0.7),
+            Row(f"level behind the edge, {scene}", "dB", edges[0], edges[1], 1.2),
+        ]
+        plots.append(Plot(f"behind a cyst, {scene}", "lateral [mm]", "dB", [Curve("", place, level, place, wave)]))
+    return Outcome(tuple(rows), partial(draw_plots, plots=plots))
+
+
+def _levels_db(scene: str, probe_name: str, beam: str, rotation: np.ndarray, device) -> np.ndarray:
+    """(lines,) power of speckle in the deeper part, re the same with the reference speed of sound everywhere."""
+    phantom, probe = _SCENES[scene](rotation=rotation), PROBES[probe_name]
+    assert phantom.baseline is not None
+    settings = SimulationSettings(beam=beam, interfaces=False)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
+    powers = []
+    for tissues in (phantom.tissues, phantom.baseline):
+        simulator.set_tissues(tissues)
+        power = 0.0
+        for seed in range(_SEEDS):
+            simulator.settings = replace(settings, seed=seed)
+            frame = simulator.simulate(probe, phantom.probe_to_ras)
+            deep = slice(*(int(depth / frame.sample_interval_mm) for depth in (_DEPTHS_MM[0], _DEPTHS_MM[-1])))
+            power = power + np.mean(np.abs(frame.iq[_LINES, deep]) ** 2, axis=1)
+        powers.append(power)
+    return 10.0 * np.log10(powers[0] / powers[1])
+
+
+@lru_cache
+def _wave_levels_db(scene: str, probe_name: str) -> np.ndarray:
+    """(lines,) the same from wave propagation in the plane of the image."""
+    phantom, probe = _SCENES[scene](), PROBES[probe_name]
+    labels, to_ijk = phantom.labels.array, phantom.labels.ras_to_ijk @ phantom.probe_to_ras
+    speeds = np.full(256, REFERENCE_SPEED_M_S)
+    for label, tissue in phantom.tissues.items():
+        speeds[label] = tissue.speed_of_sound_m_s
+    levels = []
+    for position in probe.line_positions()[_LINES]:
+        origin, direction = (v[:2] for v in probe.line_at(position))
+        across = np.array([direction[1], -direction[0]])
+
+        def speed(x, depth, origin=origin, direction=direction, across=across):
+            points = origin[:, None] + np.outer(across, x) + np.outer(direction, depth)
+            ijk = to_ijk @ np.stack([*points, 0.0 * x, 0.0 * x + 1.0])
+            i, j, k = (np.clip(np.rint(c).astype(int), 0, n - 1) for c, n in zip(ijk, labels.shape[::-1], strict=False))
+            return speeds[labels[k, j, i]]
+
+        # Steered lines see the flat face from the side.
+        seen = float(direction[1]) if probe_name == "phased" else 1.0
+        beam = partial(
+            speckle_power, depths_mm=_DEPTHS_MM, frequency_mhz=probe.frequency_mhz,
+            aperture_mm=probe.aperture_mm * seen, f_number=probe.receive_f_number / seen, focus_mm=probe.focus_mm,
+            reference_m_s=REFERENCE_SPEED_M_S,
+        )  # fmt: skip
+        levels.append(10.0 * np.log10(np.mean(beam(speed) / beam(None))))
+    return np.array(levels)
+
+
+CHECKS = (
+    Check(
+        "beams in folds",
+        "Sulci change the level of a line as wave propagation says, without streaks; single rays do not follow it.",
+        beams_in_folds,
+    ),
+    Check(
+        "beams behind cysts",
+        "Behind a cyst of another speed of sound, mean power and edge shadow are those of wave propagation.",
+        beams_behind_cysts,
+    ),
+)

@@ -1,0 +1,207 @@
+"""Beams from an aperture: what soft and strong tissue do to them, against predictions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from SlicerUSSim.Logic import (
+    ConvexProbe,
+    LinearProbe,
+    PhasedProbe,
+    SimulationError,
+    SimulationSettings,
+    Tissue,
+    TissueTable,
+    UltrasoundSimulator,
+)
+from SlicerUSSim.Logic.verification.measurement import echo_near
+from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, STEEL, layered, refracting_wedge
+from tests.conftest import block, rigid, simulator
+
+PLAIN = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
+PROBES = {
+    "linear": LinearProbe(30, 40, scan_lines=61, focus_mm=30, elevation_focus_mm=30),
+    "convex": ConvexProbe(40, 40, 40, scan_lines=61, focus_mm=30, elevation_focus_mm=30),
+    "phased": PhasedProbe(60, 40, scan_lines=61, focus_mm=30, elevation_focus_mm=30),
+}
+FACE = rigid(np.eye(3), [0.0, -22.0, 0.0])  # 22 mm before the middle of a volume
+
+
+def lossy(name: str, speed: float, attenuation: float) -> Tissue:
+    return replace(PLAIN, name=name, speed_of_sound_m_s=speed, attenuation_db_cm_mhz=attenuation)
+
+
+def axis_segments(tree, line: int):
+    """The segments of the direct path of a scan line."""
+    return tree.segments[(tree.segment_line == line) & (tree.segments["reflections"] == 0)]
+
+
+def level_db(found, probe, top: float, bottom: float, seeds: int = 6) -> np.ndarray:
+    """(lines,) mean power of speckle between two depths."""
+    power, settings = 0.0, found.settings
+    for seed in range(seeds):
+        found.settings = replace(settings, seed=seed)
+        frame = found.simulate(probe, FACE)
+        deep = slice(*(int(depth / frame.sample_interval_mm) for depth in (top, bottom)))
+        power = power + np.mean(np.abs(frame.iq[:, deep]) ** 2, axis=1)
+    found.settings = settings
+    return 10.0 * np.log10(power)
+
+
+@pytest.mark.parametrize("kind", PROBES)
+def test_a_homogeneous_medium_changes_depth_and_attenuation_alone(kind):
+    """At 1500 m/s, depths are displayed 1540 / 1500 times as deep; 0.5 dB/(cm MHz) are 0.5 dB/mm both ways at 5 MHz."""
+    slow = lossy("slow", 1500.0, 0.5)
+    found = simulator(block(lambda x, y, z: 1, (36, 36, 8)), slow, coupling=slow)
+    tree = found.trace(PROBES[kind], FACE)
+    for line in (0, 30, 60):
+        path = axis_segments(tree, line)
+        np.testing.assert_allclose(path["depth_mm"], path["path_mm"] * 1540.0 / 1500.0, atol=2e-3)
+        np.testing.assert_allclose(20 * np.log10(path["attenuation"]), -0.5 * path["path_mm"], atol=0.02)
+        np.testing.assert_allclose(path["direction"], path["direction"][:1].repeat(len(path), 0), atol=2e-4)
+
+
+@pytest.mark.parametrize("kind", PROBES)
+@pytest.mark.parametrize("speeds", [(1500.0, 1560.0), (1580.0, 1510.0)])
+def test_a_soft_wedge_shifts_wires_as_snell_says(kind, speeds):
+    phantom = refracting_wedge(speeds_m_s=speeds)
+    probe = replace(PROBES[kind], depth_mm=52.0, scan_lines=161)
+    frame = UltrasoundSimulator(phantom.labels, phantom.tissues).simulate(probe, phantom.probe_to_ras)
+    for echo in phantom.expected(probe):
+        x, y, _ = echo_near(frame, probe, echo.shown_mm, 1.5)
+        # The prediction steers by the speed of the first tissue, the simulator by the mean speed to the depth.
+        assert (x, y) == pytest.approx(echo.shown_mm, abs=0.4 if kind == "phased" else 0.2)
+
+
+def test_there_is_no_seam_at_the_first_strong_border():
+    """Steel behind two soft layers: its echoes are at their depth and have lost what the layers take."""
+    layers = [lossy("a", 1540.0, 0.3), lossy("b", 1600.0, 0.6), STEEL]
+    phantom = layered(layers, [9.0, 21.5])
+    found = UltrasoundSimulator(phantom.labels, phantom.tissues, SimulationSettings(reflections=False))
+    probe = replace(PROBES["linear"], scan_lines=61)
+    hits = found.trace(probe, phantom.probe_to_ras).hits
+    steel = hits[hits["label_behind"] == 3]
+    assert len(steel) >= 61
+    np.testing.assert_allclose(steel["depth_mm"], 9.0 + 12.5 * 1540.0 / 1600.0, atol=0.02)
+    np.testing.assert_allclose(20 * np.log10(steel["attenuation"]), -(0.3 * 9.0 + 0.6 * 12.5), atol=0.1)
+
+
+def test_soft_borders_neither_bend_nor_split_a_ray_and_strong_ones_do():
+    """A wall inclined by 60 degrees: 2600 m/s reflects totally from 36 degrees on, 1600 m/s from 74 degrees on."""
+
+    def wall(x, y, z):
+        return 1 + (y > -2.0 + np.tan(np.radians(60.0)) * x)
+
+    other = {"soft": replace(PLAIN, name="soft", speed_of_sound_m_s=1600.0), "strong": Tissue("strong", 2600, 3.5, 0.5)}
+    for kind, tissue in other.items():
+        found = simulator(block(wall, (30, 40, 8), 0.5), PLAIN, tissue, coupling=PLAIN)
+        tree = found.trace(PROBES["linear"], FACE)
+        assert (tree.segments["reflections"] > 0).any() == (kind == "strong")
+        middle = tree.segments[np.abs(tree.segment_line - 30) < 1e-6]
+        assert (middle["label"] == 2).any() == (kind == "soft")
+        found.settings = SimulationSettings(beam="ray")
+        bent = found.trace(PROBES["linear"], FACE).segments
+        assert bent["direction"][:, 1].min() < 0.999
+
+
+def test_the_shadow_of_a_bone_has_the_penumbra_of_the_aperture():
+    """A share n of the aperture is open: each intensity has n^2 of its peak and 1 / n of its width, speckle n^3."""
+
+    def plate(x, y, z):
+        return np.where((x > 0.0) & (np.abs(y + 10.0) < 1.0), 2, 1)
+
+    found = simulator(block(plate, (34, 34, 8), 0.5), PLAIN, STEEL, coupling=PLAIN, interfaces=False, reflections=False)
+    level = level_db(found, PROBES["linear"], 26.0, 34.0)
+    place = PROBES["linear"].line_positions()
+    fall = level - level[place < -8.0].mean()
+    # At 30 mm, the edge of a plate at 12 mm is seen from the face under 30 / 18 times the distance of the line.
+    is_open = (6.0 + 0.75 * 30.0 / 18.0) / 12.0
+    assert fall[np.abs(place + 0.75) < 0.6].mean() == pytest.approx(30.0 * np.log10(is_open), abs=2.5)
+    assert np.abs(fall[place < -7.0]).max() < 1.5 and fall[place > 1.0].max() < -20.0
+
+
+def test_single_rays_change_from_line_to_line_and_beams_do_not():
+    """A sulcus of 1.6 mm at 5 degrees to the beam; lines are 0.25 mm apart."""
+
+    def sulcus(x, y, z):
+        return np.where((np.abs(x - 0.09 * y - 1.0) < 0.8) & (y < 4.0), 2, 1)
+
+    brain, csf = replace(PLAIN, speed_of_sound_m_s=1541.0, impedance_mrayl=1.607), Tissue("csf", 1504.5, 1.515, 0.0)
+    found = simulator(block(sulcus, (34, 34, 8), 0.5), brain, csf, coupling=brain, interfaces=False)
+    probe = replace(PROBES["linear"], scan_lines=121)
+    depth = np.linspace(30.0, 36.0, 5)
+
+    def largest_step_db() -> float:
+        tree, reached = found.trace(probe, FACE), []
+        for line in range(30, 91):
+            path = axis_segments(tree, line)
+            past = depth[:, None] - path["path_mm"]
+            inside = (past >= 0.0) & (past < path["length_mm"])
+            amplitude = path["weight"] * path["attenuation"] * np.exp(-path["decay_per_mm"] * past)
+            reached.append(np.where(inside, amplitude, 0.0).sum(axis=1).mean())
+        return float(np.abs(np.diff(20 * np.log10(np.maximum(reached, 1e-3)))).max())
+
+    assert largest_step_db() < 5.0  # a part of it is for scatterers that count for two lines
+    found.settings = replace(found.settings, beam="ray")
+    assert largest_step_db() > 10.0
+
+
+@pytest.mark.parametrize(
+    "probe",
+    [
+        ConvexProbe(20, 60, 30, scan_lines=24, aperture_mm=200.0),
+        LinearProbe(1, 30, scan_lines=2, aperture_mm=0.5),
+        LinearProbe(200, 10, scan_lines=16, aperture_mm=0.5),
+        PhasedProbe(170, 30, scan_lines=24),
+    ],
+)
+def test_a_beam_may_be_wider_or_narrower_than_everything(probe):
+    found = simulator(block(lambda x, y, z: 1 + (np.abs(x) + np.abs(y) + np.abs(z) < 1.5), (6, 6, 6)), PLAIN, STEEL)
+    frame = found.simulate(probe, FACE @ rigid(np.eye(3), [0.0, 10.0, 0.0]))
+    assert np.isfinite(frame.iq).all()
+
+
+def test_an_unknown_beam_is_refused():
+    with pytest.raises(SimulationError, match="beam"):
+        SimulationSettings(beam="wave")
+
+
+@pytest.mark.parametrize("border_mm", [12.0, 35.0])
+@pytest.mark.parametrize("kind", ["linear", "phased"])
+def test_a_wedge_across_the_image_plane_displaces_the_beam_as_snell_says(kind, border_mm):
+    """At 55 mm, for borders near the face and near the target, over turned grids: 10 % on average.
+
+    Delays over the aperture alone would not tell them apart. Labels are stairs, of which one sheet sees few.
+    """
+    slow, fast = Tissue("slow", 1500.0, 1.55, 0.0), Tissue("fast", 1545.0, 1.6, 0.0)
+    probe = (
+        LinearProbe(10, 60, scan_lines=24, elevation_focus_mm=20)
+        if kind == "linear"
+        else PhasedProbe(20, 60, elevation_focus_mm=20)
+    )
+    tilt = np.radians(40.0)
+    found = []
+    for turn in Rotation.random(8, rng=5).as_matrix():
+        normal, origin = turn @ [0.0, np.cos(tilt), np.sin(tilt)], turn @ [0.0, -30.0, 0.0]
+        on_border = turn @ [0.0, border_mm - 30.0, 0.0]
+        halves = block(
+            lambda x, y, z, n=normal, far=normal @ on_border: np.where(x * n[0] + y * n[1] + z * n[2] > far, 2, 1),
+            half_mm=(45, 45, 45),
+        )
+        simulator = UltrasoundSimulator(halves, TissueTable({0: slow, 1: slow, 2: fast}))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, origin
+        segments = simulator.trace(probe, pose).segments
+        end = segments["start"] + segments["length_mm"][:, None] * segments["direction"]
+        place = (np.concatenate([segments["start"], end]) - origin) @ turn  # in the probe's frame
+        place = place[np.abs(place[:, 0]) < 1.0]
+        place = place[np.argsort(place[:, 1])]
+        found.append(np.interp(55.0, place[:, 1], place[:, 2]))
+    refracted = np.arcsin(np.sin(tilt) * fast.speed_of_sound_m_s / slow.speed_of_sound_m_s)
+    expected = np.tan(tilt - refracted) * (55.0 - border_mm)
+    assert np.mean(found) == pytest.approx(expected, rel=0.1)
+    assert np.std(found) < 0.3 * abs(expected)

@@ -1,0 +1,336 @@
+"""Label maps whose numbers or header would mislead: tissues in another order, heads upside down, parts of one."""
+
+from __future__ import annotations
+
+import re
+from itertools import permutations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic.tissue import LabelMapping, read_label_file, read_label_map
+from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
+from SlicerUSSim.Logic.tissue.label_sources import is_label_file
+from SlicerUSSim.Logic.tissue.probability_maps import combined_probability_maps
+from tests.test_label_maps import (
+    ASEG,
+    DESTRIEUX,
+    SYNTHSEG,
+    WMPARC,
+    brain,
+    freesurfer,
+    head,
+    probability_maps,
+    refusal_of,
+    refused,
+    ussim,
+)
+
+NAMES = ("csf", "grey matter", "white matter")
+FAST = {"csf": "T1_pve_0.nii.gz", "grey matter": "T1_pve_1.nii.gz", "white matter": "T1_pve_2.nii.gz"}
+SPM = {"grey matter": "c1T1.nii.gz", "white matter": "c2T1.nii.gz", "csf": "c3T1.nii.gz"}
+
+
+def in_order(numbers: tuple[int, int, int], *, has_sulci: bool = False) -> Volume:
+    """A brain with CSF in its ventricles, or also around it, whose CSF, grey and white matter have these numbers."""
+    z, y, x = np.indices((50, 50, 50)) * 3.0 - 73.5
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    ventricle = (np.abs(x) > 3) & (np.abs(x) < 15) & (np.abs(y) < 30) & (np.abs(z) < 9)
+    outermost = 1 if has_sulci else 0
+    shells = np.select([radius > 68, radius > 65, ventricle, radius > 50], [0, outermost, 1, 2], 3)
+    return Volume(np.array([0, *numbers], np.uint8)[shells], np.diag([3.0, 3.0, 3.0, 1.0]))
+
+
+# ---- three tissues in some order -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("has_sulci", [False, True])
+def test_three_tissues_are_read_in_our_order_only_and_the_right_one_is_proposed_for_others(has_sulci):
+    for csf, grey, white in permutations((1, 2, 3)):
+        numbers = (csf, grey, white)
+        volume = in_order(numbers, has_sulci=has_sulci)
+        truth = dict(sorted(zip(numbers, NAMES, strict=True)))
+        if numbers == (1, 2, 3):
+            assert "ussim segment and FSL FAST" in read_label_map(volume).message
+            continue
+        message = str(refusal_of(volume))
+        maps = " ".join(f"--map {number}={name.split()[0]}" for number, name in truth.items())
+        assert message.endswith(f"if that is right, say so with {maps}"), message
+        found = read_label_map(volume, mapping=LabelMapping.of(re.findall(r"--map (\S+)", message)))
+        assert [found.names[found.relabelled[number] - 1] for number in truth] == list(truth.values())
+
+
+def test_spms_order_with_ventricles_only_is_refused_by_the_command_with_a_remedy_that_works(tmp_path):
+    """Its ventricles are deep and touch label 2, as white matter does in our order."""
+    path = tmp_path / "seg.nii.gz"
+    in_order((3, 1, 2)).write(path)
+    message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert re.search(r"1 grey matter \(\d+%\), 2 white matter \(\d+%\), 3 csf \(\d%\)", message), message
+    remedy = re.search(r"--map 1=grey --map 2=white --map 3=csf", message)
+    assert remedy is not None
+    result = ussim("simulate", path, *remedy[0].split(), "--pose", "auto", "-o", tmp_path / "o.png")
+    assert result.exit_code == 0, result.output
+
+
+def test_other_numbers_get_a_proposal_but_no_tissues():
+    message = str(refusal_of(in_order((10, 150, 250))))
+    assert "labels 10, 150, 250 are in no known program's order" in message
+    assert message.endswith("--map 10=csf --map 150=grey --map 250=white")
+
+
+def test_three_organs_beside_each_other_get_no_proposal():
+    array = np.zeros((60, 60, 60), np.uint8)
+    for label, j in ((1, 2), (2, 22), (3, 42)):
+        array[5:55, j : j + 16, 5:55] = label
+    message = str(refusal_of(Volume(array, np.diag([3.0, 3.0, 3.0, 1.0]))))
+    assert "no program's numbers are recognised" in message and "if that is right" not in message
+
+
+# ---- the head's way up -----------------------------------------------------------------------------------------------
+
+
+def whole_head(*, structures: tuple[str, ...] = ("cerebellum", "brain stem")) -> Volume:
+    """A round brain with cerebellum and brain stem in FreeSurfer's numbers."""
+    volume = head()
+    array = volume.array.astype(np.int16)
+    k, j, i = np.indices(array.shape)
+    x, y, z = (volume.ijk_to_ras[:3, :3] @ np.stack([i, j, k]).reshape(3, -1)).reshape(3, *array.shape)
+    x, y, z = (v + offset for v, offset in zip((x, y, z), volume.ijk_to_ras[:3, 3], strict=True))
+    if "cerebellum" in structures:
+        array[(x**2 / 3 + (y + 35) ** 2 + (z + 47) ** 2) < 16**2] = 8
+        array[(array == 8) & (x > 0)] = 47
+    if "brain stem" in structures:
+        array[(x**2 + (y + 8) ** 2) * 2 + (z + 45) ** 2 < 15**2] = 16
+    return volume.with_array(array)
+
+
+def moved(volume: Volume, *, flip: str = "", turned: tuple[float, float, float] = (0, 0, 0)) -> Volume:
+    """The volume with another header: axes mirrored, then turned by degrees about each axis."""
+    mirror = np.diag([-1.0 if axis in flip else 1.0 for axis in "xyz"] + [1.0])
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("xyz", turned, degrees=True).as_matrix()
+    return Volume(volume.array, turn @ mirror @ volume.ijk_to_ras)
+
+
+TILTS = [(0, 0, 0), (45, 0, 0), (-45, 0, 0), (0, 40, 0), (0, 0, -40), (30, 20, 20), (-30, -20, 20)]
+
+
+@pytest.mark.parametrize("structures", [("cerebellum", "brain stem"), ("cerebellum",), ("brain stem",)])
+def test_a_head_that_is_tilted_is_no_head_upside_down(structures):
+    for turned in TILTS:
+        found = read_label_map(moved(whole_head(structures=structures), turned=turned))
+        assert found.message.startswith("FreeSurfer") and not found.warnings, turned
+
+
+@pytest.mark.parametrize(("flip", "words"), [("z", "upside down"), ("y", "back to front"), ("yz", "upside down")])
+def test_a_head_whose_header_is_mirrored_is_refused_also_if_it_is_tilted(flip, words):
+    for turned in ((0, 0, 0), (30, 0, 0), (-30, 0, 0), (0, 30, 0)):
+        assert words in str(refusal_of(moved(whole_head(), flip=flip, turned=turned))), turned
+
+
+def test_one_structure_below_the_cerebrum_is_enough_for_a_head_upside_down():
+    for structure in ("cerebellum", "brain stem"):
+        message = str(refusal_of(moved(whole_head(structures=(structure,)), flip="z")))
+        assert f"by its header, {structure} lies above the cerebrum's centre by" in message and "upside" in message
+
+
+def test_a_head_upside_down_is_one_clear_line_of_the_command(tmp_path):
+    path = tmp_path / "aseg.nii.gz"
+    moved(whole_head(), flip="z").write(path)
+    message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert f"{path}: by its header, brain stem and cerebellum lie above the cerebrum's centre by" in message
+    assert "the head is upside down; correct the orientation in its header" in message
+    assert not (tmp_path / "o.png").exists()
+
+
+def test_names_are_judged_as_numbers_are_and_the_users_own_tissues_are_not():
+    mirrored = moved(whole_head(), flip="z")
+    of_label = {label: freesurfer_names()[label] for label in np.unique(mirrored.array).tolist() if label}
+    assert "upside down" in str(refusal_of(mirrored, of_label))
+    mapping = LabelMapping.of({8: "grey matter", 47: "grey matter", 16: "white matter"})
+    assert read_label_map(mirrored, of_label, mapping).names
+
+
+# ---- parts of FreeSurfer's segmentation ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("labels", [(2, 3, 4, 10), (2, 3), (3, 42), (2, 3, 4, 5, 7, 8, 10, 11, 12, 13, 17, 18, 26, 28)])
+def test_a_part_of_freesurfers_segmentation_is_refused_with_its_numbering(labels):
+    volume = head()
+    array = np.where(np.isin(volume.array, labels), volume.array, 0).astype(np.int16)
+    for place, label in enumerate(label for label in labels if not (array == label).any()):
+        array[20 + place, 25:28, 15:18] = label
+    part = volume.with_array(array)
+    message = str(refusal_of(part))
+    assert "are all in FreeSurfer's table" in message and message.endswith("say which with --map freesurfer"), message
+    assert "leptomeninges" not in message  # no list of all tissues
+    assert read_label_map(part, mapping=LabelMapping.of("freesurfer")).message.startswith("FreeSurfer")
+
+
+FIRST = [10, 11, 12, 13, 17, 18, 26, 49, 50, 51, 52, 53, 54, 58, 16]
+
+
+@pytest.mark.parametrize(
+    ("labels", "missing"),
+    [
+        (FIRST, "without cortex, cerebral white matter, ventricles, cerebellum"),
+        ([2, 3, 41, 42], "without ventricles, cerebellum"),
+        (ASEG, None),
+        (WMPARC, None),
+        (DESTRIEUX, None),
+        ([label for label in SYNTHSEG if label not in (7, 8, 46, 47)], None),  # a cerebrum
+    ],
+    ids=["FIRST", "ribbon", "aseg", "wmparc", "a2009s", "cerebrum"],
+)
+def test_parts_of_a_brain_in_freesurfers_numbers_are_read_and_said(labels, missing):
+    warnings = read_label_map(freesurfer(labels)).warnings
+    assert [missing in line for line in warnings] == [True] if missing else not warnings
+
+
+def test_a_body_in_three_layers_is_no_brain_and_read_by_its_numbering():
+    _, y, x = np.indices((40, 50, 60)) * 8.0 - np.array([156, 196, 236])[:, None, None, None]
+    radius = np.sqrt((x / 1.3) ** 2 + y**2)
+    body = Volume(np.select([radius > 160, radius > 130, radius > 115], [0, 1, 3], 2).astype(np.uint8),
+                  np.diag([8.0, 8.0, 8.0, 1.0]))  # fmt: skip
+    message = str(refusal_of(body))
+    assert "TotalSegmentator tissue_types's table" in message and "litres, label 1 around the others" in message
+    assert message.endswith("say which with --map totalsegmentator-tissues")
+    found = read_label_map(body, mapping=LabelMapping.of("totalsegmentator-tissues"))
+    assert [found.names[found.relabelled[label] - 1] for label in (1, 2, 3)] == ["fat", "fat", "muscle"]
+    ours = in_order((1, 2, 3))
+    double = Volume(ours.array, np.diag([2.0, 2.0, 2.0, 1.0]) @ ours.ijk_to_ras)  # a brain of eight times the size
+    assert "no program's numbers are recognised" in str(refusal_of(double))
+
+
+def test_numbers_that_freesurfer_has_but_never_writes_are_not_proposed_as_its():
+    message = str(refusal_of(in_order((120, 121, 122))))
+    assert "FreeSurfer" not in message
+
+
+# ---- probability maps in larger numbers ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("scale", "dtype"), [(255, np.uint8), (100, np.uint8), (255, np.float32), (100, np.float32)])
+def test_probability_maps_up_to_100_or_255_are_combined(scale, dtype, tmp_path):
+    labels = probability_maps(tmp_path, SPM)
+    for name in SPM.values():
+        volume = Volume.read(tmp_path / name)
+        volume.with_array(np.rint(volume.array * scale).astype(dtype)).write(tmp_path / name)
+    for tissue, name in SPM.items():
+        path = tmp_path / name
+        assert is_label_file(path, Volume.read(path)), name
+        found = read_label_file(path, Volume.read(path))
+        assert f"a tissue probability map (SPM, {tissue}), combined with" in found.message
+        assert np.mean(found.labels.array == labels.array) > 0.97  # but for voxels at the borders
+
+
+def test_a_probability_map_up_to_255_alone_is_refused_if_it_is_nearly_binary(tmp_path):
+    white = brain({"csf": 0, "grey matter": 0, "white matter": 1})
+    fine = ndimage.gaussian_filter(ndimage.zoom(white.array.astype(np.float32), 2, order=0), 0.7)
+    for name in ("white.nii.gz", "c2T1.nii.gz"):
+        volume = Volume(np.rint(fine * 255).astype(np.uint8), np.diag([1.5, 1.5, 1.5, 1.0]))
+        with pytest.raises(SimulationError, match=r"a (tissue )?probability map .*, not an MRI; "):
+            assert is_label_file(tmp_path / name, volume)
+            read_label_file(tmp_path / name, volume)
+
+
+def test_a_mask_or_label_map_up_to_255_is_no_probability_map(tmp_path):
+    white = brain({"csf": 0, "grey matter": 17, "white matter": 255})
+    for volume in (white, white.with_array(white.array // 255 * 255)):
+        assert combined_probability_maps(tmp_path / "c2T1.nii.gz", volume) is None
+
+
+T2 = {"white matter": "T2_pve_0.nii.gz", "grey matter": "T2_pve_1.nii.gz", "csf": "T2_pve_2.nii.gz"}
+
+
+@pytest.mark.parametrize("scale", [1, 100])
+def test_fasts_maps_of_a_t2_are_refused_with_the_order_that_their_places_show(scale, tmp_path):
+    labels = probability_maps(tmp_path, T2)
+    for name in T2.values():
+        volume = Volume.read(tmp_path / name)
+        volume.with_array((scale * volume.array).astype(np.float32)).write(tmp_path / name)
+    path, out = tmp_path / "T2_pve_0.nii.gz", tmp_path / "o.png"
+    message = refused("simulate", path, "--pose", "auto", "-o", out)
+    assert "(labels 1 T2_pve_0.nii.gz, 2 T2_pve_1.nii.gz, 3 T2_pve_2.nii.gz)" in message
+    assert re.search(r"but 1 white matter \(\d+%\), 2 grey matter \(\d+%\), 3 csf \(\d+%\), as of a T2", message)
+    assert message.endswith("say so with --map 1=white --map 2=grey --map 3=csf") and not out.exists()
+    found = read_label_file(path, Volume.read(path), LabelMapping.of(re.findall(r"--map (\S+)", message)))
+    truth = np.array(["", *NAMES])[labels.array]
+    assert np.mean(np.array(["", *found.names])[found.labels.array] == truth) > 0.97
+
+
+def test_maps_named_by_tissue_are_refused_only_if_another_order_is_sure(tmp_path):
+    probability_maps(tmp_path, dict(zip(SPM, [SPM["white matter"], SPM["grey matter"], SPM["csf"]], strict=True)))
+    message = refused("simulate", tmp_path / SPM["csf"], "--pose", "auto", "-o", tmp_path / "o.png")
+    assert "--map 1=csf --map 2=white --map 3=grey" in message and "T2" not in message
+    for folder, names, is_read in ((tmp_path / "spm", SPM, True), (tmp_path / "fast", T2, False)):
+        folder.mkdir()
+        probability_maps(folder, names)
+        for name in names.values():  # a block within the brain, without an outside
+            volume = Volume.read(folder / name)
+            Volume(volume.array[15:35, 10:40, 3:24], volume.ijk_to_ras).write(folder / name)
+        path = folder / names["csf"]
+        if is_read:
+            assert read_label_file(path, Volume.read(path)).names == NAMES
+        else:
+            with pytest.raises(SimulationError, match=r"are not surely 1 csf \(.*; if that is right, .*--map 3=white"):
+                read_label_file(path, Volume.read(path))
+
+
+def test_a_fourth_map_by_brightness_is_refused_and_not_left_out(tmp_path):
+    probability_maps(tmp_path, FAST)
+    for name in FAST.values():
+        volume = Volume.read(tmp_path / name)
+        volume.write(tmp_path / "T1_pve_3.nii.gz")
+        message = refused("simulate", tmp_path / name, "--pose", "auto", "-o", tmp_path / "o.png")
+        assert "of 4 classes (FSL FAST, T1_pve_3.nii.gz), expected 3" in message and "-n 3" in message
+    assert "of 4 classes" in refused(
+        "simulate", tmp_path / "T1_pve_3.nii.gz", "--pose", "auto", "-o", tmp_path / "o.png"
+    )
+
+
+def test_cat12s_partial_volume_map_is_read_as_its_nearest_tissues(tmp_path):
+    labels = brain({"csf": 1, "grey matter": 2, "white matter": 3})
+    fine = ndimage.gaussian_filter(ndimage.zoom(labels.array.astype(np.float32), 2, order=0), 0.7)
+    p0 = Volume(np.rint(fine * 85).astype(np.float32) / np.float32(85), np.diag([1.5, 1.5, 1.5, 1.0]))
+    path = tmp_path / "p0T1.nii"
+    p0.write(path)
+    result = ussim("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
+    assert result.exit_code == 0 and "p0T1.nii: CAT12's partial volume map (p0), 3 tissues: 1 csf" in result.stderr
+    found = read_label_file(path, p0)
+    assert found.names == NAMES and np.mean(found.labels.array[::2, ::2, ::2] == labels.array) > 0.95
+
+
+def test_a_modulated_map_is_refused_as_one_and_not_with_the_contrast_that_it_resembles(tmp_path):
+    probability_maps(tmp_path, SPM)
+    grey = Volume.read(tmp_path / SPM["grey matter"])
+    for name in ("mwp1T1.nii", "smwc1T1.nii", "m0wp1T1.nii"):
+        grey.with_array(grey.array * np.float32(1.3)).write(tmp_path / name)
+        for arguments in (("segment", tmp_path / name, "-o", tmp_path / "l.nii.gz"),
+                          ("simulate", tmp_path / name, "--pose", "auto", "-o", tmp_path / "o.png")):  # fmt: skip
+            message = refused(*arguments)
+            assert f"{name}: a modulated tissue map ({name[:-6]}, volumes" in message and "c1, c2, c3 of SPM" in message
+
+
+@pytest.mark.parametrize("cut_at", [100, 97, 80])
+def test_an_mri_up_to_3_is_no_partial_volume_map(cut_at, mni, tmp_path):
+    t1 = mni[0].array.astype(np.float32)
+    top = np.percentile(t1[t1 > 0], cut_at)
+    scaled = mni[0].with_array(np.minimum(t1, top) / np.float32(top) * np.float32(3))
+    assert not is_label_file(tmp_path / "p0T1.nii", scaled)
+    assert not is_label_file(tmp_path / "mwp1T1.nii", mni[0])
+
+
+@pytest.mark.parametrize("cut_at", [100, 97, 80, 60])
+def test_an_mri_up_to_100_or_255_is_no_probability_map_whatever_it_is_called(cut_at, mni, tmp_path):
+    t1 = mni[0].array.astype(float)
+    top = np.percentile(t1[t1 > 0], cut_at)  # also with the brightest cut off, as pictures have
+    for scale in (100, 255):
+        volume = mni[0].with_array(np.rint(np.minimum(t1, top) / top * scale).astype(np.uint8))
+        for name in SPM.values():
+            volume.with_array(volume.array).write(tmp_path / name)
+        for name in ("t1.nii.gz", *SPM.values()):  # with two companions, which add up to three times as much
+            assert combined_probability_maps(tmp_path / name, volume) is None
