@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from SlicerUSSim.Logic import LinearProbe, SimulationError, UltrasoundSimulator,
 from SlicerUSSim.Logic.opencl import runtimes
 from SlicerUSSim.Logic.opencl.device import Device, kernel_folder
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device, faster_hint
-from SlicerUSSim.Logic.opencl.pocl import require_linker
+from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, require_linker
 from SlicerUSSim.Logic.opencl.runtimes import register_pip_runtimes
 from tests.conftest import SPECKLE, block, rigid, simulator
 
@@ -202,3 +204,45 @@ def test_pocl_without_a_linker_is_an_error_and_not_the_end_of_the_process(monkey
     require_linker("OpenCL 3.0 PoCL 6.0  Linux, Release")  # which brings its own
     monkeypatch.undo()
     require_linker("OpenCL 3.0 PoCL 3.0  Linux")
+
+
+_AVX512 = {
+    "avx512f",
+    "avx512bw",
+    "avx512cd",
+    "avx512dq",
+    "avx512vl",
+    "avx2",
+    "fma",
+    "bmi1",
+    "bmi2",
+    "f16c",
+    "movbe",
+    "avx",
+}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="PoCL's wheel, and the memory that is searched, are Linux's")
+@pytest.mark.parametrize(
+    ("called", "flags", "named"),
+    [
+        ("generic", _AVX512, "skylake-avx512"),  # Zen 5
+        ("znver3", _AVX512, "skylake-avx512"),  # Zen 4: vectors of 16 floats ended the process
+        ("znver3", _AVX512 - {"avx512f"}, None),  # Zen 3
+        ("icelake-server", _AVX512, None),
+        ("generic", {"avx", "f16c"}, "ivybridge"),
+        ("generic", set(), None),
+    ],
+)
+def test_pocl_builds_for_a_processor_with_the_vectors_of_its_kernel_library(monkeypatch, called, flags, named):
+    libc = ctypes.CDLL(None)
+    libc.malloc.restype = ctypes.c_void_p
+    name = libc.malloc(ctypes.c_size_t(24))
+    ctypes.memmove(name, called.encode() + b"\0", len(called) + 1)
+    structure = (ctypes.c_uint64 * 512)(3, 0, name)  # a device's structure, with a pointer to its processor's name
+    handle = SimpleNamespace(
+        version=f"OpenCL 3.0 PoCL HSTR: pthread-x86_64-{called}", int_ptr=ctypes.addressof(structure)
+    )
+    monkeypatch.setattr("SlicerUSSim.Logic.opencl.pocl._processor_flags", lambda: flags)
+    assert name_unknown_processor(handle) == named
+    assert ctypes.string_at(name).decode() == (named or called)

@@ -1,9 +1,11 @@
 """Workarounds for PoCL 3.0: a processor name that its compiler supports, and a check for a linker.
 
-LLVM 14 calls a processor it does not know "generic" (AMD Zen 4 and 5, for instance). PoCL passes that name to clang,
-which rejects it: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open since 2022). PoCL 3.0 has no setting for
-the name, but stores it as a C string that is read at every build. This module replaces the string by the name of a
-processor that LLVM 14 supports and whose instructions this processor has.
+LLVM 14 calls a processor it does not know "generic" (AMD Zen 5, for instance). PoCL passes that name to clang, which
+rejects it: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open since 2022). Zen 4 it takes for Zen 3, which has
+no AVX-512, while PoCL selects its AVX-512 kernel library by the processor's flags: vectors of 16 floats then end the
+process while they are compiled. PoCL 3.0 has no setting for the name, but stores it as a C string that is read at every
+build. This module replaces the string by the name of a processor that LLVM 14 supports and whose instructions this
+processor has.
 """
 
 from __future__ import annotations
@@ -29,19 +31,24 @@ _KNOWN_PROCESSORS = (
     ("ivybridge", {"avx", "f16c"}),
     ("nehalem", {"sse4_1", "sse4_2"}),
 )
+# What LLVM 14 calls processors that it does not know
+_UNKNOWN = "generic"
+# Names that LLVM 14 also gives to later processors, which have AVX-512
+_WITHOUT_AVX512 = ("znver1", "znver2", "znver3")
 _DEVICE_STRUCT_BYTES = 4096
-_NOT_NAMED = "PoCL's compiler does not know this processor, and it cannot be named to it: %s; kernels may not build"
+_NOT_NAMED = "PoCL's compiler calls this processor %s, and that cannot be changed: %s; kernels may not build"
 
 
 def name_unknown_processor(handle) -> str | None:
     """Give PoCL a processor name that its compiler accepts. Returns the name, or None if nothing was changed.
 
-    `handle` is the pyopencl Device. Nothing is written unless a pointer to exactly the string "generic", in a heap
-    block large enough for the new name, is found in the device's own structure.
+    `handle` is the pyopencl Device. Nothing is written unless a pointer to exactly the string that is its name now, in
+    a heap block large enough for the new name, is found in the device's own structure.
     """
-    if not handle.version.endswith("-generic"):
-        return None
     flags = _processor_flags()
+    called = handle.version.rsplit("-", 1)[-1]
+    if called != _UNKNOWN and not (called in _WITHOUT_AVX512 and "avx512f" in flags):
+        return None
     name = next((name for name, needed in _KNOWN_PROCESSORS if needed <= flags), None)
     if name is None:
         _log.warning("PoCL's compiler does not know this processor, and no older one is like it: kernels may not build")
@@ -50,17 +57,17 @@ def name_unknown_processor(handle) -> str | None:
         # Reading a wrong pointer through /proc/self/mem is an error; dereferencing it would end the process.
         memory = os.open("/proc/self/mem", os.O_RDONLY)
     except OSError as error:
-        _log.warning(_NOT_NAMED, f"its memory cannot be read ({error.strerror})")
+        _log.warning(_NOT_NAMED, called, f"its memory cannot be read ({error.strerror})")
         return None
     try:
-        address = _find_string(memory, handle.int_ptr, b"generic\0")
+        address = _find_string(memory, handle.int_ptr, called.encode() + b"\0")
     finally:
         os.close(memory)
     if address is None or _usable_bytes(address) <= len(name):
-        _log.warning(_NOT_NAMED, "the name is not where PoCL 3.0 has it")
+        _log.warning(_NOT_NAMED, called, "the name is not where PoCL 3.0 has it")
         return None
     ctypes.memmove(address, name.encode() + b"\0", len(name) + 1)
-    _log.info("PoCL's compiler does not know this processor; kernels are built for %s", name)
+    _log.info("PoCL's compiler calls this processor %s; kernels are built for %s", called, name)
     return name
 
 
