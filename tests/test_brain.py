@@ -374,6 +374,25 @@ def test_a_program_gets_a_copy_of_1_mm_along_lps_and_its_mask_comes_back_on_the_
     assert dice(mask, turned.array > 60) > 0.97
 
 
+@pytest.mark.parametrize("largest_turn_deg", [45.0, 1.0])
+def test_robex_is_given_a_head_that_lies_at_its_atlas(tmp_path, monkeypatch, largest_turn_deg):
+    """Its own registration is half of its time, and takes a third of that where nothing is left to be found."""
+    head = head_mri(4.0)
+    turned = np.diag([0.9, 0.9, 0.9, 1.0])
+    turned[:3, :3] @= Rotation.from_euler("x", 6.0, degrees=True).as_matrix()
+    turned[:3, 3] = 15.0, -20.0, 30.0
+    atlas = Volume(head.array, turned @ head.ijk_to_ras)
+    (tmp_path / "ref_vols").mkdir()
+    sitk.WriteImage(atlas.to_sitk(), str(tmp_path / "ref_vols/atlas.nii.gz"))
+    keep = f"sitk.WriteImage(image, {str(tmp_path / 'given.nii.gz')!r})\n"
+    monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, COPY + keep))
+    monkeypatch.setattr(extractors, "_LARGEST_TURN_DEG", largest_turn_deg)
+    assert dice(extractors.robex(head, lambda share: None), head.array > 60) > 0.97
+    given = sitk.ReadImage(str(tmp_path / "given.nii.gz"))
+    overlap = dice(sitk.GetArrayFromImage(sitk.Resample(given, atlas.to_sitk())) > 60, atlas.array > 60)
+    assert overlap > 0.95 if largest_turn_deg > 6.0 else overlap < 0.9  # as it is, where no head is turned so
+
+
 def test_a_cancelled_program_is_ended_and_leaves_nothing(tmp_path, monkeypatch):
     script = f"import os, time\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\ntime.sleep(60)"
     monkeypatch.setattr(extractors, "robex_folder", lambda: fake_robex(tmp_path, script))
