@@ -22,7 +22,7 @@ _PREFERENCE = ("t1", "t1gd", "flair", "t2")
 #: The spatial prior's exponent: the affine transform leaves the cortex some millimetres off
 _PRIOR_EXPONENT = 0.3
 #: Noise of posteriors per that of the fit, for filtered images: filters leave more error at borders than within tissues
-FILTER_BLUR = 1.75
+FILTER_BLUR = 1.5
 _START_ITERATIONS = 12
 #: Distance of means, in standard deviations of the noise, below which two tissues are one
 _LEAST_GAP = 0.5
