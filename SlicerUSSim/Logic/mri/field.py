@@ -27,8 +27,8 @@ from SlicerUSSim.Logic.mri.mixture import fit_mixture
 #: of the degree. The voxels count as if each were independent, so that the deviation is smaller than that of a field:
 #: with 0.3 degree 5 follows the tissues, with 0.01 a real field is left
 _DEGREE, _EXPECTED = 4, 0.05
-#: Weight of pure grey matter in the field, chosen with the two above on phantoms of MNI152, Colin27 and one label map of
-#: SynthSeg. By its wide class alone it counts less than white matter, which is in the middle and brighter there
+#: Weight of pure grey matter in the field, chosen with the two above on phantoms of MNI152, Colin27 and one label map
+#: of SynthSeg. By its wide class alone it counts less than white matter, which is in the middle and brighter there
 _GREY_WEIGHT = 2.0
 #: Millimetres between the voxels that are used
 _STEP_MM = 4.0
