@@ -86,11 +86,15 @@ class TissueMixture:
             result[second] += density[len(TISSUES) + n] * beyond
         return result, density[_INSIDE:].sum(axis=0)
 
-    def slope(self, points: Points) -> np.ndarray:
-        """(points,) derivative of the logarithm of the density by the intensity, for one channel."""
+    def slope(self, points: Points, grey: float = 1.0) -> np.ndarray:
+        """(points,) derivative of the logarithm of the density by the intensity, for one channel.
+
+        What pure grey matter adds to it counts `grey` times.
+        """
         parts = _Parts(points, self.means, self.covariance, self.spread)
         density = parts.density * self.weights[:, None] * _affinity(points)
         density /= density.sum(axis=0) + 1e-300
+        density[_GREY] *= grey
         values, means = points.values[:, 0], self.means[:, 0]
         pure = density[: len(TISSUES)] / self.spread[:, None]
         result = pure.T @ means - (pure.sum(axis=0) + density[len(TISSUES) : _INSIDE].sum(axis=0)) * values

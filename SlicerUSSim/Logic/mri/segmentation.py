@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
 from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, classify
 from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
-from SlicerUSSim.Logic.mri.neighbours import smoothed_posteriors
+from SlicerUSSim.Logic.mri.neighbours import less_sure, smoothed_posteriors
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.plausibility import require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities
@@ -227,7 +227,7 @@ def segment_mri(
     if atlas:
         found = with_nuclei(found, values, atlas, part.images[0], part.inside)
         timed("nuclei")
-    found = replace(found, posteriors=smoothed_posteriors(found.posteriors, part.inside))
+    found = replace(found, posteriors=less_sure(smoothed_posteriors(found.posteriors, part.inside)))
     timed("neighbours")
     report(0.9)
     warnings += doubts(found, part, filtered[0][0], filtered[0][1], atlas, contrasts)
