@@ -265,6 +265,35 @@ def test_the_membrane_fades_where_the_beam_meets_it_obliquely(spacing_mm, expone
     assert 10 * np.log10(powers[1] / powers[0]) == pytest.approx(10 * np.log10(cosine ** (2 * exponent - 1)), abs=1.0)
 
 
+@pytest.mark.parametrize("half_voxels", [0.6, 1.0])
+@pytest.mark.parametrize("across", [(0, 0, 1), (1, 2, 4), (1, 1, 1)])
+def test_a_thin_sulcus_is_one_line(half_voxels, across):
+    """A layer of the membrane's own tissue of one or two voxels, however it lies in the grid, is one sheet.
+
+    Its two borders, 1.6 mm apart and 12 dB brighter than what was between them, were two.
+    """
+    across = np.array(across) / np.linalg.norm(across)
+    (turn, _), half = Rotation.align_vectors([[0, 1, 0]], [across]), 24
+    k, j, i = np.meshgrid(*[np.arange(-half, half + 1)] * 3, indexing="ij")
+    labels = np.where(np.abs(i * across[0] + j * across[1] + k * across[2]) < half_voxels, 2, 1).astype(np.uint8)
+    ijk_to_ras = rigid(turn.as_matrix(), [0, 0, 0]) @ rigid(np.eye(3), [-half] * 3)
+    bright = Tissue("sheet", 1540.0, 1.54, 0.0, mu0=0.5, sigma0=0.5)
+    table = TissueTable(
+        {0: FLUID, 1: Tissue("silent", 1540.0, 1.54, 0.0), 2: bright},
+        Membrane(bright, 0.4, ("sheet",), diffuse_db=12.0),
+    )
+    probe = LinearProbe(20, 40, scan_lines=121, focus_mm=20, elevation_focus_mm=20)
+    power = 0.0
+    for seed in range(6):
+        simulator = UltrasoundSimulator(Volume(labels, ijk_to_ras), table, SimulationSettings(seed=seed))
+        power += (np.abs(simulator.simulate(probe, rigid(np.eye(3), [0, -20, 0])).iq) ** 2).mean(axis=0)
+    level = 10.0 * np.log10(power / power.max() + 1e-12)
+    bright_at = np.flatnonzero(level > -6.0)
+    assert level[bright_at[0] : bright_at[-1] + 1].min() > -8.5
+    assert np.ptp(bright_at) * 40.0 / len(level) < 1.6
+    assert (bright_at.mean() + 0.5) * 40.0 / len(level) == pytest.approx(20.0, abs=0.2)
+
+
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0])
 def test_roughness_of_the_membrane_takes_the_coherent_echo_of_its_border_only(tilt_deg):
     """exp(-(2 k s cos i)^2 / 2) at the border of the fluid, nothing at the border between two other tissues."""

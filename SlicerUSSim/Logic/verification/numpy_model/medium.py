@@ -72,9 +72,17 @@ class HostMedium:
         if fluid.all() or not fluid.any():
             return None, -1.0
         sigma_mm = 0.75 * np.prod(spacing_mm) ** (1.0 / 3.0)
-        share = ndimage.gaussian_filter(
-            fluid.astype(np.float32), sigma_mm / spacing_mm[::-1], mode="nearest", truncate=3.0
+        own = [label for label in fluids if self.tissues[label].name == membrane.tissue.name]
+        sheet = np.isin(self.label, own[:1])
+        share, layer = (
+            ndimage.gaussian_filter(part.astype(np.float32), sigma_mm / spacing_mm[::-1], mode="nearest", truncate=3.0)
+            for part in (fluid & ~sheet, sheet)
         )
+        # A label of the membrane's own tissue is a membrane where its middle is, unless it is thick.
+        middle = ndimage.maximum_filter(layer, size=(3, 3, 3))
+        is_thin = middle < 0.9
+        share[is_thin] = np.maximum(share, 0.5 * layer / np.maximum(middle, 0.2))[is_thin]
+        share[~is_thin] += layer[~is_thin]
         per_sigma = 127.5 / _FARTHEST
         steps = np.rint(np.clip(share, 0.0, 1.0) * _SHARES) / _SHARES
         sigmas = np.clip(special.ndtri(steps), -_FARTHEST, _FARTHEST)
