@@ -2,8 +2,12 @@
 // voxels are repeated. One work-item computes LANES voxels of a row; global size (columns / LANES rounded up, rows,
 // planes).
 //
-// Buffers: groups uchar [k][j][i] with flags; taps float [2 reach + 1] of unit sum; partial float [plane][j][i]; smooth
-// ushort [k][j][i], 65535 for 1. `columns` and `rows` are the voxels along i and j.
+// With MEMBERSHIP a voxel belongs to a second group by the share that the segmentation gives it: a border at the
+// half-level between voxels instead of their steps.
+//
+// Buffers: groups uchar [k][j][i] with flags; second uchar [k][j][i], groups; share uchar [k][j][i], 255 for 1; taps
+// float [2 reach + 1] of unit sum; partial float [plane][j][i]; smooth ushort [k][j][i], 65535 for 1. `columns` and
+// `rows` are the voxels along i and j.
 
 #include "common.clh"
 
@@ -16,9 +20,23 @@
   JOIN(vstore, LANES)(JOIN(JOIN(convert_ushort, LANES), _sat)((value) * 65535.0f + 0.5f), 0, pointer)
 #endif
 
+#ifdef MEMBERSHIP
+#define MEMBERSHIP_PARAMETERS __global const uchar *second, __global const uchar *share,
+#else
+#define MEMBERSHIP_PARAMETERS
+#endif
+
+// LANES bytes of a row from `column`, whose outermost voxels are repeated.
+inline floatn bytes_from(__global const uchar *row, int column, int columns, int is_inside) {
+  if (is_inside) return LOAD_BYTES(row + column);
+  float at_the_ends[LANES];
+  for (int n = 0; n < LANES; n++) at_the_ends[n] = row[clamp(column + n, 0, columns - 1)];
+  return LOAD_LANES(at_the_ends);
+}
+
 // Along i, from groups: planes starting at `first`, each clamped to the volume.
-__kernel void smooth_rows(__global const uchar *groups, int group, __constant const float *taps, int reach, int columns,
-                          int rows, int planes, int first, __global float *partial) {
+__kernel void smooth_rows(__global const uchar *groups, MEMBERSHIP_PARAMETERS int group, __constant const float *taps,
+                          int reach, int columns, int rows, int planes, int first, __global float *partial) {
   // The last vector of a row starts earlier: voxels shared with the previous vector are computed twice.
   const int column = min((int)get_global_id(0) * LANES, columns - LANES), row = get_global_id(1);
   const int plane = clamp((int)get_global_id(2) + first, 0, planes - 1);
@@ -26,16 +44,17 @@ __kernel void smooth_rows(__global const uchar *groups, int group, __constant co
   const int is_inside = column >= reach && column + LANES + reach <= columns;
   floatn sum = 0.0f;
   for (int k = -reach; k <= reach; k++) {
-    floatn words;  // the flag is worth 128
-    if (is_inside) {
-      words = LOAD_BYTES(from + column + k);
-    } else {
-      float at_the_ends[LANES];
-      for (int n = 0; n < LANES; n++) at_the_ends[n] = from[clamp(column + n + k, 0, columns - 1)];
-      words = LOAD_LANES(at_the_ends);
-    }
+    const int at = column + k;
+    const floatn words = bytes_from(from, at, columns, is_inside);  // the flag is worth 128
     const floatn found = words >= (floatn)SAME_GROUP ? words - (floatn)SAME_GROUP : words;
-    sum += found == (floatn)group ? (floatn)taps[k + reach] : (floatn)(0.0f);
+    floatn member = found == (floatn)group ? (floatn)(1.0f) : (floatn)(0.0f);
+#ifdef MEMBERSHIP
+    const size_t row_start = (size_t)(from - groups);
+    const floatn other = bytes_from(second + row_start, at, columns, is_inside);
+    const floatn part = bytes_from(share + row_start, at, columns, is_inside) * (1.0f / 255.0f);
+    member += part * ((other == (floatn)group ? (floatn)(1.0f) : (floatn)(0.0f)) - member);
+#endif
+    sum += taps[k + reach] * member;
   }
   STORE_LANES(sum, partial + ((size_t)get_global_id(2) * rows + row) * columns + column);
 }

@@ -16,6 +16,7 @@ from SlicerUSSim.Logic import (
     PhasedProbe,
     SimulationError,
     SimulationSettings,
+    Texture,
     Tissue,
     TissueTable,
     UltrasoundSimulator,
@@ -215,10 +216,17 @@ def test_the_pulse_follows_from_the_equations(sigma):
     np.testing.assert_allclose(bmode.pulse_taps(sigma), pulse_taps(sigma), rtol=1e-5)
 
 
-def test_the_medium_is_the_same_on_the_host():
+@pytest.mark.parametrize("has_shares", [False, True])
+def test_the_medium_is_the_same_on_the_host(has_shares):
     labels, tissues = scene()
-    found = UltrasoundSimulator(labels, tissues).medium
-    model = NumpyModel(UltrasoundSimulator(labels, tissues)).medium
+    texture = None
+    if has_shares:
+        rng, shape = np.random.default_rng(0), labels.array.shape
+        second = rng.choice(np.unique(labels.array), shape).astype(np.uint8)
+        nothing = np.zeros(shape, np.float32)
+        texture = Texture(second, nothing, nothing, rng.uniform(0.0, 0.5, shape).astype(np.float32))
+    simulator = UltrasoundSimulator(labels, tissues, texture=texture)
+    found, model = simulator.medium, NumpyModel(simulator).medium
     shape, download = model.label.shape, found.device.download
     voxels = download(found.voxel_buffer, shape, np.uint16)
     assert np.array_equal(voxels & CONSTANTS["LABEL_MASK"], model.label)
@@ -303,7 +311,11 @@ WRONG_STEPS = {
         lambda right: lambda a: right(a) + SHIFT,
     ),
     "noise": (bmode, "noise_key", lambda right: lambda *n: right(*n) ^ 1),
-    "smoothed indicators": (medium, "smoothed_indicators", lambda right: lambda d, g, n, p, f: right(d, g, n, {0}, f)),
+    "smoothed indicators": (
+        medium,
+        "smoothed_indicators",
+        lambda right: lambda d, g, n, p, f, m: right(d, g, n, {0}, f, m),
+    ),
     "fluid distance": (medium.Medium, "_fluid_distance", _moved_distance),
 }
 

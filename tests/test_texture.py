@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
@@ -19,6 +21,8 @@ from SlicerUSSim.Logic import (
     Volume,
     segment_mri,
 )
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.tissue.texture import volume_shares
 from SlicerUSSim.Logic.verification.measurement import correlation, level_db, region_level_db
 from tests.conftest import SPECKLE, block, rigid
 
@@ -180,6 +184,69 @@ def test_the_medium_gives_its_texture_back_as_the_kernels_read_it():
     inner = (slice(1, -1),) * 3  # without the margin of coupling medium
     np.testing.assert_array_equal(packed[inner], known.packed(SOLID.array, True, 2.0))
     assert UltrasoundSimulator(SOLID, TABLE).medium.packed_texture() is None
+
+
+def tilted_plane(turn_deg: float, spacing_mm: float, noise: float) -> tuple[Volume, Volume, np.ndarray]:
+    """(image, labels, (k, j, i) part beyond) of the plane y = 0, in voxels that are turned against it."""
+    turned = Rotation.from_euler("xz", [turn_deg, 0.6 * turn_deg], degrees=True).as_matrix()
+    count = np.ceil(np.array([56.0, 24.0, 40.0]) / spacing_mm).astype(int)
+    ijk_to_ras = rigid(turned, [0, 0, 0]) @ np.diag([spacing_mm] * 3 + [1.0])
+    ijk_to_ras[:3, 3] = -ijk_to_ras[:3, :3] @ (0.5 * (count - 1) + 0.23)
+    k, j, i = np.meshgrid(*(np.arange(n) for n in count[::-1]), indexing="ij")
+    beyond_mm = ijk_to_ras[1, 0] * i + ijk_to_ras[1, 1] * j + ijk_to_ras[1, 2] * k + ijk_to_ras[1, 3]
+    part = np.clip(0.5 + beyond_mm / np.abs(ijk_to_ras[1, :3]).sum(), 0.0, 1.0)
+    rng = np.random.default_rng(0)
+    image = (100.0 * part + 100.0 * noise * rng.standard_normal(part.shape)).astype(np.float32)
+    return Volume(image, ijk_to_ras), Volume((1 + (image > 50.0)).astype(np.uint8), ijk_to_ras), part
+
+
+def texture_of(image: np.ndarray, labels: np.ndarray) -> Texture:
+    second = (3 - labels).astype(np.uint8)
+    # A class is more certain than the parts of a voxel.
+    share = np.clip(0.5 - np.abs(image - 50.0) / 40.0, 0.0, 0.5).astype(np.float32) + np.float32(1e-3)
+    return Texture(second, share, np.zeros_like(share), volume_shares(image, labels, second, share))
+
+
+@pytest.mark.parametrize("spacing_mm", [0.5, 1.0])
+@pytest.mark.parametrize("turn_deg", [2.0, 3.0, 15.0])
+def test_shares_of_voxels_place_planes_that_labels_cannot(turn_deg, spacing_mm):
+    """The steps of a plane turned by 2 degrees are 28 voxels long; the MRI knows more than its labels. 3 % of noise."""
+    before, behind = (replace(SPECKLE, name=str(z), impedance_mrayl=z) for z in (1.54, 1.8))
+    table = TissueTable({0: before, 1: before, 2: behind})
+    image, labels, _ = tilted_plane(turn_deg, spacing_mm, noise=0.075)  # 3 % of white matter, between CSF and grey
+    settings = SimulationSettings(scattering=False, specular_exponent=0.0)
+    probe = LinearProbe(20, 40, scan_lines=81, focus_mm=25, elevation_focus_mm=25)
+    lowest = {}
+    for name, known in (("labels", None), ("shares", texture_of(image.array, labels.array))):
+        simulator = UltrasoundSimulator(labels, table, settings, texture=known)
+        frame = simulator.simulate(probe, rigid(np.eye(3), [0, -25, 0]))
+        level = 20 * np.log10(np.abs(frame.iq[10:-10]).max(axis=1) * (1.8 + 1.54) / (1.8 - 1.54))
+        lowest[name] = level.min() - settings.interface_gain_db
+    assert lowest["shares"] > -1.7
+    assert turn_deg == 15.0 or lowest["labels"] < 2.0 * lowest["shares"]  # what shares are for
+
+
+def test_shares_of_voxels_follow_from_the_image():
+    image, labels, part = tilted_plane(15.0, 1.0, noise=0.03)
+    known = texture_of(image.array, labels.array)
+    assert known.volume_share is not None
+    beyond = np.where(labels.array == 2, 1.0 - known.volume_share, known.volume_share)
+    mixed = (part > 0.2) & (part < 0.8)
+    assert np.sqrt(np.mean((beyond - part)[mixed] ** 2)) < 0.12
+    assert (beyond == labels.array - 1)[(part == 0.0) | (part == 1.0)].mean() > 0.99
+    # Where intensities do not tell two tissues apart, the class does.
+    alike = np.random.default_rng(1).normal(50.0 + labels.array, 1.0).astype(np.float32)
+    shares = volume_shares(alike, labels.array, known.second_label, known.second_share)
+    np.testing.assert_array_equal(shares[mixed], known.second_share[mixed])
+
+
+def test_a_segmentation_knows_the_shares_of_its_voxels():
+    segmentation = segment_mri(head_mri(2.0))
+    known = segmentation.texture()
+    assert known.volume_share is not None and 0.01 < (known.volume_share > 0).mean() < 0.4
+    assert known.volume_share.max() <= 0.5
+    edge = ndimage.maximum_filter(segmentation.labels.array, 3) != ndimage.minimum_filter(segmentation.labels.array, 3)
+    assert edge[known.volume_share > 0].all()
 
 
 def test_textures_that_do_not_fit_are_refused():

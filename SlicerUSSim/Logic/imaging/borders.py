@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,13 +16,21 @@ if TYPE_CHECKING:
 _SLAB = 48  # planes at a time, to limit the memory between the passes
 
 
-def smoothed_indicators(device: Device, group_buffer: Buffer, dims, present: set[int], fields: int) -> Buffer:
+def smoothed_indicators(
+    device: Device,
+    group_buffer: Buffer,
+    dims,
+    present: set[int],
+    fields: int,
+    membership: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Buffer:
     """Device buffer ushort: indicators of the first `fields` groups, smoothed by Gaussians, at two resolutions.
 
     First [field][k][j][i] with WIDE_SIGMA voxels, then the same at half the resolution, rounded up, smoothed as widely
     in voxels of that grid. `group_buffer` has uint8 groups with flags, `dims` (i, j, k) voxels, `present` the groups
     that occur. Fields of other groups are 0, and all fields if there is only one group, which has no border.
-    65535 means 1.
+    65535 means 1. `membership` are the second group of every voxel and its share in 1/255, (k, j, i) uint8 each:
+    borders then lie at the half-level of the shares and not at the faces of voxels.
     """
     dims = np.asarray(dims)
     voxels, halved = int(dims.prod()), int(((dims + 1) // 2).prod())
@@ -30,8 +39,10 @@ def smoothed_indicators(device: Device, group_buffer: Buffer, dims, present: set
         return smooth
     *all_but_last, last = sorted(present)
     workspace = Workspace(device)
+    # Rows are read a vector at a time, including the last one.
+    others = [] if membership is None else [device.upload(np.pad(part.ravel(), (0, 16))) for part in membership]
     for group in all_but_last[:fields]:
-        _smooth(device, workspace, group_buffer, dims, group, smooth)
+        _smooth(device, workspace, [group_buffer, *others], dims, group, smooth)
         _smooth_halved(device, workspace, dims, group * voxels, fields * voxels + group * halved, smooth)
     if last < fields:
         rest = device.kernels("smoothing.cl")["smooth_rest"]
@@ -40,11 +51,11 @@ def smoothed_indicators(device: Device, group_buffer: Buffer, dims, present: set
     return smooth
 
 
-def _smooth(device: Device, workspace: Workspace, group_buffer: Buffer, dims, group: int, smooth: Buffer) -> None:
-    """The indicator of one group, from the groups of voxels."""
+def _smooth(device: Device, workspace: Workspace, groups: Sequence[Buffer], dims, group: int, smooth: Buffer) -> None:
+    """The indicator of one group, from the groups of voxels, and their second groups and shares if they have any."""
     columns, rows, planes = (int(n) for n in dims)
     lanes = device.lanes if columns >= device.lanes else 1
-    kernels = device.kernels("smoothing.cl", lanes)
+    kernels = device.kernels("smoothing.cl", lanes, *(["MEMBERSHIP"] if len(groups) > 1 else []))
     taps = gaussian_taps(CONSTANTS["WIDE_SIGMA"])
     reach, tap_buffer = np.int32(len(taps) // 2), device.upload(taps)
     slab = min(_SLAB, planes)
@@ -54,7 +65,7 @@ def _smooth(device: Device, workspace: Workspace, group_buffer: Buffer, dims, gr
         count = min(slab, planes - first)
         around = count + 2 * int(reach)
         device.run(
-            kernels["smooth_rows"], (across, rows, around), group_buffer, np.int32(group), tap_buffer, reach,
+            kernels["smooth_rows"], (across, rows, around), *groups, np.int32(group), tap_buffer, reach,
             *shape, np.int32(planes), np.int32(first - reach), partial[0],
         )  # fmt: skip
         device.run(kernels["smooth_columns"], (across, rows, around), partial[0], tap_buffer, reach, *shape, partial[1])

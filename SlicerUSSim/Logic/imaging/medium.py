@@ -48,11 +48,20 @@ class Medium:
     labels : Volume of whole numbers; 0 is the coupling medium.
     tissues : a Tissue for every label that occurs.
     texture : (k, j, i) uint32 of Texture.packed, if scatterers depend on more than labels.
+    membership : (second label, the part of a voxel that it fills in 1/255), (k, j, i) uint8 each, as from
+        Texture.membership, for borders between voxels.
 
     Raises SimulationError for labels that are not whole numbers or have no tissue.
     """
 
-    def __init__(self, labels: Volume, tissues: TissueTable, device: Device, texture: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        labels: Volume,
+        tissues: TissueTable,
+        device: Device,
+        texture: np.ndarray | None = None,
+        membership: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
         started = perf_counter()
         self.device = device
         self.labels = labels
@@ -73,6 +82,8 @@ class Medium:
         self.membrane_reach: float
         #: layout.TISSUE per label, as on the device
         self.rows = self._tissue_rows(tissues)
+        #: As given
+        self.membership = membership
         self._upload(padded, tissues)
         self._upload_groups(padded)
         self.has_texture = texture is not None
@@ -168,7 +179,14 @@ class Medium:
         groups = {int(group_of[label]) for label in (0, *self.present)}
         room = max(_SMOOTHED_VOXELS // padded.size, 2)
         self.smooth_groups = min(max(groups) + 1, _MOST_SMOOTHED_GROUPS, room)
-        self.smooth_buffer = smoothed_indicators(self.device, self.group_buffer, self.dims, groups, self.smooth_groups)
+        membership = None
+        if self.membership is not None:
+            second, share = (np.pad(part, _PAD) for part in self.membership)
+            membership = group_of[second], share
+            groups |= {int(group) for group in np.unique(membership[0][share > 0])}
+        self.smooth_buffer = smoothed_indicators(
+            self.device, self.group_buffer, self.dims, groups, self.smooth_groups, membership
+        )
 
     def _fluid_distance(self, padded: np.ndarray, tissues: TissueTable) -> tuple[np.ndarray | None, float]:
         """(distance as uint8 about 127.5, half the membrane in that unit), or (None, -1) without a membrane."""

@@ -58,8 +58,8 @@ class UltrasoundSimulator:
     settings : SimulationSettings. The attribute may be replaced between frames, for example by another seed; the
         settings of the texture only apply at construction.
     device : see opencl.devices.choose_device.
-    texture : data from the MRI in addition to labels (Segmentation.texture, Texture.from_mri); used only with the
-        settings partial_volume or mri_modulation_db.
+    texture : data from the MRI in addition to labels (Segmentation.texture, Texture.from_mri). Its probabilities place
+        borders between voxels; scatterers use it with the settings partial_volume or mri_modulation_db.
 
     Raises SimulationError for labels without a tissue, if a required texture is missing or has another shape, and if no
     device can be used.
@@ -89,7 +89,9 @@ class UltrasoundSimulator:
             f"settings are {self.settings!r:.80}, expected SimulationSettings",
         )
         self.device = Device.get(device)
-        self.medium = Medium(labels, tissues, self.device, _packed_texture(texture, labels, self.settings))
+        packed = _packed_texture(texture, labels, self.settings)
+        membership = None if texture is None else texture.membership()
+        self.medium = Medium(labels, tissues, self.device, packed, membership)
         #: The stages of stages.py, also for the appearance model and verification
         self.impulse_stages = [stage(self.device) for stage in stages.IMPULSE_STAGES]
         self.linear_stages = [stage(self.device) for stage in stages.LINEAR_STAGES]
@@ -420,16 +422,17 @@ class UltrasoundSimulator:
 
 def _packed_texture(texture: Texture | None, labels: Volume, settings: SimulationSettings) -> np.ndarray | None:
     """The texture in the device's format, or None if the settings do not require it."""
+    if texture is not None:
+        require(
+            texture.deviation.shape == labels.array.shape,
+            f"the texture has shape {texture.deviation.shape}, expected that of the labels, {labels.array.shape}",
+        )
     if not settings.needs_texture:
         return None
     texture = required(
         texture,
         f"partial_volume {settings.partial_volume}, mri_modulation_db {settings.mri_modulation_db:g} need a texture; "
         "pass segmentation.texture(), or Texture.from_mri(mri, labels) for your own label map",
-    )
-    require(
-        texture.deviation.shape == labels.array.shape,
-        f"the texture has shape {texture.deviation.shape}, expected that of the labels, {labels.array.shape}",
     )
     return texture.packed(as_labels(labels.array), settings.partial_volume, settings.mri_modulation_db)
 

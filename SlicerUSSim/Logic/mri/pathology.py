@@ -165,6 +165,7 @@ def texture_below(texture: Texture, mri: Volume, before: Volume, after: Volume) 
         texture.second_label,
         np.where(changed, np.float32(0), texture.second_share),
         np.where(changed, deviation, texture.deviation).astype(np.float32),
+        None if texture.volume_share is None else np.where(changed, np.float32(0), texture.volume_share),
     )
 
 

@@ -32,7 +32,7 @@ from SlicerUSSim.Logic.mri.segmentation_steps import (
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.label_sources import is_interpolated
-from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation
+from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation, volume_shares
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +77,8 @@ class Segmentation:
 
     def texture(self) -> Texture:
         """Information of the MRI beyond labels: the second most probable tissue of every voxel with its probability
-        relative to the two, and the filtered intensity in standard deviations of its tissue."""
+        relative to the two and the part of the voxel it fills, and the filtered intensity in standard deviations of its
+        tissue."""
         labels = self.labels.array
         foreground = labels > 0
         label, posteriors = labels[foreground], self._shares.copy()
@@ -89,7 +90,8 @@ class Segmentation:
         second_label, second_share = np.zeros(labels.shape, np.uint8), np.zeros(labels.shape, np.float32)
         second_label[foreground] = posteriors.argmax(axis=0) + 1
         second_share[foreground] = np.where(sure, 0.0, other / np.maximum(first + other, 1e-12))
-        return Texture(second_label, second_share, tissue_deviation(self._filtered, labels))
+        shares = volume_shares(self._filtered, labels, second_label, second_share)
+        return Texture(second_label, second_share, tissue_deviation(self._filtered, labels), shares)
 
     def table(self) -> str:
         """Share, volume, mean intensity and standard deviation of every label, one per line."""

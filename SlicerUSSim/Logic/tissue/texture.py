@@ -6,6 +6,8 @@ Two kinds of information, which can be used separately:
   weighted mean of both tissues, and the signal remains linear in mu0 and sigma0 of every tissue;
 - intensity: the deviation of the MRI from the mean of the tissue. Amplitudes follow it in decibels, normalised so that
   the tissue as a whole keeps its mean power.
+
+A third places borders between voxels, without a setting: the part of a voxel that its second tissue fills.
 """
 
 from __future__ import annotations
@@ -13,12 +15,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 
 _FARTHEST_DEVIATION = 2.5
+#: Of volume shares: voxels whose second tissue is less probable are whole; standard deviations between the means of
+#: tissues from which on an intensity between them tells a share; the part of that range in which it does
+_SURE, _CLEAR, _INNER_RANGE = 0.05, 5.0, 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +36,8 @@ class Texture:
     second_label : (k, j, i) uint8, the most probable other tissue of every voxel.
     second_share : (k, j, i) float32, its probability, 0 to 1; 0 if the label is certain.
     deviation : (k, j, i) float32, MRI intensity in standard deviations from the mean of the voxel's tissue.
+    volume_share : (k, j, i) float32, the part of the voxel that the second tissue fills, 0 to 1 (volume_shares). It
+        places borders between voxels; without it labels do.
 
     Raises SimulationError if the shapes differ, or for a probability outside 0 to 1.
     """
@@ -37,12 +45,16 @@ class Texture:
     second_label: np.ndarray
     second_share: np.ndarray
     deviation: np.ndarray
+    volume_share: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        shapes = {name: np.shape(getattr(self, name)) for name in ("second_label", "second_share", "deviation")}
+        shapes = {name: np.shape(array) for name, array in vars(self).items() if array is not None}
         require(len(set(shapes.values())) == 1, f"texture arrays have different shapes: {shapes}")
-        low, high = float(np.min(self.second_share)), float(np.max(self.second_share))
-        require(low >= 0.0 and high <= 1.0, f"second_share goes from {low:g} to {high:g}, expected 0 to 1")
+        for name in ("second_share", "volume_share"):
+            share = getattr(self, name)
+            if share is not None:
+                low, high = float(np.min(share)), float(np.max(share))
+                require(low >= 0.0 and high <= 1.0, f"{name} goes from {low:g} to {high:g}, expected 0 to 1")
         require(bool(np.isfinite(self.deviation).all()), "deviation has values that are not finite, expected none")
 
     @classmethod
@@ -75,7 +87,14 @@ class Texture:
             "the labels are on another grid than their MRI; segment the MRI again",
         )
         part = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
-        return Texture(self.second_label[part], self.second_share[part], self.deviation[part])
+        share = None if self.volume_share is None else self.volume_share[part]
+        return Texture(self.second_label[part], self.second_share[part], self.deviation[part], share)
+
+    def membership(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """(second label, the part of the voxel that it fills in 1/255), (k, j, i) uint8 each; None if not known."""
+        if self.volume_share is None:
+            return None
+        return self.second_label.astype(np.uint8), np.rint(255.0 * self.volume_share).astype(np.uint8)
 
     def packed(self, labels: np.ndarray, partial_volume: bool, modulation_db: float) -> np.ndarray:
         """(k, j, i) uint32 for kernels/scattering.cl: second label | share in 1/255 << 8 | gain << 16.
@@ -93,6 +112,40 @@ class Texture:
             share = np.rint(255.0 * self.second_share).astype(np.uint32)
             packed |= np.where(share > 0, self.second_label, 0).astype(np.uint32) | (share << np.uint32(8))
         return packed
+
+
+def volume_shares(
+    intensity: np.ndarray, labels: np.ndarray, second_label: np.ndarray, second_share: np.ndarray
+) -> np.ndarray:
+    """(k, j, i) float32 part of every voxel that its second tissue fills, 0 to 1/2, from a denoised image.
+
+    A voxel of both tissues lies between their means by the parts that they fill; its class is more certain than that
+    (`second_share`). Only voxels next to the second tissue are taken for such, and pairs of tissues whose means differ
+    by _CLEAR standard deviations; of the others the share is that of the class. The outer parts of the range count as
+    whole, since noise there would have one sign.
+    """
+    sure = np.where(second_share < _SURE, labels, 0)
+    mean = _means(intensity.astype(np.float64), sure)
+    spread = np.sqrt(np.maximum(_means(intensity.astype(np.float64) ** 2, sure) - mean**2, 0.0))
+    size = int(max(labels.max(), second_label.max())) + 1
+    mean, spread = (np.pad(values, (0, max(size - len(values), 0))) for values in (mean, spread))
+    apart = np.abs(mean[None] - mean[:, None])
+    is_clear = apart > _CLEAR * 0.5 * (spread[None] + spread[:, None]) + 1e-12
+    shares = np.zeros(labels.shape, np.float32)
+    for own in np.unique(labels[labels > 0]):
+        for other in np.unique(second_label[labels == own]):
+            where = np.flatnonzero((labels == own) & (second_label == other) & _beside(labels == other))
+            found = second_share.flat[where]
+            if is_clear[own, other]:
+                fraction = (intensity.flat[where] - mean[own]) / (mean[other] - mean[own])
+                found = np.where(found > 0.0, np.clip((fraction - 0.5) / _INNER_RANGE + 0.5, 0.0, 0.5), 0.0)
+            shares.flat[where] = found
+    return shares
+
+
+def _beside(where: np.ndarray) -> np.ndarray:
+    """(k, j, i) voxels that have a True one among the 26 around them, or are one."""
+    return ndimage.maximum_filter(where, 3)
 
 
 def tissue_deviation(intensity: np.ndarray, labels: np.ndarray) -> np.ndarray:

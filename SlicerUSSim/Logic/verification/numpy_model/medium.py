@@ -23,9 +23,12 @@ class HostMedium:
     ----------
     labels : Volume of tissue labels.
     tissues : TissueTable with a tissue for every label.
+    membership : as in Medium.
     """
 
-    def __init__(self, labels: Volume, tissues: TissueTable) -> None:
+    def __init__(
+        self, labels: Volume, tissues: TissueTable, membership: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> None:
         self.tissues = tissues
         #: (k, j, i) with a voxel of coupling medium on every side
         self.label = np.pad(labels.array.astype(np.uint8), 1)
@@ -42,16 +45,20 @@ class HostMedium:
         self.rows = _tissue_rows(tissues, present)
         #: (k, j, i) uint8
         self.group = self.rows["group"].astype(np.uint8)[self.label]
-        groups = np.unique(self.group)
+        if membership is None:
+            second, part = self.group, np.zeros(self.group.shape)
+        else:
+            second = self.rows["group"].astype(np.uint8)[np.pad(membership[0], 1)]
+            part = np.pad(membership[1], 1) / 255.0
+        groups = np.union1d(self.group, second[part > 0.0])
         self.smooth_groups = int(min(groups.max() + 1, _MOST_GROUPS, max(_MOST_VALUES // self.label.size, 2)))
         #: (groups, k, j, i) uint16, 65535 for 1; and at half the resolution
         self.smooth = np.zeros((self.smooth_groups, *self.label.shape), np.uint16)
         self.smoother = np.zeros((self.smooth_groups, *((n + 1) // 2 for n in self.label.shape)), np.uint16)
         if len(groups) > 1:
             for number in groups[groups < self.smooth_groups]:
-                share = ndimage.gaussian_filter(
-                    (self.group == number).astype(np.float32), WIDE_SIGMA, mode="nearest", truncate=2.5
-                )
+                member = (1.0 - part) * (self.group == number) + part * (second == number)
+                share = ndimage.gaussian_filter(member.astype(np.float32), WIDE_SIGMA, mode="nearest", truncate=2.5)
                 self.smooth[number] = np.rint(65535.0 * np.clip(share, 0.0, 1.0))
                 half = np.pad(self.smooth[number], [(0, n % 2) for n in self.label.shape], mode="edge") / 65535.0
                 for axis in range(3):
