@@ -108,12 +108,10 @@ def _wave_levels_db(scene: str, probe_name: str) -> np.ndarray:
             i, j, k = (np.clip(np.rint(c).astype(int), 0, n - 1) for c, n in zip(ijk, labels.shape[::-1], strict=False))
             return speeds[labels[k, j, i]]
 
-        # Steered lines see the flat face from the side.
-        seen = float(direction[1]) if probe_name == "phased" else 1.0
         beam = partial(
-            speckle_power, depths_mm=_DEPTHS_MM, frequency_mhz=probe.frequency_mhz,
-            aperture_mm=probe.aperture_mm * seen, f_number=probe.receive_f_number / seen, focus_mm=probe.focus_mm,
-            reference_m_s=REFERENCE_SPEED_M_S,
+            speckle_power, depths_mm=_DEPTHS_MM, frequency_mhz=probe.frequency_mhz, aperture_mm=probe.aperture_mm,
+            f_number=probe.receive_f_number, focus_mm=probe.focus_mm, reference_m_s=REFERENCE_SPEED_M_S,
+            steering_rad=position if probe_name == "phased" else 0.0,
         )  # fmt: skip
         levels.append(10.0 * np.log10(np.mean(beam(speed) / beam(None))))
     return np.array(levels)
