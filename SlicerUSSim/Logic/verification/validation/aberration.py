@@ -62,9 +62,15 @@ def beams_behind_cysts(rotation: np.ndarray, device) -> Outcome:
         level = _levels_db(scene, "linear", "aperture", rotation, device)
         means = [float(10 * np.log10(np.mean(10 ** (values[behind] / 10)))) for values in (wave, level)]
         edges = [float(values[np.abs(np.abs(place) - 4.0) < 1.2].mean()) for values in (wave, level)]
+        # Of the two edges; a shadow's place moves with depth, and its darkest line with the scatterers.
+        darkest = [
+            float(np.mean([values[behind & (side * place > 1.5)].min() for side in (-1, 1)]))
+            for values in (wave, level)
+        ]
         rows += [
             Row(f"mean power behind, {scene}", "dB", means[0], means[1], 0.7),
             Row(f"level behind the edge, {scene}", "dB", edges[0], edges[1], 1.2),
+            Row(f"darkest line beside the middle, {scene}", "dB", darkest[0], darkest[1], 1.7),
         ]
         plots.append(Plot(f"behind a cyst, {scene}", "lateral [mm]", "dB", [Curve("", place, level, place, wave)]))
     return Outcome(tuple(rows), partial(draw_plots, plots=plots))
