@@ -14,26 +14,13 @@ import argparse
 from dataclasses import replace
 
 import numpy as np
-from scipy import ndimage
 
-from SlicerUSSim.Logic import (
-    ConvexProbe,
-    PhasedProbe,
-    SimulationSettings,
-    TissueTable,
-    UltrasoundSimulator,
-    Volume,
-    segment_mri,
-)
-from SlicerUSSim.Logic.mri import demo_mri
-from SlicerUSSim.Logic.probe import Probe, pose_looking_at
-from SlicerUSSim.Logic.probe.placement import surface_point
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
+from SlicerUSSim.Logic import ConvexProbe, PhasedProbe, SimulationSettings, UltrasoundSimulator
+from SlicerUSSim.Logic.probe import Probe
+from SlicerUSSim.Logic.verification.brain_views import even_brains, random_pose
 
 PROBES = {"phased": PhasedProbe(75, 73, scan_lines=192), "convex": ConvexProbe(60, 60, 100, scan_lines=192)}
 DARK_DB, LEAST_SHARE = -12.0, 0.02
-SCATTERERS = {"mu0": 0.33, "sigma0": 0.15, "mu1": 0.0}
-BRAIN_M_S = 1541.0
 
 
 def main() -> None:
@@ -41,27 +28,19 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=40, help="of every brain, by either probe")
     parser.add_argument("--device", help="see `ussim devices`")
     arguments = parser.parse_args()
-    colin27 = COLIN27 / "ch2bet.nii.gz"
-    brains = {"MNI152": demo_mri()[0]} | ({"Colin27": Volume.read(colin27)} if colin27.exists() else {})
-    for brain, mri in brains.items():
-        found = segment_mri(mri, thin_sulci=True, device=arguments.device)
-        tissues = TissueTable.brain(found.tissue_names).with_membrane(None)
-        for name in dict.fromkeys(tissues.names()):
-            tissues = tissues.replace(name, **SCATTERERS)
-        even = tissues
-        for name in dict.fromkeys(tissues.names()):
-            even = even.replace(name, speed_of_sound_m_s=BRAIN_M_S)
-        simulators = [UltrasoundSimulator(found.labels, table, device=arguments.device) for table in (tissues, even)]
+    for brain in even_brains(arguments.device):
+        tables = (brain.tissues, brain.baseline)
+        simulators = [UltrasoundSimulator(brain.labels, table, device=arguments.device) for table in tables]
         for kind, probe in PROBES.items():
             rng = np.random.default_rng(11)
-            poses = [random_pose(found.labels, rng) for _ in range(arguments.views)]
+            poses = [random_pose(brain.labels, rng) for _ in range(arguments.views)]
             for beam in ("aperture", "ray"):
                 changes = np.array([change_db(simulators, probe, pose, beam) for pose in poses])
                 streaks = int(((changes < DARK_DB).mean(axis=1) >= LEAST_SHARE).sum())
                 darkest = np.percentile(changes, 100 * LEAST_SHARE, axis=1)
                 print(
-                    f"{brain:8s} {kind:7s} {beam:9s} streaks in {streaks:2d} of {len(poses)} views; the darkest 2 % of "
-                    f"lines below {np.median(darkest):6.1f} dB (median), {darkest.min():6.1f} dB (worst view)"
+                    f"{brain.name:8s} {kind:7s} {beam:9s} streaks in {streaks:2d} of {len(poses)} views; the darkest "
+                    f"2 % of lines below {np.median(darkest):6.1f} dB (median), {darkest.min():6.1f} dB (worst view)"
                 )
 
 
@@ -73,18 +52,6 @@ def change_db(simulators: list[UltrasoundSimulator], probe: Probe, pose: np.ndar
         iq = simulator.simulate(probe, pose).iq
         levels.append(10.0 * np.log10((np.abs(iq[:, iq.shape[1] // 2 :]) ** 2).mean(axis=1) + 1e-30))
     return levels[0] - levels[-1]
-
-
-def random_pose(labels: Volume, rng: np.random.Generator) -> np.ndarray:
-    """(4, 4) pose on the surface of a brain, not from below, aimed within 10 mm of its centre along each axis."""
-    centre = labels.ijk_to_ras[:3] @ [*ndimage.center_of_mass(labels.array > 0)[::-1], 1.0]
-    outward = rng.normal(size=3)
-    while outward[2] < -0.3 * np.linalg.norm(outward):
-        outward = rng.normal(size=3)
-    outward /= np.linalg.norm(outward)
-    target = centre + rng.uniform(-10.0, 10.0, 3)
-    face = surface_point(labels, target, outward) + outward
-    return pose_looking_at(face, target, lateral_ras=tuple(rng.normal(size=3)))
 
 
 if __name__ == "__main__":

@@ -35,10 +35,32 @@ inline float2 point_on_face(__constant const Acquisition *acquisition, float alo
   return angle == 0.0f ? (float2)(along, 0.0f) : acquisition->apex_radius_mm * (float2)(sin(angle), cos(angle) - 1.0f);
 }
 
+// Extra path and nepers per mm at the fraction f of a cell of voxels, linear between its eight labels; unless
+// `all_soft`, a label counts as `soft` if a border between them is strong.
+inline float2 rates_in_cell(__global const float4 *acoustics, __global const ushort *cell, int nx, int nxy, float3 f,
+                            float4 soft, int all_soft) {
+  float2 along_y[2], along_z[2];
+  for (int z = 0; z < 2; z++) {
+    for (int y = 0; y < 2; y++) {
+      __global const ushort *row = cell + y * nx + z * nxy;
+      const float4 left = acoustics[row[0] & LABEL_MASK], right = acoustics[row[1] & LABEL_MASK];
+      const float2 a = all_soft || is_soft(soft.z, soft.w, left.z, left.w) ? left.xy : soft.xy;
+      const float2 b = all_soft || is_soft(soft.z, soft.w, right.z, right.w) ? right.xy : soft.xy;
+      along_y[y] = a + f.x * (b - a);
+    }
+    along_z[z] = along_y[0] + f.y * (along_y[1] - along_y[0]);
+  }
+  return along_z[0] + f.z * (along_z[1] - along_z[0]);
+}
+
 // One work-item follows one ray of a fan. Global size (angles, points, rows). Look-ups are trilinear, so that sums over
-// steps of a voxel are smooth. Strong tissue counts as what lies in front of it, with its length recorded.
+// steps of a voxel are smooth. Strong tissue counts as what lies in front of it, with its length recorded; with
+// `all_soft`, no tissues have a strong border.
+#ifdef NO_IMPLICIT_VECTORS
+__attribute__((intel_vec_len_hint(1)))
+#endif
 __kernel void fans(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                   __global const float4 *acoustics, __global float *sums) {
+                   __global const float4 *acoustics, int all_soft, __global float *sums) {
   const int ray = get_global_id(0), point = get_global_id(1), row = get_global_id(2);
   const int depths = acquisition->fan_depths;
   const int nx = acquisition->dims[0], ny = acquisition->dims[1], nxy = nx * ny;
@@ -59,7 +81,6 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
   const float length = acquisition->fan_step;
 
   float4 soft = acoustics[0];
-  int label = -1;
   float4 sum = (float4)(0.0f);
   float lean = 0.0f;
   vstore4(sum, 0, to);
@@ -71,29 +92,18 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
     const float3 f = at - convert_float3(base);
     __global const ushort *cell = voxels + (base.z * ny + base.y) * nx + base.x;
     const int first = cell[0];
-    const int nearest = first & SAME_LABEL
-                            ? first & LABEL_MASK
-                            : cell[(f.x > 0.5f) + (f.y > 0.5f ? nx : 0) + (f.z > 0.5f ? nxy : 0)] & LABEL_MASK;
+    const int is_mixed = !(first & SAME_LABEL);
     float blocked = 0.0f;
-    if (nearest != label) {
-      const float4 found = acoustics[nearest];
-      if (label < 0 || is_soft(soft.z, soft.w, found.z, found.w)) {
-        soft = found;
-        label = nearest;
-      } else {
-        blocked = length;
-      }
+    if (all_soft) {
+      soft = acoustics[first & LABEL_MASK];
+    } else {
+      const int nearest = is_mixed ? cell[(f.x > 0.5f) + (f.y > 0.5f ? nx : 0) + (f.z > 0.5f ? nxy : 0)] : first;
+      const float4 found = acoustics[nearest & LABEL_MASK];
+      const int goes_on = depth == 1 || is_soft(soft.z, soft.w, found.z, found.w);
+      soft = goes_on ? found : soft;
+      blocked = goes_on ? 0.0f : length;
     }
-    float2 rate = soft.xy;
-    if (!(first & SAME_LABEL)) {
-      rate = (float2)(0.0f);
-      for (int corner = 0; corner < 8; corner++) {
-        const int x = corner & 1, y = (corner >> 1) & 1, z = corner >> 2;
-        const float weight = (x ? f.x : 1.0f - f.x) * (y ? f.y : 1.0f - f.y) * (z ? f.z : 1.0f - f.z);
-        const float4 found = acoustics[cell[x + y * nx + z * nxy] & LABEL_MASK];
-        rate += weight * (is_soft(soft.z, soft.w, found.z, found.w) ? found.xy : soft.xy);
-      }
-    }
+    const float2 rate = is_mixed ? rates_in_cell(acoustics, cell, nx, nxy, f, soft, all_soft) : soft.xy;
     // A path turns towards slower tissue by the gradient of the extra path, here the difference of the outer sheets
     // over their distance; what a turn moves aside grows with the length behind it.
     const float turned = length * rate.x / (2.0f * ROW_SIGMA * sigma);

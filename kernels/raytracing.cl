@@ -272,9 +272,18 @@ inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_
   return root;
 }
 
-// The beam of a traced line at the end `number` of a piece, as in aperture.cl; 0 at the face. Where neighbouring axes
-// come together, scatterers between them count for several, which must not create energy: amplitude^2 is lowered by
-// the ratio of distances.
+// The factor by which the power of speckle would grow where the axes of neighbouring lines come together to the part
+// `ratio` of their distance: a scatterer then counts for several lines, whose phases differ by `turns` from one to the
+// next (docs/physics.md#beams-from-an-aperture).
+inline float gathered_power(__constant const Acquisition *acquisition, float path, float ratio, float turns) {
+  const float strip = line_distance(acquisition, path), sigma = lateral_sigma(acquisition, path);
+  const float strip2 = strip * strip / 12.0f, beam2 = sigma * sigma, narrowed2 = ratio * ratio * beam2 + strip2;
+  const float coherent = fmax(sqrt((beam2 + strip2) / narrowed2), 1.0f);
+  return 1.0f + (coherent - 1.0f) * exp_fast(-3.2898681f * turns * turns * beam2 / narrowed2);  // (2 pi)^2 / 12
+}
+
+// The beam of a traced line at the end `number` of a piece, as in aperture.cl; 0 at the face. Axes that come together
+// must not create energy.
 inline float4 beam_at(__constant const Acquisition *acquisition, __global const float *screens, int line, int number) {
   if (number == 0) return (float4)(0.0f);
   const float per_line = (acquisition->screen_lines - 1.0f) / (acquisition->traced_lines - 1);
@@ -283,8 +292,11 @@ inline float4 beam_at(__constant const Acquisition *acquisition, __global const 
   const float4 left = vload4(before * depths + number - 1, screens);
   const float4 right = vload4((before + 1) * depths + number - 1, screens);
   float4 beam = left + (place - before) * (right - left);
-  const float apart = line_distance(acquisition, number * acquisition->screen_step) / per_line;
-  beam.x -= 0.5f * log_fast(clamp(1.0f + (right.z - left.z) / apart, 0.25f, 1.0f));
+  const float path = number * acquisition->screen_step;
+  const float4 per_strip = (right - left) * per_line;  // from line to line
+  const float apart = line_distance(acquisition, path), tilt = beam.z / path;
+  const float turns = acquisition->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
+  beam.x += 0.5f * log_fast(gathered_power(acquisition, path, 1.0f + per_strip.z / apart, turns));
   return beam;
 }
 

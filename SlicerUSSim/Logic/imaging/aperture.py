@@ -8,6 +8,7 @@ from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
 
 ROWS = 3  # of points across the elevational aperture
@@ -18,7 +19,7 @@ _LONGEST = 1.06  # of paths, in image depths: the fastest soft tissue
 _SCREEN_STEP_MM, _SCREEN_DEPTHS = 5.0, (8, 24)
 _LINES_PER_SCREEN = 3
 _FAN_STEP_MM, _MOST_DEPTHS = (0.25, 1.0), 192  # limits of the length of a look-up; else a voxel
-_ANGLE_STEP, _WIDEST = 0.035, 1.5  # radians
+_ANGLE_STEP, _WIDEST = 0.022, 1.5  # radians
 
 _NEPERS_PER_DB = np.log(10.0) / 20.0
 _PER_LOOK_UP, _PER_SUM = 60, 60  # operations counted in the kernels
@@ -49,7 +50,8 @@ class Aperture(Stage):
         acoustics = get("acoustics", len(frame.medium.rows) * 16)
         self.device.write(acoustics, acoustic_rows(frame.medium.rows, fields))
         sums = get("sums", int(np.prod(fan)) * int(fields["fan_depths"]) * 16)
-        self.device.run(self._fans, fan, frame.acquisition_buffer, frame.medium.voxel_buffer, acoustics, sums)
+        all_soft = np.int32(are_soft(frame.medium.rows[frame.medium.present]))
+        self.device.run(self._fans, fan, frame.acquisition_buffer, frame.medium.voxel_buffer, acoustics, all_soft, sums)
         self.device.run(
             self._screens, (depths, lines), frame.acquisition_buffer, sums, np.int32(with_level), frame.screens
         )
@@ -74,6 +76,20 @@ def acoustic_rows(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
         extra = np.where(speed > 0.0, acquisition["reference_speed_m_s"] / speed - 1.0, 0.0)
     nepers = tissues["attenuation_db_cm_mhz"] * acquisition["frequency_mhz"] * 0.2 * _NEPERS_PER_DB
     return np.stack([extra, nepers, speed, tissues["impedance_mrayl"]], axis=1).astype(np.float32)
+
+
+def are_soft(tissues: np.ndarray) -> bool:
+    """Whether the borders between all layout.TISSUE records are soft (is_soft in kernels/common.clh)."""
+
+    def contrast(name: str) -> float:
+        low, high = float(tissues[name].min()), float(tissues[name].max())
+        return (high - low) / (high + low)
+
+    # A little less, since the kernels round.
+    return (
+        contrast("speed_of_sound_m_s") < 0.4999 * CONSTANTS["SOFT_SPEED"]
+        and contrast("impedance_mrayl") < 0.9999 * CONSTANTS["SOFT_REFLECTION"]
+    )
 
 
 def aperture_fields(

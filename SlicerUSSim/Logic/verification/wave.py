@@ -15,6 +15,17 @@ _EDGE_MM = 3.0  # over which waves fade at the sides
 
 
 def speckle_power(
+    speed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None, depths_mm: np.ndarray, **beam: float
+) -> np.ndarray:
+    """(depths,) mean power of speckle on a scan line: the integral of the transmitted times the received intensity.
+
+    Parameters as in beam_intensities.
+    """
+    _, transmitted, received = beam_intensities(speed, depths_mm, **beam)
+    return (transmitted * received).sum(axis=1)
+
+
+def beam_intensities(
     speed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None,
     depths_mm: np.ndarray,
     *,
@@ -23,30 +34,38 @@ def speckle_power(
     f_number: float,
     focus_mm: float,
     reference_m_s: float,
-) -> np.ndarray:
-    """(depths,) mean power of speckle on a scan line: the integral of the transmitted times the received intensity.
+    steering_rad: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Intensities across a scan line: (lateral,) place in mm, (depths, lateral) transmitted and received.
 
     `speed` gives metres per second at lateral positions and depths in the line's frame (mm, any one shape); None is a
     medium of the reference speed. The aperture transmits to `focus_mm` and receives focused at each depth, at
-    `f_number` until it is fully open. Continuous waves.
+    `f_number` until it is fully open. It is flat, and its normal lies `steering_rad` from the line against the lateral
+    axis; behind it is the reference speed. Continuous waves.
     """
     x = (np.arange(_WIDTH) - _WIDTH / 2) * _DX_MM
     k = 2e-3 * np.pi * frequency_mhz * 1e6 / reference_m_s  # radians per millimetre
     kx = 2.0 * np.pi * np.fft.fftfreq(_WIDTH, _DX_MM)
     step = np.exp(1j * (np.sqrt(np.maximum(k**2 - kx**2, 0.0)) - k) * _DZ_MM) * (np.abs(kx) < 0.8 * k)
     sides = np.exp(-((np.maximum(np.abs(x) - x[-1] + 2.0 * _EDGE_MM, 0.0) / _EDGE_MM) ** 2))
-    foci = np.array([focus_mm, *depths_mm])[:, None]
+    sine, cosine = np.sin(steering_rad), np.cos(steering_rad)
+    start = -np.ceil(0.5 * aperture_mm * abs(sine) / _DZ_MM) * _DZ_MM  # waves start behind all of the aperture
+    away = np.array([focus_mm, *depths_mm])[:, None] - start
     open_mm = np.minimum(aperture_mm, np.r_[np.inf, depths_mm / f_number])[:, None]
+    # Where the way from the start to the focus crosses the aperture: its part, and the place on the aperture
+    crossed = (x * sine - start * cosine) / (away * cosine + x * sine)
+    face = x * (1.0 - crossed) * cosine + (start + crossed * away) * sine
     # Over an element, the edge of the aperture is soft: so is that of the simulator's.
-    waves = np.clip((0.5 * open_mm - np.abs(x)) / _DX_MM + 0.5, 0.0, 1.0)
-    waves = waves * np.exp(-1j * k * (np.hypot(x, foci) - foci))
-    ends = np.rint(np.asarray(depths_mm) / _DZ_MM).astype(int)
-    powers = np.zeros(len(ends))
+    waves = np.clip((0.5 * open_mm - np.abs(face)) / _DX_MM + 0.5, 0.0, 1.0)
+    waves = waves * np.exp(-1j * k * (np.hypot(x, away) - away))
+    ends = np.rint((np.asarray(depths_mm) - start) / _DZ_MM).astype(int)
+    transmitted, received = np.zeros((2, len(ends), _WIDTH))
     for n in range(ends.max()):
         waves = np.fft.ifft(np.fft.fft(waves, axis=1) * step, axis=1) * sides
         if speed is not None:
-            here = speed(x, np.full_like(x, (n + 0.5) * _DZ_MM))
+            depth = start + (n + 0.5) * _DZ_MM
+            here = np.where(depth * cosine > x * sine, speed(x, np.full_like(x, depth)), reference_m_s)
             waves = waves * np.exp(1j * k * (reference_m_s / here - 1.0) * _DZ_MM)
         for at in np.flatnonzero(ends == n + 1):
-            powers[at] = np.sum(np.abs(waves[0]) ** 2 * np.abs(waves[at + 1]) ** 2)
-    return powers
+            transmitted[at], received[at] = np.abs(waves[[0, at + 1]]) ** 2
+    return x, transmitted, received

@@ -154,7 +154,7 @@ def _fans(probe: Probe, voxel_mm: float, edge: float) -> dict[str, float]:
         if isinstance(probe, ConvexProbe):
             half_angle += 0.5 * (probe.aperture_mm + pitch) / radius
     half_angle = min(half_angle, 1.5)
-    points, angles = round(length / pitch) + 1, int(np.ceil(2.0 * half_angle / 0.035)) + 1
+    points, angles = round(length / pitch) + 1, int(np.ceil(2.0 * half_angle / 0.022)) + 1
     return {
         "screen_depths": screens,
         "screen_step": longest / screens,

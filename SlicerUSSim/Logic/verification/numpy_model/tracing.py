@@ -131,10 +131,19 @@ class Tracer:
         before = np.minimum(place.astype(int), count - 2)
         left, right = (self.screens[before + n, np.maximum(number - 1, 0)] for n in (0, 1))
         beam = left + (place - before.astype(np.float32))[:, None] * (right - left)
-        apart = Beam(acquisition).line_distance(f32(number) * acquisition["screen_step"]) / per_line
-        # No energy is created where axes come together.
-        beam[:, 0] -= f32(0.5) * log(np.clip(f32(1) + (right - left)[:, 2] / apart, f32(0.25), f32(1)))
+        path, per_strip = f32(np.maximum(number, 1)) * acquisition["screen_step"], (right - left) * per_line
+        apart = Beam(acquisition).line_distance(path)
+        turns = acquisition["cycles_per_mm"] * (per_strip[:, 1] - (apart + per_strip[:, 2]) * (beam[:, 2] / path))
+        beam[:, 0] += f32(0.5) * log(self._gathered_power(path, f32(1) + per_strip[:, 2] / apart, turns))
         return np.where(number[:, None] == 0, f32(0), beam)
+
+    def _gathered_power(self, path: np.ndarray, ratio: np.ndarray, turns: np.ndarray) -> np.ndarray:
+        """How power would grow where axes come together to the part `ratio` of their distance; `turns` per line."""
+        strip, sigma = Beam(self.acquisition).line_distance(path), Beam(self.acquisition).lateral_sigma(path)
+        strip2, beam2 = strip * strip / f32(12), sigma * sigma
+        narrowed2 = ratio * ratio * beam2 + strip2
+        coherent = np.maximum(np.sqrt((beam2 + strip2) / narrowed2), f32(1))
+        return f32(1) + (coherent - f32(1)) * exp(f32(-(np.pi**2) / 3.0) * turns * turns * beam2 / narrowed2)
 
     def _start_pieces(self, rays: Rays, number: np.ndarray) -> Rays:
         """The rays at the start of the pieces `number` of their lines; behind the last one they go straight on."""

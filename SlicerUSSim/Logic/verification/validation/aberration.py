@@ -62,9 +62,15 @@ def beams_behind_cysts(rotation: np.ndarray, device) -> Outcome:
         level = _levels_db(scene, "linear", "aperture", rotation, device)
         means = [float(10 * np.log10(np.mean(10 ** (values[behind] / 10)))) for values in (wave, level)]
         edges = [float(values[np.abs(np.abs(place) - 4.0) < 1.2].mean()) for values in (wave, level)]
+        # Of the two edges; a shadow's place moves with depth, and its darkest line with the scatterers.
+        darkest = [
+            float(np.mean([values[behind & (side * place > 1.5)].min() for side in (-1, 1)]))
+            for values in (wave, level)
+        ]
         rows += [
             Row(f"mean power behind, {scene}", "dB", means[0], means[1], 0.7),
             Row(f"level behind the edge, {scene}", "dB", edges[0], edges[1], 1.2),
+            Row(f"darkest line beside the middle, {scene}", "dB", darkest[0], darkest[1], 1.7),
         ]
         plots.append(Plot(f"behind a cyst, {scene}", "lateral [mm]", "dB", [Curve("", place, level, place, wave)]))
     return Outcome(tuple(rows), partial(draw_plots, plots=plots))
@@ -108,12 +114,10 @@ def _wave_levels_db(scene: str, probe_name: str) -> np.ndarray:
             i, j, k = (np.clip(np.rint(c).astype(int), 0, n - 1) for c, n in zip(ijk, labels.shape[::-1], strict=False))
             return speeds[labels[k, j, i]]
 
-        # Steered lines see the flat face from the side.
-        seen = float(direction[1]) if probe_name == "phased" else 1.0
         beam = partial(
-            speckle_power, depths_mm=_DEPTHS_MM, frequency_mhz=probe.frequency_mhz,
-            aperture_mm=probe.aperture_mm * seen, f_number=probe.receive_f_number / seen, focus_mm=probe.focus_mm,
-            reference_m_s=REFERENCE_SPEED_M_S,
+            speckle_power, depths_mm=_DEPTHS_MM, frequency_mhz=probe.frequency_mhz, aperture_mm=probe.aperture_mm,
+            f_number=probe.receive_f_number, focus_mm=probe.focus_mm, reference_m_s=REFERENCE_SPEED_M_S,
+            steering_rad=position if probe_name == "phased" else 0.0,
         )  # fmt: skip
         levels.append(10.0 * np.log10(np.mean(beam(speed) / beam(None))))
     return np.array(levels)

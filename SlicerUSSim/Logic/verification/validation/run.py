@@ -83,9 +83,9 @@ class Report:
 
 def all_checks() -> tuple[Check, ...]:
     """Every check, in the order of the physics: rays, speckle, artefacts, space."""
-    from SlicerUSSim.Logic.verification.validation import aberration, artefacts, beams, rays, speckle, walls
+    from SlicerUSSim.Logic.verification.validation import aberration, artefacts, beams, heads, rays, speckle, walls
 
-    groups = (rays, speckle, artefacts, beams, walls, aberration)
+    groups = (rays, speckle, artefacts, beams, walls, aberration, heads)
     return tuple(check for group in groups for check in group.CHECKS)
 
 
