@@ -189,7 +189,7 @@ def test_the_medium_gives_its_texture_back_as_the_kernels_read_it():
 def tilted_plane(turn_deg: float, spacing_mm: float, noise: float) -> tuple[Volume, Volume, np.ndarray]:
     """(image, labels, (k, j, i) part beyond) of the plane y = 0, in voxels that are turned against it."""
     turned = Rotation.from_euler("xz", [turn_deg, 0.6 * turn_deg], degrees=True).as_matrix()
-    count = np.ceil(np.array([56.0, 24.0, 40.0]) / spacing_mm).astype(int)
+    count = np.ceil(np.array([60.0, 60.0, 48.0]) / spacing_mm).astype(int)
     ijk_to_ras = rigid(turned, [0, 0, 0]) @ np.diag([spacing_mm] * 3 + [1.0])
     ijk_to_ras[:3, 3] = -ijk_to_ras[:3, :3] @ (0.5 * (count - 1) + 0.23)
     k, j, i = np.meshgrid(*(np.arange(n) for n in count[::-1]), indexing="ij")
@@ -222,8 +222,8 @@ def test_shares_of_voxels_place_planes_that_labels_cannot(turn_deg, spacing_mm):
         frame = simulator.simulate(probe, rigid(np.eye(3), [0, -25, 0]))
         level = 20 * np.log10(np.abs(frame.iq[10:-10]).max(axis=1) * (1.8 + 1.54) / (1.8 - 1.54))
         lowest[name] = level.min() - settings.interface_gain_db
-    assert lowest["shares"] > -1.7
-    assert turn_deg == 15.0 or lowest["labels"] < 2.0 * lowest["shares"]  # what shares are for
+    assert lowest["shares"] > -1.0
+    assert turn_deg != 2.0 or lowest["labels"] < 2.0 * lowest["shares"]  # what shares are for
 
 
 def test_shares_of_voxels_follow_from_the_image():
