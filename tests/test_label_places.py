@@ -334,3 +334,22 @@ def test_an_mri_up_to_100_or_255_is_no_probability_map_whatever_it_is_called(cut
             volume.with_array(volume.array).write(tmp_path / name)
         for name in ("t1.nii.gz", *SPM.values()):  # with two companions, which add up to three times as much
             assert combined_probability_maps(tmp_path / name, volume) is None
+
+
+def test_a_background_that_is_not_0_is_recognised():
+    """ITK-SNAP and machine learning use 255; it was one more label that no program knows."""
+    right = in_order((1, 2, 3))
+    volume = right.with_array(np.where(right.array == 0, 255, right.array).astype(np.uint8))
+    with pytest.raises(SimulationError, match=r"label 255 fills \d+% of the volume and all its corners.*--map 255=0"):
+        read_label_map(volume, source="b.nii.gz")
+    found = read_label_map(volume, mapping=LabelMapping.of(["255=0"]), source="b.nii.gz")
+    np.testing.assert_array_equal(found.labels.array, read_label_map(right).labels.array)
+
+
+@pytest.mark.parametrize("scale", [0.2, 1.0, 3.0])
+def test_a_brain_of_an_impossible_size_is_said(scale):
+    volume = in_order((1, 2, 3))
+    sized = Volume(volume.array, volume.ijk_to_ras @ np.diag([scale] * 3 + [1.0]))
+    mapping = LabelMapping.of(dict(enumerate(NAMES, 1)))
+    doubts = [line for line in read_label_map(sized, mapping=mapping).warnings if "size of the voxels" in line]
+    assert bool(doubts) == (scale != 1.0), doubts

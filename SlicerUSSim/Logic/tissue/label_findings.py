@@ -21,6 +21,8 @@ from SlicerUSSim.Logic.tissue.tissue import Tissue
 _LONGEST_LIST = 12
 #: Tissues of a lesion, which alone are no patient
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
+#: Tissues of every brain, and the least and largest volume of both that is not remarkable
+_BRAIN, _BRAIN_ML = ("grey matter", "white matter"), (30.0, 2500.0)
 #: A larger binary mask is that of a brain or a head.
 _LARGEST_LESION_ML = 500.0
 
@@ -106,13 +108,17 @@ class Findings:
         unused = self.mapping.unused(self.names)
         if unused:
             doubts.append(f"{self.source}: has no label {listed(unused)}, which --map mentions")
+        is_part = False
         if self.scheme is not None and self.scheme.key == "freesurfer":
             missing = missing_structures([name for name in self.names.values() if name is not None])
+            is_part = bool(missing)
             if missing:
                 doubts.append(
                     f"{self.source}: a part of a brain, without {', '.join(missing)}: they are the coupling medium; "
                     "a whole one is in aseg and aparc+aseg"
                 )
+        if not is_part:
+            doubts += self._brain_of_another_size()
         is_body = self.scheme is not None and self.scheme.key.startswith("totalsegmentator")
         if is_body and 0 not in self.mapping.by_label and self.counts[0]:
             share = self.counts[0] / self.counts.sum()
@@ -121,6 +127,16 @@ class Findings:
                 f"organs; {self.advice.between}"
             )
         return doubts
+
+    def _brain_of_another_size(self) -> list[str]:
+        brain = [label for label, tissue in self.found.items() if tissue and tissue.name in _BRAIN]
+        has_both = {tissue.name for tissue in self.found.values() if tissue} >= set(_BRAIN)
+        if not has_both or _BRAIN_ML[0] < self._millilitres(brain) < _BRAIN_ML[1]:
+            return []
+        return [
+            f"{self.source}: grey and white matter have {self._size(brain)}, an adult's 900 to 1500 ml: if it is a whole "
+            f"brain, check the size of the voxels in its header ({1e3 * self.voxel_ml:.3g} mm3)"
+        ]
 
     def _described(self, label: int) -> str:
         """'Left-Lesion' (25, 3.1 ml)"""

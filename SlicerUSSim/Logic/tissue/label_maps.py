@@ -157,6 +157,7 @@ class _Reading:
 
     def by_tissue(self) -> LabelledTissues:
         """Labels renumbered from 1, one for each tissue, in the order of their first labels."""
+        self._require_background()
         scheme = self._scheme()
         names = {label: self._names.get(label, scheme.names.get(label) if scheme else None) for label in self._present}
         found = {label: self._tissue(label, name) for label, name in names.items()}
@@ -193,6 +194,21 @@ class _Reading:
         message = f"{self._title(findings)}: {findings.labels()} to {tissues}"
         return LabelledTissues(labels, table, relabelled, message, (*self._warnings, *findings.doubts()))
 
+    def _require_background(self) -> None:
+        """Raise SimulationError for a background that is not 0: a label without a name around everything else."""
+        array = self._volume.array
+        corner = int(array[0, 0, 0])
+        is_around = (
+            corner != 0 and (array[:: array.shape[0] - 1, :: array.shape[1] - 1, :: array.shape[2] - 1] == corner).all()
+        )
+        if not is_around or len(self._present) == 1 or self._counts[0] or self._tissue(corner, self._names.get(corner)):
+            return
+        share = self._counts[corner] / self._counts.sum()
+        raise SimulationError(
+            f"{self._source}: label {corner} fills {share:.0%} of the volume and all its corners, as a background "
+            f"does, which is expected to be 0; {self._advice.background.format(label=corner)}"
+        )
+
     def _require_upright(self, names: Mapping[int, str | None]) -> None:
         """Raise SimulationError for a head that is upside down by what its labels are called."""
         own = {label: name for label, name in names.items() if self._mapping.tissue_of(label, name) is None}
@@ -212,7 +228,9 @@ class _Reading:
         unknown = [label for label in self._present if self._tissue(label, self._names.get(label)) is None]
         if not unknown or (self._names and len(unknown) < len(self._present)):
             return None
-        recognition = recognised(self._volume, unknown)
+        left_out = [label for label, name in self._mapping.by_label.items() if name == "coupling"]
+        kept = self._volume.with_array(np.where(np.isin(self._volume.array, left_out), 0, self._volume.array))
+        recognition = recognised(kept, unknown)
         if recognition.is_mirrored:
             self._warnings.append(
                 f"{self._source}: labels of the left side are on the right; check the orientation in its header"
