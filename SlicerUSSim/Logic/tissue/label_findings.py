@@ -134,8 +134,8 @@ class Findings:
         if not has_both or _BRAIN_ML[0] < self._millilitres(brain) < _BRAIN_ML[1]:
             return []
         return [
-            f"{self.source}: grey and white matter have {self._size(brain)}, an adult's 900 to 1500 ml: if it is a whole "
-            f"brain, check the size of the voxels in its header ({1e3 * self.voxel_ml:.3g} mm3)"
+            f"{self.source}: grey and white matter have {self._size(brain)}, an adult's 900 to 1500 ml: if it is a "
+            f"whole brain, check the size of the voxels in its header ({1e3 * self.voxel_ml:.3g} mm3)"
         ]
 
     def _described(self, label: int) -> str:
