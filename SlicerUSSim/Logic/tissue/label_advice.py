@@ -14,7 +14,7 @@ class Advice:
     #: About several labels without a tissue
     leave_out: str = "leave them out with {maps}"
     #: About a label that is the background; {label} is its number
-    background: str = "leave it out with --map {label}=0"
+    background: str = "leave it out with --map {label}=0, or say what it is with --map {label}=TISSUE"
     #: About a mask or lesion without a patient; {tissue}, {source} and {maps} are for this label map
     lesion: str = (
         "add it to a segmentation with --add {tissue}={source}, or simulate it alone with {maps} (ussim simulate)"
@@ -45,7 +45,7 @@ PAGE = replace(
         "if it is the mask of a brain, start ussim serve MRI --mask {source} with that brain's MRI, or ussim serve "
         "--labels {source} {maps}"
     ),
-    background="start ussim serve --labels with --map {label}=0",
+    background="start ussim serve --labels with --map {label}=0, or with --map {label}=TISSUE",
     ambiguous="start ussim serve --labels with --map {key}",
     likely="if that is right, start ussim serve --labels with {maps}",
 )
@@ -53,7 +53,7 @@ PAGE = replace(
 SCENE = Advice(
     unknown="rename to one of",
     leave_out="",
-    background="set it to 0",
+    background="set it to 0, or give the label map colours with the name of its tissue",
     lesion="add it to a segmentation as a segment",
     brain_mask="if it is the mask of a brain, choose it as the brain mask of that brain's MRI",
     ambiguous="give the label map colours with the names of its structures",

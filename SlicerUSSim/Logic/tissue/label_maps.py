@@ -201,7 +201,9 @@ class _Reading:
         is_around = (
             corner != 0 and (array[:: array.shape[0] - 1, :: array.shape[1] - 1, :: array.shape[2] - 1] == corner).all()
         )
-        if not is_around or len(self._present) == 1 or self._counts[0] or self._tissue(corner, self._names.get(corner)):
+        if not is_around or len(self._present) == 1 or self._counts[0]:
+            return
+        if corner in self._names or self._tissue(corner, None):
             return
         share = self._counts[corner] / self._counts.sum()
         raise SimulationError(
