@@ -408,7 +408,7 @@ def test_labels_without_names_follow_the_tissues_that_have_their_numbers(bench):
     write_volume(labels, cyst())
     assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["speckle", "fluid"]
     bench.logic.preset = replace(PRESET, tissues=TissueTable({0: FLUID, 2: SPECKLE, 3: FLUID}))
-    with pytest.raises(SimulationError, match="label 1 fills 98% .*colours with the name of its tissue"):
+    with pytest.raises(SimulationError, match=r"label 1 fills 98% .*colours with the name of its tissue"):
         bench.logic.tissues(labels)
     bench.logic.preset = replace(PRESET, tissues=TissueTable({0: FLUID, 1: FLUID, 2: SPECKLE}))
     assert [bench.logic.tissues(labels)[n].name for n in (1, 2)] == ["fluid", "speckle"]
