@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import ConvexProbe, DisplaySettings, LinearProbe, SimulationSettings, Tissue, UltrasoundSimulator
 from SlicerUSSim.Logic.imaging.borders import gaussian_taps
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
-from SlicerUSSim.Logic.verification.phantoms import folds
+from SlicerUSSim.Logic.verification.phantoms import folds, parallel_plates
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
 
 PROBE = LinearProbe(30, 60, scan_lines=121, focus_mm=30, elevation_focus_mm=30)
@@ -96,14 +97,43 @@ def test_the_two_borders_of_a_slab_have_opposite_signs():
     np.testing.assert_allclose(hits["curvature"], 0.0, atol=1e-3)
 
 
-def test_the_variances_of_the_smoothing_are_those_of_its_taps():
-    variances = []
-    for sigma in (CONSTANTS["WIDE_SIGMA"], CONSTANTS["HALVED_SIGMA"]):
+def test_the_variances_of_the_smoothing_are_those_of_gaussians_with_the_same_centre():
+    """The density of the distance from a plane, and its second derivative, at 0; a Gaussian cut off has a smaller
+    variance than it resembles."""
+    frequency = np.linspace(0.0, 2.0, 4001)  # radians per voxel
+    normal = np.array([1.0, 2.0, 2.0]) / 3.0
+
+    def transform(sigma: float, scale: float) -> np.ndarray:
         taps = gaussian_taps(sigma).astype(float)
-        variances.append(float(taps @ (np.arange(len(taps)) - len(taps) // 2) ** 2))
-    assert CONSTANTS["WIDE_VARIANCE"] == pytest.approx(variances[0], abs=1e-3)
-    # Pairs of voxels have a variance of 1/4 of a squared voxel; the unit of the half resolution is four of these.
-    assert CONSTANTS["WIDEST_VARIANCE"] == pytest.approx(variances[1] + (variances[0] + 0.25) / 4.0, abs=1e-3)
+        at = scale * (np.arange(len(taps)) - len(taps) // 2)
+        return np.prod([np.cos(np.outer(frequency, n * at)) @ taps for n in normal], axis=0)
+
+    wide = transform(CONSTANTS["WIDE_SIGMA"], 1.0)
+    pairs = np.prod([np.cos(0.5 * n * frequency) for n in normal], axis=0)
+    widest = wide * pairs * transform(CONSTANTS["HALVED_SIGMA"], 2.0)
+    for found, cell, spectrum in (("WIDE_VARIANCE", 1.0, wide), ("WIDEST_VARIANCE", 4.0, widest)):
+        spectrum = np.where(frequency < 1.2, spectrum, 0.0)  # beyond, the taps repeat
+        density = np.trapezoid(spectrum, frequency) / np.pi
+        bend = np.trapezoid(spectrum * frequency**2, frequency) / np.pi
+        by_share, by_bend = 1.0 / (2.0 * np.pi * density**2), density / bend
+        assert by_share / cell == pytest.approx(CONSTANTS[found], rel=0.015)
+        assert by_bend / cell == pytest.approx(CONSTANTS[found], rel=0.015)
+
+
+@pytest.mark.parametrize("gap_mm", [7.2, 14.4])
+@pytest.mark.parametrize("seed", [0, 3])
+def test_plates_closer_than_the_smoothing_are_found_one_by_one(seed, gap_mm):
+    """In voxels of 1 mm: each plane from the tissue beyond both; formerly with place errors of some .02 voxels."""
+    phantom = parallel_plates(Rotation.random(random_state=seed).as_matrix(), gap_mm=gap_mm, spacing_mm=1.0)
+    settings = SimulationSettings(scattering=False, reflections=False)
+    hits = UltrasoundSimulator(phantom.labels, phantom.tissues, settings).trace(PROBE, phantom.probe_to_ras).hits
+    inverse = np.linalg.inv(phantom.probe_to_ras)
+    depth = hits["position"] @ inverse[1, :3] + inverse[1, 3]
+    middle = np.abs(hits["position"] @ inverse[0, :3] + inverse[0, 3]) < 10.0
+    for behind, expected in ((2, 15.0), (3, 15.0 + gap_mm)):
+        found = depth[middle & (hits["label_behind"] == behind)]
+        assert found.mean() == pytest.approx(expected, abs=0.01)
+        assert found.std() < 0.012
 
 
 @pytest.mark.parametrize("beam", ["aperture", "ray"])

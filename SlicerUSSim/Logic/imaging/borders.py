@@ -26,11 +26,11 @@ def smoothed_indicators(
 ) -> Buffer:
     """Device buffer ushort: indicators of the first `fields` groups, smoothed by Gaussians, at two resolutions.
 
-    First [field][k][j][i] with WIDE_SIGMA voxels, then the same at half the resolution, rounded up, smoothed as widely
-    in voxels of that grid. `group_buffer` has uint8 groups with flags, `dims` (i, j, k) voxels, `present` the groups
-    that occur. Fields of other groups are 0, and all fields if there is only one group, which has no border.
-    65535 means 1. `membership` are the second group of every voxel and its share in 1/255, (k, j, i) uint8 each:
-    borders then lie at the half-level of the shares and not at the faces of voxels.
+    First [field][k][j][i] with WIDE_SIGMA voxels, then the same at half the resolution, rounded up, smoothed once more
+    with HALVED_SIGMA voxels of that grid. `group_buffer` has uint8 groups, with or without flags, `dims` (i, j, k)
+    voxels, `present` the groups that occur. Fields of other groups are 0, and all fields if there is only one group,
+    which has no border. 65535 means 1. `membership` are the second group of every voxel and its share in 1/255,
+    (k, j, i) uint8 each: borders then lie at the half-level of the shares and not at the faces of voxels.
     """
     dims = np.asarray(dims)
     voxels, halved = int(dims.prod()), int(((dims + 1) // 2).prod())

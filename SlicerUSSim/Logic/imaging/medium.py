@@ -168,7 +168,7 @@ class Medium:
 
     def _upload_groups(self, padded: np.ndarray) -> None:
         """The acoustic group of every voxel, and smoothed indicators of the first groups, which give the most accurate
-        normals on flat interfaces."""
+        normals on flat interfaces. For them tissues go on beyond the volume, whose ends are no borders."""
         group_of = self.rows["group"].astype(np.uint8)
         group = group_of[padded]
         lowest, highest = _cell_extremes(group)
@@ -181,11 +181,13 @@ class Medium:
         self.smooth_groups = min(max(groups) + 1, _MOST_SMOOTHED_GROUPS, room)
         membership = None
         if self.membership is not None:
-            second, share = (np.pad(part, _PAD) for part in self.membership)
+            second, share = (np.pad(part, _PAD, mode="edge") for part in self.membership)
             membership = group_of[second], share
             groups |= {int(group) for group in np.unique(membership[0][share > 0])}
+        inside = tuple(slice(_PAD, -_PAD) for _ in range(3))
+        continued = self.device.upload(np.pad(np.pad(group[inside], _PAD, mode="edge").ravel(), (0, 16)))
         self.smooth_buffer = smoothed_indicators(
-            self.device, self.group_buffer, self.dims, groups, self.smooth_groups, membership
+            self.device, continued, self.dims, groups, self.smooth_groups, membership
         )
 
     def _fluid_distance(self, padded: np.ndarray, tissues: TissueTable) -> tuple[np.ndarray | None, float]:

@@ -21,12 +21,12 @@ CONSTANTS = {
     "MEMBRANE_LABEL": 63,
     "MAX_TISSUES": 64,
     # Of the Gaussians that smooth the indicators of acoustic groups (borders.py), in voxels: at full resolution, and
-    # after that at half the resolution; with the variances of
-    # the Gaussians as cut off, the second together with the first
+    # after that at half the resolution. The variances are those of the Gaussians that they resemble near their centre:
+    # more than of their taps, since they are cut off
     "WIDE_SIGMA": 3.0,
-    "WIDE_VARIANCE": 8.639,
-    "HALVED_SIGMA": 2.6,
-    "WIDEST_VARIANCE": 8.747,
+    "WIDE_VARIANCE": 8.91,
+    "HALVED_SIGMA": 3.0,
+    "WIDEST_VARIANCE": 11.15,
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray

@@ -17,12 +17,16 @@ from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     sum8,
     unit,
 )
-from SlicerUSSim.Logic.verification.numpy_model.medium import HALVED_SIGMA, WIDE_SIGMA, HostMedium
+from SlicerUSSim.Logic.verification.numpy_model.medium import HostMedium
 
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])  # (x, y, z) of the corners of a cell
 _FINE_SIGMA = f32(1.5)
 _FINE_REACH = f32(3.5)
 _EIGHT = np.arange(8, dtype=np.float32)
+# D = [before] - [behind], or where a third group lies behind one of them as a layer, the other one against all others:
+# factors of both indicators, and what is added
+_OF_BOTH, _OF_BEFORE, _OF_BEHIND = (1.0, 1.0, 0.0), (2.0, 0.0, -65535.0), (0.0, 2.0, 65535.0)
+_TWO_GROUPS, _MOSTLY_TWO = 0.9999, 0.97  # sums of both indicators
 
 
 class Labels:
@@ -39,11 +43,9 @@ class Labels:
         # Rows of eight voxels are read at once, including the last one.
         self.groups = np.pad(medium.group.ravel(), (0, 8))
         self.smooth_groups = medium.smooth_groups
-        # Smoothed indicators with the variance of the Gaussians of which they are the result, in their voxels; pairs of
-        # voxels have 1/4
-        first, second = (_variance_of_taps(sigma) for sigma in (WIDE_SIGMA, HALVED_SIGMA))
-        self.wide = SmoothGrid(medium.smooth, first, 0.94, 1.0)
-        self.widest = SmoothGrid(medium.smoother, second + (first + 0.25) / 4.0, 0.98, 0.5)
+        # Smoothed indicators with the variance of the Gaussians that they resemble near their centre, in their voxels
+        self.wide = SmoothGrid(medium.smooth, 8.91, 0.955, 1.0)
+        self.widest = SmoothGrid(medium.smoother, 11.15, 0.99, 0.5)
         self.distance = None if medium.distance is None else medium.distance.ravel()
 
     def cells(self, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,58 +152,101 @@ class SmoothGrid:
         if self.dims.min() < 4:
             return towards, overshoot, curvature, confidence
         known = np.flatnonzero((before < self.groups) & (behind < self.groups))
-        difference, both, up, down = self._stencil(voxel[known], before[known], behind[known])
-        fits = (both >= f32(0.97)) & (np.abs(difference) <= f32(0.5))
-        known, difference, both, up, down = known[fits], difference[fits], both[fits], up[fits], down[fits]
+        both = self._both(voxel[known], before[known], behind[known])
+        results = towards, overshoot, curvature, confidence
+        *found, _ = self._border(voxel[known], before[known], behind[known], both, _OF_BOTH)
+        found[3][both < f32(_MOSTLY_TWO)] = 0
+        for result, values in zip(results, found, strict=True):
+            result[known] = values
+        near = both < f32(_TWO_GROUPS)
+        known, both = known[near], both[near]
+        *front, steep_front = self._border(voxel[known], before[known], behind[known], both, _OF_BEFORE)
+        *back, steep_back = self._border(voxel[known], before[known], behind[known], both, _OF_BEHIND)
+        of_before, of_behind = steep_front[:, None] * front[0], steep_back[:, None] * back[0]
+        gradient, normal = f32(0.5) * (of_before - of_behind), of_before + of_behind
+        along = dot(gradient, normal) / np.maximum(length(normal), f32(1e-9))
+        steep = np.maximum(length(gradient), f32(1e-9))
+        is_front = along > 0
+        layer = [
+            np.where(is_front[:, None] if a.ndim > 1 else is_front, a, b) for a, b in zip(front, back, strict=True)
+        ]
+        layer[3] = layer[3] * ramp(f32(0.4), f32(0.8), np.sqrt(self.variance) * steep / (f32(1) - both))
+        layer[3] = layer[3] * ramp(f32(0.9), f32(0.97), np.abs(along) / steep)
+        better = layer[3] >= confidence[known]
+        for result, values in zip(results, layer, strict=True):
+            result[known[better]] = values[better]
+        return results
+
+    def _border(self, voxel, before, behind, both, way):
+        """The same and the steepness of D of one way: the factors of both indicators, and what is added."""
+        towards = np.zeros_like(voxel)
+        overshoot, curvature, confidence, steep = np.zeros((4, len(voxel)), np.float32)
+        difference, up, down = self._stencil(voxel, before, behind, way)
+        known = np.flatnonzero(np.abs(difference) <= f32(0.5))
+        difference, up, down = difference[known], up[known], down[known]
         slope, bends = f32(0.5) * (up - down), up + down - (f32(2) * difference)[:, None]
         steepness = np.maximum(length(slope), f32(1e-6))
         normal = slope / steepness[:, None]
         # Linear interpolation adds f (1 - f) to the variance along each axis; a central difference sees 1/3 more.
         clipped = np.clip(voxel[known], f32(0), f32(self.dims) - f32(1.001))
         f = clipped - f32(np.clip(clipped.astype(np.int32), 1, self.dims - 3))
-        variance = self.variance + dot(normal * normal, f * (f32(1) - f))
+        squares = normal * normal
+        variance = self.variance + dot(squares, f * (f32(1) - f))
         sigma = np.sqrt(variance)
-        share = f32(0.5) - f32(0.5) * difference / both
+        share = f32(0.5) - f32(0.5) * difference / (both[known] if way == _OF_BOTH else f32(1))
         laplacian = bends[:, 0] + bends[:, 1] + bends[:, 2]
         distance, curvature[known] = _border_place(sigma, share, variance * laplacian / steepness)
         of_plane = f32(0.79788456) / sigma * exp(f32(-0.5) * distance * distance / variance)
-        of_plane = of_plane * (f32(1) - dot(normal * normal, normal * normal) / (f32(6) * variance))
-        towards[known] = unit(normal * (f32(1) + normal * normal / (f32(6) * variance[:, None])))
+        of_plane = of_plane * (f32(1) - dot(squares, squares) / (f32(6) * variance))
+        steep[known] = steepness
+        towards[known] = unit(normal * (f32(1) + squares / (f32(6) * variance[:, None])))
         overshoot[known] = distance
         with np.errstate(divide="ignore"):
             confidence[known] = ramp(self.least, 0.5 + 0.5 * self.least, steepness / of_plane)
         confidence[known] *= np.abs(distance) <= self.farthest
-        return towards, overshoot, curvature, confidence
+        return towards, overshoot, curvature, confidence, steep
 
-    def _stencil(self, voxel, before, behind):
-        """(D, [before] + [behind]) of the smoothed indicators at voxel positions, and D a voxel up and down each axis.
-
-        (n,), (n,), (n, 3), (n, 3). Trilinear; the outermost cells are extrapolated from the next.
-        """
+    def _place(self, voxel):
+        """(index of the base voxel, fractions (x, y, z), 1 - fractions) of the stencil at (n, 3) voxel positions."""
         voxel = np.clip(voxel, f32(0), f32(self.dims) - f32(1.001))
         base = np.clip(voxel.astype(np.int32), 1, self.dims - 3)
-        (fx, fy, fz), (gx, gy, gz) = (w.T for w in (voxel - f32(base), f32(1) - (voxel - f32(base))))
-        here = base @ self.steps
+        return base @ self.steps, (voxel - f32(base)).T, (f32(1) - (voxel - f32(base))).T
+
+    def _both(self, voxel, before, behind):
+        """(n,) sum of the two indicators; trilinear, the outermost cells are extrapolated from the next."""
+        here, (fx, fy, fz), (gx, gy, gz) = self._place(voxel)
+        both = f32(0)
+        for k, wz in enumerate((gz, fz)):
+            for j, wy in enumerate((gy, fy)):
+                at = here + np.array([0, j, k]) @ self.steps
+                near, far = (f32(self.smooth[before, n]) + f32(self.smooth[behind, n]) for n in (at, at + 1))
+                both = both + wy * wz * (gx * near + fx * far)
+        return both * f32(1.0 / 65535.0)
+
+    def _stencil(self, voxel, before, behind, way):
+        """D of the smoothed indicators at voxel positions, and D a voxel up and down each axis: (n,), (n, 3), (n, 3).
+
+        Trilinear; the outermost cells are extrapolated from the next.
+        """
+        here, (fx, fy, fz), (gx, gy, gz) = self._place(voxel)
+        of_before, of_behind, added = (f32(value) for value in way)
 
         def node(i, j, k):
             at = here + np.array([i, j, k]) @ self.steps
-            return f32(self.smooth[before, at]), f32(self.smooth[behind, at])
+            return of_before * f32(self.smooth[before, at]) - of_behind * f32(self.smooth[behind, at]) + added
 
         def row(j, k, shift=0):
             """D at the position's i + shift on a row of the stencil."""
-            (a0, b0), (a1, b1) = node(shift, j, k), node(shift + 1, j, k)
-            return gx * (a0 - b0) + fx * (a1 - b1)
+            return gx * node(shift, j, k) + fx * node(shift + 1, j, k)
 
         rows = {(j, k): row(j, k) for k in (0, 1) for j in (0, 1)}
         wy, wz = (gy, fy), (gz, fz)
-        difference = both = right = left = f32(0)
+        difference = right = left = f32(0)
         for k in (0, 1):
             for j in (0, 1):
                 weight = wy[j] * wz[k]
                 difference = difference + weight * rows[j, k]
                 right, left = right + weight * row(j, k, 1), left + weight * row(j, k, -1)
-                (a0, b0), (a1, b1) = node(0, j, k), node(1, j, k)
-                both = both + weight * (gx * (a0 + b0) + fx * (a1 + b1))
         ahead = behind_ = above = below = f32(0)
         for n in (0, 1):
             ahead = ahead + wz[n] * (gy * rows[1, n] + fy * row(2, n))
@@ -210,7 +255,7 @@ class SmoothGrid:
             below = below + wy[n] * (gz * row(n, -1) + fz * rows[n, 0])
         unit = f32(1.0 / 65535.0)
         up, down = np.stack([right, ahead, above], -1) * unit, np.stack([left, behind_, below], -1) * unit
-        return difference * unit, both * unit, up, down
+        return difference * unit, up, down
 
 
 def _refined(narrow, wider) -> list[np.ndarray]:
@@ -220,14 +265,6 @@ def _refined(narrow, wider) -> list[np.ndarray]:
         start + wider[3].reshape((-1,) + (1,) * (start.ndim - 1)) * (end - start)
         for start, end in zip((towards, sure * overshoot, curvature), wider[:3], strict=True)
     ]
-
-
-def _variance_of_taps(sigma: float) -> float:
-    """Of a Gaussian cut off at 2.5 standard deviations."""
-    reach = int(2.5 * sigma + 0.5)
-    at = np.arange(-reach, reach + 1)
-    taps = np.exp(-0.5 * (at / sigma) ** 2)
-    return float((taps * at**2).sum() / taps.sum())
 
 
 def _border_place(sigma, share, bend):

@@ -10,7 +10,7 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 
-WIDE_SIGMA, HALVED_SIGMA = 3.0, 2.6  # of the Gaussians for smoothing the indicators, voxels of their grids
+WIDE_SIGMA, HALVED_SIGMA = 3.0, 3.0  # of the Gaussians for smoothing the indicators, voxels of their grids
 _FARTHEST = 2.2  # limit of the fluid distance in standard deviations; it has eight bits
 _SHARES = 4095  # quantisation steps of the smoothed indicator for the fluid distance
 _MOST_GROUPS, _MOST_VALUES = 6, 100_000_000  # of the smoothed indicators of acoustic groups
@@ -45,11 +45,13 @@ class HostMedium:
         self.rows = _tissue_rows(tissues, present)
         #: (k, j, i) uint8
         self.group = self.rows["group"].astype(np.uint8)[self.label]
+        # Tissues are smoothed as if they went on beyond the volume.
+        continued = np.pad(self.group[1:-1, 1:-1, 1:-1], 1, mode="edge")
         if membership is None:
-            second, part = self.group, np.zeros(self.group.shape)
+            second, part = continued, np.zeros(continued.shape)
         else:
-            second = self.rows["group"].astype(np.uint8)[np.pad(membership[0], 1)]
-            part = np.pad(membership[1], 1) / 255.0
+            second = self.rows["group"].astype(np.uint8)[np.pad(membership[0], 1, mode="edge")]
+            part = np.pad(membership[1], 1, mode="edge") / 255.0
         groups = np.union1d(self.group, second[part > 0.0])
         self.smooth_groups = int(min(groups.max() + 1, _MOST_GROUPS, max(_MOST_VALUES // self.label.size, 2)))
         #: (groups, k, j, i) uint16, 65535 for 1; and at half the resolution
@@ -57,7 +59,7 @@ class HostMedium:
         self.smoother = np.zeros((self.smooth_groups, *((n + 1) // 2 for n in self.label.shape)), np.uint16)
         if len(groups) > 1:
             for number in groups[groups < self.smooth_groups]:
-                member = (1.0 - part) * (self.group == number) + part * (second == number)
+                member = (1.0 - part) * (continued == number) + part * (second == number)
                 share = ndimage.gaussian_filter(member.astype(np.float32), WIDE_SIGMA, mode="nearest", truncate=2.5)
                 self.smooth[number] = np.rint(65535.0 * np.clip(share, 0.0, 1.0))
                 half = np.pad(self.smooth[number], [(0, n % 2) for n in self.label.shape], mode="edge") / 65535.0
