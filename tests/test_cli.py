@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import Preset, Volume
+from SlicerUSSim.Logic import Preset, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tracked.pose_files import read_pose, write_pose
@@ -291,6 +291,21 @@ def test_a_preset_gives_the_same_image_and_options_go_before_it(head, labels, tm
     quieter = image("--preset", tmp_path / "preset.json", "--gain", -6)
     np.testing.assert_array_equal(quieter, image("--probe", probe, "--gain", -6, "--seed", 5))
     assert quieter.mean() < whole.mean()
+
+
+def test_an_mri_gives_its_simulator_the_shares_of_voxels_and_labels_have_none(head, labels, tmp_path, monkeypatch):
+    textures = []
+
+    class Seen(UltrasoundSimulator):
+        def __init__(self, labels, tissues, settings=None, device=None, texture=None):
+            textures.append(texture)
+            super().__init__(labels, tissues, settings, device, texture)
+
+    monkeypatch.setattr("SlicerUSSim.Logic.imaging.simulator.UltrasoundSimulator", Seen)
+    for source in (head, labels):
+        result = ussim("simulate", source, "--pose", "auto", "-o", tmp_path / "image.png")
+        assert result.exit_code == 0, result.output
+    assert textures[0].volume_share.max() > 0.4 and textures[1] is None
 
 
 def test_set_changes_the_tissues_of_labels_and_of_an_mri(head, labels, tmp_path):

@@ -183,9 +183,7 @@ def open_examination(patient: PatientOptions) -> Examination:
     names = segmentation.tissue_names if table is None else tissues.names_by_label()
     added = additions.on(segmentation.labels, names, has_brain_mask=True)
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
-    texture = None
-    if preset.settings.needs_texture:
-        texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
+    texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
     simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device, texture)
     return Examination(simulator, preset.probe, preset.display, is_labels)

@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
@@ -124,28 +123,40 @@ def volume_shares(
     by _CLEAR standard deviations; of the others the share is that of the class. The outer parts of the range count as
     whole, since noise there would have one sign.
     """
-    sure = np.where(second_share < _SURE, labels, 0)
-    mean = _means(intensity.astype(np.float64), sure)
-    spread = np.sqrt(np.maximum(_means(intensity.astype(np.float64) ** 2, sure) - mean**2, 0.0))
+    inside = labels > 0
+    own_label, other_label, share, value = (a[inside] for a in (labels, second_label, second_share, intensity))
+    value = value.astype(np.float64)
+    sure = np.where(share < _SURE, own_label, 0)
+    mean = _means(value, sure)
+    spread = np.sqrt(np.maximum(_means(value**2, sure) - mean**2, 0.0))
     size = int(max(labels.max(), second_label.max())) + 1
     mean, spread = (np.pad(values, (0, max(size - len(values), 0))) for values in (mean, spread))
     apart = np.abs(mean[None] - mean[:, None])
     is_clear = apart > _CLEAR * 0.5 * (spread[None] + spread[:, None]) + 1e-12
-    shares = np.zeros(labels.shape, np.float32)
-    for own in np.unique(labels[labels > 0]):
-        for other in np.unique(second_label[labels == own]):
-            where = np.flatnonzero((labels == own) & (second_label == other) & _beside(labels == other))
-            found = second_share.flat[where]
+    found = np.zeros(len(value), np.float32)
+    for other in np.unique(other_label):
+        beside = (other_label == other) & (own_label != other)
+        beside &= _beside(labels == other)[inside]
+        for own in np.unique(own_label[beside]):
+            where = np.flatnonzero(beside & (own_label == own))
+            of_class = share[where]
             if is_clear[own, other]:
-                fraction = (intensity.flat[where] - mean[own]) / (mean[other] - mean[own])
-                found = np.where(found > 0.0, np.clip((fraction - 0.5) / _INNER_RANGE + 0.5, 0.0, 0.5), 0.0)
-            shares.flat[where] = found
+                fraction = (value[where] - mean[own]) / (mean[other] - mean[own])
+                by_value = np.clip((fraction - 0.5) / _INNER_RANGE + 0.5, 0.0, 0.5)
+                of_class = np.where(of_class > 0.0, by_value, 0.0)
+            found[where] = of_class
+    shares = np.zeros(labels.shape, np.float32)
+    shares[inside] = found
     return shares
 
 
 def _beside(where: np.ndarray) -> np.ndarray:
     """(k, j, i) voxels that have a True one among the 26 around them, or are one."""
-    return ndimage.maximum_filter(where, 3)
+    for axis in range(3):  # several times faster than a filter of any size
+        narrow, wide = np.moveaxis(where, axis, 0), np.moveaxis(where := where.copy(), axis, 0)
+        wide[1:] |= narrow[:-1]
+        wide[:-1] |= narrow[1:]
+    return where
 
 
 def tissue_deviation(intensity: np.ndarray, labels: np.ndarray) -> np.ndarray:
