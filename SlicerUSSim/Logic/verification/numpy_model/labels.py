@@ -45,7 +45,7 @@ class Labels:
         self.smooth_groups = medium.smooth_groups
         # Smoothed indicators with the variance of the Gaussians that they resemble near their centre, in their voxels
         self.wide = SmoothGrid(medium.smooth, 8.91, 0.955, 1.0)
-        self.widest = SmoothGrid(medium.smoother, 11.15, 0.99, 0.5)
+        self.widest = SmoothGrid(medium.smoother, 17.75, 0.99, 0.5)
         self.distance = None if medium.distance is None else medium.distance.ravel()
 
     def cells(self, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

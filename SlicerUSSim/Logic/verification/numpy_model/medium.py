@@ -10,7 +10,7 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 
-WIDE_SIGMA, HALVED_SIGMA = 3.0, 3.0  # of the Gaussians for smoothing the indicators, voxels of their grids
+WIDE_SIGMA, HALVED_SIGMA = 3.0, 4.0  # of the Gaussians for smoothing the indicators, voxels of their grids
 _FARTHEST = 2.2  # limit of the fluid distance in standard deviations; it has eight bits
 _SHARES = 4095  # quantisation steps of the smoothed indicator for the fluid distance
 _MOST_GROUPS, _MOST_VALUES = 6, 100_000_000  # of the smoothed indicators of acoustic groups
