@@ -35,7 +35,7 @@ def main() -> None:
     mri = Volume.read(path) if path else demo_mri()[0]
     found = segment_mri(mri, thin_sulci=True, device=arguments.device)
     table = TissueTable.read(arguments.table) if arguments.table else TissueTable.brain(found.tissue_names)
-    simulator = UltrasoundSimulator(found.labels, table, device=arguments.device)
+    simulator = UltrasoundSimulator(found.labels, table, device=arguments.device, texture=found.texture())
     rng = np.random.default_rng(11)
     probe = PROBES[arguments.probe]
     images = [simulator.simulate(probe, random_pose(found.labels, rng)).image for _ in range(arguments.views)]

@@ -189,7 +189,8 @@ inline void find_lines(__constant const Acquisition *acquisition, __global const
     middles += lines->middle[i];
   }
   // Where the axis itself is in strong tissue, oblique lines may be so for longer: a beam changes only beside its end.
-  const float allowed = 2.0f * own_strong / fmax(middles, 1e-6f);
+  // Lengths in strong tissue are whole steps: a line may seem to enter it one step before the axis does.
+  const float allowed = 2.0f * own_strong / fmax(middles, 1e-6f) + acquisition->fan_step;
   for (int row = 0; row < ROWS; row++)
     for (int i = 0; i < lines->count; i++)
       lines->passed[row][i] = exp(-BLOCKED_PER_MM * fmax(lines->passed[row][i] - allowed, 0.0f));

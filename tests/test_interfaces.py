@@ -132,7 +132,7 @@ def test_plates_closer_than_the_smoothing_are_found_one_by_one(seed, gap_mm):
     middle = np.abs(hits["position"] @ inverse[0, :3] + inverse[0, 3]) < 10.0
     for behind, expected in ((2, 15.0), (3, 15.0 + gap_mm)):
         found = depth[middle & (hits["label_behind"] == behind)]
-        assert found.mean() == pytest.approx(expected, abs=0.01)
+        assert found.mean() == pytest.approx(expected, abs=0.02)
         assert found.std() < 0.012
 
 

@@ -64,6 +64,14 @@ def test_beam_is_narrowest_near_its_focus_and_diffraction_limited_there():
     assert lateral[-1] > lateral[250] and elevational[0] > elevational[250]
 
 
+def test_a_focus_is_at_least_as_wide_as_that_of_half_its_aperture():
+    """Formerly f/0.005 was 0.7 micrometres wide, and a frame took minutes."""
+    close, least = (PhasedProbe(75, 90, focus_mm=focus, aperture_mm=20.0) for focus in (0.1, 10.0))
+    assert close.transmit_waist()[0] == least.transmit_waist()[0]
+    wavelength = 1.54 / 5
+    assert least.transmit_waist()[0] == pytest.approx(1.21 * wavelength * 0.5 / 2.3548, rel=1e-3)
+
+
 def test_pulse_has_the_bandwidth_asked_for():
     probe = PhasedProbe(75, 90, frequency_mhz=4.0, fractional_bandwidth=0.6)
     depth = np.arange(-4, 4, 0.001)

@@ -223,6 +223,21 @@ def test_changed_tissues_give_what_a_new_simulator_would(solid):
     )
 
 
+@pytest.mark.parametrize("spacing_mm", [0.3, 0.5])
+def test_there_is_no_membrane_beside_a_label_map_of_small_voxels(spacing_mm):
+    """Look-ups outside the volume find its margin, half a voxel from the border to the coupling medium."""
+    half = block(lambda x, y, z: np.where(y > 0, 1, 0), (8, 12, 6), spacing_mm)
+    bright = Tissue("bright", 1540.0, 1.54, 0.0, mu0=1.0, sigma0=0.5)
+    silent = Tissue("silent", 1540.0, 1.54, 0.0)
+    table = TissueTable({0: FLUID, 1: silent}, Membrane(bright, 0.4, (FLUID.name,), diffuse_db=0.0))
+    probe = LinearProbe(40, 22, scan_lines=81, focus_mm=12, elevation_focus_mm=12)
+    settings = SimulationSettings(interfaces=False)
+    iq = UltrasoundSimulator(half, table, settings).simulate(probe, rigid(np.eye(3), [0, -10, 0])).iq
+    power, outside = np.mean(np.abs(iq) ** 2, axis=1), np.abs(probe.line_positions()) > 12.0
+    assert power[np.abs(probe.line_positions()) < 6.0].min() > 1e-4
+    assert power[outside].max() < 1e-9
+
+
 @pytest.mark.parametrize("thickness", [0.6, 1.0, 1.6])
 def test_the_membrane_is_as_thick_as_it_is_set(thickness):
     """Thinner and thicker than a voxel: the fraction of scatterers in it is its thickness (within 15 %)."""
@@ -310,6 +325,13 @@ def test_roughness_of_the_membrane_takes_the_coherent_echo_of_its_border_only(ti
     at_fluid, inside = np.divide(echoes[1], echoes[0])
     phase = 2 * (2 * np.pi * 5.0 / 1.54) * 0.03 * np.cos(np.radians(tilt_deg))
     assert at_fluid == pytest.approx(np.exp(-0.5 * phase**2), rel=0.03) and inside == pytest.approx(1.0, rel=1e-4)
+
+
+def test_a_label_map_without_labels_is_a_warning_and_a_black_image():
+    empty = Volume(np.zeros((20, 20, 20), np.uint8), np.eye(4))
+    sim = UltrasoundSimulator(empty, TissueTable({0: FLUID}))
+    with pytest.warns(EmptyViewWarning, match="no labels"):
+        assert not sim.simulate(PROBES["linear"], rigid(np.eye(3), [10, 0, 10])).image.any()
 
 
 def test_a_probe_that_looks_past_the_volume_gives_a_black_image_and_a_warning(solid):

@@ -226,7 +226,8 @@ class Medium:
         smooth = np.clip(smooth, 0.0, 1.0, out=smooth)
         smooth *= len(share) - 1
         distance = table[np.rint(smooth, out=smooth).astype(np.uint16)]
-        return distance, 0.5 * membrane.thickness_mm / sigma_mm * unit
+        reach = 0.5 * membrane.thickness_mm / sigma_mm * unit
+        return _without_membrane_outside(distance, reach), reach
 
 
 def as_labels(array: np.ndarray) -> np.ndarray:
@@ -283,6 +284,18 @@ def _with_crest(fluid: np.ndarray, sheet: np.ndarray) -> np.ndarray:
         np.maximum(wide[:-1], narrow[1:], out=wide[:-1])
     on_crest = 0.5 * sheet / np.maximum(crest, _LEAST_CREST)
     return np.where(crest < _THICK_CREST, np.maximum(fluid, on_crest), fluid + sheet)
+
+
+def _without_membrane_outside(distance: np.ndarray, reach: float) -> np.ndarray:
+    """The fluid distance, (k, j, i) uint8 with a margin, whose margin is beyond the membrane on its own side.
+
+    Look-ups outside the volume find the margin: within the membrane, as in small voxels, it would fill all space.
+    """
+    beyond = np.clip([127.5 - reach - 2.0, 127.5 + reach + 2.0], 0.0, 255.0)
+    side = np.where(distance < 127.5, np.minimum(distance, beyond[0]), np.maximum(distance, beyond[1])).astype(np.uint8)
+    inner = tuple(slice(_PAD, -_PAD) for _ in range(3))
+    side[inner] = distance[inner]
+    return side
 
 
 def _membrane_shape(tissues: TissueTable) -> tuple | None:

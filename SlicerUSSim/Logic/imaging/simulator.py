@@ -391,7 +391,9 @@ class UltrasoundSimulator:
         return int(np.ceil(probe.depth_mm / self._sample_mm(probe)))
 
     def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
-        """Warn if the bounding box of the imaged field, in voxels, does not intersect the volume."""
+        """Warn if the volume has no labels, or the bounding box of the imaged field, in voxels, does not meet it."""
+        if list(self.medium.present) == [0] and not self.medium.tissues[0].scatterer_variance:
+            warnings.warn("the label map has no labels, only 0: the image is black", EmptyViewWarning, stacklevel=3)
         left, right, top, bottom = probe.image_bounds_mm()
         corners = np.array([[x, y, 0.0, 1.0] for x in (left, right) for y in (top, bottom)])
         voxels = (self.medium.labels.ras_to_ijk @ pose @ corners.T)[:3]

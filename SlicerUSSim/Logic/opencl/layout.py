@@ -25,8 +25,8 @@ CONSTANTS = {
     # more than of their taps, since they are cut off
     "WIDE_SIGMA": 3.0,
     "WIDE_VARIANCE": 8.91,
-    "HALVED_SIGMA": 3.0,
-    "WIDEST_VARIANCE": 11.15,
+    "HALVED_SIGMA": 4.0,
+    "WIDEST_VARIANCE": 17.75,
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray

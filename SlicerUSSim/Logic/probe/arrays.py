@@ -26,6 +26,8 @@ from SlicerUSSim.Logic.base.errors import require
 NOMINAL_SPEED_M_S = 1540.0
 #: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
 MAIN_LOBE = 1.21
+#: Smallest f-number of a focus on transmission and of the lens
+LEAST_F_NUMBER = 0.5
 FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 #: None until the probe's depth is set. Typed Any, since constructed probes never have None
 _BY_DEPTH: Any = None
@@ -236,7 +238,9 @@ class Probe(Declared):
         return self._waist(self.elevation_focus_mm, self.elevation_aperture_mm)
 
     def _waist(self, focus_mm: float, aperture_mm: float) -> tuple[float, float, float]:
-        sigma = MAIN_LOBE * self.wavelength_mm * focus_mm / aperture_mm / FWHM_PER_SIGMA
+        # Elements farther aside than the focus is deep hardly contribute (and scanners close them).
+        f_number = max(focus_mm / aperture_mm, LEAST_F_NUMBER)
+        sigma = MAIN_LOBE * self.wavelength_mm * f_number / FWHM_PER_SIGMA
         # A Gaussian beam of amplitude exp(-y^2 / w^2), w^2 = 2 sigma^2, has the Rayleigh length pi w^2 / wavelength.
         return sigma, focus_mm, 2.0 * np.pi * sigma**2 / self.wavelength_mm
 

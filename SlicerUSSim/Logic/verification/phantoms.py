@@ -243,7 +243,8 @@ def parallel_plates(
         rotation,
         spacing_mm,
         expected,
-        box=_Box(half_width=20.0),
+        # Plates go on beyond the widest Gaussian that places them.
+        box=_Box(half_width=20.0, half_thickness=max(6.0, 20.0 * spacing_mm)),
     )
 
 

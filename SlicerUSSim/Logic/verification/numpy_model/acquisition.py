@@ -31,8 +31,8 @@ def acquisition_record(
     traced = 2 * guard + 1 + lateral * (probe.scan_lines - 1)
     samples = int(np.ceil(probe.depth_mm / sample_mm(probe, settings)))
     membrane = medium.tissues.membrane
-    transmit = _one_way_sigma(probe, probe.focus_mm / probe.aperture_mm)
-    elevational = _one_way_sigma(probe, probe.elevation_focus_mm / probe.elevation_aperture_mm)
+    transmit = _one_way_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5))
+    elevational = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
     values = {
         "ras_to_voxel": medium.ras_to_voxel.ravel(),
         "dims": medium.dims,
@@ -202,7 +202,7 @@ def _rayleigh_mm(probe: Probe, sigma_mm: float) -> float:
 def _traced_lines(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
     """(traced lines per scan line, traced lines beyond either edge of the field)."""
     depth = np.linspace(0.0, probe.depth_mm, 65)
-    waist = _one_way_sigma(probe, probe.focus_mm / probe.aperture_mm)
+    waist = _one_way_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5))
     transmit = waist * np.hypot(1.0, (depth - probe.focus_mm) / _rayleigh_mm(probe, waist))
     receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
     lateral = (transmit**-2.0 + receive**-2.0) ** -0.5

@@ -145,7 +145,7 @@ class Screens:
         delay, loss, strong, lift = self._sums_at(sums, used, origin + path * direction) * path
 
         own = (on_axis * strong[1]).sum() / max(on_axis.sum(), 1e-6)
-        passed = np.exp(-_BLOCKED * np.maximum(strong - 2.0 * own, 0.0))
+        passed = np.exp(-_BLOCKED * np.maximum(strong - 2.0 * own - fields["fan_step"], 0.0))
         power = _WEIGHTS[:, None] * (open_ * passed**2 + 1e-4 * on_axis)
         share = power / power.sum()
         mean_x, mean_delay = (share * x).sum(), (share * delay).sum()

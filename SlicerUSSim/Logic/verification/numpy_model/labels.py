@@ -45,7 +45,7 @@ class Labels:
         self.smooth_groups = medium.smooth_groups
         # Smoothed indicators with the variance of the Gaussians that they resemble near their centre, in their voxels
         self.wide = SmoothGrid(medium.smooth, 8.91, 0.955, 1.0)
-        self.widest = SmoothGrid(medium.smoother, 11.15, 0.99, 0.5)
+        self.widest = SmoothGrid(medium.smoother, 17.75, 0.99, 0.5)
         self.distance = None if medium.distance is None else medium.distance.ravel()
 
     def cells(self, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -170,8 +170,8 @@ class SmoothGrid:
         layer = [
             np.where(is_front[:, None] if a.ndim > 1 else is_front, a, b) for a, b in zip(front, back, strict=True)
         ]
-        layer[3] = layer[3] * ramp(f32(0.4), f32(0.8), np.sqrt(self.variance) * steep / (f32(1) - both))
-        layer[3] = layer[3] * ramp(f32(0.9), f32(0.97), np.abs(along) / steep)
+        layer[3] = layer[3] * ramp(0.4, 0.8, np.sqrt(self.variance) * steep / (f32(1) - both))
+        layer[3] = layer[3] * ramp(0.9, 0.97, np.abs(along) / steep)
         better = layer[3] >= confidence[known]
         for result, values in zip(results, layer, strict=True):
             result[known[better]] = values[better]

@@ -10,7 +10,7 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 
-WIDE_SIGMA, HALVED_SIGMA = 3.0, 3.0  # of the Gaussians for smoothing the indicators, voxels of their grids
+WIDE_SIGMA, HALVED_SIGMA = 3.0, 4.0  # of the Gaussians for smoothing the indicators, voxels of their grids
 _FARTHEST = 2.2  # limit of the fluid distance in standard deviations; it has eight bits
 _SHARES = 4095  # quantisation steps of the smoothed indicator for the fluid distance
 _MOST_GROUPS, _MOST_VALUES = 6, 100_000_000  # of the smoothed indicators of acoustic groups
@@ -95,7 +95,14 @@ class HostMedium:
         per_sigma = 127.5 / _FARTHEST
         steps = np.rint(np.clip(share, 0.0, 1.0) * _SHARES) / _SHARES
         sigmas = np.clip(special.ndtri(steps), -_FARTHEST, _FARTHEST)
-        return np.rint(127.5 + per_sigma * sigmas).astype(np.uint8), 0.5 * membrane.thickness_mm / sigma_mm * per_sigma
+        distance, reach = np.rint(127.5 + per_sigma * sigmas), 0.5 * membrane.thickness_mm / sigma_mm * per_sigma
+        # Outside the volume, where look-ups find its margin, there is no membrane.
+        margin = np.ones(distance.shape, bool)
+        margin[1:-1, 1:-1, 1:-1] = False
+        below, above = (np.clip(127.5 + sign * (reach + 2.0), 0.0, 255.0) for sign in (-1.0, 1.0))
+        distance[margin & (distance < 127.5)] = np.minimum(distance, np.floor(below))[margin & (distance < 127.5)]
+        distance[margin & (distance > 127.5)] = np.maximum(distance, np.floor(above))[margin & (distance > 127.5)]
+        return distance.astype(np.uint8), reach
 
 
 def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
