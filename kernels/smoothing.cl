@@ -98,12 +98,23 @@ __kernel void halve(__global const ushort *smooth, ulong offset, int columns, in
 // Along i, within planes of floats.
 __kernel void smooth_halved_rows(__global const float *from, __constant const float *taps, int reach, int columns,
                                  int rows, __global float *to) {
-  const int column = get_global_id(0);
-  const size_t row = (size_t)get_global_id(2) * rows + get_global_id(1);
-  float sum = 0.0f;
-  for (int k = -reach; k <= reach; k++)
-    sum += taps[k + reach] * from[row * columns + clamp(column + k, 0, columns - 1)];
-  to[row * columns + column] = sum;
+  const int column = min((int)get_global_id(0) * LANES, columns - LANES);
+  __global const float *row = from + ((size_t)get_global_id(2) * rows + get_global_id(1)) * columns;
+  const int is_inside = column >= reach && column + LANES + reach <= columns;
+  floatn sum = 0.0f;
+  for (int k = -reach; k <= reach; k++) {
+    const int at = column + k;
+    floatn values;
+    if (is_inside) {
+      values = LOAD_LANES(row + at);
+    } else {
+      float at_the_ends[LANES];
+      for (int n = 0; n < LANES; n++) at_the_ends[n] = row[clamp(at + n, 0, columns - 1)];
+      values = LOAD_LANES(at_the_ends);
+    }
+    sum += taps[k + reach] * values;
+  }
+  STORE_LANES(sum, to + (row - from) + column);
 }
 
 // Indicators sum to one, so the last group needs no Gaussian. One work-item computes one voxel.

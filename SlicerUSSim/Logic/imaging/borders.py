@@ -78,17 +78,21 @@ def _smooth(device: Device, workspace: Workspace, groups: Sequence[Buffer], dims
 def _smooth_halved(device: Device, workspace: Workspace, dims, offset: int, to_offset: int, smooth: Buffer) -> None:
     """One indicator at half the resolution, from that at full resolution; both at offsets, in values, of `smooth`."""
     columns, rows, planes = (-(-int(n) // 2) for n in dims)
-    kernels = device.kernels("smoothing.cl")
+    lanes = device.lanes if columns >= device.lanes else 1
+    scalar, kernels = device.kernels("smoothing.cl"), device.kernels("smoothing.cl", lanes)
     taps = gaussian_taps(CONSTANTS["HALVED_SIGMA"])
     reach, tap_buffer = np.int32(len(taps) // 2), device.upload(taps)
-    around, shape = planes + 2 * int(reach), (np.int32(columns), np.int32(rows))
+    around, across, shape = planes + 2 * int(reach), -(-columns // lanes), (np.int32(columns), np.int32(rows))
     partial = [workspace.get(name, 4 * columns * rows * around) for name in ("halved", "halved rows")]
-    size = columns, rows, around
-    device.run(kernels["halve"], size, smooth, np.uint64(offset), *(np.int32(n) for n in dims), -reach, partial[0])
+    device.run(
+        scalar["halve"], (columns, rows, around), smooth, np.uint64(offset), *(np.int32(n) for n in dims), -reach,
+        partial[0],
+    )  # fmt: skip
+    size = across, rows, around
     device.run(kernels["smooth_halved_rows"], size, partial[0], tap_buffer, reach, *shape, partial[1])
     device.run(kernels["smooth_columns"], size, partial[1], tap_buffer, reach, *shape, partial[0])
     device.run(
-        kernels["smooth_planes"], (columns, rows, planes), partial[0], tap_buffer, reach, *shape, np.int32(0),
+        kernels["smooth_planes"], (across, rows, planes), partial[0], tap_buffer, reach, *shape, np.int32(0),
         np.uint64(to_offset), smooth,
     )  # fmt: skip
 

@@ -227,7 +227,8 @@ class Medium:
         smooth *= len(share) - 1
         distance = table[np.rint(smooth, out=smooth).astype(np.uint16)]
         reach = 0.5 * membrane.thickness_mm / sigma_mm * unit
-        return _without_membrane_outside(distance, reach), reach
+        _keep_membrane_inside(distance, reach)
+        return distance, reach
 
 
 def as_labels(array: np.ndarray) -> np.ndarray:
@@ -286,16 +287,16 @@ def _with_crest(fluid: np.ndarray, sheet: np.ndarray) -> np.ndarray:
     return np.where(crest < _THICK_CREST, np.maximum(fluid, on_crest), fluid + sheet)
 
 
-def _without_membrane_outside(distance: np.ndarray, reach: float) -> np.ndarray:
-    """The fluid distance, (k, j, i) uint8 with a margin, whose margin is beyond the membrane on its own side.
+def _keep_membrane_inside(distance: np.ndarray, reach: float) -> None:
+    """Move the margin of the fluid distance, (k, j, i) uint8, beyond the membrane, on its own side.
 
     Look-ups outside the volume find the margin: within the membrane, as in small voxels, it would fill all space.
     """
-    beyond = np.clip([127.5 - reach - 2.0, 127.5 + reach + 2.0], 0.0, 255.0)
-    side = np.where(distance < 127.5, np.minimum(distance, beyond[0]), np.maximum(distance, beyond[1])).astype(np.uint8)
-    inner = tuple(slice(_PAD, -_PAD) for _ in range(3))
-    side[inner] = distance[inner]
-    return side
+    below, above = np.clip([127.5 - reach - 2.0, 127.5 + reach + 2.0], 0.0, 255.0).astype(np.uint8)
+    for axis in range(3):
+        for end in (0, -1):
+            face = np.moveaxis(distance, axis, 0)[end]
+            face[:] = np.where(face < 128, np.minimum(face, below), np.maximum(face, above))
 
 
 def _membrane_shape(tissues: TissueTable) -> tuple | None:
