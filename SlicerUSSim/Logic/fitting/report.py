@@ -127,7 +127,7 @@ def _parameter_row(result: AppearanceResult, parameter: Parameter) -> str:
     return (
         f'<tr title="{html.escape(_explained(parameter))}"><td>{html.escape(parameter.name)}{note}</td>'
         f"<td>{html.escape(f'{declared.label} {declared.symbol}'.strip())}</td><td>{html.escape(declared.unit)}</td>"
-        f"<td>{parameter.low:g} to {parameter.high:g}</td>"
+        f"<td>{parameter.low:.4g} to {parameter.high:.4g}</td>"
         f"<td>{result.before[parameter.name]:.3f}</td><td>{result.after[parameter.name]:.3f}</td>{_spread_cells(spread)}</tr>"
     )
 
