@@ -930,3 +930,11 @@ def test_colin_on_his_side_is_refused(order, top):
 def test_the_alignment_finds_the_size_and_the_nod_of_the_brain(found):
     assert found.alignment.size == pytest.approx(0.93, abs=0.02)
     assert found.alignment.turn_deg == pytest.approx(12.6, abs=3.0)  # 12 and 4 degrees about two axes
+
+
+def test_an_image_in_metres_is_refused_before_it_fills_the_memory():
+    """Lengths of a NIfTI in metres are read as 1000 mm per voxel; formerly it was resampled until memory ran out."""
+    head = head_mri(4.0)
+    scaled = Volume(head.array, np.diag([1000.0, 1000.0, 1000.0, 1.0]) @ head.ijk_to_ras)
+    with pytest.raises(SimulationError, match="mm large, expected a head of 100 to 400 mm; correct its voxel size"):
+        find_brain(scaled)

@@ -190,6 +190,7 @@ def bad_inputs(folder):
         (["segment", folder / "constant.nrrd", "-o", folder / "l.nii.gz"], "constant"),
         (["segment", folder / "nan.nrrd", "-o", folder / "l.nii.gz"], "not finite"),
         (["segment", mri, "-o", folder / "l.gif"], "unknown image format"),
+        (["segment", mri, "-o", folder / "l.NII.GZ"], "in small letters"),
         (["segment", mri, "-o", folder / "nowhere" / "l.nii.gz"], "does not exist"),
         (["segment", mri, "-o", folder / "l.nii.gz", "--classes", 9], "classes is 9"),
         (["segment", mri, "-o", folder / "l.nii.gz", "--mask", folder / "nine.nrrd"], "same grid"),
@@ -211,11 +212,11 @@ def bad_inputs(folder):
     ]
 
 
-@pytest.mark.parametrize("number", range(25))
+@pytest.mark.parametrize("number", range(26))
 def test_a_mistake_is_one_line_and_writes_nothing(number, head, tmp_path):
     (tmp_path / "head.nii.gz").write_bytes(head.read_bytes())
     cases = bad_inputs(tmp_path)
-    assert len(cases) == 25
+    assert len(cases) == 26
     arguments, message = cases[number]
     before = sorted(tmp_path.rglob("*"))
     result = ussim(*arguments)

@@ -353,3 +353,12 @@ def test_a_brain_of_an_impossible_size_is_said(scale):
     mapping = LabelMapping.of(dict(enumerate(NAMES, 1)))
     doubts = [line for line in read_label_map(sized, mapping=mapping).warnings if "size of the voxels" in line]
     assert bool(doubts) == (scale != 1.0), doubts
+
+
+def test_very_many_unknown_labels_are_one_short_line_that_thinks_of_an_mri():
+    """An MRI of bytes that was cut off while it was copied was answered by 247 options."""
+    intensities = np.random.default_rng(0).integers(0, 250, (24, 24, 24)).astype(np.uint8)
+    intensities[:2] = 0
+    message = str(refusal_of(Volume(intensities, np.eye(4))))
+    assert "if these are intensities of an MRI, its file may be incomplete" in message
+    assert message.count("--map") < 20 and len(message) < 1500

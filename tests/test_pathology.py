@@ -588,6 +588,15 @@ def test_segment_replaces_only_labels_that_it_wrote_and_nobody_edited(files, tmp
     assert "l.nii.gz: exists and was not written by this program (l.json is not beside it)" in refused()
 
 
+def test_the_table_of_another_label_map_is_not_replaced(tmp_path):
+    """p.nrrd and p.nii.gz have the table p.json in common: the first would be read by the tissues of the second."""
+    write_label_files(tmp_path / "p.nrrd", BRAIN, TissueTable.brain())
+    require_replaceable(tmp_path / "p.nrrd")
+    with pytest.raises(SimulationError, match=r"p\.json: has the tissues of p\.nrrd, so it is not replaced"):
+        require_replaceable(tmp_path / "p.nii.gz")
+    require_replaceable(tmp_path / "q.nii.gz")
+
+
 @pytest.mark.parametrize("name", ["l.nii.gz", "l.nrrd", "l.mha", "l.vti"])
 def test_labels_are_recognised_in_every_format(name, tmp_path):
     turned = Volume(BRAIN.array, rigid(TURNED, [0.1, 0.2, 1 / 3]) @ np.diag([0.7, 0.7, 0.7, 1.0]) @ BRAIN.ijk_to_ras)

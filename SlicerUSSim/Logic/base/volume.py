@@ -281,6 +281,8 @@ def require_image_name(path: Path, also: tuple[str, ...] = ()) -> None:
         path.name.lower().endswith(suffixes),
         f"{path}: unknown image format, expected a name ending in one of {', '.join(suffixes)}",
     )
+    nifti = next((suffix for suffix in (".nii.gz", ".nii") if path.name.lower().endswith(suffix)), "")
+    require(path.name.endswith(nifti), f"{path}: expected {nifti} in small letters; others cannot be written")
 
 
 def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:

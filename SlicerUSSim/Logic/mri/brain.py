@@ -38,6 +38,8 @@ _NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
 #: Overlap with the registered atlas above which a mask is taken without asking another method, and below which it is
 #: refused
 _SURE, _LEAST_SURE = 0.915, 0.85
+#: Largest image
+_LARGEST_MM = 2500.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +88,12 @@ def find_brain(
     kept = _kept(keep_at, mri, method) if keep_at is not None else None
     if kept is not None:
         return kept
+    size = mri.spacing_mm * mri.array.shape[::-1]
+    require(
+        float(size.max()) <= _LARGEST_MM,
+        f"the image is {'x'.join(f'{mm:g}' for mm in size)} mm large, expected a head of 100 to 400 mm; correct its "
+        "voxel size, or the unit of length in its header",
+    )
     with ExitStack() as ahead:
         robex = extractors.robex
         _require_program(method, mri)

@@ -19,6 +19,8 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 _LONGEST_LIST = 12
+#: More unknown labels may be the intensities of an image
+_MOST_LABELS = 100
 #: Tissues of a lesion, which alone are no patient
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
 #: Tissues of every brain, and the least and largest volume of both that is not remarkable
@@ -88,7 +90,11 @@ class Findings:
         remedy = self.advice.unknown.format(label=unknown[0])
         nothing = "no program's numbers are recognised, and " if len(unknown) == len(self.names) else ""
         if len(unknown) > 1 and self.advice.leave_out:
-            remedy = f"{self.advice.leave_out.format(maps=' '.join(f'--map {n}=0' for n in unknown))}; or {remedy}"
+            each = [f"--map {n}=0" for n in unknown[:_LONGEST_LIST]]
+            maps = " ".join([*each, "..."] if len(unknown) > len(each) else each)
+            remedy = f"{self.advice.leave_out.format(maps=maps)}; or {remedy}"
+        if nothing and len(unknown) > _MOST_LABELS:
+            nothing += "if these are intensities of an MRI, its file may be incomplete; "
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
         raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}; {remedy}: {known}")

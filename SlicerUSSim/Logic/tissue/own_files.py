@@ -10,7 +10,8 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json, write_json
-from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.label_numbers import whole_numbers
+from SlicerUSSim.Logic.base.volume import WRITABLE_SUFFIXES, Volume
 from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 
 #: Entries of the table's file: hashes of the labels and of the table, as they were written.
@@ -31,14 +32,35 @@ def write_label_files(path: Path, labels: Volume, tissues: TissueTable) -> Path:
 
 
 def require_replaceable(path: Path, remedy: str = "give another name, or --overwrite to replace it") -> None:
-    """Raise SimulationError for a label map, or a table beside it, that were made or edited by others."""
+    """Raise SimulationError for a label map, or a table beside it, that were made or edited by others.
+
+    So for the table of another label map, whose file has the same name with another ending.
+    """
     beside = tissues_beside(path)
+    other = None if path.exists() or not beside.exists() else _other_labels(path, beside)
+    require(other is None, f"{beside}: has the tissues of {other}, so it is not replaced; {remedy}")
     for file in (path, beside):
         why = None if not file.exists() else _why_not_ours(path, beside)
         require(
             why is None,
             f"{file}: {why}, so it is not replaced; {remedy}",
         )
+
+
+def _other_labels(path: Path, beside: Path) -> str | None:
+    """The name of another label map with this table, as far as it can be read."""
+    for file in sorted(path.parent.iterdir()):
+        if (
+            file not in (path, beside)
+            and tissues_beside(file) == beside
+            and file.name.lower().endswith(WRITABLE_SUFFIXES)
+        ):
+            try:
+                if whole_numbers(Volume.read(file).array) is not None:
+                    return file.name
+            except SimulationError:
+                continue
+    return None
 
 
 def _why_not_ours(path: Path, beside: Path) -> str | None:
