@@ -362,3 +362,16 @@ def test_very_many_unknown_labels_are_one_short_line_that_thinks_of_an_mri():
     message = str(refusal_of(Volume(intensities, np.eye(4))))
     assert "if these are intensities of an MRI, its file may be incomplete" in message
     assert message.count("--map") < 20 and len(message) < 1500
+
+
+def test_a_mirrored_freesurfer_map_of_few_structures_says_so():
+    """Formerly "no program's numbers are recognised", with the advice to leave all labels out."""
+    array = np.zeros((30, 30, 30), np.uint8)
+    for label, i in ((2, 20), (41, 6), (3, 24), (42, 2)):  # left structures at large i, which is right
+        array[8:22, 8:22, i : i + 4] = label
+    labels = Volume(array, np.diag([4.0, 4.0, 4.0, 1.0]))
+    message = str(refusal_of(labels))
+    assert "are all in FreeSurfer's table, but structures of the left do not lie to the left" in message
+    assert "check the orientation in its header" in message and "--map freesurfer" in message
+    known = read_label_map(labels, mapping=LabelMapping.of(["freesurfer"]))
+    assert any("labels of the left side are on the right" in line for line in known.warnings)

@@ -94,7 +94,7 @@ class Findings:
             maps = " ".join([*each, "..."] if len(unknown) > len(each) else each)
             remedy = f"{self.advice.leave_out.format(maps=maps)}; or {remedy}"
         if nothing and len(unknown) > _MOST_LABELS:
-            nothing += "if these are intensities of an MRI, its file may be incomplete; "
+            remedy = f"if these are intensities of an MRI, its file may be incomplete; {remedy}"
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
         raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}; {remedy}: {known}")

@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.tissue.label_findings import Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised, scheme_with_names, schemes, title_of
+from SlicerUSSim.Logic.tissue.schemes import Scheme, is_mirrored, recognised, scheme_with_names, schemes, title_of
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.tissue.upright import wrong_way_up
@@ -226,7 +226,10 @@ class _Reading:
     def _scheme(self) -> Scheme | None:
         """The numbering scheme, if some labels have neither a name nor a tissue of the user's."""
         if self._mapping.scheme:
-            return schemes()[self._mapping.scheme]
+            scheme = schemes()[self._mapping.scheme]
+            if scheme.key == "freesurfer" and is_mirrored(scheme, self._volume):
+                self._warn_of_sides()
+            return scheme
         unknown = [label for label in self._present if self._tissue(label, self._names.get(label)) is None]
         if not unknown or (self._names and len(unknown) < len(self._present)):
             return None
@@ -234,9 +237,7 @@ class _Reading:
         kept = self._volume.with_array(np.where(np.isin(self._volume.array, left_out), 0, self._volume.array))
         recognition = recognised(kept, unknown)
         if recognition.is_mirrored:
-            self._warnings.append(
-                f"{self._source}: labels of the left side are on the right; check the orientation in its header"
-            )
+            self._warn_of_sides()
         if recognition.candidates:
             titles = " and ".join(scheme.title for scheme in recognition.candidates)
             remedy = self._advice.ambiguous.format(key=recognition.candidates[0].key)
@@ -250,6 +251,10 @@ class _Reading:
         if recognition.order:
             raise SimulationError(f"{self._source}: {self._likely(recognition.order)}")
         return recognition.scheme
+
+    def _warn_of_sides(self) -> None:
+        line = f"{self._source}: labels of the left side are on the right; check the orientation in its header"
+        self._warnings.append(line)
 
     def _likely(self, order: Mapping[int, str]) -> str:
         """What three labels of a brain probably are, and how to say so."""

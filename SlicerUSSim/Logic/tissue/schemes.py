@@ -121,6 +121,9 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
             usual = np.mean([freesurfer.is_usual(value) for value in values])
             if len(values) > 1 and min(known, usual) == 1 and holds >= _AGREEING * count:
                 possible = Recognition(None, possible=scheme, doubt="structures of both sides are too few to be sure")
+            elif count > 1 and min(known, usual) == 1:
+                doubt = "structures of the left do not lie to the left of those of the right: check the orientation in "
+                possible = Recognition(None, possible=scheme, doubt=f"{doubt}its header")
         elif known >= _KNOWN and count >= _FEWEST and holds >= _AGREEING * count:
             fits.append((holds, scheme))
     if not fits:
@@ -131,6 +134,12 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
     if len({tuple(scheme.names.get(value) for value in values) for scheme in best}) > 1:
         return Recognition(None, tuple(best))
     return Recognition(best[0])
+
+
+def is_mirrored(scheme: Scheme, labels: Volume) -> bool:
+    """Whether the structures of both sides that a (k, j, i) label map has lie the other way round."""
+    holds, reverse, count = _agreement(scheme.order, _centres(labels))
+    return reverse > holds and reverse >= _AGREEING * count
 
 
 def _freesurfer(
