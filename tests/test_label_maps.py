@@ -203,9 +203,7 @@ def test_numbers_alone_do_not_make_a_program():
     with pytest.raises(SimulationError, match="no program's numbers are recognised"):
         read_label_map(made(aal))
     shuffled = dict(zip(ASEG, rng.permutation([freesurfer_names()[n] for n in ASEG]), strict=True))
-    with pytest.raises(
-        SimulationError, match="in FreeSurfer's table, but structures of the left do not lie to the left"
-    ):
+    with pytest.raises(SimulationError, match="in FreeSurfer's table, but structures of the left do not lie"):
         read_label_map(made(shuffled))
 
 
