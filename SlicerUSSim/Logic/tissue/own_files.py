@@ -10,7 +10,6 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json, write_json
-from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import WRITABLE_SUFFIXES, Volume
 from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 
@@ -49,6 +48,8 @@ def require_replaceable(path: Path, remedy: str = "give another name, or --overw
 
 def _other_labels(path: Path, beside: Path) -> str | None:
     """The name of another label map with this table, as far as it can be read."""
+    from SlicerUSSim.Logic.tissue.label_sources import is_label_file  # which needs more than files
+
     for file in sorted(path.parent.iterdir()):
         if (
             file not in (path, beside)
@@ -56,7 +57,7 @@ def _other_labels(path: Path, beside: Path) -> str | None:
             and file.name.lower().endswith(WRITABLE_SUFFIXES)
         ):
             try:
-                if whole_numbers(Volume.read(file).array) is not None:
+                if is_label_file(file, Volume.read(file)):
                     return file.name
             except SimulationError:
                 continue
