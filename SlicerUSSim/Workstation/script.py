@@ -103,7 +103,8 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         more_options = (f", also={also!r}" if also else "") + ("" if source.is_labels else ", has_brain_mask=True")
         lines.append(f"labels = add_tissues(labels, {names}, [{masks}]{more_options}).labels")
         texture = f"texture_below({texture}, mri, segmentation.labels, labels)"
-    if source.additions and not source.is_labels:
+    needs_texture = preset.settings.needs_texture and not source.is_labels
+    if needs_texture and source.additions:
         more += "from SlicerUSSim.Logic.mri.pathology import texture_below\n"
     return _TEMPLATE.format(
         missing="".join(
@@ -114,7 +115,7 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         labels="\n".join(lines),
         preset=indent(pformat(_plain(preset), width=112, sort_dicts=False), "    ").strip(),
         pose=np.array2string(probe_to_ras, separator=", ", floatmode="unique", max_line_width=118),
-        texture=f", texture={texture}" if not source.is_labels else "",
+        texture=f", texture={texture}" if needs_texture else "",
     )
 
 

@@ -579,18 +579,15 @@ class UltrasoundSceneLogic:
         return self._simulators.get(patient.version, patient.labels, tissues, preset.settings, self.device, texture)
 
     def _texture_of(self, patient: Patient) -> Texture | None:
-        """The texture from the MRI of labels that Segment wrote and nobody has changed; None for others.
-
-        Raises SimulationError where the settings need one.
-        """
+        """The texture from the MRI, if the settings require it."""
+        if not self.preset.settings.needs_texture:
+            return None
         segmented = self._segmented
         if segmented is None or segmented.version != patient.node_version:
-            if self.preset.settings.needs_texture:
-                raise SimulationError(
-                    f"the settings need a texture from the MRI, which {patient.name} lacks; segment the MRI again, or "
-                    "set partial_volume to false and mri_modulation_db to 0"
-                )
-            return None
+            raise SimulationError(
+                f"the settings need a texture from the MRI, which {patient.name} lacks; segment the MRI again, or set "
+                "partial_volume to false and mri_modulation_db to 0"
+            )
         if self._texture is None or self._texture[0] != patient.version:
             # A segmentation node returns its labels cropped to their content.
             texture = segmented.texture().on_grid_of(patient.labels, segmented.labels)
