@@ -18,6 +18,7 @@ from SlicerUSSim.Logic import Preset, UltrasoundSimulator, Volume
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.tracked.pose_files import read_pose, write_pose
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 
 def ussim(*arguments):
@@ -344,3 +345,16 @@ def test_a_command_says_every_parameter_and_its_type(name):
 def test_python_m_is_the_command():
     done = subprocess.run([sys.executable, "-m", "SlicerUSSim.Command", "--version"], capture_output=True, text=True)
     assert done.returncode == 0 and "ussim, version" in done.stdout
+
+
+@pytest.mark.parametrize("command", ["segment", "simulate"])
+def test_a_tracked_sweep_given_as_an_mri_is_called_what_it_is(command, tmp_path):
+    """Formerly it "goes through the image from the bottom to the top, as a limb or a body does"."""
+    rng = np.random.default_rng(0)
+    sweep = TrackedSequence(
+        rng.integers(0, 255, (4, 40, 30)).astype(np.uint8), [{"ImageToReference": np.eye(4)}] * 4, [0.0, 0.1, 0.2, 0.3]
+    )
+    sweep.write(tmp_path / "sweep.igs.mha")
+    options = ["--pose", "auto", "--mri"] if command == "simulate" else []
+    result = ussim(command, tmp_path / "sweep.igs.mha", *options, "-o", tmp_path / "out.nii.gz")
+    assert result.exit_code == 2 and "is a sequence of tracked ultrasound images, expected an MRI" in result.stderr

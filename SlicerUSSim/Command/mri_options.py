@@ -63,7 +63,12 @@ def segmented_file(
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
+    from SlicerUSSim.Logic.tracked.sequence import is_tracked_sequence
 
+    require(
+        not is_tracked_sequence(path),
+        f"{path}: is a sequence of tracked ultrasound images, expected an MRI; use it with --sequence",
+    )
     others = read_also(also)
     brain = Volume.read(mask) if mask else None
     if additions is not None:

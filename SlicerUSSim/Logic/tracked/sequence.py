@@ -267,6 +267,16 @@ class TrackedSequence:
         return cls(array, transforms, np.arange(len(poses), dtype=float))
 
 
+def is_tracked_sequence(path: str | os.PathLike) -> bool:
+    """Whether the header of an image file has fields of tracked images."""
+    path = Path(path)
+    if not path.name.lower().endswith(SEQUENCE_SUFFIXES) or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        start = file.read(65536)
+    return b"Seq_Frame" in start or _ORIENTATION.encode() in start
+
+
 def require_sequence_name(path: Path) -> None:
     """Raise SimulationError unless TrackedSequence.write supports the format of this file name."""
     require(
