@@ -358,3 +358,9 @@ def test_a_tracked_sweep_given_as_an_mri_is_called_what_it_is(command, tmp_path)
     options = ["--pose", "auto", "--mri"] if command == "simulate" else []
     result = ussim(command, tmp_path / "sweep.igs.mha", *options, "-o", tmp_path / "out.nii.gz")
     assert result.exit_code == 2 and "is a sequence of tracked ultrasound images, expected an MRI" in result.stderr
+
+
+def test_the_demo_refuses_a_label_map_as_segment_does(labels, tmp_path):
+    result = ussim("demo", "--mri", labels, "--out", tmp_path / "demo")
+    assert result.exit_code == 2 and "is a label map" in result.stderr and "expected an MRI" in result.stderr
+    assert not (tmp_path / "demo").exists()

@@ -200,3 +200,17 @@ def test_voxels_within_the_head_that_are_no_numbers_are_refused(tmp_path, place,
     message = rf"1 of 336 voxels are not finite numbers, the first at \(i, j, k\) = \({', '.join(map(str, place))}\)"
     with pytest.raises(SimulationError, match=message):
         Volume.read(tmp_path / "mri.nii.gz")
+
+
+@pytest.mark.parametrize("new", ["a.mhd", "a.nhdr"])
+def test_the_voxels_of_another_header_are_not_replaced(new, tmp_path):
+    """Both keep them in a file of their own: the labels of a patient replaced her MRI."""
+    volume = Volume(np.arange(60, dtype=np.int16).reshape(3, 4, 5), np.eye(4))
+    (tmp_path / "a.raw").write_bytes(volume.array.tobytes())
+    with pytest.raises(SimulationError, match=r"a\.raw: has the voxels of another image, and a\.(mhd|nhdr) would"):
+        volume.write(tmp_path / new)
+    assert (tmp_path / "a.raw").read_bytes() == volume.array.tobytes()
+    (tmp_path / "a.raw").unlink()
+    volume.write(tmp_path / new)
+    volume.write(tmp_path / new)  # its own may be
+    np.testing.assert_array_equal(Volume.read(tmp_path / new).array, volume.array)

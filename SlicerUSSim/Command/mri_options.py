@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Logic.base.declaration import parameter_of
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 if TYPE_CHECKING:
@@ -81,3 +82,15 @@ def segmented_file(
     for line in result.notes if tell_all else (result.brain.message,):
         note(line)
     return result
+
+
+def require_mri(path: str, volume: Volume) -> None:
+    """Raise SimulationError, saying what it is, for a label map or a mask."""
+    from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file
+
+    if is_label_file(Path(path), volume):
+        found = read_label_file(Path(path), volume)  # refuses a mask, and says how to add it
+        raise SimulationError(
+            f"{path}: is a label map ({found.message}), expected an MRI; use it as it is (ussim simulate {path} ...), "
+            "or segment it all the same with --skull-strip none"
+        )

@@ -5,19 +5,15 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, segmented_file, split_also
+from SlicerUSSim.Command.mri_options import also_option, require_mri, segmented_file, split_also
 from SlicerUSSim.Command.options import check_output, device_option, gathered, mask_option
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
-
-if TYPE_CHECKING:
-    from SlicerUSSim.Logic.base.volume import Volume
 
 
 @click.command()
@@ -54,7 +50,7 @@ def segment(
     masks = Additions.read(additions)
     volume = Volume.read(mri)
     if mask is None and settings.skull_strip != "none":
-        _require_mri(mri, volume)
+        require_mri(mri, volume)
     start = perf_counter()
     result = segmented_file(
         mri, volume, asdict(settings), mask=mask, also=also, device=device, additions=masks, tell_all=True
@@ -75,15 +71,3 @@ def _require_no_kept_mask(out: Path, mri: str) -> None:
         f"-o is {out}, where the brain mask of {mri} is kept, expected another name",
     )
     require(not is_kept_mask(out), f"-o is {out}, the kept brain mask of another MRI, expected another name")
-
-
-def _require_mri(path: str, volume: Volume) -> None:
-    """Raise SimulationError, saying what it is, for a label map or a mask."""
-    from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file
-
-    if is_label_file(Path(path), volume):
-        found = read_label_file(Path(path), volume)  # refuses a mask, and says how to add it
-        raise SimulationError(
-            f"{path}: is a label map ({found.message}), expected an MRI; use it as it is (ussim simulate {path} ...), "
-            "or segment it all the same with --skull-strip none"
-        )

@@ -20,6 +20,19 @@ def require_place(path: Path) -> None:
     require(path.parent.is_dir(), f"{path}: the folder {path.parent} does not exist")
     require(not path.is_dir(), f"{path}: is a folder, expected a file name")
     require(os.access(path.parent, os.W_OK), f"{path}: cannot be written (no permission in {path.parent})")
+    require_own_voxels(path)
+
+
+def require_own_voxels(path: Path) -> None:
+    """Raise SimulationError for a new header whose file of voxels would replace that of another image."""
+    if path.suffix.lower() not in (".mhd", ".nhdr") or path.exists():
+        return
+    for suffix in (".raw", ".zraw", ".raw.gz"):
+        voxels = path.with_suffix(suffix)
+        require(
+            not voxels.exists(),
+            f"{voxels}: has the voxels of another image, and {path.name} would replace them; give another name",
+        )
 
 
 def make_folder(path: str | os.PathLike) -> Path:

@@ -12,7 +12,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
-from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.files import require_own_voxels, written_whole
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
 from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry
 from SlicerUSSim.Logic.base.segments import flattened, segments_of
@@ -178,6 +178,7 @@ class Volume:
         """
         path = Path(path)
         require_image_name(path)
+        require_own_voxels(path)
         with written_whole(path) as partial:
             if path.suffix.lower() == ".vti":
                 self._write_vti(partial)
