@@ -162,6 +162,13 @@ def test_a_phantom_is_refused_as_one(shape):
         find_brain(phantom(shape))
 
 
+@needs_nilearn
+def test_an_image_of_noise_is_refused_as_one():
+    noise = np.random.default_rng(0).normal(100.0, 20.0, (50, 50, 50)).astype(np.float32)
+    with pytest.raises(SimulationError, match="is noise, in which neighbours have nothing in common"):
+        find_brain(Volume(noise, np.diag([3.0, 3.0, 3.0, 1.0])))
+
+
 def test_a_head_is_no_phantom_no_ultrasound_and_is_cut_nowhere(head):
     assert not is_phantom(CoarseImage.of(head[0])) and not is_ultrasound(head[0]) and cut_ends(head[0]) == ()
     assert not is_ultrasound(head_mri(3.0))
@@ -621,6 +628,26 @@ def test_masks_that_take_skull_in_or_lie_below_the_cortex_everywhere_are_said(he
 
 
 @needs_nilearn
+def test_a_shifted_or_turned_mask_is_called_so_and_gives_no_hint_to_contrast_agent(head):
+    mri, brain = head
+    step = round(20.0 / mri.spacing_mm[0])
+    for moved in (
+        np.roll(brain, step, axis=2),
+        np.roll(brain, step, axis=1),
+        np.rot90(brain, axes=(0, 1))[: len(brain)],
+    ):
+        mask = np.zeros(brain.shape, np.uint8)
+        part = tuple(map(slice, np.minimum(moved.shape, brain.shape)))
+        mask[part] = moved[part]
+        given = given_brain(mri.with_array(mask), mri)
+        (line,) = [line for line in given.warnings if "of the mask lie outside the brain that the atlas finds" in line]
+        assert "shifted or turned" in line and not any("cortex" in line for line in given.warnings)
+        assert given.takes_in_more
+    tight = refinement.signed_distance(brain, mri.spacing_mm, 25.0) < -5.0
+    assert not given_brain(mri.with_array(tight.astype(np.uint8)), mri).takes_in_more
+
+
+@needs_nilearn
 def test_a_mask_without_the_ventricles_is_said(head):
     mri, brain = head
     depth = refinement.signed_distance(brain, mri.spacing_mm, 25.0)
@@ -785,6 +812,8 @@ def test_a_lesion_given_as_the_brain_is_said():
     assert any("expected" in line for line in given_brain(half, mri).warnings)
     (warning,) = given_brain(mri.with_array(lesion), mri).warnings
     assert "the mask has 4.1 ml, expected a brain of 1000 to 1900 ml" in warning and "--add" in warning
+    with pytest.raises(SimulationError, match=r"the mask has 4.1 ml, expected a brain .* registered to each other"):
+        segment_mri(mri, mask=mri.with_array(lesion), others={"t2": mri.with_array(255.0 - mri.array)})
 
 
 def atrophied_vertex(spacing=1.5):

@@ -360,6 +360,28 @@ def test_a_tracked_sweep_given_as_an_mri_is_called_what_it_is(command, tmp_path)
     assert result.exit_code == 2 and "is a sequence of tracked ultrasound images, expected an MRI" in result.stderr
 
 
+def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
+    pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
+    out = tmp_path / "out"
+    out.mkdir()
+    mine = out / "figure.png"
+    mine.write_bytes(b"my figure")
+    (out / "notes.txt").write_text("mine")
+    result = ussim("demo", "--mri", head, "--out", out)
+    assert result.exit_code == 2 and f"{mine}: exists and is not as this command wrote it" in result.stderr
+    assert mine.read_bytes() == b"my figure"
+    mine.unlink()
+    assert ussim("demo", "--mri", head, "--out", out).exit_code == 0
+    assert ussim("demo", "--mri", head, "--out", out).exit_code == 0  # its own files are replaced
+    assert not list(out.glob(".results-*")) and (out / "notes.txt").read_text() == "mine"
+    preset = out / "preset.json"
+    preset.write_text(preset.read_text() + "\n")  # edited
+    edited = preset.read_text()
+    result = ussim("demo", "--mri", head, "--out", out)
+    assert result.exit_code == 2 and "preset.json: exists and is not as" in result.stderr
+    assert preset.read_text() == edited
+
+
 def test_the_demo_refuses_a_label_map_as_segment_does(labels, tmp_path):
     result = ussim("demo", "--mri", labels, "--out", tmp_path / "demo")
     assert result.exit_code == 2 and "is a label map" in result.stderr and "expected an MRI" in result.stderr

@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
+from SlicerUSSim.Logic.mri import segment_mri
 from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map
 from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, tissue_named
@@ -228,6 +229,21 @@ def refusal_of(volume: Volume, *arguments, **options) -> SimulationError:
     return caught.value
 
 
+def few(labels: tuple[int, ...]) -> Volume:
+    """Cubes in a row."""
+    array = np.zeros((20, 20, 20 * len(labels)), np.int16)
+    for n, label in enumerate(labels):
+        array[4:16, 4:16, 20 * n + 4 : 20 * n + 16] = label
+    return Volume(array, np.diag([2.0, 2.0, 2.0, 1.0]))
+
+
+def test_too_few_labels_of_a_program_are_refused_with_the_program_whose_numbers_they_are():
+    refusal = str(refusal_of(few((90, 91)), mapping=LabelMapping.of("92=0")))
+    assert "if the numbers are those of TotalSegmentator CT (90 brain, 91 skull)" in refusal
+    assert "--map totalsegmentator" in refusal
+    assert read_label_map(few((90, 91)), mapping=LabelMapping.of("totalsegmentator")).message.startswith("TotalSegm")
+
+
 def test_a_mirrored_head_is_read_with_a_warning():
     found = read_label_map(freesurfer(ASEG, mirrored=True))
     assert found.message.startswith("FreeSurfer aseg")
@@ -349,6 +365,7 @@ def test_a_mapping_goes_before_names_and_numbers_and_removes_labels():
         ("csf", "--map is 'csf', expected LABEL=TISSUE such as 24=csf"),
         ("24=", "--map is '24=', expected LABEL=TISSUE"),
         ("=csf", "--map is '=csf', expected LABEL=TISSUE"),
+        ("24=csf=2", "--map is '24=csf=2', expected LABEL=TISSUE"),
         ("24=chese", "--map 24=chese: no tissue 'chese', expected 0"),
         ("24=live", "no tissue 'live', expected 0 (nothing) or one of: liver"),
         ("-1=csf", "label is -1, expected a whole number from 0 to 99999"),
@@ -376,6 +393,24 @@ def test_a_bad_mapping_is_one_line(text, message, tmp_path, monkeypatch):
     with pytest.raises(SimulationError) as caught:
         LabelMapping.of([text])
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (lambda labels: labels + 0.3 * (labels > 0), "uniform regions of few values with fractions"),
+        (lambda labels: labels * 0.3, "uniform regions of few values with fractions"),
+        (lambda labels: labels + np.random.default_rng(0).normal(0, 1e-3, labels.shape), "label map"),
+        (lambda labels: labels, "label map"),
+    ],
+)
+def test_labels_are_no_mri_also_with_fractions_and_noise_and_in_python(changed, message, tmp_path):
+    labels = freesurfer(ASEG)
+    labels = labels.with_array(changed(labels.array.astype(np.float32)))
+    with pytest.raises(SimulationError, match=message):
+        segment_mri(labels)
+    labels.write(tmp_path / "labels.nii.gz")
+    assert message in refused("segment", tmp_path / "labels.nii.gz", "-o", tmp_path / "out.nii.gz")
 
 
 def test_a_mapping_of_an_mri_is_refused(tmp_path):

@@ -256,7 +256,7 @@ def moved(volume: Volume, *mm) -> Volume:
         (moved(ball(BRAIN), 200, 0, 0), "tumour", "lies 174 mm outside the patient, expected a mask in the frame of"),
         (ball(BRAIN, 2.0, [27, 27, 27]), "tumour", "lies 21 mm outside the patient"),
         (BRAIN, "tumour", "covers 100 % of the patient, expected a lesion in it; is it the mask of the brain"),
-        (head_mri(8.0), "tumour", "holds numbers from 0 to .*, expected a mask"),
+        (head_mri(8.0), "tumour", "holds fractions from 0 to .*, expected a mask"),
         (BRAIN.with_array(np.arange(BRAIN.array.size).reshape(BRAIN.array.shape)), "cyst", "226981 whole numbers from"),
         (BRAIN.with_array(BRAIN.array * np.nan), "tumour", "has 226981 voxels that are not finite numbers"),
         (BRAIN.with_array(ball(BRAIN).array * 0.4), "tumour", r"no probability is above 0.5 \(the largest is 0.4\)"),
@@ -264,7 +264,7 @@ def moved(volume: Volume, *mm) -> Volume:
         (BRAIN.with_array(ball(BRAIN).array * 5), "brats", "holds the labels 5, expected those of BraTS: 1 necrosis"),
         (ball(BRAIN), "brats", "the label 1 alone, as the mask of a whole tumour does, .*: tumour=FILE, or necrosis="),
         (BRAIN.with_array(ball(BRAIN).array * 3), "brats-2022", "1 necrosis, 2 oedema, 4 enhancing$"),
-        (BRAIN.with_array(ball(BRAIN).array * 0.7), "brats", "holds numbers from 0 to 0.7, expected a mask"),
+        (BRAIN.with_array(ball(BRAIN).array * 0.7), "brats", "holds fractions from 0 to 0.7, expected labels"),
         (ball(empty((0.1, 0.1, 0.1), half_mm=1), 0.3, [0, 0, 0]), "tumour", "mm³ are too small for the voxels"),
     ],
 )
@@ -538,7 +538,7 @@ def test_every_command_that_simulates_takes_additions_for_an_mri_and_for_labels(
         ("=x.nrrd", "--add is '=x.nrrd', expected TISSUE=FILE"),
         ("tumour=none.nrrd", "none.nrrd: no such file"),
         ("cheese={cyst.nrrd}", "no tissue is called 'cheese', expected one of: coupling"),
-        ("tumour={head.nii.gz}", "head.nii.gz: holds numbers from"),
+        ("tumour={head.nii.gz}", "head.nii.gz: holds fractions from"),
         ("tumour={far.nrrd}", "far.nrrd: lies 2"),
         ("brats={far.nrrd}", "far.nrrd: holds the label 1 alone"),
     ],
@@ -595,6 +595,9 @@ def test_the_table_of_another_label_map_is_not_replaced(tmp_path):
     with pytest.raises(SimulationError, match=r"p\.json: has the tissues of p\.nrrd, so it is not replaced"):
         require_replaceable(tmp_path / "p.nii.gz")
     require_replaceable(tmp_path / "q.nii.gz")
+    BRAIN.with_array(np.roll(BRAIN.array, 3, axis=0)).write(tmp_path / "p.nii.gz")
+    with pytest.raises(SimulationError, match=r"p\.nii\.gz: exists, and p\.json has the tissues of p\.nrrd"):
+        require_replaceable(tmp_path / "p.nii.gz")
 
 
 @pytest.mark.parametrize("name", ["l.nii.gz", "l.nrrd", "l.mha", "l.vti"])

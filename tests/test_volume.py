@@ -111,6 +111,29 @@ def test_images_that_are_not_3d_are_refused(tmp_path, shape):
         Volume.read(tmp_path / "i.nrrd")
 
 
+def test_what_is_wrong_with_an_unreadable_image_is_said(tmp_path):
+    import SimpleITK as sitk
+
+    nibabel = pytest.importorskip("nibabel")
+    values = np.arange(60, dtype=np.int16).reshape(3, 4, 5)
+    Volume(values, np.eye(4)).write(tmp_path / "good.nii.gz")
+    (tmp_path / "packed.nii").write_bytes((tmp_path / "good.nii.gz").read_bytes())
+    (tmp_path / "empty.nrrd").write_bytes(b"")
+    (tmp_path / "text.nii.gz").write_text("no image")
+    nibabel.save(nibabel.Nifti2Image(values, np.eye(4)), tmp_path / "second.nii.gz")
+    complex_values = sitk.GetImageFromArray(values.astype(np.complex64))
+    sitk.WriteImage(complex_values, str(tmp_path / "complex.nii.gz"))
+    for name, message in {
+        "packed.nii": r"it is compressed by gzip: rename it to packed\.nii\.gz",
+        "empty.nrrd": "it is empty, 0 bytes",
+        "text.nii.gz": "it is not compressed by gzip, as its name says",
+        "second.nii.gz": "it is NIfTI-2, expected NIfTI-1",
+        "complex.nii.gz": "holds complex numbers, expected real ones",
+    }.items():
+        with pytest.raises(SimulationError, match=f"{name}: .*{message}"):
+            Volume.read(tmp_path / name)
+
+
 def test_missing_and_unreadable_files_are_named(tmp_path):
     with pytest.raises(SimulationError, match=r"nothing\.nii: no such file"):
         Volume.read(tmp_path / "nothing.nii")

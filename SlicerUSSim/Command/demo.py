@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, read_also, require_mri
+from SlicerUSSim.Command.mri_options import also_option, read_also, read_mri
 from SlicerUSSim.Command.options import device_option, mask_option, parameter_option
 from SlicerUSSim.Command.progress import Steps, note
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
@@ -55,9 +55,9 @@ def demo(
 
     settings = SimulationSettings(seed=seed)
     masks = Additions.read(additions)
-    volume, source = (Volume.read(mri), os.path.abspath(mri)) if mri else demo_mri()
-    if mri and mask is None and skull_strip != "none":
-        require_mri(mri, volume)
+    volume, source = demo_mri() if mri is None else (
+        read_mri(mri, mask=mask, skull_strip=skull_strip), os.path.abspath(mri),
+    )  # fmt: skip
     note(f"MRI: {source}, {volume.size_text} voxels")
     brain = {
         "contrast": contrast, "skull_strip": skull_strip, "mask": Volume.read(mask) if mask else None,

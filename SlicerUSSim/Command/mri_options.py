@@ -64,12 +64,7 @@ def segmented_file(
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
-    from SlicerUSSim.Logic.tracked.sequence import is_tracked_sequence
 
-    require(
-        not is_tracked_sequence(path),
-        f"{path}: is a sequence of tracked ultrasound images, expected an MRI; use it with --sequence",
-    )
     others = read_also(also)
     brain = Volume.read(mask) if mask else None
     if additions is not None:
@@ -84,13 +79,36 @@ def segmented_file(
     return result
 
 
-def require_mri(path: str, volume: Volume) -> None:
-    """Raise SimulationError, saying what it is, for a label map or a mask."""
+def read_mri(path: str, *, mask: str | None, skull_strip: str) -> Volume:
+    """Read an MRI, which is not a label map unless it is segmented all the same, with a mask or without extraction.
+
+    Raises SimulationError, saying what it is, for a label map, a mask or a tracked sequence, and if it is constant.
+    """
+    from SlicerUSSim.Logic.base.errors import about_file
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mri.recognition import check_finite
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file
 
+    require_no_sequence(path)
+    volume = Volume.read(path)
+    if mask is not None or skull_strip == "none":
+        return volume
+    with about_file(path):
+        check_finite(volume)
     if is_label_file(Path(path), volume):
         found = read_label_file(Path(path), volume)  # refuses a mask, and says how to add it
         raise SimulationError(
             f"{path}: is a label map ({found.message}), expected an MRI; use it as it is (ussim simulate {path} ...), "
             "or segment it all the same with --skull-strip none"
         )
+    return volume
+
+
+def require_no_sequence(path: str) -> None:
+    """Raise SimulationError for a file of tracked ultrasound images."""
+    from SlicerUSSim.Logic.tracked.sequence import is_tracked_sequence
+
+    require(
+        not is_tracked_sequence(path),
+        f"{path}: is a sequence of tracked ultrasound images, expected an MRI; use it with --sequence",
+    )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, segmented_file, split_also
+from SlicerUSSim.Command.mri_options import also_option, require_no_sequence, segmented_file, split_also
 from SlicerUSSim.Command.options import declared, declared_parameters, device_option, mask_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
@@ -140,6 +140,7 @@ def open_examination(patient: PatientOptions) -> Examination:
 
     log = logging.getLogger(__name__)
     preset = patient.changed_preset()
+    require_no_sequence(patient.mri_or_labels)
     volume = Volume.read(patient.mri_or_labels)
     is_labels = patient.is_labels
     if is_labels is None:

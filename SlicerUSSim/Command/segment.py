@@ -9,7 +9,7 @@ from time import perf_counter
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, require_mri, segmented_file, split_also
+from SlicerUSSim.Command.mri_options import also_option, read_mri, segmented_file, split_also
 from SlicerUSSim.Command.options import check_output, device_option, gathered, mask_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import require
@@ -38,7 +38,6 @@ def segment(
     additions: tuple[str, ...], overwrite: bool, device: str | None,
 ) -> None:  # fmt: skip
     """Segment an MRI of a head or a brain into tissues."""
-    from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
     from SlicerUSSim.Logic.tissue.table import TissueTable
 
@@ -48,9 +47,7 @@ def segment(
         require_replaceable(out)
     split_also(also)
     masks = Additions.read(additions)
-    volume = Volume.read(mri)
-    if mask is None and settings.skull_strip != "none":
-        require_mri(mri, volume)
+    volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip)
     start = perf_counter()
     result = segmented_file(
         mri, volume, asdict(settings), mask=mask, also=also, device=device, additions=masks, tell_all=True

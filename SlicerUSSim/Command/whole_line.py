@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from SlicerUSSim.Command.additions import Additions
+from SlicerUSSim.Command.own_folder import require_own_results, results_of
 from SlicerUSSim.Logic.base.errors import about_file
-from SlicerUSSim.Logic.base.files import make_folder, write_json
+from SlicerUSSim.Logic.base.files import make_folder
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.figures import draw_views, require_matplotlib, write_png
@@ -23,9 +24,16 @@ from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, slice_under_probe
-from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
+from SlicerUSSim.Logic.tissue.own_files import write_label_files
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.pose_files import write_pose
+
+#: Files of the results, and the one that says what was done
+_RESULTS = (
+    "figure.png", "mri.png", "labels.png", "bmode.png", "bmode.mha", "labels.nii.gz", "labels.json", "pose.json",
+    "preset.json",
+)  # fmt: skip
+SUMMARY = "demo.json"
 
 
 def run_whole_line(
@@ -50,7 +58,7 @@ def run_whole_line(
     """
     require_matplotlib()  # before the computation, not after it
     make_folder(out)
-    require_replaceable(out / "labels.nii.gz", "choose another folder (--out)")
+    require_own_results(out, _RESULTS, SUMMARY)
     timings: dict[str, float] = {}
 
     progress("segment the MRI")
@@ -82,46 +90,46 @@ def run_whole_line(
     stages = {stage: min(f.timings_ms[stage] for f in frames) for stage in frame.timings_ms}
     timings |= {"frame": sum(stages.values())}
 
-    progress("draw")
-    bounds = probe.image_bounds_mm()
-    seen = ("MRI under the probe", slice_under_probe(mri, frame.grid, pose), "mri")
-    labelled = ("Tissues", slice_under_probe(labels, frame.grid, pose, order=0), "labels")
-    simulated = ("Simulated B-mode", frame.image, "bmode")
-    draw_views(out / "figure.png", [seen, labelled, simulated], probe, bounds, names)
-    draw_views(out / "mri.png", [seen], probe, bounds, names)
-    draw_views(out / "labels.png", [labelled], probe, bounds, names)
+    with results_of(out, SUMMARY) as (folder, summary):
+        progress("draw")
+        bounds = probe.image_bounds_mm()
+        seen = ("MRI under the probe", slice_under_probe(mri, frame.grid, pose), "mri")
+        labelled = ("Tissues", slice_under_probe(labels, frame.grid, pose, order=0), "labels")
+        simulated = ("Simulated B-mode", frame.image, "bmode")
+        draw_views(folder / "figure.png", [seen, labelled, simulated], probe, bounds, names)
+        draw_views(folder / "mri.png", [seen], probe, bounds, names)
+        draw_views(folder / "labels.png", [labelled], probe, bounds, names)
 
-    progress("write")
-    write_png(out / "bmode.png", frame.image)
-    frame.to_volume().write(out / "bmode.mha")
-    write_label_files(out / "labels.nii.gz", labels, tissues)
-    write_pose(out / "pose.json", pose)
-    Preset(probe, display, settings, tissues).write(out / "preset.json")
-    summary = {
-        "mri": source,
-        "device": str(simulator.device.info),
-        "probe": probe.to_dict(),
-        "probe_to_ras": pose.tolist(),
-        "settings": asdict(settings),
-        "display": asdict(display),
-        "segmentation": {
-            "tissue_names": list(names),
-            "brain": {
-                "method": segmentation.brain.method,
-                "message": segmentation.brain.message,
-                "warnings": list(segmentation.brain.warnings),
-                "volume_ml": segmentation.brain.volume_ml,
+        progress("write")
+        write_png(folder / "bmode.png", frame.image)
+        frame.to_volume().write(folder / "bmode.mha")
+        write_label_files(folder / "labels.nii.gz", labels, tissues)
+        write_pose(folder / "pose.json", pose)
+        Preset(probe, display, settings, tissues).write(folder / "preset.json")
+        summary |= {
+            "mri": source,
+            "device": str(simulator.device.info),
+            "probe": probe.to_dict(),
+            "probe_to_ras": pose.tolist(),
+            "settings": asdict(settings),
+            "display": asdict(display),
+            "segmentation": {
+                "tissue_names": list(names),
+                "brain": {
+                    "method": segmentation.brain.method,
+                    "message": segmentation.brain.message,
+                    "warnings": list(segmentation.brain.warnings),
+                    "volume_ml": segmentation.brain.volume_ml,
+                },
+                "means": segmentation.means.tolist(),
+                "standard_deviations": segmentation.standard_deviations.tolist(),
+                "weights": segmentation.weights.tolist(),
+                "noise": segmentation.noise,
+                "added": list(added.messages),
+                "voxels": np.bincount(labels.array.ravel()).tolist(),
             },
-            "means": segmentation.means.tolist(),
-            "standard_deviations": segmentation.standard_deviations.tolist(),
-            "weights": segmentation.weights.tolist(),
-            "noise": segmentation.noise,
-            "added": list(added.messages),
-            "voxels": np.bincount(labels.array.ravel()).tolist(),
-        },
-        "tissues": tissues.to_dict(),
-        "milliseconds": {name: round(value, 3) for name, value in timings.items()},
-        "milliseconds_per_stage": {name: round(value, 3) for name, value in stages.items()},
-    }
-    write_json(out / "demo.json", summary)
+            "tissues": tissues.to_dict(),
+            "milliseconds": {name: round(value, 3) for name, value in timings.items()},
+            "milliseconds_per_stage": {name: round(value, 3) for name, value in stages.items()},
+        }
     return summary

@@ -8,8 +8,8 @@ import numpy as np
 _TOO_LARGE = 100_000
 #: Share of negative voxels, by positive ones, up to which they may be slips in a label map, which then is no MRI either
 _FEW_NEGATIVE = 0.05
-#: What formats and resampling leave of whole numbers
-_ROUNDING = 1e-3
+#: What formats, resampling and augmentation by noise leave of whole numbers
+_ROUNDING = 0.02
 #: Labels that were stored as bytes with a scale: each is one multiple of it, at most so far from a whole number
 _SCALED, _BYTES = 0.25, 256
 #: Label maps of up to this many labels are not examined further. Above, at least this share of neighbours has to be
@@ -53,6 +53,19 @@ def whole_numbers(array: np.ndarray) -> np.ndarray | None:
     return rounded if rounded.any() or not array.any() else None
 
 
+def has_uniform_fractions(array: np.ndarray) -> bool:
+    """Whether these are few values with fractions, in uniform regions: labels to which something was added or done."""
+    if not np.issubdtype(array.dtype, np.floating):
+        return False
+    middle = _middle(array)
+    values = np.unique(array[middle])
+    return 1 < len(values) <= _BYTES and _has_regions(array, values)
+
+
+def _middle(array: np.ndarray) -> tuple[slice, ...]:
+    return tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)
+
+
 def _is_scaled(array: np.ndarray, rounded: np.ndarray) -> bool:
     """Whether every whole number stands for one value near it, as labels have that were stored with a scale."""
     if not float(np.abs(array - rounded).max()) <= _SCALED or rounded.max() <= 1:
@@ -63,8 +76,7 @@ def _is_scaled(array: np.ndarray, rounded: np.ndarray) -> bool:
 
 def _has_regions(array: np.ndarray, values: np.ndarray) -> bool:
     """Whether neighbours that are not 0 have mostly equal `values`, as in a label map; see the constants above."""
-    middle = tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)
-    part = np.searchsorted(values, array[middle]) + (values[0] > 0)  # ranks; 0 is 0
+    part = np.searchsorted(values, array[_middle(array)]) + (values[0] > 0)  # ranks; 0 is 0
     total = equal = following = 0
     for axis in range(3):
         first, second = np.moveaxis(part, axis, 0)[:-1], np.moveaxis(part, axis, 0)[1:]

@@ -12,7 +12,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
-from SlicerUSSim.Logic.base.files import require_own_voxels, written_whole
+from SlicerUSSim.Logic.base.files import require_own_voxels, why_unreadable, written_whole
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
 from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry
 from SlicerUSSim.Logic.base.segments import flattened, segments_of
@@ -20,8 +20,8 @@ from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singu
 
 _log = logging.getLogger(__name__)
 
-#: A larger side of a volume indicates a wrong unit.
-_SMALLEST_MM, _LARGEST_MM = 5.0, 2500.0
+#: A smaller or larger side of a volume indicates a wrong unit.
+SMALLEST_MM, LARGEST_MM = 5.0, 2500.0
 WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
 
 
@@ -261,7 +261,7 @@ def _log_size(volume: Volume, path: Path) -> None:
         "%s: %s voxels of %s mm, %s, i, j, k towards %s", path, volume.size_text,
         "x".join(f"{round(mm, 3):g}" for mm in volume.spacing_mm), volume.array.dtype, axis_letters(volume.ijk_to_ras),
     )  # fmt: skip
-    if not _SMALLEST_MM <= size.max() <= _LARGEST_MM:
+    if not SMALLEST_MM <= size.max() <= LARGEST_MM:
         _log.warning(
             "%s: its size is %s mm if lengths are in millimetres, as assumed; check its voxel size", path,
             "x".join(f"{round(mm, 3):g}" for mm in size),
@@ -308,10 +308,13 @@ def read_itk_image(path: Path):
 
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
     try:
-        return sitk.ReadImage(str(path))
+        image = sitk.ReadImage(str(path))
     except RuntimeError as error:
-        reason = str(error).strip().splitlines()[-1]
+        reason = why_unreadable(path) or str(error).strip().splitlines()[-1]
         raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
+    is_complex = "complex" in image.GetPixelIDTypeAsString()
+    require(not is_complex, f"{path}: holds complex numbers, expected real ones; save its magnitude")
+    return image
 
 
 def _require_volume(size, name: str) -> None:

@@ -205,8 +205,9 @@ class Medium:
         thickest = 2.0 * _FARTHEST_SIGMAS * sigma_mm
         require(
             membrane.thickness_mm < thickest,
-            f"membrane thickness_mm is {membrane.thickness_mm:g}, expected less than {thickest:.2g} at this voxel "
-            "size; label thicker layers in the label map",
+            f"membrane thickness_mm is {membrane.thickness_mm:g}, expected less than {thickest:.2g} in voxels of "
+            f"{'x'.join(f'{mm:.3g}' for mm in spacing[::-1])} mm: resample the labels to larger voxels, set a thinner "
+            "membrane, or label it; check the voxel size in the header",
         )
 
         def smoothed(where: np.ndarray) -> np.ndarray:

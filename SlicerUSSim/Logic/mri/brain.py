@@ -12,7 +12,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require
-from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.volume import LARGEST_MM, Volume
 from SlicerUSSim.Logic.mri import extractors
 from SlicerUSSim.Logic.mri.alignment import align_template
 from SlicerUSSim.Logic.mri.atlas import mni152
@@ -38,8 +38,6 @@ _NAMES = {"robex": "ROBEX", "deepbet": "deepbet", "atlas": "the atlas"}
 #: Overlap with the registered atlas above which a mask is taken without asking another method, and below which it is
 #: refused
 _SURE, _LEAST_SURE = 0.915, 0.85
-#: Largest image
-_LARGEST_MM = 2500.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +53,8 @@ class BrainMask:
     #: One line each, for what a user should check
     warnings: tuple[str, ...] = ()
     seconds: float = 0.0
+    #: Whether a given mask also holds skull or scalp, as far as it can be told
+    takes_in_more: bool = False
 
     @property
     def volume_ml(self) -> float:
@@ -90,7 +90,7 @@ def find_brain(
         return kept
     size = mri.spacing_mm * mri.array.shape[::-1]
     require(
-        float(size.max()) <= _LARGEST_MM,
+        float(size.max()) <= LARGEST_MM,
         f"the image is {'x'.join(f'{mm:g}' for mm in size)} mm large, expected a head of 100 to 400 mm; correct its "
         "voxel size, or the unit of length in its header",
     )
@@ -135,8 +135,11 @@ def given_brain(mask: Volume, mri: Volume) -> BrainMask:
     inside = checked_mask(mask, mri)
     millilitres = _millilitres(inside, mri)
     found = mri.with_array(inside.astype(np.uint8))
-    warnings = (*label_doubts(mask), *mask_doubts(mri, inside))
-    return BrainMask(found, "given", f"brain mask as given, {millilitres:.0f} ml", warnings)
+    doubts = mask_doubts(mri, inside)
+    return BrainMask(
+        found, "given", f"brain mask as given, {millilitres:.0f} ml", (*label_doubts(mask), *doubts.lines),
+        takes_in_more=doubts.takes_in_more,
+    )  # fmt: skip
 
 
 def left_out(mask: Volume, lesion: Volume) -> float:
@@ -278,8 +281,10 @@ def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
         by = _NAMES.get(kept.method, kept.method)
         message = f"whole head: brain mask kept in {kept.path}, by {by} in {kept.seconds:.0f} s, {millilitres:.0f} ml"
     mask = mri.with_array(kept.inside.astype(np.uint8))
-    warnings = mask_doubts(mri, kept.inside) if kept.is_edited else kept.warnings
-    return BrainMask(mask, "given" if kept.is_edited else kept.method, message, warnings, 0.0)
+    if not kept.is_edited:
+        return BrainMask(mask, kept.method, message, kept.warnings, 0.0)
+    doubts = mask_doubts(mri, kept.inside)
+    return BrainMask(mask, "given", message, doubts.lines, 0.0, doubts.takes_in_more)
 
 
 def _head_warnings(millilitres: float) -> tuple[str, ...]:

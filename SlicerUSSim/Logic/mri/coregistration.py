@@ -77,8 +77,8 @@ def aligned(other: Volume, reference: Volume, inside: np.ndarray, name: str) -> 
     found = f"{name}: {share:.0%} of the brain's parts lie where the first volume has them, expected"
     require(
         share >= _LEAST_IN_PLACE,
-        f"{found} {_LEAST_IN_PLACE:.0%} or more of one patient: two patients, or too different images to be registered "
-        "by this program",
+        f"{found} {_LEAST_IN_PLACE:.0%} or more of one patient: two patients, or one does not lie as its header says, "
+        "or too different images to be registered by this program",
     )
     is_usual = share >= _USUAL_IN_PLACE
     warnings = () if is_usual else (f"{found} {_USUAL_IN_PLACE:.0%} or more of one patient: check that both are",)

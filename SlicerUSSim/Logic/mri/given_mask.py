@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.mask_check import border_doubts
+from SlicerUSSim.Logic.mri.mask_check import MaskDoubts, border_doubts
 from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 from SlicerUSSim.Logic.mri.recognition import POSSIBLE_ML, USUAL_ML
 
@@ -96,20 +96,21 @@ def _is_probability(array: np.ndarray) -> bool:
     return bool(some.size and (some > 0.95).mean() > 0.5)
 
 
-def mask_doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
-    """Warnings about a mask (k, j, i) that a user made."""
+def mask_doubts(mri: Volume, inside: np.ndarray) -> MaskDoubts:
+    """What should be checked in a mask (k, j, i) that a user made."""
     millilitres = float(inside.sum() * mri.voxel_ml)
     if millilitres < POSSIBLE_ML[0]:
-        return (
-            *_islands(mri, inside),
+        small = (
             f"the mask has {millilitres:.3g} ml, expected a brain of {USUAL_ML[0]:.0f} to {USUAL_ML[1]:.0f} ml or a "
-            "large part of one; what is outside it has no tissue (a lesion is added with --add tumour=FILE)",
+            "large part of one; what is outside it has no tissue (a lesion is added with --add tumour=FILE)"
         )
+        return MaskDoubts((*_islands(mri, inside), small))
     reason = is_whole_brain(mri, inside)
     warnings = volume_warnings(millilitres)
     if reason and not warnings:
         warnings = (f"the mask is not that of a whole brain: {reason}",)
-    return (*warnings, *_islands(mri, inside), *border_doubts(mri, inside))
+    border = border_doubts(mri, inside)
+    return replace(border, lines=(*warnings, *_islands(mri, inside), *border.lines))
 
 
 def label_doubts(mask: Volume) -> tuple[str, ...]:

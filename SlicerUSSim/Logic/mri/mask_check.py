@@ -9,6 +9,8 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.alignment import align_template
+from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.coarse import resampled_to_ras
 from SlicerUSSim.Logic.mri.refinement import brightness_near, closed, on_grid, signed_distance
 
@@ -32,6 +34,10 @@ _BEYOND_MM, _BEYOND_BRIGHT_CSF_MM, _BRIGHT_CSF = 5.5, 3.5, 1.1
 _HOLE_DEPTH_MM, _HOLE_ML = 24.0, 3.0
 #: Share of voxels with the value of the first one, from which they are a background that was set
 _STRIPPED = 0.15
+#: Agreement from which the atlas's brain is sure (see recognition.py), and share of a mask and of that brain outside
+#: each other from which the mask lies elsewhere: shifted by 10 mm 0.11 or turned by 20 degrees 0.12, 6 to 8 mm too wide
+#: or too tight 0.00 to 0.02
+_SURELY_ALIGNED, _ELSEWHERE = 0.4, 0.09
 #: Brightness, relative to the brain, of what is surely outside it
 _DARK = 0.7
 
@@ -70,14 +76,47 @@ def _depth(mask: np.ndarray) -> np.ndarray:
     return -signed_distance(mask, np.full(3, _SPACING_MM), 2.0 * _ABOVE_MM)
 
 
-def border_doubts(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
-    """One line if a mask that was made by others reaches beyond the brain, or cuts it off; see cut_off."""
+@dataclass(frozen=True)
+class MaskDoubts:
+    """What a user should check in a mask."""
+
+    #: One line each
+    lines: tuple[str, ...] = ()
+    #: Whether skull or scalp are among what it holds
+    takes_in_more: bool = False
+
+
+def border_doubts(mri: Volume, inside: np.ndarray) -> MaskDoubts:
+    """Whether a mask that was made by others lies elsewhere, reaches beyond the brain, or cuts it off; see cut_off."""
     checked = _Checked.of(mri, inside)
     if checked is None:
-        return ()
+        return MaskDoubts()
     smooth = closed(checked.mask, _SULCI_MM / _SPACING_MM)
     # A mask that ends in the scalp ends in bright tissue, too; that it cuts the cortex off would be the wrong word.
-    return (*_holes(checked, smooth), *(_taken_in(checked, smooth) or _cut_off(checked)))
+    beyond = _taken_in(checked, smooth)
+    border = beyond or _cut_off(checked)
+    misplaced = _misplaced(mri, inside) if border else ()
+    return MaskDoubts((*_holes(checked, smooth), *(misplaced or border)), bool(misplaced or beyond))
+
+
+def _misplaced(mri: Volume, inside: np.ndarray) -> tuple[str, ...]:
+    """One line if a mask leaves a part of the brain out and has as much elsewhere: shifted, turned, of another image.
+
+    It takes 4 s, so that it is asked about a doubtful mask only.
+    """
+    if mni152() is None:
+        return ()
+    alignment = align_template(mri)
+    if alignment.agreement < _SURELY_ALIGNED:
+        return ()
+    brain = alignment.brain_on(mri) < 0.0
+    elsewhere, left_out = float((inside & ~brain).sum() / inside.sum()), float((brain & ~inside).sum() / brain.sum())
+    if min(elsewhere, left_out) < _ELSEWHERE:
+        return ()
+    return (
+        f"{elsewhere:.0%} of the mask lie outside the brain that the atlas finds, and {left_out:.0%} of that brain "
+        "outside the mask: it is shifted or turned, or of another image",
+    )
 
 
 def _holes(checked: _Checked, smooth: np.ndarray) -> tuple[str, ...]:

@@ -83,10 +83,12 @@ def read_masks(volume: Volume, tissue: str, source: str) -> Masks:
     whole = _whole_numbers(array)
     low, high = float(array.min()), float(array.max())
     if whole is None:
+        expected = (
+            "labels, whole numbers" if is_several else "a mask (0 and not 0), labels, or probabilities from 0 to 1"
+        )
         require(
             not is_several and low >= 0.0 and high <= 1.0,
-            f"{source}: holds numbers from {low:g} to {high:g}, expected a mask (0 and not 0), a label map"
-            + ("" if is_several else ", or probabilities from 0 to 1"),
+            f"{source}: holds fractions from {low:g} to {high:g}, expected {expected}",
         )
         require(high > 0.5, f"{source}: no probability is above 0.5 (the largest is {high:g}); nothing would be added")
         return _masks(volume, {tissue: array}, source)

@@ -16,6 +16,8 @@ _STRAIGHT = 0.006
 #: Share of the inner object that varies by less than 3 % within 20 mm: heads 0.00 to 0.01 (proton density), phantoms
 #: 0.01 (a noisy box) to 0.32
 _UNIFORM_SHARE, _UNIFORM_SHARE_OF_NO_HEAD, _UNIFORM = 0.02, 0.005, 0.03
+#: Correlation of voxels 8 mm apart below which an image is noise: in noise 0.0, in heads 0.8
+_NOISE_CORRELATION = 0.2
 #: Cross-section at an end of the image, relative to the largest, from which the object is cut there. The neck is cut in
 #: most images of a head, so that the bottom has to be cut through the head itself.
 _CUT, _CUT_AT_BOTTOM = 0.5, 0.85
@@ -47,6 +49,16 @@ def uniform_share(image: CoarseImage) -> float:
     mean = ndimage.gaussian_filter(smooth, window)
     variance = ndimage.gaussian_filter(smooth**2, window) - mean**2
     return float((variance[deep] < (_UNIFORM * mean[deep]) ** 2).mean())
+
+
+def is_noise(image: CoarseImage) -> bool:
+    """Whether neighbours have nothing in common, as in an image of noise alone."""
+    if min(image.array.shape) < 8:
+        return False
+    inner = image.array[2:-2, 2:-2, 2:-2]  # beyond the edge of the image it is air
+    inner = inner - inner.mean()
+    # Interpolation has given direct neighbours something in common.
+    return float((inner[2:] * inner[:-2]).mean()) < _NOISE_CORRELATION * float((inner**2).mean())
 
 
 def is_phantom(image: CoarseImage, looks_like_a_head: bool = True) -> bool:

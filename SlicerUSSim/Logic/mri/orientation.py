@@ -10,7 +10,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, agreement_by_moments, align_coarse, align_turned
 from SlicerUSSim.Logic.mri.coarse import CoarseImage
-from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom
+from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_noise, is_phantom
 
 _ENDS = ("RL", "AP", "SI")
 #: Agreement with the atlas, put at the centre of a stripped brain with its size. T1 that lie as their header says had
@@ -39,9 +39,12 @@ def lies_otherwise(
     turns = _turns()
     number, other = align_turned(image, turns, lambda share: report(0.7 * share))
     if other.agreement >= enough and other.turn_from(turns[number]) < 45.0:
+        compared = f"{other.agreement:.2f}, in the header's orientation {alignment.agreement:.2f}"
+        if alignment.turn_deg >= MOST_TURN_DEG:  # it was turned by the search itself
+            compared = f"{other.agreement:.2f}, only when turned so"
         return (
             f"the head does not lie as its header says: {_described(turns[number])} (agreement with the atlas "
-            f"{other.agreement:.2f}, in the header's orientation {alignment.agreement:.2f}); {_TURN_IT}"
+            f"{compared}); {_TURN_IT}"
         )
     ends = cut_ends(mri)
     is_cut = set(ends) - {"bottom"}  # where the neck leaves the image
@@ -60,8 +63,8 @@ def lies_otherwise(
     axes = zip(sizes[number], ("width", "length", "height"), strict=True)
     words = ", ".join(f"{axis} {factor:g} times" for factor, axis in axes if factor != 1)
     return (
-        f"the head has a wrong size ({words} an adult's), or does not lie as its header says; correct the voxel size "
-        "or the orientation in its header"
+        f"the head has a wrong size ({words} an adult's), or a part of it is missing, or it does not lie as its header "
+        "says; use a series of the whole head, or correct the voxel size or the orientation in its header"
     )
 
 
@@ -92,6 +95,8 @@ def why_refused(
 ) -> str:
     """One line about an image that the atlas does not fit: what it shows instead, and what to do."""
     size = " x ".join(f"{n * image.spacing_mm:.0f}" for n in image.array.shape[::-1])
+    if is_noise(image):
+        return f"this {size} mm image is noise, in which neighbours have nothing in common, expected an MRI of a head"
     if is_phantom(image, looks_like_a_head=alignment.agreement > 0.75 * least):
         return (
             f"this {size} mm image has large uniform parts, as a phantom has and no head; "

@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.neighbours import less_sure, smoothed_posteriors
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
-from SlicerUSSim.Logic.mri.plausibility import require_contrast
+from SlicerUSSim.Logic.mri.plausibility import enhancement, require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities
 from SlicerUSSim.Logic.mri.segmentation_steps import (
     BrainPart,
@@ -31,11 +31,13 @@ from SlicerUSSim.Logic.mri.segmentation_steps import (
 )
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
-from SlicerUSSim.Logic.tissue.label_sources import is_interpolated
+from SlicerUSSim.Logic.tissue.label_sources import not_intensities
 from SlicerUSSim.Logic.tissue.texture import Texture, tissue_deviation, volume_shares
 
 _log = logging.getLogger(__name__)
 
+#: Least volume of a mask in which several images are compared
+_LEAST_TO_REGISTER_ML = 100.0
 #: Means from which on the table has two decimals, and three digits below
 _LARGE = 10.0
 
@@ -170,6 +172,8 @@ def segment_mri(
     )
     timed = StepTimes()
     intensity = finite(mri)
+    if mask is None and settings.skull_strip != "none":
+        _require_intensities(mri, "MRI")
     if mask is None:
         brain = find_brain(
             mri.with_array(intensity), settings.skull_strip, keep_at=keep_mask_at,
@@ -177,17 +181,20 @@ def segment_mri(
         )  # fmt: skip
     else:
         brain = given_brain(mask, mri)
+        require(
+            not others or brain.volume_ml >= _LEAST_TO_REGISTER_ML,
+            f"the mask has {brain.volume_ml:.3g} ml, expected a brain or a large part of one, from which volumes are "
+            "registered to each other; a lesion is added with --add tumour=FILE",
+        )
     foreground = brain.mask.array > 0
     timed("brain")
     report(0.2)
     notes, warnings = [brain.message], [*brain.warnings]
     images = [mri.with_array(intensity)]
     for name, other in others.items():
-        named = f"{name} ({other.name})" if isinstance(other, Volume) and other.name else name
-        check_intensities(other, named)
-        is_labels = other.looks_like_labels() or is_interpolated(other.array)
-        require(not is_labels, f"{named} is a label map, expected the intensities of an MRI")
-        image, message, doubts_of_it = aligned(other.with_array(finite(other)), images[0], foreground, name)
+        named = _called(name, other)
+        _require_intensities(other, named)
+        image, message, doubts_of_it = aligned(other.with_array(finite(other)), images[0], foreground, named)
         images.append(image)
         notes.append(message)
         warnings += doubts_of_it
@@ -232,7 +239,10 @@ def segment_mri(
     found = replace(found, posteriors=less_sure(smoothed_posteriors(found.posteriors, part.inside)))
     timed("neighbours")
     report(0.9)
-    warnings += doubts(found, part, filtered[0][0], filtered[0][1], atlas, contrasts)
+    warnings += doubts(found, part, filtered[0][1], atlas, contrasts)
+    if contrasts == ("t1",) and not brain.takes_in_more:  # fat is as bright
+        voxel_ml = part.images[0].voxel_ml
+        warnings += enhancement(filtered[0][0], part.inside, *found.grey_and_white, voxel_ml)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
@@ -264,3 +274,15 @@ def segment_mri(
         _filtered=part.whole(filtered[0][0]),
         _shares=found.posteriors,
     )
+
+
+def _called(name: str, volume: object) -> str:
+    """The image and its file in messages: "t2 (scan.nii.gz)"."""
+    return f"{name} ({volume.name})" if isinstance(volume, Volume) and volume.name else name
+
+
+def _require_intensities(volume: Volume, name: str) -> None:
+    """Raise SimulationError for a label map, or what is left of one."""
+    check_intensities(volume, name)
+    why = not_intensities(volume)
+    require(why is None, f"{name} {why}")

@@ -18,7 +18,6 @@ from SlicerUSSim.Logic.mri.bias import corrected
 from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import (
     csf_is_doubtful,
-    enhancement,
     faint,
     implausible,
     is_whole_brain,
@@ -140,12 +139,11 @@ def require_different(values: np.ndarray, contrasts: tuple[str, ...]) -> None:
 def doubts(
     found: Classes,
     part: BrainPart,
-    filtered: np.ndarray,
     noise: float,
     atlas: AtlasFit | None,
     contrasts: tuple[str, ...],
 ) -> list[str]:
-    """What the user should check; `filtered` (k, j, i) is the first image after the filter, `noise` before it.
+    """What the user should check; `noise` is that of the first image before the filter.
 
     Raises SimulationError where the result is none: one tissue only, or tissues in the order of another contrast.
     """
@@ -155,8 +153,6 @@ def doubts(
     if len(contrasts) == 1:
         lines += csf_is_doubtful(found, contrasts[0])
         lines += faint(found, noise)
-    if contrasts == ("t1",):
-        lines += enhancement(filtered, part.inside, *found.grey_and_white, part.images[0].voxel_ml)
     return lines
 
 

@@ -8,7 +8,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, either
 from SlicerUSSim.Logic.tissue.freesurfer import missing_structures
 from SlicerUSSim.Logic.tissue.label_advice import Advice
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
@@ -19,6 +19,8 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 _LONGEST_LIST = 12
+#: So few labels are not recognised by their places.
+_TOO_FEW = 3
 #: More unknown labels may be the intensities of an image
 _MOST_LABELS = 100
 #: Tissues of a lesion, which alone are no patient
@@ -93,11 +95,23 @@ class Findings:
             each = [f"--map {n}=0" for n in unknown[:_LONGEST_LIST]]
             maps = " ".join([*each, "..."] if len(unknown) > len(each) else each)
             remedy = f"{self.advice.leave_out.format(maps=maps)}; or {remedy}"
+        if nothing:
+            remedy = f"{self._if_of_a_program(unknown)}{remedy}"
         if nothing and len(unknown) > _MOST_LABELS:
             remedy = f"if these are intensities of an MRI, its file may be incomplete; {remedy}"
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
         raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}; {remedy}: {known}")
+
+    def _if_of_a_program(self, labels: list[int]) -> str:
+        """Which programs have all these numbers, though they are too few to be recognised, and how to say so."""
+        programs = [scheme for scheme in schemes().values() if scheme.order and set(labels) <= set(scheme.names)]
+        if not programs or len(labels) > _TOO_FEW:
+            return ""
+        first = programs[0]
+        called = ", ".join(f"{label} {first.names[label]}" for label in labels)
+        titles = either([f"{first.title} ({called})", *(scheme.title for scheme in programs[1:])])
+        return f"if the numbers are those of {titles}, {self.advice.ambiguous.format(key=first.key)}; "
 
     def doubts(self) -> list[str]:
         """What a user should know, each in one line."""

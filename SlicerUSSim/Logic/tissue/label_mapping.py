@@ -71,7 +71,8 @@ class LabelMapping:
                 require(found, f"{path}: has no names of labels, expected lines such as: 24 CSF 60 60 60 0")
                 names |= found
             else:
-                require(key.strip() and equals and value.strip(), f"--map is {short(text)}, {_expected()}")
+                is_pair = key.strip() and value.strip() and "=" not in value
+                require(is_pair, f"--map is {short(text)}, {_expected()}")
                 _add(by_label, by_name, key, value, f"--map {text}", tissues)
         return cls(by_label, by_name, names, scheme)
 

@@ -140,7 +140,7 @@ class _Reading:
         self._tissues, self._by_number = tissues, by_number
         self._counts = np.bincount(volume.array.ravel())
         self._present = [int(label) for label in np.flatnonzero(self._counts) if label]
-        require(self._present, f"{source}: is empty, expected labels that are not 0")
+        require(self._present, f"{source}: is 0 everywhere, expected labels that are not 0")
         everything = {**names, **mapping.names}
         self._names = {label: everything[label] for label in self._present if label in everything}
         self._warnings: list[str] = []

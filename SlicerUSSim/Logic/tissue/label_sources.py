@@ -10,6 +10,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json
+from SlicerUSSim.Logic.base.label_numbers import has_uniform_fractions
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_files import names_of_file
@@ -33,12 +34,26 @@ def is_label_file(path: Path, volume: Volume) -> bool:
     """
     if volume.looks_like_labels() or _without_labels(path, volume) is not None:
         return True
-    require(
-        not is_interpolated(volume.array),
-        f"{path}: is mostly uniform regions of whole numbers with fractions between them, as a label map that was "
-        "resampled with interpolation, expected an MRI or labels; resample the label map with nearest neighbours",
-    )
+    why = not_intensities(volume)
+    require(why is None, f"{path}: {why}")
     return False
+
+
+def not_intensities(volume: Volume) -> str | None:
+    """What a volume is, and what to do, if it is a label map or what is left of one; None for an image."""
+    if volume.looks_like_labels():
+        return "is a label map, expected the intensities of an MRI"
+    if is_interpolated(volume.array):
+        return (
+            "is mostly uniform regions of whole numbers with fractions between them, as a label map that was "
+            "resampled with interpolation, expected an MRI or labels; resample the label map with nearest neighbours"
+        )
+    if has_uniform_fractions(volume.array):
+        return (
+            "is uniform regions of few values with fractions, as a label map that was scaled or shifted, expected an "
+            "MRI or labels; save the labels as whole numbers"
+        )
+    return None
 
 
 def _without_labels(path: Path, volume: Volume) -> CombinedMaps | None:

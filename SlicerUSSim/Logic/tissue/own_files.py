@@ -46,8 +46,8 @@ def require_replaceable(path: Path, remedy: str = "give another name, or --overw
         )
 
 
-def _other_labels(path: Path, beside: Path) -> str | None:
-    """The name of another label map with this table, as far as it can be read."""
+def _other_labels(path: Path, beside: Path, labels_hash: str | None = None) -> str | None:
+    """The name of another label map with this table, as far as it can be read; of the one with this hash."""
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file  # which needs more than files
 
     for file in sorted(path.parent.iterdir()):
@@ -57,7 +57,8 @@ def _other_labels(path: Path, beside: Path) -> str | None:
             and file.name.lower().endswith(WRITABLE_SUFFIXES)
         ):
             try:
-                if is_label_file(file, Volume.read(file)):
+                volume = Volume.read(file)
+                if is_label_file(file, volume) and labels_hash in (None, _hash_of_labels(volume)):
                     return file.name
             except SimulationError:
                 continue
@@ -75,6 +76,9 @@ def _why_not_ours(path: Path, beside: Path) -> str | None:
         if hashes[1] != _hash_of_table(values):
             return f"the tissues in {beside.name} have been edited"
         if path.exists() and hashes[0] != _hash_of_labels(Volume.read(path)):
+            other = _other_labels(path, beside, hashes[0])
+            if other is not None:
+                return f"exists, and {beside.name} has the tissues of {other}"
             return "the labels have been edited since this program wrote them"
     except SimulationError as error:
         return f"exists and cannot be read ({error})"
