@@ -12,11 +12,12 @@ import argparse
 
 import numpy as np
 import SimpleITK as sitk
-from streaks import PROBES, random_pose
+from streaks import PROBES
 
 from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume, segment_mri
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
+from SlicerUSSim.Logic.verification.brain_views import random_pose
 
 COLUMNS, GAP = 6, 4
 

@@ -26,13 +26,16 @@
 #define MEMBERSHIP_PARAMETERS
 #endif
 
-// LANES bytes of a row from `column`, whose outermost voxels are repeated.
-inline floatn bytes_from(__global const uchar *row, int column, int columns, int is_inside) {
-  if (is_inside) return LOAD_BYTES(row + column);
-  float at_the_ends[LANES];
-  for (int n = 0; n < LANES; n++) at_the_ends[n] = row[clamp(column + n, 0, columns - 1)];
-  return LOAD_LANES(at_the_ends);
-}
+// Defines a function for LANES values of a row from `column`; beyond the row its outermost voxels are repeated.
+#define DEFINE_ROW_FROM(NAME, TYPE, LOAD)                                                    \
+  inline floatn NAME(__global const TYPE *row, int column, int columns, int is_inside) {     \
+    if (is_inside) return LOAD(row + column);                                                \
+    float at_the_ends[LANES];                                                                \
+    for (int n = 0; n < LANES; n++) at_the_ends[n] = row[clamp(column + n, 0, columns - 1)]; \
+    return LOAD_LANES(at_the_ends);                                                          \
+  }
+DEFINE_ROW_FROM(bytes_from, uchar, LOAD_BYTES)
+DEFINE_ROW_FROM(floats_from, float, LOAD_LANES)
 
 // Along i, from groups: planes starting at `first`, each clamped to the volume.
 __kernel void smooth_rows(__global const uchar *groups, MEMBERSHIP_PARAMETERS int group, __constant const float *taps,
@@ -102,18 +105,7 @@ __kernel void smooth_halved_rows(__global const float *from, __constant const fl
   __global const float *row = from + ((size_t)get_global_id(2) * rows + get_global_id(1)) * columns;
   const int is_inside = column >= reach && column + LANES + reach <= columns;
   floatn sum = 0.0f;
-  for (int k = -reach; k <= reach; k++) {
-    const int at = column + k;
-    floatn values;
-    if (is_inside) {
-      values = LOAD_LANES(row + at);
-    } else {
-      float at_the_ends[LANES];
-      for (int n = 0; n < LANES; n++) at_the_ends[n] = row[clamp(at + n, 0, columns - 1)];
-      values = LOAD_LANES(at_the_ends);
-    }
-    sum += taps[k + reach] * values;
-  }
+  for (int k = -reach; k <= reach; k++) sum += taps[k + reach] * floats_from(row, column + k, columns, is_inside);
   STORE_LANES(sum, to + (row - from) + column);
 }
 

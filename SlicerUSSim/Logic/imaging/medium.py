@@ -17,6 +17,7 @@ import numpy as np
 from scipy import ndimage, special
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.neighbourhood import largest_around
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.borders import smoothed_indicators
 from SlicerUSSim.Logic.opencl.device import Device
@@ -278,12 +279,7 @@ def _with_crest(fluid: np.ndarray, sheet: np.ndarray) -> np.ndarray:
     A label of the membrane's own tissue is the membrane, where its two sides meet: one to two voxels thick as the grid
     has it, and one line in an image. Its indicator is scaled so that it just reaches the half-level, on its crest.
     """
-    crest = sheet
-    for axis in range(3):  # the largest of 3 x 3 x 3 voxels, several times faster than by a filter of any size
-        narrow, crest = np.moveaxis(crest, axis, 0), crest.copy()
-        wide = np.moveaxis(crest, axis, 0)
-        np.maximum(wide[1:], narrow[:-1], out=wide[1:])
-        np.maximum(wide[:-1], narrow[1:], out=wide[:-1])
+    crest = largest_around(sheet)
     on_crest = 0.5 * sheet / np.maximum(crest, _LEAST_CREST)
     return np.where(crest < _THICK_CREST, np.maximum(fluid, on_crest), fluid + sheet)
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.neighbourhood import largest_around
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 
@@ -136,7 +137,7 @@ def volume_shares(
     found = np.zeros(len(value), np.float32)
     for other in np.unique(other_label):
         beside = (other_label == other) & (own_label != other)
-        beside &= _beside(labels == other)[inside]
+        beside &= largest_around(labels == other)[inside]
         for own in np.unique(own_label[beside]):
             where = np.flatnonzero(beside & (own_label == own))
             of_class = share[where]
@@ -148,15 +149,6 @@ def volume_shares(
     shares = np.zeros(labels.shape, np.float32)
     shares[inside] = found
     return shares
-
-
-def _beside(where: np.ndarray) -> np.ndarray:
-    """(k, j, i) voxels that have a True one among the 26 around them, or are one."""
-    for axis in range(3):  # several times faster than a filter of any size
-        narrow, wide = np.moveaxis(where, axis, 0), np.moveaxis(where := where.copy(), axis, 0)
-        wide[1:] |= narrow[:-1]
-        wide[:-1] |= narrow[1:]
-    return where
 
 
 def tissue_deviation(intensity: np.ndarray, labels: np.ndarray) -> np.ndarray:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache, partial
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.settings import SimulationSettings
-from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.verification.phantoms import REFERENCE_SPEED_M_S, Phantom, folds, speed_cyst
+from SlicerUSSim.Logic.verification.validation.beam_levels import along_line, beam_of_line, levels_db
 from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_plots
 from SlicerUSSim.Logic.verification.wave import speckle_power
@@ -80,19 +78,10 @@ def _levels_db(scene: str, probe_name: str, beam: str, rotation: np.ndarray, dev
     """(lines,) power of speckle in the deeper part, re the same with the reference speed of sound everywhere."""
     phantom, probe = _SCENES[scene](rotation=rotation), PROBES[probe_name]
     assert phantom.baseline is not None
-    settings = SimulationSettings(beam=beam, interfaces=False)
-    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
-    powers = []
-    for tissues in (phantom.tissues, phantom.baseline):
-        simulator.set_tissues(tissues)
-        power = 0.0
-        for seed in range(_SEEDS):
-            simulator.settings = replace(settings, seed=seed)
-            frame = simulator.simulate(probe, phantom.probe_to_ras)
-            deep = slice(*(int(depth / frame.sample_interval_mm) for depth in (_DEPTHS_MM[0], _DEPTHS_MM[-1])))
-            power = power + np.mean(np.abs(frame.iq[_LINES, deep]) ** 2, axis=1)
-        powers.append(power)
-    return 10.0 * np.log10(powers[0] / powers[1])
+    return levels_db(
+        phantom.labels, phantom.tissues, phantom.baseline, probe, phantom.probe_to_ras, device,
+        beam=beam, edges_mm=_DEPTHS_MM[[0, -1]], lines=_LINES, seeds=_SEEDS,
+    )  # fmt: skip
 
 
 @lru_cache
@@ -105,20 +94,14 @@ def _wave_levels_db(scene: str, probe_name: str) -> np.ndarray:
         speeds[label] = tissue.speed_of_sound_m_s
     levels = []
     for position in probe.line_positions()[_LINES]:
-        origin, direction = (v[:2] for v in probe.line_at(position))
-        across = np.array([direction[1], -direction[0]])
+        voxel = along_line(probe, position, to_ijk)
 
-        def speed(x, depth, origin=origin, direction=direction, across=across):
-            points = origin[:, None] + np.outer(across, x) + np.outer(direction, depth)
-            ijk = to_ijk @ np.stack([*points, 0.0 * x, 0.0 * x + 1.0])
-            i, j, k = (np.clip(np.rint(c).astype(int), 0, n - 1) for c, n in zip(ijk, labels.shape[::-1], strict=False))
+        def speed(x, depth, voxel=voxel):
+            indices = zip(voxel(x, depth), labels.shape[::-1], strict=False)
+            i, j, k = (np.clip(np.rint(c).astype(int), 0, n - 1) for c, n in indices)
             return speeds[labels[k, j, i]]
 
-        beam = partial(
-            speckle_power, depths_mm=_DEPTHS_MM, frequency_mhz=probe.frequency_mhz, aperture_mm=probe.aperture_mm,
-            f_number=probe.receive_f_number, focus_mm=probe.focus_mm, reference_m_s=REFERENCE_SPEED_M_S,
-            steering_rad=position if probe_name == "phased" else 0.0,
-        )  # fmt: skip
+        beam = beam_of_line(speckle_power, probe, position, _DEPTHS_MM, REFERENCE_SPEED_M_S)
         levels.append(10.0 * np.log10(np.mean(beam(speed) / beam(None))))
     return np.array(levels)
 

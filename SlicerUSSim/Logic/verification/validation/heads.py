@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from SlicerUSSim.Logic.base.settings import SimulationSettings
-from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import ConvexProbe, PhasedProbe, Probe
 from SlicerUSSim.Logic.verification.brain_views import BRAIN_M_S, EvenBrain, even_brains, random_pose
+from SlicerUSSim.Logic.verification.validation.beam_levels import along_line, beam_of_line, levels_db
 from SlicerUSSim.Logic.verification.validation.checks import Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_plots
 from SlicerUSSim.Logic.verification.wave import beam_intensities
@@ -37,7 +35,12 @@ def beams_in_heads(rotation: np.ndarray, device) -> Outcome:
             brain = brains[number * len(brains) // _VIEWS]
             pose = random_pose(brain.labels, rng)
             for beam in ("aperture", "ray"):
-                found[beam].append(_levels_db(brain, probe, pose, beam, device))
+                found[beam].append(
+                    levels_db(
+                        brain.labels, brain.tissues, brain.baseline, probe, pose, device,
+                        beam=beam, edges_mm=_EDGES * probe.depth_mm, lines=_LINES, seeds=_SEEDS[beam],
+                    )
+                )  # fmt: skip
             wave, near = _wave_levels_db(brain, probe, pose)
             found["wave"].append(wave)
             found["near"].append(near)
@@ -66,29 +69,8 @@ def _correlation(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.corrcoef(first.ravel(), second.ravel())[0, 1])
 
 
-def _levels_db(brain: EvenBrain, probe: Probe, pose: np.ndarray, beam: str, device) -> np.ndarray:
-    """(lines,) power of speckle in the deeper half, re the same with the speed of sound of brain everywhere.
-
-    It is the mean over blocks of depth of their changes, whatever the gain of depths is.
-    """
-    settings = SimulationSettings(beam=beam, interfaces=False)
-    simulator = UltrasoundSimulator(brain.labels, brain.tissues, settings, device)
-    powers = []
-    for tissues in (brain.tissues, brain.baseline):
-        simulator.set_tissues(tissues)
-        power = 0.0
-        for seed in range(_SEEDS[beam]):
-            simulator.settings = replace(settings, seed=seed)
-            frame = simulator.simulate(probe, pose)
-            starts = (_EDGES * probe.depth_mm / frame.sample_interval_mm).astype(int)
-            samples = np.abs(frame.iq[_LINES, : starts[-1]]) ** 2
-            power = power + np.add.reduceat(samples, starts[:-1], axis=1)
-        powers.append(power)
-    return 10.0 * np.log10(np.mean(powers[0] / powers[1], axis=1))
-
-
 def _wave_levels_db(brain: EvenBrain, probe: Probe, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(lines,) the same from wave propagation in the image plane, and twice the one-way power near the line."""
+    """(lines,) the level from wave propagation in the image plane, and twice the one-way power near the line."""
     extra = np.zeros(256, np.float32)  # of the path, per length
     for label, tissue in brain.tissues.items():
         extra[label] = BRAIN_M_S / tissue.speed_of_sound_m_s - 1.0
@@ -96,19 +78,12 @@ def _wave_levels_db(brain: EvenBrain, probe: Probe, pose: np.ndarray) -> tuple[n
     depths = 0.5 * (_EDGES[1:] + _EDGES[:-1]) * probe.depth_mm
     levels = []
     for position in probe.line_positions()[_LINES]:
-        origin, direction = (v[:2] for v in probe.line_at(position))
-        across = np.array([direction[1], -direction[0]])
+        voxel = along_line(probe, position, to_ijk)
 
-        def speed(x, depth, origin=origin, direction=direction, across=across):
-            points = origin[:, None] + np.outer(across, x) + np.outer(direction, depth)
-            ijk = to_ijk @ np.stack([*points, 0.0 * x, 0.0 * x + 1.0])
-            return BRAIN_M_S / (1.0 + map_coordinates(extras, ijk[2::-1], order=1, cval=extra[0]))
+        def speed(x, depth, voxel=voxel):
+            return BRAIN_M_S / (1.0 + map_coordinates(extras, voxel(x, depth)[2::-1], order=1, cval=extra[0]))
 
-        beam = partial(
-            beam_intensities, depths_mm=depths, frequency_mhz=probe.frequency_mhz, aperture_mm=probe.aperture_mm,
-            f_number=probe.receive_f_number, focus_mm=probe.focus_mm, reference_m_s=BRAIN_M_S,
-            steering_rad=position if probe.apex_radius_mm == 0.0 else 0.0,
-        )  # fmt: skip
+        beam = beam_of_line(beam_intensities, probe, position, depths, BRAIN_M_S)
         speckle, near = [], []
         for medium in (speed, None):
             x, transmitted, received = beam(medium)

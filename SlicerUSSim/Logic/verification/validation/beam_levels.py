@@ -1,0 +1,68 @@
+"""The level of speckle along lines, of images and of wave propagation, re a medium of one speed of sound."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.settings import SimulationSettings
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.probe.arrays import PhasedProbe, Probe
+from SlicerUSSim.Logic.tissue.table import TissueTable
+
+_Result = TypeVar("_Result")
+
+
+def levels_db(
+    labels: Volume, tissues: TissueTable, baseline: TissueTable, probe: Probe, pose: np.ndarray, device,
+    *, beam: str, edges_mm: np.ndarray, lines: slice, seeds: int,
+) -> np.ndarray:  # fmt: skip
+    """(lines,) power of speckle between the edges of blocks of depth, re the same with the tissues of `baseline`.
+
+    It is the mean over blocks of their changes, whatever the gain of depths is; over `seeds` speckle averages.
+    """
+    settings = SimulationSettings(beam=beam, interfaces=False)
+    simulator = UltrasoundSimulator(labels, tissues, settings, device)
+    powers = []
+    for table in (tissues, baseline):
+        simulator.set_tissues(table)
+        power = 0.0
+        for seed in range(seeds):
+            simulator.settings = replace(settings, seed=seed)
+            frame = simulator.simulate(probe, pose)
+            starts = (edges_mm / frame.sample_interval_mm).astype(int)
+            samples = np.abs(frame.iq[lines, : starts[-1]]) ** 2
+            power = power + np.add.reduceat(samples, starts[:-1], axis=1)
+        powers.append(power)
+    return 10.0 * np.log10(np.mean(powers[0] / powers[1], axis=1))
+
+
+def along_line(probe: Probe, position: float, to_ijk: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Function of x and depth (mm, both (points,)) in the frame of a line: (4, points) voxel indices i, j, k and 1.
+
+    `to_ijk` (4, 4) is from the probe's frame.
+    """
+    origin, direction = (v[:2] for v in probe.line_at(position))
+    across = np.array([direction[1], -direction[0]])
+
+    def ijk(x: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        points = origin[:, None] + np.outer(across, x) + np.outer(direction, depth)
+        return to_ijk @ np.stack([*points, 0.0 * x, 0.0 * x + 1.0])
+
+    return ijk
+
+
+def beam_of_line(
+    propagated: Callable[..., _Result], probe: Probe, position: float, depths_mm: np.ndarray, reference_m_s: float
+) -> Callable[..., _Result]:
+    """A function of verification.wave with the beam of a line; its argument is the speed of sound, or None."""
+    return partial(
+        propagated, depths_mm=depths_mm, frequency_mhz=probe.frequency_mhz, aperture_mm=probe.aperture_mm,
+        f_number=probe.receive_f_number, focus_mm=probe.focus_mm, reference_m_s=reference_m_s,
+        steering_rad=position if isinstance(probe, PhasedProbe) else 0.0,
+    )  # fmt: skip
