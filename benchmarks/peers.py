@@ -25,6 +25,7 @@ from scipy.integrate import trapezoid
 
 from SlicerUSSim.Logic import SimulationSettings, TissueTable, UltrasoundSimulator, segment_mri
 from SlicerUSSim.Logic.base import write_json
+from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
 from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.opencl.devices import devices_to_measure
 from SlicerUSSim.Logic.probe import craniotomy_pose
@@ -81,7 +82,7 @@ def scatterers_in_beam(settings: SimulationSettings) -> float:
     depth = np.linspace(0.0, PROBE.depth_mm, 257)
     lateral, elevation = PROBE.beam_sigma_mm(depth)
     areas = 4.0 * settings.beam_cutoff**2 * lateral * elevation
-    return float(settings.scatterers_per_mm3 * trapezoid(areas, depth))
+    return float(sites_per_mm3(settings, PROBE) * trapezoid(areas, depth))
 
 
 def scaled(transmission: Callable[[int], Callable[[], object]], in_beam: float) -> dict:

@@ -4,26 +4,34 @@
 // are straight, and the echo is the coherent sum over them. From every point of the face goes a fan of straight rays
 // with running sums of delay and attenuation (fans). For every traced line and depth, the sums along the lines from the
 // points of its aperture to the point on its axis are interpolated between those rays; they give the mean delay, the
-// deflection of the beam, the loss of coherence and the mean attenuation (screens). raytracing.cl follows them up to
-// the first strong border (is_soft).
+// deflection of the beam, the loss of coherence and the mean attenuation (screens). raytracing.cl follows them (beams)
+// up to the first strong border (is_soft). What phases remain after mean and deflection make the beam wider (beam.cl).
 //
 // The elevational aperture is represented by three sheets, at quantiles of the elevational beam (ROW_SIGMA).
 //
 // Buffers: voxels ushort [k][j][i] (medium.py); acoustics float4 [label]: extra path per mm, attenuation in nepers per
-// mm (both ways), speed of sound, impedance; sums float4 [row][point][angle][depth]: extra path in mm, nepers, mm of
-// strong tissue, and the sheet's part in the elevational deflection in mm; screens float4 [screen line][depth], depths
-// from screen_step on: nepers lost both ways, extra path in mm, deflection in the lateral and in the elevational
-// direction in mm.
+// mm (both ways), speed of sound, impedance; sums float4 [row][point][angle][depth]: extra path in mm, nepers, nepers
+// that strong tissue takes, and the sheet's part in the elevational deflection in mm; screens float4 [screen
+// line][depth], depths from screen_step on: nepers lost both ways, extra path in mm, deflection in the lateral and in
+// the elevational direction in mm; shades float [screen line][depth]: the nepers of them that strong tissue takes;
+// spreads float2 [screen line][depth]: width of the beam and a factor of its echoes, both re an undisturbed one; beams
+// float4 [traced line][1 + depth] as screens, followed by float [traced line][1 + depth] as shades.
 
 #include "common.clh"
+
+DEFINE_ELEVATION(float8, elevation_sigma8)
 
 #define ROWS 3
 // Nodes and weights of the three-point Gauss-Hermite rule for the power of the elevational beam.
 #define ROW_SIGMA 1.2247449f
 #define ROW_WEIGHT(row) ((row) == 1 ? 0.6666667f : 0.1666667f)
-#define MOST_POINTS 16       // of one aperture: it has at most 12 intervals, and two partial ones
-#define STEEPEST 0.1f        // slope of the delay: tissue is soft
-#define BLOCKED_PER_MM 2.0f  // nepers per millimetre of strong tissue that the axis does not meet
+#define MOST_POINTS 16        // of one aperture: it has at most 12 intervals, and two partial ones
+#define STEEPEST 0.1f         // slope of the delay: tissue is soft
+#define MOST_SPREAD 3.0f      // of a beam
+#define BENT_PER_MM 4.0f      // nepers, both ways, that a line loses in strong tissue that bends what goes through
+#define LEAST_PER_MM 1e-3f    // nepers by which strong tissue differs from soft, so that its ends are seen in the sums
+#define LEFT_FOR_MEANS 0.01f  // of the power of a line that strong tissue stops
+#define LEAST_POWER 1e-7f     // of a beam re an undisturbed one
 
 // Position along the face (mm) and angle of the normal of a point of the array.
 inline float point_angle(__constant const Acquisition *acquisition, float along) {
@@ -35,8 +43,14 @@ inline float2 point_on_face(__constant const Acquisition *acquisition, float alo
   return angle == 0.0f ? (float2)(along, 0.0f) : acquisition->apex_radius_mm * (float2)(sin(angle), cos(angle) - 1.0f);
 }
 
-// Extra path and nepers per mm at the fraction f of a cell of voxels, linear between its eight labels; unless
-// `all_soft`, a label counts as `soft` if a border between them is strong.
+// Extra path and nepers per mm of tissue beside `soft`, of which strong tissue has the attenuation, and also the extra
+// path if it bends what goes through.
+inline float2 rates_beside(float4 soft, float4 tissue) {
+  if (is_soft(soft.z, soft.w, tissue.z, tissue.w)) return tissue.xy;
+  return (float2)(bends(soft.z, tissue.z) ? soft.x : tissue.x, soft.y);
+}
+
+// Extra path and nepers per mm at the fraction f of a cell of voxels, linear between its eight labels.
 inline float2 rates_in_cell(__global const float4 *acoustics, __global const ushort *cell, int nx, int nxy, float3 f,
                             float4 soft, int all_soft) {
   float2 along_y[2], along_z[2];
@@ -44,8 +58,8 @@ inline float2 rates_in_cell(__global const float4 *acoustics, __global const ush
     for (int y = 0; y < 2; y++) {
       __global const ushort *row = cell + y * nx + z * nxy;
       const float4 left = acoustics[row[0] & LABEL_MASK], right = acoustics[row[1] & LABEL_MASK];
-      const float2 a = all_soft || is_soft(soft.z, soft.w, left.z, left.w) ? left.xy : soft.xy;
-      const float2 b = all_soft || is_soft(soft.z, soft.w, right.z, right.w) ? right.xy : soft.xy;
+      const float2 a = all_soft ? left.xy : rates_beside(soft, left);
+      const float2 b = all_soft ? right.xy : rates_beside(soft, right);
       along_y[y] = a + f.x * (b - a);
     }
     along_z[z] = along_y[0] + f.y * (along_y[1] - along_y[0]);
@@ -53,9 +67,14 @@ inline float2 rates_in_cell(__global const float4 *acoustics, __global const ush
   return along_z[0] + f.z * (along_z[1] - along_z[0]);
 }
 
+// What a border takes from an amplitude, both ways, in nepers.
+inline float border_nepers(float impedance, float other_impedance) {
+  return -log(fmax(1.0f - square_reflection(impedance, other_impedance), 1e-6f));
+}
+
 // One work-item follows one ray of a fan. Global size (angles, points, rows). Look-ups are trilinear, so that sums over
-// steps of a voxel are smooth. Strong tissue counts as what lies in front of it, with its length recorded; with
-// `all_soft`, no tissues have a strong border.
+// steps of a voxel are smooth. Strong tissue counts as what lies in front of it, with what it takes more recorded: by
+// its borders, its attenuation, and by refraction. With `all_soft`, no tissues have a strong border.
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
@@ -80,36 +99,68 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
       (ROW_SIGMA * (row - 1));
   const float length = acquisition->fan_step;
 
+  int label = 0, was_strong = 0;  // of the last soft tissue; whether there was strong tissue behind it
   float4 soft = acoustics[0];
+  float impedance = 0.0f;
   float4 sum = (float4)(0.0f);
   float lean = 0.0f;
   vstore4(sum, 0, to);
-  for (int depth = 1; depth < depths; depth++) {
-    const float path = (depth - 0.5f) * length;
-    const float sigma = elevation_sigma(acquisition, path);
-    const float3 at = clamp(start + path * step + sigma * aside, (float3)(0.0f), top);
-    const int3 base = convert_int3(at);
-    const float3 f = at - convert_float3(base);
-    __global const ushort *cell = voxels + (base.z * ny + base.y) * nx + base.x;
-    const int first = cell[0];
-    const int is_mixed = !(first & SAME_LABEL);
-    float blocked = 0.0f;
-    if (all_soft) {
-      soft = acoustics[first & LABEL_MASK];
-    } else {
-      const int nearest = is_mixed ? cell[(f.x > 0.5f) + (f.y > 0.5f ? nx : 0) + (f.z > 0.5f ? nxy : 0)] : first;
-      const float4 found = acoustics[nearest & LABEL_MASK];
-      const int goes_on = depth == 1 || is_soft(soft.z, soft.w, found.z, found.w);
-      soft = goes_on ? found : soft;
-      blocked = goes_on ? 0.0f : length;
-    }
-    const float2 rate = is_mixed ? rates_in_cell(acoustics, cell, nx, nxy, f, soft, all_soft) : soft.xy;
+  for (int depth = 1; depth < depths; depth += 8) {
+    // Eight look-ups at once, which are nearly always in one tissue.
+    const float8 path = (depth - 0.5f + (float8)(0, 1, 2, 3, 4, 5, 6, 7)) * length;
+    const float8 sigma = elevation_sigma8(acquisition, path);
+    const float8 x = clamp(start.x + path * step.x + sigma * aside.x, (float8)(0.0f), (float8)(top.x));
+    const float8 y = clamp(start.y + path * step.y + sigma * aside.y, (float8)(0.0f), (float8)(top.y));
+    const float8 z = clamp(start.z + path * step.z + sigma * aside.z, (float8)(0.0f), (float8)(top.z));
+    const int8 i = convert_int8(x), j = convert_int8(y), k = convert_int8(z);
+    int here[8], differs = depth == 1;
+    float turn_per_rate[8], fx[8], fy[8], fz[8];
+    vstore8((k * ny + j) * nx + i, 0, here);
+    for (int n = 0; n < 8; n++) differs |= (voxels[here[n]] & (LABEL_MASK | SAME_LABEL)) ^ (label | SAME_LABEL);
     // A path turns towards slower tissue by the gradient of the extra path, here the difference of the outer sheets
     // over their distance; what a turn moves aside grows with the length behind it.
-    const float turned = length * rate.x / (2.0f * ROW_SIGMA * sigma);
-    sum += (float4)(length * rate.x, length * rate.y, blocked, length * (lean + 0.5f * turned));
-    lean += turned;
-    vstore4(sum, depth, to);
+    vstore8(length / (2.0f * ROW_SIGMA * sigma), 0, turn_per_rate);
+    if (differs) {
+      vstore8(x - convert_float8(i), 0, fx);
+      vstore8(y - convert_float8(j), 0, fy);
+      vstore8(z - convert_float8(k), 0, fz);
+    }
+    for (int n = 0; n < min(8, depths - depth); n++) {
+      float2 rate = soft.xy;
+      float strong = 0.0f;
+      int is_strong = 0;
+      if (differs) {
+        __global const ushort *cell = voxels + here[n];
+        const float3 f = (float3)(fx[n], fy[n], fz[n]);
+        const int first = cell[0];
+        const int is_mixed = !(first & SAME_LABEL);
+        const int corner = (f.x > 0.5f) + (f.y > 0.5f ? nx : 0) + (f.z > 0.5f ? nxy : 0);
+        const int nearest = (is_mixed && !all_soft ? cell[corner] : first) & LABEL_MASK;
+        const float4 found = acoustics[nearest];
+        const int goes_on = all_soft || depth + n == 1 || is_soft(soft.z, soft.w, found.z, found.w);
+        if (goes_on) {
+          soft = found;
+          label = nearest;
+        }
+        rate = is_mixed ? rates_in_cell(acoustics, cell, nx, nxy, f, soft, all_soft) : soft.xy;
+        is_strong = !goes_on;
+        if (is_strong || was_strong) strong = border_nepers(was_strong ? impedance : soft.w, found.w);
+        impedance = found.w;
+        if (is_strong) {
+          const float excess = found.y - soft.y;
+          const int is_bent = bends(soft.z, found.z);
+          strong += length * (is_bent ? BENT_PER_MM : fabs(excess) < LEAST_PER_MM ? LEAST_PER_MM : excess);
+          if (!is_bent && !is_mixed) rate.x = found.x;
+        }
+      } else if (was_strong) {
+        strong = border_nepers(impedance, soft.w);
+      }
+      was_strong = is_strong;
+      const float turned = rate.x * turn_per_rate[n];
+      sum += (float4)(length * rate.x, length * rate.y, strong, length * (lean + 0.5f * turned));
+      lean += turned;
+      vstore4(sum, depth + n, to);
+    }
   }
 }
 
@@ -144,12 +195,68 @@ inline float overlap(const float2 *first, const float2 *second, int count) {
   return sum;
 }
 
+// Where the line from a point of the face to a target lies in its fan: direction in rays, distance in stored depths,
+// and in mm.
+inline float3 place_in_fan(__constant const Acquisition *acquisition, float along, float2 target) {
+  const float2 towards = target - point_on_face(acquisition, along);
+  const float away = sqrt(towards.x * towards.x + towards.y * towards.y);
+  const float turned = atan2(towards.x, towards.y) - point_angle(acquisition, along);
+  return (float3)(clamp((turned - acquisition->fan_first_angle) / acquisition->fan_angle_step, 0.0f,
+                        acquisition->fan_angles - 1.001f),
+                  clamp(away / acquisition->fan_step, 0.0f, acquisition->fan_depths - 1.001f), away);
+}
+
+// How much of the axis is in strong tissue at the stored depth `depth`: of the rays beside it, at `places` in the fans
+// of the two points beside it.
+inline float share_strong(__constant const Acquisition *acquisition, __global const float *sums, int before, float part,
+                          const float *places, int depth) {
+  float strong = 0.0f;
+  for (int n = 0; n < 2; n++) {
+    const int point = min(before + n, acquisition->fan_points - 1), ray = (int)places[n];
+    for (int m = 0; m < 2; m++) {
+      const float share = (n ? part : 1.0f - part) * (m ? places[n] - ray : 1.0f - places[n] + ray);
+      __global const float *at = sums + 4 * (((acquisition->fan_points + point) * acquisition->fan_angles + ray + m) *
+                                                 acquisition->fan_depths +
+                                             depth);
+      if (at[6] != at[2]) strong += share;
+    }
+  }
+  return strong;
+}
+
+// The last depth on the axis, up to `path`, that is not in strong tissue or a step before it.
+inline float depth_before_strong(__constant const Acquisition *acquisition, __global const float *sums, float path,
+                                 float2 origin, float2 direction, float centre) {
+  const float place =
+      clamp((centre - acquisition->fan_first) / acquisition->fan_pitch, 0.0f, acquisition->fan_points - 1.0f);
+  const int before = (int)place;
+  float places[2], depth;
+  for (int n = 0; n < 2; n++) {
+    const float along = acquisition->fan_first + min(before + n, acquisition->fan_points - 1) * acquisition->fan_pitch;
+    const float3 at = place_in_fan(acquisition, along, origin + path * direction);
+    places[n] = at.x;
+    depth = at.y;
+  }
+  // Lines are interpolated between rays, and labels found at the middle of a step: they seem to enter strong tissue up
+  // to four steps before the axis does.
+  const int own = clamp((int)depth, 2, acquisition->fan_depths - 6);
+  const float own_share = share_strong(acquisition, sums, before, place - before, places, own);
+  float in_front = 0.0f, beyond = own_share;
+  for (int n = 1; n <= 4; n++) {
+    beyond += share_strong(acquisition, sums, before, place - before, places, own + n);
+    if (n <= 2) in_front += share_strong(acquisition, sums, before, place - before, places, own - n);
+  }
+  if (own_share <= 0.5f && beyond <= 2.0f * in_front) return path;  // not in it, nor before it: behind it
+  int last = own;
+  while (last > 4 && share_strong(acquisition, sums, before, place - before, places, last) > 0.0f) last--;
+  return fmin(fmax(last - 3.0f, 1.0f) * acquisition->fan_step, path);
+}
+
 // Straight lines from the points of an aperture to a point on its axis.
 typedef struct {
   int count;
   float x[MOST_POINTS];       // lateral position of the point
   float weight[MOST_POINTS];  // 1 in the aperture, less where a point is partly in it
-  float middle[MOST_POINTS];  // weights of the points next to the axis
   // Sums along the lines, per length of the axis: extra path, nepers, elevational deflection; and the amplitude that
   // passes strong tissue
   float delay[ROWS][MOST_POINTS], loss[ROWS][MOST_POINTS], lift[ROWS][MOST_POINTS], passed[ROWS][MOST_POINTS];
@@ -164,76 +271,106 @@ inline void find_lines(__constant const Acquisition *acquisition, __global const
   const int low = max((int)ceil((centre - reach - 0.5f * pitch - acquisition->fan_first) / pitch), 0);
   const int high = (int)floor((centre + reach + 0.5f * pitch - acquisition->fan_first) / pitch);
   lines->count = clamp(high - low + 1, 1, min(MOST_POINTS, acquisition->fan_points - low));
-  float own_strong = 0.0f, middles = 0.0f;
   for (int i = 0; i < lines->count; i++) {
     const float along = acquisition->fan_first + (low + i) * pitch;
     const float2 point = point_on_face(acquisition, along);
-    const float2 towards = origin + path * direction - point;
-    const float away = sqrt(towards.x * towards.x + towards.y * towards.y);
-    const float turned = atan2(towards.x, towards.y) - point_angle(acquisition, along);
-    const float place = clamp((turned - acquisition->fan_first_angle) / acquisition->fan_angle_step, 0.0f,
-                              acquisition->fan_angles - 1.001f);
-    const float far = clamp(away / acquisition->fan_step, 0.0f, acquisition->fan_depths - 1.001f);
+    const float3 at = place_in_fan(acquisition, along, origin + path * direction);
     lines->x[i] = (point.x - origin.x) * direction.y - (point.y - origin.y) * direction.x;
     lines->weight[i] = clamp((reach - fabs(along - centre)) / pitch + 0.5f, 0.0f, 1.0f);
-    lines->middle[i] = fmax(1.0f - fabs(along - centre) / pitch, 0.0f);
     for (int row = 0; row < ROWS; row++) {
-      // Per length of the axis: a homogeneous medium changes nothing but the mean.
-      const float4 found = sums_at(acquisition, sums, row, low + i, place, far) * (path / away);
-      lines->delay[row][i] = found.x;
-      lines->loss[row][i] = found.y;
-      lines->passed[row][i] = found.z;
-      lines->lift[row][i] = found.w;
+      const float4 found = sums_at(acquisition, sums, row, low + i, at.x, at.y);
+      const float ratio = path / at.z;  // per length of the axis: a homogeneous medium changes nothing but the mean
+      lines->delay[row][i] = ratio * found.x;
+      lines->loss[row][i] = ratio * found.y;
+      lines->passed[row][i] = exp(-0.5f * fmax(found.z, -4.0f));
+      lines->lift[row][i] = ratio * found.w;
     }
-    own_strong += lines->middle[i] * lines->passed[1][i];
-    middles += lines->middle[i];
   }
-  // Where the axis itself is in strong tissue, oblique lines may be so for longer: a beam changes only beside its end.
-  // Lengths in strong tissue are whole steps: a line may seem to enter it one step before the axis does.
-  const float allowed = 2.0f * own_strong / fmax(middles, 1e-6f) + acquisition->fan_step;
-  for (int row = 0; row < ROWS; row++)
-    for (int i = 0; i < lines->count; i++)
-      lines->passed[row][i] = exp(-BLOCKED_PER_MM * fmax(lines->passed[row][i] - allowed, 0.0f));
 }
 
-// Adds a sheet's share to the autocorrelations of the received and of the transmitted wave; `turns` of focusing at the
-// lateral position of 1 mm. Without `disturbed`, the wave of a homogeneous medium.
-inline void add_waves(const Lines *lines, int row, int disturbed, float cycles, float mean_delay, float focusing,
-                      float2 *received, float2 *transmitted) {
-  float2 wave[MOST_POINTS], focused[MOST_POINTS];
-  for (int i = 0; i < lines->count; i++) {
-    const float amplitude = lines->weight[i] * (disturbed ? lines->passed[row][i] : 1.0f);
-    const float turns = disturbed ? cycles * (lines->delay[row][i] - mean_delay) : 0.0f;
-    float c, s;
-    turn(turns, &c, &s);
-    wave[i] = amplitude * (float2)(c, s);
-    turn(turns + focusing * lines->x[i] * lines->x[i], &c, &s);
-    focused[i] = amplitude * (float2)(c, s);
+// The integral of the square of that product. Its spectrum is the convolution of the two autocorrelations.
+inline float squared_overlap(const float2 *first, const float2 *second, int count) {
+  float sum = 0.0f;
+  for (int k = 0; k < 2 * count - 1; k += 2) {  // it is smooth, so that every second sample is enough
+    float2 value = (float2)(0.0f);
+    for (int n = k + 1 - count; n < count; n++) {
+      const int rest = k - n;
+      const float2 a = first[abs(n)], b = second[abs(rest)];
+      const float a_y = n < 0 ? -a.y : a.y, b_y = rest < 0 ? -b.y : b.y;
+      value += (float2)(a.x * b.x - a_y * b_y, a.x * b_y + a_y * b.x);
+    }
+    sum += (k == 0 ? 0.5f : 1.0f) * (value.x * value.x + value.y * value.y);
   }
-  const float share = disturbed ? ROW_WEIGHT(row) : 1.0f;
-  add_correlation(wave, lines->count, share, received);
-  add_correlation(focused, lines->count, share, transmitted);
+  return sum;
 }
 
-// Logarithm of the amplitude of speckle relative to an undisturbed beam. The power of speckle is the integral over the
-// beam of the transmitted times the received intensity. There is one transmit focus; every depth is a receive focus. A
-// shift of both beams changes nothing.
-inline float level_of(__constant const Acquisition *acquisition, const Lines *lines, float path, float mean_delay) {
+// Autocorrelations of the received and of the transmitted wave of a beam: the spectra of its intensities.
+typedef struct {
+  float2 received[MOST_POINTS], transmitted[MOST_POINTS];
+} Waves;
+
+#define UNDISTURBED 0
+#define BY_PHASE 1   // with the phases of soft tissue
+#define BY_TISSUE 2  // and with what strong tissue stops
+
+// The waves at the depth `path`. There is one transmit focus; every depth is a receive focus.
+inline void find_waves(__constant const Acquisition *acquisition, const Lines *lines, float path, float mean_delay,
+                       int kind, Waves *waves) {
   const float cycles = 0.5f * acquisition->cycles_per_mm;  // per millimetre of path, one way
-  const float focusing = 0.5f * cycles * (1.0f / path - 1.0f / acquisition->transmit_focus);
-  float2 received[2][MOST_POINTS], transmitted[2][MOST_POINTS];  // [undisturbed, disturbed]
-  for (int i = 0; i < lines->count; i++)
-    received[0][i] = received[1][i] = transmitted[0][i] = transmitted[1][i] = (float2)(0.0f);
-  add_waves(lines, 0, 0, cycles, mean_delay, focusing, received[0], transmitted[0]);
+  const float focusing = 0.5f * cycles * (1.0f / path - 1.0f / acquisition->transmit_focus);  // turns per mm^2
+  for (int i = 0; i < lines->count; i++) waves->received[i] = waves->transmitted[i] = (float2)(0.0f);
+  for (int row = 0; row < (kind == UNDISTURBED ? 1 : ROWS); row++) {
+    float2 wave[MOST_POINTS], focused[MOST_POINTS];
+    for (int i = 0; i < lines->count; i++) {
+      const float amplitude = lines->weight[i] * (kind == BY_TISSUE ? lines->passed[row][i] : 1.0f);
+      const float turns = kind == UNDISTURBED ? 0.0f : cycles * (lines->delay[row][i] - mean_delay);
+      float c, s;
+      turn(turns, &c, &s);
+      wave[i] = amplitude * (float2)(c, s);
+      turn(turns + focusing * lines->x[i] * lines->x[i], &c, &s);
+      focused[i] = amplitude * (float2)(c, s);
+    }
+    const float share = kind == UNDISTURBED ? 1.0f : ROW_WEIGHT(row);
+    add_correlation(wave, lines->count, share, waves->received);
+    add_correlation(focused, lines->count, share, waves->transmitted);
+  }
+}
+
+// The equivalent width of a beam in units of its own: the square of the integral of its intensity over the integral of
+// its square.
+inline float width_of(const Waves *waves, int count) {
+  const float power = overlap(waves->received, waves->transmitted, count);
+  return power * power / fmax(squared_overlap(waves->received, waves->transmitted, count), 1e-20f);
+}
+
+// Relative to an undisturbed beam: (nepers of the amplitude of speckle lost by phases, nepers lost to strong tissue,
+// width). The power of speckle is the integral over the beam of the transmitted times the received intensity. A shift
+// of both beams changes nothing.
+inline float3 level_and_spread(__constant const Acquisition *acquisition, const Lines *lines, float path,
+                               float mean_delay) {
+  const int count = lines->count;
+  Waves waves;
+  find_waves(acquisition, lines, path, mean_delay, UNDISTURBED, &waves);
+  const float still = overlap(waves.received, waves.transmitted, count), own_width = width_of(&waves, count);
+  find_waves(acquisition, lines, path, mean_delay, BY_PHASE, &waves);
+  // Strong tissue takes parts of the aperture away. That is in the level; the line's neighbours are taken away by it
+  // too, so that a wider beam would brighten its shadow.
+  const float spread = clamp(width_of(&waves, count) / own_width, 1.0f, MOST_SPREAD);
+  const float by_phase = fmax(overlap(waves.received, waves.transmitted, count) / still, 1e-4f);
+  float differs = 0.0f;
   for (int row = 0; row < ROWS; row++)
-    add_waves(lines, row, 1, cycles, mean_delay, focusing, received[1], transmitted[1]);
-  const float still = overlap(received[0], transmitted[0], lines->count);
-  return 0.5f * log(fmax(overlap(received[1], transmitted[1], lines->count) / still, 1e-4f));
+    for (int i = 0; i < count; i++) differs = fmax(differs, fabs(lines->passed[row][i] - 1.0f));
+  float level = by_phase;
+  if (differs > 0.0f) {
+    find_waves(acquisition, lines, path, mean_delay, BY_TISSUE, &waves);
+    level = fmax(overlap(waves.received, waves.transmitted, count) / still, LEAST_POWER);
+  }
+  return (float3)(-0.5f * log(by_phase), 0.5f * log(by_phase / level), spread);
 }
 
 // One work-item computes one depth of one screen line. Global size (depths, screen lines).
 __kernel void screens(__constant const Acquisition *acquisition, __global const float *sums, int with_level,
-                      __global float *screens_) {
+                      __global float *screens_, __global float *shades, __global float *spreads) {
   const int node = get_global_id(0), line = get_global_id(1), nodes = acquisition->screen_depths;
   const float path = (node + 1) * acquisition->screen_step;
   const float traced = (float)line * (acquisition->traced_lines - 1) / (acquisition->screen_lines - 1);
@@ -243,8 +380,9 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
   const float2 direction = acquisition->linear ? (float2)(0.0f, 1.0f) : (float2)(sin(position), cos(position));
   const float2 origin =
       acquisition->linear ? (float2)(position, 0.0f) : radius * (float2)(direction.x, direction.y - 1.0f);
+  const float centre = acquisition->linear ? position : radius * position;
   Lines lines;
-  find_lines(acquisition, sums, path, origin, direction, acquisition->linear ? position : radius * position, &lines);
+  find_lines(acquisition, sums, path, origin, direction, centre, &lines);
 
   // Means over the aperture by power, and the slope of the delay across it.
   float all = 0.0f, first = 0.0f, second = 0.0f, delays = 0.0f, moments = 0.0f, losses = 0.0f;
@@ -254,8 +392,8 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
     row_lift[row] = 0.0f;
     for (int i = 0; i < lines.count; i++) {
       const float passed = lines.passed[row][i], x = lines.x[i], delay = lines.delay[row][i];
-      // A little of the axis is left, so that there is always a mean.
-      const float power = ROW_WEIGHT(row) * (lines.weight[i] * passed * passed + 1e-4f * lines.middle[i]);
+      // A little is left of what strong tissue stops, so that there is always a mean.
+      const float power = ROW_WEIGHT(row) * (lines.weight[i] * (passed * passed + LEFT_FOR_MEANS) + 1e-6f);
       row_power += power;
       row_lift[row] += power * lines.lift[row][i];
       delays += power * delay;
@@ -271,7 +409,81 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
   const float spread = second / all - mean_x * mean_x, common = moments / all - mean_x * mean_delay;
   const float slope = clamp(common / (spread + 0.02f * pitch * pitch), -STEEPEST, STEEPEST);
   const float rise = clamp(row_lift[2] - row_lift[0], -STEEPEST * path, STEEPEST * path);
-  const float level = with_level ? level_of(acquisition, &lines, path, mean_delay) : 0.0f;
-  vstore4((float4)(losses / all - level, mean_delay - slope * mean_x, slope * path, rise), line * nodes + node,
-          screens_);
+  float3 found = (float3)(0.0f, 0.0f, 1.0f);
+  if (with_level) {
+    // In strong tissue, a beam has the level that it has before it: what this tissue takes is a matter of its ray.
+    const float depth = depth_before_strong(acquisition, sums, path, origin, direction, centre);
+    if (depth < path) find_lines(acquisition, sums, depth, origin, direction, centre, &lines);
+    found = level_and_spread(acquisition, &lines, depth, mean_delay);
+  }
+  const float4 screen = (float4)(losses / all + found.x + found.y, mean_delay - slope * mean_x, slope * path, rise);
+  vstore4(screen, line * nodes + node, screens_);
+  shades[line * nodes + node] = found.y;
+  vstore2((float2)(found.z, 1.0f), line * nodes + node, spreads);
+}
+
+// Mean power over a beam of standard deviation `sigma`, in screen lines, of what the lines at one depth let through,
+// relative to its own line. The power of the beam has sigma / sqrt 2; a Gauss-Hermite rule of three points.
+inline float mean_passed(__constant const Acquisition *acquisition, __global const float *screens_, int node, int line,
+                         float sigma) {
+  const int nodes = acquisition->screen_depths, lines = acquisition->screen_lines;
+  const float own = screens_[4 * (line * nodes + node)];
+  float sum = 0.6666667f;
+  for (int side = -1; side <= 1; side += 2) {
+    const float place = clamp(line + side * 1.2247449f * sigma, 0.0f, lines - 1.001f);
+    const int left = (int)place;
+    const float a = screens_[4 * (left * nodes + node)], b = screens_[4 * ((left + 1) * nodes + node)];
+    sum += 0.1666667f * exp(clamp(-2.0f * (blend(a, b, place - left) - own), -10.0f, 10.0f));
+  }
+  return sum;
+}
+
+// An echo has the level of the line that its scatterer is on, but should have that of the line whose beam receives it.
+// Over the width of an undisturbed beam the two hardly differ. For a wider one this is the factor that leaves a line
+// the mean power that it had. One work-item computes one depth of one screen line. Global size (depths, screen lines).
+__kernel void keep_levels(__constant const Acquisition *acquisition, __global const float *screens_,
+                          __global float *spreads) {
+  const int node = get_global_id(0), line = get_global_id(1), at = line * acquisition->screen_depths + node;
+  const float path = (node + 1) * acquisition->screen_step, spread = spreads[2 * at];
+  const float traced_lines = (float)(acquisition->traced_lines - 1) / (acquisition->screen_lines - 1);
+  const float sigma = lateral_sigma(acquisition, path) / (line_distance(acquisition, path) * traced_lines);
+  spreads[2 * at + 1] = sqrt(mean_passed(acquisition, screens_, node, line, sigma) /
+                             mean_passed(acquisition, screens_, node, line, sigma * spread));
+}
+
+// The factor by which the power of speckle would grow where the axes of neighbouring lines come together to the part
+// `ratio` of their distance: a scatterer then counts for several lines, whose phases differ by `turns` from one to the
+// next (docs/physics.md#beams-from-an-aperture).
+inline float gathered_power(__constant const Acquisition *acquisition, float path, float ratio, float turns) {
+  const float strip = line_distance(acquisition, path), sigma = lateral_sigma(acquisition, path);
+  const float strip2 = strip * strip / 12.0f, beam2 = sigma * sigma, narrowed2 = ratio * ratio * beam2 + strip2;
+  const float coherent = fmax(sqrt((beam2 + strip2) / narrowed2), 1.0f);
+  return 1.0f + (coherent - 1.0f) * exp_fast(-3.2898681f * turns * turns * beam2 / narrowed2);  // (2 pi)^2 / 12
+}
+
+// The beams of traced lines, interpolated between screens; 0 at the face. Axes that come together must not create
+// energy. One work-item computes one depth of one traced line. Global size (1 + depths, traced lines).
+__kernel void beams(__constant const Acquisition *acquisition, __global const float *screens_,
+                    __global const float *shades, __global float *beams_) {
+  const int number = get_global_id(0), line = get_global_id(1), depths = acquisition->screen_depths;
+  const int to = line * (1 + depths) + number;
+  __global float *shade = beams_ + 4 * acquisition->traced_lines * (1 + depths) + to;
+  if (number == 0) {
+    vstore4((float4)(0.0f), to, beams_);
+    *shade = 0.0f;
+    return;
+  }
+  const float per_line = (acquisition->screen_lines - 1.0f) / (acquisition->traced_lines - 1);
+  const float place = line * per_line;
+  const int before = min((int)place, acquisition->screen_lines - 2);
+  const float4 left = vload4(before * depths + number - 1, screens_);
+  const float4 right = vload4((before + 1) * depths + number - 1, screens_);
+  float4 beam = left + (place - before) * (right - left);
+  *shade = blend(shades[before * depths + number - 1], shades[(before + 1) * depths + number - 1], place - before);
+  const float path = number * acquisition->screen_step;
+  const float4 per_strip = (right - left) * per_line;  // from line to line
+  const float apart = line_distance(acquisition, path), tilt = beam.z / path;
+  const float turns = acquisition->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
+  beam.x += 0.5f * log_fast(gathered_power(acquisition, path, 1.0f + per_strip.z / apart, turns));
+  vstore4(beam, to, beams_);
 }

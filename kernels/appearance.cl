@@ -1,21 +1,9 @@
-// Images of one pose as a function of the free parameters (docs/optimization.md#efficient-evaluation). Parts of the
-// echoes are combined before beam and pulse, which are linear too, and the results again for every image
-// (appearance.py).
+// Images of one pose as a function of the free parameters (docs/optimization.md#efficient-evaluation). The
+// echoes of each varied tissue are combined again for every image (appearance.py).
 //
-// Buffers: parts float [part][values]; lengths, path float [scan line][sample]; bases and iq float2 [scan
-// line][sample].
+// Buffers: lengths, path float [scan line][sample]; bases and iq float2 [scan line][sample].
 
 #include "common.clh"
-
-// One linear combination of the parts written by scattering.cl. Global size (values / LANES).
-__kernel void mix_parts(__global const float *parts, __global const float *weights, int count, int values,
-                        __global float *mixed) {
-  const int here = get_global_id(0) * LANES;
-  floatn sum = 0.0f;
-  for (int part = 0; part < count; part++)
-    if (weights[part] != 0.0f) sum += weights[part] * LOAD_LANES(parts + part * values + here);
-  STORE_LANES(sum, mixed + here);
-}
 
 // Two-way attenuation in nepers along the direct path to every sample of a scan line. One work-item computes one line.
 // Reflected branches, which overlap the direct path in time, are assumed to have the same attenuation.
@@ -44,7 +32,8 @@ __kernel void direct_path(__constant const Acquisition *acquisition, __global co
 // One image's baseband signal: the bases with these weights, times exp2 of the paths with theirs. Global size
 // (samples / LANES, scan lines).
 __kernel void mix_bases(__global const float *bases, __constant const float *weights, int count,
-                        __global const float *paths, __constant const float *decays, int tissues, __global float *iq,
+                        __global const float *paths, __constant const float *decays, int tissues,
+                        __constant const Acquisition *acquisition, __global const float *losses, __global float *iq,
                         int samples) {
   const int here = get_global_id(1) * samples + get_global_id(0) * LANES;
   const int values = (int)get_global_size(1) * samples;
@@ -61,6 +50,11 @@ __kernel void mix_bases(__global const float *bases, __constant const float *wei
   }
   floatn exponent = 0.0f;
   for (int t = 0; t < tissues; t++) exponent += decays[t] * LOAD_LANES(paths + t * values + here);
+  // A further loss costs less of a pulse whose frequency has fallen (downshift.cl).
+  const int sample = get_global_id(0) * LANES;
+  const floatn loss = loss_at(losses + 2 * (int)get_global_id(1) * (samples / LOSS_STEP + 1), sample);
+  const floatn further = exponent / -LOG2_E;
+  exponent += LOG2_E * acquisition->downshift * further * (loss + 0.5f * further);
   const floatn factor = exp2_fast(clamp(exponent, -100.0f, 100.0f));
 #if LANES == 1
   vstore2((float2)(low, high) * factor, here, iq);

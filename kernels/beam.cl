@@ -8,17 +8,47 @@
 // scatterers between the two edges of a strip, with a mean variance of step^2 / 6; the variance of this Gaussian is
 // reduced by that.
 //
-// Buffers: from_re, from_im float [2 traced line + side][stride]; to_re, to_im float [scan line][stride].
+// Where tissue has disturbed the phases of the aperture, the beam is wider (aperture.cl), of the same power of speckle:
+// the level has what it loses.
+//
+// Buffers: from_re, from_im float [2 traced line + side][stride]; spreads float2 [screen line][depth]; losses as in
+// downshift.cl; to_re, to_im float [scan line][stride].
 
 #include "common.clh"
 
+// Writes the width of the beam of a traced line at path lengths `s` and the factor of its echoes, both re an
+// undisturbed one, linear between the screens.
+inline void find_spread(__constant const Acquisition *acquisition, __global const float *spreads, int traced, floatn s,
+                        floatn *width, floatn *factor) {
+  *width = *factor = (floatn)(1.0f);
+  if (!acquisition->aperture_beams) return;
+  const int depths = acquisition->screen_depths;
+  const float line = (float)traced * (acquisition->screen_lines - 1) / (acquisition->traced_lines - 1);
+  const int left = min((int)line, acquisition->screen_lines - 2);
+  const floatn far = s / acquisition->screen_step - 1.0f;
+  SPREAD(float, far_, far);
+  const int near = clamp((int)far_[0], 0, depths - 2);  // for all lanes, which are much closer than screens
+  const floatn t = clamp(far - (float)near, (floatn)(0.0f), (floatn)(1.0f));
+  const float4 a = vload4(0, spreads + 2 * (left * depths + near));
+  const float4 b = vload4(0, spreads + 2 * ((left + 1) * depths + near));
+  const float4 found = a + (line - left) * (b - a);  // width and factor at one depth and at the next
+  *width = found.x + t * (found.z - found.x);
+  *factor = found.y + t * (found.w - found.y);
+}
+
 __kernel void lateral_beam(__constant const Acquisition *acquisition, __global const float *from_re,
-                           __global const float *from_im, __global float *to_re, __global float *to_im, int stride) {
+                           __global const float *from_im, __global const float *spreads, __global const float *losses,
+                           __global float *to_re, __global float *to_im, int stride) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int centre = acquisition->guard_lines + line * acquisition->lateral_rays;
   // One width per lane: near a tight focus the width changes from sample to sample.
   const floatn s = (TO_FLOATN(LANE_INDEX) + sample) * acquisition->sample_mm;
-  const floatn apart = line_distance_lanes(acquisition, s), sigma = lateral_sigma_lanes(acquisition, s);
+  floatn spread, factor;
+  find_spread(acquisition, spreads, centre, s, &spread, &factor);
+  __global const float *of_line = losses + 2 * line * (acquisition->samples / LOSS_STEP + 1);
+  const floatn stretch = 1.0f / frequency_after_lanes(acquisition, loss_at(of_line, sample));
+  const floatn apart = line_distance_lanes(acquisition, s);
+  const floatn sigma = spread * lateral_sigma_lanes_at(acquisition, s, stretch);
   floatn step = apart / sigma;  // between traced lines, in sigmas
   floatn step2 = step * step;
   floatn narrow2 = fmax(1.0f - step2 / 6.0f, 0.25f);  // (sigma of these weights / sigma of the beam)^2
@@ -49,7 +79,7 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
     weight *= ratio;
     ratio *= fall;
   }
-  floatn scale = step * rsqrt(narrow2) * 0.39894228f;  // 1 / sqrt(2 pi)
+  floatn scale = factor * step * rsqrt(narrow2) * sqrt(spread) * 0.39894228f;  // 1 / sqrt(2 pi)
   STORE_LANES(sum_re * scale, to_re + line * stride + here);
   STORE_LANES(sum_im * scale, to_im + line * stride + here);
 }

@@ -1,7 +1,8 @@
 // From complex baseband impulses to grey levels (docs/physics.md#4-beam-and-pulse, docs/physics.md#6-from-rf-to-image).
 // Global size (samples / LANES, scan lines).
 //
-// Buffers: re, im float [scan line][stride], LINE_PAD zeros on either side of the samples; pulse float [2 reach + 1];
+// Buffers: re, im float [scan line][stride], LINE_PAD zeros on either side of the samples; losses as in downshift.cl;
+// pulse float [2 reach + 1];
 // iq float2 (real, imaginary), envelope float and grey uchar [scan line][samples].
 
 #include "display.clh"
@@ -9,7 +10,8 @@
 // The axial part of the point spread function. The pulse is exp(-x^2 / 2 sx^2) cos(2 pi f x). Baseband impulses contain
 // the phase of the carrier, so only the Gaussian envelope remains, and the magnitude needs no Hilbert transform.
 __kernel void convolve_pulse(__global const float *re, __global const float *im, int stride,
-                             __constant const float *pulse, int reach, __global float *iq, int samples) {
+                             __constant const float *pulse, int reach, __constant const Acquisition *acquisition,
+                             __global const float *losses, __global float *iq, int samples) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   __global const float *from_re = re + line * stride + LINE_PAD + sample - reach;
   __global const float *from_im = im + line * stride + LINE_PAD + sample - reach;
@@ -18,18 +20,30 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
     sum_re += pulse[k] * LOAD_LANES(from_re + k);
     sum_im += pulse[k] * LOAD_LANES(from_im + k);
   }
+  if (acquisition->downshift > 0.0f) {  // back to the carrier of the transmitted pulse
+    floatn c, s;
+    turn(turns_at(acquisition, losses + 2 * line * (samples / LOSS_STEP + 1), sample), &c, &s);
+    const floatn x = sum_re;
+    sum_re = x * c + sum_im * s;
+    sum_im = sum_im * c - x * s;
+  }
   STORE_PAIRS(sum_re, sum_im, iq + 2 * (line * samples + sample));
 }
 
 // Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC rises by tgc_per_sample [dB]
-// until sample tgc_samples and stays there.
-__kernel void compress(__global const float *iq, int samples, float noise, uint noise_seed, float tgc_per_sample,
-                       float tgc_samples, float level_of_white_db, Display display, __global float *envelope,
-                       __global uchar *grey) {
+// until sample tgc_samples and stays there. `ringing`, float2 [sample], is added to every line: the reverberation at
+// the face.
+__kernel void compress(__global const float *iq, int samples, __global const float *ringing, float noise,
+                       uint noise_seed, float tgc_per_sample, float tgc_samples, float level_of_white_db,
+                       Display display, __global float *envelope, __global uchar *grey) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int here = line * samples + sample;
   floatn re, im;
   LOAD_PAIRS(re, im, iq + 2 * here);
+  floatn ring_re, ring_im;
+  LOAD_PAIRS(ring_re, ring_im, ringing + 2 * sample);
+  re += ring_re;
+  im += ring_im;
   const intn index = sample + LANE_INDEX;
   if (noise > 0.0f) {
     uintn key = hash_mixn(TO_UINTN(index) * 0x9E3779B1u + (noise_seed + (uint)line * 0x85EBCA77u));

@@ -73,7 +73,7 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
       const float stretch = fmin(1.0f + hit->lateral_slope * hit->lateral_slope, 10.0f);
       const float bend = hit->curvature * stretch * sqrt(stretch);
       Wall wall;
-      wall.echo = hit->echo;
+      wall.echo = hit->echo * exp_fast(gain_of_band(acquisition, hit->loss));
       wall.depth_mm = hit->depth_mm - carried_aside * hit->elevational_slope * hit->elevational_mm;
       const float inside2 =
           bent_patch(per_mm, hit->lateral_slope, bend, inside * sigma2, &wall.depth_mm) +

@@ -11,7 +11,7 @@
 // attenuation are those of the ray itself, corrected linearly over each piece so that at its ends they are the beam's.
 //
 // Buffers: voxels ushort [k][j][i], groups uchar [k][j][i] and smooth ushort [group][k][j][i] (medium.py); tissues
-// Tissue [label]; roots float4 [traced line], origin and direction (x, y) in the probe frame; screens as in
+// Tissue [label]; roots float4 [traced line], origin and direction (x, y) in the probe frame; beams as in
 // aperture.cl; quantiles float [traced line][elevational ray], offsets in units of the elevational sigma; segments
 // Segment [traced line][MAX_SEGMENTS] with segment_counts; hits Hit [traced line][elevational ray][MAX_HITS] with
 // hit_counts; cut float [traced line][1 + elevational ray], the weight of the branches that were not followed;
@@ -27,6 +27,7 @@ typedef struct {
   float path;
   float depth;
   float log_attenuation;  // natural logarithm, two-way amplitude
+  float loss;             // the part of it, in nepers, that is attenuation by tissues
   float weight;
   float4 tube;        // widths and growths per mm at `path`: lateral, its growth, elevational, its growth
   float blind_until;  // path length before which crossings are ignored: a reflected ray must leave its interface
@@ -34,7 +35,19 @@ typedef struct {
   int label;
   int piece;      // of the beam, that starts at path piece x screen_step; -1 where the line is a ray
   int piece_has;  // number of segments or hits written before this piece
+  float from;     // path length from which the piece is corrected: its start, or the end of strong tissue in it
+  float shade;    // nepers lost there to strong tissue beside the axis or in front
+  // Strong tissue in which a beam goes straight on; the last soft tissue, the weight there, and the nepers since then
+  // by which this tissue attenuates more.
+  int strong, front;
+  float front_weight, excess;
 } Ray;
+
+#define NOT_STRONG 0
+#define THROUGH 1       // strong tissue that does not bend
+#define UNDER 2         // strong tissue that does: nothing is written of it, since it is a matter of the refracted ray
+#define MOST_LOSS 1.0f  // nepers by which strong tissue may change the frequency of what has passed it
+#define DARKEST 7.0f    // nepers lost to strong tissue: behind it nothing is left of a beam
 
 // The label at fraction f of the cell of voxels at index `here`: the acoustic group with the largest trilinear weight,
 // so that borders are smooth at the sub-voxel scale, and within the group the label of the nearest corner. Voting by
@@ -220,7 +233,8 @@ inline Segment segment_of(Ray ray, float from, float to, float spent_from, float
   segment.depth_per_mm = depth_per_mm;
   segment.weight = ray.weight;
   segment.attenuation = exp_fast(ray.log_attenuation - spent_from);
-  segment.decay_per_mm = (spent_to - spent_from) / (to - from);
+  segment.decay_per_mm = segment.loss_per_mm = (spent_to - spent_from) / (to - from);
+  segment.loss = ray.loss + spent_from;
   segment.reflections = ray.reflections;
   segment.label = ray.label;
   return segment;
@@ -245,11 +259,6 @@ inline Interface interface_between(Tissue here, Tissue behind, float3 direction,
   return result;
 }
 
-inline float square_reflectance(Tissue here, Tissue behind) {
-  const float r = (behind.impedance_mrayl - here.impedance_mrayl) / (behind.impedance_mrayl + here.impedance_mrayl);
-  return r * r;
-}
-
 // The root of a traced line: the beam frame at the probe face, transformed from the probe frame to RAS.
 // `origin_and_direction` are (x, y) each.
 inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_direction) {
@@ -262,54 +271,31 @@ inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_
   root.path = 0.0f;
   root.depth = 0.0f;
   root.log_attenuation = 0.0f;
+  root.loss = 0.0f;
   root.weight = 1.0f;
   root.tube = (float4)(1.0f, 0.0f, 1.0f, 0.0f);
   root.blind_until = -1.0f;
   root.reflections = 0;
   root.label = -1;  // looked up at its start
   root.piece = -1;
-  root.piece_has = 0;
+  root.piece_has = root.strong = root.front = 0;
+  root.from = root.shade = root.excess = 0.0f;
+  root.front_weight = 1.0f;
   return root;
 }
 
-// The factor by which the power of speckle would grow where the axes of neighbouring lines come together to the part
-// `ratio` of their distance: a scatterer then counts for several lines, whose phases differ by `turns` from one to the
-// next (docs/physics.md#beams-from-an-aperture).
-inline float gathered_power(__constant const Acquisition *acquisition, float path, float ratio, float turns) {
-  const float strip = line_distance(acquisition, path), sigma = lateral_sigma(acquisition, path);
-  const float strip2 = strip * strip / 12.0f, beam2 = sigma * sigma, narrowed2 = ratio * ratio * beam2 + strip2;
-  const float coherent = fmax(sqrt((beam2 + strip2) / narrowed2), 1.0f);
-  return 1.0f + (coherent - 1.0f) * exp_fast(-3.2898681f * turns * turns * beam2 / narrowed2);  // (2 pi)^2 / 12
-}
-
-// The beam of a traced line at the end `number` of a piece, as in aperture.cl; 0 at the face. Axes that come together
-// must not create energy.
-inline float4 beam_at(__constant const Acquisition *acquisition, __global const float *screens, int line, int number) {
-  if (number == 0) return (float4)(0.0f);
-  const float per_line = (acquisition->screen_lines - 1.0f) / (acquisition->traced_lines - 1);
-  const float place = line * per_line;
-  const int before = min((int)place, acquisition->screen_lines - 2), depths = acquisition->screen_depths;
-  const float4 left = vload4(before * depths + number - 1, screens);
-  const float4 right = vload4((before + 1) * depths + number - 1, screens);
-  float4 beam = left + (place - before) * (right - left);
-  const float path = number * acquisition->screen_step;
-  const float4 per_strip = (right - left) * per_line;  // from line to line
-  const float apart = line_distance(acquisition, path), tilt = beam.z / path;
-  const float turns = acquisition->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
-  beam.x += 0.5f * log_fast(gathered_power(acquisition, path, 1.0f + per_strip.z / apart, turns));
-  return beam;
-}
-
 // Set a ray to the start of piece `number` of its line; behind the last one it goes straight on.
-inline void start_piece(__constant const Acquisition *acquisition, __global const float *screens, Ray root, int line,
-                        int number, int count, Ray *ray) {
+inline void start_piece(__constant const Acquisition *acquisition, __global const float *beams,
+                        __global const float *shades, Ray root, int number, int count, Ray *ray) {
   ray->piece = number < acquisition->screen_depths ? number : -1;
   ray->piece_has = count;
-  const float4 here = beam_at(acquisition, screens, line, number);
+  ray->from = number * acquisition->screen_step;
+  ray->shade = shades[number];
+  const float4 here = vload4(number, beams);
   const float path = number * acquisition->screen_step;
   ray->axis = root.axis + path * root.direction + here.z * root.lateral + here.w * root.elevational;
   if (ray->piece < 0) return;
-  const float4 next = beam_at(acquisition, screens, line, number + 1);
+  const float4 next = vload4(number + 1, beams);
   const float3 along = acquisition->screen_step * root.direction + (next.z - here.z) * root.lateral +
                        (next.w - here.w) * root.elevational;
   ray->direction = unit3(along);
@@ -318,13 +304,21 @@ inline void start_piece(__constant const Acquisition *acquisition, __global cons
 }
 
 // The changes of depth and of the logarithm of amplitude per mm, by which a ray agrees with its beam at the end of the
-// piece. The ray is at `path`; from there on it is continued with these rates of depth and decay.
-inline float2 correction(__constant const Acquisition *acquisition, __global const float *screens, int line, int piece,
-                         float path, float depth, float log_attenuation, float depth_per_mm, float decay) {
-  const float4 beam = beam_at(acquisition, screens, line, piece + 1);
-  const float end = (piece + 1) * acquisition->screen_step, rest = end - path;
-  return (float2)(end + beam.y - (depth + rest * depth_per_mm), -beam.x - (log_attenuation - rest * decay)) /
-         acquisition->screen_step;
+// piece, which has lost `more` nepers there. The ray is at `path`; from there on it is continued with these rates of
+// depth and decay.
+inline float2 correction(__constant const Acquisition *acquisition, __global const float *beams, const Ray *ray,
+                         float path, float depth, float log_attenuation, float depth_per_mm, float decay, float more) {
+  const float4 beam = vload4(ray->piece + 1, beams);
+  const float end = (ray->piece + 1) * acquisition->screen_step, rest = end - path;
+  return (float2)(end + beam.y - (depth + rest * depth_per_mm), -beam.x - more - (log_attenuation - rest * decay)) /
+         fmax(end - ray->from, 1e-3f);
+}
+
+// Whether strong tissue leaves nothing of a beam from piece `piece` on.
+inline int is_dark(__constant const Acquisition *acquisition, __global const float *shades, int piece) {
+  for (int n = piece + 1; n <= acquisition->screen_depths; n++)
+    if (shades[n] < DARKEST) return 0;
+  return 1;
 }
 
 // Correct what a ray has written since the start of its piece.
@@ -365,7 +359,7 @@ __attribute__((intel_vec_len_hint(1)))
 #endif
 __kernel void trace(__constant const Acquisition *acquisition, __global const ushort *voxels,
                     __global const uchar *groups, __global const ushort *smooth, __constant const Tissue *tissues,
-                    __global const float *roots, __global const float *quantiles, __global const float *screens,
+                    __global const float *roots, __global const float *quantiles, __global const float *beams,
                     __global Segment *segments, __global int *segment_counts, __global Hit *hits,
                     __global int *hit_counts, __global float *cut, __global int *overflown) {
   const int line = get_global_id(0), ray_of_line = get_global_id(1), rays = acquisition->elevational_rays;
@@ -374,6 +368,8 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
   const float quantile = on_axis ? 0.0f : quantiles[slot];
   __global Segment *my_segments = segments + line * MAX_SEGMENTS;
   __global Hit *my_hits = hits + max(slot, 0) * MAX_HITS;
+  __global const float *my_beams = beams + line * (1 + acquisition->screen_depths) * 4;
+  __global const float *my_shades = beams + (4 * acquisition->traced_lines + line) * (1 + acquisition->screen_depths);
   const int room = on_axis ? MAX_SEGMENTS : MAX_HITS;
   int count = 0;  // of segments or hits; a value above `room` means that some are missing
   float cut_weight = 0.0f;
@@ -381,7 +377,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
   const Ray root = root_of(acquisition, vload4(line, roots));
   Ray stack[MAX_STACK];
   stack[0] = root;
-  if (acquisition->aperture_beams) start_piece(acquisition, screens, root, line, 0, 0, stack);
+  if (acquisition->aperture_beams) start_piece(acquisition, my_beams, my_shades, root, 0, 0, stack);
   int waiting = 1;
   while (waiting > 0) {
     Ray ray = stack[--waiting];
@@ -397,10 +393,13 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       course.path = ray.path;
       if (ray.label < 0) ray.label = label_at(voxels, groups, acquisition, course_at(acquisition, &course, 0.0f));
       Tissue here = tissues[ray.label], behind = here;
-      const float depth_per_mm = acquisition->reference_speed_m_s / here.speed_of_sound_m_s;
+      const int is_under = ray.strong == UNDER;
+      const Tissue front = tissues[ray.strong == NOT_STRONG ? ray.label : ray.front];
+      const float front_decay = decay_in(acquisition, front);
+      const float depth_per_mm =
+          acquisition->reference_speed_m_s / (is_under ? front.speed_of_sound_m_s : here.speed_of_sound_m_s);
       const float to_depth = (acquisition->depth_mm - ray.depth) / depth_per_mm;
-      const float piece_start = ray.piece * acquisition->screen_step;
-      const float to_piece = ray.piece < 0 ? 2.0f * to_depth : piece_start + acquisition->screen_step - ray.path;
+      const float to_piece = ray.piece < 0 ? 2.0f * to_depth : (ray.piece + 1) * acquisition->screen_step - ray.path;
       const float2 span =
           volume_span(acquisition, &course, 3.0f + fabs(quantile) * 4.0f / acquisition->voxel_mm, to_depth);
 
@@ -410,7 +409,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       float since = 0.0f, spent = 0.0f, open = 0.0f, spent_open = 0.0f, inside = span.x, border, until;
       int other = ray.label, is_silenced, piece_ends;
       while (1) {
-        const float decay = decay_in(acquisition, here);
+        const float decay = is_under ? front_decay : decay_in(acquisition, here);
         const float reserve = log_fast(ray.weight / acquisition->intensity_threshold) + ray.log_attenuation - spent;
         const float to_silence = since + fmax(reserve, 0.0f) / fmax(decay, 1e-9f);
         const float longest = fmin(fmin(to_depth, to_silence), to_piece);
@@ -422,7 +421,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         const float spent_until = spent + decay * (until - since);
         if (border >= 0.0f) behind = tissues[other];
         const int node_ends = border < 0.0f || behind.group != here.group;
-        if (on_axis) {
+        if (on_axis && !is_under) {
           // A segment has one decay, its mean. If the error inside would exceed 0.02 neper (0.17 dB), the segment is
           // closed at the last change of tissue.
           const float earlier = since - open, mean_decay = earlier > 0.0f ? (spent - spent_open) / earlier : decay;
@@ -444,23 +443,40 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         ray.label = other;
         inside = border;
       }
+      const float own_decay = ray.strong == NOT_STRONG ? decay_in(acquisition, here) : front_decay;
+      const int written = is_under ? 0 : min(count, room) - ray.piece_has;  // in this piece
       if (border < 0.0f) {
         float2 per_mm = (float2)(0.0f);
+        const int goes_dark = is_silenced && ray.strong == THROUGH;
+        if (ray.strong == THROUGH) ray.excess += spent - until * front_decay;
         if (ray.piece >= 0)
-          per_mm = correction(acquisition, screens, line, ray.piece, ray.path + until, ray.depth + until * depth_per_mm,
-                              ray.log_attenuation - spent, depth_per_mm, decay_in(acquisition, here));
-        if (ray.piece >= 0 && on_axis)
-          correct_segments(my_segments + ray.piece_has, min(count, room) - ray.piece_has, per_mm, piece_start);
-        if (ray.piece >= 0 && !on_axis)
-          correct_hits(my_hits + ray.piece_has, min(count, room) - ray.piece_has, per_mm, piece_start);
-        if (!piece_ends) {
+          per_mm = correction(acquisition, my_beams, &ray, ray.path + until, ray.depth + until * depth_per_mm,
+                              ray.log_attenuation - spent, depth_per_mm, own_decay,
+                              ray.excess + (goes_dark ? ray.shade - my_shades[ray.piece + 1] : 0.0f));
+        if (ray.piece >= 0 && on_axis) correct_segments(my_segments + ray.piece_has, written, per_mm, ray.from);
+        if (ray.piece >= 0 && !on_axis) correct_hits(my_hits + ray.piece_has, written, per_mm, ray.from);
+        if (!piece_ends && !goes_dark) {
           if (is_silenced) cut_weight += ray.weight;
           break;
         }
         ray.path += until;
-        ray.depth += until * depth_per_mm + per_mm.x * acquisition->screen_step;
-        ray.log_attenuation += per_mm.y * acquisition->screen_step - spent;
-        start_piece(acquisition, screens, root, line, ray.piece + 1, count, &ray);
+        ray.depth += until * depth_per_mm + per_mm.x * (ray.path - ray.from);
+        ray.log_attenuation += per_mm.y * (ray.path - ray.from) - spent;
+        ray.loss += spent;
+        if (goes_dark) {  // but the beam may go on behind this tissue
+          cut_weight += ray.weight;
+          ray.axis += until * ray.direction;
+          ray.tube = tube_after(ray.tube, until);
+          ray.strong = UNDER;
+          ray.weight = ray.front_weight;
+          ray.log_attenuation += ray.excess;
+          ray.loss -= ray.excess;
+          ray.excess = 0.0f;
+          ray.from = ray.blind_until = ray.path;
+          continue;
+        }
+        start_piece(acquisition, my_beams, my_shades, root, ray.piece + 1, count, &ray);
+        if (ray.piece < 0 && ray.strong != NOT_STRONG) break;
         continue;
       }
 
@@ -479,34 +495,54 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         behind = tissues[other];
       }
       border -= back;
-      spent -= back * decay_in(acquisition, here);
-      if (on_axis && count > 0 && count <= room)
+      spent -= back * (is_under ? front_decay : decay_in(acquisition, here));
+      if (on_axis && !is_under && count > 0 && count <= room)
         my_segments[count - 1].length_mm = fmax(my_segments[count - 1].length_mm - back, 0.0f);
-      const int is_straight = acquisition->aperture_beams && is_soft(here.speed_of_sound_m_s, here.impedance_mrayl,
-                                                                     behind.speed_of_sound_m_s, behind.impedance_mrayl);
+      const int is_strong_border =
+          !acquisition->aperture_beams ||
+          !is_soft(here.speed_of_sound_m_s, here.impedance_mrayl, behind.speed_of_sound_m_s, behind.impedance_mrayl);
+      // Strong tissue ends where there is soft tissue again, as compared with what lies in front of it.
+      const int is_strong = ray.strong == NOT_STRONG ? is_strong_border
+                                                     : !is_soft(front.speed_of_sound_m_s, front.impedance_mrayl,
+                                                                behind.speed_of_sound_m_s, behind.impedance_mrayl);
+      const int is_beam = ray.piece >= 0;
+      const int is_bent =
+          !is_under && is_strong && !(is_beam && !bends(front.speed_of_sound_m_s, behind.speed_of_sound_m_s));
       const float path = ray.path + border;
       float depth = ray.depth + border * depth_per_mm, log_attenuation = ray.log_attenuation - spent;
       const int leaves = depth >= acquisition->depth_mm;
-      if (ray.piece >= 0 && (leaves || !is_straight)) {  // the beam ends here
-        const float2 per_mm = correction(acquisition, screens, line, ray.piece, path, depth, log_attenuation,
-                                         depth_per_mm, decay_in(acquisition, here));
+      if (ray.strong == THROUGH) ray.excess += spent - border * front_decay;
+      float2 per_mm = (float2)(0.0f);
+      // At a border that is not soft, as if the beam had up to the piece's end what strong tissue has left of it here.
+      if (is_beam)
+        per_mm = correction(
+            acquisition, my_beams, &ray, path, depth, log_attenuation,
+            is_bent || is_under || leaves ? depth_per_mm : acquisition->reference_speed_m_s / behind.speed_of_sound_m_s,
+            own_decay, ray.excess + (leaves ? 0.0f : ray.shade - my_shades[ray.piece + 1]));
+      const float corrected_depth = depth + per_mm.x * (path - ray.from);
+      const float corrected_log = log_attenuation + per_mm.y * (path - ray.from);
+      Ray under = ray;                                                   // where the beam goes on below strong tissue
+      if (is_beam && (leaves || is_bent || (is_under && !is_strong))) {  // this course of the beam ends here
         if (on_axis)
-          correct_segments(my_segments + ray.piece_has, min(count, room) - ray.piece_has, per_mm, piece_start);
+          correct_segments(my_segments + ray.piece_has, written, per_mm, ray.from);
         else
-          correct_hits(my_hits + ray.piece_has, min(count, room) - ray.piece_has, per_mm, piece_start);
-        depth += per_mm.x * (path - piece_start);
-        log_attenuation += per_mm.y * (path - piece_start);
-        ray.piece = -1;
+          correct_hits(my_hits + ray.piece_has, written, per_mm, ray.from);
+        depth = corrected_depth;
+        log_attenuation = corrected_log;
+        if (is_bent) {
+          ray.piece = -1;
+          ray.strong = NOT_STRONG;
+        }
       }
       if (leaves) break;  // without the overshoot, the border lies beyond the field
-      const float attenuation = exp_fast(log_attenuation);
+      const float attenuation = exp_fast(log_attenuation), loss = ray.loss + spent;
       const float3 aside = quantile * elevation_sigma(acquisition, path) * ray.elevational;
       const float3 hit_point = ray.axis + border * ray.direction + aside;
       const float4 tube = tube_after(ray.tube, border);
       const Interface surface = interface_between(here, behind, ray.direction, normal);
       const float reflectance = surface.pressure * surface.pressure;
 
-      if (!on_axis) {
+      if (!on_axis && !is_under) {
         if (count < room) {
           Hit hit;
           vstore3(hit_point, 0, hit.position);
@@ -515,6 +551,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
           hit.depth_mm = depth;
           hit.weight = ray.weight;
           hit.attenuation = attenuation;
+          hit.loss = loss;
           hit.cos_incidence = surface.cos_in;
           hit.reflectance = reflectance;
           hit.lateral_slope = depth_per_mm * tube.x * slope_along(ray.lateral, ray.direction, normal);
@@ -533,43 +570,97 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         count++;
       }
 
-      if (is_straight) {
+      // The reflected child is pushed onto the stack; weak ones and those beyond the tree's depth are cut.
+      const float reflected_weight = ray.weight * reflectance, refracted_weight = ray.weight * (1.0f - reflectance);
+      if (is_strong_border && !is_under) {
+        if (ray.reflections < acquisition->max_ray_depth && reflected_weight >= acquisition->reflection_threshold &&
+            reflected_weight * attenuation >= acquisition->intensity_threshold && waiting < MAX_STACK) {
+          Ray child = ray;
+          child.direction = unit3(mirror(ray.direction, normal));
+          child.lateral = mirror(ray.lateral, normal);
+          child.elevational = mirror(ray.elevational, normal);
+          child.axis = hit_point - mirror(aside, normal);
+          if (acquisition->reflection_spreading)
+            child.tube =
+                tube_reflected(groups, smooth, acquisition, tube, ray, hit_point, normal, here.group, behind.group);
+          child.path = path;
+          child.depth = corrected_depth;
+          child.log_attenuation = corrected_log;
+          child.loss = loss;
+          child.weight = reflected_weight;
+          child.blind_until = path + acquisition->voxel_mm;
+          child.reflections = ray.reflections + 1;
+          child.piece = -1;
+          child.strong = NOT_STRONG;
+          stack[waiting++] = child;
+        } else {
+          cut_weight += reflected_weight;
+        }
+      }
+
+      // Up to a point beyond the trilinear border too: at grazing incidence the ray would cross the same border again.
+      const float blind_until = overshoot > 0.0f ? path + overshoot + 0.5f * acquisition->voxel_mm : path;
+      if (!is_bent) {
+        if (is_strong && ray.strong == NOT_STRONG) {
+          ray.strong = THROUGH;
+          ray.front = ray.label;
+          ray.front_weight = ray.weight;
+        }
         // What is lost is what a square border reflects: grazing ones are a matter of the whole aperture.
-        const float lost = ray.weight * square_reflectance(here, behind);
-        cut_weight += lost;
+        const float lost =
+            is_under ? 0.0f : ray.weight * square_reflection(here.impedance_mrayl, behind.impedance_mrayl);
+        if (!is_strong_border) cut_weight += lost;
         ray.weight -= lost;
         ray.axis = hit_point - aside;
         ray.tube = tube;
         ray.path = path;
         ray.depth = depth;
         ray.log_attenuation = log_attenuation;
+        ray.loss = loss;
         ray.label = other;
-        ray.blind_until = overshoot > 0.0f ? path + overshoot + 0.5f * acquisition->voxel_mm : path;
+        ray.blind_until = blind_until;
         if (count > room) break;
+        if (!is_strong && ray.strong != NOT_STRONG) {
+          // What this and other strong tissue has taken from the beam is in the level of its aperture.
+          const float shade = my_shades[ray.piece + 1];
+          ray.log_attenuation += ray.excess - (shade - ray.shade);
+          // Of the pulse, the frequency falls by attenuation. Behind opaque tissue it is what has come past that.
+          ray.loss -= ray.excess - clamp(shade - ray.shade, fmin(ray.excess, 0.0f), clamp(ray.excess, 0.0f, MOST_LOSS));
+          ray.weight = ray.front_weight;
+          ray.shade = shade;
+          ray.excess = 0.0f;
+          ray.strong = NOT_STRONG;
+          if (is_under) {
+            ray.from = path;
+            ray.piece_has = count;
+          }
+          if (is_dark(acquisition, my_shades, ray.piece)) {
+            cut_weight += ray.weight;
+            break;
+          }
+        }
         continue;
       }
 
-      // The reflected child is pushed onto the stack; weak ones and those beyond the tree's depth are cut.
-      const float reflected_weight = ray.weight * reflectance, refracted_weight = ray.weight * (1.0f - reflectance);
-      if (ray.reflections < acquisition->max_ray_depth && reflected_weight >= acquisition->reflection_threshold &&
-          reflected_weight * attenuation >= acquisition->intensity_threshold && waiting < MAX_STACK) {
-        Ray child = ray;
-        child.direction = unit3(mirror(ray.direction, normal));
-        child.lateral = mirror(ray.lateral, normal);
-        child.elevational = mirror(ray.elevational, normal);
-        child.axis = hit_point - mirror(aside, normal);
-        if (acquisition->reflection_spreading)
-          child.tube =
-              tube_reflected(groups, smooth, acquisition, tube, ray, hit_point, normal, here.group, behind.group);
-        child.path = path;
-        child.depth = depth;
-        child.log_attenuation = log_attenuation;
-        child.weight = reflected_weight;
-        child.blind_until = path + acquisition->voxel_mm;
-        child.reflections = ray.reflections + 1;
-        stack[waiting++] = child;
-      } else {
-        cut_weight += reflected_weight;
+      // Beside what is refracted, the beam goes on: from strong tissue's edge on, parts of its aperture see past it.
+      if (is_beam && waiting < MAX_STACK && !is_dark(acquisition, my_shades, under.piece)) {
+        if (under.strong == NOT_STRONG) {
+          under.front = under.label;
+          under.front_weight = under.weight;
+        }
+        under.weight = under.front_weight;
+        under.strong = UNDER;
+        under.axis = hit_point - aside;
+        under.tube = tube;
+        under.path = path;
+        under.depth = depth;
+        under.log_attenuation = log_attenuation + under.excess;
+        under.excess = 0.0f;
+        under.loss = loss;
+        under.from = path;
+        under.label = other;
+        under.blind_until = blind_until;
+        stack[waiting++] = under;
       }
 
       // The refracted child continues this ray in a new direction.
@@ -588,10 +679,10 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       ray.path = path;
       ray.depth = depth;
       ray.log_attenuation = log_attenuation;
+      ray.loss = loss;
       ray.weight = refracted_weight;
       ray.label = other;
-      // Up to a point beyond the trilinear border too: at grazing incidence the ray would cross the same border again.
-      ray.blind_until = overshoot > 0.0f ? path + overshoot + 0.5f * acquisition->voxel_mm : path;
+      ray.blind_until = blind_until;
     }
   }
   cut[line * (rays + 1) + ray_of_line] = cut_weight;

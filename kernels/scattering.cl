@@ -9,28 +9,28 @@
 // computed once per image, not once per beam. Work-items write disjoint samples in a fixed order: a pose always gives
 // the same bits. Global size (chunks, traced lines).
 //
-// Position, T0 and T1 of a cell's scatterer come from a hash of the cell's index and the seed. Its amplitude is
-//   mu0 (E - p) + sigma0 T0 E,  E = [T1 >= mu1],  p = P(E):
-// zero mean, variance p (1 - p) mu0^2 + p sigma0^2, linear in mu0 and sigma0. The mean p mu0 of the field is subtracted
-// because a uniform medium returns no echo; on a fine regular lattice the pulse would cancel it, on a jittered one not.
+// Position, sign and existence of a cell's scatterer come from a hash of the cell's index and the seed. It stands for
+// all scatterers that tissue has in the cell: it exists if there is any, and its amplitude is the tissue's in every
+// cell, with a random sign (scattering.py). The signal is linear in that amplitude.
 //
 // With TEXTURE defined, scatterers depend on the MRI in addition to labels (texture.py): a scatterer takes the second
 // tissue of its voxel with that tissue's probability, and its amplitude follows the intensity.
 //
-// With VARIED defined, the echoes are written in PARTS parts. For all mu0, sigma0 and mu1 of one tissue, the image of
-// this pose is a linear combination of the parts (appearance.py). Part 0 has the echoes of all other tissues. The
-// scatterers of the varied tissue are divided into bands of T1: part 1 + 2 b has the scatterers of band b with
-// amplitude 1, part 2 + 2 b with amplitude T0.
+// With VARIED defined, the echoes are written in PARTS parts, each of which has the tissues given for it. So the image
+// of a pose is a linear combination of the parts for all amplitudes of these tissues (appearance.py).
 //
-// Buffers: voxels, tissues, segments as in raytracing.cl; texture uint [k][j][i] (one element without TEXTURE); re, im
-// float [2 traced line + side][stride]; with VARIED also [part] before these, role int [label] (ROLE_...) and
-// band_top float [BANDS], the cumulative fraction of sites up to each band.
+// With ADDED defined, the echoes are added to those that are there: of the elevational side lobes, which have a record
+// and a coarser lattice of their own (side_lobes.py).
+//
+// Buffers: voxels, segments as in raytracing.cl; texture uint [k][j][i] (one element without TEXTURE); sites float2
+// [label], the share of cells with a scatterer, in 1/65536, and its amplitude; re, im float [2 traced line +
+// side][stride]; with VARIED also [part] before these, and part_of int [label], -1 for a tissue in none.
 
 #include "common.clh"
 
 #ifdef VARIED
-#define VARIED_PARAMETERS , __global const int *role, __global const float *band_top
-#define VARIED_ARGUMENTS , role, band_top
+#define VARIED_PARAMETERS , __global const int *part_of
+#define VARIED_ARGUMENTS , part_of
 #else
 #define VARIED_PARAMETERS
 #define VARIED_ARGUMENTS
@@ -39,6 +39,11 @@
 #endif
 #ifndef CHUNK
 #define CHUNK BLOCK
+#endif
+#ifdef ADDED
+#define STORE_ECHO(to, value) to += value
+#else
+#define STORE_ECHO(to, value) to = value
 #endif
 #define PART (CHUNK + 2)  // one extra sample at either end: echoes lie between samples
 
@@ -71,11 +76,9 @@ inline void add_echo(float4 *sum, int bin, float between, float right, float str
 }
 
 // The label of a scatterer at fraction (fx, fy, fz) of the cell of voxels at `corner`, which contains a border or the
-// membrane, and its gain; `random` are random bits of the scatterer. A scatterer of the membrane is the brighter the
-// more squarely the beam meets the sheet.
+// membrane; `random` are random bits of the scatterer. With TEXTURE, also its gain.
 inline int drawn_label(__constant const Acquisition *acquisition, __global const ushort *corner,
-                       __global const uint *texture, const Piece *piece, float fx, float fy, float fz, uint random,
-                       float *gain) {
+                       __global const uint *texture, float fx, float fy, float fz, uint random, float *gain) {
   const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
   // Partial volume without blending: the scatterer takes the label of one corner, drawn with that corner's trilinear
   // weight. The border is soft on average and fixed in the patient.
@@ -89,25 +92,37 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
   if ((hash_mix(random) & 255u) < ((known >> 8) & 255u)) label = known & LABEL_MASK;
 #endif
   if (corner[0] & NO_MEMBRANE) return label;
-  // Fluid distance and its gradient, from lines of two voxels along i: first those of the near plane, then of the far.
+  const float near_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
+                             blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
+  corner += nxy;
+  const float far_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
+                            blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
+  if (fabs(blend(near_z, far_z, fz) - 127.5f) >= acquisition->membrane_reach) return label;
+  *gain = 1.0f;
+  return MEMBRANE_LABEL;
+}
+
+// A scatterer of the membrane is the brighter the more squarely the beam meets the sheet, whose normal is the gradient
+// of the fluid distance: from lines of two voxels along i, first those of the near plane, then of the far.
+inline float gain_on_membrane(__constant const Acquisition *acquisition, __global const ushort *corner,
+                              const Piece *piece, float fx, float fy, float fz) {
+  const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
   const float4 from = (float4)(corner[0] >> 8, corner[nx] >> 8, corner[nxy] >> 8, corner[nxy + nx] >> 8);
   const float4 to = (float4)(corner[1] >> 8, corner[nx + 1] >> 8, corner[nxy + 1] >> 8, corner[nxy + nx + 1] >> 8);
   const float4 lines = from + fx * (to - from), rise = to - from;
-  const float near_z = blend(lines.x, lines.y, fy), far_z = blend(lines.z, lines.w, fy);
-  if (fabs(blend(near_z, far_z, fz) - 127.5f) >= acquisition->membrane_reach) return label;
   const float gx = blend(blend(rise.x, rise.y, fy), blend(rise.z, rise.w, fy), fz);
-  const float gy = blend(lines.y - lines.x, lines.w - lines.z, fz), gz = far_z - near_z;
+  const float gy = blend(lines.y - lines.x, lines.w - lines.z, fz);
+  const float gz = blend(lines.z, lines.w, fy) - blend(lines.x, lines.y, fy);
   const float3 normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
   const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
-  *gain = acquisition->membrane_gain *
-          exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
-  return MEMBRANE_LABEL;
+  return acquisition->membrane_gain *
+         exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 
 // Three passes over a batch, each without unpredictable branches: vectors of all cells; labels of the scatterers that
 // contribute; their echoes, one after the other.
 inline void scatter_batch(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                          __global const uint *texture, __global const Tissue *tissues, const Piece *piece,
+                          __global const uint *texture, __global const float *sites, const Piece *piece,
                           const int *cell_u, const uint *row_key, const float *row_v, const float *row_w, int count,
                           float4 *sum VARIED_PARAMETERS) {
   const float cell = acquisition->cell_mm, grain = cell / 1024.0f;
@@ -119,7 +134,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   const uint step_u = axis_step(u);
   const float3 d = piece->direction, l = piece->lateral, e = piece->elevational;
 
-  float part_[BATCH], right_[BATCH], re_[BATCH], im_[BATCH], t0_[BATCH], fx_[BATCH], fy_[BATCH], fz_[BATCH];
+  float part_[BATCH], right_[BATCH], re_[BATCH], im_[BATCH], fx_[BATCH], fy_[BATCH], fz_[BATCH];
   int bin_[BATCH], voxel_[BATCH];
   uint random_[BATCH];
   ushort chosen[BATCH + 1];
@@ -127,7 +142,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   for (int begin = 0; begin < count; begin += LANES) {
     const intn cells = LOAD_LANES(cell_u + begin);
     const uintn key = hash_mixn((LOAD_LANES(row_key + begin) + TO_UINTN(cells) * step_u) ^ acquisition->seed);
-    const uintn key1 = hash_mixn(key + 0x9E3779B9u), key2 = hash_mixn(key + 0x3C6EF372u);
+    const uintn random = hash_mixn(key + 0x3C6EF372u);  // 16 bits for its existence, one for its sign, 15 for its label
     // (The seed is not added to the index: seeds would then give the same scatterers, shifted by cells.)
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
@@ -155,6 +170,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     }
     const floatn amplitude =
         exp2_fast(clamp(piece->gain0 + t * piece->gain1 - r2, (floatn)(-100.0f), (floatn)(100.0f)));
+    const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
     turn(depth * acquisition->cycles_per_mm, &cosine, &sine);
     const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
@@ -165,10 +181,9 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     STORE_LANES(bins, bin_ + begin);
     STORE_LANES(place - bin, part_ + begin);
     STORE_LANES(right, right_ + begin);
-    STORE_LANES(amplitude * cosine, re_ + begin);
-    STORE_LANES(amplitude * -sine, im_ + begin);
-    STORE_LANES(gaussian(key1), t0_ + begin);
-    STORE_LANES(key2, random_ + begin);
+    STORE_LANES(echo * cosine, re_ + begin);
+    STORE_LANES(echo * -sine, im_ + begin);
+    STORE_LANES(random, random_ + begin);
     STORE_LANES((iz * ny + iy) * nx + ix, voxel_ + begin);
     STORE_LANES(vx - TO_FLOATN(ix), fx_ + begin);
     STORE_LANES(vy - TO_FLOATN(iy), fy_ + begin);
@@ -176,13 +191,11 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   }
 
   uchar label_[BATCH];
-  float gain_[BATCH];
   ushort mixed[BATCH + 1];
   int several = 0;
   for (int i = 0; i < n; i++) {
     const int word = voxels[voxel_[chosen[i]]];
     label_[i] = word & LABEL_MASK;
-    gain_[i] = 1.0f;
     mixed[several] = i;
 #ifdef TEXTURE
     several++;  // texture also varies within tissues
@@ -192,38 +205,38 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   }
   for (int k = 0; k < several; k++) {
     const int i = mixed[k], j = chosen[i], here = voxel_[j];
-    label_[i] =
-        drawn_label(acquisition, voxels + here, texture + here, piece, fx_[j], fy_[j], fz_[j], random_[j], gain_ + i);
+    float gain = 1.0f;
+    label_[i] = drawn_label(acquisition, voxels + here, texture + here, fx_[j], fy_[j], fz_[j], random_[j], &gain);
+#ifdef TEXTURE
+    re_[j] *= gain;
+    im_[j] *= gain;
+#endif
   }
 
   for (int i = 0; i < n; i++) {
     const int j = chosen[i], b = bin_[j], label = label_[i];
-    const float gain = gain_[i];
-#ifdef VARIED
-    if (role[label] == ROLE_SILENT) continue;
-    if (role[label] == ROLE_VARIED) {
-      const float site = ((random_[j] >> 16) + 0.5f) / 65536.0f;
-      int band = 0;
-      while (band < BANDS - 1 && site >= band_top[band]) band++;
-      float4 *part = sum + (1 + 2 * band) * PART;
-      add_echo(part, b, part_[j], right_[j], gain, re_[j], im_[j]);
-      add_echo(part + PART, b, part_[j], right_[j], gain * t0_[j], re_[j], im_[j]);
-      continue;
+    if (label == MEMBRANE_LABEL) {
+      const float gain = gain_on_membrane(acquisition, voxels + voxel_[j], piece, fx_[j], fy_[j], fz_[j]);
+      re_[j] *= gain;
+      im_[j] *= gain;
     }
+#ifdef VARIED
+    if (part_of[label] < 0) continue;
+    float4 *to = sum + part_of[label] * PART;
+#else
+    float4 *to = sum;
 #endif
-    const float p = tissues[label].scatterer_share;
-    const int exists = (random_[j] >> 16) + 0.5f < p * 65536.0f;
-    const float strength = tissues[label].mu0 * (exists - p) + tissues[label].sigma0 * t0_[j] * exists;
-    add_echo(sum, b, part_[j], right_[j], gain * strength, re_[j], im_[j]);
+    const float2 site = vload2(label, sites);
+    const float strength = (random_[j] >> 16) + 0.5f < site.x ? site.y : 0.0f;
+    add_echo(to, b, part_[j], right_[j], strength, re_[j], im_[j]);
   }
 }
 
 // The scatterers of one piece: finds the lattice cells beside it and computes them in batches. `start` is the segment's
 // start, `low` and `high` are the piece's ends along it, `radius_l` and `radius_e` how far it reaches to either side.
 inline void scatter_piece(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                          __global const uint *texture, __global const Tissue *tissues, const Piece *piece,
-                          float3 start, float low, float high, float radius_l, float radius_e,
-                          float4 *sum VARIED_PARAMETERS) {
+                          __global const uint *texture, __global const float *sites, const Piece *piece, float3 start,
+                          float low, float high, float radius_l, float radius_e, float4 *sum VARIED_PARAMETERS) {
   int cell_u[BATCH + LANES];
   uint row_key[BATCH + LANES];
   float row_v[BATCH + LANES], row_w[BATCH + LANES];
@@ -285,7 +298,7 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
           STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
           waiting += min(LANES, cells_[j] - cu);
           if (waiting >= BATCH) {
-            scatter_batch(acquisition, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, BATCH,
+            scatter_batch(acquisition, voxels, texture, sites, piece, cell_u, row_key, row_v, row_w, BATCH,
                           sum VARIED_ARGUMENTS);
             waiting -= BATCH;
             for (int i = 0; i < waiting; i++) {
@@ -299,7 +312,7 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
       }
     }
   }
-  scatter_batch(acquisition, voxels, texture, tissues, piece, cell_u, row_key, row_v, row_w, waiting,
+  scatter_batch(acquisition, voxels, texture, sites, piece, cell_u, row_key, row_v, row_w, waiting,
                 sum VARIED_ARGUMENTS);
 }
 
@@ -307,7 +320,7 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
 __attribute__((intel_vec_len_hint(1)))
 #endif
 __kernel void scatter(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                      __global const uint *texture, __global const Tissue *tissues, __global const Segment *segments,
+                      __global const uint *texture, __global const float *sites, __global const Segment *segments,
                       __global const int *segment_counts, __global float *re, __global float *im,
                       int stride VARIED_PARAMETERS) {
   int chunk = get_global_id(0), line = get_global_id(1);
@@ -355,16 +368,22 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
     piece.row_k = (float3)(m[8 + u], m[8 + v], m[8 + w]);
 
     // Widths and gains are assumed linear between the two ends of a piece, so it must be short compared with the beam's
-    // waist.
+    // waist, and end at most twice as far from the apex as it begins: lines are apart in proportion to that distance.
     const float waist = fmin(acquisition->transmit_rayleigh, acquisition->elevation_rayleigh);
     const int pieces = max(1, (int)ceil((segment_high - segment_low) / (0.4f * waist)));
-    for (int n = 0; n < pieces; n++) {
-      const float low = blend(segment_low, segment_high, (float)n / pieces);
-      const float high = blend(segment_low, segment_high, (float)(n + 1) / pieces);
-      piece.from_mm = n == 0 ? 0.0f : low;
-      piece.to_mm = n == pieces - 1 ? segment->length_mm : high;
+    const float to_apex = segment->path_mm + (acquisition->linear ? 1e6f : acquisition->apex_radius_mm);
+    float high = segment_low;
+    for (int n = 0; n < pieces;) {
+      const float low = high, next_high = blend(segment_low, segment_high, (float)(n + 1) / pieces);
+      high = fmin(next_high, low + fmax(to_apex + low, 0.2f));
+      n += high >= next_high;
+      piece.from_mm = low == segment_low ? 0.0f : low;
+      piece.to_mm = n == pieces ? segment->length_mm : high;
       const float path_low = segment->path_mm + low, path_high = segment->path_mm + high;
-      const float2 sigma_low = beam_sigma(acquisition, path_low), sigma_high = beam_sigma(acquisition, path_high);
+      const float loss_low = segment->loss + segment->loss_per_mm * low;
+      const float loss_high = segment->loss + segment->loss_per_mm * high;
+      const float2 sigma_low = sigma_after(acquisition, path_low, loss_low);
+      const float2 sigma_high = sigma_after(acquisition, path_high, loss_high);
       const float apart_low = line_distance(acquisition, path_low), apart_high = line_distance(acquisition, path_high);
       piece.low = low;
       piece.span = 1.0f / fmax(high - low, 1e-6f);
@@ -380,16 +399,19 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       // Behind a curved mirror the same power is spread over a wider tube.
       const float4 tube_low = tube_after(vload4(0, segment->tube), low);
       const float4 tube_high = tube_after(vload4(0, segment->tube), high);
-      piece.gain0 =
-          gain - decay * low + 0.5f * log2(sigma_low.x / (sigma_low.y * tube_low.x * tube_low.z)) - log2(apart_low);
-      piece.gain1 = gain - decay * high + 0.5f * log2(sigma_high.x / (sigma_high.y * tube_high.x * tube_high.z)) -
-                    log2(apart_high) - piece.gain0;
+      const float band_low = LOG2_E * gain_of_band(acquisition, loss_low);
+      const float band_high = LOG2_E * gain_of_band(acquisition, loss_high);
+      piece.gain0 = gain + band_low - decay * low + 0.5f * log2(sigma_low.x / (sigma_low.y * tube_low.x * tube_low.z)) -
+                    log2(apart_low);
+      piece.gain1 = gain + band_high - decay * high +
+                    0.5f * log2(sigma_high.x / (sigma_high.y * tube_high.x * tube_high.z)) - log2(apart_high) -
+                    piece.gain0;
 
       // Off the axis of a curved array the same range is reached slightly earlier.
       const float radius_l = 0.5f * fmax(apart_low, apart_high), early = piece.bend * radius_l * radius_l;
       const float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
       if (begin >= end) continue;
-      scatter_piece(acquisition, voxels, texture, tissues, &piece, start, begin, end, radius_l,
+      scatter_piece(acquisition, voxels, texture, sites, &piece, start, begin, end, radius_l,
                     acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum VARIED_ARGUMENTS);
     }
   }
@@ -397,10 +419,10 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
     const float4 *echoes = sum + part * PART + 1;
     const int left = 2 * (part * (int)get_global_size(1) + line) * stride + LINE_PAD + first, right = left + stride;
     for (int i = 0; i < CHUNK; i++) {
-      re[left + i] = echoes[i].x;
-      im[left + i] = echoes[i].y;
-      re[right + i] = echoes[i].z;
-      im[right + i] = echoes[i].w;
+      STORE_ECHO(re[left + i], echoes[i].x);
+      STORE_ECHO(im[left + i], echoes[i].y);
+      STORE_ECHO(re[right + i], echoes[i].z);
+      STORE_ECHO(im[right + i], echoes[i].w);
     }
   }
 }

@@ -45,9 +45,9 @@ def block(label_function, half_mm=(30, 30, 30), spacing_mm=1.0) -> Volume:
 def simulator(
     labels: Volume, *tissues: Tissue, coupling: Tissue = FLUID, membrane=None, **settings
 ) -> UltrasoundSimulator:
-    """A simulator for labels 1, 2, ... with `coupling` around them."""
+    """A simulator for labels 1, 2, ... with `coupling` around them, without the probe's own ring-down."""
     table = TissueTable({0: coupling, **dict(enumerate(tissues, 1))}, membrane)
-    return UltrasoundSimulator(labels, table, SimulationSettings(**settings))
+    return UltrasoundSimulator(labels, table, SimulationSettings(**{"ring_down": False, **settings}))
 
 
 def example(name: str):

@@ -64,10 +64,10 @@ def test_images_at_the_anchor_are_those_of_whole_simulations(layers, model):
 
 
 @settings(max_examples=12)
-@given(st.floats(0.0, 1.0), st.floats(0.0, 0.6), st.floats(0.0, 0.8), st.floats(0.02, 0.5))
-def test_mu0_and_sigma0_are_exact_far_from_the_anchor(layers, model, mu0, sigma0, other_mu0, other_sigma0):
+@given(st.floats(0.0, 1.0), st.floats(-1.0, 1.5), st.floats(0.0, 0.6), st.floats(0.0, 0.8), st.floats(0.02, 0.5))
+def test_scatterers_are_exact_far_from_the_anchor(layers, model, mu0, mu1, sigma0, other_mu0, other_sigma0):
     found, poses = layers
-    tissues = found.medium.tissues.replace("upper", mu0=mu0, sigma0=sigma0)
+    tissues = found.medium.tissues.replace("upper", mu0=mu0, mu1=mu1, sigma0=sigma0)
     tissues = tissues.replace("lower", mu0=other_mu0, sigma0=other_sigma0)
     difference = model.image(1, tissues, DISPLAY).astype(int) - whole(found, poses[1], tissues)
     assert np.abs(difference).mean() < 0.02
@@ -81,32 +81,35 @@ def test_attenuation_by_the_direct_path_is_that_of_a_whole_simulation(layers, mo
     before = whole(found, poses[0], found.medium.tissues)
     field = exact > 0
     assert np.abs(exact[field].astype(int) - before[field]).mean() > 10.0 * abs(attenuation - 0.5)
-    assert abs((image - exact)[field].mean()) < 0.3
-    assert np.abs(image - exact)[field].mean() < 1.0
+    assert abs((image - exact)[field].mean()) < 0.4
+    # The grains are those of the anchor's frequency.
+    assert np.abs(image - exact)[field].mean() < 10.0 * abs(attenuation - 0.5)
 
 
-@pytest.mark.parametrize("mu1", [-1.0, -0.4, 0.3, 0.8, 1.4])
-def test_mu1_keeps_the_level_of_a_whole_simulation(layers, model, mu1):
+def test_attenuation_without_downshift_has_the_same_grains(layers):
     found, poses = layers
-    display = replace(DISPLAY, dynamic_range_db=80.0, gain_db=20.0, noise_db=None)  # nothing is cut off
-    tissues = found.medium.tissues.replace("upper", mu1=mu1)
-    # In dB: a grey level of this display is 80 / 255 dB. The upper layer only, above y = -10 at this pose.
-    rows = slice(20, 120)
-    ours = model.image(0, tissues, display)[rows].astype(float).mean() * 80 / 255
-    exact = whole(found, poses[0], tissues, display)[rows].astype(float).mean() * 80 / 255
-    # The variance is the same; the log of sparse speckle (8 % of the sites at mu1 = 1.4) is a little lower.
-    assert ours == pytest.approx(exact, abs=0.8 if mu1 > 1 else 0.4)
+    before = found.settings
+    try:
+        found.settings = replace(before, frequency_downshift=False)
+        model = AppearanceModel(found, PROBE, poses[:1], VARIED)
+        for attenuation in (0.2, 1.0):
+            tissues = found.medium.tissues.replace("upper", attenuation_db_cm_mhz=attenuation)
+            exact = whole(found, poses[0], tissues)
+            off = (model.image(0, tissues, DISPLAY).astype(int) - exact)[exact > 0]
+            assert abs(off.mean()) < 0.3 and np.abs(off).mean() < 1.0
+    finally:
+        found.settings = before
 
 
 def test_moving_the_anchor_makes_the_model_exact_there(layers):
     found, poses = layers
     model = AppearanceModel(found, PROBE, poses[:1], VARIED)
-    tissues = found.medium.tissues.replace("upper", mu1=0.9, attenuation_db_cm_mhz=0.9)
+    tissues = found.medium.tissues.replace("upper", mu1=0.9, attenuation_db_cm_mhz=1.5)
     before = found.medium.tissues
     exact = whole(found, poses[0], tissues)
     off = np.abs(model.image(0, tissues, DISPLAY).astype(int) - exact).mean()
     model.anchor(tissues)
-    assert off > 1.0 and np.abs(model.image(0, tissues, DISPLAY).astype(int) - exact).max() <= 1
+    assert off > 0.2 and np.abs(model.image(0, tissues, DISPLAY).astype(int) - exact).max() <= 1
     assert found.medium.tissues is before
 
 
@@ -136,7 +139,8 @@ def test_one_tissue_on_two_labels_is_varied_on_both():
     model = AppearanceModel(found, PROBE, [at(-15.0)], {"upper": ("mu0", "attenuation_db_cm_mhz")})
     tissues = found.medium.tissues.with_tissue(replace(UPPER, mu0=0.9, attenuation_db_cm_mhz=0.3))
     exact = whole(found, at(-15.0), tissues)
-    assert np.abs(model.image(0, tissues, DISPLAY).astype(int) - exact)[exact > 0].mean() < 0.5
+    off = (model.image(0, tissues, DISPLAY).astype(int) - exact)[exact > 0]
+    assert abs(off.mean()) < 0.4 and np.abs(off).mean() < 3.0  # with the grains of the anchor's frequency
 
 
 def test_pixels_of_another_grid_are_the_same_image(layers):
@@ -172,5 +176,5 @@ def test_every_tissue_parameter_with_bounds_of_a_fit_has_an_effect_and_others_ar
 
 
 def test_more_images_than_memory_holds_are_refused(layers):
-    with pytest.raises(SimulationError, match=r"2000 images with 11 parts each need [\d.]+ GB, expected at most 4"):
-        AppearanceModel(layers[0], PROBE, layers[1] * 1000, VARIED)
+    with pytest.raises(SimulationError, match=r"8000 images with 3 parts each need [\d.]+ GB, expected at most 4"):
+        AppearanceModel(layers[0], PROBE, layers[1] * 4000, VARIED)

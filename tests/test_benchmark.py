@@ -13,7 +13,7 @@ from scipy.integrate import trapezoid
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import ConvexProbe, SimulationError
-from SlicerUSSim.Logic.imaging.scattering import scatterer_counts
+from SlicerUSSim.Logic.imaging.scattering import scatterer_counts, sites_per_mm3
 from SlicerUSSim.Logic.imaging.stage import Work
 from SlicerUSSim.Logic.opencl.devices import choose_device
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -25,7 +25,17 @@ from SlicerUSSim.Logic.verification.benchmark.tables import comparison
 from SlicerUSSim.Logic.verification.benchmark.work import frame_work
 from tests.conftest import SPECKLE, block, rigid, simulator
 
-STAGES = {"aperture", "ray tree", "scatterers", "interfaces", "beam", "pulse", "B-mode", "scan conversion"}
+STAGES = {
+    "aperture",
+    "ray tree",
+    "scatterers",
+    "interfaces",
+    "beam",
+    "side lobes",
+    "pulse",
+    "B-mode",
+    "scan conversion",
+}
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +57,8 @@ def test_a_machine_is_measured_within_what_machines_can_do(solid):
 
 def test_the_work_of_a_frame_grows_with_its_depth(solid):
     pose = rigid(np.eye(3), [0, -20, 0])
-    probe, deeper = (ConvexProbe(30, 50, depth, scan_lines=64) for depth in (20.0, 40.0))
+    foci = {"focus_mm": 15.0, "elevation_focus_mm": 15.0}
+    probe, deeper = (ConvexProbe(30, 50, depth, scan_lines=64, **foci) for depth in (20.0, 40.0))
     work, more = (frame_work(solid, p, pose, ImageGrid.for_probe(p, None)) for p in (probe, deeper))
     assert set(work) == STAGES
     for stage in STAGES - {"interfaces", "scan conversion"}:  # nothing reflects; an image has as many rows
@@ -64,7 +75,7 @@ def test_scatterers_are_counted_by_the_volume_of_the_beam(solid):
     depth = np.linspace(0, 30, 1001)
     height = 2 * solid.settings.beam_cutoff * probe.beam_sigma_mm(depth)[1]
     width = np.deg2rad(50) * (30 + depth) * 64 / 63  # half a strip beyond either edge
-    expected = solid.settings.scatterers_per_mm3 * trapezoid(width * height, depth)
+    expected = sites_per_mm3(solid.settings, probe) * trapezoid(width * height, depth)
     assert found == pytest.approx(expected, rel=0.02)
     assert 1.2 * found < looked_at < 6 * found
 

@@ -27,7 +27,7 @@ from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain, left
 from SlicerUSSim.Logic.mri.coarse import CoarseImage
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
-from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_ultrasound
+from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_symmetric, is_ultrasound
 from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
@@ -158,8 +158,20 @@ def phantom(shape):
 @needs_nilearn
 @pytest.mark.parametrize("shape", [pytest.param("box", marks=pytest.mark.slow), "sphere"])
 def test_a_phantom_is_refused_as_one(shape):
-    with pytest.raises(SimulationError, match=r"large uniform parts, as a phantom has.*--skull-strip none"):
+    with pytest.raises(SimulationError, match=r"as a phantom (has|does).*--skull-strip none"):
         find_brain(phantom(shape))
+
+
+@needs_nilearn
+@pytest.mark.parametrize("radii", [(70, 70, 70), (75, 92, 72)])
+def test_a_phantom_of_shells_is_refused_and_not_called_a_head_of_a_wrong_size(radii):
+    grid, _ = ellipsoid((80, 96, 80))
+    places = (np.indices(grid.array.shape).T * 3.0 - np.array(grid.array.shape) * 1.5).T
+    depth = np.sqrt(sum((place / radius) ** 2 for place, radius in zip(places, radii[::-1], strict=True)))
+    values = np.select([depth < 0.4, depth < 0.7, depth < 0.9, depth < 1.0], [120.0, 80.0, 30.0, 100.0], 0.0)
+    values = values + np.random.default_rng(1).normal(0.0, 4.0, values.shape)
+    with pytest.raises(SimulationError, match=r"looks the same upside down and from the back, as a phantom does"):
+        find_brain(Volume(values.astype(np.float32), grid.ijk_to_ras))
 
 
 @needs_nilearn
@@ -170,7 +182,12 @@ def test_an_image_of_noise_is_refused_as_one():
 
 
 def test_a_head_is_no_phantom_no_ultrasound_and_is_cut_nowhere(head):
-    assert not is_phantom(CoarseImage.of(head[0])) and not is_ultrasound(head[0]) and cut_ends(head[0]) == ()
+    assert (
+        not is_phantom(CoarseImage.of(head[0]))
+        and not is_symmetric(CoarseImage.of(head[0]))
+        and not is_ultrasound(head[0])
+        and cut_ends(head[0]) == ()
+    )
     assert not is_ultrasound(head_mri(3.0))
 
 
@@ -802,7 +819,9 @@ def test_a_program_that_is_not_installed_is_said_before_the_image_is_looked_at(h
         assert find_brain(stripped, method).method == "stripped"
 
 
-def test_a_lesion_given_as_the_brain_is_said():
+@pytest.mark.parametrize("others", [False, True])
+def test_a_lesion_given_as_the_brain_is_refused(others):
+    """It was said only, and the simulation showed a lesion in water."""
     mri = head_mri(4.0)
     lesion = np.zeros(mri.array.shape, np.uint8)
     middle = tuple(n // 2 for n in lesion.shape)
@@ -810,10 +829,30 @@ def test_a_lesion_given_as_the_brain_is_said():
     half = mri.with_array((mri.array > 20).astype(np.uint8))
     half.array[..., half.array.shape[2] // 2 :] = 0
     assert any("expected" in line for line in given_brain(half, mri).warnings)
-    (warning,) = given_brain(mri.with_array(lesion), mri).warnings
-    assert "the mask has 4.1 ml, expected a brain of 1000 to 1900 ml" in warning and "--add" in warning
-    with pytest.raises(SimulationError, match=r"the mask has 4.1 ml, expected a brain .* registered to each other"):
-        segment_mri(mri, mask=mri.with_array(lesion), others={"t2": mri.with_array(255.0 - mri.array)})
+    with pytest.raises(
+        SimulationError, match=r"mask has 4.1 ml, 0.\d% of what .* \(1000 to 1900 ml.*--add tumour=FILE"
+    ):
+        volumes = {"t2": mri.with_array(255.0 - mri.array)} if others else {}
+        segment_mri(mri, mask=mri.with_array(lesion), others=volumes)
+
+
+def test_masks_of_an_infant_of_a_part_and_of_a_small_image_are_taken():
+    def of(millilitres, box_mm):
+        """A ball of so many ml in a noisy cube, without whole heads' surroundings."""
+        place = np.linalg.norm(np.indices([round(box_mm / 2)] * 3) * 2.0 - box_mm / 2, axis=0)
+        ball = (place < 10.0 * (3.0 * millilitres / (4.0 * np.pi)) ** (1 / 3)).astype(np.uint8)
+        values = np.random.default_rng(0).normal(100.0, 10.0, ball.shape).astype(np.float32)
+        mri = Volume(values, np.diag([2.0, 2.0, 2.0, 1.0]))
+        return mri, mri.with_array(ball)
+
+    for millilitres, box_mm in ((300.0, 160.0), (110.0, 160.0), (60.0, 54.0)):
+        mri, mask = of(millilitres, box_mm)
+        assert given_brain(mask, mri).volume_ml == pytest.approx(millilitres, rel=0.05)
+    mri, mask = of(60.0, 160.0)
+    with pytest.raises(SimulationError, match=r"mask has \d+ ml, 1.5% of what the image shows"):
+        given_brain(mask, mri)
+    stripped = mri.with_array(mri.array * mask.array)  # a small brain in a large empty box
+    assert given_brain(mask, stripped).volume_ml == pytest.approx(60.0, rel=0.05)
 
 
 def atrophied_vertex(spacing=1.5):

@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import (
@@ -87,6 +88,40 @@ def test_optimize_writes_result_report_preset_and_state(folder):
         "white matter.mu0=0.1:0.9",
     )  # fmt: skip
     assert "(0 evaluations)" in again.output
+
+    outputs = {"-o": "result.json", "--report": "report.html", "--save-preset": "preset.json"}
+    for option, name in outputs.items():  # edited by hand: they were replaced without a word
+        own = (folder / name).read_text()
+        edited = own.replace("gain_db", "gain_dB", 1) if name != "report.html" else own.replace("<td>", "<td>mine ", 1)
+        assert edited != own
+        (folder / name).write_text(edited)
+        refused = optimize(folder, "--evaluations", 1, option, folder / name)
+        assert refused.exit_code == 2 and f"{folder / name}: exists and is not as" in refused.stderr
+        assert (folder / name).read_text() == edited
+        (folder / name).write_text(own)
+
+
+@pytest.mark.parametrize("name", ["o.igs.mha", "o.nrrd"])
+def test_sweep_replaces_only_what_it_wrote(name, folder, tmp_path):
+    out, field = tmp_path / name, tmp_path / "field.png"
+    sweep = (
+        "sweep", folder / "labels.nii.gz", "--sequence", folder / "tracked.igs.mha", "-o", out, "--field", field,
+        "--frames", "0:2",
+    )  # fmt: skip
+    for _ in range(2):
+        result = ussim(*sweep)
+        assert result.exit_code == 0, result.output
+    again = ussim("sweep", folder / "labels.nii.gz", "--sequence", out, "-o", tmp_path / "of_it.igs.mha")
+    assert again.exit_code == 0, again.output  # the mark of its input is not that of its output
+    Image.fromarray(np.zeros((4, 4), np.uint8)).save(field)
+    result = ussim(*sweep)
+    assert result.exit_code == 2 and f"{field}: exists and is not as" in result.stderr
+    field.unlink()
+    TrackedSequence.read(folder / "tracked.igs.mha").write(out)
+    before = out.read_bytes()
+    result = ussim(*sweep)
+    assert result.exit_code == 2 and f"{out}: exists and is not as" in result.stderr
+    assert out.read_bytes() == before and not field.exists()
 
 
 def test_a_state_is_not_resumed_with_other_images_or_another_mri(folder, tmp_path):

@@ -10,7 +10,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import ConvexProbe, DisplaySettings, LinearProbe, SimulationSettings, Tissue, UltrasoundSimulator
-from SlicerUSSim.Logic.imaging.borders import gaussian_taps
+from SlicerUSSim.Logic.imaging.borders import HALVED_CUT, WIDE_CUT, gaussian_taps
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.verification.phantoms import folds, parallel_plates
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
@@ -103,14 +103,14 @@ def test_the_variances_of_the_smoothing_are_those_of_gaussians_with_the_same_cen
     frequency = np.linspace(0.0, 2.0, 4001)  # radians per voxel
     normal = np.array([1.0, 2.0, 2.0]) / 3.0
 
-    def transform(sigma: float, scale: float) -> np.ndarray:
-        taps = gaussian_taps(sigma).astype(float)
+    def transform(sigma: float, cut: float, scale: float) -> np.ndarray:
+        taps = gaussian_taps(sigma, cut).astype(float)
         at = scale * (np.arange(len(taps)) - len(taps) // 2)
         return np.prod([np.cos(np.outer(frequency, n * at)) @ taps for n in normal], axis=0)
 
-    wide = transform(CONSTANTS["WIDE_SIGMA"], 1.0)
+    wide = transform(CONSTANTS["WIDE_SIGMA"], WIDE_CUT, 1.0)
     pairs = np.prod([np.cos(0.5 * n * frequency) for n in normal], axis=0)
-    widest = wide * pairs * transform(CONSTANTS["HALVED_SIGMA"], 2.0)
+    widest = wide * pairs * transform(CONSTANTS["HALVED_SIGMA"], HALVED_CUT, 2.0)
     for found, cell, spectrum in (("WIDE_VARIANCE", 1.0, wide), ("WIDEST_VARIANCE", 4.0, widest)):
         spectrum = np.where(frequency < 1.2, spectrum, 0.0)  # beyond, the taps repeat
         density = np.trapezoid(spectrum, frequency) / np.pi

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
 from SlicerUSSim.Logic.mri import segment_mri
 from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map
 from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
+from SlicerUSSim.Logic.tissue.label_sources import is_label_file
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.schemes import schemes
@@ -63,9 +66,14 @@ def side_cm(name: str) -> float:
 
 
 def made(labels: dict[int, str], *, mirrored: bool = False, dtype=np.int16) -> Volume:
-    """A label map in which each structure is a small cube at its height and side, one behind the other."""
+    """A label map in which each structure is a small cube at its height and side, one behind the other.
+
+    Those of both sides are beside each other.
+    """
     array = np.zeros((180, 2 * len(labels) + 2, 30), dtype)
-    for place, (label, name) in enumerate(labels.items()):
+    places: dict[str, int] = {}
+    for label, name in labels.items():
+        place = places.setdefault(re.sub(r"left|right|(?<=[-_])[lr]h(?=[-_])", "", name.lower()), len(places))
         i = round(15 + side_cm(name) * (-1 if mirrored else 1))
         k = round(height_cm(name))
         array[k : k + 2, 2 * place + 1 : 2 * place + 3, i : i + 2] = label
@@ -188,6 +196,24 @@ def test_a_part_of_a_body_is_recognised_by_its_places():
     assert read_label_map(made(abdomen)).message.startswith("TotalSegmentator CT: 13 labels to ")
 
 
+def test_a_part_of_a_body_that_two_tasks_number_alike_is_called_so():
+    """The upper abdomen of an MR was called TotalSegmentator CT, whose first nine labels are the same."""
+    shared = {n: name for n, name in numbered(MR).items() if n in (1, 2, 3, 4, 5, 6, 7, 8, 9)}
+    assert read_label_map(made(shared)).message.startswith("TotalSegmentator CT or MR: 9 labels to ")
+    said = read_label_map(made(shared), mapping=LabelMapping.of("totalsegmentator-mr"))
+    assert said.message.startswith("TotalSegmentator MR: 9 labels to ")
+    lungs = {**shared, 10: "lung_left"}  # and with names in the header, nine of ten are those of CT
+    assert read_label_map(made(lungs), lungs).message.startswith("TotalSegmentator MR: 10 labels to ")
+
+
+def test_two_tissues_for_one_label_are_refused(tmp_path):
+    for texts in (["24=csf", "24=tumour"], ["Left-Lesion=csf", "left lesion=tumour"], ["24=csf", "{json}"]):
+        (tmp_path / "map.json").write_text('{"24": "tumour"}')
+        with pytest.raises(SimulationError, match=r"is csf already and cannot be tumour, too; expected one tissue"):
+            LabelMapping.of([text.format(json=tmp_path / "map.json") for text in texts])
+    assert LabelMapping.of(["24=csf", "24=CSF"]).by_label == {24: "csf"}
+
+
 def test_more_than_62_labels_are_merged_by_tissue_before_they_are_counted():
     found = read_label_map(made(numbered(CT)))
     assert len(found.relabelled) == 118 and found.labels.array.max() == len(found.names) < 20
@@ -286,9 +312,12 @@ def tumour(labels: tuple[int, int, int]) -> Volume:
 
 
 @pytest.mark.parametrize(("labels", "title"), [((1, 2, 4), "BraTS 2017 to 2022"), ((1, 2, 3), "BraTS since 2023")])
-def test_a_tumour_of_brats_is_no_patient(labels, title, tmp_path):
+@pytest.mark.parametrize("stored", [np.uint8, np.float32])
+def test_a_tumour_of_brats_is_no_patient(labels, title, stored, tmp_path):
+    """Also stored as floating point, in which 1, 2 and 3 are the numbers of CAT12's p0 as well."""
     path = tmp_path / "BraTS-GLI-00001-000-seg.nii.gz"
-    tumour(labels).write(path)
+    found = tumour(labels)
+    found.with_array(found.array.astype(stored)).write(path)
     message = refused("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
     assert f"a tumour's labels (as {title}: necrotic core, oedema, enhancing tumour; 3 labels, 67 ml)" in message
     assert f"not a patient's tissues; add it to a segmentation with --add brats={path}" in message
@@ -373,7 +402,7 @@ def test_a_mapping_goes_before_names_and_numbers_and_removes_labels():
         ("100000=csf", "label is 100000, expected a whole number from 0 to 99999"),
         ("none.json", "none.json: cannot be read"),
         ("list.json", "list.json: is a list, expected a mapping such as"),
-        ("nested.json", "expected a mapping such as"),
+        ("nested.json", "label 24 is"),
         ("broken.json", "broken.json: is not JSON"),
         ("twice.json", "twice.json: is not JSON"),
         ("table.json", "is a tissue table, give it with --tissues"),
@@ -703,6 +732,76 @@ def test_a_label_map_is_one_in_every_resolution():
     for spacing in (2.0, 4.0, 8.0):
         assert head(spacing).looks_like_labels()
     assert freesurfer(WMPARC, dtype=np.float32).looks_like_labels()
+
+
+def test_an_mri_enlarged_by_nearest_neighbours_is_an_mri(mni):
+    small = mni[0].array[::2, ::2, ::2]
+    for scale in (1, 1.37):
+        twice = np.kron(small, np.ones((2, 2, 2))) * scale
+        enlarged = Volume(twice.astype(np.uint8 if scale == 1 else np.float32), np.eye(4))
+        assert not is_label_file(Path("t1.nii.gz"), enlarged)
+    assert Volume(
+        np.kron(parcellation(mni, 150)[::3, ::3, ::3], np.ones((2, 2, 2), int)), np.eye(4)
+    ).looks_like_labels()
+
+
+@pytest.mark.parametrize("mm", [3, 5, 8])
+@pytest.mark.parametrize("regions", [0, 150])
+def test_a_parcellation_is_no_mri_in_coarse_voxels(mm, regions, mni):
+    """Cortex and white matter in random parcels, with wmparc's numbers; at 8 mm less than half of neighbours agree."""
+    labels = parcellation(mni, regions)[mm // 2 :: mm, mm // 2 :: mm, mm // 2 :: mm]
+    assert Volume(labels, np.eye(4)).looks_like_labels()
+    t1 = ndimage.gaussian_filter(mni[0].array.astype(float), mm / 2.5)[mm // 2 :: mm, mm // 2 :: mm, mm // 2 :: mm]
+    for levels in (24, 64, 128, 256, 2000):
+        assert not Volume(np.rint(t1 / t1.max() * levels).astype(np.int16), np.eye(4)).looks_like_labels()
+
+
+def parcellation(mni, regions: int) -> np.ndarray:
+    """(k, j, i) int32 labels of the MNI152's grey and white matter: lobes as in an aseg, and parcels of each."""
+    _, grey, white = mni
+    random = np.random.default_rng(0)
+    tissue = np.where(white.array > 0.5, 2, np.where(grey.array > 0.5, 3, 0))
+    labels = np.zeros(tissue.shape, np.int32)
+    for number in (2, 3):
+        where = np.argwhere(tissue == number)
+        seeds = where[random.choice(len(where), max(regions, 12), replace=False)]
+        nearest = cKDTree(seeds).query(where)[1]
+        base = 1000 * number if regions else 20 * number
+        labels[tuple(where.T)] = base + random.permutation(len(seeds))[nearest]
+    return labels
+
+
+@pytest.mark.parametrize("change", ["negative", "large", "one large", "wrapped"])
+def test_labels_out_of_range_are_refused_as_labels(change, mni, tmp_path):
+    labels = parcellation(mni, 150)[::3, ::3, ::3]
+    out = {
+        "negative": np.where(labels > 3100, -labels, labels),
+        "large": labels * 1000,
+        "one large": np.where(labels == 2001, 600_000_001, labels),
+        "wrapped": labels.astype(np.uint8).astype(np.int8),
+    }[change]
+    path = tmp_path / "labels.nii.gz"
+    Volume(out, np.diag([3.0, 3.0, 3.0, 1.0])).write(path)
+    message = refused("segment", path, "-o", tmp_path / "o.nii.gz")
+    assert "label map" in message or "expected labels, whole numbers from 0 to 99999" in message, message
+    assert not (tmp_path / "o.nii.gz").exists()
+
+
+def test_an_mri_with_negative_numbers_is_an_mri(mni):
+    t1 = mni[0]
+    for shift in (1, 40, 120, 400):
+        assert not t1.with_array(t1.array.astype(np.int16) - shift).looks_like_labels()
+    z = (t1.array - t1.array.mean()) / t1.array.std()
+    assert not t1.with_array(np.rint(z * 4).astype(np.int8)).looks_like_labels()
+
+
+@pytest.mark.parametrize("background", [-1.0, -2.0, 5.0])
+def test_an_mri_whose_background_is_a_whole_number_is_no_interpolated_label_map(background, mni):
+    t1 = mni[0]
+    inside = t1.array > 0
+    scaled = np.where(inside, t1.array / 104.3 - 1.0, background).astype(np.float32)
+    scaled[inside & (np.indices(inside.shape).sum(axis=0) % 9 == 0)] = 1.0  # clipped
+    assert not is_label_file(Path("t1.nii.gz"), t1.with_array(scaled))
 
 
 def test_a_head_of_freesurfer_is_simulated_as_float_and_whole_numbers(tmp_path):

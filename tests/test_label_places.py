@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from itertools import permutations
+from itertools import permutations, product
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic.mri import segment_mri
 from SlicerUSSim.Logic.tissue import LabelMapping, read_label_file, read_label_map
 from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file
@@ -129,6 +130,59 @@ def test_a_head_that_is_tilted_is_no_head_upside_down(structures):
 def test_a_head_whose_header_is_mirrored_is_refused_also_if_it_is_tilted(flip, words):
     for turned in ((0, 0, 0), (30, 0, 0), (-30, 0, 0), (0, 30, 0)):
         assert words in str(refusal_of(moved(whole_head(), flip=flip, turned=turned))), turned
+
+
+def body(*, flip: str = "", words: str = "{}") -> tuple[Volume, dict[int, str]]:
+    """(labels, names) of a supine body in balls of 28 mm; their places in cm (right, front, up) as in an atlas."""
+    places = {
+        "sacrum": (0, -6, -20), "vertebrae_L5": (0, -4, -14), "vertebrae_L3": (0, -3, -7), "vertebrae_L1": (0, -4, 0),
+        "vertebrae_T8": (0, -7, 16), "urinary_bladder": (0, 5, -24), "kidney_left": (-7, -3, 0), "liver": (8, 3, 6),
+        "kidney_right": (7, -3, -2), "spleen": (-10, -4, 7), "heart": (-3, 4, 14), "sternum": (0, 10, 17),
+        "autochthon_left": (-4, -9, 0), "autochthon_right": (4, -9, 0), "aorta": (-1, -1, 3),
+        "spinal_cord": (0, -9, 10),
+    }  # fmt: skip
+    at = np.indices((70, 50, 50))[::-1] * 10.0 - np.array([250.0, 250.0, 350.0])[:, None, None, None]
+    labels, names = np.zeros((70, 50, 50), np.uint8), {}
+    for label, (name, place) in enumerate(places.items(), 1):
+        centre = np.array(place, float) * 10.0
+        centre[["xyz".index(axis) for axis in flip]] *= -1
+        labels[np.linalg.norm(at - centre[:, None, None, None], axis=0) < 14.0] = label
+        names[label] = words.format(name)
+    return Volume(labels, np.diag([10.0, 10.0, 10.0, 1.0])), names
+
+
+def test_a_body_whose_header_is_mirrored_is_refused_or_said():
+    whole, names = body()
+    assert not any("side" in warning for warning in read_label_map(whole, names).warnings)
+    assert "by its header, structures lie in the wrong order: the body is upside down" in str(
+        refusal_of(*body(flip="z"))
+    )
+    assert "the body is back to front" in str(refusal_of(*body(flip="y")))
+    spaced = {label: name.replace("_", " ").title() for label, name in names.items()}
+    for mirrored in (names, spaced):
+        warnings = " ".join(read_label_map(body(flip="x")[0], mirrored).warnings)
+        assert warnings.count("labels of the left side are on the right; check the orientation in its header") == 1
+    some = {label: name for label, name in names.items() if "kidney" in name or name == "liver"}
+    part = whole.with_array(np.where(np.isin(whole.array, list(some)), whole.array, 0))
+    assert not read_label_map(part, some).warnings
+
+
+def test_a_head_with_exchanged_axes_is_refused_or_its_sides_are_said():
+    """Of the 48 orders and signs of axes only the right one passes in silence, and the one that exchanges sides."""
+    head_ = whole_head()
+    accepted = {}
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            matrix = np.eye(4)
+            matrix[:3, :3] = np.diag(signs) @ np.eye(3)[list(order)]
+            turned = Volume(head_.array, matrix @ head_.ijk_to_ras)
+            try:
+                accepted[(order, signs)] = read_label_map(turned).warnings
+            except SimulationError as error:
+                assert "in its header" in str(error)
+    right, mirrored = ((0, 1, 2), (1.0, 1.0, 1.0)), ((0, 1, 2), (-1.0, 1.0, 1.0))
+    assert right in accepted and set(accepted) <= {right, mirrored}
+    assert not accepted[right] and all("left side" in line for line in accepted.get(mirrored, ()))
 
 
 def test_one_structure_below_the_cerebrum_is_enough_for_a_head_upside_down():
@@ -300,6 +354,8 @@ def test_cat12s_partial_volume_map_is_read_as_its_nearest_tissues(tmp_path):
     p0.write(path)
     result = ussim("simulate", path, "--pose", "auto", "-o", tmp_path / "o.png")
     assert result.exit_code == 0 and "p0T1.nii: CAT12's partial volume map (p0), 3 tissues: 1 csf" in result.stderr
+    with pytest.raises(SimulationError, match="is a partial volume map of three tissues, as CAT12's p0"):
+        segment_mri(p0)
     found = read_label_file(path, p0)
     assert found.names == NAMES and np.mean(found.labels.array[::2, ::2, ::2] == labels.array) > 0.95
 

@@ -82,6 +82,24 @@ def test_the_kernels_draw_what_numpy_draws(kind, turn):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k != "phased")) for k in PROBES])
+def test_numpy_follows_beams_through_and_past_strong_tissue(kind):
+    """A plate that does not bend, stone behind it, and both beside open parts of the aperture."""
+
+    def label(x, y, z):
+        plate = np.where((y > 8) & (y < 10.5) & (x > -8) & (x < 1), 2, 1)
+        return np.where((y > 15) & (y < 16.5) & (x > 2) | (y > 18) & (y < 20) & (x > -7) & (x < -1), 3, plate)
+
+    gristle = Tissue("gristle", 1700, 2.4, 1.5, 0.4, 0.1, 0.2)
+    tissues = TissueTable({0: BRAIN, 1: BRAIN, 2: gristle, 3: STONE})
+    simulator = UltrasoundSimulator(block(label, half_mm=(22, 34, 12)), tissues)
+    pose, display = rigid(np.eye(3), [1.0, -4.0, 0.5]), DisplaySettings(image_size=(240, 200))
+    image = simulator.simulate(PROBES[kind], pose, display).image
+    difference = np.abs(image.astype(int) - NumpyModel(simulator).simulate(PROBES[kind], pose, display))
+    assert image.max() > 100
+    assert (difference <= 1).mean() > 0.97
+
+
 @pytest.mark.parametrize(
     "settings",
     [

@@ -411,7 +411,7 @@ def levels():
     """{tissue: (dB inside a 16 mm ball relative to white matter, dB behind it)} without compression of the display."""
     brain = block(lambda x, y, z: np.where(z < 0, 1, 0), half_mm=(18, 8, 62))
     lesion = ball(brain, HEIGHT_MM / 2, [0, 0, -DEPTH_MM])
-    settings = SimulationSettings(interfaces=False)
+    settings = SimulationSettings(interfaces=False, frequency_downshift=False)  # theory is of one frequency
 
     def power(labels: Volume, names) -> tuple[float, float]:
         frame = UltrasoundSimulator(labels, TissueTable.named(names), settings).simulate(

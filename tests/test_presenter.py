@@ -8,6 +8,7 @@ import sys
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
@@ -16,11 +17,11 @@ from SlicerUSSim.Logic.base.declaration import Shown, parameter  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
-from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, LinearProbe  # noqa: E402
+from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, LinearProbe  # noqa: E402
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS  # noqa: E402
 from SlicerUSSim.Widget.controls import by_widget, part_of, shown_by, usable  # noqa: E402
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS, PanelPresenter  # noqa: E402
-from SlicerUSSim.Widget.sections import panel_sections  # noqa: E402
+from SlicerUSSim.Widget.sections import CUSTOM_PROBE, panel_sections  # noqa: E402
 
 
 class PlainView:
@@ -84,6 +85,22 @@ def test_from_mri_to_live_image(presenter):
     assert after.astype(float).mean() > before.astype(float).mean() + 10
     presenter.setLive(False)
     assert not presenter.isLive()
+
+
+def test_an_output_of_others_is_kept_and_a_new_one_selected(presenter):
+    logic = presenter.logic
+    presenter.segment()
+    presenter.setValue("probe.scan_lines", 48)
+    scan = logic.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "CT")
+    write_volume(scan, head_mri(3.0))
+    logic.parameters.output = scan
+    presenter.simulate()
+    assert not presenter.view.errors and logic.parameters.output.GetName() == "Ultrasound"
+    assert "'CT' has data of others and is kept; the result is 'Ultrasound'" in presenter.notes()
+    np.testing.assert_array_equal(slicer.util.arrayFromVolume(scan), head_mri(3.0).array)
+    chosen = logic.parameters.output
+    presenter.simulate()
+    assert logic.parameters.output is chosen
 
 
 def test_every_name_in_the_list_of_sections_is_one_of_the_presenter(presenter):
@@ -155,6 +172,21 @@ def test_values_are_shown_in_the_unit_of_the_panel_and_meant_in_their_own(presen
         presenter.setValue("scene.fit_evaluations", wrong)
         assert "fit_evaluations is" in presenter.view.errors[-1] and presenter.value("scene.fit_evaluations") == 70
     assert len(presenter.view.errors) == 4
+
+
+@pytest.mark.parametrize("name", PROBES)
+def test_every_probe_preset_is_offered_by_a_readable_name(presenter, name):
+    control = by_widget(panel_sections())["probePresetComboBox"]
+    shown = name.replace("_", " ")
+    assert shown in control.choices and len(control.choices) == len(PROBES) + 1
+    assert f"{shown} {PROBES[name].frequency_mhz:g} MHz" in control.tip
+    for spelling in (shown, name):  # scripts may use the name in PROBES
+        presenter.chooseProbe(CUSTOM_PROBE)
+        presenter.logic.preset = presenter.logic.preset.changed("probe", depth_mm=77.0)
+        assert presenter.probeName() == CUSTOM_PROBE
+        presenter.chooseProbe(spelling)
+        assert presenter.logic.preset.probe == PROBES[name] and presenter.probeName() == shown
+    assert not presenter.view.errors
 
 
 @pytest.mark.parametrize(

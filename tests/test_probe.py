@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from SlicerUSSim.Logic import ConvexProbe, LinearProbe, PhasedProbe, SimulationError
-from SlicerUSSim.Logic.probe.arrays import probe_from_dict
+from SlicerUSSim.Logic import (
+    ConvexProbe,
+    DisplaySettings,
+    LinearProbe,
+    PhasedProbe,
+    Preset,
+    SimulationError,
+    SimulationSettings,
+    UltrasoundSimulator,
+)
+from SlicerUSSim.Logic.probe import tilt_sweep
+from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA, PROBES, Probe, probe_from_dict
+from SlicerUSSim.Logic.verification.measurement import correlation, depth_window
+from SlicerUSSim.Logic.verification.phantoms import uniform_speckle
+from tests.conftest import SPECKLE, block, simulator
 
+PROBES_PAGE = Path(__file__).parents[1] / "docs" / "probes.md"
 lines = st.integers(2, 300)
+each_preset = pytest.mark.parametrize("name", PROBES)
 
 
 @given(st.floats(5, 120), st.floats(10, 120), st.floats(10, 200), lines)
@@ -107,3 +126,119 @@ def test_probes_survive_json(depth, count, frequency, kind):
 def test_wrong_probe_files_say_what_is_wrong(values, message):
     with pytest.raises(SimulationError, match=message):
         probe_from_dict(values, "probe.json")
+
+
+# ---- presets ---------------------------------------------------------------------------------------------------------
+
+
+def footprint_mm(probe: Probe) -> float:
+    """Lateral size of the face: the width of the scan lines on it, or the aperture of a phased array."""
+    return float(np.ptp(probe.origins_mm()[:, 0])) or probe.aperture_mm
+
+
+def fwhm_mm(probe: Probe, depth_mm) -> np.ndarray:
+    """Two-way lateral resolution."""
+    return FWHM_PER_SIGMA * probe.beam_sigma_mm(depth_mm)[0]
+
+
+@each_preset
+def test_a_preset_is_a_probe_that_could_be_built(name):
+    probe = PROBES[name]
+    assert probe.aperture_mm <= footprint_mm(probe) + 1e-9
+    assert probe.elevation_aperture_mm <= max(footprint_mm(probe), 14.0)
+    if isinstance(probe, ConvexProbe):  # elements at the edge of the aperture still look along the line
+        assert np.degrees(np.arcsin(0.5 * probe.aperture_mm / probe.radius_mm)) < 25.0
+    for focus, size in ((probe.focus_mm, probe.aperture_mm), (probe.elevation_focus_mm, probe.elevation_aperture_mm)):
+        assert 0.2 * probe.depth_mm < focus < 0.8 * probe.depth_mm
+        assert 1.5 < focus / size < 10.0
+    low, high = (probe.frequency_mhz * (1.0 + side * probe.fractional_bandwidth / 2.0) for side in (-1, 1))
+    assert 1.5 < low < high < 20.0
+
+
+@each_preset
+def test_a_preset_has_scan_lines_finer_than_its_beam_and_penetrates_its_depth(name):
+    probe = PROBES[name]
+    depth = np.linspace(0.0, probe.depth_mm, 101)
+    assert (probe.line_distance_mm(depth) < 0.7 * fwhm_mm(probe, depth)).all()
+    assert 2.0 * 0.5 * probe.frequency_mhz * 0.1 * probe.depth_mm < 65.0  # dB, of tissue with 0.5 dB/(cm MHz)
+    # Resolution of 0.5 to 3 % of the depth: neither an image of a few blobs nor one finer than its own pixels
+    assert 0.003 < fwhm_mm(probe, probe.focus_mm) / probe.depth_mm < 0.03
+
+
+@each_preset
+def test_a_preset_resolves_at_its_focus_what_its_aperture_and_band_say(name):
+    """The speckle of the simulated image has the size of the beam: neighbours correlate as exp(-d^2 / 4 sigma^2)."""
+    probe = PROBES[name]
+    phantom = uniform_speckle(SPECKLE)
+    settings = [SimulationSettings(seed=seed) for seed in range(6)]
+    simulators = [UltrasoundSimulator(phantom.labels, phantom.tissues, chosen) for chosen in settings]
+    frames = [found.simulate(probe, phantom.probe_to_ras) for found in simulators]
+    half = 0.03 * probe.depth_mm
+    signals = [depth_window(frame, probe.focus_mm, half) for frame in frames]
+    deep = probe.focus_mm + np.linspace(-half, half, 61)  # where the beam is not equally wide
+    lateral, apart = probe.beam_sigma_mm(deep)[0], probe.line_distance_mm(deep)
+    lines = max(1, round(1.2 * float(lateral[30] / apart[30])))
+    samples = round(1.2 * probe.axial_sigma_mm / frames[0].sample_interval_mm)
+    across = np.mean([correlation(signal[:-lines], signal[lines:]) for signal in signals])
+    along = np.mean([correlation(signal[:, :-samples], signal[:, samples:]) for signal in signals])
+    assert across == pytest.approx(np.exp(-((lines * apart / lateral) ** 2) / 4.0).mean(), abs=0.05)
+    distance = samples * frames[0].sample_interval_mm / probe.axial_sigma_mm
+    assert along == pytest.approx(np.exp(-(distance**2) / 4.0), abs=0.05)
+
+
+def test_the_burr_hole_probe_fits_through_a_burr_hole():
+    probe = PROBES["burr_hole"]
+    assert np.hypot(footprint_mm(probe), probe.elevation_aperture_mm) < 14.0  # mm, of a usual perforator
+
+
+def test_a_matrix_array_is_focused_elevationally_as_laterally_at_every_depth():
+    probe = PROBES["matrix"]
+    for depth in (probe.depth_mm, 90.0):
+        seen = Preset(probe).changed("probe", depth_mm=depth).probe
+        assert seen.elevation_waist() == seen.transmit_waist()
+        sigma = seen.beam_sigma_mm(seen.focus_mm)
+        assert sigma[0] == pytest.approx(sigma[1], rel=0.01)
+
+
+def test_a_matrix_array_gives_a_volume_of_a_sphere():
+    """A black ball of 20 mm, 60 mm deep, seen by a tilt sweep: it is where it was put, and about as large each way."""
+    ball = block(lambda x, y, z: np.where(x**2 + y**2 + z**2 < 100.0, 2, 1), half_mm=(40, 40, 40))
+    found = simulator(ball, SPECKLE, replace(SPECKLE, name="ball", mu0=0.0, sigma0=0.0), coupling=SPECKLE)
+    pose = np.eye(4)
+    pose[1, 3] = -60.0
+    probe = replace(PROBES["matrix"], depth_mm=90.0, focus_mm=60.0, elevation_focus_mm=60.0)
+    volume = found.volume(probe, tilt_sweep(pose, 50.0, 26), DisplaySettings(tgc_db_cm_mhz=0.0), like=ball)
+    axis = np.arange(-40, 41)
+    place = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"))  # (z, y, x) of the voxels in mm
+    away = np.linalg.norm(place, axis=0)
+    grey = volume.array.astype(float)
+    around = grey[(away > 14) & (away < 20)].mean()
+    assert grey[away < 6].mean() < 0.1 * around
+    dark = (grey < 0.5 * around) & (away < 16)
+    np.testing.assert_allclose([along[dark].mean() for along in place], 0.0, atol=0.7)
+    z, y, x = (2.0 * along[dark].std() * np.sqrt(5.0) for along in place)  # diameters of an ellipsoid
+    assert 18.0 < y < 23.0 and 15.0 < x < 23.0 and z == pytest.approx(x, rel=0.12), (x, y, z)
+
+
+def row_of(name: str) -> str:
+    """The numbers of a preset as in the table of docs/probes.md."""
+    probe = PROBES[name]
+    low, high = (probe.frequency_mhz * (1.0 + side * probe.fractional_bandwidth / 2.0) for side in (-1, 1))
+    face = f"{footprint_mm(probe):.3g}"
+    if isinstance(probe, ConvexProbe):
+        face += f", R {probe.radius_mm:g}"
+    lens, height = probe.elevation_focus_mm, probe.elevation_aperture_mm
+    columns = (
+        f"`{name}`", probe.kind, f"{probe.frequency_mhz:g} ({low:.1f} to {high:.1f})", face, f"{probe.aperture_mm:g}",
+        f"{probe.focus_mm:g}, f/{probe.focus_mm / probe.aperture_mm:.1f}",
+        f"{height:g}", f"{lens:g}, f/{lens / height:.1f}",
+        f"{probe.depth_mm:g}",
+    )  # fmt: skip
+    return f"| {' | '.join(columns)} |"
+
+
+def test_the_page_of_the_presets_has_their_numbers_and_a_source_for_each():
+    rows = re.findall(r"^\| `.*$", PROBES_PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    numbers = [row for row in rows if row.count("|") > 3]
+    assert numbers == [row_of(name) for name in PROBES]
+    assert [re.findall("`(.*?)`", row)[0] for row in rows if row not in numbers] == list(PROBES)

@@ -28,6 +28,7 @@ from scipy.signal import hilbert
 from SlicerUSSim.Logic import LinearProbe
 from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, echo_near, full_width, level_db
+from SlicerUSSim.Logic.verification.phantoms import band_power
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
 
 pymust = pytest.importorskip("pymust", reason="PyMUST is the reference: pip install PyMUST")
@@ -203,7 +204,7 @@ def correlation_length(pairs, spacing: float) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("depth", "lateral_tolerance"), [(12.0, 0.3), (30.0, 0.15), (39.0, 0.3)])
+@pytest.mark.parametrize(("depth", "lateral_tolerance"), [(12.0, 0.3), (30.0, 0.15), (39.0, 0.35)])
 def test_focused_speckle_has_the_same_correlation_lengths(scatterers, depth, lateral_tolerance):
     """Within 15 %, axially at all depths, laterally in the focus (for the reason see the module's docstring)."""
     array = focused_probe()
@@ -237,5 +238,6 @@ def test_attenuation_lowers_the_level_of_speckle_by_as_much(scatterers):
         windows, _ = our_windows(probe(), WINDOWS_MM, attenuation)
         levels["ours"][attenuation] = np.array([level_db(np.stack(window)) for window in windows])
     fall = {name: np.diff(found[0.3] - found[0.0]) for name, found in levels.items()}
-    np.testing.assert_allclose(fall["ours"], -2 * 0.3 * 5 * np.diff(WINDOWS_MM) / 10, atol=0.1)
+    theory = 10 * np.log10(band_power(probe(), 2 * 0.3 * 5 * np.array(WINDOWS_MM) / 10))
+    np.testing.assert_allclose(fall["ours"], np.diff(theory), atol=0.1)
     np.testing.assert_allclose(fall["ours"], fall["theirs"], atol=1.0)

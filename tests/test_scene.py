@@ -212,6 +212,31 @@ def test_the_image_is_shown_from_black_to_white_whatever_is_in_it(bench):
     assert display.GetWindowLevelMax() == 180
 
 
+def test_only_nodes_that_are_empty_or_hold_results_are_replaced(bench):
+    """A CT, a surface or a recording that was chosen as the output was lost."""
+    scan = volume_node(bench.scene, cyst(), "CT")
+    before = pixels(scan)
+    for call in (bench.logic.simulate, bench.logic.startLiveUpdate):
+        with pytest.raises(SimulationError, match="output Volume 'CT' has data that this module did not make"):
+            call(bench.labels, bench.probe, scan)
+    np.testing.assert_array_equal(pixels(scan), before)
+    assert scan.GetParentTransformNode() is None and not bench.logic.isLive
+
+    surface = add(bench.scene, "Model", "skin")
+    bench.logic.showOutline(surface, bench.probe)
+    own = surface.GetPolyData()
+    skin = add(bench.scene, "Model", "skin")
+    skin.SetAndObservePolyData(own)
+    with pytest.raises(SimulationError, match="outline Model 'skin' has data that this module did not make"):
+        bench.logic.showOutline(skin, bench.probe)
+    bench.logic.showOutline(surface, bench.probe)  # its own again
+
+    recorded = sequence_of(bench.scene, [ABOVE] * 2)
+    with pytest.raises(SimulationError, match=r"sequence of images Sequence .* did not make, so it is not replaced"):
+        bench.logic.simulateSequence(bench.labels, sequence_of(bench.scene, [ABOVE] * 3), recorded)
+    assert recorded.GetNumberOfDataNodes() == 2
+
+
 def test_the_outline_is_that_of_the_field(bench):
     model = add(bench.scene, "Model", "field")
     bench.logic.showOutline(model, bench.probe)

@@ -163,6 +163,13 @@ def test_images_to_compare_lie_where_the_real_one_does(scene, found):
     pose = scene.twin.sequence().pose(1, "ImageToReference")
     pixel = np.linalg.inv(pose) @ at
     assert whole[round(pixel[1]), round(pixel[0])] == real.max()
+    scene.logic.showFit(found, scene.labels, nodes, 0)  # its own are replaced
+    mine = scene.volume("mine")
+    write_volume(mine, read_volume(nodes["real"]))
+    after = read_volume(nodes["after"]).array.copy()
+    with pytest.raises(SimulationError, match="volume for real Volume 'mine' has data that this module did not make"):
+        scene.logic.showFit(found, scene.labels, {"after": nodes["after"], "real": mine}, 1)
+    assert np.array_equal(read_volume(nodes["after"]).array, after)
     with pytest.raises(SimulationError, match="image 7 was not fitted, expected one of 0, 1, 2"):
         scene.logic.showFit(found, scene.labels, nodes, 7)
 
@@ -249,6 +256,10 @@ def test_a_registration_of_labels_that_were_moved_is_written_for_where_they_are(
     node = own.scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "registration")
     own.logic.writeRegistration(Fit(None, moved, None, [], []), own.labels, node)
     point = np.array([12.0, -7.0, 3.0, 1.0])  # in the frame of the labels
+    own.logic.writeRegistration(Fit(None, moved, None, [], []), own.labels, node)  # its own is replaced
+    with pytest.raises(SimulationError, match="registration LinearTransform 'room' has data that this module did not"):
+        own.logic.writeRegistration(Fit(None, moved, None, [], []), own.labels, room)
+    assert np.allclose(node_to_world(room), to_world)
     assert np.allclose(node_to_world(node) @ to_world @ point, to_world @ correction @ point, atol=1e-6)
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from SlicerUSSim.Logic import LinearProbe
-from SlicerUSSim.Logic.verification.measurement import correlation, level_db
+from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, level_db
 from SlicerUSSim.Logic.verification.validation import ORIENTATIONS
 from tests.conftest import SPECKLE, block, rigid, simulator
 
@@ -57,15 +58,27 @@ def test_the_same_pose_gives_the_same_bits_and_another_seed_another_patient(simu
     np.testing.assert_array_equal(once.iq, fresh.iq)
 
 
-def test_the_signal_is_linear_in_mu0_and_sigma0():
-    """The basis of docs/optimization.md#efficient-evaluation: RF(mu0, sigma0) = mu0 RF(1, 0) + sigma0 RF(0, 1)."""
+def test_the_signal_of_a_tissue_is_linear_in_the_deviation_of_its_scatterers():
+    """The basis of docs/optimization.md#efficient-evaluation, for all mu0, mu1 and sigma0 but the sparsest."""
     pose = rigid(ORIENTATIONS["oblique"], [0, -25, 0])
-    rf = {
-        (mu0, sigma0): simulator(SOLID, replace(SPECKLE, mu0=mu0, sigma0=sigma0)).simulate(LINEAR, pose).iq
-        for mu0, sigma0 in ((1.0, 0.0), (0.0, 1.0), (0.4, 0.15))
-    }
-    combined = 0.4 * rf[1.0, 0.0] + 0.15 * rf[0.0, 1.0]
-    np.testing.assert_allclose(rf[0.4, 0.15], combined, atol=1e-5 * np.abs(combined).max())
+    tissues = [
+        replace(SPECKLE, mu0=mu0, mu1=mu1, sigma0=sigma0)
+        for mu0, mu1, sigma0 in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.4, -1.0, 0.15), (0.06, 2.0, 0.31))
+    ]
+    first, *others = (
+        simulator(SOLID, tissue).simulate(LINEAR, pose).iq / np.sqrt(tissue.scatterer_variance) for tissue in tissues
+    )
+    for other in others:
+        np.testing.assert_allclose(other, first, atol=1e-5 * np.abs(first).max())
+
+
+def test_sparse_tissue_is_sparse_with_the_same_power():
+    """With mu1 = 4.5 there are 0.4 of the paper's sites per mm^3: fewer than one in a resolution cell of 0.2 mm^3."""
+    pose, sparse = rigid(ORIENTATIONS["oblique"], [0, -25, 0]), replace(SPECKLE, mu0=10.0, mu1=4.5, sigma0=80.0)
+    signal = np.stack([simulator(SOLID, sparse, seed=seed).simulate(LINEAR, pose).iq for seed in range(6)])
+    envelope = np.abs(signal)
+    assert 10 * np.log10((envelope**2).mean() / sparse.scatterer_variance) == pytest.approx(0.0, abs=1.0)
+    assert envelope.mean() / envelope.std() < 1.0  # of developed speckle 1.91
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -98,3 +111,32 @@ def test_a_scatterer_is_in_the_same_place_seen_from_the_front_and_from_the_side(
     found_line, found_sample = np.unravel_index(np.argmax(near), near.shape)
     assert abs(found_line - 3) <= 2  # 0.2 mm a line; the beam is wider
     assert abs((found_sample + int(19.6 / dz)) * dz - 20.0) < 0.25
+
+
+def test_a_pulse_loses_less_than_its_centre_frequency():
+    """(A sf)^2 / 2 nepers, for a Gaussian band: 1.6 dB after 25 dB, and its mean frequency falls by 0.65 MHz."""
+    lossy = replace(SPECKLE, attenuation_db_cm_mhz=1.0)
+    probe = LinearProbe(20, 30, scan_lines=65, focus_mm=25, elevation_focus_mm=25)
+    levels, frequencies = [], []
+    for is_on in (True, False):
+        frames = [
+            simulator(SOLID, lossy, seed=seed, frequency_downshift=is_on).simulate(probe, rigid(np.eye(3), [0, -26, 0]))
+            for seed in range(8)
+        ]
+        near = np.stack([depth_window(frame, 25.0, 1.0) for frame in frames])
+        levels.append(level_db(near))
+        turn = np.angle((near[..., 1:] * near[..., :-1].conj()).sum())
+        frequencies.append(5.0 + 5.0 * turn / (2 * np.pi * frames[0].sample_interval_mm * frames[0].cycles_per_mm))
+    assert levels[0] - levels[1] == pytest.approx(1.6, abs=0.25)
+    assert frequencies[0] - frequencies[1] == pytest.approx(-0.65, abs=0.06)
+
+
+@pytest.mark.parametrize("name", ["phased", "cardiac"])
+def test_speckle_near_the_point_where_all_lines_of_a_phased_array_begin_has_its_level(name):
+    """Formerly 11 dB above it, and 9 dB below it some millimetres deeper."""
+    probe = replace(PROBES[name], scan_lines=64)
+    pose = rigid(np.eye(3), [0, -10, 0])
+    signals = [simulator(SOLID, SPECKLE, coupling=SPECKLE, seed=s).simulate(probe, pose) for s in range(30)]
+    for depth in (1.5, 2.5, 3.5, 4.5):
+        near = np.stack([at_depth(frame.iq, frame, depth, 0.5) for frame in signals])
+        assert level_db(near) == pytest.approx(10 * np.log10(SPECKLE.scatterer_variance), abs=1.2), depth

@@ -58,6 +58,7 @@ def test_the_simulator_runs_the_stages_of_the_list_in_its_order():
         "scatterers",
         "beam",
         "interfaces",
+        "side lobes",
         "pulse",
         "B-mode",
         "scan conversion",

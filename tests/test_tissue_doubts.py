@@ -104,7 +104,7 @@ def test_grey_and_white_matter_that_noise_hides_are_said():
 def test_a_mask_says_why_it_does_not_fit():
     mri = Volume(np.random.default_rng(0).integers(0, 500, (40, 40, 40)).astype(np.int16), np.eye(4))
     inside = np.zeros((40, 40, 40), np.uint8)
-    inside[10:30, 10:30, 10:30] = 1
+    inside[5:35, 5:35, 5:35] = 1
     shifted = np.eye(4)
     shifted[0, 3] = 12.0
     with pytest.raises(SimulationError, match=r"mask lies up to 12.0 mm from the MRI's voxels"):

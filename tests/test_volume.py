@@ -8,6 +8,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.transforms import check_rigid
 
 angles = st.floats(-180, 180)
@@ -60,10 +61,11 @@ def test_minc2_is_read_as_written_by_itk(tmp_path):
     np.testing.assert_allclose(back.array, numbered(), atol=1e-3)
 
 
-def test_dicom_series_in_a_folder_is_read(tmp_path):
+def write_dicom(volume, folder):
+    """A series of one file per slice."""
     import SimpleITK as sitk
 
-    volume = Volume(numbered(), np.diag([-1.0, -1.0, 2.5, 1.0]))
+    folder.mkdir(parents=True, exist_ok=True)
     image = volume.to_sitk()
     writer = sitk.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
@@ -75,9 +77,17 @@ def test_dicom_series_in_a_folder_is_read(tmp_path):
             "0020|0032": "\\".join(map(str, position)), "0020|0037": "1\\0\\0\\0\\1\\0", "0018|0050": "2.5",
         }.items():  # fmt: skip
             sheet.SetMetaData(tag, value)
-        writer.SetFileName(str(tmp_path / f"{k}.dcm"))
+        writer.SetFileName(str(folder / f"{k}.dcm"))
         writer.Execute(sheet)
+
+
+@pytest.mark.parametrize("place", [".", "DICOM/0000"])
+def test_dicom_series_in_a_folder_is_read(place, tmp_path, caplog):
+    """Or in the folders in it, as on a CD."""
+    volume = Volume(numbered(), np.diag([-1.0, -1.0, 2.5, 1.0]))
+    write_dicom(volume, tmp_path / place)
     back = Volume.read(tmp_path)
+    assert ("those below it are read, in" in caplog.text) == (place != ".")
     np.testing.assert_array_equal(back.array, volume.array)
     np.testing.assert_allclose(back.ijk_to_ras, volume.ijk_to_ras, atol=1e-4)
 
@@ -111,6 +121,55 @@ def test_images_that_are_not_3d_are_refused(tmp_path, shape):
         Volume.read(tmp_path / "i.nrrd")
 
 
+def test_a_damaged_file_among_those_of_a_series_is_named(tmp_path):
+    write_dicom(Volume(numbered((6, 4, 5)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    whole = (tmp_path / "3.dcm").read_bytes()
+    (tmp_path / "3.dcm").write_bytes(whole[:200])
+    with pytest.raises(SimulationError, match=r"slices are missing.*; 3\.dcm cannot be read; export"):
+        Volume.read(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["image.nii", "image.nii.gz"])
+def test_a_truncated_or_damaged_nifti_file_is_refused(name, tmp_path):
+    """ITK reads the missing voxels as 0 without a word."""
+    rng = np.random.default_rng(0)
+    Volume(rng.integers(0, 1000, (40, 41, 42)).astype(np.int16), np.eye(4)).write(tmp_path / name)
+    whole = (tmp_path / name).read_bytes()
+    Volume.read(tmp_path / name)
+    for share in (0.95, 0.5):
+        (tmp_path / name).write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(SimulationError, match=rf"{name}: the file is incomplete, \d+ of 138112 bytes"):
+            Volume.read(tmp_path / name)
+    if name.endswith(".gz"):
+        middle = len(whole) // 2
+        (tmp_path / name).write_bytes(whole[:middle] + bytes([whole[middle] ^ 16]) + whole[middle + 1 :])
+        with pytest.raises(SimulationError, match=rf"{name}: .*(file|content) is damaged"):
+            Volume.read(tmp_path / name)
+
+
+def test_metaimage_with_missing_voxels_says_so(tmp_path):
+    Volume(numbered((20, 20, 20)), np.eye(4)).write(tmp_path / "image.mhd")
+    (tmp_path / "image.raw").write_bytes(b"1234")
+    with pytest.raises(SimulationError, match=r"image\.mhd: .*its voxels are missing or incomplete"):
+        Volume.read(tmp_path / "image.mhd")
+
+
+@pytest.mark.parametrize("name", ["mri.nii.gz.nii.gz", "mri.nii.nii.gz", "mri.nii.gz.nii"])
+def test_a_name_that_would_be_written_as_another_is_refused(name, tmp_path):
+    """ITK writes mri.nii.gz.nii.gz as mri.nii.gz: a patient's MRI was replaced by its labels."""
+    mri = Volume(numbered(), np.eye(4))
+    mri.write(tmp_path / "mri.nii.gz")
+    before = (tmp_path / "mri.nii.gz").read_bytes()
+    with pytest.raises(SimulationError, match="after another one"):
+        Volume(numbered() + 1, np.eye(4)).write(tmp_path / name)
+    with (
+        pytest.raises(SimulationError, match=r"would be written as mri\.nii\.gz"),
+        written_whole(tmp_path / name) as partial,
+    ):
+        partial.with_name("mri.nii.gz").write_bytes(b"labels")
+    assert (tmp_path / "mri.nii.gz").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
 def test_what_is_wrong_with_an_unreadable_image_is_said(tmp_path):
     import SimpleITK as sitk
 
@@ -140,7 +199,10 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
     (tmp_path / "bad.nii").write_text("not an image")
     with pytest.raises(SimulationError, match=r"bad\.nii: cannot be read"):
         Volume.read(tmp_path / "bad.nii")
-    with pytest.raises(SimulationError, match="has no DICOM series"):
+    with pytest.raises(SimulationError, match=r"has no DICOM series.*images of their own \(bad\.nii\): give"):
+        Volume.read(tmp_path)
+    (tmp_path / "bad.nii").unlink()
+    with pytest.raises(SimulationError, match=r"has no DICOM series, nor have the folders in it$"):
         Volume.read(tmp_path)
 
 

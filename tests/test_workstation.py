@@ -923,6 +923,7 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
         (["{head}", "--also", "t2={head}", "--also", "flair={head}"], "--also is given 2 times, expected one"),
         (["{head}", "--add", "tumuor={head}"], "no tissue is called 'tumuor', expected tumour"),
         (["{head}", "--add", "tumour={far}"], "far.nii.gz: lies "),
+        (["--labels", "{head}", "--contrast", "t2"], "head.nii.gz: is a label map, and --contrast is for an MRI"),
         (["{head}", "--map", "24=csf"], "--map is for a label map, expected --labels too"),
     ],
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from SlicerUSSim.Command.options import device_option
+from SlicerUSSim.Command.options import check_outputs, device_option
 from SlicerUSSim.Command.progress import Steps
 from SlicerUSSim.Logic.base.version import __version__
 
@@ -31,14 +31,14 @@ def bench(ctx: click.Context, json_file: Path | None, repeat: int, brief: bool, 
     The images are also compared with the numpy model and between devices; exit status 1 if they differ. Times do not
     affect the exit status.
     """
-    from SlicerUSSim.Logic.base.files import require_place, write_json
+    from SlicerUSSim.Logic.base.own_outputs import write_own_json
     from SlicerUSSim.Logic.opencl.devices import devices_to_measure
     from SlicerUSSim.Logic.verification.benchmark.suite import run_benchmark
     from SlicerUSSim.Logic.verification.benchmark.tables import table_of
 
     prints_json = str(json_file) == "-"
     if json_file and not prints_json:
-        require_place(json_file)
+        check_outputs(json_file)
     devices = devices_to_measure(device)
     steps = len(devices) * (3 if brief else 6) + 1
     with Steps(steps) as step:
@@ -46,5 +46,5 @@ def bench(ctx: click.Context, json_file: Path | None, repeat: int, brief: bool, 
     result = {"version": __version__, **result}
     click.echo(json.dumps(result, indent=2) if prints_json else table_of(result))
     if json_file and not prints_json:
-        write_json(json_file, result)
+        write_own_json(json_file, result)
     ctx.exit(1 if result["wrong"] else 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,6 +15,9 @@ from SlicerUSSim.Command.options import device_option, mask_option, parameter_op
 from SlicerUSSim.Command.progress import Steps, note
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.mri import Segmentation
 
 
 class ProbeName(click.Choice):
@@ -29,6 +33,12 @@ class ProbeName(click.Choice):
         return tuple(PROBES)
 
 
+def _tell(segmentation: Segmentation) -> None:
+    """Say how the MRI was segmented, and into what."""
+    for line in (*segmentation.notes, *segmentation.table().splitlines()):
+        note(line)
+
+
 @click.command()
 @click.option(
     "--out", type=click.Path(path_type=Path), default="ussim-demo", show_default=True, help="Folder for the results."
@@ -37,7 +47,7 @@ class ProbeName(click.Choice):
 @parameter_option(SegmentationSettings, "contrast")
 @parameter_option(SegmentationSettings, "skull_strip")
 @mask_option
-@click.option("--probe", "kind", type=ProbeName(), default="phased", show_default=True)
+@click.option("--probe", "kind", type=ProbeName(), default="phased", show_default=True, help="Preset of the probe.")
 @parameter_option(SimulationSettings, "seed")
 @also_option
 @add_option
@@ -61,12 +71,12 @@ def demo(
     note(f"MRI: {source}, {volume.size_text} voxels")
     brain = {
         "contrast": contrast, "skull_strip": skull_strip, "mask": Volume.read(mask) if mask else None,
-        "others": read_also(also), "keep_mask_at": mask_beside(mri) if mri else None,
+        "others": read_also(also, mri), "keep_mask_at": mask_beside(mri) if mri else None,
     }  # fmt: skip
     with Steps(5) as step:
         summary = run_whole_line(
             out, volume, source, PROBES[kind], settings, DisplaySettings(), device, step,
-            segmentation_options=brain, found=lambda brain: note(brain.message), additions=masks,
+            segmentation_options=brain, found=_tell, additions=masks,
         )  # fmt: skip
     times = summary["milliseconds"]
     note(f"device: {summary['device']}")

@@ -37,11 +37,23 @@ def split_also(texts: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def read_also(texts: Iterable[str]) -> dict[str, Volume]:
-    """{contrast: volume} of the values of --also."""
+def read_also(texts: Iterable[str], mri: str | None = None) -> dict[str, Volume]:
+    """{contrast: volume} of the values of --also. Raises SimulationError for the file of the first `mri` again."""
     from SlicerUSSim.Logic.base.volume import Volume  # imported here to keep --help fast
 
-    return {contrast: Volume.read(file) for contrast, file in split_also(texts).items()}
+    files = split_also(texts)
+    require_other_files(mri, files)
+    return {contrast: Volume.read(file) for contrast, file in files.items()}
+
+
+def require_other_files(mri: str | None, also: Mapping[str, str]) -> None:
+    """Raise SimulationError if two of an MRI and {contrast: file} of --also are one file."""
+    known = [] if mri is None else [("the MRI", Path(mri))]
+    for contrast, file in also.items():
+        for name, other in known:
+            is_same = Path(file).exists() and other.exists() and other.samefile(file)
+            require(not is_same, f"--also {contrast}={file}: is the file of {name} again, expected another image")
+        known.append((f"--also {contrast}", Path(file)))
 
 
 def segmented_file(
@@ -65,7 +77,7 @@ def segmented_file(
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
     from SlicerUSSim.Logic.mri.segmentation import segment_mri
 
-    others = read_also(also)
+    others = read_also(also, path)
     brain = Volume.read(mask) if mask else None
     if additions is not None:
         additions.require_addable(mri, brain, settings["skull_strip"])

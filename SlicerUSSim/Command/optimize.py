@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from SlicerUSSim.Command.options import gathered, require_no_input
+from SlicerUSSim.Command.options import check_outputs, check_places, gathered
 from SlicerUSSim.Command.patient_options import PatientOptions
 from SlicerUSSim.Command.progress import Curve, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, TrackedExamination, open_tracked
@@ -62,16 +62,16 @@ def optimize(
     save_transform: Path | None,
 ) -> None:
     """Fit display and tissue parameters to tracked real ultrasound."""
-    from SlicerUSSim.Logic.base.files import read_json, require_place, write_json
+    from SlicerUSSim.Logic.base.files import read_json, write_json
+    from SlicerUSSim.Logic.base.own_outputs import write_own_json
     from SlicerUSSim.Logic.fitting.tracked_fit import fit
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
-    from SlicerUSSim.Logic.tracked.pose_files import write_pose
 
     places = [place for place in (out, report, save_preset, save_transform, state) if place]
-    require_no_input(*places, recording.field)
+    check_outputs(out, report, save_preset, save_transform, recording.field)
+    check_places(state)  # which is read before it is written
     for place in places:
-        require_place(place)
         same = [other for other in places if other.resolve() == place.resolve()]
         require(len(same) == 1, f"{place}: given for {len(same)} outputs, expected a separate file for each")
     if save_transform:
@@ -91,12 +91,14 @@ def optimize(
             progress=curve, resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
             checkpoint=(lambda reached: write_json(state, reached)) if state else None,
         )  # fmt: skip
-    write_json(out, found.to_dict())
+    write_own_json(out, found.to_dict())
     if save_preset:
         result = found.appearance
-        Preset(found.tracked.probe, result.display, simulator.settings, result.tissues).write(save_preset)
+        preset = Preset(found.tracked.probe, result.display, simulator.settings, result.tissues)
+        write_own_json(save_preset, preset.to_dict())
     if save_transform and found.registration:
-        write_pose(save_transform, found.registration.correction @ tracked.reference_to_ras)
+        to_mri = found.registration.correction @ tracked.reference_to_ras
+        write_own_json(save_transform, {"probe_to_ras": to_mri.tolist()})
     if report:
         _write_report(report, found, tracked, patient, recording)
     _tell(found)

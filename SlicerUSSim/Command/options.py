@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter_of, parameters_of
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
 Command = Callable[..., None]
 Decorator = Callable[[Command], Command]
@@ -180,6 +182,23 @@ def _value(entry: Field, given: dict[str, Any]) -> Any:
     return {name: value for name, value in values.items() if value is not (None if name in flags else _NOT_GIVEN)}
 
 
+def given_options(*names: str) -> list[str]:
+    """Those of the running command's options with these names of parameters that the user gave, as "--mask"."""
+    context = click.get_current_context()
+    return [
+        parameter.opts[0]
+        for parameter in context.command.params
+        if parameter.name in names and context.get_parameter_source(parameter.name) is ParameterSource.COMMANDLINE
+    ]
+
+
+def require_no_mri_options(labels: str, remedy: str) -> None:
+    """Raise SimulationError if options for the segmentation of an MRI were given with the label map of this file."""
+    given = given_options("mask", "also", *(entry.name for entry in parameters_of(SegmentationSettings)))
+    verb = "is" if len(given) == 1 else "are"
+    require(not given, f"{labels}: is a label map, and {' and '.join(given)} {verb} for an MRI; {remedy}")
+
+
 def require_no_input(*outputs: Path | None) -> None:
     """Raise SimulationError if an output of the running command would replace a file that it reads.
 
@@ -198,10 +217,27 @@ def require_no_input(*outputs: Path | None) -> None:
 
 
 def check_output(out: Path, png: bool = False) -> None:
-    """Raise SimulationError before the computation if an output cannot be written, or is an input."""
-    from SlicerUSSim.Logic.base.files import require_place
+    """Raise SimulationError before the computation if an image cannot be written, or would replace an input or a file
+    that is not as this program wrote it."""
     from SlicerUSSim.Logic.base.volume import require_image_name
 
     require_image_name(out, also=(".png",) if png else ())
-    require_place(out)
-    require_no_input(out)
+    check_outputs(out)
+
+
+def check_outputs(*outputs: Path | None) -> None:
+    """As check_output, for files of any kind; None stands for an output that was not asked for."""
+    from SlicerUSSim.Logic.base.own_outputs import require_own
+
+    check_places(*outputs)
+    require_own(*outputs)
+
+
+def check_places(*outputs: Path | None) -> None:
+    """Raise SimulationError before the computation if an output cannot be written, or is an input; None as above."""
+    from SlicerUSSim.Logic.base.files import require_place
+
+    for out in outputs:
+        if out is not None:
+            require_place(out)
+    require_no_input(*outputs)

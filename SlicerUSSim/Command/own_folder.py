@@ -8,7 +8,6 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import make_folder, read_json, write_json
@@ -19,12 +18,7 @@ _FILES = "files_sha256"
 
 def require_own_results(folder: Path, names: Iterable[str], summary: str) -> None:
     """Raise SimulationError if one of these files is in the folder and is not as its `summary` says it was written."""
-    written: Any = {}
-    try:
-        if (folder / summary).exists():
-            written = read_json(folder / summary).get(_FILES, {})
-    except (SimulationError, AttributeError):  # somebody else's file of that name
-        pass
+    written = _written(folder, summary)
     for name in (*names, summary):
         path = folder / name
         is_ours = bool(written) if name == summary else path.exists() and written.get(name) == _hash_of(path)
@@ -34,19 +28,31 @@ def require_own_results(folder: Path, names: Iterable[str], summary: str) -> Non
         )
 
 
+def _written(folder: Path, summary: str) -> dict[str, str]:
+    """{file name: hash} of the files that were written to the folder before."""
+    try:
+        if (folder / summary).exists():
+            return dict(read_json(folder / summary).get(_FILES, {}))
+    except (SimulationError, AttributeError, TypeError, ValueError):  # somebody else's file of that name
+        pass
+    return {}
+
+
 @contextmanager
 def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
     """(a temporary folder for files, the summary to be filled): both are moved to `folder` if the block succeeds.
 
-    So a run that fails or is interrupted changes nothing. Raises SimulationError if the folder cannot be created.
+    So a run that fails or is interrupted changes nothing. The summary also has the hashes of what earlier runs wrote,
+    which may be more files. Raises SimulationError if the folder cannot be created.
     """
     make_folder(folder)
     content: dict = {}
     with tempfile.TemporaryDirectory(dir=folder, prefix=".results-") as name:
         partial = Path(name)
         yield partial, content
-        files = sorted(partial.iterdir())
-        write_json(partial / summary, {**content, _FILES: {file.name: _hash_of(file) for file in files}})
+        files = sorted(file for file in partial.iterdir() if file.name != summary)
+        hashes = _written(folder, summary) | {file.name: _hash_of(file) for file in files}
+        write_json(partial / summary, {**content, _FILES: hashes})
         for file in (*files, partial / summary):
             os.replace(file, folder / file.name)
 

@@ -12,7 +12,13 @@ import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.mri_options import also_option, require_no_sequence, segmented_file, split_also
-from SlicerUSSim.Command.options import declared, declared_parameters, device_option, mask_option
+from SlicerUSSim.Command.options import (
+    declared,
+    declared_parameters,
+    device_option,
+    mask_option,
+    require_no_mri_options,
+)
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Logic.base.errors import SimulationError
@@ -31,12 +37,13 @@ map_option = click.option(
     "--map", "maps", multiple=True, metavar="LABEL=TISSUE",
     help="Tissue of a label of the label map, by its number or its name: 24=csf; 0 removes a label. Or a .json file "
     'with {"24": "csf"}, a table of names (.txt, .ctbl, .tsv), or the numbering: freesurfer, totalsegmentator, '
-    "totalsegmentator-v1, totalsegmentator-mr, totalsegmentator-tissues, ussim, brats. May be repeated.",
+    "totalsegmentator-v1, totalsegmentator-mr, totalsegmentator-tissues, ussim, brats-2022, brats. May be repeated.",
 )  # fmt: skip
 
 pose_option = click.option(
     "--pose", required=True,
-    help='File with probe_to_ras (4 x 4 in JSON, 16 numbers in text, or a Slicer transform), or "auto".',
+    help='File with probe_to_ras (4 x 4 in JSON, 16 numbers in text, or a Slicer transform), or "auto": a coronal '
+    "view through a craniotomy, of what --add laid over the labels if there is something.",
 )  # fmt: skip
 
 
@@ -122,6 +129,8 @@ class Examination:
     display: DisplaySettings
     #: Whether the input was a label map, and not an MRI
     is_labels: bool
+    #: (3,) RAS mm of what --add laid over the labels; None without
+    added_ras: np.ndarray | None = None
 
 
 def open_examination(patient: PatientOptions) -> Examination:
@@ -155,10 +164,8 @@ def open_examination(patient: PatientOptions) -> Examination:
         raise SimulationError(
             f"{patient.mri_or_labels}: is an MRI, and --map is for labels; use --labels if it is none"
         )
-    if is_labels and patient.also:
-        raise SimulationError(
-            f"{patient.mri_or_labels}: is a label map, and --also is for an MRI; use --mri if it is one"
-        )
+    if is_labels:
+        require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")
     split_also(patient.also)
     changes = Changes.of(patient.changes)
     table = TissueTable.read(patient.tissues) if patient.tissues else None
@@ -169,7 +176,7 @@ def open_examination(patient: PatientOptions) -> Examination:
         )
         tissues = changes.to_tissues(added.table(tissues))
         simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device)
-        return Examination(simulator, preset.probe, preset.display, is_labels)
+        return Examination(simulator, preset.probe, preset.display, is_labels, added.centre_ras(labels))
     log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
     tissues = preset.tissues if table is None else table
     additions = Additions.read(patient.additions, (tissue.name for tissue in tissues.all_tissues()))
@@ -187,11 +194,14 @@ def open_examination(patient: PatientOptions) -> Examination:
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
     simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device, texture)
-    return Examination(simulator, preset.probe, preset.display, is_labels)
+    return Examination(simulator, preset.probe, preset.display, is_labels, added.centre_ras(segmentation.labels))
 
 
 def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination, np.ndarray]:
-    """(Examination, (4, 4) probe_to_ras) of a command's options; the pose "auto" is a view through a craniotomy."""
+    """(Examination, (4, 4) probe_to_ras) of a command's options.
+
+    The pose "auto" is a view through a craniotomy, of what --add laid over the labels if there is something.
+    """
     from SlicerUSSim.Logic.probe.placement import craniotomy_pose
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
@@ -199,7 +209,8 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
     examination = open_examination(patient)
     if given is not None:
         return examination, given
-    return examination, craniotomy_pose(examination.simulator.medium.labels, examination.probe)
+    labels = examination.simulator.medium.labels
+    return examination, craniotomy_pose(labels, examination.probe, target_ras=examination.added_ras)
 
 
 def _labelled(

@@ -10,7 +10,7 @@ import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.mri_options import also_option, read_mri, segmented_file, split_also
-from SlicerUSSim.Command.options import check_output, device_option, gathered, mask_option
+from SlicerUSSim.Command.options import check_places, device_option, gathered, mask_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
@@ -38,10 +38,12 @@ def segment(
     additions: tuple[str, ...], overwrite: bool, device: str | None,
 ) -> None:  # fmt: skip
     """Segment an MRI of a head or a brain into tissues."""
+    from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
     from SlicerUSSim.Logic.tissue.table import TissueTable
 
-    check_output(out)
+    require_image_name(out)
+    check_places(out)
     _require_no_kept_mask(out, mri)
     if not overwrite:
         require_replaceable(out)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option, split_additions
-from SlicerUSSim.Command.mri_options import also_option, split_also
-from SlicerUSSim.Command.options import device_option, mask_option, parameter_option
+from SlicerUSSim.Command.mri_options import also_option, require_other_files, split_also
+from SlicerUSSim.Command.options import device_option, mask_option, parameter_option, require_no_mri_options
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.sequence_options import (
     calibration_option,
@@ -85,6 +85,7 @@ def serve(
     others = split_also(also)
     if len(others) > 1:
         raise SimulationError(f"--also is given {len(others)} times, expected one further MRI in the workstation")
+    require_other_files(mri, others)
     files = [file for file in (mri, labels, mask, *(file for _, file in added), *others.values()) if file is not None]
     # Checked here, so that the error is reported in the terminal and not on the page.
     for file in files:
@@ -96,6 +97,8 @@ def serve(
         if labels is None:
             raise SimulationError("--map is for a label map, expected --labels too")
         LabelMapping.of(maps)
+    if labels is not None and mri is None:
+        require_no_mri_options(labels, "give an MRI, too, to segment it")
     if igtl is not None:
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
 

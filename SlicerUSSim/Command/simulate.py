@@ -19,6 +19,7 @@ from SlicerUSSim.Command.progress import note
 )
 def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
     """Simulate one B-mode image from an MRI or a label map at a given pose."""
+    from SlicerUSSim.Logic.base.own_outputs import write_own_volume
     from SlicerUSSim.Logic.imaging.figures import write_png
 
     check_output(out, png=True)
@@ -27,6 +28,6 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
     if out.suffix.lower() == ".png":
         write_png(out, frame.image)
     else:
-        frame.to_volume().write(out)
+        write_own_volume(out, frame.to_volume())
     kind = "labels" if examination.is_labels else "MRI"
     note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {kind})")

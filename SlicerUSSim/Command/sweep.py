@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from SlicerUSSim.Command.options import gathered, require_no_input
+from SlicerUSSim.Command.options import check_outputs, gathered
 from SlicerUSSim.Command.patient_options import PatientOptions
 from SlicerUSSim.Command.progress import Share, note
 from SlicerUSSim.Command.sequence_options import SequenceOptions, open_tracked
@@ -21,12 +22,12 @@ def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> Non
     """Simulate the images of a tracked sequence, at its poses and on its pixels."""
     import numpy as np
 
-    from SlicerUSSim.Logic.base.files import require_place
+    from SlicerUSSim.Logic.base.own_outputs import mark_of
+    from SlicerUSSim.Logic.base.volume import MADE_BY
     from SlicerUSSim.Logic.tracked.sequence import require_sequence_name
 
     require_sequence_name(out)
-    require_place(out)
-    require_no_input(out, recording.field)
+    check_outputs(out, recording.field)
     tracked = open_tracked(patient, recording)
     simulator, display = tracked.examination.simulator, tracked.examination.display
     real = tracked.images
@@ -37,5 +38,6 @@ def sweep(patient: PatientOptions, recording: SequenceOptions, out: Path) -> Non
             frame = simulator.simulate(real.probe, pose, display, real.grid, noise_seed=number)
             simulated[place][real.field.window] = frame.image
             progress((place + 1) / len(real.poses))
-    tracked.sequence.with_images(real.numbers, simulated).write(out)
+    sequence = tracked.sequence.with_images(real.numbers, simulated)
+    replace(sequence, fields={**sequence.fields, MADE_BY: mark_of(simulated)}).write(out)
     note(f"wrote {out} ({len(simulated)} images of {columns}x{rows})")

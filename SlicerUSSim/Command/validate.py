@@ -7,7 +7,10 @@ from pathlib import Path
 import click
 
 from SlicerUSSim.Command.options import device_option
+from SlicerUSSim.Command.own_folder import require_own_results, results_of
 from SlicerUSSim.Command.progress import Steps, note
+
+_TABLES, _SUMMARY = "report.md", "report.json"
 
 
 @click.command()
@@ -27,8 +30,12 @@ def validate(ctx: click.Context, out: Path, only: tuple[str, ...], device: str |
     """Compare the simulator with theory on phantoms, in tables and figures; exit status 1 for values out of limits."""
     from SlicerUSSim.Logic.verification.validation import chosen_checks, validate as run
 
-    with Steps(sum(len(check.orientations) for check in chosen_checks(only))) as step:
-        report = run(out, device, only, step)
+    checks = chosen_checks(only)
+    require_own_results(out, (_TABLES, *(check.picture for check in checks)), _SUMMARY)
+    count = sum(len(check.orientations) for check in checks)
+    with results_of(out, _SUMMARY) as (folder, summary), Steps(count) as step:
+        report = run(folder, device, only, step)
+        summary |= report.to_dict()
     for finding in report.failed:
         row = finding.row
         click.echo(

@@ -28,6 +28,7 @@ def volume(
     spacing: float, like: str | None,
 ) -> None:  # fmt: skip
     """Simulate a 3D ultrasound volume: a sweep of images around a pose, compounded in patient space."""
+    from SlicerUSSim.Logic.base.own_outputs import write_own_volume
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.probe.placement import slide_sweep, tilt_sweep
 
@@ -45,5 +46,5 @@ def volume(
             examination.probe, sweep(middle, extent, frames), examination.display, spacing_mm=spacing, like=grid,
             progress=lambda done: progress(done / frames),
         )  # fmt: skip
-    result.write(out)
+    write_own_volume(out, result)
     note(f"wrote {out} ({result.size_text} voxels from {frames} images)")

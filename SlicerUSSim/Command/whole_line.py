@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -19,8 +19,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.figures import draw_views, require_matplotlib, write_png
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.mri.brain import BrainMask
-from SlicerUSSim.Logic.mri.segmentation import segment_mri
+from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, slice_under_probe
@@ -47,13 +46,13 @@ def run_whole_line(
     progress: Callable[[str], None] = lambda stage: None,
     *,
     segmentation_options: Mapping[str, Any] | None = None,
-    found: Callable[[BrainMask], None] = lambda brain: None,
+    found: Callable[[Segmentation], None] = lambda segmentation: None,
     additions: Additions | None = None,
 ) -> dict:
     """Segment, place the probe, simulate, and write figures, volumes and a summary to the folder `out`.
 
-    `progress` is called with the name of every step at its start, `found` with the brain; `segmentation_options` are
-    further arguments of segment_mri. Returns the content of demo.json.
+    `progress` is called with the name of every step at its start, `found` with the segmentation and what was added;
+    `segmentation_options` are further arguments of segment_mri. Returns the content of demo.json.
     Raises SimulationError for errors that the caller can correct.
     """
     require_matplotlib()  # before the computation, not after it
@@ -68,16 +67,16 @@ def run_whole_line(
     additions.require_addable(mri, options.get("mask"), options.get("skull_strip", SegmentationSettings.skull_strip))
     with about_file(mri.name):
         segmentation = segment_mri(mri, thin_sulci=True, device=device, **options)
-    found(segmentation.brain)
     timings["segmentation"] = (perf_counter() - start) * 1e3
 
     progress("build the acoustic medium")
     start = perf_counter()
     added = additions.on(segmentation.labels, segmentation.tissue_names, has_brain_mask=True)
     labels, names = added.labels, added.tissue_names
+    found(replace(segmentation, labels=labels, tissue_names=names))
     tissues = TissueTable.brain(names)
     simulator = UltrasoundSimulator(labels, tissues, settings, device)
-    pose = craniotomy_pose(labels, probe)
+    pose = craniotomy_pose(labels, probe, target_ras=added.centre_ras(segmentation.labels))
     timings["medium"] = (perf_counter() - start) * 1e3
 
     progress("simulate")

@@ -14,7 +14,8 @@ from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.fit_nodes import COMPARED, CostPlot
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import composite_of, node_called, require_node
+from SlicerUSSim.Logic.mrml.nodes import composite_of, require_node
+from SlicerUSSim.Logic.mrml.own_results import result_called
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.sequence import frame_numbers
@@ -153,7 +154,7 @@ class FitPresenter:
             found, labels = required(self._fit, "nothing to apply, fit first")
             before = panel.logic.applyFit(found)
             if found.registration is not None:
-                transform = node_called(self._panel.logic.scene, "LinearTransform", _REGISTRATION)
+                transform = result_called(self._panel.logic.scene, "LinearTransform", _REGISTRATION)
                 panel.logic.writeRegistration(found, labels, transform)
             self._before = before
         panel.view.refresh()
@@ -193,7 +194,7 @@ class FitPresenter:
         found, labels = required(self._fit, "nothing to show, fit first")
         logic = self._panel.logic
         require_node(labels, "vtkMRMLLabelMapVolumeNode", "vtkMRMLSegmentationNode", use="label map of the fit")
-        nodes = {name: node_called(self._panel.logic.scene, "ScalarVolume", f"Fit: {name}") for name in COMPARED}
+        nodes = {name: result_called(self._panel.logic.scene, "ScalarVolume", f"Fit: {name}") for name in COMPARED}
         logic.showFit(found, labels, nodes, number)
         view = self._panel.view.sliceNode()
         if view is not None:

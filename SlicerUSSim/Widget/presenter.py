@@ -27,7 +27,7 @@ from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS, Tissue
 from SlicerUSSim.Widget.controls import SCENE, from_shown, to_shown, value_parameter
 from SlicerUSSim.Widget.fit_presenter import FitPresenter
 from SlicerUSSim.Widget.interface import PanelView
-from SlicerUSSim.Widget.sections import CUSTOM_PROBE
+from SlicerUSSim.Widget.sections import CUSTOM_PROBE, SHOWN_PROBES
 
 _BUSY = "Wait until the work under way is done"
 #: Columns of the tissue table: parameter, heading, tool tip.
@@ -98,17 +98,18 @@ class PanelPresenter:
                 self.logic.preset = preset
 
     def chooseProbe(self, name: str) -> None:
-        """Select a probe of probe.PROBES; CUSTOM_PROBE changes nothing."""
+        """Select a probe of probe.PROBES by its name there or in the panel; CUSTOM_PROBE changes nothing."""
         with self.shown():
             if name != CUSTOM_PROBE:
-                require(name in PROBES, f"no probe is called {name!r}, expected one of {', '.join(PROBES)}")
-                self.logic.preset = replace(self._preset(), probe=PROBES[name])
+                key = SHOWN_PROBES.get(name, name)
+                require(key in PROBES, f"no probe is called {name!r}, expected one of {', '.join(SHOWN_PROBES)}")
+                self.logic.preset = replace(self._preset(), probe=PROBES[key])
         self.view.refresh()
 
     def probeName(self) -> str:
-        """Name of the probe in probe.PROBES; sections.CUSTOM_PROBE if it is not one of them."""
+        """Name in the panel of the probe of probe.PROBES; sections.CUSTOM_PROBE if it is not one of them."""
         probe = self._preset().probe
-        return next((name for name, known in PROBES.items() if known == probe), CUSTOM_PROBE)
+        return next((shown for shown, name in SHOWN_PROBES.items() if PROBES[name] == probe), CUSTOM_PROBE)
 
     def loadPreset(self, path: str | os.PathLike) -> None:
         """Read the preset from a JSON file of the module or the `ussim` command."""
@@ -351,11 +352,18 @@ class PanelPresenter:
         require(parameters.labels is not None, "no label map chosen; segment the MRI first")
         if parameters.probe_transform is None:
             self._put_probe()
-        if parameters.output is None:
-            parameters.output = self._add("ScalarVolume", "Ultrasound")
-        if parameters.outline is None:
-            parameters.outline = self._add("Model", "Ultrasound outline")
+        parameters.output = self._own(parameters.output, "ScalarVolume", "Ultrasound")
+        parameters.outline = self._own(parameters.outline, "Model", "Ultrasound outline")
         return parameters
+
+    def _own(self, chosen: Any, kind: str, name: str):
+        """The chosen node, or a new one if none is chosen or it has data of others, which the notes say."""
+        if chosen is not None and self.logic.mayReplaceResult(chosen):
+            return chosen
+        node = self._add(kind, name)
+        if chosen is not None:
+            self._notes.append(f"{chosen.GetName()!r} has data of others and is kept; the result is {node.GetName()!r}")
+        return node
 
     def _put_probe(self, slice_node=None) -> None:
         """Place the probe's transform, or a new one if none is selected."""

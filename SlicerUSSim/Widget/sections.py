@@ -18,6 +18,8 @@ from SlicerUSSim.Widget.controls import SCENE, Control, Row, Section, button, no
 
 #: Option of the probe preset for a probe that is not one of PROBES.
 CUSTOM_PROBE = "custom"
+#: {option of the probe preset: name in PROBES}
+SHOWN_PROBES: dict[str, str] = {name.replace("_", " "): name for name in PROBES}
 #: Values of the probe that are adjusted while viewing the image; shown in Ultrasound.
 _CONSOLE = ("probe.depth_mm", "probe.frequency_mhz", "probe.focus_mm")
 
@@ -83,8 +85,10 @@ def _inputs() -> tuple[Row, ...]:
 def _probe() -> tuple[Row, ...]:
     return (
         Control(
-            "probePreset", "choice", "Preset", "Geometry and frequency of a typical probe",
-            choices=(CUSTOM_PROBE, *PROBES), shows="probeName", action="chooseProbe",
+            "probePreset", "choice", "Preset",
+            "Geometry and frequency of a typical probe: "
+            + ", ".join(f"{shown} {PROBES[name].frequency_mhz:g} MHz" for shown, name in SHOWN_PROBES.items()),
+            choices=(CUSTOM_PROBE, *SHOWN_PROBES), shows="probeName", action="chooseProbe",
         ),
         *values(*(name for name in _probe_values() if name not in _CONSOLE)),
         node(

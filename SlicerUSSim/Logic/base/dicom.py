@@ -14,6 +14,10 @@ _log = logging.getLogger(__name__)
 
 #: Fewer parallel images than this are a localiser
 _LEAST_IMAGES = 10
+#: Endings of files with a whole volume each
+_ONE_FILE = (".nii", ".nii.gz", ".nrrd", ".mha", ".mgz")
+#: Folders below one that is searched for images
+_MOST_FOLDERS = 1000
 #: Spacing that differs by more than this share of the median, and tilt of the stack, that ITK would silently ignore
 _UNEVEN, _TILT_DEG = 0.2, 0.5
 
@@ -29,11 +33,11 @@ class Series:
     size: str
 
     @classmethod
-    def of(cls, folder: Path, uid: str) -> Series:
-        """The series of this identifier in a folder."""
+    def of(cls, folder: Path, uid: str, recursive: bool = False) -> Series:
+        """The series of this identifier in a folder, with `recursive` also in the folders in it."""
         import SimpleITK as sitk
 
-        files = tuple(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), uid))
+        files = tuple(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), uid, False, recursive))
         header = _header(files[0])
         size = f"{_value(header, '0028|0011') or '?'}x{_value(header, '0028|0010') or '?'}"
         return cls(uid, files, _value(header, "0020|0011"), _value(header, "0008|103e"), size)
@@ -51,13 +55,26 @@ class Series:
         return all(one is not None for one in orientations) and np.allclose(*orientations, atol=1e-3)  # type: ignore
 
 
+def _other_images(folder: Path) -> str:
+    """What to give instead of a folder with images of one file each, as TotalSegmentator writes its masks."""
+    files = sorted(file.name for file in folder.iterdir() if file.name.lower().endswith(_ONE_FILE))
+    if not files:
+        return ""
+    some = ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")
+    return f"; files there are images of their own ({some}): give one, or one label map of several masks"
+
+
 def read_dicom_folder(folder: Path):
-    """The SimpleITK image of the only series of a folder that is a volume.
+    """The SimpleITK image of the only series of a folder that is a volume, or else of the folders in it.
 
     Raises SimulationError if there is none, or if several are volumes: the message lists them.
     """
     found = _series_of(folder)
-    require(bool(found), f"{folder}: has no DICOM series")
+    if not found:  # as on a CD, whose images are in folders of their own
+        found = _series_of(folder, recursive=True)
+        places = sorted({str(Path(file).parent) for series in found for file in series.files})
+        require(bool(found), f"{folder}: has no DICOM series, nor have the folders in it{_other_images(folder)}")
+        _log.warning("%s: has no DICOM images itself; those below it are read, in %s", folder, ", ".join(places[:4]))
     stacks = found if len(found) == 1 else [series for series in found if series.is_stack]
     if len(stacks) != 1:
         many = "; ".join(map(str, found[:12])) + ("; ..." if len(found) > 12 else "")
@@ -97,12 +114,18 @@ def is_dicom(file: Path) -> bool:
         return opened.read(132)[128:] == b"DICM"
 
 
-def _series_of(folder: Path) -> list[Series]:
+def _series_of(folder: Path, recursive: bool = False) -> list[Series]:
     import SimpleITK as sitk
 
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
-    uids = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
-    return sorted((Series.of(folder, uid) for uid in uids), key=lambda series: (len(series.number), series.number))
+    folders = [folder]
+    if recursive:
+        folders = [place for place in sorted(folder.rglob("*")) if place.is_dir()]
+        require(len(folders) <= _MOST_FOLDERS, f"{folder}: has {len(folders)} folders in it, give that of the series")
+    uids = {uid for place in folders for uid in sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(place))}
+    return sorted(
+        (Series.of(folder, uid, recursive) for uid in uids), key=lambda series: (len(series.number), series.number)
+    )
 
 
 def _read(series: Series, name: str):
@@ -143,7 +166,8 @@ def _check_slices(series: Series, name: str) -> None:
         at = int(wide[0])
         raise SimulationError(
             f"{name}: slices are missing or unevenly spaced at {len(wide)} place{'s' * (len(wide) > 1)}, first "
-            f"{steps[at]:.4g} mm after slice {at + 1} of {len(along)}, expected {usual:.4g} mm; export the series again"
+            f"{steps[at]:.4g} mm after slice {at + 1} of {len(along)}, expected {usual:.4g} mm"
+            f"{_not_readable(series)}; export the series again"
         )
     first, last = positions[np.argmin(positions @ normal)], positions[np.argmax(positions @ normal)]
     direction = last - first
@@ -154,6 +178,19 @@ def _check_slices(series: Series, name: str) -> None:
         f"{name}: the stack is tilted by {tilt:.1f} degrees against its slices (gantry tilt), expected a rectangular "
         "volume; resample it, for example with dcm2niix or 3D Slicer",
     )
+
+
+def _not_readable(series: Series) -> str:
+    """Names the DICOM files beside those of a series that have no readable header: "; IM12 cannot be read"."""
+    beside = sorted({Path(file).parent for file in series.files})
+    known = {Path(file) for folder in beside for other in _series_of(folder) for file in other.files}
+    bad = [
+        file.name
+        for folder in beside
+        for file in sorted(folder.iterdir())
+        if file.is_file() and file not in known and is_dicom(file)
+    ]
+    return f"; {', '.join(bad[:4])}{' and others' * (len(bad) > 4)} cannot be read" if bad else ""
 
 
 def _header(file: str) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -45,6 +46,27 @@ def require(condition: object, message: str) -> None:
         raise SimulationError(message)
 
 
+def require_kind(name: str, value: object, kind: type, hint: str = "") -> None:
+    """Raise SimulationError unless `value`, called `name` in the message, is a `kind`; `hint` is how one is made."""
+    article = "an" if kind.__name__[0] in "AEIO" else "a"
+    require(
+        isinstance(value, kind),
+        f"{name} is {_type_of(value)}, expected {article} {kind.__name__}" + (f" ({hint})" if hint else ""),
+    )
+
+
+def require_path(path: object) -> None:
+    """Raise SimulationError unless `path` is text or a path."""
+    require(
+        isinstance(path, str | os.PathLike),
+        f"the file is {_type_of(path)}, expected its name: text or a Path",
+    )
+
+
+def _type_of(value: object) -> str:
+    return "None" if value is None else f"a {type(value).__name__}"
+
+
 def require_package(module: str, distribution: str, purpose: str) -> None:
     """Raise SimulationError if `module` is missing; the message names the pip `distribution` to install."""
     if importlib.util.find_spec(module) is None:
@@ -85,10 +107,26 @@ def about_file(path: str) -> Iterator[None]:
     """Within the block the message of a SimulationError begins with the file that it is about."""
     try:
         yield
-    except Cancelled:
+    except (Cancelled, OtherFileError):
         raise
     except SimulationError as error:
         raise SimulationError(f"{path}: {error}") from error
+
+
+class OtherFileError(SimulationError):
+    """An error about another file than the one that about_file names; its message says which."""
+
+
+@contextmanager
+def about_other_file(name: str) -> Iterator[None]:
+    """Within the block a SimulationError is about another image, whose name its message has, at least in front."""
+    try:
+        yield
+    except Cancelled:
+        raise
+    except SimulationError as error:
+        message = str(error)
+        raise OtherFileError(message if name in message else f"{name}: {message}") from error
 
 
 def is_our_warning(category: type[Warning]) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_path
 
 _DEEPEST_NESTING = 16
 #: The first number in a NIfTI-2 file, its header's size: https://nifti.nimh.nih.gov/nifti-2
@@ -29,14 +29,19 @@ def require_place(path: Path) -> None:
 
 def require_own_voxels(path: Path) -> None:
     """Raise SimulationError for a new header whose file of voxels would replace that of another image."""
-    if path.suffix.lower() not in (".mhd", ".nhdr") or path.exists():
+    if path.exists():
         return
-    for suffix in (".raw", ".zraw", ".raw.gz"):
-        voxels = path.with_suffix(suffix)
+    for voxels in _files_of_voxels(path):
         require(
             not voxels.exists(),
             f"{voxels}: has the voxels of another image, and {path.name} would replace them; give another name",
         )
+
+
+def _files_of_voxels(path: Path) -> list[Path]:
+    """Names that the second file of an image with this header may have."""
+    is_header = path.suffix.lower() in (".mhd", ".nhdr")
+    return [path.with_suffix(suffix) for suffix in (".raw", ".zraw", ".raw.gz")] if is_header else []
 
 
 def make_folder(path: str | os.PathLike) -> Path:
@@ -63,7 +68,11 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
         raise SimulationError(f"{path}: cannot be written ({error.strerror})") from None
     try:
         yield Path(folder) / path.name
-        for file in sorted(Path(folder).iterdir()):  # .mhd and .nhdr have a second file
+        written = sorted(Path(folder).iterdir())
+        for file in written:  # .mhd and .nhdr have a second file
+            is_own = file.name == path.name or file.name in (voxels.name for voxels in _files_of_voxels(path))
+            require(is_own, f"{path}: would be written as {file.name}; give another name")
+        for file in written:
             file.replace(path.parent / file.name)
     except (OSError, RuntimeError) as error:
         raise SimulationError(f"{path}: cannot be written ({str(error).strip().splitlines()[-1]})") from None
@@ -79,6 +88,7 @@ def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):
     Raises SimulationError naming the file if it cannot be read, is larger than `most_bytes`, is nested deeper than any
     file of this project, or has ambiguous content: duplicate names, NaN and infinities.
     """
+    require_path(path)
     try:
         size = Path(path).stat().st_size
         require(size <= most_bytes, f"{path}: has {size} bytes, expected at most {most_bytes}")
@@ -136,6 +146,8 @@ def why_unreadable(path: Path) -> str | None:
         try:
             with gzip.open(path) as file:
                 start = file.read(4)
+                while file.read(2**20):
+                    pass
         except (OSError, EOFError, zlib.error):
             return "its compressed content is damaged"
     if _NIFTI2_HEADER in (int.from_bytes(start, "little"), int.from_bytes(start, "big")):

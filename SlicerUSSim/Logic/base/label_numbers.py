@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-#: Numbers from here on are not labels.
-_TOO_LARGE = 100_000
-#: Share of negative voxels, by positive ones, up to which they may be slips in a label map, which then is no MRI either
-_FEW_NEGATIVE = 0.05
 #: What formats, resampling and augmentation by noise leave of whole numbers
 _ROUNDING = 0.02
 #: Labels that were stored as bytes with a scale: each is one multiple of it, at most so far from a whole number
@@ -17,6 +13,12 @@ _SCALED, _BYTES = 0.25, 256
 _FEW, _EQUAL_NEIGHBOURS = 8, 0.6
 #: An MRI of few grey levels has more equal neighbours, but evenly spaced levels, and the others are the next level.
 _FEW_LEVELS, _EQUAL_NEIGHBOURS_OF_LEVELS, _NEXT_LEVEL = 32, 0.8, 0.5
+#: In coarse voxels fewer neighbours are equal, but labels are names: those that differ are far apart, 0.5 to 0.9 of two
+#: labels by chance, where intensities are near each other, 0.25 to 0.45. From so many values on, the share of equal
+#: neighbours and half of that ratio are at least so much: labels of 3 to 8 mm 0.70 to 0.90, MRIs up to 0.58.
+_MANY, _EQUAL_OR_FAR = 20, 0.65
+#: Ranges of numbers up to this wide are counted one by one, wider ones sorted
+_COUNTED = 1_000_000
 #: Voxels along each side of the part of a volume that is examined
 _EXAMINED = 128
 
@@ -26,18 +28,31 @@ def numbers_of(original: np.ndarray) -> tuple[str, bool]:
     low, high = original.min(), original.max()
     array = whole_numbers(original) if np.isfinite(low) and np.isfinite(high) else None
     if array is None:
-        found, is_labels = f"{original.dtype} numbers", False
-    else:
-        below = low < 0 and float((array < 0).sum()) > _FEW_NEGATIVE * float((array > 0).sum())
-        if low < 0 and (high < 1 or (below and low < -1)):
-            return f"negative numbers (down to {low:g})", False
-        if below:  # the background of a label map
-            array, high = array.astype(np.float64) + 1.0, float(high) + 1.0
-        array = np.maximum(array, 0)
-        values = np.flatnonzero(np.bincount(array.ravel().astype(np.int64))) if high < _TOO_LARGE else np.unique(array)
-        found = f"{len(values)} whole numbers from {values[0]:g} to {values[-1]:g}"
-        is_labels = high < _TOO_LARGE and (len(values) <= _FEW or _has_regions(array, values))
-    return found, is_labels
+        return f"{original.dtype} numbers", False
+    array = _without_repeats(array)
+    values, counts = _counted(array)
+    is_labels = (len(values) <= _FEW and low >= 0) or _has_regions(array, values, int(np.argmax(counts)))
+    if low < 0 and not is_labels:
+        return f"negative numbers (down to {low:g})", False
+    return f"{len(values)} whole numbers from {values[0]:g} to {values[-1]:g}", is_labels
+
+
+def _without_repeats(array: np.ndarray) -> np.ndarray:
+    """The array before it was enlarged twice by nearest neighbours, which makes neighbours equal also in an MRI."""
+    for axis in range(3):
+        along = np.moveaxis(array, axis, 0)
+        if len(along) % 2 == 0 and np.array_equal(along[::2], along[1::2]):
+            array = np.moveaxis(along[::2], 0, axis)
+    return array
+
+
+def _counted(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ascending values of an array of whole numbers, and how many voxels have each."""
+    low, high = int(array.min()), int(array.max())
+    if high - low > _COUNTED:
+        return np.unique(array, return_counts=True)
+    counts = np.bincount(array.ravel().astype(np.int64) - low)
+    return np.flatnonzero(counts) + low, counts[counts > 0]
 
 
 def whole_numbers(array: np.ndarray) -> np.ndarray | None:
@@ -57,9 +72,9 @@ def has_uniform_fractions(array: np.ndarray) -> bool:
     """Whether these are few values with fractions, in uniform regions: labels to which something was added or done."""
     if not np.issubdtype(array.dtype, np.floating):
         return False
-    middle = _middle(array)
-    values = np.unique(array[middle])
-    return 1 < len(values) <= _BYTES and _has_regions(array, values)
+    array = _without_repeats(array)
+    values = np.unique(array[_middle(array)])
+    return 1 < len(values) <= _BYTES and _has_regions(array, values, 0 if values[0] == 0 else None)
 
 
 def _middle(array: np.ndarray) -> tuple[slice, ...]:
@@ -74,18 +89,38 @@ def _is_scaled(array: np.ndarray, rounded: np.ndarray) -> bool:
     return len(values) <= _BYTES and len(np.unique(np.rint(values))) == len(values)
 
 
-def _has_regions(array: np.ndarray, values: np.ndarray) -> bool:
-    """Whether neighbours that are not 0 have mostly equal `values`, as in a label map; see the constants above."""
-    part = np.searchsorted(values, array[_middle(array)]) + (values[0] > 0)  # ranks; 0 is 0
-    total = equal = following = 0
-    for axis in range(3):
-        first, second = np.moveaxis(part, axis, 0)[:-1], np.moveaxis(part, axis, 0)[1:]
-        steps = np.abs(first - second)[(first > 0) & (second > 0)]
-        total += steps.size
-        equal += int(np.count_nonzero(steps == 0))
-        following += int(np.count_nonzero(steps == 1))
-    if equal < _EQUAL_NEIGHBOURS * total:
-        return False
-    spacing = np.diff(values[values > 0])
-    is_graded = len(values) <= _FEW_LEVELS and len(spacing) > 0 and spacing.max() <= 2 * spacing.min()
-    return not (is_graded and equal < _EQUAL_NEIGHBOURS_OF_LEVELS * total and following > _NEXT_LEVEL * (total - equal))
+def _has_regions(array: np.ndarray, values: np.ndarray, background: int | None) -> bool:
+    """Whether neighbours have mostly equal `values`, as in a label map; see the constants above.
+
+    Those of the background, given by its index among the values, are not counted.
+    """
+    ranks = np.searchsorted(values, array[_middle(array)])
+    inside = np.ones(ranks.shape, bool) if background is None else ranks != background
+    pairs = np.concatenate([_pairs(ranks, inside, axis) for axis in range(3)], axis=1)
+    is_equal = pairs[0] == pairs[1]
+    total, equal, unequal = len(is_equal), int(is_equal.sum()), pairs[:, ~is_equal]
+    spacing = np.diff(values if background is None else np.delete(values, background))
+    if len(values) <= _FEW_LEVELS and len(spacing) > 0 and spacing.max() <= 2 * spacing.min():  # levels of grey?
+        following = int((np.abs(unequal[0] - unequal[1]) == 1).sum())
+        few_follow = following <= _NEXT_LEVEL * (total - equal)
+        return equal >= _EQUAL_NEIGHBOURS_OF_LEVELS * total or (few_follow and equal >= _EQUAL_NEIGHBOURS * total)
+    if equal >= _EQUAL_NEIGHBOURS * total:
+        return True
+    return len(values) >= _MANY and equal / total + 0.5 * _distance(unequal, len(values)) >= _EQUAL_OR_FAR
+
+
+def _pairs(ranks: np.ndarray, inside: np.ndarray, axis: int) -> np.ndarray:
+    """(2, n) ranks of neighbours along an axis that are both inside."""
+    first, second = (np.moveaxis(each, axis, 0) for each in (ranks, inside))
+    both = second[:-1] & second[1:]
+    return np.stack([first[:-1][both], first[1:][both]])
+
+
+def _distance(pairs: np.ndarray, n_values: int) -> float:
+    """Mean distance of two unequal neighbours, in ranks among all these, by that of two which do not touch."""
+    counts = np.bincount(pairs.ravel(), minlength=n_values)
+    place = (np.cumsum(counts) - 0.5 * counts)[pairs]
+    apart = np.roll(pairs[1], pairs.shape[1] // 2)
+    differ = apart != pairs[0]
+    by_chance = np.abs(place[0] - np.roll(place[1], pairs.shape[1] // 2))[differ]
+    return float(np.abs(place[0] - place[1]).mean() / by_chance.mean()) if differ.any() else 0.0

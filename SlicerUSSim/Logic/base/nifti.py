@@ -1,10 +1,13 @@
-"""Geometry of a NIfTI file and how ITK interpreted it, for the log."""
+"""What ITK does not say of a NIfTI file: how it read the geometry, missing bytes, and voxels that are no numbers."""
 
 from __future__ import annotations
 
+import gzip
 import itertools
 import logging
+import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +17,7 @@ _log = logging.getLogger(__name__)
 
 #: Millimetres per unit and name of the lower three bits of xyzt_units (nifti1.h)
 _UNITS = {1: (1000.0, "metres"), 2: (1.0, "millimetres"), 3: (0.001, "micrometres")}
+_CHUNK = 2**18  # bytes
 #: Two orientations are different if they move a corner of the volume by more than this, millimetres.
 _SAME_MM = 0.1
 
@@ -90,6 +94,46 @@ def _distance_mm(one: np.ndarray, other: np.ndarray, size) -> float:
     return float(np.linalg.norm((corners @ (one - other).T)[:, :3], axis=1).max())
 
 
+def require_complete(path: Path) -> None:
+    """Raise SimulationError if bytes of a NIfTI file are missing or damaged: ITK reads the missing voxels as 0.
+
+    Files of other formats pass.
+    """
+    import nibabel
+
+    try:
+        image = nibabel.load(path)
+    except Exception:  # whatever nibabel cannot read and ITK can is no ordinary NIfTI file
+        return
+    if not isinstance(image, nibabel.Nifti1Pair):  # type: ignore[attr-defined]
+        return
+    stored: Any = image.dataobj
+    file = Path(image.file_map["image"].filename or path)
+    expected = int(stored.offset) + int(np.prod(stored.shape)) * stored.dtype.itemsize
+    found, is_damaged = _bytes_of(file)
+    require(
+        found >= expected and not is_damaged,
+        f"{file}: the file is {'damaged' if is_damaged else 'incomplete'}, {found} of {expected} bytes"
+        f"{' of its content' if file.suffix == '.gz' else ''} can be read; copy or export it again",
+    )
+
+
+def _bytes_of(file: Path) -> tuple[int, bool]:
+    """The bytes of a file, decompressed if it is compressed, and whether they are not those that were compressed."""
+    if file.suffix != ".gz":
+        return file.stat().st_size, False
+    count = 0
+    try:
+        with gzip.open(file) as content:
+            while chunk := content.read1(_CHUNK):
+                count += len(chunk)
+    except EOFError:
+        return count, False
+    except (OSError, zlib.error):  # a checksum that differs, or codes that do not exist
+        return count, True
+    return count, False
+
+
 def check_numbers(path: Path, image) -> None:
     """Look for voxels of a NIfTI file that are not numbers: ITK reads them as 0 without a word.
 
@@ -126,7 +170,7 @@ def check_numbers(path: Path, image) -> None:
         gaps = first + np.flatnonzero(is_gap[first:last])
         if gaps.size:
             raise SimulationError(
-                f"{path}: {gaps.size} slices are NaN between slices with values, the first at {name} = {gaps[0]}; "
-                "expected numbers, or NaN around the head alone"
+                f"{path}: {gaps.size} slice{'s are' if gaps.size > 1 else ' is'} NaN between slices with values, the "
+                f"first at {name} = {gaps[0]}; expected numbers, or NaN around the head alone"
             )
     _log.warning("%s: %d of %d voxels, at the border of the volume, are NaN: they are read as 0", path, count, bad.size)

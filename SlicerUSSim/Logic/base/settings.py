@@ -51,15 +51,29 @@ class SimulationSettings(Declared):
         "wide as its aperture, hardly notices: black radial streaks",
         source="ray is the paper's",
     )  # fmt: skip
+    frequency_downshift: bool = parameter(
+        True, "Frequency downshift",
+        "Attenuation takes more of the high frequencies of a pulse: its centre falls with depth, and the beam widens",
+        shown=True, source="Off in the paper",
+    )  # fmt: skip
     reflections: bool = parameter(
         True, "Reflected rays", "Simulate mirror images and reverberation by following reflected rays", shown=True
     )
     scattering: bool = parameter(True, "Speckle", "Echoes of scatterers within tissues", shown=True)
     interfaces: bool = parameter(True, "Interfaces", "Echoes of interfaces between tissues", shown=True)
-    scatterers_per_mm3: float = parameter(
-        42.0, "Scatterers", "Sites of the scatterer lattice per cubic millimetre", unit="1/mm³", bounds=(0.1, 200_000),
-        note="42 means cells of 0.29 mm. At the tightest focus of a 5 MHz probe, ten fill the resolution cell and the "
-        "envelope's ratio of mean to standard deviation is 1.87 instead of 1.91; 100 gives 1.90 in twice the time",
+    side_lobes: bool = parameter(
+        True, "Side lobes", "Echoes from beside the beam, which fill cysts and shadows", shown=True,
+        note="Their level and width follow from the probe's apertures and apodisation",
+    )  # fmt: skip
+    ring_down: bool = parameter(
+        True, "Ring-down", "Reverberation between the probe's face and the skin, as the probe has it", shown=True
+    )
+    scatterers_per_mm3: float | None = parameter(
+        None, "Scatterers",
+        "Sites of the scatterer lattice per cubic millimetre; none: eight in the probe's smallest resolution cell",
+        unit="1/mm³", bounds=(0.1, 200_000), can_be_none=True,
+        note="Eight are enough for developed speckle, and there are at least 4 per mm³; the lattice is fixed in the "
+        "patient for a given probe",
         source="The paper's Rayleigh test uses cells of 20 µm (125000/mm³), of which mu1 keeps 1 %",
     )  # fmt: skip
     partial_volume: bool = parameter(

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import require_own_voxels, why_unreadable, written_whole
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
-from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry
+from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry, require_complete
 from SlicerUSSim.Logic.base.segments import flattened, segments_of
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
 
@@ -23,6 +23,8 @@ _log = logging.getLogger(__name__)
 #: A smaller or larger side of a volume indicates a wrong unit.
 SMALLEST_MM, LARGEST_MM = 5.0, 2500.0
 WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc", ".vti")
+#: Entry of a header for the origin of an image
+MADE_BY = "ussim_made_by"
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +115,7 @@ class Volume:
 
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
+        require_path(path)
         path = Path(path)
         require(path.exists(), f"{path}: no such file or folder")
         if path.suffix.lower() == ".vti":
@@ -171,9 +174,10 @@ class Volume:
         image.SetDirection(direction.ravel().tolist())
         return image
 
-    def write(self, path: str | os.PathLike) -> None:
+    def write(self, path: str | os.PathLike, made_by: str | None = None) -> None:
         """Write the volume in the format of the suffix; on failure an existing file is kept.
 
+        `made_by` is a text about its origin, up to 79 characters, for the file's header (MINC has no place for it).
         Raises SimulationError for an unknown suffix or if the file cannot be written.
         """
         path = Path(path)
@@ -181,11 +185,15 @@ class Volume:
         require_own_voxels(path)
         with written_whole(path) as partial:
             if path.suffix.lower() == ".vti":
-                self._write_vti(partial)
+                self._write_vti(partial, made_by)
             else:
                 import SimpleITK as sitk
 
-                sitk.WriteImage(self.to_sitk(), str(partial), useCompression=not path.name.lower().endswith(".mhd"))
+                image = self.to_sitk()
+                if made_by is not None:
+                    is_nifti = path.name.lower().endswith((".nii", ".nii.gz"))
+                    image.SetMetaData("ITK_FileNotes" if is_nifti else MADE_BY, made_by)
+                sitk.WriteImage(image, str(partial), useCompression=not path.name.lower().endswith(".mhd"))
 
     # ---- VTK ---------------------------------------------------------------------------------------------------
 
@@ -245,12 +253,19 @@ class Volume:
         reader.Update()
         return cls.from_vtk(reader.GetOutput())
 
-    def _write_vti(self, path: Path) -> None:
+    def _write_vti(self, path: Path, made_by: str | None) -> None:
+        from vtkmodules.vtkCommonCore import vtkStringArray
         from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
+        image = self.to_vtk()
+        if made_by is not None:
+            text = vtkStringArray()
+            text.SetName(MADE_BY)
+            text.InsertNextValue(made_by)
+            image.GetFieldData().AddArray(text)
         writer = vtkXMLImageDataWriter()
         writer.SetFileName(str(path))
-        writer.SetInputData(self.to_vtk())
+        writer.SetInputData(image)
         require(writer.Write() == 1, f"{path}: cannot be written")
 
 
@@ -284,6 +299,8 @@ def require_image_name(path: Path, also: tuple[str, ...] = ()) -> None:
     )
     nifti = next((suffix for suffix in (".nii.gz", ".nii") if path.name.lower().endswith(suffix)), "")
     require(path.name.endswith(nifti), f"{path}: expected {nifti} in small letters; others cannot be written")
+    twice = nifti and path.name[: -len(nifti)].lower().endswith((".nii", ".nii.gz"))
+    require(not twice, f"{path}: has the ending {nifti} after another one; ITK would write a file of another name")
 
 
 def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
@@ -311,7 +328,10 @@ def read_itk_image(path: Path):
         image = sitk.ReadImage(str(path))
     except RuntimeError as error:
         reason = why_unreadable(path) or str(error).strip().splitlines()[-1]
+        if "No such file" in reason and path.exists():  # ITK's words for voxels that it could not read
+            reason = "its voxels are missing or incomplete; copy or export it again"
         raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
+    require_complete(path)
     is_complex = "complex" in image.GetPixelIDTypeAsString()
     require(not is_complex, f"{path}: holds complex numbers, expected real ones; save its magnitude")
     return image

@@ -1,13 +1,13 @@
 """AppearanceModel: images at fixed poses as a function of the parameters that an optimiser varies.
 
 Constant parts are computed once (docs/optimization.md#efficient-evaluation). The ray tree depends on none of these
-parameters. The echoes of a tissue are linear in mu0 and sigma0, so a few baseband images, its *bases*, represent them
-for all values:
+parameters. The echoes of a tissue are linear in the amplitude of its scatterers, so one baseband image, its *basis*,
+represents them for all values of mu0, mu1 and sigma0:
 
-    iq = [ base + sum over varied tissues (mu0 M + sigma0 S) ] exp(-sum over tissues (alpha - alpha_0) path)
+    iq = [ base + sum over varied tissues sqrt(Var) B ] exp(-sum over tissues (alpha - alpha_0) path)
 
-- M and S for another mu1 are sums over bands of T1, since scatterers exist where T1 >= mu1. A band that mu1 divides is
-  weighted so that the variance p (1 - p) mu0^2 + p sigma0^2, the only quantity visible in developed speckle, is exact.
+- B has the scatterers that the anchor's mu1 has. As long as sites without any are rare, as for every mu1 that a fit
+  tries, this is exact; sparser tissue is as sparse as at the anchor.
 - Another attenuation changes the amplitude of each sample by the loss along the direct path. This is an approximation
   where the beam covers the edge of a shadow, and for echoes of reflected rays. At the anchor alpha_0 the model is
   exact; `anchor` changes it.
@@ -39,7 +39,6 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.table import TissueTable
-from SlicerUSSim.Logic.tissue.tissue import Tissue
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
@@ -49,7 +48,6 @@ _log = logging.getLogger(__name__)
 _ATTENUATION = "attenuation_db_cm_mhz"
 #: Tissue parameters whose effect on an image the bases and paths have
 VARIABLE = SCATTERING | {_ATTENUATION}
-_BANDS = CONSTANTS["BANDS"]
 #: Limit for the memory of bases and paths of all images.
 _MOST_BYTES = 4 * 2**30
 #: Attenuation over the image depth for measuring path lengths: large compared to the tracer's tolerance, small compared
@@ -95,13 +93,12 @@ class AppearanceModel:
         self._check_memory()
         device = self.device
         mixing = device.kernels("appearance.cl", device.lanes)
-        self._mix_parts, self._mix_bases = mixing["mix_parts"], mixing["mix_bases"]
+        self._mix_bases = mixing["mix_bases"]
         self._direct_path = device.kernels("appearance.cl")["direct_path"]
-        self._parts, self._mixed = EchoLines(device), EchoLines(device)
+        self._parts, self._part = EchoLines(device), EchoLines(device)
         self._scatterers, self._interfaces = simulator.stage(Scatterers), simulator.stage(InterfaceEchoes)
         self._display_stages = [stage(device) for stage in stages.DISPLAY_STAGES]
         self._workspace = Workspace(device)
-        self._part_weights_buffer = device.empty(4 * CONSTANTS["PARTS"])
         self._weights = device.empty(4 * self._base_count)
         self._decays = device.empty(4 * max(len(self.attenuating), 1))
         self.anchor(simulator.medium.tissues)
@@ -152,6 +149,8 @@ class AppearanceModel:
             self._buffer("paths", number),
             self._decays,
             np.int32(len(self.attenuating)),
+            frame.acquisition_buffer,
+            self._buffer("losses", number),
             frame.iq,
             np.int32(samples),
         )
@@ -163,10 +162,7 @@ class AppearanceModel:
 
     @property
     def _base_count(self) -> int:
-        return 1 + sum(self._bases_of(name) for name in self.scattering)
-
-    def _bases_of(self, name: str) -> int:
-        return 2 * _BANDS if "mu1" in self.varied[name] else 2
+        return 1 + len(self.scattering)
 
     def _check_memory(self) -> None:
         simulator = self.simulator
@@ -183,103 +179,64 @@ class AppearanceModel:
 
     def _buffer(self, kind: str, number: int) -> Buffer:
         lines, samples = self._frames[number].line_shape
+        if kind == "losses":
+            return self._workspace.get(f"{kind} {number}", lines * (samples // CONSTANTS["LOSS_STEP"] + 1) * 8)
         count = 2 * self._base_count if kind == "bases" else max(len(self.attenuating), 1)
         return self._workspace.get(f"{kind} {number}", 4 * count * lines * samples)
 
     def _compute_bases(self, number: int) -> None:
-        """Trace, compute the scatterers tissue by tissue, and apply beam and pulse to the parts of the bases."""
+        """Trace, compute the scatterers of several tissues at once, and apply beam and pulse to each."""
         device, frame = self.device, self._frames[number]
         self.simulator.trace_rays(frame)
         lines, (_, samples) = 2 * int(frame.acquisition["traced_lines"]), frame.line_shape
-        self._parts.prepare(CONSTANTS["PARTS"] * lines, samples)
-        self._mixed.prepare(lines, samples)
-        done = 0
-        for place in range(max(len(self.scattering), 1)):
-            name = self.scattering[place] if self.scattering else None
+        parts = CONSTANTS["PARTS"]
+        self._parts.prepare(parts * lines, samples)
+        self._part.prepare(lines, samples)
+        bases, tissues = self._bases(), self._unit_tissues(frame)
+        device.copy(frame.losses, self._buffer("losses", number), self._buffer("losses", number).size)
+        for first in range(0, self._base_count, parts):
             if frame.settings.scattering:
-                roles, tops = device.upload(self._roles(place)), device.upload(self._band_tops(name))
-                self._scatterers.scatter(frame, self._parts, varied=(roles, tops))
+                part_of = np.where((bases >= first) & (bases < first + parts), bases - first, -1).astype(np.int32)
+                self._scatterers.scatter(frame, self._parts, tissues, device.upload(part_of))
             else:
                 self._parts.clear()
-            if place == 0:
-                self._keep(number, done, _only(0), with_interfaces=True)
-                done += 1
-            if name is not None:
-                for weights in self._part_weights(name):
-                    self._keep(number, done, weights)
-                    done += 1
+            for base in range(first, min(first + parts, self._base_count)):
+                self._keep(number, base, base - first)
 
-    def _keep(self, number: int, base: int, weights: np.ndarray, with_interfaces: bool = False) -> None:
-        """One base: a weighted sum of the parts, then the linear stages beam and pulse."""
+    def _keep(self, number: int, base: int, part: int) -> None:
+        """One base: beam and pulse of a part; the first one also has the interfaces."""
         device, frame = self.device, self._frames[number]
-        values = self._mixed.stride * 2 * int(frame.acquisition["traced_lines"])
-        device.write(self._part_weights_buffer, weights)
-        for parts, mixed in ((self._parts.re, self._mixed.re), (self._parts.im, self._mixed.im)):
-            device.run(
-                self._mix_parts, (values // device.lanes,), parts, self._part_weights_buffer, np.int32(weights.size),
-                np.int32(values), mixed,
-            )  # fmt: skip
-        frame.traced = self._mixed
+        nbytes = 4 * self._part.stride * 2 * int(frame.acquisition["traced_lines"])
+        device.copy(self._parts.re, self._part.re, nbytes, source_offset=part * nbytes)
+        device.copy(self._parts.im, self._part.im, nbytes, source_offset=part * nbytes)
+        frame.traced = self._part
         for stage in self.simulator.linear_stages:
-            if with_interfaces or stage is not self._interfaces:
+            if base == 0 or stage is not self._interfaces:
                 stage.run(frame)
         lines, samples = frame.line_shape
         nbytes = lines * samples * 8
         device.copy(frame.iq, self._buffer("bases", number), nbytes, base * nbytes)
 
-    def _roles(self, place: int) -> np.ndarray:
-        """(MAX_TISSUES,) int32: role of each tissue's scatterers while tissue `place` is computed."""
-        # Fixed tissues are computed once, with the first varied tissue.
-        fixed = CONSTANTS["ROLE_FIXED" if place == 0 else "ROLE_SILENT"]
-        roles = np.full(CONSTANTS["MAX_TISSUES"], fixed, np.int32)
+    def _bases(self) -> np.ndarray:
+        """(MAX_TISSUES,) number of the base of each label's scatterers: 0 for fixed tissues."""
+        bases = np.zeros(CONSTANTS["MAX_TISSUES"], int)
         members = dict(self.tissues)
         if self.tissues.membrane is not None:
             members[CONSTANTS["MEMBRANE_LABEL"]] = self.tissues.membrane.tissue
         for label, tissue in members.items():
             if tissue.name in self.scattering:
-                is_its = tissue.name == self.scattering[place]
-                roles[label] = CONSTANTS["ROLE_VARIED" if is_its else "ROLE_SILENT"]
-        return roles
+                bases[label] = 1 + self.scattering.index(tissue.name)
+        return bases
 
-    def _band_tops(self, name: str | None) -> np.ndarray:
-        """(BANDS,) float32 tops of the bands; one is the anchor's, so that its mu1 does not divide a band."""
-        tops = np.ones(_BANDS, np.float32)
-        if name is not None:
-            share = self.tissues.tissue(name).scatterer_share
-            half = _BANDS // 2
-            tops[:half] = share * np.arange(1, half + 1) / half
-            tops[half:] = share + (1.0 - share) * np.arange(1, _BANDS - half + 1) / (_BANDS - half)
-        return tops
-
-    def _part_weights(self, name: str) -> list[np.ndarray]:
-        """Weights of the parts in the bases of a tissue: single parts if mu1 varies, else M and S for its mu1."""
-        parts = CONSTANTS["PARTS"]
-        if "mu1" in self.varied[name]:
-            return [_only(part) for part in range(1, parts)]
-        mean, deviation = np.zeros(parts, np.float32), np.zeros(parts, np.float32)
-        mean[1::2], deviation[2::2] = self._band_weights(name, self.tissues.tissue(name))
-        return [mean, deviation]
-
-    def _band_weights(self, name: str, tissue: Tissue) -> tuple[np.ndarray, np.ndarray]:
-        """((BANDS,), (BANDS,)) weights of the bands' scatterers of amplitude 1 and of amplitude T0."""
-        share = tissue.scatterer_share
-        tops = self._band_tops(name).astype(float)
-        widths = np.diff(tops, prepend=0.0)
-        exists = np.clip((share - (tops - widths)) / np.maximum(widths, 1e-12), 0.0, 1.0)
-        variance = float(widths @ exists**2 - (widths @ exists) ** 2)
-        kept = np.sqrt(share * (1.0 - share) / variance) if variance > 1e-9 else 1.0
-        return kept * (exists - share), np.sqrt(exists)
+    def _unit_tissues(self, frame: DeviceFrame) -> np.ndarray:
+        """layout.TISSUE per label, with scatterers of unit variance where they are varied."""
+        rows = frame.medium.rows.copy()
+        rows["scatterer_variance"][self._bases() > 0] = 1.0
+        return rows
 
     def _base_weights(self, tissues: TissueTable) -> np.ndarray:
-        weights = [1.0]
-        for name in self.scattering:
-            tissue = tissues.tissue(name)
-            if "mu1" in self.varied[name]:
-                mean, deviation = self._band_weights(name, tissue)
-                weights += np.stack([tissue.mu0 * mean, tissue.sigma0 * deviation], axis=1).ravel().tolist()
-            else:
-                weights += [tissue.mu0, tissue.sigma0]
-        return np.array(weights, np.float32)
+        deviations = [np.sqrt(tissues.tissue(name).scatterer_variance) for name in self.scattering]
+        return np.array([1.0, *deviations], np.float32)
 
     # ---- paths -------------------------------------------------------------------------------------------------
 
@@ -314,12 +271,6 @@ class AppearanceModel:
             for name in self.attenuating
         ]
         return -np.array(change or [0.0], np.float32) / np.float32(self._probing_db_cm_mhz * np.log(2.0))
-
-
-def _only(part: int) -> np.ndarray:
-    weights = np.zeros(CONSTANTS["PARTS"], np.float32)
-    weights[part] = 1.0
-    return weights
 
 
 def _only_attenuating(tissues: TissueTable, name: str, attenuation_db_cm_mhz: float) -> TissueTable:

@@ -19,6 +19,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.fitting.image_similarity import PatchComparison, SimilaritySettings
 from SlicerUSSim.Logic.fitting.search import Evaluation, Progress, Search
 from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
+from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -29,6 +30,7 @@ _ALGORITHM = "LN_NELDERMEAD"
 #: Fraction of coarse evaluations; initial steps of the simplices, in units of the range. The best place of the coarse
 #: cost is off by up to one degree, so that the simplices of the full cost have to start as wide as that.
 _COARSE_SHARE = 0.6
+_COARSE_SITES_PER_MM3 = 8.0
 _STEPS, _FINE_STEPS = (0.12, 0.25, 0.12, 0.2, 0.12, 0.06), (0.08, 0.06, 0.04)
 
 
@@ -123,7 +125,7 @@ def register_poses(
     ]
     coarse = _PoseCost(
         simulator, coarse_probe, poses, coarse_comparisons, coarse_grid, display, correction,
-        _coarser_settings(simulator.settings),
+        _coarser_settings(simulator.settings, coarse_probe),
     )  # fmt: skip
     search = Search(coarse, describe, max_evaluations, 0, progress)
     here = np.full(6, 0.5)
@@ -212,11 +214,11 @@ def _coarser(probe: Probe, grid: ImageGrid, references, masks):
     return coarse_probe, ImageGrid(rows, columns, grid.left_mm, grid.top_mm, spacing), images, insides
 
 
-def _coarser_settings(settings: SimulationSettings) -> SimulationSettings:
+def _coarser_settings(settings: SimulationSettings, probe: Probe) -> SimulationSettings:
     """Fewer scatterers (of the same variance) and rays; no mirror images."""
     return replace(
         settings,
-        scatterers_per_mm3=min(settings.scatterers_per_mm3, 8.0),
+        scatterers_per_mm3=min(sites_per_mm3(settings, probe), _COARSE_SITES_PER_MM3),
         elevational_rays=min(settings.elevational_rays, 3),
         max_ray_depth=min(settings.max_ray_depth, 1),
     )

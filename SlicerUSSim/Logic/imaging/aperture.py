@@ -16,7 +16,7 @@ ROWS = 3  # of points across the elevational aperture
 _POINTS = 12  # intervals of points across one aperture
 _MOST_POINTS = 96  # along the whole face
 _LONGEST = 1.06  # of paths, in image depths: the fastest soft tissue
-_SCREEN_STEP_MM, _SCREEN_DEPTHS = 5.0, (8, 24)
+_SCREEN_STEP_MM, _SCREEN_DEPTHS = 8.0, (8, 24)
 _LINES_PER_SCREEN = 3
 _FAN_STEP_MM, _MOST_DEPTHS = (0.25, 1.0), 192  # limits of the length of a look-up; else a voxel
 _ANGLE_STEP, _WIDEST = 0.022, 1.5  # radians
@@ -33,18 +33,22 @@ class Aperture(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         kernels = device.kernels("aperture.cl")
-        self._fans, self._screens = kernels["fans"], kernels["screens"]
+        self._fans, self._screens, self._keep_levels, self._beams = (
+            kernels[name] for name in ("fans", "screens", "keep_levels", "beams")
+        )
         self.workspace = Workspace(device)
 
     def run(self, frame: DeviceFrame, with_level: bool = True) -> None:
-        """Enqueue the beams of one frame: its `screens`, which are empty if beams are single rays.
+        """Enqueue the beams of one frame: `screens`, `spreads` and `beams`, which are empty if beams are single rays.
 
-        Without `with_level` they have attenuation alone, and not what is lost because a beam is no longer focused.
+        Without `with_level` screens have attenuation alone, and not what is lost because a beam is no longer focused.
         """
         fields, get = frame.acquisition, self.workspace.get
-        lines, depths = int(fields["screen_lines"]), int(fields["screen_depths"])
+        lines, depths, traced = (int(fields[name]) for name in ("screen_lines", "screen_depths", "traced_lines"))
         fan = int(fields["fan_angles"]), int(fields["fan_points"]), ROWS
-        frame.screens = get("screens", lines * depths * 16)
+        frame.screens, frame.spreads = get("screens", lines * depths * 16), get("spreads", lines * depths * 8)
+        frame.beams = get("beams", traced * (1 + depths) * 20)
+        shades = get("shades", lines * depths * 4)
         if not fields["aperture_beams"]:
             return
         acoustics = get("acoustics", len(frame.medium.rows) * 16)
@@ -53,8 +57,11 @@ class Aperture(Stage):
         all_soft = np.int32(are_soft(frame.medium.rows[frame.medium.present]))
         self.device.run(self._fans, fan, frame.acquisition_buffer, frame.medium.voxel_buffer, acoustics, all_soft, sums)
         self.device.run(
-            self._screens, (depths, lines), frame.acquisition_buffer, sums, np.int32(with_level), frame.screens
-        )
+            self._screens, (depths, lines), frame.acquisition_buffer, sums, np.int32(with_level), frame.screens,
+            shades, frame.spreads,
+        )  # fmt: skip
+        self.device.run(self._keep_levels, (depths, lines), frame.acquisition_buffer, frame.screens, frame.spreads)
+        self.device.run(self._beams, (1 + depths, traced), frame.acquisition_buffer, frame.screens, shades, frame.beams)
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
         fields = frame.acquisition

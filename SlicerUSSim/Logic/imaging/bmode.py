@@ -12,6 +12,7 @@ from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA, Probe
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
@@ -27,6 +28,7 @@ class PulseFilter(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.kernel = device.kernels("bmode.cl", device.lanes)["convolve_pulse"]
+        self._shift = device.kernels("downshift.cl", device.lanes)["shift_frequency"]
         self.workspace = Workspace(device)
         self._sigma: float | None = None
         # Taps of the pulse with this sigma
@@ -34,13 +36,23 @@ class PulseFilter(Stage):
         self._reach: int
 
     def run(self, frame: DeviceFrame) -> None:
-        """Enqueue the convolution of every line: the frame's `iq`."""
+        """Enqueue the convolution of every line: the frame's `iq`. Its impulses get the frequency of their depth."""
         sigma = frame.axial_sigma_mm / float(frame.acquisition["sample_mm"])
         if sigma != self._sigma:
             taps = pulse_taps(sigma)
             self._pulse, self._reach, self._sigma = self.device.upload(taps), taps.size // 2, sigma
         lines, samples = frame.line_shape
         frame.iq = self.workspace.get("iq", lines * samples * SAMPLE_BYTES)
+        if frame.acquisition["downshift"] > 0.0:
+            self.device.run(
+                self._shift,
+                (samples // self.device.lanes, lines),
+                frame.acquisition_buffer,
+                frame.losses,
+                frame.scanned.re,
+                frame.scanned.im,
+                np.int32(frame.scanned.stride),
+            )
         self.device.run(
             self.kernel,
             (samples // self.device.lanes, lines),
@@ -49,6 +61,8 @@ class PulseFilter(Stage):
             np.int32(frame.scanned.stride),
             self._pulse,
             np.int32(self._reach),
+            frame.acquisition_buffer,
+            frame.losses,
             frame.iq,
             np.int32(samples),
         )
@@ -57,6 +71,11 @@ class PulseFilter(Stage):
         lines, samples = frame.line_shape
         taps = pulse_taps(frame.axial_sigma_mm / float(frame.acquisition["sample_mm"])).size
         return Work(2 * lines * samples * SAMPLE_BYTES, 4 * taps * lines * samples)
+
+
+def downshift(probe: Probe) -> float:
+    """Part of the centre frequency that a pulse loses per neper of two-way loss: (sf / f0)^2 of its Gaussian band."""
+    return (probe.fractional_bandwidth / FWHM_PER_SIGMA) ** 2
 
 
 class Compressor(Stage):
@@ -68,6 +87,8 @@ class Compressor(Stage):
         super().__init__(device)
         self.kernel = device.kernels("bmode.cl", device.lanes)["compress"]
         self.workspace = Workspace(device)
+        #: What the ring-down depends on, and its buffer
+        self._ringing: tuple[tuple, Buffer] | None = None
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the grey levels of every line: the frame's `envelope` and `grey`."""
@@ -84,6 +105,7 @@ class Compressor(Stage):
             (samples // self.device.lanes, lines),
             frame.iq,
             np.int32(samples),
+            self._ring_down(frame),
             np.float32(noise),
             np.uint32(noise_key(acquisition, frame.noise_seed)),
             np.float32(tgc),
@@ -94,9 +116,35 @@ class Compressor(Stage):
             frame.grey,
         )
 
+    def _ring_down(self, frame: DeviceFrame) -> Buffer:
+        """complex64 [sample], the same for all lines."""
+        probe, samples, sigma = frame.probe, frame.line_shape[1], frame.axial_sigma_mm
+        sample_mm, cycles_per_mm = (float(frame.acquisition[name]) for name in ("sample_mm", "cycles_per_mm"))
+        key = (probe, frame.settings.ring_down, samples, sigma, sample_mm, cycles_per_mm)
+        if self._ringing is None or self._ringing[0] != key:
+            signal = ring_down(probe, np.arange(samples) * sample_mm, sigma, cycles_per_mm)
+            self._ringing = key, self.device.upload(signal * frame.settings.ring_down)
+        return self._ringing[1]
+
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
         lines, samples = frame.line_shape
         return Work((SAMPLE_BYTES + 5) * lines * samples, _PER_SAMPLE * lines * samples)
+
+
+def ring_down(probe: Probe, depth_mm: np.ndarray, axial_sigma_mm: float, cycles_per_mm: float) -> np.ndarray:
+    """(samples,) complex64 baseband signal of the pulse that bounces between the face's layers and the skin.
+
+    One echo a pulse length after the other, each weaker by the same factor and of the other sign, since one of the two
+    borders is harder than what is between them. It falls by 40 dB over the probe's ring_down_mm.
+    """
+    if probe.ring_down_mm == 0.0:
+        return np.zeros(len(depth_mm), np.complex64)
+    apart_mm = FWHM_PER_SIGMA * axial_sigma_mm
+    places = np.arange(0.0, 2.0 * probe.ring_down_mm, apart_mm)
+    level_db = probe.ring_down_db - 40.0 * places / probe.ring_down_mm
+    echoes = 10.0 ** (level_db / 20.0) * (-1.0) ** np.arange(len(places)) * np.exp(-2j * np.pi * cycles_per_mm * places)
+    pulses = np.exp(-0.5 * ((depth_mm[:, None] - places) / axial_sigma_mm) ** 2)
+    return (pulses @ echoes).astype(np.complex64)
 
 
 def pulse_taps(sigma: float) -> np.ndarray:

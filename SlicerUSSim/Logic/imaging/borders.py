@@ -13,6 +13,8 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
+#: Standard deviations at which the Gaussians are cut off; layers are found by the tails of the second
+WIDE_CUT, HALVED_CUT = 2.5, 3.5
 _SLAB = 48  # planes at a time, to limit the memory between the passes
 
 
@@ -56,7 +58,7 @@ def _smooth(device: Device, workspace: Workspace, groups: Sequence[Buffer], dims
     columns, rows, planes = (int(n) for n in dims)
     lanes = device.lanes if columns >= device.lanes else 1
     kernels = device.kernels("smoothing.cl", lanes, *(["MEMBERSHIP"] if len(groups) > 1 else []))
-    taps = gaussian_taps(CONSTANTS["WIDE_SIGMA"])
+    taps = gaussian_taps(CONSTANTS["WIDE_SIGMA"], WIDE_CUT)
     reach, tap_buffer = np.int32(len(taps) // 2), device.upload(taps)
     slab = min(_SLAB, planes)
     partial = [workspace.get(name, 4 * columns * rows * (slab + 2 * int(reach))) for name in ("rows", "columns")]
@@ -80,7 +82,7 @@ def _smooth_halved(device: Device, workspace: Workspace, dims, offset: int, to_o
     columns, rows, planes = (-(-int(n) // 2) for n in dims)
     lanes = device.lanes if columns >= device.lanes else 1
     scalar, kernels = device.kernels("smoothing.cl"), device.kernels("smoothing.cl", lanes)
-    taps = gaussian_taps(CONSTANTS["HALVED_SIGMA"])
+    taps = gaussian_taps(CONSTANTS["HALVED_SIGMA"], HALVED_CUT)
     reach, tap_buffer = np.int32(len(taps) // 2), device.upload(taps)
     around, across, shape = planes + 2 * int(reach), -(-columns // lanes), (np.int32(columns), np.int32(rows))
     partial = [workspace.get(name, 4 * columns * rows * around) for name in ("halved", "halved rows")]
@@ -97,8 +99,8 @@ def _smooth_halved(device: Device, workspace: Workspace, dims, offset: int, to_o
     )  # fmt: skip
 
 
-def gaussian_taps(sigma: float) -> np.ndarray:
-    """(2 reach + 1,) float32 Gaussian of unit sum, cut off at 2.5 standard deviations."""
-    reach = int(2.5 * sigma + 0.5)
+def gaussian_taps(sigma: float, cut: float) -> np.ndarray:
+    """(2 reach + 1,) float32 Gaussian of unit sum, cut off at `cut` standard deviations."""
+    reach = int(cut * sigma + 0.5)
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     return (taps / taps.sum()).astype(np.float32)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import os
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.own_outputs import save_marked_png
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tissue.presets import colour_of
 
@@ -70,16 +72,26 @@ def draw_views(
             spine.set_color("#555555")
         axis.set_xlabel("lateral [mm]", color=_INK, fontsize=8)
     axes[0].set_ylabel("depth [mm]", color=_INK, fontsize=8)
+    save_figure(path, figure, _BACKGROUND)
+
+
+def save_figure(path: str | os.PathLike, figure, background: str) -> None:
+    """Write a matplotlib figure as PNG, marked as made by this program; on failure an existing file is kept."""
+    from PIL import Image
+
+    data = io.BytesIO()
+    figure.savefig(data, format="png", facecolor=background)
     with written_whole(path) as partial:
-        figure.savefig(partial, facecolor=_BACKGROUND)
+        save_marked_png(partial, Image.open(data))
 
 
 def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
-    """Write a (rows, columns) uint8 image unchanged; on failure an existing file is kept."""
+    """Write a (rows, columns) uint8 image unchanged, marked as made by this program; on failure an existing file is
+    kept."""
     from PIL import Image
 
     with written_whole(path) as partial:
-        Image.fromarray(image).save(partial)
+        save_marked_png(partial, Image.fromarray(image))
 
 
 def _scale_bar(axis, right: float, bottom: float) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parameters_of, short
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.own_outputs import MARK
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, Probe, probe_from_dict, probe_kind
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -81,7 +82,7 @@ class Preset:
         """
         known = ("probe", *SECTIONS, "tissues", "membrane")
         require(isinstance(values, dict), f"{source}: is {kind_of(values)}, expected an object")
-        for name in values:
+        for name in values.keys() - {MARK}:
             require(name in known, f"{source}: has {short(name)}, expected {', '.join(known)}")
         sections: dict[str, Any] = {}
         if "probe" in values:

@@ -31,6 +31,7 @@ class RayTracer(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.kernel = device.kernels("raytracing.cl")["trace"]
+        self._losses = device.kernels("downshift.cl", device.lanes)["losses"]
         self.workspace = Workspace(device)
         self._quantile_key: tuple | None = None
         self._root_key: tuple | None = None
@@ -44,7 +45,7 @@ class RayTracer(Stage):
         self._tree: TreeBuffers
 
     def run(self, frame: DeviceFrame) -> None:
-        """Enqueue the tracing of one frame: its `tree`."""
+        """Enqueue the tracing of one frame: its `tree`, and the `losses` along its scan lines."""
         acquisition, medium = frame.acquisition, frame.medium
         traced, rays = int(acquisition["traced_lines"]), int(acquisition["elevational_rays"])
         self.shape, self._acquisition = (traced, rays), acquisition
@@ -73,7 +74,7 @@ class RayTracer(Stage):
             medium.tissue_buffer,
             self._roots,
             self._quantiles,
-            frame.screens,
+            frame.beams,
             tree.segments,
             tree.segment_counts,
             tree.hits,
@@ -81,6 +82,16 @@ class RayTracer(Stage):
             tree.cut,
             self._overflown,
             heavy=True,
+        )
+        lines, samples = frame.line_shape
+        frame.losses = get("losses", lines * (samples // CONSTANTS["LOSS_STEP"] + 1) * 8)
+        self.device.run(
+            self._losses,
+            (lines,),
+            frame.acquisition_buffer,
+            tree.segments,
+            tree.segment_counts,
+            frame.losses,
         )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:

@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.integrate import trapezoid
 
+from SlicerUSSim.Logic.imaging.side_lobes import elevational_lobe_record
 from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
-from SlicerUSSim.Logic.opencl.layout import CONSTANTS, HIT, WALL
+from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS, HIT, WALL
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
+    from SlicerUSSim.Logic.base.settings import SimulationSettings
+    from SlicerUSSim.Logic.probe.arrays import Probe
+
 # Operations counted in the kernels
-_PER_CELL = 180  # per examined lattice cell: three hashes, position, pulse phase, amplitude
+_PER_CELL = 130  # per examined lattice cell: two hashes, position, pulse phase, amplitude
 _PER_SCATTERER = 40  # per contributing scatterer: label, amplitude, four impulses
 _PER_HIT = 80
 _PER_ECHO = 40  # of a hit on a scan line
 _PER_EDGE_PAIR = 16  # for the lateral beam, per sample
+#: Of the paper's lattice of scatterers
+PAPER_SITES_PER_MM3 = 0.02**-3
+# In the probe's smallest resolution cell, for developed speckle; thin structures need some too, whatever the probe
+_SITES_PER_CELL, _LEAST_PER_MM3 = 8.0, 4.0
 _SLICES = 16  # of a scan line for the interfaces on GPUs, which have more work-items than scan lines
 
 
@@ -32,44 +41,61 @@ class Scatterers(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.lines = EchoLines(device)
+        self._sites = [device.empty(8 * CONSTANTS["MAX_TISSUES"]) for _ in range(2)]
+        self._lobes = device.empty(ACQUISITION.itemsize)
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the speckle of one frame: its `traced` impulses, zero if scattering is off."""
         frame.traced = self.lines
         self.lines.prepare(2 * int(frame.acquisition["traced_lines"]), frame.line_shape[1])  # two edges of each strip
         if frame.settings.scattering:
-            self.scatter(frame, self.lines)
+            self.scatter(frame, self.lines, frame.medium.rows)
         else:
             self.lines.clear()
 
-    def scatter(self, frame: DeviceFrame, lines: EchoLines, varied: tuple[Buffer, ...] = ()) -> None:
-        """Enqueue the speckle of one frame; it overwrites `lines`.
+    def scatter(self, frame: DeviceFrame, lines: EchoLines, tissues: np.ndarray, part_of: Buffer | None = None) -> None:
+        """Enqueue the speckle of one frame with these tissues (layout.TISSUE per label); it overwrites `lines`.
 
-        With `varied`, the device buffers of roles (MAX_TISSUES,) int32 and band tops (BANDS,) float32, it comes in
-        CONSTANTS["PARTS"] consecutive parts: see kernels/scattering.cl and appearance.py.
+        With `part_of`, a device buffer (MAX_TISSUES,) int32, it comes in CONSTANTS["PARTS"] consecutive parts: see
+        kernels/scattering.cl and appearance.py.
         """
-        medium = frame.medium
-        variant = (["TEXTURE"] if medium.has_texture else []) + (["VARIED"] if varied else [])
-        variant.append(f"CHUNK={self.device.chunk}")
+        self._scatter(frame, lines, frame.acquisition, frame.acquisition_buffer, tissues, part_of)
+        if frame.settings.side_lobes:
+            record = elevational_lobe_record(frame.acquisition, frame.probe)
+            self.device.write(self._lobes, record)
+            self._scatter(frame, lines, record, self._lobes, tissues, part_of, is_added=True)
+
+    def _scatter(
+        self, frame: DeviceFrame, lines: EchoLines, acquisition: np.ndarray, acquisition_buffer: Buffer,
+        tissues: np.ndarray, part_of: Buffer | None, *, is_added: bool = False,
+    ) -> None:  # fmt: skip
+        medium, sites = frame.medium, self._sites[is_added]
+        self.device.write(sites, lattice_sites(tissues, acquisition))
+        variant = (["TEXTURE"] if medium.has_texture else []) + (["VARIED"] if part_of is not None else [])
+        variant += [f"CHUNK={self.device.chunk}", *(["ADDED"] if is_added else [])]
         self.device.run(
             self.device.kernels("scattering.cl", self.device.lanes, *variant)["scatter"],
             (frame.line_shape[1] // self.device.chunk, int(frame.acquisition["traced_lines"])),
-            frame.acquisition_buffer,
+            acquisition_buffer,
             medium.voxel_buffer,
             medium.texture_buffer,
-            medium.tissue_buffer,
+            sites,
             frame.tree.segments,
             frame.tree.segment_counts,
             lines.re,
             lines.im,
             np.int32(lines.stride),
-            *varied,
+            *([] if part_of is None else [part_of]),
             heavy=True,
         )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
         traced, (_, samples) = int(frame.acquisition["traced_lines"]), frame.line_shape
         inside, looked_at = scatterer_counts(frame, tree.segments, self.device.chunk)
+        if frame.settings.side_lobes:
+            lobes = replace(frame, acquisition=elevational_lobe_record(frame.acquisition, frame.probe))
+            counts = scatterer_counts(lobes, tree.segments, self.device.chunk)
+            inside, looked_at = inside + counts[0], looked_at + counts[1]
         return Work(2 * inside + 2 * traced * samples * SAMPLE_BYTES, _PER_CELL * looked_at + _PER_SCATTERER * inside)
 
 
@@ -137,6 +163,8 @@ class LateralBeam(Stage):
             frame.acquisition_buffer,
             frame.traced.re,
             frame.traced.im,
+            frame.spreads,
+            frame.losses,
             scanned.re,
             scanned.im,
             np.int32(frame.traced.stride),
@@ -154,6 +182,28 @@ class LateralBeam(Stage):
         )
 
 
+def sites_per_mm3(settings: SimulationSettings, probe: Probe) -> float:
+    """Density of the lattice of scatterers: the one set, or by the probe's smallest resolution cell."""
+    if settings.scatterers_per_mm3 is not None:
+        return settings.scatterers_per_mm3
+    return float(np.clip(_SITES_PER_CELL / probe.smallest_cell_mm3(), _LEAST_PER_MM3, PAPER_SITES_PER_MM3))
+
+
+def lattice_sites(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
+    """(labels, 2) float32: share of lattice cells with a scatterer, in 1/65536, and its amplitude, by layout.TISSUE.
+
+    A cell stands for N sites of the paper's lattice of 20 um. With the share p of them it has a scatterer with the
+    probability q = 1 - (1 - p)^N, whose amplitude is sqrt(Var / q) with a random sign (docs/physics.md#5-scatterers).
+    """
+    fine_sites = max(PAPER_SITES_PER_MM3 * float(acquisition["cell_mm"]) ** 3, 1.0)
+    with np.errstate(divide="ignore"):
+        q = -np.expm1(fine_sites * np.log1p(-tissues["scatterer_share"].astype(float)))
+    share = np.round(65536.0 * q)
+    # Of the share as the kernel draws it
+    amplitude = np.sqrt(65536.0 * tissues["scatterer_variance"] / np.maximum(share, 1.0)) * (share > 0.0)
+    return np.stack([share, amplitude], axis=1).astype(np.float32)
+
+
 def scatterer_counts(frame: FrameInputs, segments: np.ndarray, chunk: int) -> tuple[float, float]:
     """(number of scatterers inside the strips of all ray segments, number of lattice cells to examine for them).
 
@@ -163,7 +213,8 @@ def scatterer_counts(frame: FrameInputs, segments: np.ndarray, chunk: int) -> tu
     ends = segments["path_mm"], segments["path_mm"] + segments["length_mm"]
     path = np.linspace(*ends, 17)  # (17, segments)
     width = probe.line_distance_mm(path) / float(acquisition["lateral_rays"])
-    height = 2.0 * settings.beam_cutoff * probe.beam_sigma_mm(path)[1]
+    away = (path - float(acquisition["elevation_focus"])) / float(acquisition["elevation_rayleigh"])
+    height = 2.0 * settings.beam_cutoff * float(acquisition["elevation_sigma"]) * np.hypot(1.0, away)
     # A scatterer is up to half a cell from its cell's centre along each axis of the lattice.
     slack = {
         name: float(acquisition["cell_mm"]) * np.abs(segments[name]).sum(axis=1) for name in ("lateral", "elevational")
@@ -171,7 +222,7 @@ def scatterer_counts(frame: FrameInputs, segments: np.ndarray, chunk: int) -> tu
     deep = float(acquisition["cell_mm"]) * np.abs(segments["direction"]).sum(axis=1)
     length = chunk * float(acquisition["sample_mm"]) / segments["depth_per_mm"]
     along = 1.0 + deep / np.minimum(length, np.maximum(segments["length_mm"], 1e-3))
-    density = settings.scatterers_per_mm3
+    density = float(acquisition["cell_mm"]) ** -3
     inside = trapezoid(width * height, path, axis=0)
     looked_at = along * trapezoid((width + slack["lateral"]) * (height + slack["elevational"]), path, axis=0)
     return float(density * inside.sum()), float(density * looked_at.sum())

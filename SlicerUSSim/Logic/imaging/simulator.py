@@ -12,17 +12,19 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import parameters_of
-from SlicerUSSim.Logic.base.errors import require, required
+from SlicerUSSim.Logic.base.errors import require, require_kind, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
+from SlicerUSSim.Logic.imaging.bmode import downshift
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
+from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
 from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
@@ -41,7 +43,7 @@ StageKind = TypeVar("StageKind", bound=Stage)
 
 
 class EmptyViewWarning(UserWarning):
-    """The imaged field is completely outside the volume; the image is black."""
+    """The imaged field is completely outside the volume; the image has no echoes of tissue."""
 
 
 class TreeOverflowWarning(UserWarning):
@@ -83,6 +85,8 @@ class UltrasoundSimulator:
         device: DeviceChoice = None,
         texture: Texture | None = None,
     ) -> None:
+        require_kind("labels", labels, Volume, "Volume.read reads a file")
+        require_kind("tissues", tissues, TissueTable, "TissueTable.brain makes one")
         self.settings = SimulationSettings() if settings is None else settings
         require(
             isinstance(self.settings, SimulationSettings),
@@ -121,6 +125,7 @@ class UltrasoundSimulator:
         Warns with EmptyViewWarning and returns a black image if the field is outside the volume.
         Raises SimulationError for a pose that is not rigid and a noise_seed that is not a whole number of 32 bits.
         """
+        require_kind("probe", probe, Probe, "a ConvexProbe, LinearProbe or PhasedProbe")
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self._warn_if_empty(probe, pose)
         timings: dict[str, float] = {}
@@ -227,6 +232,7 @@ class UltrasoundSimulator:
 
         Their noise differs: the noise_seed is the frame's number, from 0.
         """
+        require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
         for number, pose in enumerate(poses):
             yield self.simulate(probe, pose, display, noise_seed=number)
             if progress is not None:
@@ -261,6 +267,8 @@ class UltrasoundSimulator:
         >>> volume.spacing_mm.tolist()
         [1.0, 1.0, 1.0]
         """
+        require_kind("probe", probe, Probe, "a ConvexProbe, LinearProbe or PhasedProbe")
+        require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
         poses = list(poses)
         grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
         _log.info(
@@ -371,10 +379,12 @@ class UltrasoundSimulator:
             acquisition[name] = value
         acquisition["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
         acquisition["interface_is_energy"] = settings.interface_reflection == "energy"
-        acquisition["cell_mm"] = settings.scatterers_per_mm3 ** (-1.0 / 3.0)
+        density = sites_per_mm3(settings, probe)
+        acquisition["downshift"] = downshift(probe) if settings.frequency_downshift else 0.0
+        acquisition["cell_mm"] = density ** (-1.0 / 3.0)
         acquisition["seed"] = _mixed(settings.seed)
         # The integral of the squared point spread function is pi^1.5 times the product of the three sigmas.
-        acquisition["speckle_scale"] = (settings.scatterers_per_mm3 * np.pi**1.5 * axial_sigma) ** -0.5
+        acquisition["speckle_scale"] = (density * np.pi**1.5 * axial_sigma) ** -0.5
         return acquisition
 
     def _cycles_per_mm(self, probe: Probe) -> float:
@@ -393,13 +403,17 @@ class UltrasoundSimulator:
     def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
         """Warn if the volume has no labels, or the bounding box of the imaged field, in voxels, does not meet it."""
         if list(self.medium.present) == [0] and not self.medium.tissues[0].scatterer_variance:
-            warnings.warn("the label map has no labels, only 0: the image is black", EmptyViewWarning, stacklevel=3)
+            warnings.warn(
+                "the label map has no labels, only 0: the image has no echoes of tissue", EmptyViewWarning, stacklevel=3
+            )
         left, right, top, bottom = probe.image_bounds_mm()
         corners = np.array([[x, y, 0.0, 1.0] for x in (left, right) for y in (top, bottom)])
         voxels = (self.medium.labels.ras_to_ijk @ pose @ corners.T)[:3]
         size = np.array(self.medium.labels.array.shape[::-1])
         if (voxels.max(axis=1) < -0.5).any() or (voxels.min(axis=1) > size - 0.5).any():
-            warnings.warn("the probe looks past the volume: the image is black", EmptyViewWarning, stacklevel=3)
+            warnings.warn(
+                "the probe looks past the volume: the image has no echoes of tissue", EmptyViewWarning, stacklevel=3
+            )
 
     def _warn_if_overflown(self, frames: int = 1) -> None:
         lines, traced = self.tracer.overflown_lines(), frames * self.tracer.shape[0]

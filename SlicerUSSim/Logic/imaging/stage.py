@@ -76,10 +76,16 @@ class DeviceFrame(FrameInputs):
 
     acquisition_buffer: Buffer
     medium: Medium
-    #: What soft tissue does to the beam: float4 [screen line][depth] of aperture.cl
+    #: What soft tissue does to beams: float4 [screen line][depth] of aperture.cl
     screens: Buffer = field(init=False)
+    #: The same of the traced lines, from the face on: float4 [traced line][1 + depth]
+    beams: Buffer = field(init=False)
+    #: How much wider that makes the beam, and a factor of its echoes: float2 [screen line][depth]
+    spreads: Buffer = field(init=False)
     #: Of the ray tree
     tree: TreeBuffers = field(init=False)
+    #: Of the direct path to the samples of scan lines: float2 [scan line][1 + samples / LOSS_STEP] of downshift.cl
+    losses: Buffer = field(init=False)
     #: Impulses on the left and right edges of every traced line's strip
     traced: EchoLines = field(init=False)
     #: Impulses of every scan line

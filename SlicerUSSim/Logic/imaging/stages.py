@@ -10,12 +10,13 @@ from SlicerUSSim.Logic.imaging.bmode import Compressor, PulseFilter
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
 from SlicerUSSim.Logic.imaging.scattering import InterfaceEchoes, LateralBeam, Scatterers
+from SlicerUSSim.Logic.imaging.side_lobes import SideLobes
 from SlicerUSSim.Logic.imaging.stage import Stage
 
 #: From the acquisition to impulses along the traced lines
 IMPULSE_STAGES: tuple[type[Stage], ...] = (Aperture, RayTracer, Scatterers)
 #: From there to the baseband signal. They are linear, so the appearance model applies them to each of its bases, and
 #: adds the interfaces to the one of the fixed tissues
-LINEAR_STAGES: tuple[type[Stage], ...] = (LateralBeam, InterfaceEchoes, PulseFilter)
+LINEAR_STAGES: tuple[type[Stage], ...] = (LateralBeam, InterfaceEchoes, SideLobes, PulseFilter)
 #: From the baseband signal to pixels
 DISPLAY_STAGES: tuple[type[Stage], ...] = (Compressor, ScanConverter)

@@ -50,6 +50,17 @@ class Added:
     #: A line for each thing that a user should check
     warnings: tuple[str, ...] = ()
 
+    def centre_ras(self, before: Volume) -> np.ndarray | None:
+        """(3,) RAS mm of the innermost voxel of the largest region that differs from `before`; None without any."""
+        differs = self.labels.array != before.array
+        parts, count = ndimage.label(differs)  # type: ignore[misc]
+        if not count:
+            return None
+        largest = parts == np.bincount(parts.ravel())[1:].argmax() + 1
+        depth = np.asarray(ndimage.distance_transform_edt(np.pad(largest, 1)))
+        place = np.subtract(np.unravel_index(int(np.argmax(depth)), np.add(largest.shape, 2)), 1)
+        return self.labels.ijk_to_ras[:3] @ np.append(place[::-1], 1.0)
+
     def table(self, tissues: TissueTable) -> TissueTable:
         """The tissue table of the labels before, with the tissues of new labels from the presets."""
         mine = {tissue.name: tissue for tissue in tissues.all_tissues()[::-1]}

@@ -9,12 +9,12 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
-from SlicerUSSim.Logic.mri.not_a_head import is_ultrasound
+from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_symmetric, is_ultrasound
 from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, lies_otherwise, stripped_lies_otherwise, why_refused
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
@@ -62,6 +62,11 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
         return Shown(brain)
     image = CoarseImage.of(mri)
     _check_size(image)
+    require(
+        not is_symmetric(image) or {"bottom", "top"} <= set(cut_ends(mri)),  # a limb, which is called so below
+        "image shows an object that looks the same upside down and from the back, as a phantom does and no head; "
+        "use an MRI of a head, or --skull-strip none to take everything brighter than the background",
+    )
     if mni152() is None:
         return Shown(None, warnings=("without nilearn it is not checked that the image shows a head",))
     alignment = align_coarse(image, lambda share: report(0.1 + 0.6 * share))
@@ -103,7 +108,7 @@ def check_finite(mri: Volume) -> None:
 
 def check_intensities(mri: Volume, name: str = "MRI") -> None:
     """Raise SimulationError if the image `name` has as few different values as a mask or a label map."""
-    require(isinstance(mri, Volume), f"{name} is a {type(mri).__name__}, expected a Volume (Volume.read reads a file)")
+    require_kind(name, mri, Volume, "Volume.read reads a file")
     sample = np.unique(mri.array[::3, ::3, ::3])
     require(
         len(sample) > _MOST_LABELS,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import about_other_file, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
 from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, classify
@@ -159,6 +159,7 @@ def segment_mri(
     >>> segmentation.labels.array.dtype
     dtype('uint8')
     """
+    require_kind("mri", mri, Volume, "Volume.read reads a file")
     report = progress or (lambda share: None)
     others = dict(others or {})
     require(
@@ -193,8 +194,9 @@ def segment_mri(
     images = [mri.with_array(intensity)]
     for name, other in others.items():
         named = _called(name, other)
-        _require_intensities(other, named)
-        image, message, doubts_of_it = aligned(other.with_array(finite(other)), images[0], foreground, named)
+        with about_other_file(named):
+            _require_intensities(other, named)
+            image, message, doubts_of_it = aligned(other.with_array(finite(other)), images[0], foreground, named)
         images.append(image)
         notes.append(message)
         warnings += doubts_of_it
@@ -214,8 +216,10 @@ def segment_mri(
     report(0.4)
     prior = atlas.prior(part.images[0], part.inside) if atlas else None
     if prior is not None:
-        for name, image in zip(contrasts, part.images, strict=True):
-            warnings += require_contrast(image, part.inside, prior, name)
+        warnings += require_contrast(part.images[0], part.inside, prior, contrast)
+        for (name, other), image in zip(others.items(), part.images[1:], strict=True):
+            with about_other_file(_called(name, other)):
+                warnings += require_contrast(image, part.inside, prior, name)
 
     if bias_correction is not False:
         share = lambda done: report(0.4 + 0.3 * done)  # noqa: E731

@@ -27,6 +27,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     require_node,
     write_volume,
 )
+from SlicerUSSim.Logic.mrml.own_results import mark_as_result, require_result
 from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, number_in
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages
@@ -202,8 +203,11 @@ def write_compared(nodes: dict, fit: Fit, number: int, to_world: np.ndarray) -> 
     geometry = to_world @ tracked.poses[place] @ tracked.grid.slice_to_probe
     for name, node in nodes.items():
         require_node(node, "vtkMRMLScalarVolumeNode", use=f"volume for {name}")
+        require_result(node, f"volume for {name}")
+    for name, node in nodes.items():
         node.SetAndObserveTransformNodeID(None)
         write_volume(node, Volume(images[name].astype(np.uint8)[None], geometry))
+        mark_as_result(node)
         display = display_of(node)
         if display is not None:
             display.SetAutoWindowLevel(False)

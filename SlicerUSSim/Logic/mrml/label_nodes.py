@@ -185,9 +185,10 @@ def _read_segmentation(segmentation_node) -> tuple[Volume, dict[int, str]]:
         segmentation_node.CreateBinaryLabelmapRepresentation(),
         f"label map {named(segmentation_node)} has no binary label map and cannot be converted to one",
     )
+    # A segmentation is stored cropped to its voxels, but a head does not end where the border to its surroundings lies.
     merged = slicer.vtkOrientedImageData()
     segmentation_node.GenerateMergedLabelmapForAllSegments(
-        merged, slicer.vtkSegmentation.EXTENT_UNION_OF_EFFECTIVE_SEGMENTS, None, ids, values
+        merged, slicer.vtkSegmentation.EXTENT_UNION_OF_EFFECTIVE_SEGMENTS_AND_REFERENCE_GEOMETRY, None, ids, values
     )
     require(
         min(merged.GetDimensions()) > 0 and merged.GetScalarRange()[1] > 0,

@@ -53,6 +53,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     write_outline,
 )
 from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
+from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_result, require_result
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_in_slice
@@ -239,6 +240,10 @@ class UltrasoundSceneLogic:
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         return may_replace(labels_node)
 
+    def mayReplaceResult(self, node) -> bool:
+        """Whether simulate(), showOutline() and others may write into a node: if it is empty, or has their result."""
+        return may_replace_result(node)
+
     def addTissues(self, labels_node, lesions_node, output_node=None) -> Added:
         """Lay the segments of a segmentation node over the tissues of a label map or segmentation node.
 
@@ -283,6 +288,7 @@ class UltrasoundSceneLogic:
         `labels_node` is a label map or a segmentation; its names determine the tissues, see label_nodes.read_labels.
         Amplifier noise differs between poses in the labels' frame (noise.seed_of_pose). `warned` is called with each
         warning.
+        Raises SimulationError, before anything is computed, for an output with data that this module did not make.
         """
         self._check_output(labels_node, output_node)
         probe_to_world = probe_pose(probe_transform_node)
@@ -291,6 +297,7 @@ class UltrasoundSceneLogic:
         require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         self._last = (frame, probe_to_world)
         write_image(output_node, frame, probe_transform_node)
+        mark_as_result(output_node)
         return frame
 
     @property
@@ -321,7 +328,7 @@ class UltrasoundSceneLogic:
         node cannot distinguish, so that no image is lost. Their numbers are the seeds of their noise. With the browser
         of the transforms, the parents of its current transform are applied, and the images are added to it, under that
         transform. `progress` is called with the fraction done and may raise errors.Cancelled; `images_node` is then
-        unchanged.
+        unchanged. Raises SimulationError for an `images_node` with data that this module did not make.
         """
         require_node(transforms_node, "vtkMRMLSequenceNode", use="sequence of transforms")
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
@@ -329,6 +336,7 @@ class UltrasoundSceneLogic:
             images_node is not transforms_node,
             f"input and output are both {named(images_node)}, expected different nodes",
         )
+        require_result(images_node, "sequence of images")
         count = transforms_node.GetNumberOfDataNodes()
         require(count > 0, f"sequence {named(transforms_node)} is empty, expected transforms")
         proxy = None if browser_node is None else browser_node.GetProxyNode(transforms_node)
@@ -344,12 +352,14 @@ class UltrasoundSceneLogic:
             image = self.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
             image.UnRegister(None)
             write_image(image, frame)
+            mark_as_result(image)  # the browser's node for the shown image is a copy
             images.append(image)
             if progress is not None:
                 progress((number + 1) / count)
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
 
         SequenceIndex.of_node(transforms_node).fill(images_node, images)
+        mark_as_result(images_node)
         if browser_node is not None:
             if not browser_node.IsSynchronizedSequenceNode(images_node, True):
                 browser_node.AddSynchronizedSequenceNode(images_node)
@@ -376,10 +386,15 @@ class UltrasoundSceneLogic:
         set_node_to_world(probe_transform_node, pose)
 
     def showOutline(self, model_node, probe_transform_node) -> None:
-        """The outline of the imaged field as a model under the probe's transform."""
+        """The outline of the imaged field as a model under the probe's transform.
+
+        Raises SimulationError for a model with a surface that this module did not make.
+        """
         require_node(model_node, "vtkMRMLModelNode", use="outline")
         require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
+        require_result(model_node, "outline")
         write_outline(model_node, self.preset.probe, probe_transform_node)
+        mark_as_result(model_node)
 
     def showInSlice(self, slice_node, output_node, probe_transform_node, fit: bool = True) -> None:
         """Move a slice view to the image plane and overlay the image."""
@@ -453,15 +468,23 @@ class UltrasoundSceneLogic:
         return before
 
     def writeRegistration(self, found: Fit, labels_node, transform_node) -> None:
-        """Write the registration's correction into a linear transform: the last parent of the tracking."""
+        """Write the registration's correction into a linear transform: the last parent of the tracking.
+
+        Raises SimulationError for a transform that is neither the identity nor written by this method.
+        """
         require_node(transform_node, "vtkMRMLLinearTransformNode", use="registration")
         registration = required(found.registration, "the fit was made without registration")
+        require_result(transform_node, "registration")
         to_world = self._fit_to_world(labels_node)
         set_node_to_world(transform_node, to_world @ registration.correction @ np.linalg.inv(to_world))
+        mark_as_result(transform_node)
 
     def showFit(self, found: Fit, labels_node, nodes: Mapping[str, object], number: int | None = None) -> None:
         """Write one image of a fit, by default the first, into volume nodes: any of {"real": ..., "before": ...,
-        "after": ..., "difference": ...}."""
+        "after": ..., "difference": ...}.
+
+        Raises SimulationError for one with data that this module did not make; none is changed then.
+        """
         number = found.tracked.numbers[0] if number is None else number
         write_compared(dict(nodes), found, number, self._fit_to_world(labels_node))
 
@@ -546,6 +569,7 @@ class UltrasoundSceneLogic:
         require(
             output_node is not self.parameters.mri, f"output is the MRI {named(output_node)}, expected another volume"
         )
+        require_result(output_node, "output")
 
     def _patient(self, labels_node) -> Patient:
         return self._patients.read(labels_node, self.preset.tissues)
@@ -589,7 +613,7 @@ class UltrasoundSceneLogic:
                 "partial_volume to false and mri_modulation_db to 0"
             )
         if self._texture is None or self._texture[0] != patient.version:
-            # A segmentation node returns its labels cropped to their content.
+            # A segmentation node may return its labels on a larger or smaller part of the grid.
             texture = segmented.texture().on_grid_of(patient.labels, segmented.labels)
             self._texture = (patient.version, texture)
         return self._texture[1]

@@ -137,9 +137,13 @@ class Device:
         """Enqueue filling a buffer, whose size is a multiple of four, with zeros."""
         self.cl.enqueue_fill_buffer(self.queue, buffer, _ZERO, 0, buffer.size)
 
-    def copy(self, source: Buffer, target: Buffer, nbytes: int, target_offset: int = 0) -> None:
-        """Enqueue copying the first `nbytes` of a buffer to `target_offset` (bytes) of another."""
-        self.cl.enqueue_copy(self.queue, target, source, byte_count=nbytes, dst_offset=target_offset)
+    def copy(
+        self, source: Buffer, target: Buffer, nbytes: int, target_offset: int = 0, *, source_offset: int = 0
+    ) -> None:
+        """Enqueue copying `nbytes` from `source_offset` (bytes) of a buffer to `target_offset` of another."""
+        self.cl.enqueue_copy(
+            self.queue, target, source, byte_count=nbytes, src_offset=source_offset, dst_offset=target_offset
+        )
 
     def write(self, buffer: Buffer, array: np.ndarray) -> None:
         """Enqueue copying `array` into a buffer that is at least as large, without waiting for completion."""

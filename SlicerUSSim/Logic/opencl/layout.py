@@ -26,19 +26,17 @@ CONSTANTS = {
     "WIDE_SIGMA": 3.0,
     "WIDE_VARIANCE": 8.91,
     "HALVED_SIGMA": 4.0,
-    "WIDEST_VARIANCE": 17.75,
+    "WIDEST_VARIANCE": 18.29,
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
     "SOFT_SPEED": 0.105,  # largest relative difference of speed of sound at a soft border (common.clh), ...
     "SOFT_REFLECTION": 0.12,  # ... and largest reflection coefficient at normal incidence
+    "STRAIGHT_SPEED": 0.2,  # ... and largest relative difference of speed at which a path goes straight on
     "MAX_STACK": 24,  # reflected rays waiting to be followed
     "BLOCK": 64,  # samples over which beam widths and gains are assumed linear; lines are whole blocks long
-    "BANDS": 4,  # of T1, into which a tissue's scatterers are divided when mu1 is varied (appearance.py)
-    "PARTS": 9,  # 1 + 2 BANDS
-    "ROLE_FIXED": 0,  # of a tissue while the parts are computed: in part 0, ...
-    "ROLE_VARIED": 1,  # ... in separate parts, ...
-    "ROLE_SILENT": 2,  # ... or in none
+    "PARTS": 4,  # of the echoes, which are computed at once for fits (scattering.cl)
+    "LOSS_STEP": 16,  # samples between those at which losses are stored (downshift.cl); a multiple of all LANES
     "MAX_BINS": 256,  # of the histograms in similarity.cl
     "LINE_PAD": 448,  # zeros on either side of a line: the longest pulse filter (bandwidth 0.05, 16 samples per cycle)
 }
@@ -107,6 +105,7 @@ ACQUISITION = np.dtype(
         ("interface_gain", _FLOAT),
         ("interface_is_energy", _INT),
         ("specular_exponent", _FLOAT),
+        ("downshift", _FLOAT),  # part of the frequency that is lost per neper of two-way loss; 0: none
         # scatterers
         ("cell_mm", _FLOAT),
         ("seed", _UINT),
@@ -121,9 +120,8 @@ TISSUE = np.dtype(
         ("speed_of_sound_m_s", _FLOAT),
         ("impedance_mrayl", _FLOAT),
         ("attenuation_db_cm_mhz", _FLOAT),
-        ("mu0", _FLOAT),
-        ("sigma0", _FLOAT),
         ("scatterer_share", _FLOAT),  # p = 1 - Phi(mu1)
+        ("scatterer_variance", _FLOAT),
         ("group", _INT),  # tissues of one speed and impedance: no interface between them
         ("is_fluid", _INT),  # of the membrane's fluids
     ]
@@ -144,6 +142,8 @@ SEGMENT = np.dtype(
         ("weight", _FLOAT),  # product of R and 1 - R along the path
         ("attenuation", _FLOAT),  # two-way amplitude factor at `start`
         ("decay_per_mm", _FLOAT),  # -d ln(attenuation) / ds
+        ("loss", _FLOAT),  # nepers at `start` by the attenuation of tissues alone, without what a beam loses otherwise
+        ("loss_per_mm", _FLOAT),
         ("reflections", _INT),
         ("label", _INT),
     ]
@@ -158,12 +158,11 @@ HIT = np.dtype(
         ("depth_mm", _FLOAT),
         ("weight", _FLOAT),
         ("attenuation", _FLOAT),
+        ("loss", _FLOAT),  # as of a segment
         ("cos_incidence", _FLOAT),
         ("reflectance", _FLOAT),  # R = r^2
-        (
-            "lateral_slope",
-            _FLOAT,
-        ),  # depth (displayed) per mm of lateral offset along the interface, in the unfolded beam
+        # depth (displayed) per mm of lateral offset along the interface, in the unfolded beam
+        ("lateral_slope", _FLOAT),
         ("elevational_slope", _FLOAT),  # the same for elevational offset
         ("curvature", _FLOAT),  # mean curvature of the interface in 1/mm, positive where convex against the ray
         ("elevational_mm", _FLOAT),  # the ray's offset from the beam axis

@@ -47,8 +47,8 @@ class Probe(Declared):
 
     >>> from dataclasses import replace
     >>> from SlicerUSSim.Logic.probe import PROBES
-    >>> sorted(PROBES)
-    ['abdominal', 'convex', 'linear', 'microconvex', 'phased']
+    >>> ", ".join(PROBES)
+    'phased, convex, linear, microconvex, abdominal, cardiac, neonatal, linear_15, burr_hole, hockey_stick, matrix'
     >>> replace(PROBES["convex"], frequency_mhz=3.5).depth_mm
     100.0
     """
@@ -75,12 +75,25 @@ class Probe(Declared):
         2.5, "Receive f-number", "Smallest f-number of the receive aperture", bounds=(0.5, 20),
         note="The receive aperture grows with depth up to the full aperture",
     )  # fmt: skip
+    receive_apodization: float = parameter(
+        0.0, "Apodisation", "Weights of the receive aperture, for its side lobes: 0 uniform, 1 Hann", bounds=(0, 1),
+        note="Power of the side lobes re the main beam: -27 dB with 0, -32 dB with 0.5",
+    )  # fmt: skip
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
     )
     elevation_focus_mm: float = parameter(
         _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), can_be_none=True, note="It then moves with the depth",
+    )  # fmt: skip
+
+    ring_down_mm: float = parameter(
+        1.5, "Ring-down", "Depth in which reverberation between face and skin falls by 40 dB; 0: none", unit="mm",
+        bounds=(0, 10),
+    )  # fmt: skip
+    ring_down_db: float = parameter(
+        0.0, "Ring-down level", "Of the reverberation at the face, re tissue of unit scatterer variance", unit="dB",
+        bounds=(-100, 100),
     )  # fmt: skip
 
     #: Name of the kind in a preset, and a description for tool tips
@@ -224,6 +237,11 @@ class Probe(Declared):
         elevational = self._gaussian_beam(depth, *self.elevation_waist()) / np.sqrt(2.0)
         return lateral, elevational
 
+    def smallest_cell_mm3(self) -> float:
+        """Volume of the smallest resolution cell within the image depth: (2 pi)^1.5 times the product of the sigmas."""
+        lateral, elevational = self.beam_sigma_mm(np.linspace(0.0, self.depth_mm, 257))
+        return float((2.0 * np.pi) ** 1.5 * self.axial_sigma_mm * (lateral * elevational).min())
+
     def receive_beam(self) -> tuple[float, float]:
         """(least sigma in mm, sigma per mm of depth) of the one-way lateral receive beam, focused at every depth."""
         per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
@@ -363,7 +381,7 @@ def probe_from_dict(values: dict, source: str = "probe") -> Probe:
     return built(PROBE_KINDS[kind], arguments, source)
 
 
-#: Preset probes by name, such as PROBES["phased"].
+#: Preset probes by name, such as PROBES["phased"]. docs/probes.md has their sources.
 PROBES: dict[str, Probe] = {
     "phased": PhasedProbe(field_of_view_deg=80.0, depth_mm=90.0, scan_lines=196, frequency_mhz=5.0),
     "convex": ConvexProbe(radius_mm=40.0, field_of_view_deg=60.0, depth_mm=100.0, scan_lines=192, frequency_mhz=5.0),
@@ -374,5 +392,29 @@ PROBES: dict[str, Probe] = {
     "abdominal": ConvexProbe(
         radius_mm=60.0, field_of_view_deg=70.0, depth_mm=160.0, frequency_mhz=3.5, aperture_mm=20.0,
         elevation_aperture_mm=12.0,
+    ),
+    "cardiac": PhasedProbe(  # 64 elements of 0.3 mm
+        field_of_view_deg=90.0, depth_mm=160.0, frequency_mhz=2.7, fractional_bandwidth=0.74, aperture_mm=19.2,
+        elevation_aperture_mm=14.0, elevation_focus_mm=60.0,
+    ),
+    "neonatal": ConvexProbe(  # for the anterior fontanelle
+        radius_mm=11.0, field_of_view_deg=110.0, depth_mm=80.0, frequency_mhz=7.5, fractional_bandwidth=0.6,
+        aperture_mm=8.0, focus_mm=40.0, elevation_aperture_mm=5.0, elevation_focus_mm=40.0,
+    ),
+    "linear_15": LinearProbe(
+        width_mm=25.6, depth_mm=30.0, scan_lines=256, frequency_mhz=15.0, aperture_mm=6.4, focus_mm=15.0,
+        elevation_aperture_mm=2.5, elevation_focus_mm=12.0,
+    ),
+    "burr_hole": PhasedProbe(  # its face fits into a hole of 14 mm
+        field_of_view_deg=90.0, depth_mm=80.0, frequency_mhz=5.2, fractional_bandwidth=0.58, aperture_mm=10.9,
+        focus_mm=40.0, elevation_aperture_mm=7.0, elevation_focus_mm=40.0,
+    ),
+    "hockey_stick": LinearProbe(
+        width_mm=22.8, depth_mm=35.0, frequency_mhz=11.0, fractional_bandwidth=0.7, aperture_mm=8.5, focus_mm=20.0,
+        elevation_aperture_mm=4.0, elevation_focus_mm=15.0,
+    ),
+    "matrix": PhasedProbe(  # 3000 elements half a wavelength apart; its elevational focus is electronic
+        field_of_view_deg=90.0, depth_mm=140.0, frequency_mhz=3.0, fractional_bandwidth=0.8, aperture_mm=14.0,
+        elevation_aperture_mm=14.0,
     ),
 }  # fmt: skip

@@ -56,10 +56,13 @@ def surface_point(foreground: Volume, target_ras, outward_ras) -> np.ndarray:
     return points[np.flatnonzero(inside)[-1]]
 
 
-def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standoff_mm: float = 1.0) -> np.ndarray:
+def craniotomy_pose(
+    brain: Volume, probe: Probe, tilt_deg: float = 32.0, standoff_mm: float = 1.0, target_ras=None
+) -> np.ndarray:
     """(4, 4) probe_to_ras of a coronal view through a parasagittal craniotomy, aimed below the centre of the brain.
 
     `brain` is a mask or label map (non-zero inside). The view crosses cortex, a lateral ventricle and the midline.
+    With `target_ras` (mm) it is the coronal view of that point, through a craniotomy of its side.
 
     >>> from SlicerUSSim.Logic.mri import head_mri
     >>> from SlicerUSSim.Logic.probe import PROBES, craniotomy_pose
@@ -74,6 +77,9 @@ def craniotomy_pose(brain: Volume, probe: Probe, tilt_deg: float = 32.0, standof
     tilt = np.deg2rad(tilt_deg)
     outward = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
     target = centre + [0.0, 0.0, 2.0]
+    if target_ras is not None:
+        target = np.asarray(target_ras, float)
+        outward[0] *= 1.0 if target[0] >= centre[0] else -1.0
     face = surface_point(brain, target, outward) + standoff_mm * outward
     _log.info("probe placed by itself: coronal view from RAS %s, %.0f degrees from the midline", _point(face), tilt_deg)
     return pose_looking_at(face, target, lateral_ras=(1.0, 0.0, 0.0))

@@ -15,10 +15,8 @@ class Advice:
     leave_out: str = "leave them out with {maps}"
     #: About a label that is the background; {label} is its number
     background: str = "leave it out with --map {label}=0, or say what it is with --map {label}=TISSUE"
-    #: About a mask or lesion without a patient; {tissue}, {source} and {maps} are for this label map
-    lesion: str = (
-        "add it to a segmentation with --add {tissue}={source}, or simulate it alone with {maps} (ussim simulate)"
-    )
+    #: About a mask or lesion without a patient; {added}, {source} and {maps} are for this label map
+    lesion: str = "add it to a segmentation with --add {added}, or simulate it alone with {maps} (ussim simulate)"
     #: The same about one as large as a brain
     brain_mask: str = (
         "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or simulate it alone with "

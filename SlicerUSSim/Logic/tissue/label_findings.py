@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import PurePath
@@ -74,12 +75,14 @@ class Findings:
         else:
             return
         of_file = _tissue_of_file(self.source) or "tumour"
-        maps = " ".join(f"--map {label}={tissue or of_file}" for label, tissue in zip(self.names, known, strict=True))
+        pairs = zip(self.names, known, strict=True)
+        maps = " ".join("--map " + shlex.quote(f"{label}={tissue or of_file}") for label, tissue in pairs)
         is_brats = self.scheme is not None and self.scheme.is_lesion
         tissue = "brats" if is_brats or len(set(known)) > 1 else known[0] or of_file
         is_large = len(known) == 1 and self._millilitres(self.names) > _LARGEST_LESION_ML
         advice = self.advice.brain_mask if is_large else self.advice.lesion
-        remedy = advice.format(tissue=tissue, source=self.source, maps=maps)
+        added = shlex.quote(f"{tissue}={self.source}")
+        remedy = advice.format(added=added, source=self.source, maps=maps)
         if self.scheme is not None and is_brats and set(self.names) <= set(schemes()["ussim"].names):
             remedy += f"; if it is a brain, {self.advice.ambiguous.format(key='ussim')}"
         raise SimulationError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
@@ -101,7 +104,9 @@ class Findings:
             remedy = f"if these are intensities of an MRI, its file may be incomplete; {remedy}"
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
-        raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}; {remedy}: {known}")
+        unused = self.mapping.unused(self.names)
+        mistaken = f"; it has no label {listed(unused)}, which --map mentions" if unused else ""
+        raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}{mistaken}; {remedy}: {known}")
 
     def _if_of_a_program(self, labels: list[int]) -> str:
         """Which programs have all these numbers, though they are too few to be recognised, and how to say so."""

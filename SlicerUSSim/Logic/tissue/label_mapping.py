@@ -48,9 +48,8 @@ class LabelMapping:
     def of(cls, texts: Iterable[str] | Mapping[object, str], tissues: TissueTable | None = None) -> LabelMapping:
         """From texts "24=csf", "Left-Lesion=tumour", files and keys of schemes, or from a mapping {24: "csf"}.
 
-        One text alone may be given without a list. Of several texts for one label the last counts. `tissues` are known
-        by their names in addition to the presets.
-        Raises SimulationError for texts that are none of these, and for unknown tissues.
+        One text alone may be given without a list. `tissues` are known by their names in addition to the presets.
+        Raises SimulationError for texts that are none of these, for unknown tissues, and for two tissues of one label.
         """
         if isinstance(texts, Mapping):
             texts = [f"{label}={tissue}" for label, tissue in texts.items()]
@@ -62,7 +61,8 @@ class LabelMapping:
             key, equals, value = text.partition("=")
             path = Path(text)
             if text.strip().lower() in schemes():
-                scheme = text.strip().lower()
+                before, scheme = scheme, text.strip().lower()
+                require(before in (None, scheme), f"--map {before} and --map {scheme}: expected one numbering")
             elif path.suffix.lower() == ".json" and (not equals or path.exists()):
                 for entry, tissue in _read_json(path).items():
                     _add(by_label, by_name, entry, tissue, str(path), tissues)
@@ -100,8 +100,10 @@ def _read_json(path: Path) -> dict:
     values = read_json(path)
     if isinstance(values, dict) and "tissues" in values:
         raise SimulationError(f"--map {path}: is a tissue table, give it with --tissues")
-    is_mapping = isinstance(values, dict) and all(isinstance(value, str | int) for value in values.values())
-    require(is_mapping, f'{path}: is {kind_of(values)}, expected a mapping such as {{"24": "csf"}}')
+    require(isinstance(values, dict), f'{path}: is {kind_of(values)}, expected a mapping such as {{"24": "csf"}}')
+    for label, tissue in values.items():
+        is_tissue = isinstance(tissue, str) or tissue == 0
+        require(is_tissue, f"{path}: label {label} is {kind_of(tissue)}, expected the name of a tissue, or 0")
     return values
 
 
@@ -115,9 +117,13 @@ def _add(
             key.isdecimal() and int(key) <= _LARGEST_LABEL,
             f"{owner}: label is {key}, expected a whole number from 0 to {_LARGEST_LABEL}",
         )
-        by_label[int(key)] = tissue
+        before = by_label.setdefault(int(key), tissue)
     else:
-        by_name[plain_name(key)] = tissue
+        before = by_name.setdefault(plain_name(key), tissue)
+    require(
+        plain_name(before) == plain_name(tissue),
+        f"{owner}: label {key} is {before} already and cannot be {tissue}, too; expected one tissue for each label",
+    )
 
 
 def _tissue(text: str, owner: str, tissues: TissueTable | None) -> str:

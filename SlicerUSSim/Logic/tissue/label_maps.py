@@ -12,15 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tissue.body_orientation import has_exchanged_sides, places_of, wrong_body
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_findings import Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
-from SlicerUSSim.Logic.tissue.schemes import Scheme, is_mirrored, recognised, scheme_with_names, schemes, title_of
+from SlicerUSSim.Logic.tissue.schemes import Scheme, recognised, scheme_with_names, schemes, title_of
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.tissue.upright import wrong_way_up
@@ -94,6 +95,7 @@ def read_label_map(
     >>> found.message, found.names
     ('FreeSurfer aseg: 6 labels to 3 tissues', ('white matter', 'csf', 'grey matter'))
     """
+    require_kind("label map", volume, Volume, "Volume.read reads a file")
     reading = _Reading(
         as_whole(volume, source), names or {}, mapping or LabelMapping(), source,
         tissues or by_number or TissueTable.brain(), by_number, advice,
@@ -212,32 +214,30 @@ class _Reading:
         )
 
     def _require_upright(self, names: Mapping[int, str | None]) -> None:
-        """Raise SimulationError for a head that is upside down by what its labels are called."""
+        """Raise SimulationError for a head or body that is upside down by what its labels are called."""
         own = {label: name for label, name in names.items() if self._mapping.tissue_of(label, name) is None}
-        wrong = wrong_way_up(self._volume, own)
+        places = places_of(self._volume, own)
+        wrong = wrong_way_up(self._volume, own) or wrong_body(places)
         require(
             wrong is None,
             f"{self._source}: by its header, {wrong}; correct the orientation in its header, or export it again with "
-            "that of its MRI",
+            "that of its image",
         )
+        if has_exchanged_sides(places):
+            self._warn_of_sides()
 
     # ---- what it is --------------------------------------------------------------------------------------------
 
     def _scheme(self) -> Scheme | None:
         """The numbering scheme, if some labels have neither a name nor a tissue of the user's."""
         if self._mapping.scheme:
-            scheme = schemes()[self._mapping.scheme]
-            if scheme.key == "freesurfer" and is_mirrored(scheme, self._volume):
-                self._warn_of_sides()
-            return scheme
+            return schemes()[self._mapping.scheme]
         unknown = [label for label in self._present if self._tissue(label, self._names.get(label)) is None]
         if not unknown or (self._names and len(unknown) < len(self._present)):
             return None
         left_out = [label for label, name in self._mapping.by_label.items() if name == "coupling"]
         kept = self._volume.with_array(np.where(np.isin(self._volume.array, left_out), 0, self._volume.array))
         recognition = recognised(kept, unknown)
-        if recognition.is_mirrored:
-            self._warn_of_sides()
         if recognition.candidates:
             titles = " and ".join(scheme.title for scheme in recognition.candidates)
             remedy = self._advice.ambiguous.format(key=recognition.candidates[0].key)
@@ -296,5 +296,7 @@ class _Reading:
         if findings.is_mapped:
             return "mapped"
         if findings.scheme is not None:
+            if findings.scheme.key == self._mapping.scheme != "freesurfer":  # not one of several, as the user said
+                return findings.scheme.title
             return title_of(findings.scheme, self._present)
         return "labels with names" if self._names else "labels by number"

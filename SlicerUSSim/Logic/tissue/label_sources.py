@@ -16,7 +16,11 @@ from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_files import names_of_file
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole, read_label_map
-from SlicerUSSim.Logic.tissue.partial_volume_maps import is_as_cat12_writes, partial_volume_labels
+from SlicerUSSim.Logic.tissue.partial_volume_maps import (
+    is_as_cat12_writes,
+    is_partial_volume_map,
+    partial_volume_labels,
+)
 from SlicerUSSim.Logic.tissue.probability_maps import CombinedMaps, combined_probability_maps
 from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 
@@ -43,6 +47,11 @@ def not_intensities(volume: Volume) -> str | None:
     """What a volume is, and what to do, if it is a label map or what is left of one; None for an image."""
     if volume.looks_like_labels():
         return "is a label map, expected the intensities of an MRI"
+    if is_partial_volume_map(volume.array):
+        return (
+            "is a partial volume map of three tissues, as CAT12's p0, or their label map resampled with interpolation, "
+            "expected the intensities of an MRI; use it as a label map"
+        )
     if is_interpolated(volume.array):
         return (
             "is mostly uniform regions of whole numbers with fractions between them, as a label map that was "
@@ -65,12 +74,17 @@ def _without_labels(path: Path, volume: Volume) -> CombinedMaps | None:
 
 
 def is_interpolated(array: np.ndarray) -> bool:
-    """Whether most voxels have whole numbers, in uniform regions, and others fractions. An MRI is noisy everywhere."""
-    inside = array != 0
-    if not np.issubdtype(array.dtype, np.floating) or not inside.any():
+    """Whether most voxels have whole numbers, in uniform regions, and others fractions. An MRI is noisy everywhere.
+
+    The background, which is the most frequent whole number, is uniform in both and not counted.
+    """
+    is_whole = array == np.rint(array)
+    if not np.issubdtype(array.dtype, np.floating) or not is_whole.any():
         return False
-    is_whole = inside & (array == np.rint(array))
-    if not _MOSTLY <= is_whole.sum() / inside.sum() < 1.0:
+    values, counts = np.unique(array[is_whole], return_counts=True)
+    inside = array != values[np.argmax(counts)]
+    is_whole &= inside
+    if not inside.any() or not _MOSTLY <= is_whole.sum() / inside.sum() < 1.0:
         return False
     pairs = is_whole[..., 1:] & inside[..., :-1]
     return bool(pairs.any() and (array[..., 1:] == array[..., :-1])[pairs].mean() > _UNIFORM)

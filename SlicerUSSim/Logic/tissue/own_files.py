@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.own_outputs import hash_of_values
 from SlicerUSSim.Logic.base.volume import WRITABLE_SUFFIXES, Volume
 from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 
@@ -26,7 +26,7 @@ def write_label_files(path: Path, labels: Volume, tissues: TissueTable) -> Path:
     labels.write(path)
     values = tissues.to_dict()
     # Of the file as it is read, since formats differ in the precision of positions.
-    write_json(beside, {**values, _LABELS: _hash_of_labels(Volume.read(path)), _TABLE: _hash_of_table(values)})
+    write_json(beside, {**values, _LABELS: _hash_of_labels(Volume.read(path)), _TABLE: hash_of_values(values)})
     return beside
 
 
@@ -73,7 +73,7 @@ def _why_not_ours(path: Path, beside: Path) -> str | None:
         hashes = (values.pop(_LABELS, None), values.pop(_TABLE, None)) if isinstance(values, dict) else (None, None)
         if None in hashes:
             return f"exists and was not written by this program ({beside.name} does not say so)"
-        if hashes[1] != _hash_of_table(values):
+        if hashes[1] != hash_of_values(values):
             return f"the tissues in {beside.name} have been edited"
         if path.exists() and hashes[0] != _hash_of_labels(Volume.read(path)):
             other = _other_labels(path, beside, hashes[0])
@@ -89,7 +89,3 @@ def _hash_of_labels(labels: Volume) -> str:
     content = hashlib.sha256(repr((labels.array.shape, labels.ijk_to_ras.round(4).tolist())).encode())
     content.update(labels.array.astype(np.int32).tobytes())
     return content.hexdigest()
-
-
-def _hash_of_table(values: dict) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

@@ -20,12 +20,14 @@ _LARGEST = (2.95, 3.05)
 _NEAR, _PURE_SHARE = 0.03, 0.04
 #: How many times more voxels are at 2 than half-way to 1 and 3
 _ABOVE_BETWEEN = 2.0
+#: Share of what is above zero that is at least between the peaks; a label map stored as floating point has none
+_FRACTIONS_SHARE = 0.02
 _BYTES = 256
 
 
 def partial_volume_labels(path: Path, volume: Volume) -> CombinedMaps | None:
     """The label map of CAT12's p0, each voxel its nearest tissue; None if it is none."""
-    if not np.issubdtype(volume.array.dtype, np.floating) or not _is_partial_volume_map(volume.array):
+    if not is_partial_volume_map(volume.array):
         return None
     labels = volume.with_array(np.rint(np.clip(volume.array, 0, 3)).astype(np.uint8))
     message = f"{path}: CAT12's partial volume map (p0), 3 tissues: 1 csf, 2 grey matter, 3 white matter, rounded"
@@ -37,10 +39,14 @@ def is_as_cat12_writes(path: Path, array: np.ndarray) -> bool:
     return path.name.startswith("p0") or len(np.unique(array)) <= _BYTES
 
 
-def _is_partial_volume_map(array: np.ndarray) -> bool:
+def is_partial_volume_map(array: np.ndarray) -> bool:
+    """Whether a (k, j, i) array is a partial volume map of CSF, grey and white matter, 0 to 3, by its histogram."""
+    if not np.issubdtype(array.dtype, np.floating):
+        return False
     low, high = float(array.min()), float(array.max())  # NaN fails both comparisons
     if not (low >= -_NEAR and _LARGEST[0] <= high <= _LARGEST[1]):
         return False
     inside = array[array > _NEAR]
     grey, white, below, above = (float(np.mean(np.abs(inside - at) < _NEAR)) for at in (2.0, 3.0, 1.5, 2.5))
-    return min(grey, white) >= _PURE_SHARE and grey >= _ABOVE_BETWEEN * max(below, above)
+    has_fractions = float(np.mean(np.abs(inside - np.rint(inside)) > _NEAR)) >= _FRACTIONS_SHARE
+    return has_fractions and min(grey, white) >= _PURE_SHARE and grey >= _ABOVE_BETWEEN * max(below, above)

@@ -13,11 +13,12 @@ from functools import cache
 
 import numpy as np
 
+from SlicerUSSim.Logic.base.errors import either
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue import freesurfer, totalsegmentator
 from SlicerUSSim.Logic.tissue.brain_orders import BrainLabels
 from SlicerUSSim.Logic.tissue.names import same_name
-from SlicerUSSim.Logic.tissue.thinning import thinning
+from SlicerUSSim.Logic.tissue.thinning import label_centres, thinning
 
 #: At least this share of the positions of structures has to agree with a scheme, and this number of them.
 _AGREEING, _FEWEST = 0.85, 3
@@ -58,8 +59,6 @@ class Recognition:
     scheme: Scheme | None
     #: Other schemes that fit as well; then `scheme` is None
     candidates: tuple[Scheme, ...] = ()
-    #: Whether what is labelled left is on the right
-    is_mirrored: bool = False
     #: A scheme that has all labels, but whose places cannot be compared to be sure; then `scheme` is None
     possible: Scheme | None = None
     #: Why not
@@ -106,7 +105,7 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
     ----------
     labels : (k, j, i) whole numbers.
     """
-    centres = _centres(labels)
+    centres = label_centres(labels)
     possible = None
     fits: list[tuple[int, Scheme]] = []
     for scheme in schemes().values():
@@ -136,19 +135,13 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
     return Recognition(best[0])
 
 
-def is_mirrored(scheme: Scheme, labels: Volume) -> bool:
-    """Whether the structures of both sides that a (k, j, i) label map has lie the other way round."""
-    holds, reverse, count = _agreement(scheme.order, _centres(labels))
-    return reverse > holds and reverse >= _AGREEING * count
-
-
 def _freesurfer(
     scheme: Scheme, values: list[int], known: float, holds: int, reverse: int, count: int
 ) -> Recognition | None:
     """FreeSurfer's numbers, if enough pairs of a left and a right structure lie as they should, or all are mirrored."""
     usual = np.mean([freesurfer.is_usual(value) for value in values])
     if count >= _SURE and usual >= _KNOWN and reverse >= _AGREEING * count:
-        return Recognition(scheme, is_mirrored=True)
+        return Recognition(scheme)
     if holds < _AGREEING * count:
         return None
     regions = sum(map(freesurfer.is_region, values))
@@ -159,7 +152,7 @@ def _freesurfer(
 def title_of(scheme: Scheme, values: list[int]) -> str:
     """The scheme, and which of its segmentations this is."""
     if scheme.key != "freesurfer":
-        return scheme.title
+        return _title_with_alike(scheme, values)
     if any(value >= 11100 for value in values):
         return "FreeSurfer aparc.a2009s+aseg"
     if any(3000 <= value <= 5002 for value in values):
@@ -171,13 +164,28 @@ def title_of(scheme: Scheme, values: list[int]) -> str:
     return "FreeSurfer's numbers, as SynthSeg uses them" if 24 in values else "FreeSurfer aseg"
 
 
+def _title_with_alike(scheme: Scheme, values: list[int]) -> str:
+    """The scheme's title; of TotalSegmentator's, with the others that call these labels the same."""
+    family = "TotalSegmentator "
+    alike = [
+        other.title.removeprefix(family).replace(", ", " of ")
+        for other in schemes().values()
+        if other.order and other.title.startswith(family)
+        and all(other.names.get(value) == scheme.names.get(value) for value in values)
+    ]  # fmt: skip
+    return f"{family}{either(alike)}" if scheme.title.startswith(family) and len(alike) > 1 else scheme.title
+
+
 def scheme_with_names(names: Mapping[int, str]) -> Scheme | None:
-    """The scheme that gives these labels these names, if there is one."""
-    for scheme in schemes().values():
-        same = [same_name(name, scheme.names.get(label, "")) for label, name in names.items()]
-        if same and np.mean(same) >= _KNOWN:
-            return scheme
-    return None
+    """The scheme that gives most of these labels these names, if there is one."""
+    if not names:
+        return None
+    shares = {
+        key: np.mean([same_name(name, scheme.names.get(label, "")) for label, name in names.items()])
+        for key, scheme in schemes().items()
+    }
+    best = max(shares, key=lambda key: shares[key])
+    return schemes()[best] if shares[best] >= _KNOWN else None
 
 
 def _of_brain(labels: Volume, values: list[int]) -> Recognition:
@@ -228,14 +236,3 @@ def _agreement(order: list[tuple[int, list[int]]], centres: Mapping[int, np.ndar
         holds, reverse = holds + int(np.sum(steps > 0)), reverse + int(np.sum(steps < 0))
         count += len(steps)
     return holds, reverse, count
-
-
-def _centres(labels: Volume) -> dict[int, np.ndarray]:
-    """{label: its centre in RAS mm}."""
-    step = thinning(labels.array)
-    array = labels.array[::step, ::step, ::step]
-    where = np.nonzero(array)
-    values, inverse, counts = np.unique(array[where], return_inverse=True, return_counts=True)
-    ijk = np.stack([np.bincount(inverse, axis) * step / counts for axis in where[::-1]], axis=1)
-    ras = ijk @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
-    return dict(zip(map(int, values), ras, strict=True))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import built, kind_of, parameters_of, short
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -38,6 +38,7 @@ class TissueTable(Mapping[int, Tissue]):
 
     def __init__(self, tissues: Mapping[int, Tissue], membrane: Membrane | None = None) -> None:
         table = {}
+        require_kind("tissues", tissues, Mapping, "{1: Tissue(...)}")
         for label, tissue in tissues.items():
             require(
                 isinstance(label, int | np.integer) and not isinstance(label, bool) and 0 <= label <= MAX_LABEL,

@@ -3,7 +3,7 @@
 Two kinds of information, which can be used separately:
 - partial volume: the probability that a voxel belongs to another tissue than its label. A scatterer takes the other
   tissue with this probability, with a random number that is fixed for each scatterer. The mean power is therefore the
-  weighted mean of both tissues, and the signal remains linear in mu0 and sigma0 of every tissue;
+  weighted mean of both tissues, and the signal remains linear in sqrt(Var) of every tissue;
 - intensity: the deviation of the MRI from the mean of the tissue. Amplitudes follow it in decibels, normalised so that
   the tissue as a whole keeps its mean power.
 

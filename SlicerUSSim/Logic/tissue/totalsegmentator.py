@@ -57,16 +57,22 @@ iliopsoas_left iliopsoas_right brain
 #: Names in the order of the labels, from 1
 CT, CT_V1, MR = (text.split() for text in (_CT, _CT_V1, _MR))
 
-#: Structures from the feet to the head, and from the patient's left to the right, as far as people agree.
+#: Structures from the feet to the head, from the patient's left to the right, and from the back to the front, as far as
+#: people agree.
 _SPINE = [
     f"vertebrae_{part}{n}" for part, last in (("S", 1), ("L", 5), ("T", 12), ("C", 7)) for n in range(last, 0, -1)
 ]
-_UPWARDS = (
+UPWARDS = (
     _SPINE, *([f"rib_{side}_{n}" for n in range(12, 0, -1)] for side in ("left", "right")),
     ["urinary_bladder", "liver", "heart", "brain"], ["femur_left", "hip_left"], ["femur_right", "hip_right"],
     ["prostate", "sacrum", "aorta"],
 )  # fmt: skip
-_RIGHTWARDS = (["spleen", "liver"], ["stomach", "gallbladder"])
+RIGHTWARDS = (["spleen", "liver"], ["stomach", "gallbladder"])
+FORWARDS = (
+    ["autochthon_left", "vertebrae_L2", "inferior_vena_cava"], ["autochthon_right", "vertebrae_T12", "aorta"],
+    ["vertebrae_T8", "heart", "sternum"], ["spinal_cord", "esophagus"], ["sacrum", "urinary_bladder"],
+    ["gluteus_maximus_left", "iliopsoas_left"], ["gluteus_maximus_right", "iliopsoas_right"], ["brain", "face"],
+)  # fmt: skip
 
 
 def numbered(names: Sequence[str]) -> dict[int, str]:
@@ -78,5 +84,5 @@ def anatomical_order(names: Sequence[str]) -> list[tuple[int, list[int]]]:
     """(axis of RAS, labels whose centres have increasing coordinates along it) of CT, CT_V1 or MR."""
     label = {name: number for number, name in numbered(names).items()}
     pairs = ([name, name.replace("left", "right")] for name in names if "left" in name)
-    rows = [(2, row) for row in _UPWARDS] + [(0, row) for row in (*_RIGHTWARDS, *pairs)]
+    rows = [(2, row) for row in UPWARDS] + [(0, row) for row in (*RIGHTWARDS, *pairs)]
     return [(axis, [label[name] for name in row if name in label]) for axis, row in rows]

@@ -28,9 +28,9 @@ _STRUCTURES = (
 _USUAL = {"cerebellum": (-33.0, -52.0), "brain stem": (-7.0, -44.0)}
 #: The sine from the cerebellum to the brain stem is 0.37 to 0.44 in those; it is near 0 in their posterior halves.
 _MIRRORED = -0.25
-#: A head is tilted by less, in degrees. With both known, a mirrored one is found by its sine. The cerebellum alone is
-#: turned by about 65 to 115 degrees in a mirrored head, the brain stem by 160.
-_MOST_TILTED = {"both": 100.0, "brain stem": 95.0, "cerebellum": 75.0}
+#: A head is tilted by less, in degrees; one whose axes are exchanged is turned by 90. With both known, a mirrored one
+#: is found by its sine. The cerebellum alone is turned by 65 to 115 degrees in a mirrored head, the brain stem by 160.
+_MOST_TILTED = {"both": 60.0, "brain stem": 75.0, "cerebellum": 75.0}
 #: Nearer to the cerebrum's centre, in mm, a direction is not known: a part of a brain
 _NEAREST_MM = 15.0
 

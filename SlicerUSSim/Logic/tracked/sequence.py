@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
@@ -192,6 +192,7 @@ class TrackedSequence:
         Transforms whose status is not OK were not tracked and are omitted. Colours are converted to grey levels.
         Raises SimulationError for a file that is missing, unreadable or of another format.
         """
+        require_path(path)
         path = Path(path)
         require(path.is_file(), f"{path}: no such file")
         is_nrrd = path.name.lower().endswith((".nrrd", ".nhdr"))

@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA, Probe
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 
@@ -116,12 +116,24 @@ def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence: float 
 # ---- the five phantoms of the paper's Fig. 2 ------------------------------------------------------------------------
 
 
+def band_power(probe: Probe, loss_db) -> np.ndarray:
+    """Power (...,) of a pulse after losses in dB at its centre frequency, which rise with frequency; 1 before.
+
+    A sum over 201 frequencies of a Gaussian band, each attenuated by itself.
+    """
+    part = np.linspace(-4.0, 4.0, 201)
+    frequency = np.maximum(1.0 + part * probe.fractional_bandwidth / FWHM_PER_SIGMA, 0.0)  # re the centre
+    power = np.exp(-(part**2))
+    return (power * 10.0 ** (-0.1 * np.asarray(loss_db)[..., None] * frequency)).sum(axis=-1) / power.sum()
+
+
 def attenuating_block(
     attenuation_db_cm_mhz: float = 1.2, rotation: np.ndarray | None = None, *, thickness_mm: float = 12.0
 ) -> Phantom[LevelChange]:
     """Shadow, or enhancement if the attenuation is below that of the background: a block within speckle.
 
-    Behind it the mean level changes by -2 (alpha_block - alpha_background) f d dB (docs/physics.md#3-rays).
+    Behind it the mean level changes by -2 (alpha_block - alpha_background) f d dB (docs/physics.md#3-rays), summed over
+    the frequencies of the pulse.
     """
     block = replace(BACKGROUND, name="block", attenuation_db_cm_mhz=attenuation_db_cm_mhz)
     top = 14.0
@@ -130,11 +142,12 @@ def attenuating_block(
         return np.where((np.abs(x) < 8.0) & (y > top) & (y < top + thickness_mm), 2, 1)
 
     def expected(probe: Probe):
-        more = attenuation_db_cm_mhz - BACKGROUND.attenuation_db_cm_mhz
-        change = -2.0 * more * probe.frequency_mhz * thickness_mm / 10.0
-        return (
-            LevelChange("behind the block", (-2.0, 2.0, top + thickness_mm + 6.0, top + thickness_mm + 22.0), change),
-        )
+        near, far = top + thickness_mm + 6.0, top + thickness_mm + 22.0
+        per_mm = 0.2 * probe.frequency_mhz  # dB both ways
+        before = BACKGROUND.attenuation_db_cm_mhz * per_mm * np.linspace(near, far, 33)
+        more = (attenuation_db_cm_mhz - BACKGROUND.attenuation_db_cm_mhz) * per_mm * thickness_mm
+        change = 10 * np.log10(band_power(probe, before + more).mean() / band_power(probe, before).mean())
+        return (LevelChange("behind the block", (-2.0, 2.0, near, far), float(change)),)
 
     tissues = TissueTable({0: BACKGROUND, 1: BACKGROUND, 2: block})
     return _phantom(
@@ -317,6 +330,29 @@ def speed_cyst(
     return _phantom("speed cyst", label, tissues, rotation, 0.5, lambda probe: (), baseline)
 
 
+def behind_object(
+    shape: str, tissue: Tissue, rotation: np.ndarray | None = None, *, background: Tissue = BACKGROUND
+) -> Phantom[LevelChange]:
+    """A "plate" (x > 0) or "strip" (3 mm) from 15 to 18 mm, or a "ball" of 3 mm radius at 16 mm, without attenuation.
+
+    The speckle has no attenuation around the object.
+    """
+    plain = replace(background, attenuation_db_cm_mhz=0.0)
+    tissues = TissueTable({0: plain, 1: plain, 2: tissue})
+    shapes = {
+        "plate": lambda x, y, z: (y > 15.0) & (y < 18.0) & (x > 0.0),
+        "strip": lambda x, y, z: (y > 15.0) & (y < 18.0) & (np.abs(x) < 1.5),
+        "ball": lambda x, y, z: x**2 + (y - 16.0) ** 2 + z**2 < 9.0,
+    }
+    require(shape in shapes, f"shape is {shape!r}, expected one of {', '.join(shapes)}")
+    baseline = TissueTable(dict.fromkeys(tissues, plain))
+
+    def label(x, y, z):
+        return np.where(shapes[shape](x, y, z), 2, 1)
+
+    return _phantom(f"behind a {shape}", label, tissues, rotation, 0.5, lambda probe: (), baseline)
+
+
 # ---- resolution and speckle -----------------------------------------------------------------------------------------
 
 
@@ -360,6 +396,35 @@ def wires_and_cysts(rotation: np.ndarray | None = None, *, spacing_mm: float = 0
     for number in changes_db:
         baseline = baseline.replace(tissues[number].name, mu0=BACKGROUND.mu0, sigma0=BACKGROUND.sigma0)
     return _phantom("wires and cysts", label, table, rotation, spacing_mm, expected, baseline)
+
+
+def round_cyst(rotation: np.ndarray | None = None, *, depth_mm: float = 40.0, radius_mm: float = 5.0) -> Phantom[Echo]:
+    """A ball without scatterers in speckle, without attenuation; see clutter_power."""
+    plain = replace(BACKGROUND, attenuation_db_cm_mhz=0.0)
+    cyst = replace(plain, name="cyst", mu0=0.0, sigma0=0.0)
+
+    def label(x, y, z):
+        return np.where(x**2 + (y - depth_mm) ** 2 + z**2 < radius_mm**2, 2, 1)
+
+    return _phantom("round cyst", label, TissueTable({0: plain, 1: plain, 2: cyst}), rotation, 0.5, lambda probe: ())
+
+
+def clutter_power(probe: Probe, depth_mm: float, radius_mm: float) -> float:
+    """Power received from outside a disc across the beam at its focus, re that of everything; without apodisation.
+
+    By diffraction at uniform apertures (Goodman, Introduction to Fourier Optics, section 4.4): the two-way amplitude is
+    sinc(x / a) sinc(x / b) sinc(y / c)^2 with a, b, c wavelengths x f-number on transmission, reception and in
+    elevation.
+    """
+    across = np.linspace(0.0, 60.0, 6001)
+    per_f_number = probe.wavelength_mm * depth_mm
+    transmit = per_f_number / probe.aperture_mm
+    receive = max(transmit, probe.receive_f_number * probe.wavelength_mm)
+    lateral = (np.sinc(across / transmit) * np.sinc(across / receive)) ** 2
+    elevational = np.sinc(across / (per_f_number / probe.elevation_aperture_mm)) ** 4
+    reach = np.sqrt(np.maximum(radius_mm**2 - across**2, 0.0))
+    seen = np.interp(reach, across, np.cumsum(elevational) - 0.5 * elevational)
+    return float(1.0 - (lateral * seen).sum() / (lateral.sum() * elevational.sum()))
 
 
 def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom[Level]:

@@ -14,19 +14,23 @@ _DX_MM, _DZ_MM, _WIDTH = 0.1, 0.25, 512
 _EDGE_MM = 3.0  # over which waves fade at the sides
 
 
+#: Values at lateral positions and depths in a line's frame
+Map = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
 def speckle_power(
-    speed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None, depths_mm: np.ndarray, **beam: float
+    speed: Map | None, depths_mm: np.ndarray, *, nepers_per_mm: Map | None = None, **beam: float
 ) -> np.ndarray:
     """(depths,) mean power of speckle on a scan line: the integral of the transmitted times the received intensity.
 
     Parameters as in beam_intensities.
     """
-    _, transmitted, received = beam_intensities(speed, depths_mm, **beam)
+    _, transmitted, received = beam_intensities(speed, depths_mm, nepers_per_mm=nepers_per_mm, **beam)
     return (transmitted * received).sum(axis=1)
 
 
 def beam_intensities(
-    speed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None,
+    speed: Map | None,
     depths_mm: np.ndarray,
     *,
     frequency_mhz: float,
@@ -35,12 +39,14 @@ def beam_intensities(
     focus_mm: float,
     reference_m_s: float,
     steering_rad: float = 0.0,
+    nepers_per_mm: Map | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Intensities across a scan line: (lateral,) place in mm, (depths, lateral) transmitted and received.
 
     `speed` gives metres per second at lateral positions and depths in the line's frame (mm, any one shape); None is a
-    medium of the reference speed. The aperture transmits to `focus_mm` and receives focused at each depth, at
-    `f_number` until it is fully open. It is flat, and its normal lies `steering_rad` from the line against the lateral
+    medium of the reference speed. `nepers_per_mm` is what amplitudes lose there, one way. The aperture transmits to
+    `focus_mm` and receives focused at each depth, at `f_number` until it is fully open. It is flat, and its normal lies
+    `steering_rad` from the line against the lateral
     axis; behind it is the reference speed. Continuous waves.
     """
     x = (np.arange(_WIDTH) - _WIDTH / 2) * _DX_MM
@@ -66,6 +72,8 @@ def beam_intensities(
             depth = start + (n + 0.5) * _DZ_MM
             here = np.where(depth * cosine > x * sine, speed(x, np.full_like(x, depth)), reference_m_s)
             waves = waves * np.exp(1j * k * (reference_m_s / here - 1.0) * _DZ_MM)
+        if nepers_per_mm is not None:
+            waves = waves * np.exp(-nepers_per_mm(x, np.full_like(x, start + (n + 0.5) * _DZ_MM)) * _DZ_MM)
         for at in np.flatnonzero(ends == n + 1):
             transmitted[at], received[at] = np.abs(waves[[0, at + 1]]) ** 2
     return x, transmitted, received

@@ -33,6 +33,7 @@ def acquisition_record(
     membrane = medium.tissues.membrane
     transmit = _one_way_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5))
     elevational = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
+    density = settings.scatterers_per_mm3 or _automatic_density(probe)
     values = {
         "ras_to_voxel": medium.ras_to_voxel.ravel(),
         "dims": medium.dims,
@@ -79,17 +80,34 @@ def acquisition_record(
         "interface_gain": np.exp(settings.interface_gain_db * np.log(10.0) / 20.0),
         "interface_is_energy": settings.interface_reflection == "energy",
         "specular_exponent": settings.specular_exponent,
-        "cell_mm": np.cbrt(1.0 / settings.scatterers_per_mm3),
+        "downshift": (probe.fractional_bandwidth / _FWHM) ** 2 if settings.frequency_downshift else 0.0,
+        "cell_mm": np.cbrt(1.0 / density),
         "seed": hash_mix(np.array([settings.seed], np.uint32))[0] ^ np.uint32(0x2545F491),
         "beam_cutoff": settings.beam_cutoff,
         # Scatterers of unit variance give unit mean square: the integral of the squared point spread function of
         # unit height is the product of its sigmas and pi^1.5.
-        "speckle_scale": 1.0 / np.sqrt(settings.scatterers_per_mm3 * np.pi**1.5 * axial_sigma_mm(probe, settings)),
+        "speckle_scale": 1.0 / np.sqrt(density * np.pi**1.5 * axial_sigma_mm(probe, settings)),
     }
     assert set(values) == set(ACQUISITION.names or ())
     for name, value in values.items():
         record[name] = value
     return record
+
+
+def _automatic_density(probe: Probe) -> float:
+    """Eight scatterers in the smallest resolution cell, at least 4 per mm^3 and no more than in the paper's lattice."""
+    depth = np.linspace(0.0, probe.depth_mm, 257)
+
+    def beam(focus: float, aperture: float) -> np.ndarray:
+        sigma = _one_way_sigma(probe, max(focus / aperture, 0.5))
+        return sigma * np.hypot(1.0, (depth - focus) / _rayleigh_mm(probe, sigma))
+
+    transmit = beam(probe.focus_mm, probe.aperture_mm)
+    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
+    across = beam(probe.elevation_focus_mm, probe.elevation_aperture_mm) / np.sqrt(2.0)
+    axial = 1e-3 * _DESIGN_SPEED_M_S * _FWHM / (4.0 * np.pi * probe.fractional_bandwidth * probe.frequency_mhz)
+    cell = (2.0 * np.pi) ** 1.5 * axial * across / np.sqrt(transmit**-2.0 + receive**-2.0)
+    return min(max(8.0 / float(cell.min()), 4.0), 125_000.0)
 
 
 def axial_sigma_mm(probe: Probe, settings: SimulationSettings) -> float:
@@ -140,7 +158,7 @@ def _fans(probe: Probe, voxel_mm: float, edge: float) -> dict[str, float]:
     """Fans and screens of beams, for lines traced between -edge and edge (radians about the apex, or millimetres)."""
     _, _, radius = _geometry(probe)
     longest = 1.06 * probe.depth_mm  # paths in the fastest soft tissue
-    screens = min(max(int(np.ceil(longest / 5.0)), 8), 24)
+    screens = min(max(int(np.ceil(longest / 8.0)), 8), 24)
     # By the triangle inequality, no point of the aperture is further from a target than the axis and half of it.
     reach = longest + 0.5 * probe.aperture_mm
     depths = min(int(np.ceil(reach / min(max(voxel_mm, 0.25), 1.0))) + 1, 192)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import LN10_OVER_20, affine_point, affine_vector, f32
 from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
 
-# Gauss-Hermite rule for the power of the elevational beam, in its standard deviations
+# Gauss-Hermite rule for the power of a beam across, in its standard deviations
 _ROWS, _WEIGHTS = np.sqrt(1.5) * np.array([-1.0, 0.0, 1.0]), np.array([1.0, 4.0, 1.0]) / 6.0
-_BLOCKED = 2.0  # nepers one way per millimetre of strong tissue beside the axis
+_BENT = 4.0  # nepers both ways per millimetre of strong tissue that bends what goes through
+_LEAST = 1e-3  # nepers by which strong tissue differs from soft
+_MOST_SPREAD = 3.0  # of a beam
 _SOFT_SPEED, _SOFT_REFLECTION = 0.105, 0.12  # largest contrasts of a soft border
+_STRAIGHT_SPEED = 0.2  # and of strong tissue in which paths go straight on
 
 
 def is_soft(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -23,6 +24,12 @@ def is_soft(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return (np.abs(speeds[0] - speeds[1]) <= f32(0.5 * _SOFT_SPEED) * (speeds[0] + speeds[1])) & (
         np.abs(impedances[0] - impedances[1]) <= f32(_SOFT_REFLECTION) * (impedances[0] + impedances[1])
     )
+
+
+def bends(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Whether paths between layout.TISSUE records do not go straight on, however soft or strong the border."""
+    speeds = first["speed_of_sound_m_s"], second["speed_of_sound_m_s"]
+    return np.abs(speeds[0] - speeds[1]) > f32(0.5 * _STRAIGHT_SPEED) * (speeds[0] + speeds[1])
 
 
 class Screens:
@@ -41,21 +48,26 @@ class Screens:
         #: (points, 2) in the image plane
         self.points = np.stack([self.along, 0.0 * self.along], -1) if self.is_flat else bent
 
-    def run(self) -> np.ndarray:
-        """(screen lines, depths, 4) float32: nepers lost both ways, extra path and two deflections in mm."""
+    def run(self) -> tuple[np.ndarray, np.ndarray]:
+        """((screen lines, depths, 5) float32 nepers lost both ways, extra path and two deflections in mm; widths).
+
+        The last of the five is the nepers of the first that strong tissue takes.
+        Widths (screen lines, depths, 2) are those of the beam re an undisturbed one, and factors of its echoes.
+        """
         fields = self.fields
         count, depths = fields["screen_lines"], fields["screen_depths"]
         if not fields["aperture_beams"]:
-            return np.zeros((count, depths, 4), np.float32)
+            return np.zeros((count, depths, 5), np.float32), np.ones((count, depths, 2), np.float32)
         sums = self._fans()
         traced = np.arange(count) * (fields["traced_lines"] - 1) / (count - 1) - fields["guard_lines"]
         position = fields["first_line"] + fields["line_spacing"] * traced / fields["lateral_rays"]
         paths = fields["screen_step"] * np.arange(1, depths + 1)
-        screens = [[self._beam(sums, line, path) for path in paths] for line in position]
-        return np.array(screens, np.float32)
+        found = np.array([[self._beam(sums, line, path) for path in paths] for line in position], np.float32)
+        factors = self._kept_levels(found[..., 0], found[..., 5], f32(paths))
+        return found[..., :5], np.stack([found[..., 5], factors], -1)
 
     def _fans(self) -> np.ndarray:
-        """(rows, points, angles, depths, 4) running sums: extra path, nepers, strong tissue, elevational deflection."""
+        """(rows, points, angles, depths, 4) sums: extra path, nepers, by strong tissue, elevational deflection."""
         fields, acquisition = self.fields, self.acquisition
         own = fields["fan_first_angle"] + fields["fan_angle_step"] * np.arange(fields["fan_angles"])
         angle = f32(self.normal[:, None] + own)
@@ -94,7 +106,14 @@ class Screens:
             tissues["attenuation_db_cm_mhz"] * fields["frequency_mhz"] * 0.2 * LN10_OVER_20,
         ])  # fmt: skip
         self.soft = is_soft(tissues[:, None], tissues[None])  # (label, label)
-        self.current = np.full(count, -1)
+        self.bent = bends(tissues[:, None], tissues[None])
+        impedance = tissues["impedance_mrayl"]
+        sums = np.maximum(impedance[:, None] + impedance, 1e-9)  # labels without a tissue have none
+        reflected = ((impedance[:, None] - impedance) / sums) ** 2
+        self.border = -np.log(np.maximum(1.0 - reflected, 1e-6))
+        self.current = np.full(count, -1)  # the last soft tissue
+        self.last = np.zeros(count, int)  # the tissue of the last step, and whether it was strong
+        self.was_strong = np.zeros(count, bool)
         self.total = np.zeros((3, count), np.float32)
         self.lean = np.zeros(count, np.float32)
 
@@ -106,61 +125,118 @@ class Screens:
         nearest[mixed] = self.labels.label[here[mixed] + (f[mixed] > f32(0.5)) @ self.labels.steps]
         soft = (self.current < 0) | self.soft[self.current, nearest]
         self.current = np.where(soft, nearest, self.current)
+        bent = self.bent[self.current, nearest]
         rate = self.rates[:, self.current]
+        rate[0] = np.where(bent, rate[0], self.rates[0, nearest])
         corners = self.labels.label[here[mixed][:, None] + self.labels.corner_steps].astype(int)
         current = self.current[mixed][:, None]
-        corners = np.where(self.soft[current, corners], corners, current)
-        rate[:, mixed] = (self.rates[:, corners] * self.labels.trilinear_weights(f[mixed])).sum(axis=-1)
+        weights = self.labels.trilinear_weights(f[mixed])
+        for kind, stays in enumerate((self.bent[current, corners], ~self.soft[current, corners])):
+            rate[kind, mixed] = (self.rates[kind, np.where(stays, current, corners)] * weights).sum(axis=-1)
         self.total[:2] += length * rate
-        self.total[2] += length * ~soft
+        excess = self.rates[1, nearest] - self.rates[1, self.current]
+        excess = np.where(bent, _BENT, np.where(np.abs(excess) < _LEAST, _LEAST, excess))
+        before = np.where(self.was_strong, self.last, self.current)
+        self.total[2] += np.where(soft, 0.0, length * excess)
+        self.total[2] += np.where(~soft | self.was_strong, self.border[before, nearest], 0.0)
+        self.last, self.was_strong = nearest, ~soft
 
-    def _sums_at(self, sums: np.ndarray, used: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """(4, rows, used points) sums on the straight lines to a point (2,), per length of its axis."""
+    def _places(self, used: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(rays, depths, lengths in mm) of the straight lines from points to a target (2,), within their fans."""
         fields = self.fields
         towards = target - self.points[used]
         away = np.hypot(*towards.T)
         turned = np.arctan2(towards[:, 0], towards[:, 1]) - self.normal[used] - fields["fan_first_angle"]
         place = np.clip(turned / fields["fan_angle_step"], 0.0, fields["fan_angles"] - 1.001)
-        far = np.clip(away / fields["fan_step"], 0.0, fields["fan_depths"] - 1.001)
+        return place, np.clip(away / fields["fan_step"], 0.0, fields["fan_depths"] - 1.001), away
+
+    def _sums_at(self, sums: np.ndarray, used: np.ndarray, target: np.ndarray, path: float) -> np.ndarray:
+        """(4, rows, used points) sums on the straight lines to a point; but by strong tissue, for its axis' length."""
+        place, far, away = self._places(used, target)
         ray, depth = place.astype(int), far.astype(int)
         result = 0.0
         for next_ray, of_ray in ((0, 1.0 - place + ray), (1, place - ray)):
             for next_depth, of_depth in ((0, 1.0 - far + depth), (1, far - depth)):
-                result += sums[:, used, ray + next_ray, depth + next_depth] * (of_ray * of_depth / away)[:, None]
+                result += sums[:, used, ray + next_ray, depth + next_depth] * (of_ray * of_depth)[:, None]
+        result[..., [0, 1, 3]] *= (path / away)[:, None]
         return np.moveaxis(result, -1, 0)
 
-    def _beam(self, sums: np.ndarray, position: float, path: float) -> tuple[float, float, float, float]:
-        """Nepers lost both ways, extra path, lateral and elevational deflection at one depth of one line."""
+    def _depth_before_strong(self, sums: np.ndarray, centre: float, target: np.ndarray, path: float) -> float:
+        """The last depth on the axis, up to `path`, that is not in strong tissue or shortly before it."""
+        fields, count = self.fields, self.fields["fan_points"]
+        at = float(np.clip((centre - fields["fan_first"]) / fields["fan_pitch"], 0.0, count - 1.0))
+        points = np.minimum(int(at) + np.arange(2), count - 1)
+        place, far, _ = self._places(points, target)
+        ray, aside = place.astype(int), place - place.astype(int)
+        shares = np.outer([1.0 - at + int(at), at - int(at)], [1.0, 1.0]) * np.stack([1.0 - aside, aside], -1)
+        strong = sums[1, points[:, None], ray[:, None] + np.arange(2), :, 2]
+        share = (shares[..., None] * (np.diff(strong) != 0.0)).sum(axis=(0, 1))
+        own = int(np.clip(int(far[1]), 2, fields["fan_depths"] - 6))
+        in_front = share[own - 2 : own].sum()
+        if share[own] <= 0.5 and share[own : own + 5].sum() <= 2.0 * in_front:
+            return path
+        while own > 4 and share[own] > 0.0:
+            own -= 1
+        return min(max(own - 3.0, 1.0) * fields["fan_step"], path)
+
+    def _kept_levels(self, nepers: np.ndarray, widths: np.ndarray, paths: np.ndarray) -> np.ndarray:
+        """(screen lines, depths) factors that leave every line its mean power, whatever the width of its beam."""
+        lines, beam = np.arange(len(nepers)), Beam(self.acquisition)
+        traced = (self.fields["traced_lines"] - 1) / (len(nepers) - 1)
+        sigma = beam.lateral_sigma(paths) / (beam.line_distance(paths) * traced)
+
+        def passed(width: np.ndarray) -> np.ndarray:
+            places = [lines[:, None] + row * width for row in _ROWS]
+            at = [[np.interp(place[:, n], lines, nepers[:, n]) for n in range(len(paths))] for place in places]
+            return np.einsum("r,rnl->ln", _WEIGHTS, np.exp(2.0 * (nepers.T - np.array(at))))
+
+        return np.sqrt(passed(sigma) / passed(sigma * widths)).astype(np.float32)
+
+    def _beam(self, sums: np.ndarray, position: float, path: float) -> tuple[float, ...]:
+        """Nepers lost, extra path, two deflections, nepers lost to strong tissue, width: at one depth of one line."""
         fields = self.fields
         angle = 0.0 if fields["linear"] else position
         direction, across = np.array([np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
         centre = position if fields["linear"] else fields["apex_radius_mm"] * position
         origin = [position, 0.0] if fields["linear"] else fields["apex_radius_mm"] * (direction - [0.0, 1.0])
-        pitch, reach = fields["fan_pitch"], 0.5 * min(fields["aperture_mm"], path / fields["receive_f_number"])
-        away = np.abs(self.along - centre)
-        used = np.flatnonzero(away <= reach + 0.5 * pitch * (1.0 + 1e-6))
-        open_ = np.clip((reach - away[used]) / pitch + 0.5, 0.0, 1.0)
-        on_axis = np.maximum(1.0 - away[used] / pitch, 0.0)
-        x = (self.points[used] - origin) @ across
-        delay, loss, strong, lift = self._sums_at(sums, used, origin + path * direction) * path
+        pitch = fields["fan_pitch"]
 
-        own = (on_axis * strong[1]).sum() / max(on_axis.sum(), 1e-6)
-        passed = np.exp(-_BLOCKED * np.maximum(strong - 2.0 * own - fields["fan_step"], 0.0))
-        power = _WEIGHTS[:, None] * (open_ * passed**2 + 1e-4 * on_axis)
+        def lines_to(depth: float) -> tuple[np.ndarray, ...]:
+            reach = 0.5 * min(fields["aperture_mm"], depth / fields["receive_f_number"])
+            away = np.abs(self.along - centre)
+            used = np.flatnonzero(away <= reach + 0.5 * pitch * (1.0 + 1e-6))
+            open_ = np.clip((reach - away[used]) / pitch + 0.5, 0.0, 1.0)
+            delay, loss, strong, lift = self._sums_at(sums, used, origin + depth * direction, depth)
+            return (
+                (self.points[used] - origin) @ across,
+                open_,
+                delay,
+                loss,
+                np.exp(-0.5 * np.maximum(strong, -4)),
+                lift,
+            )
+
+        x, open_, delay, loss, passed, lift = lines_to(path)
+        power = _WEIGHTS[:, None] * (open_ * (passed**2 + 0.01) + 1e-6)
         share = power / power.sum()
         mean_x, mean_delay = (share * x).sum(), (share * delay).sum()
         spread, common = (share * x**2).sum() - mean_x**2, (share * x * delay).sum() - mean_x * mean_delay
         slope = np.clip(common / (spread + 0.02 * pitch**2), -0.1, 0.1)
         row_lift = (power * lift).sum(axis=1) / power.sum(axis=1)
         rise = np.clip(row_lift[2] - row_lift[0], -0.1 * path, 0.1 * path)
+        lost = (share * loss).sum()
 
+        depth = self._depth_before_strong(sums, centre, origin + path * direction, path)
+        x, open_, delay, _, passed, _ = lines_to(depth)
         cycles = 0.5 * fields["cycles_per_mm"]
-        focus = np.exp(1j * np.pi * cycles * (1.0 / path - 1.0 / fields["transmit_focus"]) * x**2)
-        wave = open_ * passed * np.exp(2j * np.pi * cycles * (delay - mean_delay))
-        power = _common_power(_WEIGHTS @ _intensity(each) for each in (wave, wave * focus))
-        still = _common_power(_intensity(each) for each in (open_, open_ * focus))
-        level = 0.5 * np.log(max(power / still, 1e-4))
-        return (share * loss).sum() - level, mean_delay - slope * mean_x, slope * path, rise
+        focus = np.exp(1j * np.pi * cycles * (1.0 / depth - 1.0 / fields["transmit_focus"]) * x**2)
+        wave = open_ * np.exp(2j * np.pi * cycles * (delay - mean_delay))
+        still, bent, stopped = (_two_way(each, focus) for each in (open_[None], wave, wave * passed))
+        by_phase = max(bent.sum() / still.sum(), 1e-4)
+        level = max(stopped.sum() / still.sum(), 1e-7) if (passed != 1.0).any() else by_phase
+        shade = 0.5 * np.log(by_phase / level)
+        spread = np.clip(_width(bent) / _width(still), 1.0, _MOST_SPREAD)
+        return lost - 0.5 * np.log(level), mean_delay - slope * mean_x, slope * path, rise, shade, spread
 
 
 def _intensity(wave: np.ndarray) -> np.ndarray:
@@ -168,6 +244,12 @@ def _intensity(wave: np.ndarray) -> np.ndarray:
     return np.abs(np.fft.fft(wave, 64)) ** 2  # more than twice the points, as its spectrum needs
 
 
-def _common_power(intensities: Iterable[np.ndarray]) -> float:
-    """The power of speckle for a transmitted and a received beam: the integral of the product of their intensities."""
-    return float(np.prod(list(intensities), axis=0).sum())
+def _two_way(wave: np.ndarray, focus: np.ndarray) -> np.ndarray:
+    """(directions,) product of the received and the transmitted intensity of waves (rows, points) or (1, points)."""
+    weights = _WEIGHTS if len(wave) > 1 else np.ones(1)
+    return (weights @ _intensity(wave)) * (weights @ _intensity(wave * focus))
+
+
+def _width(intensity: np.ndarray) -> float:
+    """The equivalent width of a beam, in directions."""
+    return float(intensity.sum() ** 2 / (intensity**2).sum())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
@@ -12,7 +14,6 @@ from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     exp,
     exp2,
     f32,
-    gaussian,
     hash_mix,
     turn,
 )
@@ -51,21 +52,29 @@ def _add_block(acquisition, labels, tissues, segment, first: int, sums: np.ndarr
         return
     waist = np.minimum(acquisition["transmit_rayleigh"], acquisition["elevation_rayleigh"])
     pieces = max(1, int(np.ceil((high - low) / (f32(0.4) * waist))))
-    ends = [low + f32(n) / f32(pieces) * (high - low) for n in range(pieces + 1)]
-    for n in range(pieces):
-        begin = f32(0) if n == 0 else ends[n]
-        stop = segment["length_mm"] if n == pieces - 1 else ends[n + 1]
-        _add_piece(acquisition, labels, tissues, segment, first, ends[n], ends[n + 1], (begin, stop), sums)
+    to_apex = segment["path_mm"] + (f32(1e6) if acquisition["linear"] else acquisition["apex_radius_mm"])
+    ends = [low]
+    for n in range(1, pieces + 1):
+        next_end = low + f32(n) / f32(pieces) * (high - low)
+        while ends[-1] < next_end:
+            ends.append(min(next_end, ends[-1] + max(to_apex + ends[-1], f32(0.2))))
+    last = len(ends) - 2
+    for n, (begin, end) in enumerate(itertools.pairwise(ends)):
+        belongs = f32(0) if n == 0 else begin, segment["length_mm"] if n == last else end
+        _add_piece(acquisition, labels, tissues, segment, first, begin, end, belongs, sums)
 
 
 def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs, sums) -> None:
     beam = Beam(acquisition)
     path = segment["path_mm"] + np.array([low, high])
-    lateral, elevation, apart = beam.lateral_sigma(path), beam.elevation_sigma(path), beam.line_distance(path)
+    loss = segment["loss"] + segment["loss_per_mm"] * np.array([low, high])
+    lateral, elevation, apart = (
+        beam.lateral_sigma(path, loss), beam.elevation_sigma(path, loss), beam.line_distance(path)
+    )  # fmt: skip
     narrow = f32(0.5) * LOG2_E / (elevation * elevation)
     along_tube = [segment["tube"][w] + segment["tube"][w + 1] * np.array([low, high]) for w in (0, 2)]
     strength = np.log2(segment["weight"] * segment["attenuation"] * acquisition["speckle_scale"] * f32(2.50662827))
-    gain = strength - LOG2_E * segment["decay_per_mm"] * np.array([low, high])
+    gain = strength - LOG2_E * segment["decay_per_mm"] * np.array([low, high]) + LOG2_E * beam.gain_of_band(loss)
     gain = gain + f32(0.5) * np.log2(lateral / (elevation * along_tube[0] * along_tube[1])) - np.log2(apart)
 
     # Lattice axes in the kernel's order, for the same rounding of sums.
@@ -79,7 +88,7 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     cells = _cells_of_box(acquisition, start, d, side, e, low, high, 0.5 * apart.max(), elevation.max())
 
     key = hash_mix((cells.astype(np.uint32) * _AXIS_STEPS[order]).sum(axis=1, dtype=np.uint32) ^ acquisition["seed"])
-    key1, key2 = hash_mix(key + np.uint32(0x9E3779B9)), hash_mix(key + np.uint32(0x3C6EF372))
+    random = hash_mix(key + np.uint32(0x3C6EF372))
     cell, grain = acquisition["cell_mm"], acquisition["cell_mm"] / f32(1024)
     p = [
         (cells[:, n].astype(np.float32) * cell - start[n])
@@ -99,16 +108,15 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     counts = (right >= 0) & (right < 1) & (r2 <= cutoff2) & (bins >= -1) & (bins < _BLOCK)
     counts &= (along >= belongs[0]) & (along < belongs[1])
     p, t, r2, right, depth = [x[counts] for x in p], t[counts], r2[counts], right[counts], depth[counts]
-    bins, part, key1, key2 = bins[counts], (place - np.floor(place))[counts], key1[counts], key2[counts]
+    bins, part, random = bins[counts], (place - np.floor(place))[counts], random[counts]
 
     at = affine_point(acquisition["ras_to_voxel"], segment["start"])
     rows = acquisition["ras_to_voxel"].reshape(3, 4)[:, order]
     voxel = np.stack([at[n] + p[0] * r[0] + p[1] * r[1] + p[2] * r[2] for n, r in enumerate(rows)], axis=-1)
-    label, of_sheet = drawn_labels(acquisition, labels, voxel, key2, segment["direction"])
-    tissue = tissues[label]
-    share = tissue["scatterer_share"]
-    exists = ((key2 >> np.uint32(16)).astype(np.float32) + f32(0.5) < share * f32(65536)).astype(np.float32)
-    strength = tissue["mu0"] * (exists - share) + tissue["sigma0"] * gaussian(key1) * exists
+    label, of_sheet = drawn_labels(acquisition, labels, voxel, random, segment["direction"])
+    share, level = (of_label[label] for of_label in _site_statistics(tissues, float(cell)))
+    exists = (random >> np.uint32(16)).astype(np.float32) + f32(0.5) < share
+    strength = np.where(exists, level, f32(0)) * np.where((random >> np.uint32(15)) & np.uint32(1), f32(-1), f32(1))
     amplitude = exp2(np.clip(gain[0] + t * (gain[1] - gain[0]) - r2, f32(-100), f32(100)))
     cosine, sine = turn(depth * acquisition["cycles_per_mm"])
     echo = of_sheet * strength * amplitude * (cosine - 1j * sine)
@@ -119,6 +127,15 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
             value = (echo * of_edge * of_sample)[inside]
             for quadrature, component in ((1, value.real), (1j, value.imag)):
                 sums[edge] += quadrature * np.bincount(here[inside], component, _BLOCK)
+
+
+def _site_statistics(tissues: np.ndarray, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """By label, in how many of 65536 cells there is a scatterer of the paper's lattice of 20 um, and its amplitude."""
+    empty = (1.0 - tissues["scatterer_share"].astype(float)) ** max((cell_mm / 0.02) ** 3, 1.0)
+    count = np.rint(65536.0 * (1.0 - empty))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        amplitude = np.sqrt(tissues["scatterer_variance"].astype(float) / (count / 65536.0))
+    return count.astype(np.float32), np.where(count > 0, amplitude, 0.0).astype(np.float32)
 
 
 def _cells_of_box(acquisition, start, d, side, e, low, high, radius_l, sigma_e) -> np.ndarray:
@@ -194,7 +211,15 @@ def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndar
         depth = depth - f32(0.5) * per_slope * slope * slope * turning * variance / zones[-1]
     share = _patch_echo(acquisition, whole, inside)
     depth_per_line = carried[0] * hits["lateral_slope"] * step
-    strength = hits["echo"] * zones[0] ** f32(-0.25) * share * step / width * f32(1 / np.sqrt(2 * np.pi))
+    strength = (
+        hits["echo"]
+        * exp(beam.gain_of_band(hits["loss"]))
+        * zones[0] ** f32(-0.25)
+        * share
+        * step
+        / width
+        * f32(1 / np.sqrt(2 * np.pi))
+    )
     reach = f32(1.35) * acquisition["beam_cutoff"] * width / step
     for line, sums in enumerate(scanned):
         away = f32(int(acquisition["guard_lines"]) + line * int(acquisition["lateral_rays"]) - hit_lines)
@@ -229,18 +254,54 @@ def _plane_echo(acquisition: np.ndarray, phase2: np.ndarray) -> np.ndarray:
     return exp(f32(-0.5) * phase2 / spread) / np.sqrt(spread)
 
 
-def lateral_beam(acquisition: np.ndarray, lines: np.ndarray) -> np.ndarray:
-    """(scan lines, samples) complex64 from the impulses of the traced lines, distributed by the lateral profile."""
+def losses_along(acquisition: np.ndarray, segments, segment_lines) -> np.ndarray:
+    """(scan lines, samples) float32 nepers both ways along the strongest path to a sample, at the carrier's frequency.
+
+    They are stored every 16th sample, and linear in between.
+    """
+    samples = int(acquisition["samples"])
+    nodes = np.arange(0, samples + 1, 16)
+    depth, result = (
+        nodes * f32(acquisition["sample_mm"]),
+        np.zeros((int(acquisition["scan_lines"]), samples), np.float32),
+    )
+    for n in range(len(result)):
+        line = int(acquisition["guard_lines"]) + n * int(acquisition["lateral_rays"])
+        stored, strongest = np.full(len(nodes), np.nan), np.full(len(nodes), -1.0)
+        for segment in segments[segment_lines == line]:
+            along = (depth - segment["depth_mm"]) / segment["depth_per_mm"]
+            strength = segment["weight"] * segment["attenuation"] * np.exp(-segment["decay_per_mm"] * along)
+            is_its = (along >= 0) & (along <= segment["length_mm"]) & (strength > strongest)
+            strongest[is_its] = strength[is_its]
+            stored[is_its] = (segment["loss"] + segment["loss_per_mm"] * along)[is_its]
+        last = np.maximum.accumulate(np.where(np.isnan(stored), 0, np.arange(len(nodes))))
+        result[n] = np.interp(np.arange(samples), nodes, np.nan_to_num(stored[last]))
+    return result
+
+
+def lateral_beam(acquisition: np.ndarray, lines: np.ndarray, spreads: np.ndarray, losses: np.ndarray) -> np.ndarray:
+    """(scan lines, samples) complex64 from the impulses of the traced lines, distributed by the lateral profile.
+
+    `spreads` (screen lines, depths, 2) is by how much tissue has made the beam wider, and a factor of its echoes;
+    `losses` are those of losses_along.
+    """
     beam = Beam(acquisition)
     s = np.arange(int(acquisition["samples"]), dtype=np.float32) * acquisition["sample_mm"]
-    step = beam.line_distance(s) / beam.lateral_sigma(s)
-    narrow2 = np.maximum(f32(1) - step * step / f32(6), f32(0.25))
     edges = lines[1:-1:2] + lines[2::2]  # edge n is half a step after traced line n
-    scale = step / np.sqrt(narrow2) * f32(0.39894228)
     result = np.empty((int(acquisition["scan_lines"]), len(s)), np.complex64)
-    reach = np.ceil(acquisition["beam_cutoff"] * beam.lateral_sigma(s) / beam.line_distance(s)) + f32(0.5)
+    screens, depths, _ = spreads.shape
+    nodes = acquisition["screen_step"] * np.arange(1, depths + 1, dtype=np.float32)
     for n in range(len(result)):
         centre = int(acquisition["guard_lines"]) + n * int(acquisition["lateral_rays"])
+        line = f32(centre * (screens - 1) / (int(acquisition["traced_lines"]) - 1))
+        left = min(int(line), screens - 2)
+        of_line = spreads[left] + (line - left) * (spreads[left + 1] - spreads[left])
+        spread, factor = (f32(np.interp(s, nodes, of_line[:, n])) for n in range(2))
+        sigma = spread * beam.lateral_sigma(s, losses[n])
+        step = beam.line_distance(s) / sigma
+        narrow2 = np.maximum(f32(1) - step * step / f32(6), f32(0.25))
+        scale = factor * step / np.sqrt(narrow2) * np.sqrt(spread) * f32(0.39894228)
+        reach = np.ceil(acquisition["beam_cutoff"] * sigma / beam.line_distance(s)) + f32(0.5)
         away = np.arange(len(edges), dtype=np.float32)[:, None] + f32(0.5) - f32(centre)
         near = np.flatnonzero(np.abs(away[:, 0]) <= reach.max())
         weights = np.exp(f32(-0.5) * step * step / narrow2 * away[near] ** 2) * (np.abs(away[near]) <= reach)

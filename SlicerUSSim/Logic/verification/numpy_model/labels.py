@@ -27,6 +27,9 @@ _EIGHT = np.arange(8, dtype=np.float32)
 # factors of both indicators, and what is added
 _OF_BOTH, _OF_BEFORE, _OF_BEHIND = (1.0, 1.0, 0.0), (2.0, 0.0, -65535.0), (0.0, 2.0, 65535.0)
 _TWO_GROUPS, _MOSTLY_TWO = 0.9999, 0.97  # sums of both indicators
+_FARTHEST_DIFFERENCE = 0.75  # of D from 0
+_DENSITY = f32(0.39894228)  # of the normal distribution at its centre
+_TAIL = (1.330274429, -1.821255978, 1.781477937, -0.356563782, 0.31938153)  # Abramowitz and Stegun, 26.2.17
 
 
 class Labels:
@@ -45,7 +48,7 @@ class Labels:
         self.smooth_groups = medium.smooth_groups
         # Smoothed indicators with the variance of the Gaussians that they resemble near their centre, in their voxels
         self.wide = SmoothGrid(medium.smooth, 8.91, 0.955, 1.0)
-        self.widest = SmoothGrid(medium.smoother, 17.75, 0.99, 0.5)
+        self.widest = SmoothGrid(medium.smoother, 18.29, 0.99, 0.5)
         self.distance = None if medium.distance is None else medium.distance.ravel()
 
     def cells(self, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,16 +83,25 @@ class Labels:
 
     def borders(self, voxel, before, behind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(towards (n, 3), overshoot (n,), curvature (n,)) of the border between groups near (n, 3) voxel positions."""
-        towards, overshoot, curvature, confidence = self.widest.border((voxel - f32(0.5)) / f32(2), before, behind)
+        halved = (voxel - f32(0.5)) / f32(2)
+        towards, overshoot, curvature, confidence = self.widest.border(halved, before, behind)
         overshoot, curvature = f32(2) * overshoot, curvature / f32(2)
         less = np.flatnonzero(confidence < 1)
         voxel, before, behind = voxel[less], before[less], behind[less]
+        layer = list(self.widest.layer(halved[less], before, behind))
+        layer[1], layer[2] = f32(2) * layer[1], layer[2] / f32(2)
         wide = self.wide.border(voxel, before, behind)
         some = np.flatnonzero(wide[3] < 1)
         fine = self._fine(voxel[some], before[some], behind[some])
         for values, better in zip(wide[:3], _refined(fine, [values[some] for values in wide]), strict=True):
             values[some] = better
         wide[3][:] = 1
+        # A layer among others, as in a fold, is not where the nearest voxels are.
+        layer[3] = layer[3] * (f32(1) - ramp(0.4, 0.7, np.abs(layer[1] - wide[1])))
+        layer[3] = layer[3] * ramp(0.96, 0.98, dot(layer[0], wide[0]) / np.maximum(length(wide[0]), f32(1e-6)))
+        better = layer[3] > confidence[less]
+        for result, values in zip((towards, overshoot, curvature, confidence), layer, strict=True):
+            result[less[better]] = values[better]
         wider = [values[less] for values in (towards, overshoot, curvature, confidence)]
         for values, better in zip((towards, overshoot, curvature), _refined(wide, wider), strict=True):
             values[less] = better
@@ -130,6 +142,35 @@ class Labels:
         share = f32(0.5) - f32(0.5) * total_d / (sum8(wx * either) + f32(1e-6))
         overshoot, curvature = _border_place(_FINE_SIGMA, share, (square - total_square / total * total_d) / steepness)
         return towards, overshoot, curvature, f32(np.abs(overshoot) < 0.5)
+
+
+def _normal_distribution(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(cumulative, density) of the normal distribution."""
+    density, t = _DENSITY * exp(f32(-0.5) * x * x), f32(1) / (f32(1) + f32(0.2316419) * np.abs(x))
+    tail = f32(0)
+    for factor in _TAIL:
+        tail = t * (f32(factor) + tail)
+    return np.where(x < 0, density * tail, f32(1) - density * tail), density
+
+
+def _flat_layer(share, gradient, laplacian) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(depth, thickness, curvature) of a flat layer in sigmas, from its share of the Gaussian and its derivatives."""
+    gradient = np.minimum(gradient, f32(0.3985))
+    depth = np.zeros_like(share)
+    thickness = np.sqrt(f32(-2) * log(np.clip(f32(1) - gradient / _DENSITY, f32(1e-4), f32(0.98))))
+    (whole, near), (part, far) = _normal_distribution(depth), _normal_distribution(depth - thickness)
+    for _ in range(4):
+        off_share, off_gradient = whole - part - share, near - far - gradient
+        a, b, c, d = near - far, far, (depth - thickness) * far - depth * near, (thickness - depth) * far
+        determinant = a * d - b * c
+        determinant = np.where(np.abs(determinant) < 1e-5, f32(1e-5), determinant)
+        steps = (d * off_share - b * off_gradient) / determinant, (a * off_gradient - c * off_share) / determinant
+        depth = depth - np.clip(steps[0], f32(-0.5), f32(0.5))
+        thickness = np.maximum(thickness - np.clip(steps[1], f32(-0.7), f32(0.7)), f32(0.2))
+        (whole, near), (part, far) = _normal_distribution(depth), _normal_distribution(depth - thickness)
+    flat = (depth - thickness) * far - depth * near
+    curvature = f32(0.5) * (laplacian - flat) / np.maximum(near - far, f32(1e-3))
+    return depth - curvature, thickness, curvature
 
 
 class SmoothGrid:
@@ -182,29 +223,64 @@ class SmoothGrid:
         towards = np.zeros_like(voxel)
         overshoot, curvature, confidence, steep = np.zeros((4, len(voxel)), np.float32)
         difference, up, down = self._stencil(voxel, before, behind, way)
-        known = np.flatnonzero(np.abs(difference) <= f32(0.5))
+        known = np.flatnonzero(np.abs(difference) <= f32(_FARTHEST_DIFFERENCE))
         difference, up, down = difference[known], up[known], down[known]
         slope, bends = f32(0.5) * (up - down), up + down - (f32(2) * difference)[:, None]
         steepness = np.maximum(length(slope), f32(1e-6))
         normal = slope / steepness[:, None]
         # Linear interpolation adds f (1 - f) to the variance along each axis; a central difference sees 1/3 more.
-        clipped = np.clip(voxel[known], f32(0), f32(self.dims) - f32(1.001))
-        f = clipped - f32(np.clip(clipped.astype(np.int32), 1, self.dims - 3))
-        squares = normal * normal
-        variance = self.variance + dot(squares, f * (f32(1) - f))
-        sigma = np.sqrt(variance)
+        squares, sigma = normal * normal, self._sigma(voxel[known], slope)
+        variance = sigma * sigma
         share = f32(0.5) - f32(0.5) * difference / (both[known] if way == _OF_BOTH else f32(1))
         laplacian = bends[:, 0] + bends[:, 1] + bends[:, 2]
         distance, curvature[known] = _border_place(sigma, share, variance * laplacian / steepness)
-        of_plane = f32(0.79788456) / sigma * exp(f32(-0.5) * distance * distance / variance)
-        of_plane = of_plane * (f32(1) - dot(squares, squares) / (f32(6) * variance))
-        steep[known] = steepness
+        seen = f32(1) - dot(squares, squares) / (f32(6) * variance)
+        of_plane = f32(0.79788456) / sigma * exp(f32(-0.5) * distance * distance / variance) * seen
+        steep[known] = steepness / seen
         towards[known] = unit(normal * (f32(1) + squares / (f32(6) * variance[:, None])))
         overshoot[known] = distance
         with np.errstate(divide="ignore"):
             confidence[known] = ramp(self.least, 0.5 + 0.5 * self.least, steepness / of_plane)
         confidence[known] *= np.abs(distance) <= self.farthest
         return towards, overshoot, curvature, confidence, steep
+
+    def layer(self, voxel, before, behind) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The same of a border in front of or behind a flat layer, where there is no third group."""
+        towards, overshoot, curvature, confidence = np.zeros_like(voxel), *np.zeros((3, len(voxel)), np.float32)
+        if self.dims.min() < 4:
+            return towards, overshoot, curvature, confidence
+        known = np.flatnonzero((before < self.groups) & (behind < self.groups))
+        two = self._both(voxel[known], before[known], behind[known]) >= f32(_TWO_GROUPS)
+        known = known[two]
+        difference, up, down = self._stencil(voxel[known], before[known], behind[known], _OF_BOTH)
+        inside = np.abs(difference) <= f32(_FARTHEST_DIFFERENCE)
+        known, difference, up, down = known[inside], difference[inside], up[inside], down[inside]
+        towards[known], _, _, _, steepness = (
+            values
+            for values in self._border(voxel[known], before[known], behind[known], f32(np.ones(len(known))), _OF_BOTH)
+        )
+        sigma = self._sigma(voxel[known], up - down)
+        bends = (up + down - (f32(2) * difference)[:, None]).sum(axis=1, dtype=np.float32)
+        seen = length(f32(0.5) * (up - down)) / steepness
+        share, gradient = f32(0.5) - f32(0.5) * difference, f32(0.5) * sigma * steepness
+        laplacian = f32(-0.5) * sigma * sigma * bends / seen
+        layers = [
+            _flat_layer(*values) for values in ((share, gradient, laplacian), (f32(1) - share, gradient, -laplacian))
+        ]
+        is_behind = np.abs(layers[0][2]) < np.abs(layers[1][2])
+        depth, thickness, bend = (np.where(is_behind, a, b) for a, b in zip(*layers, strict=True))
+        side = np.where(is_behind, f32(1), f32(-1))
+        overshoot[known], curvature[known] = side * depth * sigma, -side * bend / sigma
+        confidence[known] = ramp(0.35, 0.55, thickness) * (f32(1) - ramp(0.06, 0.12, np.abs(bend)))
+        confidence[known] *= np.abs(overshoot[known]) <= self.farthest
+        return towards, overshoot, curvature, confidence
+
+    def _sigma(self, voxel, slope):
+        """(n,) sigma of the Gaussian along the gradient, with what linear interpolation adds."""
+        clipped = np.clip(voxel, f32(0), f32(self.dims) - f32(1.001))
+        f = clipped - f32(np.clip(clipped.astype(np.int32), 1, self.dims - 3))
+        normal = slope / np.maximum(length(slope), f32(1e-6))[:, None]
+        return np.sqrt(self.variance + dot(normal * normal, f * (f32(1) - f)))
 
     def _place(self, voxel):
         """(index of the base voxel, fractions (x, y, z), 1 - fractions) of the stencil at (n, 3) voxel positions."""

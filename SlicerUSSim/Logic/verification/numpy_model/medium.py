@@ -66,7 +66,7 @@ class HostMedium:
                 for axis in range(3):
                     even, odd = (half.take(range(start, half.shape[axis], 2), axis) for start in (0, 1))
                     half = 0.5 * (even + odd)
-                share = ndimage.gaussian_filter(half.astype(np.float32), HALVED_SIGMA, mode="nearest", truncate=2.5)
+                share = ndimage.gaussian_filter(half.astype(np.float32), HALVED_SIGMA, mode="nearest", truncate=3.5)
                 self.smoother[number] = np.rint(65535.0 * np.clip(share, 0.0, 1.0))
         #: (k, j, i) uint8 about 127.5, and half the membrane in its unit; None and -1 without a membrane
         self.distance, self.membrane_reach = self._fluid_distance(spacing)
@@ -123,6 +123,8 @@ def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
         for parameter in TISSUE_PARAMETERS:
             if parameter.name in (TISSUE.names or ()):
                 row[parameter.name] = getattr(tissue, parameter.name)
-        row["scatterer_share"], row["group"] = special.ndtr(-tissue.mu1), known.index(acoustics)
+        share = special.ndtr(-tissue.mu1)
+        row["scatterer_share"], row["group"] = share, known.index(acoustics)
+        row["scatterer_variance"] = share * (1.0 - share) * tissue.mu0**2 + share * tissue.sigma0**2
         row["is_fluid"] = label in tissues and tissue.name in fluids
     return rows

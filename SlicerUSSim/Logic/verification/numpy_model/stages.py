@@ -20,8 +20,14 @@ from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
     pulse_taps,
 )
 from SlicerUSSim.Logic.verification.numpy_model.aperture import Screens
-from SlicerUSSim.Logic.verification.numpy_model.echoes import add_interfaces, lateral_beam, scatterer_lines
+from SlicerUSSim.Logic.verification.numpy_model.echoes import (
+    add_interfaces,
+    lateral_beam,
+    losses_along,
+    scatterer_lines,
+)
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, gaussian, hash_mix
+from SlicerUSSim.Logic.verification.numpy_model.floor import add_lateral_lobes, elevational_lobes, ring_down
 from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
 from SlicerUSSim.Logic.verification.numpy_model.tracing import Tracer
 
@@ -35,11 +41,15 @@ class TwinFrame(HostFrame):
     tissues: np.ndarray
     #: (screen lines, depths, 4) float32 of aperture.Screens.run
     screens: np.ndarray = field(init=False)
+    #: (screen lines, depths, 2) float32, also of it
+    spreads: np.ndarray = field(init=False)
     #: layout.SEGMENT and layout.HIT with their traced lines
     segments: np.ndarray = field(init=False)
     segment_lines: np.ndarray = field(init=False)
     hits: np.ndarray = field(init=False)
     hit_lines: np.ndarray = field(init=False)
+    #: (scan lines, samples) float32 of echoes.losses_along
+    losses: np.ndarray = field(init=False)
     #: (2 traced lines, samples) and (scan lines, samples) complex64 impulses
     traced: np.ndarray = field(init=False)
     scanned: np.ndarray = field(init=False)
@@ -47,7 +57,7 @@ class TwinFrame(HostFrame):
 
 def aperture(frame: TwinFrame) -> None:
     """What soft tissue does to the beams."""
-    frame.screens = Screens(frame.acquisition, frame.labels, frame.tissues).run()
+    frame.screens, frame.spreads = Screens(frame.acquisition, frame.labels, frame.tissues).run()
 
 
 def ray_tree(frame: TwinFrame) -> None:
@@ -56,15 +66,16 @@ def ray_tree(frame: TwinFrame) -> None:
     tracer = Tracer(record, frame.labels, frame.tissues, frame.screens)
     quantiles = elevational_quantiles(int(record["traced_lines"]), int(record["elevational_rays"]))
     frame.segments, frame.segment_lines, frame.hits, frame.hit_lines = tracer.run(line_roots(record), quantiles)
+    frame.losses = losses_along(record, frame.segments, frame.segment_lines)
 
 
 def scatterers(frame: TwinFrame) -> None:
-    """Impulses of speckle on the edges of the traced lines' strips."""
+    """Impulses of speckle on the edges of the traced lines' strips, also of the elevational side lobes."""
     record = frame.acquisition
-    if frame.settings.scattering:
-        frame.traced = scatterer_lines(record, frame.labels, frame.tissues, frame.segments, frame.segment_lines)
-    else:
-        frame.traced = np.zeros((2 * int(record["traced_lines"]), int(record["samples"])), np.complex64)
+    frame.traced = np.zeros((2 * int(record["traced_lines"]), int(record["samples"])), np.complex64)
+    records = [record, elevational_lobes(record, frame.probe)] if frame.settings.side_lobes else [record]
+    for each in records if frame.settings.scattering else []:
+        frame.traced += scatterer_lines(each, frame.labels, frame.tissues, frame.segments, frame.segment_lines)
 
 
 def interfaces(frame: TwinFrame) -> None:
@@ -75,21 +86,36 @@ def interfaces(frame: TwinFrame) -> None:
 
 def beam(frame: TwinFrame) -> None:
     """Impulses of the scan lines."""
-    frame.scanned = lateral_beam(frame.acquisition, frame.traced)
+    frame.scanned = lateral_beam(frame.acquisition, frame.traced, frame.spreads, frame.losses)
+
+
+def side_lobes(frame: TwinFrame) -> None:
+    """Impulses of the lateral side lobes, added to those of the main beam."""
+    if frame.settings.side_lobes:
+        frame.scanned = add_lateral_lobes(frame.acquisition, frame.probe, frame.scanned)
 
 
 def pulse(frame: TwinFrame) -> None:
     """The baseband signal."""
     taps = pulse_taps(frame.axial_sigma_mm / float(frame.acquisition["sample_mm"]))
-    lines, reach = frame.scanned, len(taps) // 2
+    record, reach = frame.acquisition, len(taps) // 2
+    shift = float(record["downshift"])
+    missing = np.minimum(shift * frame.losses.astype(float), 0.5)  # part of the frequency
+    step = float(record["sample_mm"]) * float(record["cycles_per_mm"])
+    turns = np.cumsum(missing, axis=1) * step - 0.5 * step * (missing + missing[:, :1])
+    turning = np.exp(2j * np.pi * turns)
+    lines = (frame.scanned * turning).astype(np.complex64)
     padded = np.pad(lines, ((0, 0), (reach, reach)))
-    frame.iq = sum((tap * padded[:, k : k + lines.shape[1]] for k, tap in enumerate(taps)), np.zeros_like(lines))
+    pulses = sum((tap * padded[:, k : k + lines.shape[1]] for k, tap in enumerate(taps)), np.zeros_like(lines))
+    frame.iq = (pulses / turning).astype(np.complex64)
 
 
 def b_mode(frame: TwinFrame) -> None:
     """Amplifier noise, time-gain compensation, envelope, log compression to eight bits."""
     record, display, iq = frame.acquisition, frame.display, frame.iq
     index = np.arange(iq.shape[1])
+    if frame.settings.ring_down:
+        iq = iq + ring_down(record, frame.probe, frame.axial_sigma_mm)
     if display.noise_db is not None:
         noise = f32(10.0 ** (display.noise_db / 20.0) / np.sqrt(2.0))
         line = np.arange(len(iq), dtype=np.uint32)[:, None]
@@ -147,6 +173,7 @@ TWINS: dict[str, Callable[[TwinFrame], None]] = {
     "scatterers": scatterers,
     "beam": beam,
     "interfaces": interfaces,
+    "side lobes": side_lobes,
     "pulse": pulse,
     "B-mode": b_mode,
     "scan conversion": scan_conversion,

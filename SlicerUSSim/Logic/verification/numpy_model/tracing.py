@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from SlicerUSSim.Logic.opencl.layout import HIT, SEGMENT
-from SlicerUSSim.Logic.verification.numpy_model.aperture import is_soft
+from SlicerUSSim.Logic.verification.numpy_model.aperture import bends, is_soft
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     LN10_OVER_20,
@@ -26,6 +26,12 @@ from SlicerUSSim.Logic.verification.numpy_model.elementary import (
 )  # fmt: skip
 from SlicerUSSim.Logic.verification.numpy_model.labels import Labels, border_normals
 
+# What a beam goes through: strong tissue that does not bend it, or tissue that does, of which nothing is written
+_NOT_STRONG, _THROUGH, _UNDER = range(3)
+_DARKEST = 7.0  # nepers lost to strong tissue: behind it nothing is left of a beam
+_MOST_COURSES = 16
+_MOST_LOSS = 1.0  # nepers by which strong tissue may change the frequency of what has passed it
+
 
 @dataclass
 class Rays:
@@ -42,11 +48,19 @@ class Rays:
     path: np.ndarray
     depth: np.ndarray
     log_attenuation: np.ndarray
+    loss: np.ndarray  # of attenuation by tissues alone, in nepers
     weight: np.ndarray
     blind_until: np.ndarray
     reflections: np.ndarray
     label: np.ndarray
     piece: np.ndarray  # of the beam, from path piece x screen_step on; -1 where the line is a ray
+    since_path: np.ndarray  # path from which the piece is corrected
+    course: np.ndarray  # how often the piece was begun again behind strong tissue
+    shade: np.ndarray  # nepers lost to strong tissue there
+    strong: np.ndarray  # what the beam goes through, since the soft tissue `front`
+    front: np.ndarray
+    front_weight: np.ndarray
+    excess: np.ndarray  # nepers by which strong tissue has attenuated more
     # The node, set by Tracer._begin: course in voxels, its end, state since its start
     start: np.ndarray = field(init=False)
     step: np.ndarray = field(init=False)
@@ -116,15 +130,17 @@ class Tracer:
             direction=unit(affine_vector(m, np.stack([dx, dy, zero], -1))),
             lateral=unit(affine_vector(m, np.stack([dy, -dx, zero], -1))),
             elevational=unit(affine_vector(m, np.stack([zero, zero, one], -1))),
-            tube=np.stack([one, zero, one, zero], -1), path=zero, depth=zero, log_attenuation=zero, weight=one,
-            blind_until=-one, reflections=np.zeros(count, int), label=np.full(count, -1),
+            tube=np.stack([one, zero, one, zero], -1), path=zero, depth=zero, log_attenuation=zero, loss=zero,
+            weight=one, blind_until=-one, reflections=np.zeros(count, int), label=np.full(count, -1),
             piece=np.full(count, 0 if self.acquisition["aperture_beams"] else -1),
+            since_path=zero, course=np.zeros(count, int), shade=zero, strong=np.zeros(count, int),
+            front=np.zeros(count, int), front_weight=one, excess=zero,
         )  # fmt: skip
 
     # ---- pieces of a beam ------------------------------------------------------------------------------------------
 
     def _beams_at(self, line: np.ndarray, number: np.ndarray) -> np.ndarray:
-        """(n, 4) beams of traced lines at the ends `number` of pieces, as in aperture.Screens."""
+        """(n, 5) beams of traced lines at the ends `number` of pieces, as in aperture.Screens."""
         acquisition, count = self.acquisition, len(self.screens)
         per_line = f32(count - 1) / f32(acquisition["traced_lines"] - 1)
         place = line.astype(np.float32) * per_line
@@ -157,50 +173,70 @@ class Tracer:
         beam = self._beams_at(rays.line[at], number)
         path = f32(number) * step
         rays.axis[at] = (
-            root.axis + path[:, None] * root.direction + beam[:, 2:3] * root.lateral + beam[:, 3:] * root.elevational
+            root.axis + path[:, None] * root.direction + beam[:, 2:3] * root.lateral + beam[:, 3:4] * root.elevational
         )
         rays.piece[at] = np.where(number < depths, number, -1)
+        rays.since_path[at], rays.course[at], rays.shade[at] = path, 0, beam[:, 4]
         has_next = number < depths
         at, root, beam = at[has_next], root.of(has_next), beam[has_next]
         turn = self._beams_at(rays.line[at], number[has_next] + 1) - beam
-        direction = unit(step * root.direction + turn[:, 2:3] * root.lateral + turn[:, 3:] * root.elevational)
+        direction = unit(step * root.direction + turn[:, 2:3] * root.lateral + turn[:, 3:4] * root.elevational)
         rays.direction[at] = direction
         rays.lateral[at] = _carried(root.lateral, root.direction, direction)
         rays.elevational[at] = _carried(root.elevational, root.direction, direction)
         return rays
 
-    def _correction(self, rays: Rays, path, depth, log_attenuation) -> np.ndarray:
+    def _correction(self, rays: Rays, path, depth, log_attenuation, depth_per_mm, more) -> np.ndarray:
         """(n, 2) changes of depth and of log amplitude per mm by which rays agree with their beams at a piece's end.
 
-        They are kept for what was written in the piece; 0 where a line is a ray.
+        There they have lost `more` nepers; 0 where a line is a ray.
         """
-        step = self.acquisition["screen_step"]
         beam = self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))
-        end = f32(rays.piece + 1) * step
+        end = f32(rays.piece + 1) * self.acquisition["screen_step"]
         rest = end - path
-        depth_left = end + beam[:, 1] - (depth + rest * rays.depth_per_mm)
-        log_left = -beam[:, 0] - (log_attenuation - rest * self.decay[rays.label])
-        per_mm = np.where((rays.piece >= 0)[:, None], np.stack([depth_left, log_left], -1) / step, f32(0))
-        self._corrections.append((self._piece_keys(rays), per_mm))
-        return per_mm
+        depth_left = end + beam[:, 1] - (depth + rest * depth_per_mm)
+        log_left = -beam[:, 0] - more - (log_attenuation - rest * self.decay[self._front(rays)])
+        along = np.maximum(end - rays.since_path, f32(1e-3))[:, None]
+        return np.where((rays.piece >= 0)[:, None], np.stack([depth_left, log_left], -1) / along, f32(0))
+
+    def _keep_correction(self, rays: Rays, per_mm: np.ndarray) -> None:
+        """Keep a correction for what was written in the piece."""
+        written = rays.strong != _UNDER
+        self._corrections.append((self._piece_keys(rays)[written], per_mm[written], rays.since_path[written]))
+
+    @staticmethod
+    def _front(rays: Rays) -> np.ndarray:
+        """Labels of the soft tissue that rays are in, or that lies in front of strong tissue."""
+        return np.where(rays.strong == _NOT_STRONG, rays.label, rays.front)
+
+    def _next_shade(self, rays: Rays) -> np.ndarray:
+        """Nepers lost to strong tissue at the ends of pieces."""
+        return np.where(rays.piece >= 0, self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))[:, 4], f32(0))
+
+    def _are_dark(self, rays: Rays) -> np.ndarray:
+        """Whether strong tissue leaves nothing of beams from their piece on."""
+        dark = np.ones(len(rays), bool)
+        for number in range(1, self.screens.shape[1] + 1):
+            shade = self._beams_at(rays.line, np.full(len(rays), number))[:, 4]
+            dark &= (number <= rays.piece) | (shade >= f32(_DARKEST))
+        return dark
 
     def _piece_keys(self, rays: Rays) -> np.ndarray:
-        """Numbers of line, ray and piece; -1 where a line is a ray."""
+        """Numbers of line, ray, piece and course; -1 where a line is a ray."""
         ray = rays.line * (1 + int(self.acquisition["elevational_rays"])) + rays.ray
-        return np.where(rays.piece >= 0, ray * self.screens.shape[1] + rays.piece, -1)
+        return np.where(rays.piece >= 0, (ray * self.screens.shape[1] + rays.piece) * _MOST_COURSES + rays.course, -1)
 
     def _correct(self) -> None:
         """Apply the corrections to the segments and hits of the pieces."""
         if not self.acquisition["aperture_beams"]:
             return
-        keys, per_mm = (np.concatenate(parts) for parts in zip(*self._corrections, strict=True))
-        rays = len(self._root) * self.screens.shape[1]
-        table = np.zeros((rays + 1, 2), np.float32)
-        table[keys[keys >= 0]] = per_mm[keys >= 0]
+        keys, per_mm, since = (np.concatenate(parts) for parts in zip(*self._corrections, strict=True))
+        courses = len(self._root) * self.screens.shape[1] * _MOST_COURSES
+        table = np.zeros((courses + 1, 3), np.float32)
+        table[keys[keys >= 0]] = np.concatenate([per_mm, since[:, None]], axis=1)[keys >= 0]
         for records, pieces in ((self._segments, self._segment_pieces), (self._hits, self._hit_pieces)):
             for record, key in zip(records, pieces, strict=True):
-                depth, log_amplitude = table[key].T
-                start = f32(np.maximum(key, 0) % self.screens.shape[1]) * self.acquisition["screen_step"]
+                depth, log_amplitude, start = table[key].T
                 along = record["path_mm"] - start
                 factor = exp(log_amplitude * along)
                 record["depth_mm"] += depth * along
@@ -224,7 +260,8 @@ class Tracer:
         if unknown.any():
             some = rays.of(unknown)
             rays.label[unknown] = self.labels.at(self._place(some, zero[unknown]))
-        rays.depth_per_mm = acquisition["reference_speed_m_s"] / self.tissues["speed_of_sound_m_s"][rays.label]
+        medium = np.where(rays.strong == _UNDER, rays.front, rays.label)
+        rays.depth_per_mm = acquisition["reference_speed_m_s"] / self.tissues["speed_of_sound_m_s"][medium]
         rays.to_depth = (acquisition["depth_mm"] - rays.depth) / rays.depth_per_mm
         to_piece = f32(rays.piece) * acquisition["screen_step"] + acquisition["screen_step"] - rays.path
         rays.to_piece = np.where(rays.piece < 0, f32(np.inf), to_piece)
@@ -287,7 +324,7 @@ class Tracer:
     def _advance(self, rays: Rays) -> Rays:
         """Advance every ray to its next change of tissue; returns the rays that continue."""
         acquisition, group = self.acquisition, self.tissues["group"]
-        decay = self.decay[rays.label]
+        decay = self.decay[np.where(rays.strong == _UNDER, rays.front, rays.label)]
         reserve = log(rays.weight / acquisition["intensity_threshold"]) + rays.log_attenuation - rays.spent
         to_silence = rays.since + np.maximum(reserve, f32(0)) / np.maximum(decay, f32(1e-9))
         longest = np.minimum(np.minimum(rays.to_depth, to_silence), rays.to_piece)
@@ -304,25 +341,45 @@ class Tracer:
         rays.spent = spent_until
         branches = self._branch(rays.of(met), border[met], other[met], written[met])
         left = ends & (border < 0) & (rays.piece >= 0)
-        return Rays.joined([on, *branches, self._next_pieces(rays.of(left), until[left])])
+        goes_dark = (rays.strong == _THROUGH) & (to_silence < rays.to_depth) & (longest != rays.to_piece)
+        ended = rays.of(left), until[left], goes_dark[left]
+        return Rays.joined([on, *branches, *self._next_pieces(*ended)])
 
-    def _next_pieces(self, rays: Rays, until: np.ndarray) -> Rays:
-        """End the pieces of rays that met no more border; returns those that go on to another piece."""
+    def _next_pieces(self, rays: Rays, until: np.ndarray, goes_dark: np.ndarray) -> list[Rays]:
+        """End the pieces of rays that met no more border; returns those that go on, at the next piece or below."""
         path, depth = rays.path + until, rays.depth + until * rays.depth_per_mm
-        per_mm = self._correction(rays, path, depth, rays.log_attenuation - rays.spent)
-        goes_on = until == rays.to_piece
-        per_mm = per_mm[goes_on] * self.acquisition["screen_step"]
-        rays, path, depth = rays.of(goes_on), path[goes_on], depth[goes_on]
-        rays.path, rays.depth = path, depth + per_mm[:, 0]
-        rays.log_attenuation = rays.log_attenuation + per_mm[:, 1] - rays.spent
-        return self._begin(self._start_pieces(rays, rays.piece + 1))
+        rays.excess = self._excess(rays, until)
+        more = rays.excess + np.where(goes_dark, rays.shade - self._next_shade(rays), f32(0))
+        per_mm = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rays.depth_per_mm, more)
+        self._keep_correction(rays, per_mm)
+        along = (path - rays.since_path)[:, None]
+        rays.depth, rays.log_attenuation = depth, rays.log_attenuation - rays.spent
+        rays.depth, rays.log_attenuation = np.stack([rays.depth, rays.log_attenuation]) + (per_mm * along).T
+        rays.path, rays.loss = path, rays.loss + rays.spent
+
+        below = rays.of(goes_dark)  # the beam may go on behind this tissue
+        below.axis = below.axis + until[goes_dark][:, None] * below.direction
+        below.tube = _tube_after(below.tube, until[goes_dark])
+        below.strong[:], below.weight = _UNDER, below.front_weight
+        below.log_attenuation, below.loss = below.log_attenuation + below.excess, below.loss - below.excess
+        below.excess, below.since_path, below.blind_until = 0.0 * below.excess, below.path, below.path
+
+        on = rays.of((until == rays.to_piece) & ~goes_dark)
+        on = self._start_pieces(on, on.piece + 1)
+        on = on.of((on.piece >= 0) | (on.strong == _NOT_STRONG))
+        return [self._begin(below), self._begin(on)]
+
+    def _excess(self, rays: Rays, until: np.ndarray) -> np.ndarray:
+        """The nepers by which strong tissue has attenuated more, at lengths of the nodes."""
+        more = rays.spent - until * self.decay[self._front(rays)]
+        return np.where(rays.strong == _THROUGH, rays.excess + more, rays.excess)
 
     def _write_segments(self, rays: Rays, decay, until, spent_until, ends) -> np.ndarray:
         """Write the segments of the axis rays; returns the index of each ray's last segment (-1: none)."""
         earlier = rays.since - rays.open
         with np.errstate(divide="ignore", invalid="ignore"):
             mean_decay = np.where(earlier > 0, (rays.spent - rays.spent_open) / earlier, decay)
-        on_axis = rays.ray == 0
+        on_axis = (rays.ray == 0) & (rays.strong != _UNDER)
         closes = on_axis & (np.abs(decay - mean_decay) * np.minimum(earlier, until - rays.since) > f32(0.02))
         self._segment_of(rays, closes, rays.open, rays.since, rays.spent_open, rays.spent)
         rays.open = np.where(closes, rays.since, rays.open)
@@ -344,7 +401,8 @@ class Tracer:
         segment["depth_mm"] = some.depth + begin * some.depth_per_mm
         segment["depth_per_mm"], segment["weight"] = some.depth_per_mm, some.weight
         segment["attenuation"] = exp(some.log_attenuation - spent_begin)
-        segment["decay_per_mm"] = (spent_end - spent_begin) / (end - begin)
+        segment["decay_per_mm"] = segment["loss_per_mm"] = (spent_end - spent_begin) / (end - begin)
+        segment["loss"] = some.loss + spent_begin
         segment["reflections"], segment["label"] = some.reflections, some.label
         self._segments.append(segment)
         self._segment_pieces.append(self._piece_keys(some))
@@ -361,27 +419,43 @@ class Tracer:
         self._bisect(rays, np.flatnonzero(overshoot == 0), 3, rays.inside, beyond, other)
         back = np.where(overshoot == 0, border - beyond, overshoot)
         border = border - back
-        rays.spent = rays.spent - back * self.decay[rays.label]
+        rays.spent = rays.spent - back * self.decay[np.where(rays.strong == _UNDER, rays.front, rays.label)]
         shortened = written >= 0
         lengths = self._segments[-1]["length_mm"]
         lengths[written[shortened]] = np.maximum(lengths[written[shortened]] - back[shortened], f32(0))
         keep = rays.depth + border * rays.depth_per_mm < acquisition["depth_mm"]
-        soft = is_soft(tissues[rays.label], tissues[other]) & bool(acquisition["aperture_beams"])
-        # A beam ends at a strong border, and where it leaves the field. Its soft borders may be in the same piece.
-        ends = np.flatnonzero((rays.piece >= 0) & ~(soft & keep))
-        some, length = rays.of(ends), border[ends]
-        depth_there, log_there = some.depth + length * some.depth_per_mm, some.log_attenuation - some.spent
-        per_mm = self._correction(some, some.path + length, depth_there, log_there)
-        since = (some.path + length - f32(some.piece) * acquisition["screen_step"])[:, None] * per_mm
-        rays.depth[ends] += since[:, 0]
-        rays.log_attenuation[ends] += since[:, 1]
-        rays.piece[ends] = -1
-        soft = soft[keep]
+        strong_border = ~(is_soft(tissues[rays.label], tissues[other]) & bool(acquisition["aperture_beams"]))
+        front = tissues[self._front(rays)]
+        strong = np.where(rays.strong == _NOT_STRONG, strong_border, ~is_soft(front, tissues[other]))
+        under, beam = rays.strong == _UNDER, rays.piece >= 0
+        bent = ~under & strong & ~(beam & ~bends(front, tissues[other]))
+        path, depth = rays.path + border, rays.depth + border * rays.depth_per_mm
+        rays.excess = self._excess(rays, border)
+        leaves, next_shade = ~keep, self._next_shade(rays)
+        behind_rate = acquisition["reference_speed_m_s"] / tissues["speed_of_sound_m_s"][other]
+        rate = np.where(bent | under | leaves, rays.depth_per_mm, behind_rate)
+        more = rays.excess + np.where(leaves, f32(0), rays.shade - next_shade)
+        per_mm = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rate, more)
+        corrected = (path - rays.since_path)[:, None] * per_mm
+        # A beam ends where it is bent, and where it leaves the field; below strong tissue it begins again.
+        ends = np.flatnonzero(beam & (leaves | bent | (under & ~strong)))
+        self._keep_correction(rays.of(ends), per_mm[ends])
+        rays.depth[ends] += corrected[ends, 0]
+        rays.log_attenuation[ends] += corrected[ends, 1]
+        corrected[ends] = 0.0
+        below = rays.of(keep)  # where the beam goes on below strong tissue
+        ended = rays.of(bent)
+        ended.piece[:], ended.strong[:] = -1, _NOT_STRONG
+        for name, values in vars(ended).items():
+            vars(rays)[name][bent] = values
+        under, beam, bent, strong = under[keep], beam[keep], bent[keep], strong[keep]
+        strong_border, corrected, next_shade = strong_border[keep], corrected[keep], next_shade[keep]
         rays, border, other, normal, overshoot = rays.of(keep), border[keep], other[keep], normal[keep], overshoot[keep]
         before, behind, curvature = before[keep], behind[keep], curvature[keep]
 
         path, depth = rays.path + border, rays.depth + border * rays.depth_per_mm
         log_attenuation = rays.log_attenuation - rays.spent
+        rays.loss = rays.loss + rays.spent
         attenuation = exp(log_attenuation)
         aside = (rays.quantile * self.elevation_sigma(path))[:, None] * rays.elevational
         point = rays.axis + border[:, None] * rays.direction + aside
@@ -401,10 +475,11 @@ class Tracer:
             (rays.reflections < acquisition["max_ray_depth"])
             & (reflected_weight >= acquisition["reflection_threshold"])
             & (reflected_weight * attenuation >= acquisition["intensity_threshold"])
-            & ~soft
+            & strong_border
+            & ~under
         )
         refracts = np.flatnonzero(
-            ~is_total & ~soft & (refracted_weight * attenuation >= acquisition["intensity_threshold"])
+            ~is_total & bent & (refracted_weight * attenuation >= acquisition["intensity_threshold"])
         )
         child = rays.of(reflects)
         if acquisition["reflection_spreading"]:
@@ -416,31 +491,69 @@ class Tracer:
         child.axis = point[reflects] - _mirror(aside[reflects], n)
         child.weight, child.blind_until = reflected_weight[reflects], path[reflects] + self.voxel_mm
         child.reflections = child.reflections + 1
-        child.path, child.depth, child.log_attenuation = path[reflects], depth[reflects], log_attenuation[reflects]
+        child.path, child.depth = path[reflects], depth[reflects] + corrected[reflects, 0]
+        child.log_attenuation = log_attenuation[reflects] + corrected[reflects, 1]
+        child.piece[:], child.strong[:] = -1, _NOT_STRONG
 
-        bent = rays.of(refracts)
+        bent_rays = rays.of(refracts)
         path_of_all = path
         n, ratio, path = normal[refracts], ratio[refracts], path[refracts]
-        towards = unit(ratio[:, None] * bent.direction + (ratio * cos_in[refracts] - cos_out[refracts])[:, None] * n)
-        bent.lateral = _carried(bent.lateral, bent.direction, towards)
-        bent.elevational = _carried(bent.elevational, bent.direction, towards)
-        bent.direction = towards
-        bent.axis = point[refracts] - (bent.quantile * self.elevation_sigma(path))[:, None] * bent.elevational
-        bent.tube, bent.path, bent.depth = tube[refracts], path, depth[refracts]
-        bent.log_attenuation, bent.weight = log_attenuation[refracts], refracted_weight[refracts]
-        bent.label = other[refracts]
+        towards = unit(
+            ratio[:, None] * bent_rays.direction + (ratio * cos_in[refracts] - cos_out[refracts])[:, None] * n
+        )
+        bent_rays.lateral = _carried(bent_rays.lateral, bent_rays.direction, towards)
+        bent_rays.elevational = _carried(bent_rays.elevational, bent_rays.direction, towards)
+        bent_rays.direction = towards
+        bent_rays.axis = (
+            point[refracts] - (bent_rays.quantile * self.elevation_sigma(path))[:, None] * bent_rays.elevational
+        )
+        bent_rays.tube, bent_rays.path, bent_rays.depth = tube[refracts], path, depth[refracts]
+        bent_rays.log_attenuation, bent_rays.weight = log_attenuation[refracts], refracted_weight[refracts]
+        bent_rays.label = other[refracts]
         over = overshoot[refracts]
-        bent.blind_until = np.where(over > 0, path + over + f32(0.5) * self.voxel_mm, path)
+        bent_rays.blind_until = np.where(over > 0, path + over + f32(0.5) * self.voxel_mm, path)
 
-        on = rays.of(soft)
-        on.axis = point[soft] - aside[soft]
-        on.tube, on.path, on.depth, on.label = tube[soft], path_of_all[soft], depth[soft], other[soft]
-        z_in, z_out = (tissues["impedance_mrayl"][label[soft]] for label in (rays.label, other))
-        square = (z_out - z_in) / (z_out + z_in)
-        on.weight = on.weight - on.weight * (square * square)
-        on.log_attenuation, over = log_attenuation[soft], overshoot[soft]
-        on.blind_until = np.where(over > 0, on.path + over + f32(0.5) * self.voxel_mm, on.path)
-        return [self._begin(child), self._begin(bent), self._begin(on)]
+        z_in, z_out = (tissues["impedance_mrayl"][label] for label in (rays.label, other))
+        lost = np.where(under, f32(0), rays.weight * ((z_out - z_in) / (z_out + z_in)) ** 2)
+        blind_until = np.where(overshoot > 0, path_of_all + overshoot + f32(0.5) * self.voxel_mm, path_of_all)
+        goes_below = np.flatnonzero(bent & beam)
+        below = below.of(goes_below)
+        new = below.strong == _NOT_STRONG
+        below.front, below.front_weight = self._front(below), np.where(new, below.weight, below.front_weight)
+        below.weight, below.log_attenuation = below.front_weight, log_attenuation[goes_below] + below.excess
+        below.strong[:], below.excess = _UNDER, 0.0 * below.excess
+        below.loss, below.since_path = rays.loss[goes_below], path_of_all[goes_below]
+
+        ahead = np.flatnonzero(~bent)
+        on = rays.of(ahead)
+        enters = strong[ahead] & (on.strong == _NOT_STRONG)
+        on.front, on.front_weight = np.where(enters, on.label, on.front), np.where(enters, on.weight, on.front_weight)
+        on.strong = np.where(enters, _THROUGH, on.strong)
+        on.weight, on.log_attenuation = on.weight - lost[ahead], log_attenuation[ahead]
+        for course, some in ((on, ahead), (below, goes_below)):
+            course.axis, course.tube, course.path = point[some] - aside[some], tube[some], path_of_all[some]
+            course.depth, course.label, course.blind_until = depth[some], other[some], blind_until[some]
+        below = below.of(~self._are_dark(below))
+        return [
+            self._begin(child),
+            self._begin(bent_rays),
+            self._begin(below),
+            self._begin(self._left(on, strong[ahead], next_shade[ahead])),
+        ]
+
+    def _left(self, rays: Rays, strong: np.ndarray, next_shade: np.ndarray) -> Rays:
+        """Rays behind borders, without the dark ones: those out of strong tissue have again the level of their beam."""
+        out = ~strong & (rays.strong != _NOT_STRONG)
+        taken = next_shade - rays.shade
+        kept = np.clip(taken, np.minimum(rays.excess, f32(0)), np.clip(rays.excess, f32(0), f32(_MOST_LOSS)))
+        rays.log_attenuation = np.where(out, rays.log_attenuation + rays.excess - taken, rays.log_attenuation)
+        rays.loss = np.where(out, rays.loss - rays.excess + kept, rays.loss)
+        rays.weight = np.where(out, rays.front_weight, rays.weight)
+        rays.shade, rays.excess = np.where(out, next_shade, rays.shade), np.where(out, f32(0), rays.excess)
+        again = out & (rays.strong == _UNDER)
+        rays.since_path = np.where(again, rays.path, rays.since_path)
+        rays.course, rays.strong = rays.course + again, np.where(out, _NOT_STRONG, rays.strong)
+        return rays.of(~(out & self._are_dark(rays)))
 
     def _normals(self, rays: Rays, border, before, behind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(unit normals in RAS against the rays, lengths that the rays are beyond the border, curvatures in 1/mm)."""
@@ -473,7 +586,7 @@ class Tracer:
     def _write_hits(
         self, rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature
     ) -> None:
-        acquisition, beside = self.acquisition, rays.ray > 0
+        acquisition, beside = self.acquisition, (rays.ray > 0) & (rays.strong != _UNDER)
         count = acquisition["elevational_rays"].astype(np.float32)
         towards_ray = np.minimum(dot(normal, rays.direction), f32(-0.05))
         coherence = np.ones(len(rays), np.float32)
@@ -485,6 +598,7 @@ class Tracer:
         hit = np.zeros(len(rays), HIT)
         hit["position"], hit["normal"], hit["path_mm"], hit["depth_mm"] = point, normal, path, depth
         hit["weight"], hit["attenuation"], hit["cos_incidence"] = rays.weight, attenuation, cos_in
+        hit["loss"] = rays.loss
         hit["reflectance"], hit["reflections"] = pressure * pressure, rays.reflections
         hit["label_before"], hit["label_behind"] = rays.label, other
         for name, width, offset in (("lateral", 0, rays.lateral), ("elevational", 2, rays.elevational)):

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache, partial
 
 import numpy as np
 
-from SlicerUSSim.Logic.verification.phantoms import REFERENCE_SPEED_M_S, Phantom, folds, speed_cyst
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.verification.phantoms import (
+    BACKGROUND,
+    REFERENCE_SPEED_M_S,
+    Phantom,
+    behind_object,
+    folds,
+    speed_cyst,
+)
 from SlicerUSSim.Logic.verification.validation.beam_levels import along_line, beam_of_line, levels_db
 from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_plots
@@ -23,6 +32,8 @@ _SCENES: dict[str, Callable[..., Phantom]] = {
 _LINES = slice(12, 150, 4)  # around those beyond, the phantoms end
 _SEEDS = 5  # of scatterers, over which speckle averages
 _DARK_DB = -12.0
+_EDGE_MM = (-1.5, -0.7, 0.5, 1.1, 1.7)  # places of lines beside the edge of a plate
+_BEHIND_MM = np.array([27.0, 29.0, 31.0, 33.0, 35.0])
 
 
 def beams_in_folds(rotation: np.ndarray, device) -> Outcome:
@@ -106,7 +117,83 @@ def _wave_levels_db(scene: str, probe_name: str) -> np.ndarray:
     return np.array(levels)
 
 
+def beams_past_strong_tissue(rotation: np.ndarray, device) -> Outcome:
+    """Objects that differ in impedance alone, lossy plates, and fat in scalp: against theory and wave propagation."""
+    probe = replace(PROBES["linear"], frequency_mhz=5.0, focus_mm=30.0, depth_mm=48.0, scan_lines=192)
+    plain, place, rows = replace(BACKGROUND, attenuation_db_cm_mhz=0.0), probe.line_positions(), []
+
+    def level(shape: str, tissue, background=plain) -> np.ndarray:
+        phantom = behind_object(shape, tissue, rotation, background=background)
+        assert phantom.baseline is not None
+        return levels_db(
+            phantom.labels, phantom.tissues, phantom.baseline, probe, phantom.probe_to_ras, device,
+            beam="aperture", edges_mm=np.array([27.0, 35.0]), lines=slice(0, 191, 1), seeds=_SEEDS,
+            reflections=False,  # a mirror image would fill the shadow
+        )  # fmt: skip
+
+    clear = replace(plain, name="clear", impedance_mrayl=1.29 * plain.impedance_mrayl)
+    through = 40.0 * np.log10(1.0 - (0.29 / 2.29) ** 2)
+    near = np.abs(place[:-1]) < 6.0
+    for shape in ("plate", "strip", "ball"):
+        found = level(shape, clear)[near]
+        rows += [
+            Row(f"darkest line, clear {shape}", "dB", through, float(found.min()), 0.3),
+            Row(f"brightest line, clear {shape}", "dB", 0.0, float(found.max()), 0.15),
+        ]
+    plates = {
+        "plate of 30 dB": (30.0, replace(clear, name="lossy", attenuation_db_cm_mhz=10.0)),
+        "air": (90.0, TISSUES["air"]),
+    }
+    for name, (loss_db, tissue) in plates.items():
+        found = level("plate", tissue)
+        for edge in _EDGE_MM:
+            wave = _wave_behind_db(None, "plate", -edge, loss_db)
+            seen = float(np.interp(edge, place[:-1], found))
+            rows.append(Row(f"{name}, line at {edge} mm", "dB", wave, seen, 3.5))
+    fat, scalp = (replace(TISSUES[name], attenuation_db_cm_mhz=0.0) for name in ("fat", "scalp"))
+    found = level("ball", fat, scalp)
+    for edge in (-4.0, -2.4, 0.0):
+        wave = _wave_behind_db((fat.speed_of_sound_m_s, scalp.speed_of_sound_m_s), "ball", -edge, 0.0)
+        seen = float(np.interp(edge, place[:-1], found))
+        rows.append(Row(f"ball of fat in scalp, line at {edge} mm", "dB", wave, seen, 2.0))
+    return Outcome(tuple(rows), None)
+
+
+@lru_cache
+def _wave_behind_db(speeds: tuple[float, float] | None, shape: str, moved_mm: float, loss_db: float) -> float:
+    """Power of speckle on a line behind an object of phantoms.behind_object moved aside, by wave propagation.
+
+    `speeds` are of the object and around it; `loss_db` is both ways, through a plate.
+    """
+    beam = partial(
+        speckle_power, depths_mm=_BEHIND_MM, frequency_mhz=5.0, aperture_mm=12.0, f_number=2.5, focus_mm=30.0,
+        reference_m_s=REFERENCE_SPEED_M_S,
+    )  # fmt: skip
+
+    def is_inside(x, depth):
+        if shape == "ball":
+            return (x - moved_mm) ** 2 + (depth - 16.0) ** 2 < 9.0
+        return (depth > 15.0) & (depth < 18.0) & (x > moved_mm)
+
+    def nepers(x, depth):
+        return is_inside(x, depth) * loss_db / 2.0 / 3.0 * np.log(10.0) / 20.0
+
+    def speed(x, depth, inside: float, around: float):
+        return np.where(is_inside(x, depth), inside, around)
+
+    if speeds is None:
+        powers = [beam(None, nepers_per_mm=nepers), beam(None)]
+    else:
+        powers = [beam(partial(speed, inside=inside, around=speeds[1])) for inside in speeds]
+    return float(10.0 * np.log10(np.mean(powers[0] / powers[1])))
+
+
 CHECKS = (
+    Check(
+        "beams past strong tissue",
+        "Strong tissue takes from a beam what it does not let through, of the lines that meet it: levels at its edges.",
+        beams_past_strong_tissue,
+    ),
     Check(
         "beams in folds",
         "Sulci change the level of a line as wave propagation says, without streaks; single rays do not follow it.",

@@ -135,7 +135,8 @@ def curved_mirrors(rotation: np.ndarray, device) -> Outcome:
 def refraction(rotation: np.ndarray, device) -> Outcome:
     """Wires behind an oblique interface between two speeds of sound."""
     phantom = refracting_wedge(rotation)
-    return _displacements(phantom, _images(_simulator(phantom, device), phantom))
+    # By single rays: of a beam, deflection is to first order of the contrast.
+    return _displacements(phantom, _images(_simulator(phantom, device, replace(_SETTINGS, beam="ray")), phantom))
 
 
 def reverberation(rotation: np.ndarray, device) -> Outcome:

@@ -20,26 +20,60 @@ _Result = TypeVar("_Result")
 
 def levels_db(
     labels: Volume, tissues: TissueTable, baseline: TissueTable, probe: Probe, pose: np.ndarray, device,
-    *, beam: str, edges_mm: np.ndarray, lines: slice, seeds: int,
+    *, beam: str, edges_mm: np.ndarray, lines: slice, seeds: int, reflections: bool = True,
 ) -> np.ndarray:  # fmt: skip
     """(lines,) power of speckle between the edges of blocks of depth, re the same with the tissues of `baseline`.
 
-    It is the mean over blocks of their changes, whatever the gain of depths is; over `seeds` speckle averages.
+    Parameters as in levels_and_widths.
     """
-    settings = SimulationSettings(beam=beam, interfaces=False)
+    return levels_and_widths(
+        labels,
+        tissues,
+        baseline,
+        probe,
+        pose,
+        device,
+        beam=beam,
+        edges_mm=edges_mm,
+        lines=lines,
+        seeds=seeds,
+        reflections=reflections,
+    )[0]
+
+
+def levels_and_widths(
+    labels: Volume, tissues: TissueTable, baseline: TissueTable, probe: Probe, pose: np.ndarray, device,
+    *, beam: str, edges_mm: np.ndarray, lines: slice, seeds: int, reflections: bool = True,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Speckle between the edges of blocks of depth re the same with the tissues of `baseline`: levels and widths.
+
+    (lines,) power in dB, the mean over blocks of their changes, whatever the gain of depths is; and (lines, blocks) the
+    width of the beam, from the correlation between a line and the next one, exp(-d^2 / 4 sigma^2) for Gaussian beams a
+    distance d apart. Over `seeds` speckle averages.
+    """
+    settings = SimulationSettings(beam=beam, interfaces=False, reflections=reflections)
     simulator = UltrasoundSimulator(labels, tissues, settings, device)
-    powers = []
+    following = slice(lines.start + 1, lines.stop + 1, lines.step)
+    powers, decays = [], []
     for table in (tissues, baseline):
         simulator.set_tissues(table)
-        power = 0.0
+        own = other = common = 0.0
         for seed in range(seeds):
             simulator.settings = replace(settings, seed=seed)
             frame = simulator.simulate(probe, pose)
             starts = (edges_mm / frame.sample_interval_mm).astype(int)
-            samples = np.abs(frame.iq[lines, : starts[-1]]) ** 2
-            power = power + np.add.reduceat(samples, starts[:-1], axis=1)
-        powers.append(power)
-    return 10.0 * np.log10(np.mean(powers[0] / powers[1], axis=1))
+            first, second = (frame.iq[part, : starts[-1]].astype(np.complex128) for part in (lines, following))
+            own, other, common = (
+                total + np.add.reduceat(product, starts[:-1], axis=1)
+                for total, product in (
+                    (own, abs(first) ** 2),
+                    (other, abs(second) ** 2),
+                    (common, first * second.conj()),
+                )
+            )
+        powers.append(own)
+        decays.append(-np.log(abs(common) / np.sqrt(own * other)))
+    return 10.0 * np.log10(np.mean(powers[0] / powers[1], axis=1)), np.sqrt(decays[1] / decays[0])
 
 
 def along_line(probe: Probe, position: float, to_ijk: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:

@@ -105,7 +105,7 @@ def tilted_in_elevation(rotation: np.ndarray, device) -> Outcome:
             rows.append(Row(f"{tilt:.0f} degrees, {name}", "dB", theory, 20 * np.log10(peaks[tilt] / peaks[0.0]), 1.0))
         rows.append(Row(f"8 degrees, {name}", "dB", -15.0, 20 * np.log10(peaks[8.0] / peaks[0.0]), 0.0, "at most"))
         wide = replace(probe, elevation_focus_mm=55.0)
-        fall = 20 * np.log10(peak(wide, 16.0, 12.0) / peak(wide, 0.0, 12.0))
+        fall = 20 * np.log10(max(peak(wide, 16.0, 12.0), 1e-9) / peak(wide, 0.0, 12.0))
         rows.append(Row(f"16 degrees in a wide beam, {name}", "dB", -36.0, fall, 0.0, "at most"))
     return Outcome(tuple(rows))
 
@@ -114,7 +114,8 @@ def interface_width(rotation: np.ndarray, device) -> Outcome:
     """A small sheet away from the focus: its profile is a box convolved with the beam."""
     half, depth = 1.5, 20.0
     phantom = small_sheet(rotation, depth_mm=depth, half_mm=half)
-    settings = SimulationSettings(scattering=False, elevational_rays=16, specular_exponent=0.0)
+    # The second moment is that of the main beam.
+    settings = SimulationSettings(scattering=False, side_lobes=False, elevational_rays=16, specular_exponent=0.0)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     offsets = np.arange(-5.0, 5.01, 0.5)
     rows, plots = [], []

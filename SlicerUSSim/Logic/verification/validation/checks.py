@@ -90,3 +90,8 @@ class Check:
     claim: str
     measure: Callable[[np.ndarray, object], Outcome]
     orientations: tuple[str, ...] = tuple(ORIENTATIONS)
+
+    @property
+    def picture(self) -> str:
+        """File name of its figure, if it draws one."""
+        return f"{self.name.replace(' ', '-')}.png"

@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates
 
 from SlicerUSSim.Logic.probe.arrays import ConvexProbe, PhasedProbe, Probe
 from SlicerUSSim.Logic.verification.brain_views import BRAIN_M_S, EvenBrain, even_brains, random_pose
-from SlicerUSSim.Logic.verification.validation.beam_levels import along_line, beam_of_line, levels_db
+from SlicerUSSim.Logic.verification.validation.beam_levels import along_line, beam_of_line, levels_and_widths
 from SlicerUSSim.Logic.verification.validation.checks import Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_plots
 from SlicerUSSim.Logic.verification.wave import beam_intensities
@@ -31,18 +31,20 @@ def beams_in_heads(rotation: np.ndarray, device) -> Outcome:
     for kind, probe in _PROBES.items():
         rng = np.random.default_rng(_VIEW_SEED)
         found: dict[str, list[np.ndarray]] = {"aperture": [], "ray": [], "wave": [], "near": []}
+        widths: dict[str, list[np.ndarray]] = {"aperture": [], "ray": [], "wave": []}
         for number in range(_VIEWS):
             brain = brains[number * len(brains) // _VIEWS]
             pose = random_pose(brain.labels, rng)
             for beam in ("aperture", "ray"):
-                found[beam].append(
-                    levels_db(
-                        brain.labels, brain.tissues, brain.baseline, probe, pose, device,
-                        beam=beam, edges_mm=_EDGES * probe.depth_mm, lines=_LINES, seeds=_SEEDS[beam],
-                    )
+                level, width = levels_and_widths(
+                    brain.labels, brain.tissues, brain.baseline, probe, pose, device,
+                    beam=beam, edges_mm=_EDGES * probe.depth_mm, lines=_LINES, seeds=_SEEDS[beam],
                 )  # fmt: skip
-            wave, near = _wave_levels_db(brain, probe, pose)
+                found[beam].append(level)
+                widths[beam].append(width)
+            wave, near, width = _waves(brain, probe, pose)
             found["wave"].append(wave)
+            widths["wave"].append(width)
             found["near"].append(near)
         level, ray, wave, near = (np.array(values) for values in found.values())
         rms, step = float(np.sqrt(np.mean((level - wave) ** 2))), float(np.abs(np.diff(level, axis=1)).mean())
@@ -57,6 +59,7 @@ def beams_in_heads(rotation: np.ndarray, device) -> Outcome:
                 f"correlation with waves' power within {_NEAR_MM} mm of the line, {kind}", "",
                 _correlation(wave, near), _correlation(level, near), 0.15, "at least",
             ),
+            *_width_rows(kind, *(np.log(np.mean(values, axis=-1)) for values in widths.values())),
         ]  # fmt: skip
         place = probe.line_positions()[_LINES]
         views = (0, _VIEWS - 1)
@@ -69,14 +72,34 @@ def _correlation(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.corrcoef(first.ravel(), second.ravel())[0, 1])
 
 
-def _wave_levels_db(brain: EvenBrain, probe: Probe, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(lines,) the level from wave propagation in the image plane, and twice the one-way power near the line."""
+def _width_rows(kind: str, image: np.ndarray, ray: np.ndarray, wave: np.ndarray) -> list[Row]:
+    """Rows about the logarithms of the beams' widths (views, lines), re undisturbed ones."""
+    widest = np.quantile(np.exp([wave, image]), 0.9, axis=(1, 2))
+    return [
+        Row(
+            f"width of the beam re undisturbed, mean, {kind}",
+            "",
+            np.exp(wave.mean()),
+            float(np.exp(image.mean())),
+            0.15,
+        ),
+        Row(f"width of the beam, 90 % of lines below, {kind}", "", float(widest[0]), float(widest[1]), 0.25),
+        Row(f"correlation of widths with waves, {kind}", "", 1.0, _correlation(image, wave), 0.4, "at least"),
+        Row(f"control, single rays: width, {kind}", "", 1.0, float(np.exp(ray.mean())), 0.1),
+    ]
+
+
+def _waves(brain: EvenBrain, probe: Probe, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """From wave propagation in the image plane: level, twice the one-way power near the line, and width of the beam.
+
+    (lines,) in dB twice, and (lines, blocks) re an undisturbed beam.
+    """
     extra = np.zeros(256, np.float32)  # of the path, per length
     for label, tissue in brain.tissues.items():
         extra[label] = BRAIN_M_S / tissue.speed_of_sound_m_s - 1.0
     extras, to_ijk = extra[brain.labels.array], brain.labels.ras_to_ijk @ pose
     depths = 0.5 * (_EDGES[1:] + _EDGES[:-1]) * probe.depth_mm
-    levels = []
+    levels, widths = [], []
     for position in probe.line_positions()[_LINES]:
         voxel = along_line(probe, position, to_ijk)
 
@@ -84,14 +107,17 @@ def _wave_levels_db(brain: EvenBrain, probe: Probe, pose: np.ndarray) -> tuple[n
             return BRAIN_M_S / (1.0 + map_coordinates(extras, voxel(x, depth)[2::-1], order=1, cval=extra[0]))
 
         beam = beam_of_line(beam_intensities, probe, position, depths, BRAIN_M_S)
-        speckle, near = [], []
+        speckle, near, width = [], [], []
         for medium in (speed, None):
             x, transmitted, received = beam(medium)
-            speckle.append((transmitted * received).sum(axis=1))
+            both_ways = transmitted * received
+            speckle.append(both_ways.sum(axis=1))
+            width.append(speckle[-1] ** 2 / (both_ways**2).sum(axis=1))
             near.append(transmitted[:, np.abs(x) < _NEAR_MM].sum(axis=1))
         levels.append((10.0 * np.log10(np.mean(speckle[0] / speckle[1])), 20.0 * np.log10(np.mean(near[0] / near[1]))))
+        widths.append(width[0] / width[1])
     both = np.array(levels)
-    return both[:, 0], both[:, 1]
+    return both[:, 0], both[:, 1], np.array(widths)
 
 
 CHECKS = (

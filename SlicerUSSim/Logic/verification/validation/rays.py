@@ -22,6 +22,8 @@ from SlicerUSSim.Logic.verification.phantoms import (
 from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, View, draw_plots, draw_views
 
+#: Snell's law is of single rays; beams go straight through borders like this one.
+_RAYS = SimulationSettings(beam="ray")
 SLOW, FAST = Tissue("slow", 1450.0, 1.45, 0.3), Tissue("fast", 1650.0, 1.9, 0.9)
 
 
@@ -34,7 +36,7 @@ def refraction_and_reflectance(rotation: np.ndarray, device) -> Outcome:
     phantom = layered([SLOW, FAST], [20.0], rotation, tilt_deg=20.0)
     tilt = np.radians(20.0)
     normal = phantom.probe_to_ras[:3, :3] @ [-np.sin(tilt), -np.cos(tilt), 0.0]
-    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, device=device)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _RAYS, device)
     rows, curves = [], []
     for name, probe in PROBES.items():
         tree = simulator.trace(probe, phantom.probe_to_ras)
@@ -75,7 +77,7 @@ def _sine_ratio(tree, normal: np.ndarray) -> float:
 def total_reflection(rotation: np.ndarray, device) -> Outcome:
     """A plane tilted by 75 degrees; the critical angle is 61.5 degrees."""
     phantom = layered([SLOW, FAST], [25.0], rotation, tilt_deg=75.0)
-    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, device=device)
+    simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _RAYS, device)
     tree = simulator.trace(LinearProbe(2.0, 40.0, scan_lines=21), phantom.probe_to_ras)
     hits = tree.hits[(tree.hits["reflections"] == 0) & (tree.hits["label_behind"] == 2)]
     through = (tree.segments["reflections"] == 0) & (tree.segments["label"] == 2)
@@ -158,7 +160,7 @@ def energy(rotation: np.ndarray, device) -> Outcome:
     """The weights of leaves and cut branches of every tree add up to that of its root: R + T = 1 at each node."""
     phantom = layered([SLOW, FAST, SLOW, FAST], [10.0, 18.0, 29.0], rotation, tilt_deg=12.0)
     threshold = 1e-3
-    settings = SimulationSettings(reflection_threshold=threshold, intensity_threshold=1e-9)
+    settings = replace(_RAYS, reflection_threshold=threshold, intensity_threshold=1e-9)
     simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, settings, device)
     rows = []
     for name, probe in PROBES.items():

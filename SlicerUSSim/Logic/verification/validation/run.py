@@ -65,8 +65,8 @@ class Report:
         lines.append("")
         for name, findings in rows.items():
             lines += [f"## {name}", "", checks[name].claim, ""]
-            if f"{_slug(name)}.png" in self.pictures:
-                lines += [f"![{name}]({_slug(name)}.png)", ""]
+            if checks[name].picture in self.pictures:
+                lines += [f"![{name}]({checks[name].picture})", ""]
             lines += ["| | orientation | predicted | measured | limit | |", "|---|---|---|---|---|---|"]
             for finding in findings:
                 row, unit = finding.row, f" {finding.row.unit}" if finding.row.unit else ""
@@ -83,9 +83,19 @@ class Report:
 
 def all_checks() -> tuple[Check, ...]:
     """Every check, in the order of the physics: rays, speckle, artefacts, space."""
-    from SlicerUSSim.Logic.verification.validation import aberration, artefacts, beams, heads, rays, speckle, walls
+    from SlicerUSSim.Logic.verification.validation import (
+        aberration,
+        artefacts,
+        band,
+        beams,
+        floor,
+        heads,
+        rays,
+        speckle,
+        walls,
+    )
 
-    groups = (rays, speckle, artefacts, beams, walls, aberration, heads)
+    groups = (rays, speckle, band, floor, artefacts, beams, walls, aberration, heads)
     return tuple(check for group in groups for check in group.CHECKS)
 
 
@@ -115,9 +125,8 @@ def validate(
             outcome = check.measure(ORIENTATIONS[orientation], opened)
             findings += [Finding(check.name, orientation, row) for row in outcome.rows]
             if outcome.draw is not None and orientation == check.orientations[0]:
-                name = f"{_slug(check.name)}.png"
-                outcome.draw(folder / name)
-                pictures.append(name)
+                outcome.draw(folder / check.picture)
+                pictures.append(check.picture)
     report = Report(tuple(findings), str(opened.info), tuple(pictures))
     write_json(folder / "report.json", report.to_dict())
     with written_whole(folder / "report.md") as partial:

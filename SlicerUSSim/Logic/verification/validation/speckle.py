@@ -10,9 +10,11 @@ import numpy as np
 from scipy import stats
 
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
+from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.probe.arrays import LinearProbe, Probe
+from SlicerUSSim.Logic.probe.arrays import PROBES as SHIPPED, LinearProbe, Probe
 from SlicerUSSim.Logic.probe.placement import elevational_motion
+from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, fit_rayleigh, level_db
 from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, Phantom, uniform_speckle
@@ -33,6 +35,18 @@ SPECKLE = replace(BACKGROUND, name="speckle", attenuation_db_cm_mhz=0.0)
 RAYLEIGH_SNR = float(np.sqrt(np.pi / (4.0 - np.pi)))
 DEPTHS_MM = (10.0, 30.0, 46.0)
 SEEDS = range(8)
+#: The brain's echogenic tissues, and the ends of what fits try and the paper has
+TISSUES_OF_SPECKLE = {
+    tissue.name: replace(tissue, attenuation_db_cm_mhz=0.0)
+    for tissue in TissueTable.brain().all_tissues()
+    if tissue.scatterer_variance > 0.0
+} | {
+    "mu0 = 0": replace(SPECKLE, mu0=0.0),
+    "mu1 = -1": replace(SPECKLE, mu1=-1.0),
+    "mu1 = 1.5": replace(SPECKLE, mu1=1.5),
+    "mu1 = 3": replace(SPECKLE, mu1=3.0),
+    "the paper's patient 3": replace(SPECKLE, mu0=0.06, sigma0=0.31),
+}
 
 
 def _simulators(
@@ -75,6 +89,36 @@ def _spectral_peak(envelope: np.ndarray) -> float:
     smooth = median_filter(power, size=(9, 31), mode="wrap")
     strong = smooth > 1e-3 * smooth.max()
     return float((power[strong] / smooth[strong]).max())
+
+
+def everywhere(rotation: np.ndarray, device) -> Outcome:
+    """First-order statistics of the probes of the presets at their own frequencies, and of all tissues."""
+    rows = []
+    phantom, simulators = _simulators(rotation, device)
+    for name, probe in SHIPPED.items():
+        frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+        for place, depth in {"near the face": 0.1, "at the focus": 0.6, "far": 0.9}.items():
+            found = _window_statistics(frames, depth * probe.depth_mm, 0.06 * probe.depth_mm)
+            rows += _statistics_rows(f"{place}, {name}", SPECKLE, *found)
+    probe = PROBES["linear"]
+    for name, tissue in TISSUES_OF_SPECKLE.items():
+        phantom, simulators = _simulators(rotation, device, tissue)
+        frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+        rows += _statistics_rows(name, tissue, *_window_statistics(frames, 28.0, 20.0))
+    return Outcome(tuple(rows))
+
+
+def _window_statistics(frames: Sequence[Frame], depth_mm: float, half_mm: float) -> tuple[float, float]:
+    """(mean / standard deviation of the envelope, level in dB) around a depth, whatever the focus does to the level."""
+    envelope = np.abs(np.stack([depth_window(frame, depth_mm, half_mm) for frame in frames]))
+    return float(envelope.mean() / envelope.std()), level_db(envelope)
+
+
+def _statistics_rows(name: str, tissue: Tissue, snr: float, level: float) -> list[Row]:
+    return [
+        Row(f"mean / standard deviation, {name}", "", RAYLEIGH_SNR, snr, 0.015 * RAYLEIGH_SNR),
+        Row(f"level, {name}", "dB", 10 * np.log10(tissue.scatterer_variance), level, 0.3),
+    ]
 
 
 def correlations(rotation: np.ndarray, device) -> Outcome:
@@ -220,6 +264,11 @@ CHECKS = (
         "speckle correlation",
         "Signals d apart have the correlation exp(-d^2 / 4 sigma^2), with the sigma of the beam at that depth.",
         correlations,
+    ),
+    Check(
+        "speckle everywhere",
+        "Speckle is developed for every tissue, and for the probes of the presets at every depth.",
+        everywhere,
     ),
     Check("speckle coherence", "The scatterers are the same at every pose.", coherence),
     Check("echogenicity", "Var = p (1 - p) mu0^2 + p sigma0^2 alone sets the level.", echogenicity),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from functools import partial
 
@@ -35,6 +36,13 @@ _FULL_WAVE_PROBE = LinearProbe(36.0, 40.0, scan_lines=145, focus_mm=_DEPTH_MM, a
 #: Turns of the voxels in degrees, with the loss in dB that is allowed: the steps between voxels are 19 voxels long at 3
 #: degrees, longer than any smoothing
 _TURNS = {3.0: 3.0, 5.0: 1.5, 8.0: 1.5, 15.0: 1.5, 30.0: 1.5}
+
+#: The same of layers, by their thickness in voxels
+_LAYER_TURNS = {
+    6: {3.0: 3.0, 5.0: 3.0, 15.0: 3.0},
+    10: {3.0: 3.0, 5.0: 1.5, 15.0: 1.5},
+    16: {3.0: 3.0, 5.0: 1.5, 15.0: 1.5},
+}
 
 
 def _wall(rotation: np.ndarray, device) -> tuple[UltrasoundSimulator, Phantom]:
@@ -143,6 +151,30 @@ def turned_planes(rotation: np.ndarray, device) -> Outcome:
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
 
 
+def flat_layers(rotation: np.ndarray, device) -> Outcome:
+    """Both walls of a layer of one tissue in another, thinner than the smoothing of the borders is wide."""
+    square = 20 * np.log10(reflection_coefficient(FLUID, BEHIND)) + _SETTINGS.interface_gain_db
+    through = 20 * np.log10(1.0 - reflection_coefficient(FLUID, BEHIND) ** 2)
+    probe = LinearProbe(20.0, 40.0, scan_lines=81, focus_mm=_DEPTH_MM, elevation_focus_mm=_DEPTH_MM)
+    rows = []
+    for spacing, voxels in itertools.product((0.5, 1.0), _LAYER_TURNS):
+        thickness = voxels * spacing
+        depths = (_DEPTH_MM - 0.5 * thickness, _DEPTH_MM + 0.5 * thickness)
+        for turn, loss in _LAYER_TURNS[voxels].items():
+            turned = rotation @ Rotation.from_euler("xz", [turn, 0.6 * turn], degrees=True).as_matrix()
+            phantom = layered(
+                [FLUID, BEHIND, FLUID], depths, turned, spacing_mm=spacing, half_width_mm=36.0, half_thickness_mm=30.0
+            )
+            simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
+            lines = simulator.simulate(probe, phantom.probe_to_ras)
+            shown = depths[0] + thickness * phantom.tissues[0].speed_of_sound_m_s / BEHIND.speed_of_sound_m_s
+            for wall, depth, expected in (("front", depths[0], square), ("back", shown, square + through)):
+                along = 20 * np.log10(np.abs(depth_window(lines, depth, 1.5)[10:-10]).max(axis=1)) - expected
+                what = f"{wall} of {voxels} voxels, turned by {turn:g} degrees, {spacing:g} mm"
+                rows.append(Row(f"lowest level, {what}", "dB", 0.0, float(along.min()), loss, "at least"))
+    return Outcome(tuple(rows))
+
+
 def sheets(rotation: np.ndarray, device) -> Outcome:
     """Sheets thinner than the pulse: the echoes of both faces, of opposite sign, interfere."""
     probe = LinearProbe(8.0, 24.0, scan_lines=41, frequency_mhz=2.5, focus_mm=15.0, elevation_focus_mm=15.0)
@@ -172,6 +204,9 @@ CHECKS = (
     Check("walls and lines", "A wall does not depend on the number of scan lines.", walls_and_lines),
     Check(
         "turned planes", "A plane that faces the beam has the same level wherever its voxels are turned.", turned_planes
+    ),
+    Check(
+        "flat layers", "Both walls of a layer have the level of a plane, wherever its voxels are turned.", flat_layers
     ),
     Check("sheets", "The two borders of a sheet have echoes of opposite sign.", sheets),
 )
