@@ -180,7 +180,7 @@ def test_how_a_device_splits_the_work_does_not_change_the_image(lanes, chunk):
     reference = usual.simulate(probe, pose)
     other = Device(usual.device.info)
     other.lanes, other.chunk = lanes, chunk
-    found = UltrasoundSimulator(solid, usual.medium.tissues, device=other).simulate(probe, pose)
+    found = UltrasoundSimulator(solid, usual.medium.tissues, usual.settings, device=other).simulate(probe, pose)
     difference = np.abs(found.image.astype(int) - reference.image)
     assert (difference <= 1).mean() > 0.999
 
