@@ -22,11 +22,13 @@
 // With ADDED defined, the echoes are added to those that are there: of the elevational side lobes, which have a record
 // and a coarser lattice of their own (side_lobes.py).
 //
-// Buffers: voxels, segments as in raytracing.cl; texture uint [k][j][i] (one element without TEXTURE); sites float2
-// [label], the share of cells with a scatterer, in 1/65536, and its amplitude; re, im float [2 traced line +
-// side][stride]; with VARIED also [part] before these, and part_of int [label], -1 for a tissue in none.
+// Buffers: voxels, segments as in raytracing.cl; planes uint [k][j][i] of sheets.cl (one element without sheets);
+// texture uint [k][j][i] (one element without TEXTURE); sites float2 [label], the share of cells with a scatterer, in
+// 1/65536, and its amplitude; re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and
+// part_of int [label], -1 for a tissue in none.
 
 #include "common.clh"
+#include "sheets.clh"
 
 #ifdef VARIED
 #define VARIED_PARAMETERS , __global const int *part_of
@@ -75,15 +77,35 @@ inline void add_echo(float4 *sum, int bin, float between, float right, float str
   sum[bin + 2] += echo * between;
 }
 
-// The label of a scatterer at fraction (fx, fy, fz) of the cell of voxels at `corner`, which contains a border or the
+// The sheet (sheets.clh) at the voxel nearest to a scatterer at fraction `at` of a cell, or 0; and the offset from it
+inline uint nearest_sheet(__constant const Acquisition *acquisition, __global const uint *planes, float3 at,
+                          float3 *offset) {
+  const int x = at.x > 0.5f, y = at.y > 0.5f, z = at.z > 0.5f;
+  *offset = at - (float3)(x, y, z);
+  return planes[x + acquisition->dims[0] * (y + acquisition->dims[1] * z)];
+}
+
+// Whether a scatterer is in a sheet, at this offset from its voxel; and the normal, of the length of a gradient
+inline int is_in_sheet(__constant const Acquisition *acquisition, const Piece *piece, uint plane, float3 offset,
+                       float3 *normal) {
+  const float3 gradient = gradient_of_sheet(plane);
+  const float away = fabs(dot3(gradient, offset) - length3(gradient) * distance_of_sheet(plane));
+  // A gradient's length in millimetres is at most 1 / voxel_mm of that in voxels; this is seldom true.
+  if (away * acquisition->voxel_mm >= acquisition->sheet_reach_mm) return 0;
+  *normal = gradient.x * piece->row_i + gradient.y * piece->row_j + gradient.z * piece->row_k;
+  return away < acquisition->sheet_reach_mm * length3(*normal);
+}
+
+// The label of a scatterer at fraction `at` of the cell of voxels at `corner`, which contains a border, a sheet or the
 // membrane; `random` are random bits of the scatterer. With TEXTURE, also its gain.
 inline int drawn_label(__constant const Acquisition *acquisition, __global const ushort *corner,
-                       __global const uint *texture, float fx, float fy, float fz, uint random, float *gain) {
+                       __global const uint *planes, __global const uint *texture, const Piece *piece, float3 at,
+                       uint random, float *gain) {
   const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
   // Partial volume without blending: the scatterer takes the label of one corner, drawn with that corner's trilinear
   // weight. The border is soft on average and fixed in the patient.
-  const int dx = fx * 32.0f > (random & 31u) + 0.5f, dy = fy * 32.0f > ((random >> 5) & 31u) + 0.5f,
-            dz = fz * 32.0f > ((random >> 10) & 31u) + 0.5f;
+  const int dx = at.x * 32.0f > (random & 31u) + 0.5f, dy = at.y * 32.0f > ((random >> 5) & 31u) + 0.5f,
+            dz = at.z * 32.0f > ((random >> 10) & 31u) + 0.5f;
   const int drawn = dx + nx * dy + nxy * dz;
   int label = corner[drawn] & LABEL_MASK;
 #ifdef TEXTURE
@@ -92,28 +114,43 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
   if ((hash_mix(random) & 255u) < ((known >> 8) & 255u)) label = known & LABEL_MASK;
 #endif
   if (corner[0] & NO_MEMBRANE) return label;
-  const float near_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
-                             blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
-  corner += nxy;
-  const float far_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), fx),
-                            blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), fx), fy);
-  if (fabs(blend(near_z, far_z, fz) - 127.5f) >= acquisition->membrane_reach) return label;
+  int is_membrane = 0;
+  if (acquisition->sheet_label >= 0) {
+    float3 offset, normal;
+    const uint plane = nearest_sheet(acquisition, planes, at, &offset);
+    is_membrane = plane && is_in_sheet(acquisition, piece, plane, offset, &normal);
+    // Voxels are thicker than the sheet.
+    if (label == acquisition->sheet_label && planes[drawn]) label = label_beside_sheet(planes[drawn]);
+  }
+  if (!is_membrane) {
+    const float near_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), at.x),
+                               blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), at.x), at.y);
+    corner += nxy;
+    const float far_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), at.x),
+                              blend((float)(corner[nx] >> 8), (float)(corner[nx + 1] >> 8), at.x), at.y);
+    if (fabs(blend(near_z, far_z, at.z) - 127.5f) >= acquisition->membrane_reach) return label;
+  }
   *gain = 1.0f;
   return MEMBRANE_LABEL;
 }
 
-// A scatterer of the membrane is the brighter the more squarely the beam meets the sheet, whose normal is the gradient
-// of the fluid distance: from lines of two voxels along i, first those of the near plane, then of the far.
+// A scatterer of the membrane is the brighter the more squarely the beam meets the sheet. Its normal is that of the
+// fitted plane, or the gradient of the fluid distance: from lines of two voxels along i, first those of the near plane,
+// then of the far.
 inline float gain_on_membrane(__constant const Acquisition *acquisition, __global const ushort *corner,
-                              const Piece *piece, float fx, float fy, float fz) {
-  const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
-  const float4 from = (float4)(corner[0] >> 8, corner[nx] >> 8, corner[nxy] >> 8, corner[nxy + nx] >> 8);
-  const float4 to = (float4)(corner[1] >> 8, corner[nx + 1] >> 8, corner[nxy + 1] >> 8, corner[nxy + nx + 1] >> 8);
-  const float4 lines = from + fx * (to - from), rise = to - from;
-  const float gx = blend(blend(rise.x, rise.y, fy), blend(rise.z, rise.w, fy), fz);
-  const float gy = blend(lines.y - lines.x, lines.w - lines.z, fz);
-  const float gz = blend(lines.z, lines.w, fy) - blend(lines.x, lines.y, fy);
-  const float3 normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
+                              __global const uint *planes, const Piece *piece, float3 at) {
+  float3 normal, offset;
+  const uint plane = acquisition->sheet_label < 0 ? 0u : nearest_sheet(acquisition, planes, at, &offset);
+  if (!plane || !is_in_sheet(acquisition, piece, plane, offset, &normal)) {
+    const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
+    const float4 from = (float4)(corner[0] >> 8, corner[nx] >> 8, corner[nxy] >> 8, corner[nxy + nx] >> 8);
+    const float4 to = (float4)(corner[1] >> 8, corner[nx + 1] >> 8, corner[nxy + 1] >> 8, corner[nxy + nx + 1] >> 8);
+    const float4 lines = from + at.x * (to - from), rise = to - from;
+    const float gx = blend(blend(rise.x, rise.y, at.y), blend(rise.z, rise.w, at.y), at.z);
+    const float gy = blend(lines.y - lines.x, lines.w - lines.z, at.z);
+    const float gz = blend(lines.z, lines.w, at.y) - blend(lines.x, lines.y, at.y);
+    normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
+  }
   const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
   return acquisition->membrane_gain *
          exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
@@ -122,9 +159,9 @@ inline float gain_on_membrane(__constant const Acquisition *acquisition, __globa
 // Three passes over a batch, each without unpredictable branches: vectors of all cells; labels of the scatterers that
 // contribute; their echoes, one after the other.
 inline void scatter_batch(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                          __global const uint *texture, __global const float *sites, const Piece *piece,
-                          const int *cell_u, const uint *row_key, const float *row_v, const float *row_w, int count,
-                          float4 *sum VARIED_PARAMETERS) {
+                          __global const uint *planes, __global const uint *texture, __global const float *sites,
+                          const Piece *piece, const int *cell_u, const uint *row_key, const float *row_v,
+                          const float *row_w, int count, float4 *sum VARIED_PARAMETERS) {
   const float cell = acquisition->cell_mm, grain = cell / 1024.0f;
   const float cutoff2 = 0.5f * LOG2_E * acquisition->beam_cutoff * acquisition->beam_cutoff;
   const float inverse_sample = 1.0f / acquisition->sample_mm;
@@ -206,7 +243,8 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   for (int k = 0; k < several; k++) {
     const int i = mixed[k], j = chosen[i], here = voxel_[j];
     float gain = 1.0f;
-    label_[i] = drawn_label(acquisition, voxels + here, texture + here, fx_[j], fy_[j], fz_[j], random_[j], &gain);
+    label_[i] = drawn_label(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : here),
+                            texture + here, piece, (float3)(fx_[j], fy_[j], fz_[j]), random_[j], &gain);
 #ifdef TEXTURE
     re_[j] *= gain;
     im_[j] *= gain;
@@ -216,7 +254,10 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   for (int i = 0; i < n; i++) {
     const int j = chosen[i], b = bin_[j], label = label_[i];
     if (label == MEMBRANE_LABEL) {
-      const float gain = gain_on_membrane(acquisition, voxels + voxel_[j], piece, fx_[j], fy_[j], fz_[j]);
+      const int here = voxel_[j];
+      const float gain =
+          gain_on_membrane(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : here), piece,
+                           (float3)(fx_[j], fy_[j], fz_[j]));
       re_[j] *= gain;
       im_[j] *= gain;
     }
@@ -235,8 +276,9 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 // The scatterers of one piece: finds the lattice cells beside it and computes them in batches. `start` is the segment's
 // start, `low` and `high` are the piece's ends along it, `radius_l` and `radius_e` how far it reaches to either side.
 inline void scatter_piece(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                          __global const uint *texture, __global const float *sites, const Piece *piece, float3 start,
-                          float low, float high, float radius_l, float radius_e, float4 *sum VARIED_PARAMETERS) {
+                          __global const uint *planes, __global const uint *texture, __global const float *sites,
+                          const Piece *piece, float3 start, float low, float high, float radius_l, float radius_e,
+                          float4 *sum VARIED_PARAMETERS) {
   int cell_u[BATCH + LANES];
   uint row_key[BATCH + LANES];
   float row_v[BATCH + LANES], row_w[BATCH + LANES];
@@ -298,7 +340,7 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
           STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
           waiting += min(LANES, cells_[j] - cu);
           if (waiting >= BATCH) {
-            scatter_batch(acquisition, voxels, texture, sites, piece, cell_u, row_key, row_v, row_w, BATCH,
+            scatter_batch(acquisition, voxels, planes, texture, sites, piece, cell_u, row_key, row_v, row_w, BATCH,
                           sum VARIED_ARGUMENTS);
             waiting -= BATCH;
             for (int i = 0; i < waiting; i++) {
@@ -312,7 +354,7 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
       }
     }
   }
-  scatter_batch(acquisition, voxels, texture, sites, piece, cell_u, row_key, row_v, row_w, waiting,
+  scatter_batch(acquisition, voxels, planes, texture, sites, piece, cell_u, row_key, row_v, row_w, waiting,
                 sum VARIED_ARGUMENTS);
 }
 
@@ -320,9 +362,9 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
 __attribute__((intel_vec_len_hint(1)))
 #endif
 __kernel void scatter(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                      __global const uint *texture, __global const float *sites, __global const Segment *segments,
-                      __global const int *segment_counts, __global float *re, __global float *im,
-                      int stride VARIED_PARAMETERS) {
+                      __global const uint *planes, __global const uint *texture, __global const float *sites,
+                      __global const Segment *segments, __global const int *segment_counts, __global float *re,
+                      __global float *im, int stride VARIED_PARAMETERS) {
   int chunk = get_global_id(0), line = get_global_id(1);
   int first = chunk * CHUNK;
   float4 sum[PARTS * PART];  // left re, im, right re, im
@@ -411,7 +453,7 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float radius_l = 0.5f * fmax(apart_low, apart_high), early = piece.bend * radius_l * radius_l;
       const float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
       if (begin >= end) continue;
-      scatter_piece(acquisition, voxels, texture, sites, &piece, start, begin, end, radius_l,
+      scatter_piece(acquisition, voxels, planes, texture, sites, &piece, start, begin, end, radius_l,
                     acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum VARIED_ARGUMENTS);
     }
   }

@@ -4,7 +4,8 @@ A voxel has two bytes. The low byte has the label and flags for cells (the cube 
 corners agree, so that most look-ups need one load. The high byte has the *fluid distance* of the voxel from the border
 of the membrane's fluids, positive inside. It is computed from their indicator, smoothed by a Gaussian: for a planar
 border at distance d this is Phi(d / sigma), so d = sigma Phi^-1 of it. With linear interpolation between voxels, a
-layer thinner than a voxel is located without steps. Where two such borders meet, in a thin sulcus, it is one sheet.
+layer thinner than a voxel is located without steps. Thin layers of the membrane's own tissue, as of a sulcus whose two
+borders meet, are sheets instead: planes fitted to their voxels (sheets.py).
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ import numpy as np
 from scipy import ndimage, special
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.neighbourhood import largest_around
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.borders import smoothed_indicators
+from SlicerUSSim.Logic.imaging.sheets import sheet_planes
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
@@ -31,9 +32,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _FARTHEST_SIGMAS = 2.2  # limit of the stored distance
-# The smoothed indicator of a layer of one voxel reaches 0.5, of two voxels 0.82. Below the first a layer is a fragment,
-# above the second it is thick and has two borders.
-_LEAST_CREST, _THICK_CREST = 0.2, 0.9
 # Smoothed indicators need two bytes per voxel and group. Limits of groups and of all values; at least two groups.
 _MOST_SMOOTHED_GROUPS = 6
 _SMOOTHED_VOXELS = 100_000_000
@@ -81,6 +79,9 @@ class Medium:
         self.smooth_groups: int
         #: Half the membrane in the unit of the fluid distance; negative: none
         self.membrane_reach: float
+        #: uint32 [k][j][i] planes of thin sheets (sheets.cl), or one element if there are none; and their label or -1
+        self.sheet_buffer: Buffer
+        self.sheet_label: int
         #: layout.TISSUE per label, as on the device
         self.rows = self._tissue_rows(tissues)
         #: As given
@@ -156,7 +157,10 @@ class Medium:
         return rows
 
     def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:
-        distance, self.membrane_reach = self._fluid_distance(padded, tissues)
+        label = _sheet_label(tissues)
+        self.sheet_buffer, sheets = sheet_planes(self.device, padded, label, self.labels.spacing_mm)
+        self.sheet_label = label if len(sheets) else -1
+        distance, self.membrane_reach = self._fluid_distance(padded, tissues, sheets)
         words = padded.astype(np.uint16)
         lowest, highest = _cell_extremes(padded)
         same, no_membrane = lowest == highest, True
@@ -164,6 +168,8 @@ class Medium:
             words |= distance.astype(np.uint16) << 8
             lowest, highest = _cell_extremes(distance)
             no_membrane = (lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach)
+            for k, j, i in np.ndindex(2, 2, 2):  # the cells around these voxels
+                no_membrane.ravel()[sheets - np.ravel_multi_index((k, j, i), padded.shape)] = False
         words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["NO_MEMBRANE"]) * no_membrane
         self.voxel_buffer = self.device.upload(words)
 
@@ -191,8 +197,13 @@ class Medium:
             self.device, continued, self.dims, groups, self.smooth_groups, membership
         )
 
-    def _fluid_distance(self, padded: np.ndarray, tissues: TissueTable) -> tuple[np.ndarray | None, float]:
-        """(distance as uint8 about 127.5, half the membrane in that unit), or (None, -1) without a membrane."""
+    def _fluid_distance(
+        self, padded: np.ndarray, tissues: TissueTable, sheets: np.ndarray
+    ) -> tuple[np.ndarray | None, float]:
+        """(distance as uint8 about 127.5, half the membrane in that unit), or (None, -1) without a membrane.
+
+        `sheets` are the flat indices of voxels in thin sheets, which have no such border.
+        """
         membrane = tissues.membrane
         if membrane is None or membrane.thickness_mm == 0:
             return None, -1.0
@@ -211,15 +222,8 @@ class Medium:
             "membrane, or label it; check the voxel size in the header",
         )
 
-        def smoothed(where: np.ndarray) -> np.ndarray:
-            return ndimage.gaussian_filter(where.astype(np.float32), sigma_mm / spacing, mode="nearest", truncate=3.0)
-
-        is_sheet = padded == next((label for label in fluids if tissues[label].name == membrane.tissue.name), -1)
-        smooth = smoothed(is_fluid & ~is_sheet)
-        if is_sheet.any():
-            reach = np.ceil(3.0 * sigma_mm / spacing).astype(int) + 1
-            box = _box_around(is_sheet, reach)
-            smooth[box] = _with_crest(smooth[box], smoothed(is_sheet[box]))
+        is_fluid.ravel()[sheets] = False
+        smooth = ndimage.gaussian_filter(is_fluid.astype(np.float32), sigma_mm / spacing, mode="nearest", truncate=3.0)
         # Phi^-1 by a table, whose size is sufficient for the resolution of the argument.
         share = np.linspace(0.0, 1.0, 4096)
         sigmas = np.clip(special.ndtri(share), -_FARTHEST_SIGMAS, _FARTHEST_SIGMAS)
@@ -264,26 +268,6 @@ def _cell_extremes(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return lowest, highest
 
 
-def _box_around(where: np.ndarray, margin: np.ndarray) -> tuple[slice, ...]:
-    """The slices of (k, j, i) voxels that hold all True ones, with a margin (k, j, i) inside the array."""
-    box = []
-    for axis, (size, extra) in enumerate(zip(where.shape, margin, strict=True)):
-        found = np.flatnonzero(where.any(axis=tuple(other for other in range(3) if other != axis)))
-        box.append(slice(max(found[0] - extra, 0), min(found[-1] + extra + 1, size)))
-    return tuple(box)
-
-
-def _with_crest(fluid: np.ndarray, sheet: np.ndarray) -> np.ndarray:
-    """(k, j, i) smoothed indicator whose half-level is the border of the fluids, and the crest of sheets.
-
-    A label of the membrane's own tissue is the membrane, where its two sides meet: one to two voxels thick as the grid
-    has it, and one line in an image. Its indicator is scaled so that it just reaches the half-level, on its crest.
-    """
-    crest = largest_around(sheet)
-    on_crest = 0.5 * sheet / np.maximum(crest, _LEAST_CREST)
-    return np.where(crest < _THICK_CREST, np.maximum(fluid, on_crest), fluid + sheet)
-
-
 def _keep_membrane_inside(distance: np.ndarray, reach: float) -> None:
     """Move the margin of the fluid distance, (k, j, i) uint8, beyond the membrane, on its own side.
 
@@ -300,7 +284,15 @@ def _membrane_shape(tissues: TissueTable) -> tuple | None:
     membrane = tissues.membrane
     if membrane is None:
         return None
-    return membrane.thickness_mm, _fluid_labels(tissues, membrane)
+    return membrane.thickness_mm, _fluid_labels(tissues, membrane), _sheet_label(tissues)
+
+
+def _sheet_label(tissues: TissueTable) -> int:
+    """The label of the membrane's own tissue, if it is one of the fluids; -1 for none."""
+    membrane = tissues.membrane
+    if membrane is None or membrane.thickness_mm == 0:
+        return -1
+    return next((n for n in _fluid_labels(tissues, membrane) if tissues[n].name == membrane.tissue.name), -1)
 
 
 def _fluid_labels(tissues: TissueTable, membrane: Membrane) -> tuple[int, ...]:

@@ -78,6 +78,7 @@ class Scatterers(Stage):
             (frame.line_shape[1] // self.device.chunk, int(frame.acquisition["traced_lines"])),
             acquisition_buffer,
             medium.voxel_buffer,
+            medium.sheet_buffer,
             medium.texture_buffer,
             sites,
             frame.tree.segments,

@@ -352,8 +352,10 @@ class UltrasoundSimulator:
         acquisition["voxel_mm"] = medium.labels.spacing_mm.min()
         acquisition["smooth_groups"] = medium.smooth_groups
         acquisition["membrane_reach"] = medium.membrane_reach
+        acquisition["sheet_label"] = medium.sheet_label
         membrane = medium.tissues.membrane
         if membrane is not None:
+            acquisition["sheet_reach_mm"] = 0.5 * membrane.thickness_mm
             acquisition["membrane_gain"] = 10.0 ** (membrane.diffuse_db / 20.0)
             acquisition["membrane_exponent"] = membrane.diffuse_exponent
             # 2 k s of the range's deviation s: the carrier has 2 k / 2 pi cycles per millimetre of depth.

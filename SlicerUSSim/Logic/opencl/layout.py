@@ -27,6 +27,13 @@ CONSTANTS = {
     "WIDE_VARIANCE": 8.91,
     "HALVED_SIGMA": 4.0,
     "WIDEST_VARIANCE": 18.29,
+    "SHEET_SIGMA": 2.0,  # of the window in which sheets are fitted (sheets.cl), voxels, ...
+    "SHEET_REACH": 4,  # ... and where it is cut off
+    # Of the sheet's indicator, smoothed by 0.75 voxel: a layer of one voxel reaches 0.5, of two 0.82; from this on a
+    # layer is thick and has two borders
+    "SHEET_THICK": 0.9,
+    "SHEET_LEAST_AREA": 2.5,  # of a sheet in it: product of the variances along both axes of a plane, voxels^4; whole: 16
+    "SHEET_DISTANCE_STEP": 0.015625,  # of the stored distance, voxels
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
@@ -52,6 +59,8 @@ ACQUISITION = np.dtype(
         ("voxel_mm", _FLOAT),  # smallest spacing
         ("smooth_groups", _INT),  # acoustic groups with a smoothed indicator
         ("membrane_reach", _FLOAT),  # half the membrane in units of the fluid distance (0..255); negative: none
+        ("sheet_label", _INT),  # of the membrane's own tissue, which is a sheet where it is thin; -1: none
+        ("sheet_reach_mm", _FLOAT),  # half the thickness of such a sheet
         ("membrane_gain", _FLOAT),  # of the amplitude of its scatterers at normal incidence
         ("membrane_exponent", _FLOAT),  # of the cosine of incidence by which it falls
         ("membrane_phase", _FLOAT),  # deviation of the echo's phase by its roughness, radians at normal incidence
