@@ -50,15 +50,20 @@ PROBES = {
 
 
 def scene(membrane: bool = True):
-    """(labels, tissues): brain with a cyst and a stone in it, in fluid."""
+    """(labels, tissues): brain with a cyst, a stone and, if there is a membrane, a thin bent sulcus in it, in fluid."""
 
     def label(x, y, z):
         brain = np.where(np.hypot(x, np.hypot(y - 14, z)) < 17, 1, 0)
         brain = np.where(np.hypot(x + 5, np.hypot(y - 10, z)) < 4, 2, brain)
+        bent = np.abs(np.hypot(x + 6, y - 28) - 14.3 + 0.2 * z) < 0.8
+        brain = np.where(membrane & bent & (brain == 1) & (np.hypot(x, np.hypot(y - 14, z)) < 14), 4, brain)
         return np.where(np.hypot(x - 7, np.hypot(y - 16, z)) < 3, 3, brain)
 
     tissues = {0: FLUID, 1: BRAIN, 2: FLUID, 3: STONE}
-    skin = Membrane(Tissue("pia", 1546, 1.60, 0.6, 0.9, 0.0, 0.5), 1.0, ("fluid",)) if membrane else None
+    pia = Tissue("pia", 1546, 1.60, 0.6, 0.9, 0.0, 0.5)
+    skin = Membrane(pia, 1.0, ("fluid", "pia")) if membrane else None
+    if membrane:
+        tissues[4] = pia
     return block(label, half_mm=(22, 34, 12)), TissueTable(tissues, membrane=skin)
 
 
@@ -249,6 +254,15 @@ def test_the_medium_is_the_same_on_the_host(has_shares):
     voxels = download(found.voxel_buffer, shape, np.uint16)
     assert np.array_equal(voxels & CONSTANTS["LABEL_MASK"], model.label)
     assert model.distance is not None and np.abs((voxels >> 8).astype(int) - model.distance).max() <= 1
+    planes = download(found.sheet_buffer, shape, np.uint32)
+    sheets = model.sheets
+    assert found.sheet_label == sheets.label == 4 and sheets.is_thin.sum() > 500
+    has_plane = sheets.gradient.any(axis=-1)
+    assert np.array_equal(planes > 0, has_plane)
+    beside, distance = planes >> 26, (planes >> 18 & 255).astype(int) - 128
+    assert np.array_equal(beside[has_plane], sheets.beside[has_plane])
+    # Of either sign, together with the gradient's
+    assert np.abs(np.abs(distance) - 64.0 * np.abs(sheets.distance))[has_plane].max() <= 1.01
     assert np.array_equal(download(found.group_buffer, shape, np.uint8) & CONSTANTS["GROUP_MASK"], model.group)
     smooth = download(found.smooth_buffer, (found.smooth_groups, *shape), np.uint16)
     assert model.smooth_groups == found.smooth_groups
@@ -276,7 +290,8 @@ WRONG_RECORDS = {
     "speckle_scale": 1.05, "cell_mm": 1.01, "cycles_per_mm": 1.01, "sample_mm": 1.01, "line_spacing": 1.01,
     "first_line": 1.02, "apex_radius_mm": 1.05, "interface_gain": 1.3, "membrane_reach": 1.2, "beam_cutoff": 0.9,
     "reference_speed_m_s": 1.01, "frequency_mhz": 1.1, "specular_exponent": 10.0, "fractional_bandwidth": 2.0,
-    "membrane_gain": 1.1, "membrane_exponent": 1.5, "membrane_phase": 3.0, "screen_step": 1.2, "fan_step": 1.3,
+    "sheet_reach_mm": 1.3, "membrane_gain": 1.1, "membrane_exponent": 1.5, "membrane_phase": 3.0, "screen_step": 1.2,
+    "fan_step": 1.3,
 }  # fmt: skip
 
 

@@ -172,13 +172,37 @@ def drawn_labels(
         return rest[:, 0]
 
     thin = np.abs(derived(None) - f32(127.5)) < acquisition["membrane_reach"]
-    label[thin] = CONSTANTS["MEMBRANE_LABEL"]
     to_voxel = acquisition["ras_to_voxel"].reshape(3, 4)[:, :3]
-    normal = np.stack([derived(axis)[thin] for axis in range(3)], axis=-1) @ to_voxel
+    normal = np.stack([derived(axis) for axis in range(3)], axis=-1) @ to_voxel
+    if labels.sheets is not None and acquisition["sheet_label"] >= 0:
+        in_cell = (labels.label[here[:, None] + labels.corner_steps] == acquisition["sheet_label"]) & (
+            labels.sheets.is_thin.ravel()[here[:, None] + labels.corner_steps]
+        )
+        near_cell = in_cell.any(axis=1) | _has_membrane(acquisition, corners)
+        nearest = (f > f32(0.5)).astype(np.int64)
+        at = here + nearest @ labels.steps
+        gradient, distance = labels.sheets.gradient.reshape(-1, 3)[at], labels.sheets.distance.ravel()[at]
+        across = gradient @ to_voxel
+        away = np.abs((gradient * (f - nearest)).sum(axis=1) - distance)
+        in_sheet = near_cell & gradient.any(axis=1)
+        in_sheet &= away < acquisition["sheet_reach_mm"] * np.sqrt((across**2).sum(axis=1))
+        normal[in_sheet] = across[in_sheet]
+        thin |= in_sheet
+        beside = near_cell & (label == acquisition["sheet_label"])
+        beside &= labels.sheets.gradient.reshape(-1, 3)[corner].any(axis=1)
+        label[beside] = labels.sheets.beside.ravel()[corner[beside]]
+    label[thin] = CONSTANTS["MEMBRANE_LABEL"]
+    normal = normal[thin]
     size = np.maximum(np.sqrt((normal**2).sum(axis=1)), f32(1e-6))
     cosine = np.maximum(np.abs(normal @ direction) / size, f32(1e-6))
     gain[thin] = acquisition["membrane_gain"] * cosine ** acquisition["membrane_exponent"]
     return label, gain
+
+
+def _has_membrane(acquisition: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """(n,) whether the distances of a cell's (n, 8) corners let the membrane of a border pass between them."""
+    reach = acquisition["membrane_reach"]
+    return (corners.min(axis=1) <= f32(127.5) + reach) & (corners.max(axis=1) >= f32(127.5) - reach)
 
 
 def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndarray, scanned: np.ndarray) -> None:

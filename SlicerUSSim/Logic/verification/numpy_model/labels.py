@@ -50,6 +50,7 @@ class Labels:
         self.wide = SmoothGrid(medium.smooth, 8.91, 0.955, 1.0)
         self.widest = SmoothGrid(medium.smoother, 18.29, 0.99, 0.5)
         self.distance = None if medium.distance is None else medium.distance.ravel()
+        self.sheets = medium.sheets
 
     def cells(self, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(index of the cell, fraction (..., 3) inside it) of (..., 3) voxel positions, clamped to the volume."""

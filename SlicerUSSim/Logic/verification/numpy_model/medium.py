@@ -9,6 +9,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
+from SlicerUSSim.Logic.verification.numpy_model.sheets import Sheets
 
 WIDE_SIGMA, HALVED_SIGMA = 3.0, 4.0  # of the Gaussians for smoothing the indicators, voxels of their grids
 _FARTHEST = 2.2  # limit of the fluid distance in standard deviations; it has eight bits
@@ -68,8 +69,19 @@ class HostMedium:
                     half = 0.5 * (even + odd)
                 share = ndimage.gaussian_filter(half.astype(np.float32), HALVED_SIGMA, mode="nearest", truncate=3.5)
                 self.smoother[number] = np.rint(65535.0 * np.clip(share, 0.0, 1.0))
+        #: The planes of thin sheets of the membrane's own tissue, if there are any
+        self.sheets = self._sheets(spacing)
         #: (k, j, i) uint8 about 127.5, and half the membrane in its unit; None and -1 without a membrane
         self.distance, self.membrane_reach = self._fluid_distance(spacing)
+
+    def _sheets(self, spacing_mm: np.ndarray) -> Sheets | None:
+        membrane = self.tissues.membrane
+        if membrane is None or membrane.thickness_mm == 0:
+            return None
+        for label, tissue in self.tissues.items():
+            if tissue.name == membrane.tissue.name and tissue.name in membrane.fluids:
+                return Sheets(self.label, label, spacing_mm) if (self.label == label).any() else None
+        return None
 
     def _fluid_distance(self, spacing_mm: np.ndarray) -> tuple[np.ndarray | None, float]:
         """The fraction Phi(d / sigma) of a Gaussian is behind a plane at distance d from its centre."""
@@ -81,17 +93,11 @@ class HostMedium:
         if fluid.all() or not fluid.any():
             return None, -1.0
         sigma_mm = 0.75 * np.prod(spacing_mm) ** (1.0 / 3.0)
-        own = [label for label in fluids if self.tissues[label].name == membrane.tissue.name]
-        sheet = np.isin(self.label, own[:1])
-        share, layer = (
-            ndimage.gaussian_filter(part.astype(np.float32), sigma_mm / spacing_mm[::-1], mode="nearest", truncate=3.0)
-            for part in (fluid & ~sheet, sheet)
+        if self.sheets is not None:
+            fluid &= ~self.sheets.is_thin
+        share = ndimage.gaussian_filter(
+            fluid.astype(np.float32), sigma_mm / spacing_mm[::-1], mode="nearest", truncate=3.0
         )
-        # A label of the membrane's own tissue is a membrane where its middle is, unless it is thick.
-        middle = ndimage.maximum_filter(layer, size=(3, 3, 3))
-        is_thin = middle < 0.9
-        share[is_thin] = np.maximum(share, 0.5 * layer / np.maximum(middle, 0.2))[is_thin]
-        share[~is_thin] += layer[~is_thin]
         per_sigma = 127.5 / _FARTHEST
         steps = np.rint(np.clip(share, 0.0, 1.0) * _SHARES) / _SHARES
         sigmas = np.clip(special.ndtri(steps), -_FARTHEST, _FARTHEST)
