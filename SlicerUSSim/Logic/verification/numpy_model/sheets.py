@@ -31,8 +31,8 @@ class Sheets:
         is_thick = ndimage.maximum_filter(inside * member >= _THICK, size=3)
         #: (k, j, i) True in thin sheets
         self.is_thin = (member > 0) & ~is_thick
-        #: (k, j, i, 3) gradients in voxels, of length 1, 0 where there is no plane; (k, j, i) distances in voxels; labels
-        #: of the tissue beside
+        #: (k, j, i, 3) gradients in voxels, of length 1, 0 where there is no plane; (k, j, i) distances in voxels; and
+        #: labels of the tissue beside
         self.gradient = np.zeros((*labels.shape, 3), np.float32)
         self.distance = np.zeros(labels.shape, np.float32)
         self.beside = np.zeros(labels.shape, np.uint8)

@@ -92,10 +92,11 @@ def all_checks() -> tuple[Check, ...]:
         heads,
         rays,
         speckle,
+        sulci,
         walls,
     )
 
-    groups = (rays, speckle, band, floor, artefacts, beams, walls, aberration, heads)
+    groups = (rays, speckle, band, floor, artefacts, beams, walls, sulci, aberration, heads)
     return tuple(check for group in groups for check in group.CHECKS)
 
 
