@@ -313,11 +313,23 @@ typedef struct {
 #define BY_PHASE 1   // with the phases of soft tissue
 #define BY_TISSUE 2  // and with what strong tissue stops
 
-// The waves at the depth `path`. There is one transmit focus; every depth is a receive focus.
+// The transmit focus of the zone that is used at the depth `path`; `path` itself where all depths are in focus.
+inline float transmit_focus_at(__constant const Acquisition *acquisition, float path) {
+  float focus = path, least = 1e30f;
+  for (int zone = 0; zone < acquisition->transmit_zones; zone++) {
+    const float a = (path - acquisition->transmit_focus[zone]) / acquisition->transmit_rayleigh[zone];
+    const float width = acquisition->transmit_sigma[zone] * sqrt(1.0f + a * a);
+    if (width < least) focus = acquisition->transmit_focus[zone];
+    least = fmin(least, width);
+  }
+  return focus;
+}
+
+// The waves at the depth `path`, which is a receive focus.
 inline void find_waves(__constant const Acquisition *acquisition, const Lines *lines, float path, float mean_delay,
                        int kind, Waves *waves) {
   const float cycles = 0.5f * acquisition->cycles_per_mm;  // per millimetre of path, one way
-  const float focusing = 0.5f * cycles * (1.0f / path - 1.0f / acquisition->transmit_focus);  // turns per mm^2
+  const float focusing = 0.5f * cycles * (1.0f / path - 1.0f / transmit_focus_at(acquisition, path));  // turns per mm^2
   for (int i = 0; i < lines->count; i++) waves->received[i] = waves->transmitted[i] = (float2)(0.0f);
   for (int row = 0; row < (kind == UNDISTURBED ? 1 : ROWS); row++) {
     float2 wave[MOST_POINTS], focused[MOST_POINTS];

@@ -35,8 +35,11 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
     sum_re += weight * LOAD_LANES(from_re + other * stride + here);
     sum_im += weight * LOAD_LANES(from_im + other * stride + here);
   }
-  // The energy of a Gaussian of unit area is inversely proportional to its width.
-  const float scale = sqrt(power * sqrt(main_beam * main_beam + rest * rest) / main_beam) / whole;
+  // The energy of a Gaussian of unit area is inversely proportional to its width. Of a beam with a curved phase less is
+  // left by the sum.
+  const float bent = lateral_curvature(acquisition, s, 1.0f) * main_beam * main_beam;
+  const float kept = rsqrt(sqrt(1.0f + bent * bent));
+  const float scale = sqrt(power * sqrt(main_beam * main_beam + rest * rest) / main_beam) / (kept * whole);
   const int at = line * stride + here;
   STORE_LANES(LOAD_LANES(from_re + at) - scale * sum_im, to_re + at);
   STORE_LANES(LOAD_LANES(from_im + at) + scale * sum_re, to_im + at);

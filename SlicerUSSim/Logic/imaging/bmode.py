@@ -12,7 +12,8 @@ from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
-from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA, Probe
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 
 if TYPE_CHECKING:
     from pyopencl import Buffer

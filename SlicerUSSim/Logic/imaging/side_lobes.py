@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.imaging.noise import stirred
 from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device
-from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA, MAIN_LOBE
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, MAIN_LOBE
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.probe.arrays import Probe

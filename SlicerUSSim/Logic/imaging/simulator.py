@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from time import perf_counter
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -29,7 +29,8 @@ from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
-from SlicerUSSim.Logic.probe.arrays import NOMINAL_SPEED_M_S, Probe
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.beam import MOST_ZONES, NOMINAL_SPEED_M_S
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -340,7 +341,7 @@ class UltrasoundSimulator:
         """The record (layout.ACQUISITION) of the constants of one frame."""
         settings, medium = self.settings, self.medium
         block = CONSTANTS["BLOCK"]
-        transmit, elevation = probe.transmit_waist(), probe.elevation_waist()
+        elevation = probe.elevation_waist()
         axial_sigma = self.axial_sigma_mm(probe)
         acquisition = np.zeros((), ACQUISITION)
         for owner in (probe, settings):
@@ -366,7 +367,8 @@ class UltrasoundSimulator:
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
         acquisition["sample_mm"] = self._sample_mm(probe)
         acquisition["samples"] = -(-self._sample_count(probe) // block) * block
-        acquisition["transmit_sigma"], acquisition["transmit_focus"], acquisition["transmit_rayleigh"] = transmit
+        for name, value in transmit_fields(probe).items():
+            acquisition[name] = value
         acquisition["receive_sigma_min"], acquisition["receive_sigma_slope"] = probe.receive_beam()
         acquisition["elevation_sigma"] = elevation[0] / np.sqrt(2.0)
         acquisition["elevation_focus"], acquisition["elevation_rayleigh"] = elevation[1:]
@@ -451,6 +453,21 @@ def _packed_texture(texture: Texture | None, labels: Volume, settings: Simulatio
         "pass segmentation.texture(), or Texture.from_mri(mri, labels) for your own label map",
     )
     return texture.packed(as_labels(labels.array), settings.partial_volume, settings.mri_modulation_db)
+
+
+def transmit_fields(probe: Probe) -> dict[str, Any]:
+    """The fields of layout.ACQUISITION for the transmit beam."""
+    zones = np.zeros((MOST_ZONES, 3))
+    waists = [probe.transmit_waist()]
+    zones[: len(waists)] = waists
+    sigma, focus, rayleigh = zones.T
+    return {
+        "transmit_zones": len(waists),
+        "transmit_sigma": sigma,
+        "transmit_focus": focus,
+        "transmit_rayleigh": rayleigh,
+        "transmit_waist": min(waist[2] for waist in waists),
+    }
 
 
 def _mixed(seed: int) -> int:

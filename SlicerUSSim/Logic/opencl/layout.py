@@ -9,6 +9,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import parameters_of
 from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.probe.beam import MOST_ZONES
 
 #: Constants with the same name in host and kernels.
 CONSTANTS = {
@@ -70,9 +71,13 @@ ACQUISITION = np.dtype(
         ("cycles_per_mm", _FLOAT),
         ("sample_mm", _FLOAT),
         ("samples", _INT),  # rounded up to whole chunks
-        ("transmit_sigma", _FLOAT),
-        ("transmit_focus", _FLOAT),
-        ("transmit_rayleigh", _FLOAT),
+        ("transmit_zones", _INT),  # 0: focused at every depth, with transmit_sigma[0] at least
+        ("transmit_sigma", _FLOAT, MOST_ZONES),
+        ("transmit_focus", _FLOAT, MOST_ZONES),
+        ("transmit_rayleigh", _FLOAT, MOST_ZONES),
+        ("transmit_waist", _FLOAT),  # the shortest of these
+        ("transmit_sigma_slope", _FLOAT),  # where focused at every depth
+        ("wavefront_curvature", _INT),
         ("receive_sigma_min", _FLOAT),
         ("receive_sigma_slope", _FLOAT),
         ("elevation_sigma", _FLOAT),

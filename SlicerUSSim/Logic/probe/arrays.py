@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import (
-    Declared,
     Parameter,
     Shown,
     built,
@@ -22,21 +21,14 @@ from SlicerUSSim.Logic.base.declaration import (
     short,
 )
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.probe.beam import Beam
 
-NOMINAL_SPEED_M_S = 1540.0
-#: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
-MAIN_LOBE = 1.21
-#: Smallest f-number of a focus on transmission and of the lens
-LEAST_F_NUMBER = 0.5
-FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
-#: None until the probe's depth is set. Typed Any, since constructed probes never have None
-_BY_DEPTH: Any = None
 #: {name in a preset: class} of all kinds of probe
 PROBE_KINDS: dict[str, type[Probe]] = {}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Probe(Declared):
+class Probe(Beam):
     """What all probes share. Use LinearProbe, ConvexProbe or PhasedProbe.
 
     The two-way beam (amplitude, docs/physics.md#4-beam-and-pulse) is Gaussian across its axis. Laterally it is the
@@ -56,37 +48,6 @@ class Probe(Declared):
     scan_lines: int = parameter(
         192, "Scan lines", "Number of scan lines in an image", bounds=(2, 4096), shown=Shown(16, 512)
     )
-    frequency_mhz: float = parameter(
-        5.0, "Frequency", "Centre frequency of the pulse; higher: finer resolution, less penetration",
-        unit="MHz", bounds=(0.5, 40), shown=Shown(1, 20, 0.1, is_slider=True),
-    )  # fmt: skip
-    fractional_bandwidth: float = parameter(
-        0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
-    )
-    focus_mm: float = parameter(
-        _BY_DEPTH, "Focus", "Depth of the transmit focus; none (panels: 0): 60 % of the image depth", unit="mm",
-        bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
-        note="It then moves with the depth",
-    )  # fmt: skip
-    aperture_mm: float = parameter(
-        12.0, "Aperture", "Lateral size of the fully open aperture", unit="mm", bounds=(0.5, 200)
-    )
-    receive_f_number: float = parameter(
-        2.5, "Receive f-number", "Smallest f-number of the receive aperture", bounds=(0.5, 20),
-        note="The receive aperture grows with depth up to the full aperture",
-    )  # fmt: skip
-    receive_apodization: float = parameter(
-        0.0, "Apodisation", "Weights of the receive aperture, for its side lobes: 0 uniform, 1 Hann", bounds=(0, 1),
-        note="Power of the side lobes re the main beam: -27 dB with 0, -32 dB with 0.5",
-    )  # fmt: skip
-    elevation_aperture_mm: float = parameter(
-        7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
-    )
-    elevation_focus_mm: float = parameter(
-        _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: 60 % of the image depth", unit="mm",
-        bounds=(0.1, 1000), can_be_none=True, note="It then moves with the depth",
-    )  # fmt: skip
-
     ring_down_mm: float = parameter(
         1.5, "Ring-down", "Depth in which reverberation between face and skin falls by 40 dB; 0: none", unit="mm",
         bounds=(0, 10),
@@ -204,67 +165,6 @@ class Probe(Declared):
         """Whether points of the image plane (probe frame, any shape) lie in the imaged field."""
         position, along = self.line_through(lateral_mm, depth_mm)
         return (np.abs(position) <= -self.first_line) & (along >= 0.0) & (along <= self.depth_mm)
-
-    # ---- wave and beam -----------------------------------------------------------------------------------------
-
-    @property
-    def wavelength_mm(self) -> float:
-        """Wavelength at the nominal speed of sound of 1540 m/s, for which arrays are designed."""
-        return NOMINAL_SPEED_M_S / self.frequency_mhz * 1e-3
-
-    @property
-    def cycles_per_mm(self) -> float:
-        """Cycles of the centre frequency per millimetre of *depth* (two-way travel)."""
-        return 2.0 / self.wavelength_mm
-
-    @property
-    def axial_sigma_mm(self) -> float:
-        """Standard deviation of the pulse envelope in depth.
-
-        A Gaussian spectrum whose amplitude is halved (-6 dB) at f0 (1 +- b/2) has sigma_f = b f0 / FWHM_PER_SIGMA, and
-        sigma_t = 1 / (2 pi sigma_f); depth is c t / 2.
-        """
-        sigma_mhz = self.fractional_bandwidth * self.frequency_mhz / FWHM_PER_SIGMA
-        return NOMINAL_SPEED_M_S * 1e-3 / (4.0 * np.pi * sigma_mhz)
-
-    def beam_sigma_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
-        """(lateral, elevational) standard deviation of the two-way beam amplitude at `depth_mm` along a scan line."""
-        depth = np.asarray(depth_mm, dtype=float)
-        transmit = self._gaussian_beam(depth, *self.transmit_waist())
-        least, slope = self.receive_beam()
-        receive = np.maximum(least, slope * depth)
-        lateral = transmit * receive / np.hypot(transmit, receive)
-        elevational = self._gaussian_beam(depth, *self.elevation_waist()) / np.sqrt(2.0)
-        return lateral, elevational
-
-    def smallest_cell_mm3(self) -> float:
-        """Volume of the smallest resolution cell within the image depth: (2 pi)^1.5 times the product of the sigmas."""
-        lateral, elevational = self.beam_sigma_mm(np.linspace(0.0, self.depth_mm, 257))
-        return float((2.0 * np.pi) ** 1.5 * self.axial_sigma_mm * (lateral * elevational).min())
-
-    def receive_beam(self) -> tuple[float, float]:
-        """(least sigma in mm, sigma per mm of depth) of the one-way lateral receive beam, focused at every depth."""
-        per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
-        return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
-
-    def transmit_waist(self) -> tuple[float, float, float]:
-        """(sigma at the focus, focus, Rayleigh length) of the one-way lateral transmit beam, millimetres."""
-        return self._waist(self.focus_mm, self.aperture_mm)
-
-    def elevation_waist(self) -> tuple[float, float, float]:
-        """(sigma at the focus, focus, Rayleigh length) of the one-way elevational beam, millimetres."""
-        return self._waist(self.elevation_focus_mm, self.elevation_aperture_mm)
-
-    def _waist(self, focus_mm: float, aperture_mm: float) -> tuple[float, float, float]:
-        # Elements farther aside than the focus is deep hardly contribute (and scanners close them).
-        f_number = max(focus_mm / aperture_mm, LEAST_F_NUMBER)
-        sigma = MAIN_LOBE * self.wavelength_mm * f_number / FWHM_PER_SIGMA
-        # A Gaussian beam of amplitude exp(-y^2 / w^2), w^2 = 2 sigma^2, has the Rayleigh length pi w^2 / wavelength.
-        return sigma, focus_mm, 2.0 * np.pi * sigma**2 / self.wavelength_mm
-
-    @staticmethod
-    def _gaussian_beam(depth, sigma, focus, rayleigh):
-        return sigma * np.sqrt(1.0 + ((depth - focus) / rayleigh) ** 2)
 
     # ---- JSON --------------------------------------------------------------------------------------------------
 

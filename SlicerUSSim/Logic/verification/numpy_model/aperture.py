@@ -229,7 +229,7 @@ class Screens:
         depth = self._depth_before_strong(sums, centre, origin + path * direction, path)
         x, open_, delay, _, passed, _ = lines_to(depth)
         cycles = 0.5 * fields["cycles_per_mm"]
-        focus = np.exp(1j * np.pi * cycles * (1.0 / depth - 1.0 / fields["transmit_focus"]) * x**2)
+        focus = np.exp(1j * np.pi * cycles * (1.0 / depth - 1.0 / Beam(self.acquisition).transmit_focus(depth)) * x**2)
         wave = open_ * np.exp(2j * np.pi * cycles * (delay - mean_delay))
         still, bent, stopped = (_two_way(each, focus) for each in (open_[None], wave, wave * passed))
         by_phase = max(bent.sum() / still.sum(), 1e-4)

@@ -75,7 +75,9 @@ def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray
         reach = int(np.ceil(float(acquisition["beam_cutoff"]) * rest / (step * apart)))
         places = np.arange(-reach, reach + 1)
         weights = np.exp(-0.5 * (places * step * apart / rest) ** 2)
-        weights *= np.sqrt(power * np.hypot(main, rest) / main) / weights.sum()
+        # A beam with a curved phase has less left of its sum.
+        turned = 1.0 + (float(beam.lateral_curvature(s)) * main**2) ** 2
+        weights *= np.sqrt(power * np.hypot(main, rest) / main) / weights.sum() * turned**0.25
         block = scanned[:, first : first + _TOGETHER]
         for place, weight in zip(places * step, weights, strict=True):
             to = slice(max(-place, 0), lines - max(place, 0))
