@@ -457,17 +457,15 @@ def _packed_texture(texture: Texture | None, labels: Volume, settings: Simulatio
 
 def transmit_fields(probe: Probe) -> dict[str, Any]:
     """The fields of layout.ACQUISITION for the transmit beam."""
-    zones = np.zeros((MOST_ZONES, 3))
-    waists = [probe.transmit_waist()]
-    zones[: len(waists)] = waists
-    sigma, focus, rayleigh = zones.T
-    return {
-        "transmit_zones": len(waists),
-        "transmit_sigma": sigma,
-        "transmit_focus": focus,
-        "transmit_rayleigh": rayleigh,
-        "transmit_waist": min(waist[2] for waist in waists),
-    }
+    waists, fields = np.zeros((MOST_ZONES, 3)), {}
+    zones = probe.transmit_zones()
+    if zones:
+        waists[: len(zones)] = zones
+    else:
+        waists[0, 0], fields["transmit_sigma_slope"] = probe.compounded_beam()
+    fields["transmit_sigma"], fields["transmit_focus"], fields["transmit_rayleigh"] = waists.T
+    longest = 2.0 * probe.depth_mm  # a beam in focus at every depth changes slowly
+    return fields | {"transmit_zones": len(zones), "transmit_waist": min([zone[2] for zone in zones], default=longest)}
 
 
 def _mixed(seed: int) -> int:

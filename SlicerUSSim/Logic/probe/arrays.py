@@ -32,9 +32,9 @@ class Probe(Beam):
     """What all probes share. Use LinearProbe, ConvexProbe or PhasedProbe.
 
     The two-way beam (amplitude, docs/physics.md#4-beam-and-pulse) is Gaussian across its axis. Laterally it is the
-    product of a transmit beam focused once at `focus_mm` and a receive beam that is focused at every depth, with an
-    aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both ways at one
-    depth.
+    product of a transmit beam, by default focused once at `focus_mm`, and a receive beam that is focused at every depth,
+    with an aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both ways at
+    one depth.
     Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
 
     >>> from dataclasses import replace
@@ -102,6 +102,11 @@ class Probe(Beam):
     def is_linear(self) -> bool:
         """True where scan lines are parallel."""
         return bool(np.isinf(self.apex_radius_mm))
+
+    @property
+    def face_mm(self) -> float:
+        """Lateral size of the array: of a phased array its aperture, otherwise that between the outermost lines."""
+        return max(float(np.ptp(self.origins_mm()[:, 0])), self.aperture_mm)
 
     def line_positions(self) -> np.ndarray:
         """(scan_lines,) position of every line: radians around the apex, or millimetres along a linear face."""

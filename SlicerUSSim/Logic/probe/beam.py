@@ -17,6 +17,8 @@ LEAST_F_NUMBER = 0.5
 FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 #: Largest number of focal zones
 MOST_ZONES = 8
+#: f-number of a beam that is wide compared with all others
+_NO_FOCUS = 1e4
 #: None until the probe's depth is set. Typed Any, since constructed probes never have None
 _BY_DEPTH: Any = None
 
@@ -36,6 +38,24 @@ class Beam(Declared):
         _BY_DEPTH, "Focus", "Depth of the transmit focus; none (panels: 0): 60 % of the image depth", unit="mm",
         bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
         note="It then moves with the depth",
+    )  # fmt: skip
+    transmit: str = parameter(
+        "focus", "Transmit",
+        "focus: one focus. zones: several foci, each depth from the narrowest. angles: plane or diverging waves under "
+        "several angles, compounded coherently, which are in focus at every depth",
+        choices=("focus", "zones", "angles"), shown=True,
+    )  # fmt: skip
+    focal_zones: int = parameter(
+        3, "Focal zones", "Number of foci with zones, evenly over twice the focal depth", bounds=(2, MOST_ZONES),
+        shown=Shown(2, MOST_ZONES), note="Their f-number is at least that of reception",
+    )  # fmt: skip
+    transmit_angles: int = parameter(
+        5, "Angles", "Number of waves that are compounded with angles; 1: one wave, without focus", bounds=(1, 255),
+        shown=Shown(1, 99),
+    )  # fmt: skip
+    largest_angle_deg: float = parameter(
+        10.0, "Largest angle", "Of these waves to the axis; as large as the aperture they replace is seen from a depth",
+        unit="°", bounds=(0.1, 60), shown=Shown(1, 45),
     )  # fmt: skip
     aperture_mm: float = parameter(
         12.0, "Aperture", "Lateral size of the fully open aperture", unit="mm", bounds=(0.5, 200)
@@ -92,8 +112,12 @@ class Beam(Declared):
     def lateral_sigmas_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
         """(transmit, receive) standard deviations of the lateral one-way beams at `depth_mm` along a scan line."""
         depth = np.asarray(depth_mm, dtype=float)
-        least, slope = self.receive_beam()
-        return self._gaussian_beam(depth, *self.transmit_waist()), np.maximum(least, slope * depth)
+        zones = self.transmit_zones()
+        if zones:
+            transmit = np.min([self._gaussian_beam(depth, *zone) for zone in zones], axis=0)
+        else:
+            transmit = self._focused_everywhere(depth, *self.compounded_beam())
+        return transmit, self._focused_everywhere(depth, *self.receive_beam())
 
     def speckle_sigma_mm(self, depth_mm) -> np.ndarray:
         """Lateral sigma of the uncurved beam whose speckle correlates over the same distance.
@@ -107,6 +131,36 @@ class Beam(Declared):
         """(least sigma in mm, sigma per mm of depth) of the one-way lateral receive beam, focused at every depth."""
         per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
         return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
+
+    def transmit_zones(self) -> list[tuple[float, float, float]]:
+        """(sigma at the focus, focus, Rayleigh length) in mm of every transmit focus; empty if all depths are in focus.
+
+        Zones are at the odd multiples of focus_mm / focal_zones. At every depth the narrowest is used.
+        """
+        if self.transmit == "angles":
+            return []
+        if self.transmit == "focus":
+            return [self.transmit_waist()]
+        foci = self.focus_mm * (2.0 * np.arange(self.focal_zones) + 1.0) / self.focal_zones
+        return [self._waist(focus, min(self.aperture_mm, focus / self.receive_f_number)) for focus in foci]
+
+    def compounded_beam(self) -> tuple[float, float]:
+        """(least sigma in mm, sigma per mm of depth) of the lateral transmit beam of compounded waves.
+
+        The coherent sum of n waves up to the angles +-a is the beam of an aperture seen under n / (n - 1) 2 a (G.
+        Montaldo et al., IEEE TUFFC 56(3), 2009), at most that of the face.
+        """
+        per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
+        count = self.transmit_angles
+        f_number = (count - 1) / count / (2.0 * np.sin(np.deg2rad(self.largest_angle_deg)))
+        if count == 1:
+            f_number = _NO_FOCUS
+        return per_f_number * f_number, per_f_number / self.face_mm
+
+    @property
+    def face_mm(self) -> float:
+        """Lateral size of all elements that can transmit, defined by each kind."""
+        raise NotImplementedError
 
     def transmit_waist(self) -> tuple[float, float, float]:
         """(sigma at the focus, focus, Rayleigh length) of the one-way lateral transmit beam, millimetres."""
@@ -122,6 +176,10 @@ class Beam(Declared):
         sigma = MAIN_LOBE * self.wavelength_mm * f_number / FWHM_PER_SIGMA
         # A Gaussian beam of amplitude exp(-y^2 / w^2), w^2 = 2 sigma^2, has the Rayleigh length pi w^2 / wavelength.
         return sigma, focus_mm, 2.0 * np.pi * sigma**2 / self.wavelength_mm
+
+    @staticmethod
+    def _focused_everywhere(depth, least, slope):
+        return np.maximum(least, slope * depth)
 
     @staticmethod
     def _gaussian_beam(depth, sigma, focus, rayleigh):

@@ -31,7 +31,6 @@ def acquisition_record(
     traced = 2 * guard + 1 + lateral * (probe.scan_lines - 1)
     samples = int(np.ceil(probe.depth_mm / sample_mm(probe, settings)))
     membrane = medium.tissues.membrane
-    transmit = _one_way_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5))
     elevational = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
     density = settings.scatterers_per_mm3 or _automatic_density(probe)
     values = {
@@ -56,12 +55,7 @@ def acquisition_record(
         "cycles_per_mm": _cycles_per_mm(probe, settings),
         "sample_mm": sample_mm(probe, settings),
         "samples": int(np.ceil(samples / CONSTANTS["BLOCK"])) * CONSTANTS["BLOCK"],
-        "transmit_zones": 1,
-        "transmit_sigma": [transmit] + 7 * [0.0],
-        "transmit_focus": [probe.focus_mm] + 7 * [0.0],
-        "transmit_rayleigh": [_rayleigh_mm(probe, transmit)] + 7 * [0.0],
-        "transmit_waist": _rayleigh_mm(probe, transmit),
-        "transmit_sigma_slope": 0.0,
+        **_transmit(probe),
         "wavefront_curvature": settings.wavefront_curvature,
         "receive_sigma_min": _one_way_sigma(probe, probe.receive_f_number),
         "receive_sigma_slope": _one_way_sigma(probe, 1.0 / probe.aperture_mm),
@@ -98,19 +92,71 @@ def acquisition_record(
     return record
 
 
+def _transmit(probe: Probe) -> dict[str, object]:
+    """Foci of the transmit beam, or its widths where it is in focus at every depth."""
+    if probe.transmit == "angles":
+        least, slope = _compounded(probe)
+        zones, only = [], [least]
+    else:
+        zones = _zones(probe)
+        only = [sigma for sigma, _ in zones]
+        slope = 0.0
+
+    def padded(values: list[float]) -> list[float]:
+        return values + (8 - len(values)) * [0.0]
+
+    lengths = [_rayleigh_mm(probe, sigma) for sigma, _ in zones]
+    return {
+        "transmit_zones": len(zones),
+        "transmit_sigma": padded(only),
+        "transmit_focus": padded([focus for _, focus in zones]),
+        "transmit_rayleigh": padded(lengths),
+        "transmit_waist": min(lengths) if zones else 2.0 * probe.depth_mm,
+        "transmit_sigma_slope": slope,
+    }
+
+
+def _zones(probe: Probe) -> list[tuple[float, float]]:
+    """(sigma, depth) of every transmit focus."""
+    if probe.transmit == "focus":
+        return [(_one_way_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5)), probe.focus_mm)]
+    count = probe.focal_zones
+    foci = [probe.focus_mm * (n + n + 1) / count for n in range(count)]
+    return [
+        (_one_way_sigma(probe, max(focus / probe.aperture_mm, probe.receive_f_number, 0.5)), focus) for focus in foci
+    ]
+
+
+def _compounded(probe: Probe) -> tuple[float, float]:
+    """(sigma, sigma per depth) of n waves: of a sum over n / (n - 1) times their range of angles, or of all the face."""
+    count = probe.transmit_angles
+    whole = 2.0 * np.sin(probe.largest_angle_deg * np.pi / 180.0) * count / (count - 1) if count > 1 else 1e-4
+    first, _, radius = _geometry(probe)
+    face = -2.0 * first if isinstance(probe, LinearProbe) else 2.0 * radius * np.sin(-first)
+    return _one_way_sigma(probe, 1.0 / whole), _one_way_sigma(probe, 1.0 / max(face, probe.aperture_mm))
+
+
+def _lateral_sigma(probe: Probe, depth: np.ndarray) -> np.ndarray:
+    """Of the two-way beam."""
+    if probe.transmit == "angles":
+        least, slope = _compounded(probe)
+        transmit = np.maximum(least, slope * depth)
+    else:
+        transmit = np.min(
+            [sigma * np.hypot(1.0, (depth - at) / _rayleigh_mm(probe, sigma)) for sigma, at in _zones(probe)], axis=0
+        )
+    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
+    return 1.0 / np.sqrt(transmit**-2.0 + receive**-2.0)
+
+
 def _automatic_density(probe: Probe) -> float:
     """Eight scatterers in the smallest resolution cell, at least 4 per mm^3 and no more than in the paper's lattice."""
     depth = np.linspace(0.0, probe.depth_mm, 257)
 
-    def beam(focus: float, aperture: float) -> np.ndarray:
-        sigma = _one_way_sigma(probe, max(focus / aperture, 0.5))
-        return sigma * np.hypot(1.0, (depth - focus) / _rayleigh_mm(probe, sigma))
-
-    transmit = beam(probe.focus_mm, probe.aperture_mm)
-    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
-    across = beam(probe.elevation_focus_mm, probe.elevation_aperture_mm) / np.sqrt(2.0)
+    sigma = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
+    across = sigma * np.hypot(1.0, (depth - probe.elevation_focus_mm) / _rayleigh_mm(probe, sigma)) / np.sqrt(2.0)
     axial = 1e-3 * _DESIGN_SPEED_M_S * _FWHM / (4.0 * np.pi * probe.fractional_bandwidth * probe.frequency_mhz)
-    cell = (2.0 * np.pi) ** 1.5 * axial * across / np.sqrt(transmit**-2.0 + receive**-2.0)
+    cell = (2.0 * np.pi) ** 1.5 * axial * across * _lateral_sigma(probe, depth)
     return min(max(8.0 / float(cell.min()), 4.0), 125_000.0)
 
 
@@ -224,10 +270,7 @@ def _rayleigh_mm(probe: Probe, sigma_mm: float) -> float:
 def _traced_lines(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
     """(traced lines per scan line, traced lines beyond either edge of the field)."""
     depth = np.linspace(0.0, probe.depth_mm, 65)
-    waist = _one_way_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5))
-    transmit = waist * np.hypot(1.0, (depth - probe.focus_mm) / _rayleigh_mm(probe, waist))
-    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
-    lateral = (transmit**-2.0 + receive**-2.0) ** -0.5
+    lateral = _lateral_sigma(probe, depth)
     _, spacing, radius = _geometry(probe)
     apart = spacing * (np.ones_like(depth) if isinstance(probe, LinearProbe) else radius + depth)
     count = settings.lateral_rays or int(np.clip(np.ceil((apart / lateral).max() / 1.5), 1, 128))
