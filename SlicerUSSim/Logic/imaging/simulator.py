@@ -30,7 +30,7 @@ from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.beam import MOST_ZONES, NOMINAL_SPEED_M_S
+from SlicerUSSim.Logic.probe.beam import CURVED, MOST_ZONES, NOMINAL_SPEED_M_S
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -367,6 +367,7 @@ class UltrasoundSimulator:
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
         acquisition["sample_mm"] = self._sample_mm(probe)
         acquisition["samples"] = -(-self._sample_count(probe) // block) * block
+        acquisition["wavefront_curvature"] = CURVED if settings.wavefront_curvature else 0.0
         for name, value in transmit_fields(probe).items():
             acquisition[name] = value
         acquisition["receive_sigma_min"], acquisition["receive_sigma_slope"] = probe.receive_beam()

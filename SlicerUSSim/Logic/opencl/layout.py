@@ -77,7 +77,7 @@ ACQUISITION = np.dtype(
         ("transmit_rayleigh", _FLOAT, MOST_ZONES),
         ("transmit_waist", _FLOAT),  # the shortest of these
         ("transmit_sigma_slope", _FLOAT),  # where focused at every depth
-        ("wavefront_curvature", _INT),
+        ("wavefront_curvature", _FLOAT),  # probe.beam.CURVED; 0: none
         ("receive_sigma_min", _FLOAT),
         ("receive_sigma_slope", _FLOAT),
         ("elevation_sigma", _FLOAT),

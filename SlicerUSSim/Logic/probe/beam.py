@@ -15,6 +15,9 @@ MAIN_LOBE = 1.21
 #: Smallest f-number of a focus on transmission and of the lens
 LEAST_F_NUMBER = 0.5
 FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
+#: Part of the curvature with which speckle has the correlation of two equal apertures wherever the transmit beam is
+#: wider than the receive beam: as in a wave simulation of 60 % bandwidth (docs/physics.md#wavefront-curvature)
+CURVED = 0.6
 #: Largest number of focal zones
 MOST_ZONES = 8
 #: f-number of a beam that is wide compared with all others
@@ -122,10 +125,12 @@ class Beam(Declared):
     def speckle_sigma_mm(self, depth_mm) -> np.ndarray:
         """Lateral sigma of the uncurved beam whose speckle correlates over the same distance.
 
-        Speckle d apart has the correlation exp(-d^2 / 4 sigma^2). See SimulationSettings.wavefront_curvature.
+        Speckle d apart has the correlation exp(-d^2 / 4 sigma^2). With SimulationSettings.wavefront_curvature the phase
+        of the beam is k y^2 / 2 at the distance y from its axis, k^2 = CURVED (1 / receive^4 - 1 / transmit^4).
         """
         transmit, receive = self.lateral_sigmas_mm(depth_mm)
-        return np.minimum(receive / np.sqrt(2.0), transmit * receive / np.hypot(transmit, receive))
+        more = np.maximum(receive**-2.0 - transmit**-2.0, 0.0)
+        return (transmit**-2.0 + receive**-2.0 + CURVED * more) ** -0.5
 
     def receive_beam(self) -> tuple[float, float]:
         """(least sigma in mm, sigma per mm of depth) of the one-way lateral receive beam, focused at every depth."""

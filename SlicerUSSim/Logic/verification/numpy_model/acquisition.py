@@ -56,7 +56,7 @@ def acquisition_record(
         "sample_mm": sample_mm(probe, settings),
         "samples": int(np.ceil(samples / CONSTANTS["BLOCK"])) * CONSTANTS["BLOCK"],
         **_transmit(probe),
-        "wavefront_curvature": settings.wavefront_curvature,
+        "wavefront_curvature": 0.6 if settings.wavefront_curvature else 0.0,
         "receive_sigma_min": _one_way_sigma(probe, probe.receive_f_number),
         "receive_sigma_slope": _one_way_sigma(probe, 1.0 / probe.aperture_mm),
         "elevation_sigma": elevational / np.sqrt(2.0),

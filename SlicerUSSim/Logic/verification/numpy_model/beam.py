@@ -65,7 +65,8 @@ class Beam:
         if not self.acquisition["wavefront_curvature"]:
             return np.zeros_like(s)
         transmit2, receive2 = self.one_way(s, loss)
-        return np.sqrt(np.maximum(receive2 ** f32(-2) - transmit2 ** f32(-2), f32(0)))
+        share = self.acquisition["wavefront_curvature"]
+        return np.sqrt(np.maximum(share * (receive2 ** f32(-2) - transmit2 ** f32(-2)), f32(0)))
 
     def line_distance(self, s: np.ndarray) -> np.ndarray:
         step = self.acquisition["line_spacing"] / f32(self.acquisition["lateral_rays"])
