@@ -35,7 +35,7 @@ DEFINE_ELEVATION(float8, elevation_sigma8)
 
 // Position along the face (mm) and angle of the normal of a point of the array.
 inline float point_angle(__constant const Acquisition *acquisition, float along) {
-  return acquisition->linear || acquisition->apex_radius_mm <= 0.0f ? 0.0f : along / acquisition->apex_radius_mm;
+  return acquisition->flat_face ? 0.0f : along / acquisition->apex_radius_mm;
 }
 
 inline float2 point_on_face(__constant const Acquisition *acquisition, float along) {
@@ -389,10 +389,13 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
   const float position = acquisition->first_line +
                          acquisition->line_spacing * (traced - acquisition->guard_lines) / acquisition->lateral_rays;
   const float radius = acquisition->apex_radius_mm, pitch = acquisition->fan_pitch;
-  const float2 direction = acquisition->linear ? (float2)(0.0f, 1.0f) : (float2)(sin(position), cos(position));
+  const float2 direction = acquisition->linear ? (float2)(acquisition->steering_sin, acquisition->steering_cos)
+                                               : (float2)(sin(position), cos(position));
+  // Where the line leaves the face, and its place along the face
+  float centre = acquisition->linear ? position / acquisition->steering_cos : radius * position;
+  if (acquisition->steered && !acquisition->linear) centre = radius * direction.x / direction.y;
   const float2 origin =
-      acquisition->linear ? (float2)(position, 0.0f) : radius * (float2)(direction.x, direction.y - 1.0f);
-  const float centre = acquisition->linear ? position : radius * position;
+      acquisition->flat_face ? (float2)(centre, 0.0f) : radius * (float2)(direction.x, direction.y - 1.0f);
   Lines lines;
   find_lines(acquisition, sums, path, origin, direction, centre, &lines);
 

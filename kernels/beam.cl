@@ -45,7 +45,8 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int centre = acquisition->guard_lines + line * acquisition->lateral_rays;
   // One width per lane: near a tight focus the width changes from sample to sample.
-  const floatn s = (TO_FLOATN(LANE_INDEX) + sample) * acquisition->sample_mm;
+  const float start = line_start(acquisition, (float)line);
+  const floatn s = fmax((TO_FLOATN(LANE_INDEX) + sample) * acquisition->sample_mm - start, (floatn)(0.0f));
   floatn spread, factor;
   find_spread(acquisition, spreads, centre, s, &spread, &factor);
   __global const float *of_line = losses + 2 * line * (acquisition->samples / LOSS_STEP + 1);
@@ -64,7 +65,7 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   // The turns of the phase between the axis and a step beside it, and those of the weights, by recurrence too. The
   // losses between which it lies tell the frequency.
   const int node = sample / LOSS_STEP;
-  const float middle = (node + 0.5f) * LOSS_STEP * acquisition->sample_mm;
+  const float middle = fmax((node + 0.5f) * LOSS_STEP * acquisition->sample_mm - start, 0.0f);
   const float frequency = frequency_after(acquisition, 0.5f * (of_line[2 * node] + of_line[2 * node + 2]));
   SPREAD(float, spread_, spread);
   const float across = line_distance(acquisition, middle) / spread_[0];

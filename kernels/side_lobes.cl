@@ -15,7 +15,8 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
                          __global const float *from_im, __global float *to_re, __global float *to_im, int stride,
                          float wide, float power) {
   const int sample = get_global_id(0) * LANES, line = get_global_id(1), here = LINE_PAD + sample;
-  const float s = (sample / LOSS_STEP * LOSS_STEP + 0.5f * LOSS_STEP) * acquisition->sample_mm;  // for all LANES
+  const float depth = (sample / LOSS_STEP * LOSS_STEP + 0.5f * LOSS_STEP) * acquisition->sample_mm;  // for all LANES
+  const float s = fmax(depth - line_start(acquisition, (float)line), 0.0f);
   const float apart = line_distance(acquisition, s) * acquisition->lateral_rays;
   const float main_beam = lateral_sigma(acquisition, s);
   const float sigma = wide * fmax(acquisition->receive_sigma_min, acquisition->receive_sigma_slope * s);

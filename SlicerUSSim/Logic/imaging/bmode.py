@@ -98,12 +98,13 @@ class Compressor(Stage):
         frame.grey = self.workspace.get("grey", lines * samples)
         # Two-way path per sample, in cm.
         tgc = 2.0 * display.tgc_db_cm_mhz * float(acquisition["frequency_mhz"]) * float(acquisition["sample_mm"]) * 0.1
-        rising = display.tgc_reach * float(acquisition["depth_mm"]) / float(acquisition["sample_mm"])
+        rising = display.tgc_reach * frame.probe.depth_mm / float(acquisition["sample_mm"])
         # Noise power is shared between the two quadrature components.
         noise = 0.0 if display.noise_db is None else 10.0 ** (display.noise_db / 20.0) / np.sqrt(2.0)
         self.device.run(
             self.kernel,
             (samples // self.device.lanes, lines),
+            frame.acquisition_buffer,
             frame.iq,
             np.int32(samples),
             self._ring_down(frame),

@@ -38,6 +38,8 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
+#: Beyond all fields
+_FAR_MM = 1e6
 _log = logging.getLogger(__name__)
 
 StageKind = TypeVar("StageKind", bound=Stage)
@@ -362,6 +364,8 @@ class UltrasoundSimulator:
         acquisition["probe_to_ras"] = pose[:3].ravel()
         acquisition["linear"] = probe.is_linear
         acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
+        for name, value in steering_fields(probe).items():
+            acquisition[name] = value
         acquisition["first_line"] = probe.first_line
         acquisition["line_spacing"] = probe.line_spacing
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
@@ -401,7 +405,7 @@ class UltrasoundSimulator:
         return 1.0 / (self.settings.samples_per_cycle * self._cycles_per_mm(probe))
 
     def _sample_count(self, probe: Probe) -> int:
-        return int(np.ceil(probe.depth_mm / self._sample_mm(probe)))
+        return int(np.ceil(probe.displayed_mm / self._sample_mm(probe)))
 
     def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
         """Warn if the volume has no labels, or the bounding box of the imaged field, in voxels, does not meet it."""
@@ -454,6 +458,24 @@ def _packed_texture(texture: Texture | None, labels: Volume, settings: Simulatio
         "pass segmentation.texture(), or Texture.from_mri(mri, labels) for your own label map",
     )
     return texture.packed(as_labels(labels.array), settings.partial_volume, settings.mri_modulation_db)
+
+
+def steering_fields(probe: Probe) -> dict[str, Any]:
+    """The fields of layout.ACQUISITION for lines that are not at right angles to the face."""
+    starts = probe.line_starts_mm(probe.line_positions())
+    steered = bool(starts.any())
+    ends = probe.line_ends_mm(probe.line_positions())[:, 1]
+    return {
+        "depth_mm": probe.displayed_mm,
+        "steered": steered,
+        "flat_face": probe.has_flat_face,
+        "steering_sin": np.sin(probe.steering_rad),
+        "steering_cos": np.cos(probe.steering_rad),
+        "start_mm": float(probe.line_starts_mm(0.0)),
+        "spread_radius_mm": 0.0 if probe.is_linear else probe.apex_radius_mm + starts.mean(),
+        "top_mm": 0.0 if steered else -_FAR_MM,
+        "bottom_mm": ends.max() if steered and probe.is_linear else _FAR_MM,
+    }
 
 
 def transmit_fields(probe: Probe) -> dict[str, Any]:

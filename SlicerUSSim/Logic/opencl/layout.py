@@ -63,7 +63,16 @@ ACQUISITION = np.dtype(
         ("first_line", _FLOAT),
         ("line_spacing", _FLOAT),
         ("scan_lines", _INT),
-        ("depth_mm", _FLOAT),
+        ("depth_mm", _FLOAT),  # displayed, up to which lines are computed
+        # steering of a linear array (line_start in common.clh)
+        ("steered", _INT),
+        ("flat_face", _INT),
+        ("steering_sin", _FLOAT),  # of the angle of parallel lines to the normal of the face
+        ("steering_cos", _FLOAT),
+        ("start_mm", _FLOAT),  # displayed depth at which a parallel line in the middle leaves the face
+        ("spread_radius_mm", _FLOAT),  # distance from the apex to the face, on average over the lines
+        ("top_mm", _FLOAT),  # of the imaged field
+        ("bottom_mm", _FLOAT),
         # wave and beam (Probe.beam_sigma_mm)
         ("frequency_mhz", _FLOAT),
         ("fractional_bandwidth", _FLOAT),

@@ -104,6 +104,29 @@ class Probe(Beam):
         return bool(np.isinf(self.apex_radius_mm))
 
     @property
+    def has_flat_face(self) -> bool:
+        """True where scan lines start on a plane, or at one point."""
+        return self.is_linear or self.apex_radius_mm == 0.0
+
+    @property
+    def steering_rad(self) -> float:
+        """Angle of parallel scan lines to the normal of the face."""
+        return 0.0
+
+    def line_starts_mm(self, position) -> np.ndarray:
+        """Distance from line_at's origin to where lines at these positions leave the face.
+
+        Signals along lines begin at that origin. It is behind a flat face with steered lines: on a surface that all lines
+        leave at right angles.
+        """
+        return np.zeros_like(np.asarray(position, float))
+
+    @property
+    def displayed_mm(self) -> float:
+        """Largest distance from line_at's origin within the imaged field."""
+        return self.depth_mm
+
+    @property
     def face_mm(self) -> float:
         """Lateral size of the array: of a phased array its aperture, otherwise that between the outermost lines."""
         return max(float(np.ptp(self.origins_mm()[:, 0])), self.aperture_mm)
@@ -117,7 +140,10 @@ class Probe(Beam):
         position = np.asarray(position, float)
         zero = np.zeros_like(position)
         if self.is_linear:
-            return np.stack([position, zero, zero], axis=-1), np.stack([zero, zero + 1.0, zero], axis=-1)
+            sine, cosine = np.sin(self.steering_rad), np.cos(self.steering_rad)
+            direction = np.stack([zero + sine, zero + cosine, zero], axis=-1)
+            face = np.stack([position / cosine, zero, zero], axis=-1)
+            return face - self.line_starts_mm(position)[..., None] * direction, direction
         sine, cosine, radius = np.sin(position), np.cos(position), self.apex_radius_mm
         return (
             np.stack([radius * sine, radius * (cosine - 1.0), zero], axis=-1),
@@ -125,7 +151,7 @@ class Probe(Beam):
         )
 
     def origins_mm(self) -> np.ndarray:
-        """(scan_lines, 3) starting points on the probe face in the probe frame."""
+        """(scan_lines, 3) starting points of signals in the probe frame: on the face, unless lines are steered."""
         return self.line_at(self.line_positions())[0]
 
     def directions(self) -> np.ndarray:
@@ -136,7 +162,9 @@ class Probe(Beam):
         """(position of the line, millimetres along it) of points of the image plane; the inverse of line_at."""
         x, y = np.asarray(lateral_mm, float), np.asarray(depth_mm, float)
         if self.is_linear:
-            return x, y
+            sine, cosine = np.sin(self.steering_rad), np.cos(self.steering_rad)
+            across, before = x * cosine - y * sine, self.line_starts_mm(0.0)
+            return across, x * sine + y * cosine + before
         from_apex = y + self.apex_radius_mm
         return np.arctan2(x, from_apex), np.hypot(x, from_apex) - self.apex_radius_mm
 
@@ -147,8 +175,9 @@ class Probe(Beam):
 
     def image_bounds_mm(self) -> tuple[float, float, float, float]:
         """(left, right, top, bottom) of the imaged field in the probe frame; top is negative for a curved face."""
-        starts = self.origins_mm()
-        points = np.concatenate([starts, starts + self.depth_mm * self.directions()])
+        starts, directions = self.origins_mm(), self.directions()
+        starts = starts + self.line_starts_mm(self.line_positions())[:, None] * directions
+        points = np.concatenate([starts, self.line_ends_mm(self.line_positions())])
         if not self.is_linear:
             points = np.concatenate([points, [[0.0, self.depth_mm, 0.0]]])  # the middle of the arc, if there is no line
         x, y = points[:, 0], points[:, 1]
@@ -157,19 +186,25 @@ class Probe(Beam):
     def outline_mm(self, points_per_arc: int = 65) -> np.ndarray:
         """(points, 3) closed outline of the imaged field in the probe frame."""
         ends = np.linspace(self.first_line, -self.first_line, points_per_arc)
-        if self.is_linear:
-            near = np.stack([ends, 0 * ends, 0 * ends], axis=1)
-            far = near + [0.0, self.depth_mm, 0.0]
-        else:
-            ray = np.stack([np.sin(ends), np.cos(ends), 0 * ends], axis=1)
-            apex = np.array([0.0, -self.apex_radius_mm, 0.0])
-            near, far = apex + self.apex_radius_mm * ray, apex + (self.apex_radius_mm + self.depth_mm) * ray
+        origin, direction = self.line_at(ends)
+        near, far = origin + self.line_starts_mm(ends)[:, None] * direction, self.line_ends_mm(ends)
         return np.concatenate([near, far[::-1], near[:1]])
+
+    def line_ends_mm(self, position) -> np.ndarray:
+        """(..., 3) deepest points of lines at these positions in the probe frame."""
+        origin, direction = self.line_at(position)
+        length = self.depth_mm + (self.line_starts_mm(position) if self.is_linear else 0.0)
+        return origin + np.asarray(length)[..., None] * direction
 
     def holds(self, lateral_mm: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
         """Whether points of the image plane (probe frame, any shape) lie in the imaged field."""
         position, along = self.line_through(lateral_mm, depth_mm)
-        return (np.abs(position) <= -self.first_line) & (along >= 0.0) & (along <= self.depth_mm)
+        deep = self.depth_mm
+        if self.is_linear:
+            along = np.asarray(depth_mm, float) / np.cos(self.steering_rad)
+        elif self.has_flat_face:
+            deep = np.where(np.asarray(depth_mm, float) >= 0.0, deep, -1.0)
+        return (np.abs(position) <= -self.first_line) & (along >= 0.0) & (along <= deep)
 
     # ---- JSON --------------------------------------------------------------------------------------------------
 
@@ -193,20 +228,65 @@ def _field_of_view_deg() -> Any:
 
 @dataclass(frozen=True)
 class LinearProbe(Probe):
-    """A flat array with parallel scan lines over `width_mm`."""
+    """A flat array with parallel scan lines over `width_mm`.
+
+    They can be steered, or fan out from the face as of a convex array behind it (trapezoid, "virtual convex").
+    """
 
     kind = "linear"
     geometry = "parallel scan lines"
     width_mm: float = _own("Width", "Distance between the outermost scan lines", "mm", (1, 400), Shown(5, 200))
     depth_mm: float = _depth_mm()
+    steering_deg: float = parameter(
+        0.0, "Steering", "Angle of all scan lines to the normal of the face, positive to the right", unit="°",
+        bounds=(-45, 45), shown=Shown(-30, 30), kw_only=True,
+    )  # fmt: skip
+    trapezoid_deg: float = parameter(
+        0.0, "Trapezoid", "Angle of the outermost scan lines to the normal of the face, by which the field opens to both "
+        "sides; 0: parallel lines", unit="°", bounds=(0, 45), shown=Shown(0, 30), kw_only=True,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            not (self.steering_deg and self.trapezoid_deg),
+            f"LinearProbe: steering_deg is {self.steering_deg:g}, trapezoid_deg {self.trapezoid_deg:g}, "
+            "expected one of them to be 0",
+        )
 
     @property
     def apex_radius_mm(self) -> float:
-        return float("inf")
+        if self.trapezoid_deg == 0.0:
+            return float("inf")
+        return 0.5 * self.width_mm / float(np.tan(np.deg2rad(self.trapezoid_deg)))
+
+    @property
+    def has_flat_face(self) -> bool:
+        return True
+
+    @property
+    def face_mm(self) -> float:
+        return self.width_mm
+
+    @property
+    def steering_rad(self) -> float:
+        return float(np.deg2rad(self.steering_deg))
 
     @property
     def line_spacing(self) -> float:
-        return self.width_mm / (self.scan_lines - 1)
+        if self.trapezoid_deg:
+            return 2.0 * float(np.deg2rad(self.trapezoid_deg)) / (self.scan_lines - 1)
+        return self.width_mm * float(np.cos(self.steering_rad)) / (self.scan_lines - 1)
+
+    def line_starts_mm(self, position) -> np.ndarray:
+        position = np.asarray(position, float)
+        if self.trapezoid_deg:
+            return self.apex_radius_mm * (1.0 / np.cos(position) - 1.0)
+        return position * np.tan(self.steering_rad) + 0.5 * self.width_mm * abs(np.sin(self.steering_rad))
+
+    @property
+    def displayed_mm(self) -> float:
+        return self.depth_mm + self.width_mm * abs(float(np.sin(self.steering_rad)))
 
 
 @dataclass(frozen=True)

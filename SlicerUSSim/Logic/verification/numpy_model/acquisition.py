@@ -29,7 +29,7 @@ def acquisition_record(
     first, spacing, radius = _geometry(probe)
     lateral, guard = _traced_lines(probe, settings)
     traced = 2 * guard + 1 + lateral * (probe.scan_lines - 1)
-    samples = int(np.ceil(probe.depth_mm / sample_mm(probe, settings)))
+    samples = int(np.ceil(_steering(probe)["depth_mm"] / sample_mm(probe, settings)))
     membrane = medium.tissues.membrane
     elevational = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
     density = settings.scatterers_per_mm3 or _automatic_density(probe)
@@ -43,12 +43,12 @@ def acquisition_record(
         "membrane_exponent": membrane.diffuse_exponent if membrane else 0.0,
         "membrane_phase": 2.0 * np.pi * _cycles_per_mm(probe, settings) * membrane.roughness_mm if membrane else 0.0,
         "probe_to_ras": np.asarray(probe_to_ras, float)[:3].ravel(),
-        "linear": isinstance(probe, LinearProbe),
+        "linear": _is_parallel(probe),
         "apex_radius_mm": radius,
         "first_line": first,
         "line_spacing": spacing,
         "scan_lines": probe.scan_lines,
-        "depth_mm": probe.depth_mm,
+        **_steering(probe),
         "frequency_mhz": probe.frequency_mhz,
         "fractional_bandwidth": probe.fractional_bandwidth,
         "reference_speed_m_s": settings.reference_speed_m_s,
@@ -132,7 +132,7 @@ def _compounded(probe: Probe) -> tuple[float, float]:
     count = probe.transmit_angles
     whole = 2.0 * np.sin(probe.largest_angle_deg * np.pi / 180.0) * count / (count - 1) if count > 1 else 1e-4
     first, _, radius = _geometry(probe)
-    face = -2.0 * first if isinstance(probe, LinearProbe) else 2.0 * radius * np.sin(-first)
+    face = probe.width_mm if isinstance(probe, LinearProbe) else 2.0 * radius * np.sin(-first)
     return _one_way_sigma(probe, 1.0 / whole), _one_way_sigma(probe, 1.0 / max(face, probe.aperture_mm))
 
 
@@ -177,8 +177,12 @@ def line_roots(acquisition: np.ndarray) -> np.ndarray:
     step = float(acquisition["line_spacing"]) / float(acquisition["lateral_rays"])
     at = float(acquisition["first_line"]) + (n - float(acquisition["guard_lines"])) * step
     if acquisition["linear"]:
-        return np.column_stack([at, 0 * at, 0 * at, 0 * at + 1.0]).astype(np.float32)
+        sine, cosine = float(acquisition["steering_sin"]), float(acquisition["steering_cos"])
+        return np.column_stack([at / cosine, 0 * at, 0 * at + sine, 0 * at + cosine]).astype(np.float32)
     towards = np.column_stack([np.sin(at), np.cos(at)])
+    if acquisition["steered"]:
+        on_face = np.column_stack([float(acquisition["apex_radius_mm"]) * np.tan(at), 0 * at])
+        return np.column_stack([on_face, towards]).astype(np.float32)
     start = float(acquisition["apex_radius_mm"]) * (towards - [0.0, 1.0])  # the apex lies a radius above the face
     return np.column_stack([start, towards]).astype(np.float32)
 
@@ -217,7 +221,15 @@ def _fans(probe: Probe, voxel_mm: float, edge: float) -> dict[str, float]:
     if isinstance(probe, PhasedProbe):
         half_angle += edge
     else:
-        length += 2.0 * edge * (radius if isinstance(probe, ConvexProbe) else 1.0)
+        scale = radius if isinstance(probe, ConvexProbe) else 1.0
+        if isinstance(probe, LinearProbe) and probe.trapezoid_deg:
+            scale = radius * np.tan(edge) / edge
+            half_angle += edge
+        elif isinstance(probe, LinearProbe):
+            tilt = np.abs(probe.steering_deg) * np.pi / 180.0
+            scale = 1.0 / np.cos(tilt)
+            half_angle += tilt
+        length += 2.0 * edge * scale
         pitch = max(pitch, length / 95.0)
         if isinstance(probe, ConvexProbe):
             half_angle += 0.5 * (probe.aperture_mm + pitch) / radius
@@ -240,7 +252,10 @@ def _fans(probe: Probe, voxel_mm: float, edge: float) -> dict[str, float]:
 def _geometry(probe: Probe) -> tuple[float, float, float]:
     """(first line, step between lines, radius of the face): radians about the apex, or millimetres and 0 if linear."""
     if isinstance(probe, LinearProbe):
-        whole, radius = probe.width_mm, 0.0
+        whole, radius = probe.width_mm * np.cos(probe.steering_deg * np.pi / 180.0), 0.0
+        if probe.trapezoid_deg:
+            whole = 2.0 * probe.trapezoid_deg * np.pi / 180.0
+            radius = 0.5 * probe.width_mm / np.tan(0.5 * whole)
     else:
         if not isinstance(probe, ConvexProbe | PhasedProbe):
             name = type(probe).__name__
@@ -248,6 +263,37 @@ def _geometry(probe: Probe) -> tuple[float, float, float]:
         whole = probe.field_of_view_deg * np.pi / 180.0
         radius = probe.radius_mm if isinstance(probe, ConvexProbe) else 0.0
     return -0.5 * whole, whole / (probe.scan_lines - 1), radius
+
+
+def _is_parallel(probe: Probe) -> bool:
+    return isinstance(probe, LinearProbe) and not probe.trapezoid_deg
+
+
+def _spread_radius(probe: Probe) -> float:
+    """Distance from the apex to the face, the mean over the lines where it is not the same for all."""
+    first, _, radius = _geometry(probe)
+    if not isinstance(probe, LinearProbe):
+        return radius
+    return radius * float((1.0 / np.cos(np.linspace(first, -first, probe.scan_lines))).mean())
+
+
+def _steering(probe: Probe) -> dict[str, float]:
+    """Lines that leave a flat face obliquely: their depths count from a common surface behind it."""
+    tilt = probe.steering_deg * np.pi / 180.0 if isinstance(probe, LinearProbe) else 0.0
+    fan = isinstance(probe, LinearProbe) and probe.trapezoid_deg > 0.0
+    first, _, radius = _geometry(probe)
+    before = -first * np.abs(np.tan(tilt)) if tilt else 0.0  # of the middle line; the last of the outermost is on the face
+    return {
+        "depth_mm": probe.depth_mm + 2.0 * before,
+        "steered": fan or tilt != 0.0,
+        "flat_face": isinstance(probe, LinearProbe | PhasedProbe),
+        "steering_sin": np.sin(tilt),
+        "steering_cos": np.cos(tilt),
+        "start_mm": before,
+        "spread_radius_mm": _spread_radius(probe),
+        "top_mm": 0.0 if fan or tilt else -1e6,
+        "bottom_mm": probe.depth_mm * np.cos(tilt) if tilt else 1e6,
+    }
 
 
 def _wavelength_mm(probe: Probe) -> float:
@@ -272,7 +318,7 @@ def _traced_lines(probe: Probe, settings: SimulationSettings) -> tuple[int, int]
     depth = np.linspace(0.0, probe.depth_mm, 65)
     lateral = _lateral_sigma(probe, depth)
     _, spacing, radius = _geometry(probe)
-    apart = spacing * (np.ones_like(depth) if isinstance(probe, LinearProbe) else radius + depth)
+    apart = spacing * (np.ones_like(depth) if _is_parallel(probe) else _spread_radius(probe) + depth)
     count = settings.lateral_rays or int(np.clip(np.ceil((apart / lateral).max() / 1.5), 1, 128))
     below = depth >= 0.1 * probe.depth_mm  # near the apex of a phased array all lines are within the beam
     reach = np.ceil(settings.beam_cutoff * (lateral[below] / apart[below]).max() * count)

@@ -70,5 +70,15 @@ class Beam:
 
     def line_distance(self, s: np.ndarray) -> np.ndarray:
         step = self.acquisition["line_spacing"] / f32(self.acquisition["lateral_rays"])
-        along = np.ones_like(s) if self.acquisition["linear"] else self.acquisition["apex_radius_mm"] + s
+        along = np.ones_like(s) if self.acquisition["linear"] else self.acquisition["spread_radius_mm"] + s
         return np.maximum(step * along, f32(1e-4))
+
+    def line_start(self, line: np.ndarray | int) -> np.ndarray:
+        """Displayed depth at which lines leave the face; `line` in scan lines from the first."""
+        acquisition = self.acquisition
+        position = acquisition["first_line"] + acquisition["line_spacing"] * f32(line)
+        if not acquisition["steered"]:
+            return f32(0) * position
+        if acquisition["linear"]:
+            return acquisition["start_mm"] + position * acquisition["steering_sin"] / acquisition["steering_cos"]
+        return acquisition["apex_radius_mm"] * (f32(1) / np.cos(position) - f32(1))

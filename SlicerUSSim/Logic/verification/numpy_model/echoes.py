@@ -286,12 +286,14 @@ def lateral_beam(acquisition: np.ndarray, lines: np.ndarray, spreads: np.ndarray
     `losses` are those of losses_along.
     """
     beam = Beam(acquisition)
-    s = np.arange(int(acquisition["samples"]), dtype=np.float32) * acquisition["sample_mm"]
+    depth = np.arange(int(acquisition["samples"]), dtype=np.float32) * acquisition["sample_mm"]
     edges = lines[1:-1:2] + lines[2::2]  # edge n is half a step after traced line n
-    result = np.empty((int(acquisition["scan_lines"]), len(s)), np.complex64)
+    result = np.empty((int(acquisition["scan_lines"]), len(depth)), np.complex64)
     screens, depths, _ = spreads.shape
     nodes = acquisition["screen_step"] * np.arange(1, depths + 1, dtype=np.float32)
     for n in range(len(result)):
+        start = beam.line_start(n)
+        s = np.maximum(depth - start, f32(0))
         centre = int(acquisition["guard_lines"]) + n * int(acquisition["lateral_rays"])
         line = f32(centre * (screens - 1) / (int(acquisition["traced_lines"]) - 1))
         left = min(int(line), screens - 2)
@@ -307,7 +309,7 @@ def lateral_beam(acquisition: np.ndarray, lines: np.ndarray, spreads: np.ndarray
         weights = np.exp(f32(-0.5) * step * step / narrow2 * away[near] ** 2) * (np.abs(away[near]) <= reach)
         # The phase is that of the middle of sixteen samples; interpolation between the edges loses some of its power.
         blocks = np.arange(len(s)) // 16
-        middle = (f32(16) * f32(blocks) + f32(8)) * acquisition["sample_mm"]
+        middle = np.maximum((f32(16) * f32(blocks) + f32(8)) * acquisition["sample_mm"] - start, f32(0))
         of_block = losses[n].reshape(-1, 16).mean(axis=1)[blocks]
         curved = beam.lateral_curvature(middle, of_block) * (beam.line_distance(middle) / spread) ** 2
         weights = weights * np.exp(np.complex64(-0.5j) * curved * away[near] ** 2)

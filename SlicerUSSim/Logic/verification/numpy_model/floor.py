@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy import integrate, special
 
@@ -37,6 +39,7 @@ def elevational_lobes(acquisition: np.ndarray, probe: Probe) -> np.ndarray:
     return record
 
 
+@cache
 def lobes(apodization: float) -> tuple[float, float]:
     """(power, sigma in wavelengths x f-number) of a Gaussian with the pattern's power beyond 2 and 3 of these.
 
@@ -61,30 +64,35 @@ def lobes(apodization: float) -> tuple[float, float]:
 def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray) -> np.ndarray:
     """(scan lines, samples) complex64: with a broad Gaussian of the lines, in quadrature and of the lobes' power."""
     beam = Beam(acquisition)
-    power, sigma = lobes(probe.receive_apodization)
     lines, samples = scanned.shape
     result = scanned.astype(np.complex128)
+    starts = beam.line_start(np.arange(lines))
     for first in range(0, samples, _TOGETHER):
-        s = f32((first + 0.5 * _TOGETHER) * acquisition["sample_mm"])
-        apart = float(beam.line_distance(s)) * int(acquisition["lateral_rays"])
-        main = float(beam.lateral_sigma(s))
-        receive = max(float(acquisition["receive_sigma_min"]), float(acquisition["receive_sigma_slope"]) * float(s))
-        wide = sigma / _SIGMA * receive
-        rest = np.sqrt(max(wide**2 - main**2, 0.25 * wide**2))
-        step = max(1, int(2.0 * main / apart))
-        reach = int(np.ceil(float(acquisition["beam_cutoff"]) * rest / (step * apart)))
-        places = np.arange(-reach, reach + 1)
-        weights = np.exp(-0.5 * (places * step * apart / rest) ** 2)
-        # A beam with a curved phase has less left of its sum.
-        turned = 1.0 + (float(beam.lateral_curvature(s)) * main**2) ** 2
-        weights *= np.sqrt(power * np.hypot(main, rest) / main) / weights.sum() * turned**0.25
         block = scanned[:, first : first + _TOGETHER]
-        for place, weight in zip(places * step, weights, strict=True):
-            to = slice(max(-place, 0), lines - max(place, 0))
-            of = slice(max(place, 0), lines + min(place, 0))
-            if abs(place) < lines:
-                result[to, first : first + _TOGETHER] += 1j * weight * block[of]
+        paths = np.maximum(f32((first + 0.5 * _TOGETHER) * acquisition["sample_mm"]) - starts, f32(0))
+        for path in np.unique(paths):  # one, unless lines are steered
+            here = np.flatnonzero(paths == path)
+            for place, weight in zip(*_lobe_weights(acquisition, probe, beam, path), strict=True):
+                to = here[(here + place >= 0) & (here + place < lines)]
+                result[to, first : first + _TOGETHER] += 1j * weight * block[to + place]
     return result.astype(np.complex64)
+
+
+def _lobe_weights(acquisition: np.ndarray, probe: Probe, beam: Beam, s: np.float32) -> tuple[np.ndarray, np.ndarray]:
+    """(distances in scan lines, weights) of the lateral lobes at path length s."""
+    power, sigma = lobes(probe.receive_apodization)
+    apart = float(beam.line_distance(s)) * int(acquisition["lateral_rays"])
+    main = float(beam.lateral_sigma(s))
+    receive = max(float(acquisition["receive_sigma_min"]), float(acquisition["receive_sigma_slope"]) * float(s))
+    wide = sigma / _SIGMA * receive
+    rest = np.sqrt(max(wide**2 - main**2, 0.25 * wide**2))
+    step = max(1, int(2.0 * main / apart))
+    reach = int(np.ceil(float(acquisition["beam_cutoff"]) * rest / (step * apart)))
+    places = np.arange(-reach, reach + 1)
+    weights = np.exp(-0.5 * (places * step * apart / rest) ** 2)
+    # A beam with a curved phase has less left of its sum.
+    turned = 1.0 + (float(beam.lateral_curvature(s)) * main**2) ** 2
+    return places * step, weights * np.sqrt(power * np.hypot(main, rest) / main) / weights.sum() * turned**0.25
 
 
 def ring_down(acquisition: np.ndarray, probe: Probe, axial_sigma_mm: float) -> np.ndarray:
