@@ -343,7 +343,6 @@ class UltrasoundSimulator:
         """The record (layout.ACQUISITION) of the constants of one frame."""
         settings, medium = self.settings, self.medium
         block = CONSTANTS["BLOCK"]
-        elevation = probe.elevation_waist()
         axial_sigma = self.axial_sigma_mm(probe)
         acquisition = np.zeros((), ACQUISITION)
         for owner in (probe, settings):
@@ -368,6 +367,8 @@ class UltrasoundSimulator:
             acquisition[name] = value
         acquisition["first_line"] = probe.first_line
         acquisition["line_spacing"] = probe.line_spacing
+        acquisition["frequency_mhz"] = probe.received_mhz
+        acquisition["fractional_bandwidth"] = probe.received_bandwidth
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
         acquisition["sample_mm"] = self._sample_mm(probe)
         acquisition["samples"] = -(-self._sample_count(probe) // block) * block
@@ -375,8 +376,8 @@ class UltrasoundSimulator:
         for name, value in transmit_fields(probe).items():
             acquisition[name] = value
         acquisition["receive_sigma_min"], acquisition["receive_sigma_slope"] = probe.receive_beam()
-        acquisition["elevation_sigma"] = elevation[0] / np.sqrt(2.0)
-        acquisition["elevation_focus"], acquisition["elevation_rayleigh"] = elevation[1:]
+        for name, value in zip(("sigma", "focus", "rayleigh"), probe.elevation_beam(), strict=True):
+            acquisition[f"elevation_{name}"] = value
         acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
         lateral, guard = _traced_lines_for(probe, settings)
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard

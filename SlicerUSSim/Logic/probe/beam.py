@@ -34,6 +34,12 @@ class Beam(Declared):
         5.0, "Frequency", "Centre frequency of the pulse; higher: finer resolution, less penetration",
         unit="MHz", bounds=(0.5, 40), shown=Shown(1, 20, 0.1, is_slider=True),
     )  # fmt: skip
+    harmonic: bool = parameter(
+        False, "Harmonic imaging",
+        "Receive the second harmonic, which arises in tissue where the beam is strong: twice the frequency, narrower "
+        "beams, weaker side lobes, dark near the face", shown=True,
+        note="Its level is that of the fundamental at the transmit focus, as a scanner's gain makes it",
+    )  # fmt: skip
     fractional_bandwidth: float = parameter(
         0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
     )
@@ -81,12 +87,22 @@ class Beam(Declared):
 
     @property
     def wavelength_mm(self) -> float:
-        """Wavelength at the nominal speed of sound of 1540 m/s, for which arrays are designed."""
-        return NOMINAL_SPEED_M_S / self.frequency_mhz * 1e-3
+        """Wavelength of what is received, at the nominal speed of sound of 1540 m/s, for which arrays are designed."""
+        return NOMINAL_SPEED_M_S / self.received_mhz * 1e-3
+
+    @property
+    def received_mhz(self) -> float:
+        """Centre frequency of the echoes before attenuation: that of the pulse, or of its second harmonic."""
+        return self.frequency_mhz * (2.0 if self.harmonic else 1.0)
+
+    @property
+    def received_bandwidth(self) -> float:
+        """-6 dB bandwidth as a fraction of received_mhz. The square of a Gaussian pulse is shorter by the root of 2."""
+        return self.fractional_bandwidth / (np.sqrt(2.0) if self.harmonic else 1.0)
 
     @property
     def cycles_per_mm(self) -> float:
-        """Cycles of the centre frequency per millimetre of *depth* (two-way travel)."""
+        """Cycles of the received frequency per millimetre of *depth* (two-way travel)."""
         return 2.0 / self.wavelength_mm
 
     @property
@@ -96,7 +112,7 @@ class Beam(Declared):
         A Gaussian spectrum whose amplitude is halved (-6 dB) at f0 (1 +- b/2) has sigma_f = b f0 / FWHM_PER_SIGMA, and
         sigma_t = 1 / (2 pi sigma_f); depth is c t / 2.
         """
-        sigma_mhz = self.fractional_bandwidth * self.frequency_mhz / FWHM_PER_SIGMA
+        sigma_mhz = self.received_bandwidth * self.received_mhz / FWHM_PER_SIGMA
         return NOMINAL_SPEED_M_S * 1e-3 / (4.0 * np.pi * sigma_mhz)
 
     def beam_sigma_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
@@ -104,8 +120,7 @@ class Beam(Declared):
         depth = np.asarray(depth_mm, dtype=float)
         transmit, receive = self.lateral_sigmas_mm(depth)
         lateral = transmit * receive / np.hypot(transmit, receive)
-        elevational = self._gaussian_beam(depth, *self.elevation_waist()) / np.sqrt(2.0)
-        return lateral, elevational
+        return lateral, self._gaussian_beam(depth, *self.elevation_beam())
 
     def smallest_cell_mm3(self) -> float:
         """Volume of the smallest resolution cell within the image depth: (2 pi)^1.5 times the product of the sigmas."""
@@ -137,6 +152,39 @@ class Beam(Declared):
         per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
         return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
 
+    def elevation_beam(self) -> tuple[float, float, float]:
+        """(sigma at the focus, focus, Rayleigh length) of the two-way elevational beam, millimetres."""
+        sigma, focus, rayleigh = self.elevation_waist()
+        if not self.harmonic:
+            return sigma / np.sqrt(2.0), focus, rayleigh
+        # 1 / s^2 of the product is 2 / s^2 (1 + b^2) for the square of the transmitted and 1 / s^2 (1/4 + b^2) for the
+        # received beam, b in Rayleigh lengths: about 6 / (s^2 (1 + 2 b^2)), exactly so at the focus and far from it.
+        return sigma / np.sqrt(6.0), focus, rayleigh / np.sqrt(2.0)
+
+    def harmonic_level(self, depth_mm) -> np.ndarray:
+        """Amplitude of the second harmonic at `depth_mm` re the fundamental, 1 at the transmit focus.
+
+        In the quasi-linear approximation the square of a Gaussian beam feeds a Gaussian beam of twice the frequency and
+        the same Rayleigh lengths, whose amplitude grows by 1 / sqrt((1 + i b)(1 + i c)) per millimetre, with b and c
+        the distances to the lateral and elevational foci in these lengths (M. F. Hamilton, D. T. Blackstock, Nonlinear
+        Acoustics, 1998, chapter 8).
+        """
+        depth = np.asarray(depth_mm, dtype=float)
+        path = np.linspace(0.0, max(float(depth.max(initial=0.0)), self.focus_mm), 4097)
+        _, focus, rayleigh = self.elevation_waist()
+        aside = 1.0 / np.sqrt(1.0 + 1j * (path - focus) / rayleigh)
+        zones = self.transmit_zones()
+        if not zones:  # each of the waves is plane
+            found = np.abs(_running_integral(aside, path))
+        else:
+            widths = np.array([self._gaussian_beam(path, *zone) for zone in zones])
+            grown = [
+                np.abs(_running_integral(aside / np.sqrt(1.0 + 1j * (path - at) / length), path)) / np.sqrt(sigma)
+                for sigma, at, length in zones
+            ]
+            found = np.take_along_axis(np.array(grown), widths.argmin(axis=0)[None], axis=0)[0]
+        return np.interp(depth, path, found / np.interp(self.focus_mm, path, found))
+
     def transmit_zones(self) -> list[tuple[float, float, float]]:
         """(sigma at the focus, focus, Rayleigh length) in mm of every transmit focus; empty if all depths are in focus.
 
@@ -147,7 +195,7 @@ class Beam(Declared):
         if self.transmit == "focus":
             return [self.transmit_waist()]
         foci = self.focus_mm * (2.0 * np.arange(self.focal_zones) + 1.0) / self.focal_zones
-        return [self._waist(focus, min(self.aperture_mm, focus / self.receive_f_number)) for focus in foci]
+        return [self._sent(focus, min(self.aperture_mm, focus / self.receive_f_number)) for focus in foci.tolist()]
 
     def compounded_beam(self) -> tuple[float, float]:
         """(least sigma in mm, sigma per mm of depth) of the lateral transmit beam of compounded waves.
@@ -169,18 +217,24 @@ class Beam(Declared):
 
     def transmit_waist(self) -> tuple[float, float, float]:
         """(sigma at the focus, focus, Rayleigh length) of the one-way lateral transmit beam, millimetres."""
-        return self._waist(self.focus_mm, self.aperture_mm)
+        return self._sent(self.focus_mm, self.aperture_mm)
 
     def elevation_waist(self) -> tuple[float, float, float]:
-        """(sigma at the focus, focus, Rayleigh length) of the one-way elevational beam, millimetres."""
+        """(sigma at the focus, focus, Rayleigh length) of the one-way elevational beam of the pulse, millimetres."""
         return self._waist(self.elevation_focus_mm, self.elevation_aperture_mm)
 
     def _waist(self, focus_mm: float, aperture_mm: float) -> tuple[float, float, float]:
         # Elements farther aside than the focus is deep hardly contribute (and scanners close them).
         f_number = max(focus_mm / aperture_mm, LEAST_F_NUMBER)
-        sigma = MAIN_LOBE * self.wavelength_mm * f_number / FWHM_PER_SIGMA
+        wavelength = NOMINAL_SPEED_M_S / self.frequency_mhz * 1e-3
+        sigma = MAIN_LOBE * wavelength * f_number / FWHM_PER_SIGMA
         # A Gaussian beam of amplitude exp(-y^2 / w^2), w^2 = 2 sigma^2, has the Rayleigh length pi w^2 / wavelength.
-        return sigma, focus_mm, 2.0 * np.pi * sigma**2 / self.wavelength_mm
+        return sigma, focus_mm, 2.0 * np.pi * sigma**2 / wavelength
+
+    def _sent(self, focus_mm: float, aperture_mm: float) -> tuple[float, float, float]:
+        # The harmonic has the profile of the square of the pulse's beam.
+        sigma, focus, rayleigh = self._waist(focus_mm, aperture_mm)
+        return (sigma / float(np.sqrt(2.0)) if self.harmonic else sigma), focus, rayleigh
 
     @staticmethod
     def _focused_everywhere(depth, least, slope):
@@ -189,3 +243,8 @@ class Beam(Declared):
     @staticmethod
     def _gaussian_beam(depth, sigma, focus, rayleigh):
         return sigma * np.sqrt(1.0 + ((depth - focus) / rayleigh) ** 2)
+
+
+def _running_integral(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(places)
+    return np.concatenate([np.zeros(1), np.cumsum(steps)])

@@ -31,7 +31,7 @@ def acquisition_record(
     traced = 2 * guard + 1 + lateral * (probe.scan_lines - 1)
     samples = int(np.ceil(_steering(probe)["depth_mm"] / sample_mm(probe, settings)))
     membrane = medium.tissues.membrane
-    elevational = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
+    elevational, elevational_length = _elevation(probe)
     density = settings.scatterers_per_mm3 or _automatic_density(probe)
     values = {
         "ras_to_voxel": medium.ras_to_voxel.ravel(),
@@ -49,8 +49,8 @@ def acquisition_record(
         "line_spacing": spacing,
         "scan_lines": probe.scan_lines,
         **_steering(probe),
-        "frequency_mhz": probe.frequency_mhz,
-        "fractional_bandwidth": probe.fractional_bandwidth,
+        "frequency_mhz": _received_mhz(probe),
+        "fractional_bandwidth": _received_bandwidth(probe),
         "reference_speed_m_s": settings.reference_speed_m_s,
         "cycles_per_mm": _cycles_per_mm(probe, settings),
         "sample_mm": sample_mm(probe, settings),
@@ -59,9 +59,9 @@ def acquisition_record(
         "wavefront_curvature": 0.6 if settings.wavefront_curvature else 0.0,
         "receive_sigma_min": _one_way_sigma(probe, probe.receive_f_number),
         "receive_sigma_slope": _one_way_sigma(probe, 1.0 / probe.aperture_mm),
-        "elevation_sigma": elevational / np.sqrt(2.0),
+        "elevation_sigma": elevational,
         "elevation_focus": probe.elevation_focus_mm,
-        "elevation_rayleigh": _rayleigh_mm(probe, elevational),
+        "elevation_rayleigh": elevational_length,
         "aperture_beams": settings.beam == "aperture",
         "aperture_mm": probe.aperture_mm,
         "receive_f_number": probe.receive_f_number,
@@ -78,7 +78,7 @@ def acquisition_record(
         "interface_gain": np.exp(settings.interface_gain_db * np.log(10.0) / 20.0),
         "interface_is_energy": settings.interface_reflection == "energy",
         "specular_exponent": settings.specular_exponent,
-        "downshift": (probe.fractional_bandwidth / _FWHM) ** 2 if settings.frequency_downshift else 0.0,
+        "downshift": (_received_bandwidth(probe) / _FWHM) ** 2 if settings.frequency_downshift else 0.0,
         "cell_mm": np.cbrt(1.0 / density),
         "seed": hash_mix(np.array([settings.seed], np.uint32))[0] ^ np.uint32(0x2545F491),
         "beam_cutoff": settings.beam_cutoff,
@@ -119,11 +119,11 @@ def _transmit(probe: Probe) -> dict[str, object]:
 def _zones(probe: Probe) -> list[tuple[float, float]]:
     """(sigma, depth) of every transmit focus."""
     if probe.transmit == "focus":
-        return [(_one_way_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5)), probe.focus_mm)]
+        return [(_sent_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5)), probe.focus_mm)]
     count = probe.focal_zones
     foci = [probe.focus_mm * (n + n + 1) / count for n in range(count)]
     return [
-        (_one_way_sigma(probe, max(focus / probe.aperture_mm, probe.receive_f_number, 0.5)), focus) for focus in foci
+        (_sent_sigma(probe, max(focus / probe.aperture_mm, probe.receive_f_number, 0.5)), focus) for focus in foci
     ]
 
 
@@ -153,16 +153,16 @@ def _automatic_density(probe: Probe) -> float:
     """Eight scatterers in the smallest resolution cell, at least 4 per mm^3 and no more than in the paper's lattice."""
     depth = np.linspace(0.0, probe.depth_mm, 257)
 
-    sigma = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
-    across = sigma * np.hypot(1.0, (depth - probe.elevation_focus_mm) / _rayleigh_mm(probe, sigma)) / np.sqrt(2.0)
-    axial = 1e-3 * _DESIGN_SPEED_M_S * _FWHM / (4.0 * np.pi * probe.fractional_bandwidth * probe.frequency_mhz)
+    sigma, length = _elevation(probe)
+    across = sigma * np.hypot(1.0, (depth - probe.elevation_focus_mm) / length)
+    axial = 1e-3 * _DESIGN_SPEED_M_S * _FWHM / (4.0 * np.pi * _received_bandwidth(probe) * _received_mhz(probe))
     cell = (2.0 * np.pi) ** 1.5 * axial * across * _lateral_sigma(probe, depth)
     return min(max(8.0 / float(cell.min()), 4.0), 125_000.0)
 
 
 def axial_sigma_mm(probe: Probe, settings: SimulationSettings) -> float:
     """Standard deviation of the pulse in depth: c / (4 pi sf), sf = bandwidth f0 / 2.355."""
-    sigma_mhz = probe.fractional_bandwidth * probe.frequency_mhz / _FWHM
+    sigma_mhz = _received_bandwidth(probe) * _received_mhz(probe) / _FWHM
     return 1e-3 * settings.reference_speed_m_s / (4.0 * np.pi * sigma_mhz)
 
 
@@ -265,6 +265,47 @@ def _geometry(probe: Probe) -> tuple[float, float, float]:
     return -0.5 * whole, whole / (probe.scan_lines - 1), radius
 
 
+def _received_mhz(probe: Probe) -> float:
+    return probe.frequency_mhz + (probe.frequency_mhz if probe.harmonic else 0.0)
+
+
+def _received_bandwidth(probe: Probe) -> float:
+    """Re the received frequency: twice that of the pulse, whose square has a band wider by the root of 2."""
+    return probe.fractional_bandwidth * (np.sqrt(0.5) if probe.harmonic else 1.0)
+
+
+def _elevation(probe: Probe) -> tuple[float, float]:
+    """(sigma at the focus, Rayleigh length) of the two-way elevational beam."""
+    sigma = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
+    if probe.harmonic:  # of the pulse sigma and length are twice as large; transmitted, squared, received
+        return np.sqrt(2.0 / 3.0) * sigma, np.sqrt(2.0) * _rayleigh_mm(probe, sigma)
+    return np.sqrt(0.5) * sigma, _rayleigh_mm(probe, sigma)
+
+
+def _sent_sigma(probe: Probe, f_number: float) -> float:
+    """Of a transmit beam at its focus: of the pulse, or its square at half the received frequency."""
+    return _one_way_sigma(probe, f_number) * (np.sqrt(2.0) if probe.harmonic else 1.0)
+
+
+def harmonic_level(probe: Probe, depth: np.ndarray) -> np.ndarray:
+    """Amplitude of the second harmonic, 1 at the focus: what the square of the pulse's beam has fed up to a depth."""
+    edges = np.linspace(0.0, max(float(depth.max()), probe.focus_mm), 20_001)
+    middle, step = 0.5 * (edges[1:] + edges[:-1]), edges[1]
+    lens = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
+    source = (1.0 + 1j * (middle - probe.elevation_focus_mm) / (2.0 * _rayleigh_mm(probe, lens))) ** -0.5
+    if probe.transmit == "angles":
+        grown = np.abs(np.cumsum(source) * step)
+    else:
+        each, width = [], []
+        for sigma, focus in _zones(probe):
+            away = (middle - focus) / _rayleigh_mm(probe, sigma)
+            each.append(np.abs(np.cumsum(source * (1.0 + 1j * away) ** -0.5) * step) / np.sqrt(sigma))
+            width.append(sigma * np.hypot(1.0, (edges[1:] - focus) / _rayleigh_mm(probe, sigma)))
+        grown = np.choose(np.argmin(width, axis=0), each)
+    grown = np.append(0.0, grown)
+    return np.interp(depth, edges, grown / np.interp(probe.focus_mm, edges, grown))
+
+
 def _is_parallel(probe: Probe) -> bool:
     return isinstance(probe, LinearProbe) and not probe.trapezoid_deg
 
@@ -297,11 +338,11 @@ def _steering(probe: Probe) -> dict[str, float]:
 
 
 def _wavelength_mm(probe: Probe) -> float:
-    return 1e-3 * _DESIGN_SPEED_M_S / probe.frequency_mhz
+    return 1e-3 * _DESIGN_SPEED_M_S / _received_mhz(probe)
 
 
 def _cycles_per_mm(probe: Probe, settings: SimulationSettings) -> float:
-    return 2.0 * probe.frequency_mhz / (1e-3 * settings.reference_speed_m_s)
+    return 2.0 * _received_mhz(probe) / (1e-3 * settings.reference_speed_m_s)
 
 
 def _one_way_sigma(probe: Probe, f_number: float) -> float:

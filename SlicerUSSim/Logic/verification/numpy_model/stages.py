@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB
 from SlicerUSSim.Logic.imaging.stage import HostFrame, Stage
 from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
     elevational_quantiles,
+    harmonic_level,
     line_roots,
     noise_key,
     pulse_taps,
@@ -106,6 +107,10 @@ def pulse(frame: TwinFrame) -> None:
     turns = np.cumsum(missing, axis=1) * step - 0.5 * step * (missing + missing[:, :1])
     turning = np.exp(2j * np.pi * turns)
     lines = (frame.scanned * turning).astype(np.complex64)
+    if frame.probe.harmonic:
+        starts = Beam(record).line_start(np.arange(len(lines))) / record["sample_mm"]
+        below = np.maximum(np.arange(lines.shape[1]) - np.floor(starts + f32(0.5)).astype(int)[:, None], 0)
+        lines *= f32(harmonic_level(frame.probe, np.arange(lines.shape[1]) * float(record["sample_mm"])))[below]
     padded = np.pad(lines, ((0, 0), (reach, reach)))
     pulses = sum((tap * padded[:, k : k + lines.shape[1]] for k, tap in enumerate(taps)), np.zeros_like(lines))
     frame.iq = (pulses / turning).astype(np.complex64)
