@@ -35,7 +35,7 @@ DEFINE_ELEVATION(float8, elevation_sigma8)
 
 // Position along the face (mm) and angle of the normal of a point of the array.
 inline float point_angle(__constant const Acquisition *acquisition, float along) {
-  return acquisition->linear || acquisition->apex_radius_mm <= 0.0f ? 0.0f : along / acquisition->apex_radius_mm;
+  return acquisition->flat_face ? 0.0f : along / acquisition->apex_radius_mm;
 }
 
 inline float2 point_on_face(__constant const Acquisition *acquisition, float along) {
@@ -313,11 +313,23 @@ typedef struct {
 #define BY_PHASE 1   // with the phases of soft tissue
 #define BY_TISSUE 2  // and with what strong tissue stops
 
-// The waves at the depth `path`. There is one transmit focus; every depth is a receive focus.
+// The transmit focus of the zone that is used at the depth `path`; `path` itself where all depths are in focus.
+inline float transmit_focus_at(__constant const Acquisition *acquisition, float path) {
+  float focus = path, least = 1e30f;
+  for (int zone = 0; zone < acquisition->transmit_zones; zone++) {
+    const float a = (path - acquisition->transmit_focus[zone]) / acquisition->transmit_rayleigh[zone];
+    const float width = acquisition->transmit_sigma[zone] * sqrt(1.0f + a * a);
+    if (width < least) focus = acquisition->transmit_focus[zone];
+    least = fmin(least, width);
+  }
+  return focus;
+}
+
+// The waves at the depth `path`, which is a receive focus.
 inline void find_waves(__constant const Acquisition *acquisition, const Lines *lines, float path, float mean_delay,
                        int kind, Waves *waves) {
   const float cycles = 0.5f * acquisition->cycles_per_mm;  // per millimetre of path, one way
-  const float focusing = 0.5f * cycles * (1.0f / path - 1.0f / acquisition->transmit_focus);  // turns per mm^2
+  const float focusing = 0.5f * cycles * (1.0f / path - 1.0f / transmit_focus_at(acquisition, path));  // turns per mm^2
   for (int i = 0; i < lines->count; i++) waves->received[i] = waves->transmitted[i] = (float2)(0.0f);
   for (int row = 0; row < (kind == UNDISTURBED ? 1 : ROWS); row++) {
     float2 wave[MOST_POINTS], focused[MOST_POINTS];
@@ -377,10 +389,13 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
   const float position = acquisition->first_line +
                          acquisition->line_spacing * (traced - acquisition->guard_lines) / acquisition->lateral_rays;
   const float radius = acquisition->apex_radius_mm, pitch = acquisition->fan_pitch;
-  const float2 direction = acquisition->linear ? (float2)(0.0f, 1.0f) : (float2)(sin(position), cos(position));
+  const float2 direction = acquisition->linear ? (float2)(acquisition->steering_sin, acquisition->steering_cos)
+                                               : (float2)(sin(position), cos(position));
+  // Where the line leaves the face, and its place along the face
+  float centre = acquisition->linear ? position / acquisition->steering_cos : radius * position;
+  if (acquisition->steered && !acquisition->linear) centre = radius * direction.x / direction.y;
   const float2 origin =
-      acquisition->linear ? (float2)(position, 0.0f) : radius * (float2)(direction.x, direction.y - 1.0f);
-  const float centre = acquisition->linear ? position : radius * position;
+      acquisition->flat_face ? (float2)(centre, 0.0f) : radius * (float2)(direction.x, direction.y - 1.0f);
   Lines lines;
   find_lines(acquisition, sums, path, origin, direction, centre, &lines);
 

@@ -8,8 +8,11 @@
 // scatterers between the two edges of a strip, with a mean variance of step^2 / 6; the variance of this Gaussian is
 // reduced by that.
 //
+// The phase of the beam is curved across it (lateral_curvature), so that the weights are complex. Linear interpolation
+// between edges lowers their power the more they turn from edge to edge; `kept` is what is left of it.
+//
 // Where tissue has disturbed the phases of the aperture, the beam is wider (aperture.cl), of the same power of speckle:
-// the level has what it loses.
+// the level has what it loses. Its phase then turns as much over its width as before.
 //
 // Buffers: from_re, from_im float [2 traced line + side][stride]; spreads float2 [screen line][depth]; losses as in
 // downshift.cl; to_re, to_im float [scan line][stride].
@@ -42,7 +45,8 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int centre = acquisition->guard_lines + line * acquisition->lateral_rays;
   // One width per lane: near a tight focus the width changes from sample to sample.
-  const floatn s = (TO_FLOATN(LANE_INDEX) + sample) * acquisition->sample_mm;
+  const float start = line_start(acquisition, (float)line);
+  const floatn s = fmax((TO_FLOATN(LANE_INDEX) + sample) * acquisition->sample_mm - start, (floatn)(0.0f));
   floatn spread, factor;
   find_spread(acquisition, spreads, centre, s, &spread, &factor);
   __global const float *of_line = losses + 2 * line * (acquisition->samples / LOSS_STEP + 1);
@@ -58,6 +62,24 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   float longest = 0.0f;
   for (int n = 0; n < LANES; n++) longest = fmax(longest, reach_[n]);
   const int last = min((int)longest, max(centre, acquisition->traced_lines - 1 - centre));
+  // The turns of the phase between the axis and a step beside it, and those of the weights, by recurrence too. The
+  // losses between which it lies tell the frequency.
+  const int node = sample / LOSS_STEP;
+  const float middle = fmax((node + 0.5f) * LOSS_STEP * acquisition->sample_mm - start, 0.0f);
+  const float frequency = frequency_after(acquisition, 0.5f * (of_line[2 * node] + of_line[2 * node + 2]));
+  SPREAD(float, spread_, spread);
+  const float across = line_distance(acquisition, middle) / spread_[0];
+  const float curved = lateral_curvature(acquisition, middle, 1.0f / frequency) * across * across;
+  floatn cosine, sine;
+  turn((floatn)(curved / (8.0f * TWO_PI)), &cosine, &sine);
+  SPREAD(float, cosine_, cosine);
+  SPREAD(float, sine_, sine);
+  float phase_re = cosine_[0], phase_im = sine_[0];
+  turn((floatn)(curved / TWO_PI), &cosine, &sine);
+  SPREAD(float, cosine_fall_, cosine);
+  SPREAD(float, sine_fall_, sine);
+  const float fall_re = cosine_fall_[0], fall_im = sine_fall_[0];
+  float turn_re = fall_re, turn_im = fall_im;
   // Edge `edge` is half a step before traced line `edge`; the strips on both sides of it contribute. Edges come in
   // pairs, n + 1/2 lines to either side. Their weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
   const floatn fall = exp2_fast(max(2.0f * exponent, -60.0f));
@@ -74,12 +96,21 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
       pair_re += LOAD_LANES(from_re + before) + LOAD_LANES(from_re + behind);
       pair_im += LOAD_LANES(from_im + before) + LOAD_LANES(from_im + behind);
     }
-    sum_re += weight * pair_re;
-    sum_im += weight * pair_im;
+    sum_re += weight * (phase_re * pair_re + phase_im * pair_im);
+    sum_im += weight * (phase_re * pair_im - phase_im * pair_re);
     weight *= ratio;
     ratio *= fall;
+    const float was_phase = phase_re, was_turn = turn_re;
+    phase_re = phase_re * turn_re - phase_im * turn_im;
+    phase_im = was_phase * turn_im + phase_im * turn_re;
+    turn_re = turn_re * fall_re - turn_im * fall_im;
+    turn_im = was_turn * fall_im + turn_im * fall_re;
   }
-  floatn scale = factor * step * rsqrt(narrow2) * sqrt(spread) * 0.39894228f;  // 1 / sqrt(2 pi)
+  const floatn apart2 = step2 / narrow2;
+  const floatn straight = exp2_fast(max(-0.25f * LOG2_E * apart2, -60.0f));
+  const floatn bent = exp2_fast(max(-0.25f * LOG2_E * (apart2 + curved * curved / apart2), -60.0f));
+  const floatn kept = (2.0f + bent) / (2.0f + straight);
+  floatn scale = rsqrt(kept) * factor * step * rsqrt(narrow2) * sqrt(spread) * 0.39894228f;  // 1 / sqrt(2 pi)
   STORE_LANES(sum_re * scale, to_re + line * stride + here);
   STORE_LANES(sum_im * scale, to_im + line * stride + here);
 }

@@ -32,16 +32,28 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
 
 // Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC rises by tgc_per_sample [dB]
 // until sample tgc_samples and stays there. `ringing`, float2 [sample], is added to every line: the reverberation at
-// the face.
-__kernel void compress(__global const float *iq, int samples, __global const float *ringing, float noise,
+// the face. Both count from where the line leaves it.
+__kernel void compress(__constant const Acquisition *acquisition, __global const float *iq, int samples, __global const float *ringing, float noise,
                        uint noise_seed, float tgc_per_sample, float tgc_samples, float level_of_white_db,
                        Display display, __global float *envelope, __global uchar *grey) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int here = line * samples + sample;
   floatn re, im;
   LOAD_PAIRS(re, im, iq + 2 * here);
+  const int start = (int)(line_start(acquisition, (float)line) / acquisition->sample_mm + 0.5f);
   floatn ring_re, ring_im;
-  LOAD_PAIRS(ring_re, ring_im, ringing + 2 * sample);
+  if (start == 0) {
+    LOAD_PAIRS(ring_re, ring_im, ringing + 2 * sample);
+  } else {
+    float shifted_re[LANES], shifted_im[LANES];
+    for (int lane = 0; lane < LANES; lane++) {
+      const int from = sample + lane - start, at = max(from, 0);
+      shifted_re[lane] = from < 0 ? 0.0f : ringing[2 * at];
+      shifted_im[lane] = from < 0 ? 0.0f : ringing[2 * at + 1];
+    }
+    ring_re = LOAD_LANES(shifted_re);
+    ring_im = LOAD_LANES(shifted_im);
+  }
   re += ring_re;
   im += ring_im;
   const intn index = sample + LANE_INDEX;
@@ -51,7 +63,7 @@ __kernel void compress(__global const float *iq, int samples, __global const flo
     im += noise * gaussian(hash_mixn(key + 0x9E3779B9u));
   }
   floatn power = re * re + im * im + 1e-30f;
-  const floatn tgc_db = fmin(TO_FLOATN(index), (floatn)(tgc_samples)) * tgc_per_sample;
+  const floatn tgc_db = clamp(TO_FLOATN(index - start), (floatn)(0.0f), (floatn)(tgc_samples)) * tgc_per_sample;
   const floatn level_db = 3.01029996f * log2_fast(power) + tgc_db;
   STORE_LANES(sqrt(power) * exp2_fast(clamp(tgc_db * 0.166096405f, -100.0f, 100.0f)), envelope + here);
   STORE_GREY(grey_level(level_db, level_of_white_db, display.dynamic_range_db), grey + here);

@@ -260,8 +260,8 @@ inline Interface interface_between(Tissue here, Tissue behind, float3 direction,
 }
 
 // The root of a traced line: the beam frame at the probe face, transformed from the probe frame to RAS.
-// `origin_and_direction` are (x, y) each.
-inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_direction) {
+// `origin_and_direction` are (x, y) each, `start` the displayed depth at the face.
+inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_direction, float start) {
   const float2 origin = origin_and_direction.lo, direction = origin_and_direction.hi;
   Ray root;
   root.axis = affine_point(acquisition->probe_to_ras, (float3)(origin, 0.0f));
@@ -269,7 +269,7 @@ inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_
   root.lateral = unit3(affine_vector(acquisition->probe_to_ras, (float3)(direction.y, -direction.x, 0.0f)));
   root.elevational = unit3(affine_vector(acquisition->probe_to_ras, (float3)(0.0f, 0.0f, 1.0f)));
   root.path = 0.0f;
-  root.depth = 0.0f;
+  root.depth = start;
   root.log_attenuation = 0.0f;
   root.loss = 0.0f;
   root.weight = 1.0f;
@@ -306,11 +306,11 @@ inline void start_piece(__constant const Acquisition *acquisition, __global cons
 // The changes of depth and of the logarithm of amplitude per mm, by which a ray agrees with its beam at the end of the
 // piece, which has lost `more` nepers there. The ray is at `path`; from there on it is continued with these rates of
 // depth and decay.
-inline float2 correction(__constant const Acquisition *acquisition, __global const float *beams, const Ray *ray,
+inline float2 correction(__constant const Acquisition *acquisition, __global const float *beams, float start, const Ray *ray,
                          float path, float depth, float log_attenuation, float depth_per_mm, float decay, float more) {
   const float4 beam = vload4(ray->piece + 1, beams);
   const float end = (ray->piece + 1) * acquisition->screen_step, rest = end - path;
-  return (float2)(end + beam.y - (depth + rest * depth_per_mm), -beam.x - more - (log_attenuation - rest * decay)) /
+  return (float2)(start + end + beam.y - (depth + rest * depth_per_mm), -beam.x - more - (log_attenuation - rest * decay)) /
          fmax(end - ray->from, 1e-3f);
 }
 
@@ -374,7 +374,8 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
   int count = 0;  // of segments or hits; a value above `room` means that some are missing
   float cut_weight = 0.0f;
 
-  const Ray root = root_of(acquisition, vload4(line, roots));
+  const float start = line_start(acquisition, (float)(line - acquisition->guard_lines) / acquisition->lateral_rays);
+  const Ray root = root_of(acquisition, vload4(line, roots), start);
   Ray stack[MAX_STACK];
   stack[0] = root;
   if (acquisition->aperture_beams) start_piece(acquisition, my_beams, my_shades, root, 0, 0, stack);
@@ -450,7 +451,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         const int goes_dark = is_silenced && ray.strong == THROUGH;
         if (ray.strong == THROUGH) ray.excess += spent - until * front_decay;
         if (ray.piece >= 0)
-          per_mm = correction(acquisition, my_beams, &ray, ray.path + until, ray.depth + until * depth_per_mm,
+          per_mm = correction(acquisition, my_beams, start, &ray, ray.path + until, ray.depth + until * depth_per_mm,
                               ray.log_attenuation - spent, depth_per_mm, own_decay,
                               ray.excess + (goes_dark ? ray.shade - my_shades[ray.piece + 1] : 0.0f));
         if (ray.piece >= 0 && on_axis) correct_segments(my_segments + ray.piece_has, written, per_mm, ray.from);
@@ -516,7 +517,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       // At a border that is not soft, as if the beam had up to the piece's end what strong tissue has left of it here.
       if (is_beam)
         per_mm = correction(
-            acquisition, my_beams, &ray, path, depth, log_attenuation,
+            acquisition, my_beams, start, &ray, path, depth, log_attenuation,
             is_bent || is_under || leaves ? depth_per_mm : acquisition->reference_speed_m_s / behind.speed_of_sound_m_s,
             own_decay, ray.excess + (leaves ? 0.0f : ray.shade - my_shades[ray.piece + 1]));
       const float corrected_depth = depth + per_mm.x * (path - ray.from);

@@ -24,7 +24,8 @@ __kernel void scan_convert(__constant const Acquisition *acquisition, __global c
   const int scan_lines = acquisition->scan_lines, samples = acquisition->samples;
   const floatn x = left + (TO_FLOATN(column + LANE_INDEX) + 0.5f) * pixel_x;
   const floatn y = (floatn)(top + (row + 0.5f) * pixel_y);
-  floatn lateral = x, depth = y;
+  floatn lateral = x * acquisition->steering_cos - y * acquisition->steering_sin;
+  floatn depth = x * acquisition->steering_sin + y * acquisition->steering_cos + acquisition->start_mm;
   if (!acquisition->linear) {
     const floatn from_apex = y + acquisition->apex_radius_mm;
     depth = sqrt(x * x + from_apex * from_apex) - acquisition->apex_radius_mm;
@@ -33,7 +34,8 @@ __kernel void scan_convert(__constant const Acquisition *acquisition, __global c
   const floatn place = (lateral - acquisition->first_line) / acquisition->line_spacing,
                sample = depth / acquisition->sample_mm;
   const intn inside =
-      (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) & (depth < acquisition->depth_mm);
+      (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) & (depth < acquisition->depth_mm) &
+      (y >= acquisition->top_mm) & (y < acquisition->bottom_mm);
   const intn bin = clamp(TO_INTN(sample), (intn)(0), (intn)(samples - 2));
   const floatn on_line = clamp(place, 0.0f, scan_lines - 1.0f);
   const intn line = TO_INTN(on_line);

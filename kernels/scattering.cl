@@ -411,7 +411,7 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
 
     // Widths and gains are assumed linear between the two ends of a piece, so it must be short compared with the beam's
     // waist, and end at most twice as far from the apex as it begins: lines are apart in proportion to that distance.
-    const float waist = fmin(acquisition->transmit_rayleigh, acquisition->elevation_rayleigh);
+    const float waist = fmin(acquisition->transmit_waist, acquisition->elevation_rayleigh);
     const int pieces = max(1, (int)ceil((segment_high - segment_low) / (0.4f * waist)));
     const float to_apex = segment->path_mm + (acquisition->linear ? 1e6f : acquisition->apex_radius_mm);
     float high = segment_low;

@@ -15,7 +15,8 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
                          __global const float *from_im, __global float *to_re, __global float *to_im, int stride,
                          float wide, float power) {
   const int sample = get_global_id(0) * LANES, line = get_global_id(1), here = LINE_PAD + sample;
-  const float s = (sample / LOSS_STEP * LOSS_STEP + 0.5f * LOSS_STEP) * acquisition->sample_mm;  // for all LANES
+  const float depth = (sample / LOSS_STEP * LOSS_STEP + 0.5f * LOSS_STEP) * acquisition->sample_mm;  // for all LANES
+  const float s = fmax(depth - line_start(acquisition, (float)line), 0.0f);
   const float apart = line_distance(acquisition, s) * acquisition->lateral_rays;
   const float main_beam = lateral_sigma(acquisition, s);
   const float sigma = wide * fmax(acquisition->receive_sigma_min, acquisition->receive_sigma_slope * s);
@@ -35,8 +36,11 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
     sum_re += weight * LOAD_LANES(from_re + other * stride + here);
     sum_im += weight * LOAD_LANES(from_im + other * stride + here);
   }
-  // The energy of a Gaussian of unit area is inversely proportional to its width.
-  const float scale = sqrt(power * sqrt(main_beam * main_beam + rest * rest) / main_beam) / whole;
+  // The energy of a Gaussian of unit area is inversely proportional to its width. Of a beam with a curved phase less is
+  // left by the sum.
+  const float bent = lateral_curvature(acquisition, s, 1.0f) * main_beam * main_beam;
+  const float kept = rsqrt(sqrt(1.0f + bent * bent));
+  const float scale = sqrt(power * sqrt(main_beam * main_beam + rest * rest) / main_beam) / (kept * whole);
   const int at = line * stride + here;
   STORE_LANES(LOAD_LANES(from_re + at) - scale * sum_im, to_re + at);
   STORE_LANES(LOAD_LANES(from_im + at) + scale * sum_re, to_im + at);

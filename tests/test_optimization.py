@@ -28,7 +28,7 @@ from SlicerUSSim.Logic.fitting.optimization import _identifiability
 from SlicerUSSim.Logic.fitting.parameters import FreeParameters
 from SlicerUSSim.Logic.fitting.search import Evaluation, Search
 from SlicerUSSim.Logic.mri.samples import head_mri
-from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 from SlicerUSSim.Logic.verification.twins import make_twin

@@ -21,7 +21,8 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.probe import tilt_sweep
-from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA, PROBES, Probe, probe_from_dict
+from SlicerUSSim.Logic.probe.arrays import PROBES, Probe, probe_from_dict
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.verification.measurement import correlation, depth_window
 from SlicerUSSim.Logic.verification.phantoms import uniform_speckle
 from tests.conftest import SPECKLE, block, simulator

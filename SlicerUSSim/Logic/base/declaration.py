@@ -187,13 +187,14 @@ def parameter(
     *,
     compare: bool = True,
     default_factory: Any = MISSING,
+    kw_only: bool = False,
     **more: Any,
 ) -> Any:
     """A field of a dataclass, with its declaration as a Parameter."""
     metadata = {"parameter": Parameter(label=label, tip=tip, **more)}
     if default_factory is not MISSING:
         return field(default_factory=default_factory, compare=compare, metadata=metadata)
-    return field(default=default, compare=compare, metadata=metadata)
+    return field(default=default, compare=compare, kw_only=kw_only or MISSING, metadata=metadata)
 
 
 @cache

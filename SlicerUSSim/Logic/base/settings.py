@@ -56,6 +56,11 @@ class SimulationSettings(Declared):
         "Attenuation takes more of the high frequencies of a pulse: its centre falls with depth, and the beam widens",
         shown=True, source="Off in the paper",
     )  # fmt: skip
+    wavefront_curvature: bool = parameter(
+        True, "Wavefront curvature",
+        "The phase of the beam is curved across it: away from the transmit focus speckle has finer grains",
+        shown=True, note="The echo of a point is as wide with it as without", source="Off in the paper",
+    )  # fmt: skip
     reflections: bool = parameter(
         True, "Reflected rays", "Simulate mirror images and reverberation by following reflected rays", shown=True
     )

@@ -242,7 +242,7 @@ class AppearanceModel:
 
     @property
     def _probing_db_cm_mhz(self) -> float:
-        return _PROBING_DB / (2.0 * self.probe.frequency_mhz * 0.1 * self.probe.depth_mm)
+        return _PROBING_DB / (2.0 * self.probe.received_mhz * 0.1 * self.probe.depth_mm)
 
     def _measure_paths(self, number: int) -> None:
         """Loss in nepers in each varied tissue along the path to every sample, at the probing attenuation."""

@@ -316,7 +316,7 @@ def _identifiability(
     def state_of(units: Units) -> State:
         return parameters.apply(np.asarray(units), cost.tissues, cost.display)
 
-    quantities = quantities_of(parameters, cost.model.probe.frequency_mhz, cost.tissues)
+    quantities = quantities_of(parameters, cost.model.probe.received_mhz, cost.tissues)
     return Identifiability.of(quantities, state_of, best, as_good, again, restarts, tolerance)
 
 

@@ -111,10 +111,14 @@ def aperture_fields(
     widest = 0.5 / probe.receive_f_number  # of the directions from which a depth is reached, to the line
     reach = -probe.first_line + guard_lines / lateral_rays * probe.line_spacing  # of traced lines
     if probe.is_linear or probe.apex_radius_mm > 0.0:
-        along = reach if probe.is_linear else reach * probe.apex_radius_mm
+        along = reach / np.cos(probe.steering_rad) if probe.is_linear else reach * probe.apex_radius_mm
+        if probe.has_flat_face and not probe.is_linear:
+            along = probe.apex_radius_mm * np.tan(reach)
         span = 2.0 * along + probe.aperture_mm
         pitch = max(probe.aperture_mm / _POINTS, span / (_MOST_POINTS - 1))
-        if not probe.is_linear:
+        if probe.has_flat_face:
+            widest += abs(probe.steering_rad) if probe.is_linear else reach
+        else:
             widest += 0.5 * (probe.aperture_mm + pitch) / probe.apex_radius_mm
     else:
         span, pitch = probe.aperture_mm, probe.aperture_mm / _POINTS

@@ -12,7 +12,8 @@ from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
-from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA, Probe
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 
 if TYPE_CHECKING:
     from pyopencl import Buffer
@@ -30,6 +31,9 @@ class PulseFilter(Stage):
         self.kernel = device.kernels("bmode.cl", device.lanes)["convolve_pulse"]
         self._shift = device.kernels("downshift.cl", device.lanes)["shift_frequency"]
         self.workspace = Workspace(device)
+        self._level = device.kernels("harmonic.cl", device.lanes)["apply_level"]
+        #: What the level of the harmonic depends on, and its buffer
+        self._levels: tuple[tuple, Buffer] | None = None
         self._sigma: float | None = None
         # Taps of the pulse with this sigma
         self._pulse: Buffer
@@ -53,6 +57,8 @@ class PulseFilter(Stage):
                 frame.scanned.im,
                 np.int32(frame.scanned.stride),
             )
+        if frame.probe.harmonic:
+            self._apply_level(frame)
         self.device.run(
             self.kernel,
             (samples // self.device.lanes, lines),
@@ -67,6 +73,22 @@ class PulseFilter(Stage):
             np.int32(samples),
         )
 
+    def _apply_level(self, frame: DeviceFrame) -> None:
+        lines, samples = frame.line_shape
+        key = frame.probe, samples, float(frame.acquisition["sample_mm"])
+        if self._levels is None or self._levels[0] != key:
+            levels = frame.probe.harmonic_level(np.arange(samples) * key[2]).astype(np.float32)
+            self._levels = key, self.device.upload(levels)
+        self.device.run(
+            self._level,
+            (samples // self.device.lanes, lines),
+            frame.acquisition_buffer,
+            self._levels[1],
+            frame.scanned.re,
+            frame.scanned.im,
+            np.int32(frame.scanned.stride),
+        )
+
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
         lines, samples = frame.line_shape
         taps = pulse_taps(frame.axial_sigma_mm / float(frame.acquisition["sample_mm"])).size
@@ -75,7 +97,7 @@ class PulseFilter(Stage):
 
 def downshift(probe: Probe) -> float:
     """Part of the centre frequency that a pulse loses per neper of two-way loss: (sf / f0)^2 of its Gaussian band."""
-    return (probe.fractional_bandwidth / FWHM_PER_SIGMA) ** 2
+    return (probe.received_bandwidth / FWHM_PER_SIGMA) ** 2
 
 
 class Compressor(Stage):
@@ -97,12 +119,13 @@ class Compressor(Stage):
         frame.grey = self.workspace.get("grey", lines * samples)
         # Two-way path per sample, in cm.
         tgc = 2.0 * display.tgc_db_cm_mhz * float(acquisition["frequency_mhz"]) * float(acquisition["sample_mm"]) * 0.1
-        rising = display.tgc_reach * float(acquisition["depth_mm"]) / float(acquisition["sample_mm"])
+        rising = display.tgc_reach * frame.probe.depth_mm / float(acquisition["sample_mm"])
         # Noise power is shared between the two quadrature components.
         noise = 0.0 if display.noise_db is None else 10.0 ** (display.noise_db / 20.0) / np.sqrt(2.0)
         self.device.run(
             self.kernel,
             (samples // self.device.lanes, lines),
+            frame.acquisition_buffer,
             frame.iq,
             np.int32(samples),
             self._ring_down(frame),
@@ -144,7 +167,8 @@ def ring_down(probe: Probe, depth_mm: np.ndarray, axial_sigma_mm: float, cycles_
     level_db = probe.ring_down_db - 40.0 * places / probe.ring_down_mm
     echoes = 10.0 ** (level_db / 20.0) * (-1.0) ** np.arange(len(places)) * np.exp(-2j * np.pi * cycles_per_mm * places)
     pulses = np.exp(-0.5 * ((depth_mm[:, None] - places) / axial_sigma_mm) ** 2)
-    return (pulses @ echoes).astype(np.complex64)
+    level = probe.harmonic_level(depth_mm) if probe.harmonic else 1.0
+    return (level * (pulses @ echoes)).astype(np.complex64)
 
 
 def pulse_taps(sigma: float) -> np.ndarray:

@@ -134,7 +134,8 @@ class RayTracer(Stage):
 
 #: Fields that determine the traced lines in the probe frame
 _ARRAY_FIELDS = (
-    "linear", "apex_radius_mm", "first_line", "line_spacing", "lateral_rays", "guard_lines", "traced_lines"
+    "linear", "apex_radius_mm", "first_line", "line_spacing", "lateral_rays", "guard_lines", "traced_lines", "flat_face",
+    "steering_sin",
 )  # fmt: skip
 
 
@@ -149,10 +150,13 @@ def line_roots(acquisition: np.ndarray) -> np.ndarray:
     )
     roots = np.zeros((len(position), 4), np.float32)
     if acquisition["linear"]:
-        roots[:, 0], roots[:, 3] = position, 1.0
+        sine, cosine = float(acquisition["steering_sin"]), float(acquisition["steering_cos"])
+        roots[:, 0], roots[:, 2], roots[:, 3] = position / cosine, sine, cosine
     else:
         radius, sine, cosine = float(acquisition["apex_radius_mm"]), np.sin(position), np.cos(position)
         roots[:] = np.stack([radius * sine, radius * (cosine - 1.0), sine, cosine], axis=1)
+        if acquisition["flat_face"]:
+            roots[:, 0], roots[:, 1] = radius * sine / cosine, 0.0
     return roots
 
 

@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.imaging.noise import stirred
 from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device
-from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA, MAIN_LOBE
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, MAIN_LOBE
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.probe.arrays import Probe
@@ -77,7 +77,7 @@ class SideLobes(Stage):
 
 def lateral_lobes(probe: Probe) -> tuple[float, float]:
     """(power re the main lobe, sigma of the amplitude re that of the receive beam) of a probe's lateral side lobes."""
-    power, sigma = side_lobes_of(probe.receive_apodization)
+    power, sigma = side_lobes_of(probe.receive_apodization, probe.harmonic)
     return power, sigma * FWHM_PER_SIGMA / MAIN_LOBE
 
 
@@ -89,7 +89,7 @@ def elevational_lobe_record(acquisition: np.ndarray, probe: Probe) -> np.ndarray
     COARSER, with scatterers of its own.
     """
     record = acquisition.copy()
-    power, sigma = side_lobes_of(0.0)
+    power, sigma = side_lobes_of(0.0, probe.harmonic)
     waist, focus, rayleigh = (float(acquisition[f"elevation_{name}"]) for name in ("sigma", "focus", "rayleigh"))
     # The square of the width is a z^2 - 2 b z + c.
     a = (waist / rayleigh) ** 2 + (sigma * probe.wavelength_mm / probe.elevation_aperture_mm) ** 2
@@ -104,17 +104,19 @@ def elevational_lobe_record(acquisition: np.ndarray, probe: Probe) -> np.ndarray
 
 
 @cache
-def side_lobes_of(receive_apodization: float) -> tuple[float, float]:
-    """(power re the main lobe, sigma in wavelengths x f-number) of the lobes of a two-way beam.
+def side_lobes_of(receive_apodization: float, harmonic: bool = False) -> tuple[float, float]:
+    """(power re the main lobe, sigma in received wavelengths x f-number) of the lobes of a two-way beam.
 
     The transmit aperture is uniform, the receive aperture has the weights 1 - a + a cos(pi x)^2, x from -1/2 to 1/2,
-    with a from 0, uniform, to 1, Hann. The power beyond MATCHED is that of the diffraction pattern.
+    with a from 0, uniform, to 1, Hann. The power beyond MATCHED is that of the diffraction pattern. The second harmonic
+    has the square of the pattern of half its frequency.
     """
     x = (np.arange(512) + 0.5) / 512 - 0.5
     u = np.linspace(0.0, 64.0, 16_385)  # wavelengths x f-number
     weights = 1.0 - receive_apodization + receive_apodization * np.cos(np.pi * x) ** 2
     receive = np.cos(2.0 * np.pi * np.outer(u, x)) @ weights / weights.sum()
-    pattern = (np.sinc(u) * receive) ** 2
+    sent = np.sinc(0.5 * u) ** 2 if harmonic else np.sinc(u)
+    pattern = (sent * receive) ** 2
     beyond = [float(pattern[u > at].sum() / pattern.sum()) for at in MATCHED]
     # The power of a Gaussian amplitude of this sigma beyond u is erfc(u / sigma).
     ratio = beyond[1] / beyond[0]

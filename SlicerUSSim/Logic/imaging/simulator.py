@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from time import perf_counter
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -29,7 +29,8 @@ from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
-from SlicerUSSim.Logic.probe.arrays import NOMINAL_SPEED_M_S, Probe
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.beam import CURVED, MOST_ZONES, NOMINAL_SPEED_M_S
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -37,6 +38,8 @@ from SlicerUSSim.Logic.tissue.texture import Texture
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
+#: Beyond all fields
+_FAR_MM = 1e6
 _log = logging.getLogger(__name__)
 
 StageKind = TypeVar("StageKind", bound=Stage)
@@ -340,7 +343,6 @@ class UltrasoundSimulator:
         """The record (layout.ACQUISITION) of the constants of one frame."""
         settings, medium = self.settings, self.medium
         block = CONSTANTS["BLOCK"]
-        transmit, elevation = probe.transmit_waist(), probe.elevation_waist()
         axial_sigma = self.axial_sigma_mm(probe)
         acquisition = np.zeros((), ACQUISITION)
         for owner in (probe, settings):
@@ -363,15 +365,21 @@ class UltrasoundSimulator:
         acquisition["probe_to_ras"] = pose[:3].ravel()
         acquisition["linear"] = probe.is_linear
         acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
+        for name, value in steering_fields(probe).items():
+            acquisition[name] = value
         acquisition["first_line"] = probe.first_line
         acquisition["line_spacing"] = probe.line_spacing
+        acquisition["frequency_mhz"] = probe.received_mhz
+        acquisition["fractional_bandwidth"] = probe.received_bandwidth
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
         acquisition["sample_mm"] = self._sample_mm(probe)
         acquisition["samples"] = -(-self._sample_count(probe) // block) * block
-        acquisition["transmit_sigma"], acquisition["transmit_focus"], acquisition["transmit_rayleigh"] = transmit
+        acquisition["wavefront_curvature"] = CURVED if settings.wavefront_curvature else 0.0
+        for name, value in transmit_fields(probe).items():
+            acquisition[name] = value
         acquisition["receive_sigma_min"], acquisition["receive_sigma_slope"] = probe.receive_beam()
-        acquisition["elevation_sigma"] = elevation[0] / np.sqrt(2.0)
-        acquisition["elevation_focus"], acquisition["elevation_rayleigh"] = elevation[1:]
+        for name, value in zip(("sigma", "focus", "rayleigh"), probe.elevation_beam(), strict=True):
+            acquisition[f"elevation_{name}"] = value
         acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
         lateral, guard = _traced_lines_for(probe, settings)
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard
@@ -400,7 +408,7 @@ class UltrasoundSimulator:
         return 1.0 / (self.settings.samples_per_cycle * self._cycles_per_mm(probe))
 
     def _sample_count(self, probe: Probe) -> int:
-        return int(np.ceil(probe.depth_mm / self._sample_mm(probe)))
+        return int(np.ceil(probe.displayed_mm / self._sample_mm(probe)))
 
     def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
         """Warn if the volume has no labels, or the bounding box of the imaged field, in voxels, does not meet it."""
@@ -453,6 +461,37 @@ def _packed_texture(texture: Texture | None, labels: Volume, settings: Simulatio
         "pass segmentation.texture(), or Texture.from_mri(mri, labels) for your own label map",
     )
     return texture.packed(as_labels(labels.array), settings.partial_volume, settings.mri_modulation_db)
+
+
+def steering_fields(probe: Probe) -> dict[str, Any]:
+    """The fields of layout.ACQUISITION for lines that are not at right angles to the face."""
+    starts = probe.line_starts_mm(probe.line_positions())
+    steered = bool(starts.any())
+    ends = probe.line_ends_mm(probe.line_positions())[:, 1]
+    return {
+        "depth_mm": probe.displayed_mm,
+        "steered": steered,
+        "flat_face": probe.has_flat_face,
+        "steering_sin": np.sin(probe.steering_rad),
+        "steering_cos": np.cos(probe.steering_rad),
+        "start_mm": float(probe.line_starts_mm(0.0)),
+        "spread_radius_mm": 0.0 if probe.is_linear else probe.apex_radius_mm + starts.mean(),
+        "top_mm": 0.0 if steered else -_FAR_MM,
+        "bottom_mm": ends.max() if steered and probe.is_linear else _FAR_MM,
+    }
+
+
+def transmit_fields(probe: Probe) -> dict[str, Any]:
+    """The fields of layout.ACQUISITION for the transmit beam."""
+    waists, fields = np.zeros((MOST_ZONES, 3)), {}
+    zones = probe.transmit_zones()
+    if zones:
+        waists[: len(zones)] = zones
+    else:
+        waists[0, 0], fields["transmit_sigma_slope"] = probe.compounded_beam()
+    fields["transmit_sigma"], fields["transmit_focus"], fields["transmit_rayleigh"] = waists.T
+    longest = 2.0 * probe.depth_mm  # a beam in focus at every depth changes slowly
+    return fields | {"transmit_zones": len(zones), "transmit_waist": min([zone[2] for zone in zones], default=longest)}
 
 
 def _mixed(seed: int) -> int:

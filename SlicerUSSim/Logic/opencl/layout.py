@@ -9,6 +9,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import parameters_of
 from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.probe.beam import MOST_ZONES
 
 #: Constants with the same name in host and kernels.
 CONSTANTS = {
@@ -71,7 +72,16 @@ ACQUISITION = np.dtype(
         ("first_line", _FLOAT),
         ("line_spacing", _FLOAT),
         ("scan_lines", _INT),
-        ("depth_mm", _FLOAT),
+        ("depth_mm", _FLOAT),  # displayed, up to which lines are computed
+        # steering of a linear array (line_start in common.clh)
+        ("steered", _INT),
+        ("flat_face", _INT),
+        ("steering_sin", _FLOAT),  # of the angle of parallel lines to the normal of the face
+        ("steering_cos", _FLOAT),
+        ("start_mm", _FLOAT),  # displayed depth at which a parallel line in the middle leaves the face
+        ("spread_radius_mm", _FLOAT),  # distance from the apex to the face, on average over the lines
+        ("top_mm", _FLOAT),  # of the imaged field
+        ("bottom_mm", _FLOAT),
         # wave and beam (Probe.beam_sigma_mm)
         ("frequency_mhz", _FLOAT),
         ("fractional_bandwidth", _FLOAT),
@@ -79,9 +89,13 @@ ACQUISITION = np.dtype(
         ("cycles_per_mm", _FLOAT),
         ("sample_mm", _FLOAT),
         ("samples", _INT),  # rounded up to whole chunks
-        ("transmit_sigma", _FLOAT),
-        ("transmit_focus", _FLOAT),
-        ("transmit_rayleigh", _FLOAT),
+        ("transmit_zones", _INT),  # 0: focused at every depth, with transmit_sigma[0] at least
+        ("transmit_sigma", _FLOAT, MOST_ZONES),
+        ("transmit_focus", _FLOAT, MOST_ZONES),
+        ("transmit_rayleigh", _FLOAT, MOST_ZONES),
+        ("transmit_waist", _FLOAT),  # the shortest of these
+        ("transmit_sigma_slope", _FLOAT),  # where focused at every depth
+        ("wavefront_curvature", _FLOAT),  # probe.beam.CURVED; 0: none
         ("receive_sigma_min", _FLOAT),
         ("receive_sigma_slope", _FLOAT),
         ("elevation_sigma", _FLOAT),

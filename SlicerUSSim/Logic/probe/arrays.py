@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import (
-    Declared,
     Parameter,
     Shown,
     built,
@@ -22,27 +21,20 @@ from SlicerUSSim.Logic.base.declaration import (
     short,
 )
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.probe.beam import Beam
 
-NOMINAL_SPEED_M_S = 1540.0
-#: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
-MAIN_LOBE = 1.21
-#: Smallest f-number of a focus on transmission and of the lens
-LEAST_F_NUMBER = 0.5
-FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
-#: None until the probe's depth is set. Typed Any, since constructed probes never have None
-_BY_DEPTH: Any = None
 #: {name in a preset: class} of all kinds of probe
 PROBE_KINDS: dict[str, type[Probe]] = {}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Probe(Declared):
+class Probe(Beam):
     """What all probes share. Use LinearProbe, ConvexProbe or PhasedProbe.
 
     The two-way beam (amplitude, docs/physics.md#4-beam-and-pulse) is Gaussian across its axis. Laterally it is the
-    product of a transmit beam focused once at `focus_mm` and a receive beam that is focused at every depth, with an
-    aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both ways at one
-    depth.
+    product of a transmit beam, by default focused once at `focus_mm`, and a receive beam that is focused at every depth,
+    with an aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both ways at
+    one depth.
     Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
 
     >>> from dataclasses import replace
@@ -56,37 +48,6 @@ class Probe(Declared):
     scan_lines: int = parameter(
         192, "Scan lines", "Number of scan lines in an image", bounds=(2, 4096), shown=Shown(16, 512)
     )
-    frequency_mhz: float = parameter(
-        5.0, "Frequency", "Centre frequency of the pulse; higher: finer resolution, less penetration",
-        unit="MHz", bounds=(0.5, 40), shown=Shown(1, 20, 0.1, is_slider=True),
-    )  # fmt: skip
-    fractional_bandwidth: float = parameter(
-        0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
-    )
-    focus_mm: float = parameter(
-        _BY_DEPTH, "Focus", "Depth of the transmit focus; none (panels: 0): 60 % of the image depth", unit="mm",
-        bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
-        note="It then moves with the depth",
-    )  # fmt: skip
-    aperture_mm: float = parameter(
-        12.0, "Aperture", "Lateral size of the fully open aperture", unit="mm", bounds=(0.5, 200)
-    )
-    receive_f_number: float = parameter(
-        2.5, "Receive f-number", "Smallest f-number of the receive aperture", bounds=(0.5, 20),
-        note="The receive aperture grows with depth up to the full aperture",
-    )  # fmt: skip
-    receive_apodization: float = parameter(
-        0.0, "Apodisation", "Weights of the receive aperture, for its side lobes: 0 uniform, 1 Hann", bounds=(0, 1),
-        note="Power of the side lobes re the main beam: -27 dB with 0, -32 dB with 0.5",
-    )  # fmt: skip
-    elevation_aperture_mm: float = parameter(
-        7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
-    )
-    elevation_focus_mm: float = parameter(
-        _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: 60 % of the image depth", unit="mm",
-        bounds=(0.1, 1000), can_be_none=True, note="It then moves with the depth",
-    )  # fmt: skip
-
     ring_down_mm: float = parameter(
         1.5, "Ring-down", "Depth in which reverberation between face and skin falls by 40 dB; 0: none", unit="mm",
         bounds=(0, 10),
@@ -142,6 +103,34 @@ class Probe(Declared):
         """True where scan lines are parallel."""
         return bool(np.isinf(self.apex_radius_mm))
 
+    @property
+    def has_flat_face(self) -> bool:
+        """True where scan lines start on a plane, or at one point."""
+        return self.is_linear or self.apex_radius_mm == 0.0
+
+    @property
+    def steering_rad(self) -> float:
+        """Angle of parallel scan lines to the normal of the face."""
+        return 0.0
+
+    def line_starts_mm(self, position) -> np.ndarray:
+        """Distance from line_at's origin to where lines at these positions leave the face.
+
+        Signals along lines begin at that origin. It is behind a flat face with steered lines: on a surface that all lines
+        leave at right angles.
+        """
+        return np.zeros_like(np.asarray(position, float))
+
+    @property
+    def displayed_mm(self) -> float:
+        """Largest distance from line_at's origin within the imaged field."""
+        return self.depth_mm
+
+    @property
+    def face_mm(self) -> float:
+        """Lateral size of the array: of a phased array its aperture, otherwise that between the outermost lines."""
+        return max(float(np.ptp(self.origins_mm()[:, 0])), self.aperture_mm)
+
     def line_positions(self) -> np.ndarray:
         """(scan_lines,) position of every line: radians around the apex, or millimetres along a linear face."""
         return self.first_line + self.line_spacing * np.arange(self.scan_lines)
@@ -151,7 +140,10 @@ class Probe(Declared):
         position = np.asarray(position, float)
         zero = np.zeros_like(position)
         if self.is_linear:
-            return np.stack([position, zero, zero], axis=-1), np.stack([zero, zero + 1.0, zero], axis=-1)
+            sine, cosine = np.sin(self.steering_rad), np.cos(self.steering_rad)
+            direction = np.stack([zero + sine, zero + cosine, zero], axis=-1)
+            face = np.stack([position / cosine, zero, zero], axis=-1)
+            return face - self.line_starts_mm(position)[..., None] * direction, direction
         sine, cosine, radius = np.sin(position), np.cos(position), self.apex_radius_mm
         return (
             np.stack([radius * sine, radius * (cosine - 1.0), zero], axis=-1),
@@ -159,7 +151,7 @@ class Probe(Declared):
         )
 
     def origins_mm(self) -> np.ndarray:
-        """(scan_lines, 3) starting points on the probe face in the probe frame."""
+        """(scan_lines, 3) starting points of signals in the probe frame: on the face, unless lines are steered."""
         return self.line_at(self.line_positions())[0]
 
     def directions(self) -> np.ndarray:
@@ -170,7 +162,9 @@ class Probe(Declared):
         """(position of the line, millimetres along it) of points of the image plane; the inverse of line_at."""
         x, y = np.asarray(lateral_mm, float), np.asarray(depth_mm, float)
         if self.is_linear:
-            return x, y
+            sine, cosine = np.sin(self.steering_rad), np.cos(self.steering_rad)
+            across, before = x * cosine - y * sine, self.line_starts_mm(0.0)
+            return across, x * sine + y * cosine + before
         from_apex = y + self.apex_radius_mm
         return np.arctan2(x, from_apex), np.hypot(x, from_apex) - self.apex_radius_mm
 
@@ -181,8 +175,9 @@ class Probe(Declared):
 
     def image_bounds_mm(self) -> tuple[float, float, float, float]:
         """(left, right, top, bottom) of the imaged field in the probe frame; top is negative for a curved face."""
-        starts = self.origins_mm()
-        points = np.concatenate([starts, starts + self.depth_mm * self.directions()])
+        starts, directions = self.origins_mm(), self.directions()
+        starts = starts + self.line_starts_mm(self.line_positions())[:, None] * directions
+        points = np.concatenate([starts, self.line_ends_mm(self.line_positions())])
         if not self.is_linear:
             points = np.concatenate([points, [[0.0, self.depth_mm, 0.0]]])  # the middle of the arc, if there is no line
         x, y = points[:, 0], points[:, 1]
@@ -191,80 +186,25 @@ class Probe(Declared):
     def outline_mm(self, points_per_arc: int = 65) -> np.ndarray:
         """(points, 3) closed outline of the imaged field in the probe frame."""
         ends = np.linspace(self.first_line, -self.first_line, points_per_arc)
-        if self.is_linear:
-            near = np.stack([ends, 0 * ends, 0 * ends], axis=1)
-            far = near + [0.0, self.depth_mm, 0.0]
-        else:
-            ray = np.stack([np.sin(ends), np.cos(ends), 0 * ends], axis=1)
-            apex = np.array([0.0, -self.apex_radius_mm, 0.0])
-            near, far = apex + self.apex_radius_mm * ray, apex + (self.apex_radius_mm + self.depth_mm) * ray
+        origin, direction = self.line_at(ends)
+        near, far = origin + self.line_starts_mm(ends)[:, None] * direction, self.line_ends_mm(ends)
         return np.concatenate([near, far[::-1], near[:1]])
+
+    def line_ends_mm(self, position) -> np.ndarray:
+        """(..., 3) deepest points of lines at these positions in the probe frame."""
+        origin, direction = self.line_at(position)
+        length = self.depth_mm + (self.line_starts_mm(position) if self.is_linear else 0.0)
+        return origin + np.asarray(length)[..., None] * direction
 
     def holds(self, lateral_mm: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
         """Whether points of the image plane (probe frame, any shape) lie in the imaged field."""
         position, along = self.line_through(lateral_mm, depth_mm)
-        return (np.abs(position) <= -self.first_line) & (along >= 0.0) & (along <= self.depth_mm)
-
-    # ---- wave and beam -----------------------------------------------------------------------------------------
-
-    @property
-    def wavelength_mm(self) -> float:
-        """Wavelength at the nominal speed of sound of 1540 m/s, for which arrays are designed."""
-        return NOMINAL_SPEED_M_S / self.frequency_mhz * 1e-3
-
-    @property
-    def cycles_per_mm(self) -> float:
-        """Cycles of the centre frequency per millimetre of *depth* (two-way travel)."""
-        return 2.0 / self.wavelength_mm
-
-    @property
-    def axial_sigma_mm(self) -> float:
-        """Standard deviation of the pulse envelope in depth.
-
-        A Gaussian spectrum whose amplitude is halved (-6 dB) at f0 (1 +- b/2) has sigma_f = b f0 / FWHM_PER_SIGMA, and
-        sigma_t = 1 / (2 pi sigma_f); depth is c t / 2.
-        """
-        sigma_mhz = self.fractional_bandwidth * self.frequency_mhz / FWHM_PER_SIGMA
-        return NOMINAL_SPEED_M_S * 1e-3 / (4.0 * np.pi * sigma_mhz)
-
-    def beam_sigma_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
-        """(lateral, elevational) standard deviation of the two-way beam amplitude at `depth_mm` along a scan line."""
-        depth = np.asarray(depth_mm, dtype=float)
-        transmit = self._gaussian_beam(depth, *self.transmit_waist())
-        least, slope = self.receive_beam()
-        receive = np.maximum(least, slope * depth)
-        lateral = transmit * receive / np.hypot(transmit, receive)
-        elevational = self._gaussian_beam(depth, *self.elevation_waist()) / np.sqrt(2.0)
-        return lateral, elevational
-
-    def smallest_cell_mm3(self) -> float:
-        """Volume of the smallest resolution cell within the image depth: (2 pi)^1.5 times the product of the sigmas."""
-        lateral, elevational = self.beam_sigma_mm(np.linspace(0.0, self.depth_mm, 257))
-        return float((2.0 * np.pi) ** 1.5 * self.axial_sigma_mm * (lateral * elevational).min())
-
-    def receive_beam(self) -> tuple[float, float]:
-        """(least sigma in mm, sigma per mm of depth) of the one-way lateral receive beam, focused at every depth."""
-        per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
-        return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
-
-    def transmit_waist(self) -> tuple[float, float, float]:
-        """(sigma at the focus, focus, Rayleigh length) of the one-way lateral transmit beam, millimetres."""
-        return self._waist(self.focus_mm, self.aperture_mm)
-
-    def elevation_waist(self) -> tuple[float, float, float]:
-        """(sigma at the focus, focus, Rayleigh length) of the one-way elevational beam, millimetres."""
-        return self._waist(self.elevation_focus_mm, self.elevation_aperture_mm)
-
-    def _waist(self, focus_mm: float, aperture_mm: float) -> tuple[float, float, float]:
-        # Elements farther aside than the focus is deep hardly contribute (and scanners close them).
-        f_number = max(focus_mm / aperture_mm, LEAST_F_NUMBER)
-        sigma = MAIN_LOBE * self.wavelength_mm * f_number / FWHM_PER_SIGMA
-        # A Gaussian beam of amplitude exp(-y^2 / w^2), w^2 = 2 sigma^2, has the Rayleigh length pi w^2 / wavelength.
-        return sigma, focus_mm, 2.0 * np.pi * sigma**2 / self.wavelength_mm
-
-    @staticmethod
-    def _gaussian_beam(depth, sigma, focus, rayleigh):
-        return sigma * np.sqrt(1.0 + ((depth - focus) / rayleigh) ** 2)
+        deep = self.depth_mm
+        if self.is_linear:
+            along = np.asarray(depth_mm, float) / np.cos(self.steering_rad)
+        elif self.has_flat_face:
+            deep = np.where(np.asarray(depth_mm, float) >= 0.0, deep, -1.0)
+        return (np.abs(position) <= -self.first_line) & (along >= 0.0) & (along <= deep)
 
     # ---- JSON --------------------------------------------------------------------------------------------------
 
@@ -288,20 +228,65 @@ def _field_of_view_deg() -> Any:
 
 @dataclass(frozen=True)
 class LinearProbe(Probe):
-    """A flat array with parallel scan lines over `width_mm`."""
+    """A flat array with parallel scan lines over `width_mm`.
+
+    They can be steered, or fan out from the face as of a convex array behind it (trapezoid, "virtual convex").
+    """
 
     kind = "linear"
     geometry = "parallel scan lines"
     width_mm: float = _own("Width", "Distance between the outermost scan lines", "mm", (1, 400), Shown(5, 200))
     depth_mm: float = _depth_mm()
+    steering_deg: float = parameter(
+        0.0, "Steering", "Angle of all scan lines to the normal of the face, positive to the right", unit="°",
+        bounds=(-45, 45), shown=Shown(-30, 30), kw_only=True,
+    )  # fmt: skip
+    trapezoid_deg: float = parameter(
+        0.0, "Trapezoid", "Angle of the outermost scan lines to the normal of the face, by which the field opens to both "
+        "sides; 0: parallel lines", unit="°", bounds=(0, 45), shown=Shown(0, 30), kw_only=True,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            not (self.steering_deg and self.trapezoid_deg),
+            f"LinearProbe: steering_deg is {self.steering_deg:g}, trapezoid_deg {self.trapezoid_deg:g}, "
+            "expected one of them to be 0",
+        )
 
     @property
     def apex_radius_mm(self) -> float:
-        return float("inf")
+        if self.trapezoid_deg == 0.0:
+            return float("inf")
+        return 0.5 * self.width_mm / float(np.tan(np.deg2rad(self.trapezoid_deg)))
+
+    @property
+    def has_flat_face(self) -> bool:
+        return True
+
+    @property
+    def face_mm(self) -> float:
+        return self.width_mm
+
+    @property
+    def steering_rad(self) -> float:
+        return float(np.deg2rad(self.steering_deg))
 
     @property
     def line_spacing(self) -> float:
-        return self.width_mm / (self.scan_lines - 1)
+        if self.trapezoid_deg:
+            return 2.0 * float(np.deg2rad(self.trapezoid_deg)) / (self.scan_lines - 1)
+        return self.width_mm * float(np.cos(self.steering_rad)) / (self.scan_lines - 1)
+
+    def line_starts_mm(self, position) -> np.ndarray:
+        position = np.asarray(position, float)
+        if self.trapezoid_deg:
+            return self.apex_radius_mm * (1.0 / np.cos(position) - 1.0)
+        return position * np.tan(self.steering_rad) + 0.5 * self.width_mm * abs(np.sin(self.steering_rad))
+
+    @property
+    def displayed_mm(self) -> float:
+        return self.depth_mm + self.width_mm * abs(float(np.sin(self.steering_rad)))
 
 
 @dataclass(frozen=True)

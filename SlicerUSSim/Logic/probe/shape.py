@@ -60,9 +60,10 @@ def probe_polydata(probe: Probe) -> vtkPolyData:
 
     For display only; the simulation does not use it. Cell scalars "Part" are 1 on the ridge.
     """
-    half_face = max(float(np.abs(probe.origins_mm()[:, 0]).max()) + _HOUSING_MM, _LEAST_HALF_WIDTH_MM)
+    near = probe.outline_mm()[: len(probe.outline_mm()) // 2, 0]
+    half_face = max(float(np.abs(near).max()) + _HOUSING_MM, _LEAST_HALF_WIDTH_MM)
     face = _ring(half_face, _HALF_THICKNESS_MM)
-    if not probe.is_linear:
+    if not (probe.has_flat_face and probe.apex_radius_mm > 0.0):
         radius = max(probe.apex_radius_mm, 1.5 * half_face)
         face[:, 1] = np.sqrt(radius**2 - face[:, 0] ** 2) - radius
     housing = _ring(half_face, _HALF_THICKNESS_MM) - [0.0, _STRAIGHT_MM, 0.0]

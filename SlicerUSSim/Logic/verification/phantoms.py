@@ -18,7 +18,8 @@ from scipy.optimize import brentq
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA, Probe
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
 

@@ -29,10 +29,9 @@ def acquisition_record(
     first, spacing, radius = _geometry(probe)
     lateral, guard = _traced_lines(probe, settings)
     traced = 2 * guard + 1 + lateral * (probe.scan_lines - 1)
-    samples = int(np.ceil(probe.depth_mm / sample_mm(probe, settings)))
+    samples = int(np.ceil(_steering(probe)["depth_mm"] / sample_mm(probe, settings)))
     membrane = medium.tissues.membrane
-    transmit = _one_way_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5))
-    elevational = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
+    elevational, elevational_length = _elevation(probe)
     density = settings.scatterers_per_mm3 or _automatic_density(probe)
     values = {
         "ras_to_voxel": medium.ras_to_voxel.ravel(),
@@ -46,26 +45,25 @@ def acquisition_record(
         "membrane_exponent": membrane.diffuse_exponent if membrane else 0.0,
         "membrane_phase": 2.0 * np.pi * _cycles_per_mm(probe, settings) * membrane.roughness_mm if membrane else 0.0,
         "probe_to_ras": np.asarray(probe_to_ras, float)[:3].ravel(),
-        "linear": isinstance(probe, LinearProbe),
+        "linear": _is_parallel(probe),
         "apex_radius_mm": radius,
         "first_line": first,
         "line_spacing": spacing,
         "scan_lines": probe.scan_lines,
-        "depth_mm": probe.depth_mm,
-        "frequency_mhz": probe.frequency_mhz,
-        "fractional_bandwidth": probe.fractional_bandwidth,
+        **_steering(probe),
+        "frequency_mhz": _received_mhz(probe),
+        "fractional_bandwidth": _received_bandwidth(probe),
         "reference_speed_m_s": settings.reference_speed_m_s,
         "cycles_per_mm": _cycles_per_mm(probe, settings),
         "sample_mm": sample_mm(probe, settings),
         "samples": int(np.ceil(samples / CONSTANTS["BLOCK"])) * CONSTANTS["BLOCK"],
-        "transmit_sigma": transmit,
-        "transmit_focus": probe.focus_mm,
-        "transmit_rayleigh": _rayleigh_mm(probe, transmit),
+        **_transmit(probe),
+        "wavefront_curvature": 0.6 if settings.wavefront_curvature else 0.0,
         "receive_sigma_min": _one_way_sigma(probe, probe.receive_f_number),
         "receive_sigma_slope": _one_way_sigma(probe, 1.0 / probe.aperture_mm),
-        "elevation_sigma": elevational / np.sqrt(2.0),
+        "elevation_sigma": elevational,
         "elevation_focus": probe.elevation_focus_mm,
-        "elevation_rayleigh": _rayleigh_mm(probe, elevational),
+        "elevation_rayleigh": elevational_length,
         "aperture_beams": settings.beam == "aperture",
         "aperture_mm": probe.aperture_mm,
         "receive_f_number": probe.receive_f_number,
@@ -82,7 +80,7 @@ def acquisition_record(
         "interface_gain": np.exp(settings.interface_gain_db * np.log(10.0) / 20.0),
         "interface_is_energy": settings.interface_reflection == "energy",
         "specular_exponent": settings.specular_exponent,
-        "downshift": (probe.fractional_bandwidth / _FWHM) ** 2 if settings.frequency_downshift else 0.0,
+        "downshift": (_received_bandwidth(probe) / _FWHM) ** 2 if settings.frequency_downshift else 0.0,
         "cell_mm": np.cbrt(1.0 / density),
         "seed": hash_mix(np.array([settings.seed], np.uint32))[0] ^ np.uint32(0x2545F491),
         "beam_cutoff": settings.beam_cutoff,
@@ -96,25 +94,77 @@ def acquisition_record(
     return record
 
 
+def _transmit(probe: Probe) -> dict[str, object]:
+    """Foci of the transmit beam, or its widths where it is in focus at every depth."""
+    if probe.transmit == "angles":
+        least, slope = _compounded(probe)
+        zones, only = [], [least]
+    else:
+        zones = _zones(probe)
+        only = [sigma for sigma, _ in zones]
+        slope = 0.0
+
+    def padded(values: list[float]) -> list[float]:
+        return values + (8 - len(values)) * [0.0]
+
+    lengths = [_rayleigh_mm(probe, sigma) for sigma, _ in zones]
+    return {
+        "transmit_zones": len(zones),
+        "transmit_sigma": padded(only),
+        "transmit_focus": padded([focus for _, focus in zones]),
+        "transmit_rayleigh": padded(lengths),
+        "transmit_waist": min(lengths) if zones else 2.0 * probe.depth_mm,
+        "transmit_sigma_slope": slope,
+    }
+
+
+def _zones(probe: Probe) -> list[tuple[float, float]]:
+    """(sigma, depth) of every transmit focus."""
+    if probe.transmit == "focus":
+        return [(_sent_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5)), probe.focus_mm)]
+    count = probe.focal_zones
+    foci = [probe.focus_mm * (n + n + 1) / count for n in range(count)]
+    return [
+        (_sent_sigma(probe, max(focus / probe.aperture_mm, probe.receive_f_number, 0.5)), focus) for focus in foci
+    ]
+
+
+def _compounded(probe: Probe) -> tuple[float, float]:
+    """(sigma, sigma per depth) of n waves: of a sum over n / (n - 1) times their range of angles, or of all the face."""
+    count = probe.transmit_angles
+    whole = 2.0 * np.sin(probe.largest_angle_deg * np.pi / 180.0) * count / (count - 1) if count > 1 else 1e-4
+    first, _, radius = _geometry(probe)
+    face = probe.width_mm if isinstance(probe, LinearProbe) else 2.0 * radius * np.sin(-first)
+    return _one_way_sigma(probe, 1.0 / whole), _one_way_sigma(probe, 1.0 / max(face, probe.aperture_mm))
+
+
+def _lateral_sigma(probe: Probe, depth: np.ndarray) -> np.ndarray:
+    """Of the two-way beam."""
+    if probe.transmit == "angles":
+        least, slope = _compounded(probe)
+        transmit = np.maximum(least, slope * depth)
+    else:
+        transmit = np.min(
+            [sigma * np.hypot(1.0, (depth - at) / _rayleigh_mm(probe, sigma)) for sigma, at in _zones(probe)], axis=0
+        )
+    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
+    return 1.0 / np.sqrt(transmit**-2.0 + receive**-2.0)
+
+
 def _automatic_density(probe: Probe) -> float:
     """Eight scatterers in the smallest resolution cell, at least 4 per mm^3 and no more than in the paper's lattice."""
     depth = np.linspace(0.0, probe.depth_mm, 257)
 
-    def beam(focus: float, aperture: float) -> np.ndarray:
-        sigma = _one_way_sigma(probe, max(focus / aperture, 0.5))
-        return sigma * np.hypot(1.0, (depth - focus) / _rayleigh_mm(probe, sigma))
-
-    transmit = beam(probe.focus_mm, probe.aperture_mm)
-    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
-    across = beam(probe.elevation_focus_mm, probe.elevation_aperture_mm) / np.sqrt(2.0)
-    axial = 1e-3 * _DESIGN_SPEED_M_S * _FWHM / (4.0 * np.pi * probe.fractional_bandwidth * probe.frequency_mhz)
-    cell = (2.0 * np.pi) ** 1.5 * axial * across / np.sqrt(transmit**-2.0 + receive**-2.0)
+    sigma, length = _elevation(probe)
+    across = sigma * np.hypot(1.0, (depth - probe.elevation_focus_mm) / length)
+    axial = 1e-3 * _DESIGN_SPEED_M_S * _FWHM / (4.0 * np.pi * _received_bandwidth(probe) * _received_mhz(probe))
+    cell = (2.0 * np.pi) ** 1.5 * axial * across * _lateral_sigma(probe, depth)
     return min(max(8.0 / float(cell.min()), 4.0), 125_000.0)
 
 
 def axial_sigma_mm(probe: Probe, settings: SimulationSettings) -> float:
     """Standard deviation of the pulse in depth: c / (4 pi sf), sf = bandwidth f0 / 2.355."""
-    sigma_mhz = probe.fractional_bandwidth * probe.frequency_mhz / _FWHM
+    sigma_mhz = _received_bandwidth(probe) * _received_mhz(probe) / _FWHM
     return 1e-3 * settings.reference_speed_m_s / (4.0 * np.pi * sigma_mhz)
 
 
@@ -129,8 +179,12 @@ def line_roots(acquisition: np.ndarray) -> np.ndarray:
     step = float(acquisition["line_spacing"]) / float(acquisition["lateral_rays"])
     at = float(acquisition["first_line"]) + (n - float(acquisition["guard_lines"])) * step
     if acquisition["linear"]:
-        return np.column_stack([at, 0 * at, 0 * at, 0 * at + 1.0]).astype(np.float32)
+        sine, cosine = float(acquisition["steering_sin"]), float(acquisition["steering_cos"])
+        return np.column_stack([at / cosine, 0 * at, 0 * at + sine, 0 * at + cosine]).astype(np.float32)
     towards = np.column_stack([np.sin(at), np.cos(at)])
+    if acquisition["steered"]:
+        on_face = np.column_stack([float(acquisition["apex_radius_mm"]) * np.tan(at), 0 * at])
+        return np.column_stack([on_face, towards]).astype(np.float32)
     start = float(acquisition["apex_radius_mm"]) * (towards - [0.0, 1.0])  # the apex lies a radius above the face
     return np.column_stack([start, towards]).astype(np.float32)
 
@@ -169,7 +223,15 @@ def _fans(probe: Probe, voxel_mm: float, edge: float) -> dict[str, float]:
     if isinstance(probe, PhasedProbe):
         half_angle += edge
     else:
-        length += 2.0 * edge * (radius if isinstance(probe, ConvexProbe) else 1.0)
+        scale = radius if isinstance(probe, ConvexProbe) else 1.0
+        if isinstance(probe, LinearProbe) and probe.trapezoid_deg:
+            scale = radius * np.tan(edge) / edge
+            half_angle += edge
+        elif isinstance(probe, LinearProbe):
+            tilt = np.abs(probe.steering_deg) * np.pi / 180.0
+            scale = 1.0 / np.cos(tilt)
+            half_angle += tilt
+        length += 2.0 * edge * scale
         pitch = max(pitch, length / 95.0)
         if isinstance(probe, ConvexProbe):
             half_angle += 0.5 * (probe.aperture_mm + pitch) / radius
@@ -192,7 +254,10 @@ def _fans(probe: Probe, voxel_mm: float, edge: float) -> dict[str, float]:
 def _geometry(probe: Probe) -> tuple[float, float, float]:
     """(first line, step between lines, radius of the face): radians about the apex, or millimetres and 0 if linear."""
     if isinstance(probe, LinearProbe):
-        whole, radius = probe.width_mm, 0.0
+        whole, radius = probe.width_mm * np.cos(probe.steering_deg * np.pi / 180.0), 0.0
+        if probe.trapezoid_deg:
+            whole = 2.0 * probe.trapezoid_deg * np.pi / 180.0
+            radius = 0.5 * probe.width_mm / np.tan(0.5 * whole)
     else:
         if not isinstance(probe, ConvexProbe | PhasedProbe):
             name = type(probe).__name__
@@ -202,12 +267,84 @@ def _geometry(probe: Probe) -> tuple[float, float, float]:
     return -0.5 * whole, whole / (probe.scan_lines - 1), radius
 
 
+def _received_mhz(probe: Probe) -> float:
+    return probe.frequency_mhz + (probe.frequency_mhz if probe.harmonic else 0.0)
+
+
+def _received_bandwidth(probe: Probe) -> float:
+    """Re the received frequency: twice that of the pulse, whose square has a band wider by the root of 2."""
+    return probe.fractional_bandwidth * (np.sqrt(0.5) if probe.harmonic else 1.0)
+
+
+def _elevation(probe: Probe) -> tuple[float, float]:
+    """(sigma at the focus, Rayleigh length) of the two-way elevational beam."""
+    sigma = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
+    if probe.harmonic:  # of the pulse sigma and length are twice as large; transmitted, squared, received
+        return np.sqrt(2.0 / 3.0) * sigma, np.sqrt(2.0) * _rayleigh_mm(probe, sigma)
+    return np.sqrt(0.5) * sigma, _rayleigh_mm(probe, sigma)
+
+
+def _sent_sigma(probe: Probe, f_number: float) -> float:
+    """Of a transmit beam at its focus: of the pulse, or its square at half the received frequency."""
+    return _one_way_sigma(probe, f_number) * (np.sqrt(2.0) if probe.harmonic else 1.0)
+
+
+def harmonic_level(probe: Probe, depth: np.ndarray) -> np.ndarray:
+    """Amplitude of the second harmonic, 1 at the focus: what the square of the pulse's beam has fed up to a depth."""
+    edges = np.linspace(0.0, max(float(depth.max()), probe.focus_mm), 20_001)
+    middle, step = 0.5 * (edges[1:] + edges[:-1]), edges[1]
+    lens = _one_way_sigma(probe, max(probe.elevation_focus_mm / probe.elevation_aperture_mm, 0.5))
+    source = (1.0 + 1j * (middle - probe.elevation_focus_mm) / (2.0 * _rayleigh_mm(probe, lens))) ** -0.5
+    if probe.transmit == "angles":
+        grown = np.abs(np.cumsum(source) * step)
+    else:
+        each, width = [], []
+        for sigma, focus in _zones(probe):
+            away = (middle - focus) / _rayleigh_mm(probe, sigma)
+            each.append(np.abs(np.cumsum(source * (1.0 + 1j * away) ** -0.5) * step) / np.sqrt(sigma))
+            width.append(sigma * np.hypot(1.0, (edges[1:] - focus) / _rayleigh_mm(probe, sigma)))
+        grown = np.choose(np.argmin(width, axis=0), each)
+    grown = np.append(0.0, grown)
+    return np.interp(depth, edges, grown / np.interp(probe.focus_mm, edges, grown))
+
+
+def _is_parallel(probe: Probe) -> bool:
+    return isinstance(probe, LinearProbe) and not probe.trapezoid_deg
+
+
+def _spread_radius(probe: Probe) -> float:
+    """Distance from the apex to the face, the mean over the lines where it is not the same for all."""
+    first, _, radius = _geometry(probe)
+    if not isinstance(probe, LinearProbe):
+        return radius
+    return radius * float((1.0 / np.cos(np.linspace(first, -first, probe.scan_lines))).mean())
+
+
+def _steering(probe: Probe) -> dict[str, float]:
+    """Lines that leave a flat face obliquely: their depths count from a common surface behind it."""
+    tilt = probe.steering_deg * np.pi / 180.0 if isinstance(probe, LinearProbe) else 0.0
+    fan = isinstance(probe, LinearProbe) and probe.trapezoid_deg > 0.0
+    first, _, radius = _geometry(probe)
+    before = -first * np.abs(np.tan(tilt)) if tilt else 0.0  # of the middle line; the last of the outermost is on the face
+    return {
+        "depth_mm": probe.depth_mm + 2.0 * before,
+        "steered": fan or tilt != 0.0,
+        "flat_face": isinstance(probe, LinearProbe | PhasedProbe),
+        "steering_sin": np.sin(tilt),
+        "steering_cos": np.cos(tilt),
+        "start_mm": before,
+        "spread_radius_mm": _spread_radius(probe),
+        "top_mm": 0.0 if fan or tilt else -1e6,
+        "bottom_mm": probe.depth_mm * np.cos(tilt) if tilt else 1e6,
+    }
+
+
 def _wavelength_mm(probe: Probe) -> float:
-    return 1e-3 * _DESIGN_SPEED_M_S / probe.frequency_mhz
+    return 1e-3 * _DESIGN_SPEED_M_S / _received_mhz(probe)
 
 
 def _cycles_per_mm(probe: Probe, settings: SimulationSettings) -> float:
-    return 2.0 * probe.frequency_mhz / (1e-3 * settings.reference_speed_m_s)
+    return 2.0 * _received_mhz(probe) / (1e-3 * settings.reference_speed_m_s)
 
 
 def _one_way_sigma(probe: Probe, f_number: float) -> float:
@@ -222,12 +359,9 @@ def _rayleigh_mm(probe: Probe, sigma_mm: float) -> float:
 def _traced_lines(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:
     """(traced lines per scan line, traced lines beyond either edge of the field)."""
     depth = np.linspace(0.0, probe.depth_mm, 65)
-    waist = _one_way_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5))
-    transmit = waist * np.hypot(1.0, (depth - probe.focus_mm) / _rayleigh_mm(probe, waist))
-    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
-    lateral = (transmit**-2.0 + receive**-2.0) ** -0.5
+    lateral = _lateral_sigma(probe, depth)
     _, spacing, radius = _geometry(probe)
-    apart = spacing * (np.ones_like(depth) if isinstance(probe, LinearProbe) else radius + depth)
+    apart = spacing * (np.ones_like(depth) if _is_parallel(probe) else _spread_radius(probe) + depth)
     count = settings.lateral_rays or int(np.clip(np.ceil((apart / lateral).max() / 1.5), 1, 128))
     below = depth >= 0.1 * probe.depth_mm  # near the apex of a phased array all lines are within the beam
     reach = np.ceil(settings.beam_cutoff * (lateral[below] / apart[below]).max() * count)

@@ -41,7 +41,7 @@ class Screens:
             name: acquisition[name].item() for name in acquisition.dtype.names or () if acquisition[name].ndim == 0
         }
         self.fields = fields
-        self.is_flat = bool(fields["linear"]) or fields["apex_radius_mm"] <= 0.0
+        self.is_flat = bool(fields["flat_face"])
         self.along = fields["fan_first"] + fields["fan_pitch"] * np.arange(fields["fan_points"])
         self.normal = 0.0 * self.along if self.is_flat else self.along / fields["apex_radius_mm"]
         bent = fields["apex_radius_mm"] * np.stack([np.sin(self.normal), np.cos(self.normal) - 1.0], -1)
@@ -195,10 +195,12 @@ class Screens:
     def _beam(self, sums: np.ndarray, position: float, path: float) -> tuple[float, ...]:
         """Nepers lost, extra path, two deflections, nepers lost to strong tissue, width: at one depth of one line."""
         fields = self.fields
-        angle = 0.0 if fields["linear"] else position
+        angle = np.arcsin(fields["steering_sin"]) if fields["linear"] else position
         direction, across = np.array([np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
-        centre = position if fields["linear"] else fields["apex_radius_mm"] * position
-        origin = [position, 0.0] if fields["linear"] else fields["apex_radius_mm"] * (direction - [0.0, 1.0])
+        centre = position / np.cos(angle) if fields["linear"] else fields["apex_radius_mm"] * position
+        if fields["steered"] and not fields["linear"]:
+            centre = fields["apex_radius_mm"] * np.tan(position)
+        origin = [centre, 0.0] if self.is_flat else fields["apex_radius_mm"] * (direction - [0.0, 1.0])
         pitch = fields["fan_pitch"]
 
         def lines_to(depth: float) -> tuple[np.ndarray, ...]:
@@ -229,7 +231,7 @@ class Screens:
         depth = self._depth_before_strong(sums, centre, origin + path * direction, path)
         x, open_, delay, _, passed, _ = lines_to(depth)
         cycles = 0.5 * fields["cycles_per_mm"]
-        focus = np.exp(1j * np.pi * cycles * (1.0 / depth - 1.0 / fields["transmit_focus"]) * x**2)
+        focus = np.exp(1j * np.pi * cycles * (1.0 / depth - 1.0 / Beam(self.acquisition).transmit_focus(depth)) * x**2)
         wave = open_ * np.exp(2j * np.pi * cycles * (delay - mean_delay))
         still, bent, stopped = (_two_way(each, focus) for each in (open_[None], wave, wave * passed))
         by_phase = max(bent.sum() / still.sum(), 1e-4)

@@ -50,7 +50,7 @@ def _add_block(acquisition, labels, tissues, segment, first: int, sums: np.ndarr
     high = np.minimum(segment["length_mm"], (f32(first + _BLOCK) * acquisition["sample_mm"] - depth0) / slope)
     if low >= high:
         return
-    waist = np.minimum(acquisition["transmit_rayleigh"], acquisition["elevation_rayleigh"])
+    waist = np.minimum(acquisition["transmit_waist"], acquisition["elevation_rayleigh"])
     pieces = max(1, int(np.ceil((high - low) / (f32(0.4) * waist))))
     to_apex = segment["path_mm"] + (f32(1e6) if acquisition["linear"] else acquisition["apex_radius_mm"])
     ends = [low]
@@ -310,12 +310,14 @@ def lateral_beam(acquisition: np.ndarray, lines: np.ndarray, spreads: np.ndarray
     `losses` are those of losses_along.
     """
     beam = Beam(acquisition)
-    s = np.arange(int(acquisition["samples"]), dtype=np.float32) * acquisition["sample_mm"]
+    depth = np.arange(int(acquisition["samples"]), dtype=np.float32) * acquisition["sample_mm"]
     edges = lines[1:-1:2] + lines[2::2]  # edge n is half a step after traced line n
-    result = np.empty((int(acquisition["scan_lines"]), len(s)), np.complex64)
+    result = np.empty((int(acquisition["scan_lines"]), len(depth)), np.complex64)
     screens, depths, _ = spreads.shape
     nodes = acquisition["screen_step"] * np.arange(1, depths + 1, dtype=np.float32)
     for n in range(len(result)):
+        start = beam.line_start(n)
+        s = np.maximum(depth - start, f32(0))
         centre = int(acquisition["guard_lines"]) + n * int(acquisition["lateral_rays"])
         line = f32(centre * (screens - 1) / (int(acquisition["traced_lines"]) - 1))
         left = min(int(line), screens - 2)
@@ -329,5 +331,13 @@ def lateral_beam(acquisition: np.ndarray, lines: np.ndarray, spreads: np.ndarray
         away = np.arange(len(edges), dtype=np.float32)[:, None] + f32(0.5) - f32(centre)
         near = np.flatnonzero(np.abs(away[:, 0]) <= reach.max())
         weights = np.exp(f32(-0.5) * step * step / narrow2 * away[near] ** 2) * (np.abs(away[near]) <= reach)
-        result[n] = (weights * edges[near]).sum(axis=0) * scale
+        # The phase is that of the middle of sixteen samples; interpolation between the edges loses some of its power.
+        blocks = np.arange(len(s)) // 16
+        middle = np.maximum((f32(16) * f32(blocks) + f32(8)) * acquisition["sample_mm"] - start, f32(0))
+        of_block = losses[n].reshape(-1, 16).mean(axis=1)[blocks]
+        curved = beam.lateral_curvature(middle, of_block) * (beam.line_distance(middle) / spread) ** 2
+        weights = weights * np.exp(np.complex64(-0.5j) * curved * away[near] ** 2)
+        apart2 = step * step / narrow2
+        kept = 2.0 + np.exp(-0.25 * apart2 - 0.25 * curved**2 / apart2)
+        result[n] = (weights * edges[near]).sum(axis=0) * scale * np.sqrt((2.0 + np.exp(-0.25 * apart2)) / kept)
     return result

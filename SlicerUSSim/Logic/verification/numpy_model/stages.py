@@ -15,11 +15,13 @@ from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB
 from SlicerUSSim.Logic.imaging.stage import HostFrame, Stage
 from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
     elevational_quantiles,
+    harmonic_level,
     line_roots,
     noise_key,
     pulse_taps,
 )
 from SlicerUSSim.Logic.verification.numpy_model.aperture import Screens
+from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.echoes import (
     add_interfaces,
     lateral_beam,
@@ -105,6 +107,10 @@ def pulse(frame: TwinFrame) -> None:
     turns = np.cumsum(missing, axis=1) * step - 0.5 * step * (missing + missing[:, :1])
     turning = np.exp(2j * np.pi * turns)
     lines = (frame.scanned * turning).astype(np.complex64)
+    if frame.probe.harmonic:
+        starts = Beam(record).line_start(np.arange(len(lines))) / record["sample_mm"]
+        below = np.maximum(np.arange(lines.shape[1]) - np.floor(starts + f32(0.5)).astype(int)[:, None], 0)
+        lines *= f32(harmonic_level(frame.probe, np.arange(lines.shape[1]) * float(record["sample_mm"])))[below]
     padded = np.pad(lines, ((0, 0), (reach, reach)))
     pulses = sum((tap * padded[:, k : k + lines.shape[1]] for k, tap in enumerate(taps)), np.zeros_like(lines))
     frame.iq = (pulses / turning).astype(np.complex64)
@@ -114,8 +120,11 @@ def b_mode(frame: TwinFrame) -> None:
     """Amplifier noise, time-gain compensation, envelope, log compression to eight bits."""
     record, display, iq = frame.acquisition, frame.display, frame.iq
     index = np.arange(iq.shape[1])
+    starts = Beam(record).line_start(np.arange(len(iq))) / record["sample_mm"]
+    below = index - np.floor(starts + f32(0.5)).astype(int)[:, None]  # the face, in samples
     if frame.settings.ring_down:
-        iq = iq + ring_down(record, frame.probe, frame.axial_sigma_mm)
+        ringing = ring_down(record, frame.probe, frame.axial_sigma_mm)
+        iq = iq + np.where(below >= 0, ringing[np.maximum(below, 0)], 0)
     if display.noise_db is not None:
         noise = f32(10.0 ** (display.noise_db / 20.0) / np.sqrt(2.0))
         line = np.arange(len(iq), dtype=np.uint32)[:, None]
@@ -126,7 +135,7 @@ def b_mode(frame: TwinFrame) -> None:
         iq = iq + noise * (gaussian(key) + 1j * gaussian(hash_mix(key + np.uint32(0x9E3779B9))))
     power = np.real(iq) ** 2 + np.imag(iq) ** 2 + f32(1e-30)
     # Two-way path, in cm
-    rising = np.minimum(index, display.tgc_reach * float(record["depth_mm"]) / float(record["sample_mm"]))
+    rising = np.clip(below, 0, display.tgc_reach * frame.probe.depth_mm / float(record["sample_mm"]))
     tgc_db = rising * (2.0 * display.tgc_db_cm_mhz * float(record["frequency_mhz"]) * float(record["sample_mm"]) * 0.1)
     frame.envelope = (np.sqrt(power) * 10.0 ** (tgc_db / 20.0)).astype(np.float32)
     level_db = 10.0 * np.log10(power) + tgc_db
@@ -144,13 +153,16 @@ def scan_conversion(frame: TwinFrame) -> None:
     x = grid.left_mm + (np.arange(grid.columns) + 0.5) * grid.pixel_spacing_mm[0]
     y = grid.top_mm + (np.arange(grid.rows)[:, None] + 0.5) * grid.pixel_spacing_mm[1]
     if record["linear"]:
-        lateral, depth = x + 0 * y, y + 0 * x
+        tilt = np.arcsin(float(record["steering_sin"]))
+        lateral = x * np.cos(tilt) - y * np.sin(tilt)
+        depth = x * np.sin(tilt) + y * np.cos(tilt) + float(record["start_mm"])
     else:
         from_apex = y + float(record["apex_radius_mm"])
         depth = np.hypot(x, from_apex) - float(record["apex_radius_mm"])
         lateral = np.where(from_apex > 0, np.arctan2(x, from_apex), 1e9)
     place = (lateral - float(record["first_line"])) / float(record["line_spacing"])
     inside = (place >= -0.5) & (place <= lines - 0.5) & (depth >= 0) & (depth < float(record["depth_mm"]))
+    inside &= (y >= float(record["top_mm"])) & (y < float(record["bottom_mm"]))
     image = np.zeros((grid.rows, grid.columns), np.uint8)
     sample = depth[inside] / float(record["sample_mm"])
     bins = np.minimum(sample.astype(int), samples - 2)

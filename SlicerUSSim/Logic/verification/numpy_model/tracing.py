@@ -130,12 +130,17 @@ class Tracer:
             direction=unit(affine_vector(m, np.stack([dx, dy, zero], -1))),
             lateral=unit(affine_vector(m, np.stack([dy, -dx, zero], -1))),
             elevational=unit(affine_vector(m, np.stack([zero, zero, one], -1))),
-            tube=np.stack([one, zero, one, zero], -1), path=zero, depth=zero, log_attenuation=zero, loss=zero,
+            tube=np.stack([one, zero, one, zero], -1), path=zero, depth=self._starts(line), log_attenuation=zero, loss=zero,
             weight=one, blind_until=-one, reflections=np.zeros(count, int), label=np.full(count, -1),
             piece=np.full(count, 0 if self.acquisition["aperture_beams"] else -1),
             since_path=zero, course=np.zeros(count, int), shade=zero, strong=np.zeros(count, int),
             front=np.zeros(count, int), front_weight=one, excess=zero,
         )  # fmt: skip
+
+    def _starts(self, line: np.ndarray) -> np.ndarray:
+        """Displayed depths at which traced lines leave the face."""
+        scan_line = f32(line - int(self.acquisition["guard_lines"])) / f32(self.acquisition["lateral_rays"])
+        return f32(Beam(self.acquisition).line_start(scan_line))
 
     # ---- pieces of a beam ------------------------------------------------------------------------------------------
 
@@ -194,7 +199,7 @@ class Tracer:
         beam = self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))
         end = f32(rays.piece + 1) * self.acquisition["screen_step"]
         rest = end - path
-        depth_left = end + beam[:, 1] - (depth + rest * depth_per_mm)
+        depth_left = self._starts(rays.line) + end + beam[:, 1] - (depth + rest * depth_per_mm)
         log_left = -beam[:, 0] - more - (log_attenuation - rest * self.decay[self._front(rays)])
         along = np.maximum(end - rays.since_path, f32(1e-3))[:, None]
         return np.where((rays.piece >= 0)[:, None], np.stack([depth_left, log_left], -1) / along, f32(0))

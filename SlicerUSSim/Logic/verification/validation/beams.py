@@ -13,7 +13,7 @@ from scipy.special import ndtr
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.placement import elevational_motion, sample, slide_sweep, tilt_sweep
 from SlicerUSSim.Logic.verification.measurement import depth_window, echo_near, full_width
 from SlicerUSSim.Logic.verification.phantoms import (

@@ -128,7 +128,7 @@ def correlations(rotation: np.ndarray, device) -> Outcome:
     for name, probe in PROBES.items():
         frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
         for depth in DEPTHS_MM:
-            sigma_l, sigma_e = (float(s) for s in probe.beam_sigma_mm(depth))
+            sigma_l, sigma_e = float(probe.speckle_sigma_mm(depth)), float(probe.beam_sigma_mm(depth)[1])
             apart = float(probe.line_distance_mm(depth))
             lag = max(1, round(sigma_l / apart))
             beside = phantom.probe_to_ras @ elevational_motion(0.8 * sigma_e)
@@ -262,7 +262,8 @@ CHECKS = (
     ),
     Check(
         "speckle correlation",
-        "Signals d apart have the correlation exp(-d^2 / 4 sigma^2), with the sigma of the beam at that depth.",
+        "Signals d apart have the correlation exp(-d^2 / 4 sigma^2), with the sigma of the beam at that depth; laterally "
+        "at most that of two receive beams.",
         correlations,
     ),
     Check(

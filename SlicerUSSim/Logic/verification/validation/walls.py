@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.probe.arrays import FWHM_PER_SIGMA, PROBES, LinearProbe, Probe
+from SlicerUSSim.Logic.probe.arrays import PROBES, LinearProbe, Probe
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.verification.measurement import depth_window
 from SlicerUSSim.Logic.verification.phantoms import FLUID, Phantom, layered, reflection_coefficient, thin_slab

@@ -1,0 +1,250 @@
+"""The beam of a probe: its parameters, and the widths that follow from apertures, foci and frequency."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.declaration import Declared, Shown, parameter
+
+NOMINAL_SPEED_M_S = 1540.0
+#: -6 dB width of the main lobe of a uniform aperture, in wavelengths x f-number
+MAIN_LOBE = 1.21
+#: Smallest f-number of a focus on transmission and of the lens
+LEAST_F_NUMBER = 0.5
+FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
+#: Part of the curvature with which speckle has the correlation of two equal apertures wherever the transmit beam is
+#: wider than the receive beam: as in a wave simulation of 60 % bandwidth (docs/physics.md#wavefront-curvature)
+CURVED = 0.6
+#: Largest number of focal zones
+MOST_ZONES = 8
+#: f-number of a beam that is wide compared with all others
+_NO_FOCUS = 1e4
+#: None until the probe's depth is set. Typed Any, since constructed probes never have None
+_BY_DEPTH: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beam(Declared):
+    """The part of a Probe that forms its beam (docs/physics.md#4-beam-and-pulse)."""
+
+    frequency_mhz: float = parameter(
+        5.0, "Frequency", "Centre frequency of the pulse; higher: finer resolution, less penetration",
+        unit="MHz", bounds=(0.5, 40), shown=Shown(1, 20, 0.1, is_slider=True),
+    )  # fmt: skip
+    harmonic: bool = parameter(
+        False, "Harmonic imaging",
+        "Receive the second harmonic, which arises in tissue where the beam is strong: twice the frequency, narrower "
+        "beams, weaker side lobes, dark near the face", shown=True,
+        note="Its level is that of the fundamental at the transmit focus, as a scanner's gain makes it",
+    )  # fmt: skip
+    fractional_bandwidth: float = parameter(
+        0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
+    )
+    focus_mm: float = parameter(
+        _BY_DEPTH, "Focus", "Depth of the transmit focus; none (panels: 0): 60 % of the image depth", unit="mm",
+        bounds=(0.1, 1000), shown=Shown(0, 300, is_slider=True, none_at=0.0), can_be_none=True,
+        note="It then moves with the depth",
+    )  # fmt: skip
+    transmit: str = parameter(
+        "focus", "Transmit",
+        "focus: one focus. zones: several foci, each depth from the narrowest. angles: plane or diverging waves under "
+        "several angles, compounded coherently, which are in focus at every depth",
+        choices=("focus", "zones", "angles"), shown=True,
+    )  # fmt: skip
+    focal_zones: int = parameter(
+        3, "Focal zones", "Number of foci with zones, evenly over twice the focal depth", bounds=(2, MOST_ZONES),
+        shown=Shown(2, MOST_ZONES), note="Their f-number is at least that of reception",
+    )  # fmt: skip
+    transmit_angles: int = parameter(
+        5, "Angles", "Number of waves that are compounded with angles; 1: one wave, without focus", bounds=(1, 255),
+        shown=Shown(1, 99),
+    )  # fmt: skip
+    largest_angle_deg: float = parameter(
+        10.0, "Largest angle", "Of these waves to the axis; as large as the aperture they replace is seen from a depth",
+        unit="°", bounds=(0.1, 60), shown=Shown(1, 45),
+    )  # fmt: skip
+    aperture_mm: float = parameter(
+        12.0, "Aperture", "Lateral size of the fully open aperture", unit="mm", bounds=(0.5, 200)
+    )
+    receive_f_number: float = parameter(
+        2.5, "Receive f-number", "Smallest f-number of the receive aperture", bounds=(0.5, 20),
+        note="The receive aperture grows with depth up to the full aperture",
+    )  # fmt: skip
+    receive_apodization: float = parameter(
+        0.0, "Apodisation", "Weights of the receive aperture, for its side lobes: 0 uniform, 1 Hann", bounds=(0, 1),
+        note="Power of the side lobes re the main beam: -27 dB with 0, -32 dB with 0.5",
+    )  # fmt: skip
+    elevation_aperture_mm: float = parameter(
+        7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
+    )
+    elevation_focus_mm: float = parameter(
+        _BY_DEPTH, "Elevational focus", "Depth of the focus of the lens; none: 60 % of the image depth", unit="mm",
+        bounds=(0.1, 1000), can_be_none=True, note="It then moves with the depth",
+    )  # fmt: skip
+
+    @property
+    def wavelength_mm(self) -> float:
+        """Wavelength of what is received, at the nominal speed of sound of 1540 m/s, for which arrays are designed."""
+        return NOMINAL_SPEED_M_S / self.received_mhz * 1e-3
+
+    @property
+    def received_mhz(self) -> float:
+        """Centre frequency of the echoes before attenuation: that of the pulse, or of its second harmonic."""
+        return self.frequency_mhz * (2.0 if self.harmonic else 1.0)
+
+    @property
+    def received_bandwidth(self) -> float:
+        """-6 dB bandwidth as a fraction of received_mhz. The square of a Gaussian pulse is shorter by the root of 2."""
+        return self.fractional_bandwidth / (np.sqrt(2.0) if self.harmonic else 1.0)
+
+    @property
+    def cycles_per_mm(self) -> float:
+        """Cycles of the received frequency per millimetre of *depth* (two-way travel)."""
+        return 2.0 / self.wavelength_mm
+
+    @property
+    def axial_sigma_mm(self) -> float:
+        """Standard deviation of the pulse envelope in depth.
+
+        A Gaussian spectrum whose amplitude is halved (-6 dB) at f0 (1 +- b/2) has sigma_f = b f0 / FWHM_PER_SIGMA, and
+        sigma_t = 1 / (2 pi sigma_f); depth is c t / 2.
+        """
+        sigma_mhz = self.received_bandwidth * self.received_mhz / FWHM_PER_SIGMA
+        return NOMINAL_SPEED_M_S * 1e-3 / (4.0 * np.pi * sigma_mhz)
+
+    def beam_sigma_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
+        """(lateral, elevational) standard deviation of the two-way beam amplitude at `depth_mm` along a scan line."""
+        depth = np.asarray(depth_mm, dtype=float)
+        transmit, receive = self.lateral_sigmas_mm(depth)
+        lateral = transmit * receive / np.hypot(transmit, receive)
+        return lateral, self._gaussian_beam(depth, *self.elevation_beam())
+
+    def smallest_cell_mm3(self) -> float:
+        """Volume of the smallest resolution cell within the image depth: (2 pi)^1.5 times the product of the sigmas."""
+        lateral, elevational = self.beam_sigma_mm(np.linspace(0.0, self.depth_mm, 257))
+        return float((2.0 * np.pi) ** 1.5 * self.axial_sigma_mm * (lateral * elevational).min())
+
+    def lateral_sigmas_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
+        """(transmit, receive) standard deviations of the lateral one-way beams at `depth_mm` along a scan line."""
+        depth = np.asarray(depth_mm, dtype=float)
+        zones = self.transmit_zones()
+        if zones:
+            transmit = np.min([self._gaussian_beam(depth, *zone) for zone in zones], axis=0)
+        else:
+            transmit = self._focused_everywhere(depth, *self.compounded_beam())
+        return transmit, self._focused_everywhere(depth, *self.receive_beam())
+
+    def speckle_sigma_mm(self, depth_mm) -> np.ndarray:
+        """Lateral sigma of the uncurved beam whose speckle correlates over the same distance.
+
+        Speckle d apart has the correlation exp(-d^2 / 4 sigma^2). With SimulationSettings.wavefront_curvature the phase
+        of the beam is k y^2 / 2 at the distance y from its axis, k^2 = CURVED (1 / receive^4 - 1 / transmit^4).
+        """
+        transmit, receive = self.lateral_sigmas_mm(depth_mm)
+        more = np.maximum(receive**-2.0 - transmit**-2.0, 0.0)
+        return (transmit**-2.0 + receive**-2.0 + CURVED * more) ** -0.5
+
+    def receive_beam(self) -> tuple[float, float]:
+        """(least sigma in mm, sigma per mm of depth) of the one-way lateral receive beam, focused at every depth."""
+        per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
+        return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
+
+    def elevation_beam(self) -> tuple[float, float, float]:
+        """(sigma at the focus, focus, Rayleigh length) of the two-way elevational beam, millimetres."""
+        sigma, focus, rayleigh = self.elevation_waist()
+        if not self.harmonic:
+            return sigma / np.sqrt(2.0), focus, rayleigh
+        # 1 / s^2 of the product is 2 / s^2 (1 + b^2) for the square of the transmitted and 1 / s^2 (1/4 + b^2) for the
+        # received beam, b in Rayleigh lengths: about 6 / (s^2 (1 + 2 b^2)), exactly so at the focus and far from it.
+        return sigma / np.sqrt(6.0), focus, rayleigh / np.sqrt(2.0)
+
+    def harmonic_level(self, depth_mm) -> np.ndarray:
+        """Amplitude of the second harmonic at `depth_mm` re the fundamental, 1 at the transmit focus.
+
+        In the quasi-linear approximation the square of a Gaussian beam feeds a Gaussian beam of twice the frequency and
+        the same Rayleigh lengths, whose amplitude grows by 1 / sqrt((1 + i b)(1 + i c)) per millimetre, with b and c
+        the distances to the lateral and elevational foci in these lengths (M. F. Hamilton, D. T. Blackstock, Nonlinear
+        Acoustics, 1998, chapter 8).
+        """
+        depth = np.asarray(depth_mm, dtype=float)
+        path = np.linspace(0.0, max(float(depth.max(initial=0.0)), self.focus_mm), 4097)
+        _, focus, rayleigh = self.elevation_waist()
+        aside = 1.0 / np.sqrt(1.0 + 1j * (path - focus) / rayleigh)
+        zones = self.transmit_zones()
+        if not zones:  # each of the waves is plane
+            found = np.abs(_running_integral(aside, path))
+        else:
+            widths = np.array([self._gaussian_beam(path, *zone) for zone in zones])
+            grown = [
+                np.abs(_running_integral(aside / np.sqrt(1.0 + 1j * (path - at) / length), path)) / np.sqrt(sigma)
+                for sigma, at, length in zones
+            ]
+            found = np.take_along_axis(np.array(grown), widths.argmin(axis=0)[None], axis=0)[0]
+        return np.interp(depth, path, found / np.interp(self.focus_mm, path, found))
+
+    def transmit_zones(self) -> list[tuple[float, float, float]]:
+        """(sigma at the focus, focus, Rayleigh length) in mm of every transmit focus; empty if all depths are in focus.
+
+        Zones are at the odd multiples of focus_mm / focal_zones. At every depth the narrowest is used.
+        """
+        if self.transmit == "angles":
+            return []
+        if self.transmit == "focus":
+            return [self.transmit_waist()]
+        foci = self.focus_mm * (2.0 * np.arange(self.focal_zones) + 1.0) / self.focal_zones
+        return [self._sent(focus, min(self.aperture_mm, focus / self.receive_f_number)) for focus in foci.tolist()]
+
+    def compounded_beam(self) -> tuple[float, float]:
+        """(least sigma in mm, sigma per mm of depth) of the lateral transmit beam of compounded waves.
+
+        The coherent sum of n waves up to the angles +-a is the beam of an aperture seen under n / (n - 1) 2 a (G.
+        Montaldo et al., IEEE TUFFC 56(3), 2009), at most that of the face.
+        """
+        per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
+        count = self.transmit_angles
+        f_number = (count - 1) / count / (2.0 * np.sin(np.deg2rad(self.largest_angle_deg)))
+        if count == 1:
+            f_number = _NO_FOCUS
+        return per_f_number * f_number, per_f_number / self.face_mm
+
+    @property
+    def face_mm(self) -> float:
+        """Lateral size of all elements that can transmit, defined by each kind."""
+        raise NotImplementedError
+
+    def transmit_waist(self) -> tuple[float, float, float]:
+        """(sigma at the focus, focus, Rayleigh length) of the one-way lateral transmit beam, millimetres."""
+        return self._sent(self.focus_mm, self.aperture_mm)
+
+    def elevation_waist(self) -> tuple[float, float, float]:
+        """(sigma at the focus, focus, Rayleigh length) of the one-way elevational beam of the pulse, millimetres."""
+        return self._waist(self.elevation_focus_mm, self.elevation_aperture_mm)
+
+    def _waist(self, focus_mm: float, aperture_mm: float) -> tuple[float, float, float]:
+        # Elements farther aside than the focus is deep hardly contribute (and scanners close them).
+        f_number = max(focus_mm / aperture_mm, LEAST_F_NUMBER)
+        wavelength = NOMINAL_SPEED_M_S / self.frequency_mhz * 1e-3
+        sigma = MAIN_LOBE * wavelength * f_number / FWHM_PER_SIGMA
+        # A Gaussian beam of amplitude exp(-y^2 / w^2), w^2 = 2 sigma^2, has the Rayleigh length pi w^2 / wavelength.
+        return sigma, focus_mm, 2.0 * np.pi * sigma**2 / wavelength
+
+    def _sent(self, focus_mm: float, aperture_mm: float) -> tuple[float, float, float]:
+        # The harmonic has the profile of the square of the pulse's beam.
+        sigma, focus, rayleigh = self._waist(focus_mm, aperture_mm)
+        return (sigma / float(np.sqrt(2.0)) if self.harmonic else sigma), focus, rayleigh
+
+    @staticmethod
+    def _focused_everywhere(depth, least, slope):
+        return np.maximum(least, slope * depth)
+
+    @staticmethod
+    def _gaussian_beam(depth, sigma, focus, rayleigh):
+        return sigma * np.sqrt(1.0 + ((depth - focus) / rayleigh) ** 2)
+
+
+def _running_integral(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(places)
+    return np.concatenate([np.zeros(1), np.cumsum(steps)])
