@@ -59,6 +59,7 @@ def _layer_borders(isolated: Borders, farthest: float) -> Borders:
     depth, thickness, bend = (np.where(is_behind, a, b) for a, b in zip(*layers, strict=True))
     side = np.where(is_behind, f32(1), f32(-1))
     of.overshoot, of.curvature = side * depth * of.sigma, -side * bend / of.sigma
+    of.beside = thickness * of.sigma
     of.confidence = ramp(0.35, 0.55, thickness) * (f32(1) - ramp(0.06, 0.12, np.abs(bend)))
     of.confidence *= np.abs(of.overshoot) <= f32(farthest)
     found.put(some, of)
@@ -126,7 +127,7 @@ def _thin_layer_borders(grid: SmoothGrid, voxel, towards, share, before, behind,
     to = some[seen]
     found.towards[to], found.overshoot[to] = (-side[:, None] * into)[seen], overshoot[seen]
     found.curvature[to] = (f32(0.5) * side * (other_curvature - curvature))[seen]
-    found.confidence[to], found.is_thin[to] = sure[seen], True
+    found.confidence[to], found.beside[to], found.is_thin[to] = sure[seen], beyond[seen], True
     return found
 
 
@@ -145,18 +146,21 @@ def borders_of_layers(grid: SmoothGrid, voxel, towards, isolated: Borders, befor
     return found
 
 
-def _away_from_ends(dims, voxel, normal) -> tuple[np.ndarray, np.ndarray]:
-    """(displacement (n, 3) along planes to where the ends are far, distance (n,) then) in voxels."""
-    last, at = f32(dims) - f32(1.5), voxel.copy()
-    sine2 = np.maximum(f32(1) - normal * normal, f32(1e-6))
+def _away_from_ends(dims, voxel, planes: Borders) -> tuple[np.ndarray, np.ndarray]:
+    """(displacement (n, 3) along planes to where the ends do not bend them, distance (n,) to those then) in voxels."""
+    normal, first, last, at = planes.towards, f32(0.5), f32(dims) - f32(1.5), voxel.copy()
+    sine = np.sqrt(np.maximum(f32(1) - normal * normal, f32(1e-6)))
+    margin = _END_REACH * sine + np.minimum(planes.beside[:, None] * np.abs(normal), f32(24) * sine)
     for _ in range(2):
         for axis in range(3):
-            margin, middle = _END_REACH * np.sqrt(sine2[:, axis]), f32(0.5) * (f32(0.5) + last[axis])
-            low, high = np.minimum(f32(0.5) + margin, middle), np.maximum(last[axis] - margin, middle)
-            along = (np.clip(at[:, axis], low, high) - at[:, axis]) / sine2[:, axis]
+            middle = f32(0.5) * (first + last[axis])
+            low = np.minimum(first + margin[:, axis], middle)
+            high = np.maximum(last[axis] - margin[:, axis], middle)
+            along = (np.clip(at[:, axis], low, high) - at[:, axis]) / (sine[:, axis] * sine[:, axis])
             at = at - (along * normal[:, axis])[:, None] * normal
             at[:, axis] += along
-    room = (np.minimum(at - f32(0.5), last - at) / np.sqrt(sine2)).min(axis=-1)
+    nearer = np.minimum(at - first, last - at)
+    room = np.minimum(_END_REACH, (_END_REACH + (nearer - margin) / sine).min(axis=-1))
     return at - voxel, room
 
 
@@ -180,7 +184,7 @@ class FlatBorders:
         )
         better = layer.confidence > found.confidence[less]
         found.put(less[better], layer.at(better))
-        return found.scaled(2.0)
+        return found.doubled()
 
     def _inside(self, plane: Borders, on, before, behind) -> np.ndarray:
         """Moves planes along themselves to where the ends do not bend them. Returns places on them there."""
@@ -188,9 +192,9 @@ class FlatBorders:
         step, active = np.ones(len(on), np.float32), np.ones(len(on), bool)
         for n in range(4):
             some = np.flatnonzero(active)
-            towards = plane.towards[some]
-            at[some] += step[some, None] * _away_from_ends(self.dims, at[some], towards)[0]
-            found = self.widest(at[some], towards, before[some], behind[some], 1.0 if n == 3 else 6.0)
+            now = plane.at(some)
+            at[some] += step[some, None] * _away_from_ends(self.dims, at[some], now)[0]
+            found = self.widest(at[some], now.towards, before[some], behind[some], 1.0 if n == 3 else 6.0)
             known = found.confidence > 0
             lost = some[~known]
             if n > 0:
@@ -201,7 +205,7 @@ class FlatBorders:
             step[some] = 1
             at[some] += found.overshoot[:, None] * found.towards
             plane.put(some, found)
-            rest, room[some] = _away_from_ends(self.dims, at[some], found.towards)
+            rest, room[some] = _away_from_ends(self.dims, at[some], found)
             if n > 0:
                 active[some[(np.abs(found.overshoot) < 0.5) & (dot(rest, rest) < 1)]] = False
         plane.confidence *= ramp(16.0, 22.0, room)
@@ -246,16 +250,16 @@ class FlatBorders:
         """
         size = length(borders.towards)
         normal = borders.towards / np.maximum(size, f32(1e-6))[:, None]
-        shift, _ = _away_from_ends(self.dims, voxel, normal)
+        planes = borders.at(slice(None))
+        planes.towards = normal
+        shift, _ = _away_from_ends(self.dims, voxel, planes)
         near_end = dot(shift, shift) > f32(0.25)
         alignment = ramp(0.9961947, 0.9975641, np.abs(normal).max(axis=-1))
         some = np.flatnonzero((size >= 1e-6) & (near_end | (alignment * borders.confidence > 0)))
         if len(some) == 0:
             return
         voxel, before, behind, normal, alignment = (part[some] for part in (voxel, before, behind, normal, alignment))
-        now = borders.at(some)
-        plane = borders.at(some)
-        plane.towards = normal
+        now, plane = planes.at(some), planes.at(some)
         on = voxel + now.overshoot[:, None] * normal
         ends = np.flatnonzero(near_end[some])
         moved = plane.at(ends)

@@ -86,20 +86,21 @@ class Labels:
         fine.refine(near.at(some))
         near.put(some, fine)
         towards = near.towards / np.maximum(length(near.towards), f32(1e-6))[:, None]
-        layer = borders_of_layers(self.widest, halved[less], towards, widest, *sides).scaled(2.0)
-        # A layer among others, as in a fold, is not where the nearest voxels are. Those of a thin one know it less well.
+        layer = borders_of_layers(self.widest, halved[less], towards, widest, *sides).doubled()
+        # A layer among others, as in a fold, is not where the nearest voxels are. Those of a thin one know it less
+        # well.
         off, turned = np.abs(layer.overshoot - near.overshoot), dot(layer.towards, towards)
         layer.confidence *= np.where(
             layer.is_thin,
             (f32(1) - ramp(0.7, 1.0, off)) * ramp(0.9, 0.94, turned),
             (f32(1) - ramp(0.4, 0.7, off)) * ramp(0.96, 0.98, turned),
         )
-        widest.scaled(2.0)
+        widest.doubled()
         better = layer.confidence > widest.confidence
         widest.put(better, layer.at(better))
         near.refine(widest)
-        near.confidence = widest.confidence
-        found.scaled(2.0).put(less, near)
+        near.confidence, near.beside = widest.confidence, widest.beside
+        found.doubled().put(less, near)
         self.flat.straighten(voxel, found, before, behind)
         return found.towards, found.overshoot, found.curvature
 

@@ -35,13 +35,15 @@ class Borders:
     steepness: np.ndarray
     #: sigma^2 laplacian(D) / |grad D|
     bend: np.ndarray
+    #: Voxels along the normal, to either side, in which the border of a layer was looked for
+    beside: np.ndarray
     #: Whether it is that of a thin layer
     is_thin: np.ndarray
 
     @classmethod
     def none(cls, count: int) -> Borders:
         """Without any border."""
-        zeros = np.zeros((6, count), np.float32)
+        zeros = np.zeros((7, count), np.float32)
         share = np.full(count, np.nan, np.float32)
         return cls(np.zeros((count, 3), np.float32), *zeros[:3], share, *zeros[3:], np.zeros(count, bool))
 
@@ -54,9 +56,10 @@ class Borders:
         for field in fields(self):
             getattr(self, field.name)[index] = getattr(others, field.name)
 
-    def scaled(self, voxels: float) -> Borders:
-        """The same in smaller voxels, of which one is `voxels`."""
-        self.overshoot, self.curvature = f32(voxels) * self.overshoot, self.curvature / f32(voxels)
+    def doubled(self) -> Borders:
+        """The same, found at half the resolution, in voxels of the volume."""
+        self.overshoot, self.curvature = f32(2) * self.overshoot, f32(0.5) * self.curvature
+        self.beside = f32(2) * self.beside
         return self
 
     def refine(self, wider: Borders) -> None:
