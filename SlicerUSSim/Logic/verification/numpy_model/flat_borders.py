@@ -1,0 +1,281 @@
+"""Vectorised look-up of flat borders: layers, and planes near ends and along voxels (kernels/flat_borders.clh)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from SlicerUSSim.Logic.verification.numpy_model.elementary import dot, exp, f32, length, log, ramp, unit
+from SlicerUSSim.Logic.verification.numpy_model.smoothed_borders import OF_BOTH, TWO_GROUPS, Borders, SmoothGrid
+
+_DENSITY = f32(0.39894228)  # of the normal distribution at its centre
+_TAIL = (1.330274429, -1.821255978, 1.781477937, -0.356563782, 0.31938153)  # Abramowitz and Stegun, 26.2.17
+_VIEW, _THIN_SHARE = f32(3.5), 0.35  # voxels from a thin layer to where it is looked at; its share at its walls
+_END_REACH = f32(28)  # voxels to the ends of the volume, along a plane
+_SAMPLES_APART = f32(20)  # voxels
+_WEIGHTS = f32([0.35, 0.7, 1.0, 0.7, 0.35])  # of samples along an axis
+
+
+def _normal_distribution(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(cumulative, density) of the normal distribution."""
+    density, t = _DENSITY * exp(f32(-0.5) * x * x), f32(1) / (f32(1) + f32(0.2316419) * np.abs(x))
+    tail = f32(0)
+    for factor in _TAIL:
+        tail = t * (f32(factor) + tail)
+    return np.where(x < 0, density * tail, f32(1) - density * tail), density
+
+
+def _flat_layer(share, gradient, laplacian) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(depth, thickness, curvature) of a flat layer in sigmas, from its share of the Gaussian and its derivatives."""
+    gradient = np.minimum(gradient, f32(0.3985))
+    depth = np.zeros_like(share)
+    thickness = np.sqrt(f32(-2) * log(np.clip(f32(1) - gradient / _DENSITY, f32(1e-4), f32(0.98))))
+    (whole, near), (part, far) = _normal_distribution(depth), _normal_distribution(depth - thickness)
+    for _ in range(4):
+        off_share, off_gradient = whole - part - share, near - far - gradient
+        a, b, c, d = near - far, far, (depth - thickness) * far - depth * near, (thickness - depth) * far
+        determinant = a * d - b * c
+        determinant = np.where(np.abs(determinant) < 1e-5, f32(1e-5), determinant)
+        steps = (d * off_share - b * off_gradient) / determinant, (a * off_gradient - c * off_share) / determinant
+        depth = depth - np.clip(steps[0], f32(-0.5), f32(0.5))
+        thickness = np.maximum(thickness - np.clip(steps[1], f32(-0.7), f32(0.7)), f32(0.2))
+        (whole, near), (part, far) = _normal_distribution(depth), _normal_distribution(depth - thickness)
+    flat = (depth - thickness) * far - depth * near
+    curvature = f32(0.5) * (laplacian - flat) / np.maximum(near - far, f32(1e-3))
+    return depth - curvature, thickness, curvature
+
+
+def _layer_borders(isolated: Borders, farthest: float) -> Borders:
+    """Borders in front of or behind a flat layer, from those found as if there was none."""
+    found = isolated.at(slice(None))
+    found.confidence[:] = 0
+    some = np.flatnonzero(isolated.sigma > 0)
+    of = isolated.at(some)
+    gradient = f32(0.5) * of.sigma * of.steepness
+    laplacian = -of.bend * gradient / of.sigma
+    layers = [
+        _flat_layer(*values) for values in ((of.share, gradient, laplacian), (f32(1) - of.share, gradient, -laplacian))
+    ]
+    is_behind = np.abs(layers[0][2]) < np.abs(layers[1][2])
+    depth, thickness, bend = (np.where(is_behind, a, b) for a, b in zip(*layers, strict=True))
+    side = np.where(is_behind, f32(1), f32(-1))
+    of.overshoot, of.curvature = side * depth * of.sigma, -side * bend / of.sigma
+    of.beside = thickness * of.sigma
+    of.confidence = ramp(0.35, 0.55, thickness) * (f32(1) - ramp(0.06, 0.12, np.abs(bend)))
+    of.confidence *= np.abs(of.overshoot) <= f32(farthest)
+    found.put(some, of)
+    return found
+
+
+def _layer_ahead(share, gradient) -> tuple[np.ndarray, np.ndarray]:
+    """(its middle ahead, thickness) in sigmas of a flat layer, from its share of the Gaussian and its gradient."""
+    from_middle = -gradient / share
+    thickness = np.maximum(share / _normal_distribution(from_middle)[1], f32(0.05))
+    for _ in range(3):
+        near, far = from_middle + f32(0.5) * thickness, from_middle - f32(0.5) * thickness
+        (whole, p), (part, q) = _normal_distribution(near), _normal_distribution(far)
+        off_share, off_gradient = whole - part - share, p - q - gradient
+        a, b, c, d = p - q, f32(0.5) * (p + q), far * q - near * p, f32(-0.5) * (near * p + far * q)
+        determinant = a * d - b * c
+        determinant = np.where(np.abs(determinant) < 1e-6, f32(1e-6), determinant)
+        steps = (d * off_share - b * off_gradient) / determinant, (a * off_gradient - c * off_share) / determinant
+        from_middle = from_middle - np.clip(steps[0], f32(-0.4), f32(0.4))
+        thickness = np.maximum(thickness - np.clip(steps[1], f32(-0.4), f32(0.4)), f32(0.02))
+    return -from_middle, thickness
+
+
+def _view(grid: SmoothGrid, voxel, before, behind, side):
+    """What is seen of a layer: (whether anything, direction ahead, voxels to its middle, thickness, curvature)."""
+    found = grid.differences(voxel, before, behind, OF_BOTH)
+    seen = ((voxel >= 0) & (voxel <= f32(grid.dims - 1))).all(axis=-1)
+    seen &= (np.abs(found.difference) <= f32(0.99)) & (found.both >= f32(TWO_GROUPS))
+    sigma, share = np.sqrt(found.variance), f32(0.5) - f32(0.5) * side * found.difference
+    share = np.maximum(share, f32(0.004))
+    gradient = f32(0.5) * sigma * found.steepness / found.seen
+    laplacian = f32(-0.5) * side * found.variance * found.bends
+    middle, thickness = _layer_ahead(share, gradient)
+    near, far = f32(0.5) * thickness - middle, f32(-0.5) * thickness - middle
+    flat = far * _normal_distribution(far)[1] - near * _normal_distribution(near)[1]
+    curvature = f32(0.5) * (laplacian - flat) / np.maximum(gradient, f32(1e-3))
+    ahead = -side[:, None] * found.towards
+    return seen, ahead, (middle + curvature) * sigma, thickness * sigma, curvature / sigma
+
+
+def _thin_layer_borders(grid: SmoothGrid, voxel, towards, share, before, behind, farthest) -> Borders:
+    """Borders of thin layers, seen from before and from behind."""
+    found = Borders.none(len(voxel))
+    some = np.flatnonzero(np.abs(share - f32(0.5)) >= f32(0.5 - _THIN_SHARE))
+    voxel, towards, share, before, behind = (part[some] for part in (voxel, towards, share, before, behind))
+    side = np.where(share < 0.5, f32(1), f32(-1))
+    sigma, ahead = np.sqrt(grid.variance), -side[:, None] * towards
+    seen, front, middle, thickness, curvature = _view(grid, voxel - _VIEW * ahead, before, behind, side)
+    beyond = thickness + _VIEW
+    sees, back, other_middle, other_thickness, other_curvature = _view(
+        grid, voxel + np.minimum(beyond, f32(100))[:, None] * ahead, before, behind, side
+    )
+    agreement = -dot(front, back)
+    seen &= sees & (thickness <= f32(1.2) * sigma) & (dot(front, ahead) >= f32(0.85)) & (agreement >= f32(0.98))
+    from_front = (middle - f32(0.5) * thickness)[:, None] * front - _VIEW * ahead
+    from_back = (other_middle + f32(0.5) * other_thickness)[:, None] * back + beyond[:, None] * ahead
+    into = unit(front - back)
+    depth, other_depth = -dot(from_front, into), -dot(from_back, into)
+    overshoot = f32(0.5) * side * (depth + other_depth)
+    bent = sigma * np.maximum(np.abs(curvature), np.abs(other_curvature))
+    sure = (f32(1) - ramp(0.12, 0.25, np.abs(depth - other_depth))) * ramp(0.98, 0.99, agreement)
+    sure *= f32(1) - ramp(0.08, 0.15, np.abs(thickness - other_thickness))
+    sure *= (f32(1) - ramp(0.12, 0.2, bent)) * ramp(f32(0.12) * sigma, f32(0.17) * sigma, thickness)
+    sure *= (f32(1) - ramp(sigma, f32(1.2) * sigma, thickness)) * (np.abs(overshoot) <= f32(farthest))
+    to = some[seen]
+    found.towards[to], found.overshoot[to] = (-side[:, None] * into)[seen], overshoot[seen]
+    found.curvature[to] = (f32(0.5) * side * (other_curvature - curvature))[seen]
+    found.confidence[to], found.beside[to], found.is_thin[to] = sure[seen], beyond[seen], True
+    return found
+
+
+def borders_of_layers(grid: SmoothGrid, voxel, towards, isolated: Borders, before, behind, farthest=0.5) -> Borders:
+    """Borders of layers, from those found as if there was none; `towards` is about normal to them."""
+    found = Borders.none(len(voxel))
+    some = np.flatnonzero(~np.isnan(isolated.share))
+    with np.errstate(all="ignore"):  # a flat field has no layer
+        best = _thin_layer_borders(
+            grid, voxel[some], towards[some], isolated.share[some], before[some], behind[some], farthest
+        )
+        layer = _layer_borders(isolated.at(some), farthest)
+    better = (best.confidence < 1) & (layer.confidence > best.confidence)
+    best.put(better, layer.at(better))
+    found.put(some, best)
+    return found
+
+
+def _away_from_ends(dims, voxel, planes: Borders) -> tuple[np.ndarray, np.ndarray]:
+    """(displacement (n, 3) along planes to where the ends do not bend them, distance (n,) to those then) in voxels."""
+    normal, first, last, at = planes.towards, f32(0.5), f32(dims) - f32(1.5), voxel.copy()
+    sine = np.sqrt(np.maximum(f32(1) - normal * normal, f32(1e-6)))
+    margin = _END_REACH * sine + np.minimum(planes.beside[:, None] * np.abs(normal), f32(24) * sine)
+    for _ in range(2):
+        for axis in range(3):
+            middle = f32(0.5) * (first + last[axis])
+            low = np.minimum(first + margin[:, axis], middle)
+            high = np.maximum(last[axis] - margin[:, axis], middle)
+            along = (np.clip(at[:, axis], low, high) - at[:, axis]) / (sine[:, axis] * sine[:, axis])
+            at = at - (along * normal[:, axis])[:, None] * normal
+            at[:, axis] += along
+    nearer = np.minimum(at - first, last - at)
+    room = np.minimum(_END_REACH, (_END_REACH + (nearer - margin) / sine).min(axis=-1))
+    return at - voxel, room
+
+
+def _beyond_plane(voxel, on, towards) -> np.ndarray:
+    return dot(on - voxel, towards)
+
+
+class FlatBorders:
+    """What the indicators at half the resolution know of a volume of `dims` voxels."""
+
+    def __init__(self, halved: SmoothGrid, dims: np.ndarray) -> None:
+        self.halved, self.dims = halved, dims
+
+    def widest(self, voxel, towards, before, behind, farthest: float) -> Borders:
+        """Isolated borders, or those of layers, in voxels of the volume."""
+        at, limit = f32(0.5) * voxel - f32(0.25), 0.5 * farthest
+        found = self.halved.border(at, before, behind, limit)
+        less = np.flatnonzero(found.confidence < 1)
+        layer = borders_of_layers(
+            self.halved, at[less], towards[less], found.at(less), before[less], behind[less], limit
+        )
+        better = layer.confidence > found.confidence[less]
+        found.put(less[better], layer.at(better))
+        return found.doubled()
+
+    def _inside(self, plane: Borders, on, before, behind) -> np.ndarray:
+        """Moves planes along themselves to where the ends do not bend them. Returns places on them there."""
+        start, at, room = on, on.copy(), np.zeros(len(on), np.float32)
+        step, active = np.ones(len(on), np.float32), np.ones(len(on), bool)
+        for n in range(4):
+            some = np.flatnonzero(active)
+            now = plane.at(some)
+            at[some] += step[some, None] * _away_from_ends(self.dims, at[some], now)[0]
+            found = self.widest(at[some], now.towards, before[some], behind[some], 1.0 if n == 3 else 6.0)
+            known = found.confidence > 0
+            lost = some[~known]
+            if n > 0:
+                plane.confidence[lost], active[lost] = 0, False
+            else:
+                step[lost], at[lost] = 0.5, start[lost]
+            some, found = some[known], found.at(known)
+            step[some] = 1
+            at[some] += found.overshoot[:, None] * found.towards
+            plane.put(some, found)
+            rest, room[some] = _away_from_ends(self.dims, at[some], found)
+            if n > 0:
+                active[some[(np.abs(found.overshoot) < 0.5) & (dot(rest, rest) < 1)]] = False
+        plane.confidence *= ramp(16.0, 22.0, room)
+        return at
+
+    def _whole(self, voxel, plane: Borders, on, before, behind) -> tuple[Borders, np.ndarray]:
+        """Planes nearly along the voxels from samples over their steps, and places on them."""
+        count, rows = len(voxel), np.arange(len(voxel))
+        found, normal = plane.at(slice(None)), plane.towards
+        size = np.abs(normal)
+        upright = np.where(size[:, 0] > 0.9, 0, np.where(size[:, 1] > 0.9, 1, 2))
+        half_way = f32(0.5) * f32(self.dims) - f32(0.5)
+        low = np.minimum(f32(0.5) + _END_REACH, half_way)
+        high = np.maximum(f32(self.dims) - f32(1.5) - _END_REACH, half_way)
+        margin = np.minimum(f32(16), f32(0.5) * (high - low))
+        middle = np.clip(voxel, low + margin, high - margin)
+        apart = np.minimum(_SAMPLES_APART, f32(0.5) * np.minimum(middle - low, high - middle))
+        places, normals = np.zeros((2, len(_WEIGHTS) ** 2, count, 3), np.float32)
+        sure = np.ones(count, bool)
+        for sample in range(len(places)):
+            at, rise = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
+            for side, steps in enumerate((sample % 5 - 2, sample // 5 - 2)):
+                axis = (upright + 1 + side) % 3
+                at[rows, axis] = middle[rows, axis] + apart[rows, axis] * f32(steps)
+                rise += normal[rows, axis] * (at[rows, axis] - on[rows, axis])
+            at[rows, upright] = on[rows, upright] - rise / normal[rows, upright]
+            border = self.widest(at, normal, before, behind, 4.0)
+            sure &= border.confidence >= 0.5
+            normals[sample], places[sample] = border.towards, at + border.overshoot[:, None] * border.towards
+        weights = np.outer(_WEIGHTS, _WEIGHTS).ravel()[:, None, None]
+        found.towards = unit((weights * normals).sum(axis=0))
+        on = (weights * places).sum(axis=0) / weights.sum()
+        farthest = np.abs(_beyond_plane(places, on, found.towards)).max(axis=0)
+        found.curvature = np.zeros(count, np.float32)
+        found.confidence = np.where(sure, f32(1) - ramp(0.7, 1.0, farthest), f32(0))
+        return found, on
+
+    def straighten(self, voxel, borders: Borders, before, behind) -> None:
+        """Planes near an end as they are farther inside, and those nearly along the voxels as they are on the whole.
+
+        The confidence of borders near (n, 3) positions is that of being as flat as the widest Gaussian.
+        """
+        size = length(borders.towards)
+        normal = borders.towards / np.maximum(size, f32(1e-6))[:, None]
+        planes = borders.at(slice(None))
+        planes.towards = normal
+        shift, _ = _away_from_ends(self.dims, voxel, planes)
+        near_end = dot(shift, shift) > f32(0.25)
+        alignment = ramp(0.9961947, 0.9975641, np.abs(normal).max(axis=-1))
+        some = np.flatnonzero((size >= 1e-6) & (near_end | (alignment * borders.confidence > 0)))
+        if len(some) == 0:
+            return
+        voxel, before, behind, normal, alignment = (part[some] for part in (voxel, before, behind, normal, alignment))
+        now, plane = planes.at(some), planes.at(some)
+        on = voxel + now.overshoot[:, None] * normal
+        ends = np.flatnonzero(near_end[some])
+        moved = plane.at(ends)
+        on[ends] = self._inside(moved, on[ends], before[ends], behind[ends])
+        plane.put(ends, moved)
+        plane.confidence *= f32(1) - ramp(0.003, 0.006, np.abs(plane.curvature))
+        plane.overshoot = _beyond_plane(voxel, on, plane.towards)
+        along = np.flatnonzero((alignment > 0) & (plane.confidence > 0))
+        whole, middle = self._whole(voxel[along], plane.at(along), on[along], before[along], behind[along])
+        part = alignment[along] * whole.confidence
+        beyond = _beyond_plane(voxel[along], middle, whole.towards)
+        plane.overshoot[along] += part * (beyond - plane.overshoot[along])
+        plane.towards[along] += part[:, None] * (whole.towards - plane.towards[along])
+        plane.curvature[along] *= f32(1) - part
+        plane.confidence *= f32(1) - ramp(0.5, 1.0, np.abs(plane.overshoot - now.overshoot))
+        plane.confidence *= ramp(0.5, 0.7, dot(plane.towards, normal))
+        now.confidence[:] = 1
+        now.refine(plane)
+        borders.put(some, now)
