@@ -940,7 +940,7 @@ def test_dark_gyri_in_wide_csf_stay_in_the_mask(monkeypatch):
 # ---- DICOM -----------------------------------------------------------------------------------------------------------
 
 
-def write_series(folder, count, uid, number, description, skip=(), tilt=0.0):
+def write_series(folder, count, uid, number, description, skip=(), tilt=0.0, patient="1"):
     import SimpleITK as sitk
 
     folder.mkdir(exist_ok=True)
@@ -957,7 +957,7 @@ def write_series(folder, count, uid, number, description, skip=(), tilt=0.0):
             "0008|0060": "MR", "0020|000d": "1.2.3", "0020|000e": uid, "0008|0018": f"{uid}.{k + 1}",
             "0008|0016": "1.2.840.10008.5.1.4.1.1.4", "0020|0011": number, "0020|0013": str(k + 1),
             "0008|103e": description, "0020|0037": "1\\0\\0\\0\\1\\0", "0020|0032": f"0\\{tilt * k}\\{2.0 * k}",
-            "0018|0050": "2",
+            "0018|0050": "2", "0010|0020": patient if k else "1",
         }  # fmt: skip
         for key, value in tags.items():
             image.SetMetaData(key, value)
@@ -991,6 +991,12 @@ def test_a_missing_slice_and_a_tilted_stack_are_refused(tmp_path):
     write_series(tmp_path / "tilt", 14, "1.2.3.5", "5", "t1", tilt=0.5)
     with pytest.raises(SimulationError, match=r"tilted by 14\.0 degrees"):
         Volume.read(tmp_path / "tilt")
+
+
+def test_images_of_two_patients_with_one_series_number_are_refused(tmp_path):
+    write_series(tmp_path / "mixed", 14, "1.2.3.5", "5", "t1", patient="2")
+    with pytest.raises(SimulationError, match="its images are of 2 patients by their PatientID"):
+        Volume.read(tmp_path / "mixed")
 
 
 # ---- real heads ------------------------------------------------------------------------------------------------------
