@@ -27,6 +27,7 @@ from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain, left
 from SlicerUSSim.Logic.mri.coarse import CoarseImage
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
+from SlicerUSSim.Logic.mri.no_data import no_data, without_blank
 from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_symmetric, is_ultrasound
 from SlicerUSSim.Logic.mri.recognition import recognise
 from SlicerUSSim.Logic.mri.samples import head_mri
@@ -175,6 +176,58 @@ def test_a_phantom_of_shells_is_refused_and_not_called_a_head_of_a_wrong_size(ra
 
 
 @needs_nilearn
+def test_a_phantom_as_large_as_a_brain_on_a_background_of_0_is_refused_as_one():
+    """Its background has one value, as that of a skull-stripped brain."""
+    empty, radius = ellipsoid((60, 80, 65))
+    points = np.argwhere(radius < 10.0) * 3.0
+    array = np.where(radius < 1, 100.0 + np.random.default_rng(0).normal(0, 3, radius.shape), 0.0)
+    for at in ((40, 60, 50), (100, 120, 80), (70, 100, 70), (60, 130, 90)):
+        ball = (np.linalg.norm(points - at, axis=1) < 14.0).reshape(radius.shape)
+        array[ball & (radius < 1)] += 60.0
+    with pytest.raises(SimulationError, match="with uniform parts, as a phantom has and no brain"):
+        find_brain(empty.with_array(array.astype(np.float32)))
+
+
+@needs_nilearn
+@pytest.mark.parametrize("size", [0.7, 0.76])
+def test_a_small_head_is_no_skull_stripped_brain(head, size):
+    """The atlas was spread over the whole of it, and its scalp became grey and white matter."""
+    mri, _ = head
+    matrix = mri.ijk_to_ras.copy()
+    matrix[:3, :3] *= size
+    try:
+        shown = recognise(Volume(mri.array, matrix))
+    except SimulationError as error:
+        assert "wrong size" in str(error) or "neither a head" in str(error)
+    else:
+        assert shown.stripped is None and shown.alignment.size == pytest.approx(0.93 * size, rel=0.06)
+
+
+@needs_nilearn
+@pytest.mark.parametrize("value", [0.0, -3.0])
+def test_voxels_without_data_are_no_brain_and_that_is_said(head, found, value):
+    mri, _ = head
+    inside = found.result.mask.array > 0
+    array = mri.array.copy()
+    array[: np.argwhere(inside)[:, 0].min() + 12] = value  # as in an image padded below
+    brain, lines = without_blank(mri.with_array(array), inside)
+    assert not brain[array == value].any() and (brain == inside)[array != value].all()
+    lost = (inside & (array == value)).sum() * mri.voxel_ml
+    assert len(lines) == 1 and f"{lost:.0f} ml where the brain should be have no data" in lines[0]
+    assert lines[0].endswith("cut off at its bottom")
+    assert without_blank(mri, inside) == (inside, ())
+
+
+def test_a_blank_within_the_image_has_data():
+    """Dark CSF and bone may have the background's value, but do not reach the edge without a gap."""
+    empty, radius = ellipsoid((70, 90, 70), spacing=2.0)
+    array = np.where(radius < 1, 100.0, 0.0)
+    array[radius < 0.3] = 0.0
+    array[:, :, radius.shape[2] // 2][radius[:, :, radius.shape[2] // 2] < 1] = 0.0  # a slit to the edge
+    blank = no_data(empty.with_array(array))
+    assert blank[radius > 1.1].all() and not blank[radius < 0.9].any()
+
+
 def test_an_image_of_noise_is_refused_as_one():
     noise = np.random.default_rng(0).normal(100.0, 20.0, (50, 50, 50)).astype(np.float32)
     with pytest.raises(SimulationError, match="is noise, in which neighbours have nothing in common"):
@@ -887,7 +940,7 @@ def test_dark_gyri_in_wide_csf_stay_in_the_mask(monkeypatch):
 # ---- DICOM -----------------------------------------------------------------------------------------------------------
 
 
-def write_series(folder, count, uid, number, description, skip=(), tilt=0.0):
+def write_series(folder, count, uid, number, description, skip=(), tilt=0.0, patient="1"):
     import SimpleITK as sitk
 
     folder.mkdir(exist_ok=True)
@@ -904,7 +957,7 @@ def write_series(folder, count, uid, number, description, skip=(), tilt=0.0):
             "0008|0060": "MR", "0020|000d": "1.2.3", "0020|000e": uid, "0008|0018": f"{uid}.{k + 1}",
             "0008|0016": "1.2.840.10008.5.1.4.1.1.4", "0020|0011": number, "0020|0013": str(k + 1),
             "0008|103e": description, "0020|0037": "1\\0\\0\\0\\1\\0", "0020|0032": f"0\\{tilt * k}\\{2.0 * k}",
-            "0018|0050": "2",
+            "0018|0050": "2", "0010|0020": patient if k else "1",
         }  # fmt: skip
         for key, value in tags.items():
             image.SetMetaData(key, value)
@@ -938,6 +991,12 @@ def test_a_missing_slice_and_a_tilted_stack_are_refused(tmp_path):
     write_series(tmp_path / "tilt", 14, "1.2.3.5", "5", "t1", tilt=0.5)
     with pytest.raises(SimulationError, match=r"tilted by 14\.0 degrees"):
         Volume.read(tmp_path / "tilt")
+
+
+def test_images_of_two_patients_with_one_series_number_are_refused(tmp_path):
+    write_series(tmp_path / "mixed", 14, "1.2.3.5", "5", "t1", patient="2")
+    with pytest.raises(SimulationError, match="its images are of 2 patients by their PatientID"):
+        Volume.read(tmp_path / "mixed")
 
 
 # ---- real heads ------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -395,6 +396,16 @@ def test_thick_slices_of_a_turned_head_are_registered(mni, axis):
     angle = float(line.split("turned by ")[1].split()[0])
     assert angle == pytest.approx(10.0, abs=0.6) and not warnings
     assert np.corrcoef(moved.array[inside], t1.array[inside])[0, 1] < -0.75
+
+
+def test_a_second_volume_without_data_in_part_of_the_brain_is_said(mni):
+    t1 = mni[0]
+    inside = t1.array > 20
+    t2 = np.where(inside, 160.0 - t1.array, np.random.default_rng(3).uniform(1.0, 4.0, inside.shape))
+    below = np.argwhere(inside)[:, 0]
+    t2[: int(np.percentile(below, 10))] = 0.0
+    _, _, warnings = aligned(t1.with_array(t2.astype(np.float32)), t1, inside, "t2")
+    assert len(warnings) == 1 and re.match(r"t2: has no data in (9|1\d)% of the brain", warnings[0])
 
 
 def test_less_sure_posteriors_shrink_log_odds_and_change_no_label():

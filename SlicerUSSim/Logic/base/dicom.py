@@ -142,10 +142,15 @@ def _read(series: Series, name: str):
 
 
 def _check_slices(series: Series, name: str) -> None:
-    """Raise SimulationError for missing or repeated slices and a tilted stack, of which ITK makes a wrong volume."""
+    """Raise SimulationError for slices of several patients, missing or repeated ones, and a tilted stack.
+
+    ITK would make a wrong volume of them.
+    """
     if len(series.files) < 3:
         return
     headers = [_header(file) for file in series.files]
+    patients = len({_value(header, "0010|0020") for header in headers})
+    require(patients == 1, f"{name}: its images are of {patients} patients by their PatientID, expected one patient")
     places = [_numbers(header, "0020|0032", 3) for header in headers]
     axes = _numbers(headers[0], "0020|0037", 6)
     if axes is None or any(place is None for place in places):

@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.mri.extractors import Program, Report
 from SlicerUSSim.Logic.mri.given_mask import checked_mask, label_doubts, mask_doubts, volume_warnings
 from SlicerUSSim.Logic.mri.kept_mask import keep, read_kept
 from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
+from SlicerUSSim.Logic.mri.no_data import without_blank
 from SlicerUSSim.Logic.mri.recognition import (
     POSSIBLE_ML,
     USUAL_ML,
@@ -107,10 +108,12 @@ def find_brain(
             message = f"skull-stripped brain, {millilitres:.0f} ml"
             return BrainMask(mask, "stripped", message, warnings, perf_counter() - start)
         found = _extracted(mri, shown, method, robex, lambda share: report(0.15 + 0.8 * share))
-    inside, millilitres = found.inside, _millilitres(found.inside, mri)
+    inside, blank = without_blank(mri, found.inside)
+    millilitres = _millilitres(inside, mri)
     warnings = (
         *shown.warnings,
         *found.warnings,
+        *blank,
         *volume_warnings(millilitres),
         *ends_at_edge(mri, inside),
         *cut_off(mri, inside),

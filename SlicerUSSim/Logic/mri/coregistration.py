@@ -10,6 +10,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.block_matching import share_in_place
+from SlicerUSSim.Logic.mri.no_data import no_data
 
 #: Millimetres of the registration's grid
 _COARSE_MM = 3.0
@@ -20,6 +21,8 @@ _NODS, _TURNS, _MOST_SEARCHES = (-24.0, -12.0, 0.0, 12.0, 24.0), (-10.0, 0.0, 10
 _LEAST_COVER = 0.9
 #: Largest share of the brain in which it may be 0: its own mask may be tighter, CSF may be clipped
 _MOST_ZERO = 0.25
+#: Share of the brain without data from which it is said
+_WORTH_BLANK = 0.02
 #: Share of the brain's parts that lie in the same places, below which there are two patients, and below which a user
 #: should look. T1 and T2 of a patient with a glioma had 0.85, phantoms with noise of 7 % 0.95 to 0.98; seven pairs of
 #: different heads 0.03 to 0.41.
@@ -71,6 +74,7 @@ def aligned(other: Volume, reference: Volume, inside: np.ndarray, name: str) -> 
         f"{name}: is 0 in {nothing:.0%} of the brain, as the map of one tissue is, expected intensities in all of it",
     )
     moved = reference.with_array(array.astype(np.float32))
+    blank = float((inside & no_data(moved)).sum() / inside.sum())
     share = share_in_place(reference, moved, inside)
     if share is None:
         raise SimulationError(f"{name}: shows nothing where the brain of the first volume is, expected its tissues")
@@ -82,6 +86,8 @@ def aligned(other: Volume, reference: Volume, inside: np.ndarray, name: str) -> 
     )
     is_usual = share >= _USUAL_IN_PLACE
     warnings = () if is_usual else (f"{found} {_USUAL_IN_PLACE:.0%} or more of one patient: check that both are",)
+    if blank >= _WORTH_BLANK:
+        warnings += (f"{name}: has no data in {blank:.0%} of the brain: tissues are less sure there",)
     centre = fixed.TransformContinuousIndexToPhysicalPoint([0.5 * (n - 1) for n in fixed.GetSize()])
     shift = float(np.linalg.norm(np.subtract(best.TransformPoint(centre), centre)))
     axes = np.stack([np.subtract(best.TransformVector(axis, centre), 0.0) for axis in np.eye(3).tolist()], axis=1)

@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
+from SlicerUSSim.Logic.mri.no_data import edge_value
 
 #: A fan's two sides have 0.17 to 0.28 of the perimeter of its outline and open by 45 to 92 degrees. A third straight
 #: side as long as that, or one parallel to either, is of a box: an image resampled along other axes.
@@ -33,10 +34,9 @@ def is_ultrasound(mri: Volume) -> bool:
     The fan is looked for in the outlines along the three axes of the voxels.
     """
     values = mri.array
-    border = np.concatenate([values[[0, -1]].ravel(), values[:, [0, -1]].ravel(), values[:, :, [0, -1]].ravel()])
-    levels, counts = np.unique(border, return_counts=True)
-    shown = values != levels[counts.argmax()]
-    if counts.max() < 0.3 * border.size or shown.mean() > 0.9 or not shown.any():
+    background, share = edge_value(values)
+    shown = values != background
+    if share < 0.3 or shown.mean() > 0.9 or not shown.any():
         return False
     return any(_is_fan(shown.any(axis=axis)) for axis in range(3) if min(np.delete(shown.shape, axis)) > 30)
 

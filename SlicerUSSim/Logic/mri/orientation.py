@@ -13,9 +13,6 @@ from SlicerUSSim.Logic.mri.coarse import CoarseImage
 from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_noise, is_phantom
 
 _ENDS = ("RL", "AP", "SI")
-#: Agreement with the atlas, put at the centre of a stripped brain with its size. T1 that lie as their header says had
-#: 0.40 to 0.97, T2 0.24; others 0.14 to 0.23, and then 1.7 to 3.9 times as much in their true orientation.
-_SURELY_RIGHT = 0.3
 #: A patient in a scanner nods by up to 40 degrees.
 MOST_TURN_DEG = 48.0
 _TURN_IT = (
@@ -53,8 +50,8 @@ def lies_otherwise(
         f"the image ends in the middle of the object, at its {' and '.join(ends)}{upside_down}; {_WHOLE}, or correct "
         "the orientation in its header if it is whole"
     )
-    if is_cut:
-        return where if alignment.agreement < least else None
+    if is_cut and alignment.agreement < least:
+        return where
     sizes = _sizes()
     later = lambda share: report(0.7 + 0.3 * share)  # noqa: E731
     number, other = align_turned(image, [np.diag(factors) for factors in sizes], later)
@@ -64,19 +61,16 @@ def lies_otherwise(
     words = ", ".join(f"{axis} {factor:g} times" for factor, axis in axes if factor != 1)
     return (
         f"the head has a wrong size ({words} an adult's), or a part of it is missing, or it does not lie as its header "
-        "says; use a series of the whole head, or correct the voxel size or the orientation in its header"
+        "says; use a series of the whole head, correct the voxel size or the orientation in its header, or give a "
+        "brain mask (--mask)"
     )
 
 
-def stripped_lies_otherwise(image: CoarseImage, inside: np.ndarray, least: float) -> str | None:
+def stripped_lies_otherwise(image: CoarseImage, inside: np.ndarray, upright: float, least: float) -> str | None:
     """One line if a skull-stripped brain, which is `inside`, fits the atlas in another orientation only; else None.
 
-    Its place and size are known from the mask, so that this takes 0.1 s for most that lie as their header says, and 2 s
-    for the others.
+    `upright` is its agreement as its header says (agreement_by_moments). It takes 2 s.
     """
-    upright = agreement_by_moments(image, inside, np.eye(3))
-    if upright >= _SURELY_RIGHT:
-        return None
     fits = [(agreement_by_moments(image, inside, turn), number) for number, turn in enumerate(_turns())]
     best, number = max(fits)
     if best < max(least, 1.4 * upright):
@@ -140,8 +134,8 @@ def _turns() -> list[np.ndarray]:
 
 
 def _sizes() -> list[tuple[float, float, float]]:
-    return [(0.5, 0.5, 0.5), (2.0, 2.0, 2.0), (1.0, 1.0, 2.0), (1.0, 1.0, 0.5), (1.0, 2.0, 1.0), (1.0, 0.5, 1.0),
-            (2.0, 1.0, 1.0), (0.5, 1.0, 1.0)]  # fmt: skip
+    return [(0.5, 0.5, 0.5), (0.7, 0.7, 0.7), (2.0, 2.0, 2.0), (1.0, 1.0, 2.0), (1.0, 1.0, 0.5), (1.0, 2.0, 1.0),
+            (1.0, 0.5, 1.0), (2.0, 1.0, 1.0), (0.5, 1.0, 1.0)]  # fmt: skip
 
 
 def _described(turn: np.ndarray) -> str:

@@ -11,10 +11,11 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.alignment import Alignment, align_coarse
+from SlicerUSSim.Logic.mri.alignment import Alignment, agreement_by_moments, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
-from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_symmetric, is_ultrasound
+from SlicerUSSim.Logic.mri.no_data import edge_value
+from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_symmetric, is_ultrasound
 from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, lies_otherwise, stripped_lies_otherwise, why_refused
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
@@ -25,6 +26,11 @@ LEAST_AGREEMENT = 0.16
 #: Up to this agreement it is asked whether the head fits better in another orientation: back to front, a T1 had 0.23,
 #: and 0.31 with twice its height.
 _DOUBTFUL_AGREEMENT = 0.4
+#: Where the agreement is doubtful, least overlap (Dice) of a brain on a background with noise with the template: brains
+#: had 0.94 to 0.96; whole heads of 0.7 to 0.78 times their size, over which the template was spread, 0.85 to 0.90
+_STRIPPED_OVERLAP = 0.915
+#: Agreement from which a skull-stripped brain surely lies as its header says: T1 that do had 0.40 to 0.97, T2 0.24
+_SURELY_RIGHT = 0.3
 #: Brains of adults differ by less than this in shape and size.
 _MOST_STRETCH, _SIZES = 1.25, (0.74, 1.15)
 #: Share of the template's brain that must show tissue, and below which a user should look
@@ -146,10 +152,8 @@ def stripped_brain(mri: Volume) -> np.ndarray | None:
     Raises SimulationError if the brain does not lie as its header says.
     """
     values = mri.array
-    border = np.concatenate([values[[0, -1]].ravel(), values[:, [0, -1]].ravel(), values[:, :, [0, -1]].ravel()])
-    levels, counts = np.unique(border, return_counts=True)
-    background = levels[counts.argmax()]
-    if counts.max() < 0.5 * border.size or (values == background).mean() < 0.15:
+    background, share = edge_value(values)
+    if share < 0.5 or (values == background).mean() < 0.15:
         return None
     inside = largest_component(values != background)
     if _is_cut(inside):
@@ -163,8 +167,17 @@ def stripped_brain(mri: Volume) -> np.ndarray | None:
     shape = coarse.array > 0.5
     if not (_is_brain_shaped(shape) and _has_tissues(intensity.array, shape)):
         return None
-    wrong = stripped_lies_otherwise(intensity, shape, LEAST_AGREEMENT) if mni152() is not None else None
-    require(wrong is None, wrong or "")
+    if mni152() is None:
+        return inside
+    upright = agreement_by_moments(intensity, shape, np.eye(3))
+    if upright < _SURELY_RIGHT:
+        require(
+            not is_phantom(intensity, looks_like_a_head=False),
+            f"image shows an object of {millilitres:.0f} ml with uniform parts, as a phantom has and no brain; use an "
+            "MRI of a head, or --skull-strip none to take everything brighter than the background",
+        )
+        wrong = stripped_lies_otherwise(intensity, shape, upright, LEAST_AGREEMENT)
+        require(wrong is None, wrong or "")
     return inside
 
 
@@ -254,7 +267,16 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
     around = (distance > 8.0) & (distance < 24.0)
     bright = float((np.pad(image.array, pad)[around] > 0.25 * np.median(np.pad(image.array, pad)[brain])).mean())
     if bright < 0.06:
-        return Shown(above_noise(mri), alignment, warnings)
+        inside = above_noise(mri)
+        covered = alignment.brain_on(mri) < 0.0
+        overlap = float(2.0 * (inside & covered).sum() / (inside.sum() + covered.sum()))
+        require(
+            alignment.agreement >= _DOUBTFUL_AGREEMENT or overlap >= _STRIPPED_OVERLAP,
+            "image shows neither a head, with a scalp around the brain, nor the outline of a brain alone (agreement "
+            f"with the atlas {alignment.agreement:.2f}, Dice of the outlines {overlap:.2f}): a small head, a wrong "
+            "voxel size in its header, or no head; correct the header, or give a brain mask (--mask)",
+        )
+        return Shown(inside, alignment, warnings)
     return Shown(None, alignment, warnings)
 
 

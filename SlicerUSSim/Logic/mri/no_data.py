@@ -1,0 +1,69 @@
+"""Where an image has no data: what is padded, cropped or blanked with one value, and reaches the edge of the image."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.coarse import largest_component
+
+#: Voxels of the blank are a ball of this radius at least: dark CSF or bone with the same value is not
+_THICK_MM = 5.0
+#: Volume of the brain without data from which it is said, millilitres
+_WORTH_ML = 2.0
+_ENDS = (("left", "right"), ("back", "front"), ("bottom", "top"))
+
+
+def no_data(mri: Volume) -> np.ndarray:
+    """(k, j, i) True where the image has one value without a gap from its edge on, in thick pieces.
+
+    It is the lowest value, or the most frequent one at the edges. Air has noise, unless it was set to one value; then
+    this is the air, too.
+    """
+    values = mri.array
+    blank = (values == values.min()) | (values == edge_value(values)[0])
+    # Opened on every other voxel, which is fast; what is thinner than the ball does not connect.
+    step = tuple(max(1, int(_THICK_MM / 2.5 / mm)) for mm in mri.spacing_mm[::-1])
+    coarse = np.pad(blank[tuple(slice(None, None, n) for n in step)], 1, constant_values=True)
+    spacing = (mri.spacing_mm[::-1] * step).tolist()
+    inner = cast(np.ndarray, ndimage.distance_transform_edt(coarse, spacing)) > _THICK_MM
+    inner |= _frame(coarse)
+    parts, _ = cast(tuple[np.ndarray, int], ndimage.label(inner))
+    reached = np.isin(parts, np.unique(parts[_frame(coarse)])) & inner
+    near = cast(np.ndarray, ndimage.distance_transform_edt(~reached, spacing)) <= _THICK_MM
+    near = (near & coarse)[1:-1, 1:-1, 1:-1]
+    wide = near.repeat(step[0], 0).repeat(step[1], 1).repeat(step[2], 2)
+    return wide[tuple(map(slice, blank.shape))] & blank
+
+
+def edge_value(values: np.ndarray) -> tuple[float, float]:
+    """(the most frequent value at the six edges of a (k, j, i) image, its share of them)."""
+    border = np.concatenate([values[[0, -1]].ravel(), values[:, [0, -1]].ravel(), values[:, :, [0, -1]].ravel()])
+    levels, counts = np.unique(border, return_counts=True)
+    return levels[counts.argmax()], float(counts.max() / border.size)
+
+
+def without_blank(mri: Volume, inside: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """((k, j, i) the brain without voxels that have no data, one line if it loses more than a little by that)."""
+    lost = inside & no_data(mri)
+    millilitres = float(lost.sum()) * mri.voxel_ml
+    if millilitres < _WORTH_ML:
+        return inside, ()
+    away = np.argwhere(lost).mean(axis=0)[::-1] - np.argwhere(inside).mean(axis=0)[::-1]
+    towards = mri.ijk_to_ras[:3, :3] @ away
+    axis = int(np.abs(towards).argmax())
+    name = _ENDS[axis][int(towards[axis] > 0)]
+    line = (
+        f"{millilitres:.0f} ml where the brain should be have no data (one value, as around it): they "
+        f"get no tissue, and the brain is cut off at its {name}"
+    )
+    return largest_component(inside & ~lost), (line,)
+
+
+def _frame(array: np.ndarray) -> np.ndarray:
+    frame = np.ones(array.shape, bool)
+    frame[1:-1, 1:-1, 1:-1] = False
+    return frame
