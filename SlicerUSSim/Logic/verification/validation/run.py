@@ -92,10 +92,11 @@ def all_checks() -> tuple[Check, ...]:
         heads,
         rays,
         speckle,
+        transmit,
         walls,
     )
 
-    groups = (rays, speckle, band, floor, artefacts, beams, walls, aberration, heads)
+    groups = (rays, speckle, band, floor, artefacts, beams, transmit, walls, aberration, heads)
     return tuple(check for group in groups for check in group.CHECKS)
 
 
