@@ -122,9 +122,7 @@ def _zones(probe: Probe) -> list[tuple[float, float]]:
         return [(_sent_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5)), probe.focus_mm)]
     count = probe.focal_zones
     foci = [probe.focus_mm * (n + n + 1) / count for n in range(count)]
-    return [
-        (_sent_sigma(probe, max(focus / probe.aperture_mm, probe.receive_f_number, 0.5)), focus) for focus in foci
-    ]
+    return [(_sent_sigma(probe, max(focus / probe.aperture_mm, probe.receive_f_number, 0.5)), focus) for focus in foci]
 
 
 def _compounded(probe: Probe) -> tuple[float, float]:
@@ -323,7 +321,9 @@ def _steering(probe: Probe) -> dict[str, float]:
     tilt = probe.steering_deg * np.pi / 180.0 if isinstance(probe, LinearProbe) else 0.0
     fan = isinstance(probe, LinearProbe) and probe.trapezoid_deg > 0.0
     first, _, radius = _geometry(probe)
-    before = -first * np.abs(np.tan(tilt)) if tilt else 0.0  # of the middle line; the last of the outermost is on the face
+    before = (
+        -first * np.abs(np.tan(tilt)) if tilt else 0.0
+    )  # of the middle line; the last of the outermost is on the face
     return {
         "depth_mm": probe.depth_mm + 2.0 * before,
         "steered": fan or tilt != 0.0,

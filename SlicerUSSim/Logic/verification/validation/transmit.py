@@ -140,9 +140,7 @@ def harmonic(rotation: np.ndarray, device) -> Outcome:
     for name, probe in PROBES.items():
         fundamental = replace(probe, frequency_mhz=2.5, aperture_mm=12.0, elevation_aperture_mm=12.0)
         second = replace(fundamental, harmonic=True)
-        widths = [
-            _wire_widths(simulator, phantom, replace(p, scan_lines=_FINE))[30] for p in (fundamental, second)
-        ]
+        widths = [_wire_widths(simulator, phantom, replace(p, scan_lines=_FINE))[30] for p in (fundamental, second)]
         # At equal f-numbers: transmitted twice at half the frequency, received once at the whole.
         ratio = np.sqrt(2.0 / 6.0)
         rows.append(Row(f"width of a wire re the fundamental, {name}", "", ratio, widths[1] / widths[0], 0.1 * ratio))
