@@ -61,7 +61,8 @@ def compounded_angles(rotation: np.ndarray, device) -> Outcome:
     }.items():
         probe = LinearProbe(
             36.0, 52.0, scan_lines=361, frequency_mhz=frequency, receive_f_number=receive, aperture_mm=20.0,
-            focus_mm=30.0, elevation_focus_mm=30.0, transmit="angles", transmit_angles=angles, largest_angle_deg=largest,
+            focus_mm=30.0, elevation_focus_mm=30.0, transmit="angles", transmit_angles=angles,
+            largest_angle_deg=largest,
         )  # fmt: skip
         # n angles in steps of d are the samples of an aperture that is seen under n d.
         transmit = (angles - 1) / angles / (2.0 * np.sin(np.deg2rad(largest)))
@@ -112,7 +113,7 @@ def steered_lines(rotation: np.ndarray, device) -> Outcome:
     for name, probe in _STEERED.items():
         frame = simulator.simulate(probe, phantom.probe_to_ras)
         for wire in _echoes(phantom, probe):
-            if not probe.holds(*wire.shown_mm):
+            if not probe.holds(*np.array(wire.shown_mm)):
                 continue
             x, y, _ = echo_near(frame, probe, wire.shown_mm, 1.5)
             off = float(np.hypot(x - wire.shown_mm[0], y - wire.shown_mm[1]))
