@@ -262,7 +262,7 @@ class LinearProbe(Probe):
         )
         require(
             self.trapezoid_deg == 0.0 or self.trapezoid_deg >= _LEAST_TRAPEZOID_DEG,
-            f"LinearProbe: trapezoid_deg is {short(self.trapezoid_deg)}, expected 0 or at least {_LEAST_TRAPEZOID_DEG:g}",
+            f"LinearProbe: trapezoid_deg is {self.trapezoid_deg}, expected 0 or at least {_LEAST_TRAPEZOID_DEG:g}",
         )
 
     @property
