@@ -4,10 +4,10 @@ PyMUST computes every element's pressure by far-field diffraction in the frequen
 user; here its channels are beamformed by its own delay-and-sum matrix. Differences that remain, and why:
 - Its transducer's spectrum is flat-topped, ours Gaussian. Ours gets the bandwidth of the Gaussian that fits best,
   and its pulse is then 8 % shorter, while speckle correlates over a length 6 % longer.
-- Away from the transmit focus its beam is no Gaussian, or has a curved phase: speckle correlates over a shorter
-  length than the echo of a point is wide. Our beam has a phase that does the same (docs/physics.md#wavefront-curvature).
-- The mean frequency of its echoes is 4.76 MHz for 5 MHz and 60 %, and its elements' directivity tapers the aperture: its
-  compounded beams are 4 to 12 % wider than two sinc functions, and speckle correlates over a length up to 15 % longer.
+- Away from the transmit focus its beam is no Gaussian, or has a curved phase: speckle correlates over a shorter length
+  than the echo of a point is wide. Our beam has a phase that does the same (docs/physics.md#wavefront-curvature).
+- The mean frequency of its echoes is 4.76 MHz for 5 MHz and 60 %, and its elements' directivity tapers the aperture.
+  Its compounded beams are 4 to 7 % wider than two sinc functions, and speckle correlates over a length 12 % longer.
 - Its beams have side lobes (sinc), ours none; the main lobes' widths are compared.
 - It attenuates each frequency by itself, so that the pulse's centre frequency sinks with depth and it loses less than
   2 alpha f0 z: by 0.2 dB for the attenuation tested here, by 1.6 dB for 0.5 dB/(cm MHz) at 50 mm. This simulator has no
