@@ -297,7 +297,8 @@ def test_compounded_plane_waves_have_the_same_width_and_correlation(
         transmit="angles", transmit_angles=angles, largest_angle_deg=largest,
     )  # fmt: skip
     for depth in depths:
-        along, echo = depth + np.arange(-0.7, 0.7, 0.2 / mhz), 0.0
+        along = depth + np.arange(-0.7, 0.7, 0.2 / mhz)
+        echo = np.zeros((len(along), len(lateral)), complex)
         for angle in np.deg2rad(np.linspace(-largest, largest, angles)):
             delays = pymust.txdelay(param, float(angle))
             signals = channels(param, [0.0], [depth], [1.0], delays)
