@@ -59,52 +59,51 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   floatn exponent = -0.5f * LOG2_E * step2 / narrow2;
   const floatn reach = ceil(acquisition->beam_cutoff * sigma / apart);
   SPREAD(float, reach_, reach);
-  float longest = 0.0f;
-  for (int n = 0; n < LANES; n++) longest = fmax(longest, reach_[n]);
+  float longest = 0.0f, shortest = 1e6f;
+  for (int n = 0; n < LANES; n++) {
+    longest = fmax(longest, reach_[n]);
+    shortest = fmin(shortest, reach_[n]);
+  }
   const int last = min((int)longest, max(centre, acquisition->traced_lines - 1 - centre));
-  // The turns of the phase between the axis and a step beside it, and those of the weights, by recurrence too. The
-  // losses between which it lies tell the frequency.
+  // Up to here both edges of a pair are there, for all lanes.
+  const int whole = min((int)shortest, min(centre - 1, acquisition->traced_lines - 2 - centre));
+  // By how much the phase turns at one step from the axis; at the middle between stored losses, which tell the
+  // frequency.
   const int node = sample / LOSS_STEP;
   const float middle = fmax((node + 0.5f) * LOSS_STEP * acquisition->sample_mm - start, 0.0f);
   const float frequency = frequency_after(acquisition, 0.5f * (of_line[2 * node] + of_line[2 * node + 2]));
   SPREAD(float, spread_, spread);
   const float across = line_distance(acquisition, middle) / spread_[0];
   const float curved = lateral_curvature(acquisition, middle, 1.0f / frequency) * across * across;
-  floatn cosine, sine;
-  turn((floatn)(curved / (8.0f * TWO_PI)), &cosine, &sine);
-  SPREAD(float, cosine_, cosine);
-  SPREAD(float, sine_, sine);
-  float phase_re = cosine_[0], phase_im = sine_[0];
-  turn((floatn)(curved / TWO_PI), &cosine, &sine);
-  SPREAD(float, cosine_fall_, cosine);
-  SPREAD(float, sine_fall_, sine);
-  const float fall_re = cosine_fall_[0], fall_im = sine_fall_[0];
-  float turn_re = fall_re, turn_im = fall_im;
+  const float turns = curved / (2.0f * TWO_PI);
   // Edge `edge` is half a step before traced line `edge`; the strips on both sides of it contribute. Edges come in
   // pairs, n + 1/2 lines to either side. Their weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
   const floatn fall = exp2_fast(max(2.0f * exponent, -60.0f));
   floatn weight = exp2_fast(max(0.25f * exponent, -60.0f)), ratio = fall;
   int here = LINE_PAD + sample;
   floatn sum_re = 0.0f, sum_im = 0.0f;
-  for (int n = 0; n <= last; n++) {
-    weight = (float)n <= reach ? weight : (floatn)(0.0f);
-    floatn pair_re = 0.0f, pair_im = 0.0f;
-    const int edges[2] = {centre - n, centre + n + 1};
-    for (int side = 0; side < 2; side++) {
-      if (edges[side] < 1 || edges[side] >= acquisition->traced_lines) continue;
-      const int before = (2 * edges[side] - 1) * stride + here, behind = before + stride;
-      pair_re += LOAD_LANES(from_re + before) + LOAD_LANES(from_re + behind);
-      pair_im += LOAD_LANES(from_im + before) + LOAD_LANES(from_im + behind);
+  for (int first = 0; first <= last; first += LANES) {
+    const floatn beside = TO_FLOATN(first + LANE_INDEX) + 0.5f;
+    floatn cosine, sine;
+    turn(turns * beside * beside, &cosine, &sine);
+    SPREAD(float, cosine_, cosine);
+    SPREAD(float, sine_, sine);
+    for (int n = first; n <= min(first + LANES - 1, last); n++) {
+      floatn pair_re = 0.0f, pair_im = 0.0f;
+      const int edges[2] = {centre - n, centre + n + 1};
+      for (int side = 0; side < 2; side++) {
+        if (n > whole && (edges[side] < 1 || edges[side] >= acquisition->traced_lines)) continue;
+        const int before = (2 * edges[side] - 1) * stride + here, behind = before + stride;
+        pair_re += LOAD_LANES(from_re + before) + LOAD_LANES(from_re + behind);
+        pair_im += LOAD_LANES(from_im + before) + LOAD_LANES(from_im + behind);
+      }
+      if (n > whole) weight = (float)n <= reach ? weight : (floatn)(0.0f);
+      const float phase_re = cosine_[n - first], phase_im = sine_[n - first];
+      sum_re += weight * (phase_re * pair_re + phase_im * pair_im);
+      sum_im += weight * (phase_re * pair_im - phase_im * pair_re);
+      weight *= ratio;
+      ratio *= fall;
     }
-    sum_re += weight * (phase_re * pair_re + phase_im * pair_im);
-    sum_im += weight * (phase_re * pair_im - phase_im * pair_re);
-    weight *= ratio;
-    ratio *= fall;
-    const float was_phase = phase_re, was_turn = turn_re;
-    phase_re = phase_re * turn_re - phase_im * turn_im;
-    phase_im = was_phase * turn_im + phase_im * turn_re;
-    turn_re = turn_re * fall_re - turn_im * fall_im;
-    turn_im = was_turn * fall_im + turn_im * fall_re;
   }
   const floatn apart2 = step2 / narrow2;
   const floatn straight = exp2_fast(max(-0.25f * LOG2_E * apart2, -60.0f));

@@ -33,9 +33,10 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
 // Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC rises by tgc_per_sample [dB]
 // until sample tgc_samples and stays there. `ringing`, float2 [sample], is added to every line: the reverberation at
 // the face. Both count from where the line leaves it.
-__kernel void compress(__constant const Acquisition *acquisition, __global const float *iq, int samples, __global const float *ringing, float noise,
-                       uint noise_seed, float tgc_per_sample, float tgc_samples, float level_of_white_db,
-                       Display display, __global float *envelope, __global uchar *grey) {
+__kernel void compress(__constant const Acquisition *acquisition, __global const float *iq, int samples,
+                       __global const float *ringing, float noise, uint noise_seed, float tgc_per_sample,
+                       float tgc_samples, float level_of_white_db, Display display, __global float *envelope,
+                       __global uchar *grey) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int here = line * samples + sample;
   floatn re, im;

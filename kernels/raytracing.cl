@@ -306,11 +306,13 @@ inline void start_piece(__constant const Acquisition *acquisition, __global cons
 // The changes of depth and of the logarithm of amplitude per mm, by which a ray agrees with its beam at the end of the
 // piece, which has lost `more` nepers there. The ray is at `path`; from there on it is continued with these rates of
 // depth and decay.
-inline float2 correction(__constant const Acquisition *acquisition, __global const float *beams, float start, const Ray *ray,
-                         float path, float depth, float log_attenuation, float depth_per_mm, float decay, float more) {
+inline float2 correction(__constant const Acquisition *acquisition, __global const float *beams, float start,
+                         const Ray *ray, float path, float depth, float log_attenuation, float depth_per_mm,
+                         float decay, float more) {
   const float4 beam = vload4(ray->piece + 1, beams);
   const float end = (ray->piece + 1) * acquisition->screen_step, rest = end - path;
-  return (float2)(start + end + beam.y - (depth + rest * depth_per_mm), -beam.x - more - (log_attenuation - rest * decay)) /
+  return (float2)(start + end + beam.y - (depth + rest * depth_per_mm),
+                  -beam.x - more - (log_attenuation - rest * decay)) /
          fmax(end - ray->from, 1e-3f);
 }
 

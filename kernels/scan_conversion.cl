@@ -33,9 +33,8 @@ __kernel void scan_convert(__constant const Acquisition *acquisition, __global c
   }
   const floatn place = (lateral - acquisition->first_line) / acquisition->line_spacing,
                sample = depth / acquisition->sample_mm;
-  const intn inside =
-      (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) & (depth < acquisition->depth_mm) &
-      (y >= acquisition->top_mm) & (y < acquisition->bottom_mm);
+  const intn inside = (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) &
+                      (depth < acquisition->depth_mm) & (y >= acquisition->top_mm) & (y < acquisition->bottom_mm);
   const intn bin = clamp(TO_INTN(sample), (intn)(0), (intn)(samples - 2));
   const floatn on_line = clamp(place, 0.0f, scan_lines - 1.0f);
   const intn line = TO_INTN(on_line);

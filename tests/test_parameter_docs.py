@@ -19,6 +19,7 @@ from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.mrml.parameter_node import PanelSettings
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, Probe, probe_kind
+from SlicerUSSim.Logic.probe.beam import Beam
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue
 
 PAGE = Path(__file__).parents[1] / "docs" / "parameters.md"
@@ -139,7 +140,8 @@ def test_every_declared_class_is_on_the_page():
     def below(kind: type) -> set[type]:
         return {kind}.union(*map(below, kind.__subclasses__()))
 
-    ours = {kind for kind in below(Declared) - {Declared} if kind.__module__.startswith("SlicerUSSim.Logic")}
+    # A Beam is the part of a Probe that has a file of its own.
+    ours = {kind for kind in below(Declared) - {Declared, Beam} if kind.__module__.startswith("SlicerUSSim.Logic")}
     assert ours == {kind for _, kind, _ in SECTIONS}
 
 

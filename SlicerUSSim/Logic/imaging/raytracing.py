@@ -134,8 +134,8 @@ class RayTracer(Stage):
 
 #: Fields that determine the traced lines in the probe frame
 _ARRAY_FIELDS = (
-    "linear", "apex_radius_mm", "first_line", "line_spacing", "lateral_rays", "guard_lines", "traced_lines", "flat_face",
-    "steering_sin",
+    "linear", "apex_radius_mm", "first_line", "line_spacing", "lateral_rays", "guard_lines", "traced_lines",
+    "flat_face", "steering_sin",
 )  # fmt: skip
 
 

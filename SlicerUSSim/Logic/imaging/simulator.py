@@ -30,7 +30,7 @@ from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.probe.beam import CURVED, MOST_ZONES, NOMINAL_SPEED_M_S
+from SlicerUSSim.Logic.probe.beam import CURVED, NOMINAL_SPEED_M_S
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -483,7 +483,7 @@ def steering_fields(probe: Probe) -> dict[str, Any]:
 
 def transmit_fields(probe: Probe) -> dict[str, Any]:
     """The fields of layout.ACQUISITION for the transmit beam."""
-    waists, fields = np.zeros((MOST_ZONES, 3)), {}
+    waists, fields = np.zeros((CONSTANTS["MAX_ZONES"], 3)), {}
     zones = probe.transmit_zones()
     if zones:
         waists[: len(zones)] = zones

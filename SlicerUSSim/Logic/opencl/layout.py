@@ -9,7 +9,6 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import parameters_of
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.probe.beam import MOST_ZONES
 
 #: Constants with the same name in host and kernels.
 CONSTANTS = {
@@ -45,6 +44,7 @@ CONSTANTS = {
     "BLOCK": 64,  # samples over which beam widths and gains are assumed linear; lines are whole blocks long
     "PARTS": 4,  # of the echoes, which are computed at once for fits (scattering.cl)
     "LOSS_STEP": 16,  # samples between those at which losses are stored (downshift.cl); a multiple of all LANES
+    "MAX_ZONES": 8,  # of a transmit beam: probe.beam.MOST_ZONES
     "MAX_BINS": 256,  # of the histograms in similarity.cl
     "LINE_PAD": 448,  # zeros on either side of a line: the longest pulse filter (bandwidth 0.05, 16 samples per cycle)
 }
@@ -90,9 +90,9 @@ ACQUISITION = np.dtype(
         ("sample_mm", _FLOAT),
         ("samples", _INT),  # rounded up to whole chunks
         ("transmit_zones", _INT),  # 0: focused at every depth, with transmit_sigma[0] at least
-        ("transmit_sigma", _FLOAT, MOST_ZONES),
-        ("transmit_focus", _FLOAT, MOST_ZONES),
-        ("transmit_rayleigh", _FLOAT, MOST_ZONES),
+        ("transmit_sigma", _FLOAT, CONSTANTS["MAX_ZONES"]),
+        ("transmit_focus", _FLOAT, CONSTANTS["MAX_ZONES"]),
+        ("transmit_rayleigh", _FLOAT, CONSTANTS["MAX_ZONES"]),
         ("transmit_waist", _FLOAT),  # the shortest of these
         ("transmit_sigma_slope", _FLOAT),  # where focused at every depth
         ("wavefront_curvature", _FLOAT),  # probe.beam.CURVED; 0: none

@@ -23,6 +23,8 @@ from SlicerUSSim.Logic.base.declaration import (
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.probe.beam import Beam
 
+#: With less the apex is so far behind the face that depths from it are not exact in single precision
+_LEAST_TRAPEZOID_DEG = 1.0
 #: {name in a preset: class} of all kinds of probe
 PROBE_KINDS: dict[str, type[Probe]] = {}
 
@@ -32,9 +34,9 @@ class Probe(Beam):
     """What all probes share. Use LinearProbe, ConvexProbe or PhasedProbe.
 
     The two-way beam (amplitude, docs/physics.md#4-beam-and-pulse) is Gaussian across its axis. Laterally it is the
-    product of a transmit beam, by default focused once at `focus_mm`, and a receive beam that is focused at every depth,
-    with an aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both ways at
-    one depth.
+    product of a transmit beam, by default focused once at `focus_mm`, and a receive beam that is focused at every
+    depth, with an aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both
+    ways at one depth.
     Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
 
     >>> from dataclasses import replace
@@ -116,8 +118,8 @@ class Probe(Beam):
     def line_starts_mm(self, position) -> np.ndarray:
         """Distance from line_at's origin to where lines at these positions leave the face.
 
-        Signals along lines begin at that origin. It is behind a flat face with steered lines: on a surface that all lines
-        leave at right angles.
+        Signals along lines begin at that origin. It is behind a flat face with steered lines: on a surface that all
+        lines leave at right angles.
         """
         return np.zeros_like(np.asarray(position, float))
 
@@ -172,6 +174,11 @@ class Probe(Beam):
         """Distance between neighbouring scan lines, `along_mm` from the face."""
         along = np.asarray(along_mm, float)
         return self.line_spacing * (np.ones_like(along) if self.is_linear else along + self.apex_radius_mm)
+
+    def smallest_cell_mm3(self) -> float:
+        """Volume of the smallest resolution cell within the image depth: (2 pi)^1.5 times the product of the sigmas."""
+        lateral, elevational = self.beam_sigma_mm(np.linspace(0.0, self.depth_mm, 257))
+        return float((2.0 * np.pi) ** 1.5 * self.axial_sigma_mm * (lateral * elevational).min())
 
     def image_bounds_mm(self) -> tuple[float, float, float, float]:
         """(left, right, top, bottom) of the imaged field in the probe frame; top is negative for a curved face."""
@@ -242,8 +249,8 @@ class LinearProbe(Probe):
         bounds=(-45, 45), shown=Shown(-30, 30), kw_only=True,
     )  # fmt: skip
     trapezoid_deg: float = parameter(
-        0.0, "Trapezoid", "Angle of the outermost scan lines to the normal of the face, by which the field opens to both "
-        "sides; 0: parallel lines", unit="°", bounds=(0, 45), shown=Shown(0, 30), kw_only=True,
+        0.0, "Trapezoid", "Angle of the outermost scan lines to the normal of the face, by which the field opens to "
+        "both sides; 0: parallel lines", unit="°", bounds=(0, 45), shown=Shown(0, 30), kw_only=True,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -252,6 +259,10 @@ class LinearProbe(Probe):
             not (self.steering_deg and self.trapezoid_deg),
             f"LinearProbe: steering_deg is {self.steering_deg:g}, trapezoid_deg {self.trapezoid_deg:g}, "
             "expected one of them to be 0",
+        )
+        require(
+            self.trapezoid_deg == 0.0 or self.trapezoid_deg >= _LEAST_TRAPEZOID_DEG,
+            f"LinearProbe: trapezoid_deg is {self.trapezoid_deg}, expected 0 or at least {_LEAST_TRAPEZOID_DEG:g}",
         )
 
     @property

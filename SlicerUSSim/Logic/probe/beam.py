@@ -122,11 +122,6 @@ class Beam(Declared):
         lateral = transmit * receive / np.hypot(transmit, receive)
         return lateral, self._gaussian_beam(depth, *self.elevation_beam())
 
-    def smallest_cell_mm3(self) -> float:
-        """Volume of the smallest resolution cell within the image depth: (2 pi)^1.5 times the product of the sigmas."""
-        lateral, elevational = self.beam_sigma_mm(np.linspace(0.0, self.depth_mm, 257))
-        return float((2.0 * np.pi) ** 1.5 * self.axial_sigma_mm * (lateral * elevational).min())
-
     def lateral_sigmas_mm(self, depth_mm) -> tuple[np.ndarray, np.ndarray]:
         """(transmit, receive) standard deviations of the lateral one-way beams at `depth_mm` along a scan line."""
         depth = np.asarray(depth_mm, dtype=float)

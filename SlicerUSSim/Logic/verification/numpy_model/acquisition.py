@@ -124,13 +124,11 @@ def _zones(probe: Probe) -> list[tuple[float, float]]:
         return [(_sent_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5)), probe.focus_mm)]
     count = probe.focal_zones
     foci = [probe.focus_mm * (n + n + 1) / count for n in range(count)]
-    return [
-        (_sent_sigma(probe, max(focus / probe.aperture_mm, probe.receive_f_number, 0.5)), focus) for focus in foci
-    ]
+    return [(_sent_sigma(probe, max(focus / probe.aperture_mm, probe.receive_f_number, 0.5)), focus) for focus in foci]
 
 
 def _compounded(probe: Probe) -> tuple[float, float]:
-    """(sigma, sigma per depth) of n waves: of a sum over n / (n - 1) times their range of angles, or of all the face."""
+    """(sigma, sigma per depth) of n waves: over n / (n - 1) times their range of angles, or of all the face."""
     count = probe.transmit_angles
     whole = 2.0 * np.sin(probe.largest_angle_deg * np.pi / 180.0) * count / (count - 1) if count > 1 else 1e-4
     first, _, radius = _geometry(probe)
@@ -324,8 +322,8 @@ def _steering(probe: Probe) -> dict[str, float]:
     """Lines that leave a flat face obliquely: their depths count from a common surface behind it."""
     tilt = probe.steering_deg * np.pi / 180.0 if isinstance(probe, LinearProbe) else 0.0
     fan = isinstance(probe, LinearProbe) and probe.trapezoid_deg > 0.0
-    first, _, radius = _geometry(probe)
-    before = -first * np.abs(np.tan(tilt)) if tilt else 0.0  # of the middle line; the last of the outermost is on the face
+    first = _geometry(probe)[0]
+    before = -first * np.abs(np.tan(tilt))  # of the middle line
     return {
         "depth_mm": probe.depth_mm + 2.0 * before,
         "steered": fan or tilt != 0.0,
@@ -361,7 +359,7 @@ def _traced_lines(probe: Probe, settings: SimulationSettings) -> tuple[int, int]
     depth = np.linspace(0.0, probe.depth_mm, 65)
     lateral = _lateral_sigma(probe, depth)
     _, spacing, radius = _geometry(probe)
-    apart = spacing * (np.ones_like(depth) if _is_parallel(probe) else _spread_radius(probe) + depth)
+    apart = spacing * (np.ones_like(depth) if _is_parallel(probe) else radius + depth)
     count = settings.lateral_rays or int(np.clip(np.ceil((apart / lateral).max() / 1.5), 1, 128))
     below = depth >= 0.1 * probe.depth_mm  # near the apex of a phased array all lines are within the beam
     reach = np.ceil(settings.beam_cutoff * (lateral[below] / apart[below]).max() * count)

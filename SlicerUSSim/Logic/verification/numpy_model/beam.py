@@ -42,7 +42,10 @@ class Beam:
             for name in ("sigma", "focus", "rayleigh")
         ]
         return np.stack(
-            [sigma * sigma * (stretch * stretch + ((s - focus) / length) ** 2) for sigma, focus, length in zip(*fields, strict=True)]
+            [
+                sigma * sigma * (stretch * stretch + ((s - focus) / length) ** 2)
+                for sigma, focus, length in zip(*fields, strict=True)
+            ]
         )
 
     def one_way(self, s: np.ndarray, loss: np.ndarray | np.float32 = _NOTHING) -> tuple[np.ndarray, np.ndarray]:

@@ -74,13 +74,13 @@ def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray
         paths = np.maximum(f32((first + 0.5 * _TOGETHER) * acquisition["sample_mm"]) - starts, f32(0))
         for path in np.unique(paths):  # one, unless lines are steered
             here = np.flatnonzero(paths == path)
-            for place, weight in zip(*_lobe_weights(acquisition, probe, beam, path), strict=True):
+            for place, weight in zip(*_lobe_weights(acquisition, probe, beam, np.array(path)), strict=True):
                 to = here[(here + place >= 0) & (here + place < lines)]
                 result[to, first : first + _TOGETHER] += 1j * weight * block[to + place]
     return result.astype(np.complex64)
 
 
-def _lobe_weights(acquisition: np.ndarray, probe: Probe, beam: Beam, s: np.float32) -> tuple[np.ndarray, np.ndarray]:
+def _lobe_weights(acquisition: np.ndarray, probe: Probe, beam: Beam, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(distances in scan lines, weights) of the lateral lobes at path length s."""
     power, sigma = lobes(probe.receive_apodization, probe.harmonic)
     apart = float(beam.line_distance(s)) * int(acquisition["lateral_rays"])

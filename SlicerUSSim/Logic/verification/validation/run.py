@@ -93,10 +93,11 @@ def all_checks() -> tuple[Check, ...]:
         rays,
         speckle,
         sulci,
+        transmit,
         walls,
     )
 
-    groups = (rays, speckle, band, floor, artefacts, beams, walls, sulci, aberration, heads)
+    groups = (rays, speckle, band, floor, artefacts, beams, transmit, walls, sulci, aberration, heads)
     return tuple(check for group in groups for check in group.CHECKS)
 
 

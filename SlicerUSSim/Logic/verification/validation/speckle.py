@@ -262,8 +262,8 @@ CHECKS = (
     ),
     Check(
         "speckle correlation",
-        "Signals d apart have the correlation exp(-d^2 / 4 sigma^2), with the sigma of the beam at that depth; laterally "
-        "at most that of two receive beams.",
+        "Signals d apart have the correlation exp(-d^2 / 4 sigma^2), sigma of the beam at that depth; laterally "
+        "as its curved phase leaves of that.",
         correlations,
     ),
     Check(

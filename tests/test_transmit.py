@@ -1,0 +1,178 @@
+"""Transmission: focal zones, compounded angles, steered lines, harmonic imaging, the phase across the beam."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+
+from SlicerUSSim.Logic import (
+    ConvexProbe,
+    DisplaySettings,
+    LinearProbe,
+    PhasedProbe,
+    Preset,
+    SimulationError,
+    SimulationSettings,
+    UltrasoundSimulator,
+)
+from SlicerUSSim.Logic.imaging.side_lobes import side_lobes_of
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.probe.arrays import PROBES, probe_from_dict
+from SlicerUSSim.Logic.probe.beam import MOST_ZONES
+from SlicerUSSim.Logic.probe.image_grid import ImageGrid
+from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, level_db
+from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
+from tests.conftest import SPECKLE, block, rigid, simulator
+from tests.test_numpy_model import scene
+
+LINEAR = LinearProbe(12, 30, scan_lines=24, frequency_mhz=5)
+MODES = {
+    "zones": replace(LINEAR, transmit="zones", focal_zones=3),
+    "angles": PhasedProbe(35, 30, scan_lines=24, transmit="angles", transmit_angles=7),
+    "one wave": replace(LINEAR, transmit="angles", transmit_angles=1),
+    "trapezoid": replace(LINEAR, trapezoid_deg=15.0),
+    "steered": replace(LINEAR, steering_deg=-20.0),
+    "harmonic": replace(LINEAR, harmonic=True, frequency_mhz=2.5),
+    "harmonic, steered, zones": replace(
+        LINEAR, harmonic=True, frequency_mhz=2.5, steering_deg=12.0, transmit="zones", focal_zones=2
+    ),
+}
+SLOW = ("one wave", "angles", "steered", "harmonic")
+
+
+def test_the_kernels_have_room_for_all_zones():
+    assert CONSTANTS["MAX_ZONES"] == MOST_ZONES
+    assert len(replace(LINEAR, transmit="zones", focal_zones=MOST_ZONES).transmit_zones()) == MOST_ZONES
+
+
+@pytest.mark.parametrize("mode", [pytest.param(m, marks=[pytest.mark.slow] * (m in SLOW)) for m in MODES])
+def test_numpy_follows_every_mode_of_transmission(mode):
+    labels, tissues = scene()
+    sim, display = UltrasoundSimulator(labels, tissues), DisplaySettings(image_size=(240, 200))
+    pose = rigid(np.eye(3), [1.0, -4.0, 0.5])
+    image = sim.simulate(MODES[mode], pose, display).image
+    difference = np.abs(image.astype(int) - NumpyModel(sim).simulate(MODES[mode], pose, display))
+    assert image.max() > 100
+    assert (difference <= 1).mean() > 0.97
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_mode_survives_json_and_set(mode):
+    probe = MODES[mode]
+    assert probe_from_dict(probe.to_dict()) == probe
+    assert Preset(probe=PROBES["linear"]).changed("probe", **probe.to_dict()).probe == probe
+
+
+def test_the_defaults_are_one_focus_and_lines_at_right_angles_to_the_face():
+    for probe in PROBES.values():
+        assert (probe.transmit, probe.harmonic, probe.steering_rad) == ("focus", False, 0.0)
+        assert not probe.line_starts_mm(probe.line_positions()).any() and probe.displayed_mm == probe.depth_mm
+
+
+def test_lines_are_steered_or_fan_out_but_not_both():
+    with pytest.raises(SimulationError, match="steering_deg is 10, trapezoid_deg 15, expected one of them to be 0"):
+        LinearProbe(38, 40, steering_deg=10.0, trapezoid_deg=15.0)
+    with pytest.raises(SimulationError, match=r"trapezoid_deg is 0\.1, expected 0 or at least 1"):
+        LinearProbe(38, 40, trapezoid_deg=0.1)
+    with pytest.raises(SimulationError, match=r"steering_deg is 60\.0, expected a number between -45 and 45"):
+        LinearProbe(38, 40, steering_deg=60.0)
+    with pytest.raises(SimulationError, match="steering_deg is not a parameter of a convex"):
+        probe_from_dict(ConvexProbe(40, 60, 80).to_dict() | {"steering_deg": 5.0})
+
+
+@given(st.floats(-40, 40), st.floats(1.0, 40), st.booleans())
+def test_steered_lines_leave_the_face_between_its_ends(steering, opening, is_fan):
+    angles = {"trapezoid_deg": opening} if is_fan else {"steering_deg": steering}
+    probe = LinearProbe(38.0, 50.0, scan_lines=41, **angles)
+    at = probe.line_positions()
+    origin, direction = probe.line_at(at)
+    face = origin + probe.line_starts_mm(at)[:, None] * direction
+    assert np.abs(face[:, 1]).max() < 1e-6 and (probe.line_starts_mm(at) > -1e-6).all()
+    assert np.abs(face[[0, -1], 0]) == pytest.approx([19.0, 19.0])
+    expected = np.deg2rad(np.linspace(-opening, opening, 41) if is_fan else np.full(41, steering))
+    np.testing.assert_allclose(np.arctan2(direction[:, 0], direction[:, 1]), expected, atol=1e-6)
+    back, along = probe.line_through(*(origin + 7.0 * direction)[:, :2].T)
+    np.testing.assert_allclose(back, at, atol=1e-6)
+    np.testing.assert_allclose(along, 7.0, atol=1e-6)
+    # Origins are on a surface across all lines, where neighbouring lines agree in phase.
+    apart = np.diff(origin, axis=0)
+    assert np.abs((apart * (direction[1:] + direction[:-1])).sum(axis=1)).max() < 1e-5
+    bounds = probe.image_bounds_mm()
+    outline = probe.outline_mm()
+    assert bounds[2] == pytest.approx(0.0, abs=1e-6) and bounds[0] <= outline[:, 0].min() + 1e-6
+    assert bounds[1] >= outline[:, 0].max() - 1e-6 and bounds[3] >= outline[:, 1].max() - 1e-6
+
+
+@pytest.mark.parametrize("angles", [{"steering_deg": 20.0}, {"trapezoid_deg": 20.0}])
+def test_the_imaged_field_is_where_its_outline_says(angles):
+    probe = LinearProbe(20.0, 25.0, scan_lines=80, **angles)
+    solid = block(lambda x, y, z: np.ones_like(x), half_mm=(30, 30, 6))
+    frame = simulator(solid, SPECKLE, coupling=SPECKLE).simulate(
+        probe, rigid(np.eye(3), [0, -20, 0]), DisplaySettings(dynamic_range_db=200.0)
+    )
+    wrong = (frame.image > 0) != ImageGrid.for_probe(probe, None).field(probe)
+    assert wrong.mean() < 0.01
+
+
+def test_zones_are_spread_over_twice_the_focal_depth_and_the_narrowest_counts():
+    probe = LinearProbe(38, 60, focus_mm=30.0, transmit="zones", focal_zones=3, receive_f_number=2.0)
+    assert [focus for _, focus, _ in probe.transmit_zones()] == [10.0, 30.0, 50.0]
+    at_foci = probe.lateral_sigmas_mm(np.array([10.0, 30.0, 50.0]))[0] * 2.3548
+    np.testing.assert_allclose(at_foci, 1.21 * probe.wavelength_mm * np.array([2.0, 2.5, 50 / 12]), rtol=1e-3)
+    alone = [replace(probe, transmit="focus", focus_mm=f).lateral_sigmas_mm(20.0)[0] for f in (30.0, 50.0)]
+    assert probe.lateral_sigmas_mm(20.0)[0] <= min(alone)
+
+
+def test_the_sum_over_angles_has_the_width_of_the_array_factor():
+    """The magnitude of a sum of phasors, against the Gaussian of the same width at half its height."""
+    probe = LinearProbe(38, 60, transmit="angles", transmit_angles=9, largest_angle_deg=12.0)
+    angle, x = np.deg2rad(np.linspace(-12, 12, 9)), np.linspace(0.0, 1.2, 4001)
+    factor = np.abs(np.exp(2j * np.pi / probe.wavelength_mm * np.outer(x, np.sin(angle))).mean(axis=1))
+    half = x[np.argmax(factor < 0.5)]
+    assert 2.3548 * probe.lateral_sigmas_mm(20.0)[0] == pytest.approx(2.0 * half, rel=0.02)
+    # Deeper than the face is seen under these angles, it is that of the face.
+    assert probe.lateral_sigmas_mm(150.0)[0] * 2.3548 == pytest.approx(1.21 * probe.wavelength_mm * 150 / 38, rel=1e-3)
+
+
+def test_the_harmonic_grows_as_the_logarithm_of_the_quasi_linear_solution():
+    probe = LinearProbe(
+        30, 60, frequency_mhz=2.5, harmonic=True, focus_mm=30.0, elevation_focus_mm=30.0, aperture_mm=10.0,
+        elevation_aperture_mm=10.0,
+    )  # fmt: skip
+    depth = np.array([2.0, 10.0, 25.0, 30.0, 40.0, 60.0])
+    length = 2 * np.pi * (1.21 * 1.54 / 2.5 * 3.0 / 2.3548) ** 2 / (1.54 / 2.5)
+    b = (np.append([0.0, 30.0], depth) - 30.0) / length
+    grown = np.abs(np.log((1 + 1j * b[1:]) / (1 + 1j * b[0])))
+    np.testing.assert_allclose(probe.harmonic_level(depth), grown[1:] / grown[0], rtol=1e-3)
+
+
+def test_the_harmonic_has_twice_the_frequency_a_longer_pulse_and_weaker_side_lobes():
+    pulse = replace(PROBES["abdominal"], frequency_mhz=2.0)
+    second = replace(pulse, harmonic=True)
+    assert second.cycles_per_mm == 2.0 * pulse.cycles_per_mm
+    assert second.axial_sigma_mm == pytest.approx(pulse.axial_sigma_mm / np.sqrt(2.0))
+    assert (second.received_mhz, second.received_bandwidth) == (4.0, pytest.approx(0.5 / np.sqrt(2.0)))
+    assert 10 * np.log10(side_lobes_of(0.0, True)[0] / side_lobes_of(0.0)[0]) < -9.0
+
+
+SOLID = block(lambda x, y, z: np.ones_like(x), half_mm=(15, 25, 6))
+
+
+@pytest.mark.parametrize("lines", [41, 201])
+def test_a_curved_phase_shortens_the_correlation_of_speckle_and_keeps_its_level(lines):
+    probe = LinearProbe(20.0, 40.0, scan_lines=lines, focus_mm=30.0, elevation_focus_mm=25.0)
+    pose, lag, found = rigid(np.eye(3), [0, -20, 0]), lines // 40, {}
+    for curved in (False, True):
+        settings = SimulationSettings(wavefront_curvature=curved)
+        sim = UltrasoundSimulator(SOLID, simulator(SOLID, SPECKLE, coupling=SPECKLE).medium.tissues, settings)
+        windows = [depth_window(sim.simulate(probe, pose), 12.0, 4.0)]
+        found[curved] = correlation(windows[0][:-lag], windows[0][lag:]), level_db(windows[0])
+    apart = 20.0 / (lines - 1) * lag
+    if lines == 201:
+        for curved, sigma in ((False, probe.beam_sigma_mm(12.0)[0]), (True, probe.speckle_sigma_mm(12.0))):
+            assert found[curved][0] == pytest.approx(float(np.exp(-(apart**2) / (4 * sigma**2))), abs=0.05)
+    assert found[True][0] < found[False][0] - 0.05
+    assert found[True][1] == pytest.approx(found[False][1], abs=0.5)
