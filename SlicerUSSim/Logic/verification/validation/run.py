@@ -88,6 +88,7 @@ def all_checks() -> tuple[Check, ...]:
         artefacts,
         band,
         beams,
+        flat_walls,
         floor,
         heads,
         rays,
@@ -95,7 +96,7 @@ def all_checks() -> tuple[Check, ...]:
         walls,
     )
 
-    groups = (rays, speckle, band, floor, artefacts, beams, walls, aberration, heads)
+    groups = (rays, speckle, band, floor, artefacts, beams, walls, flat_walls, aberration, heads)
     return tuple(check for group in groups for check in group.CHECKS)
 
 
