@@ -106,7 +106,8 @@ def _thin_layer_borders(grid: SmoothGrid, voxel, towards, isolated: Borders, bef
     """Borders of thin layers, seen from before and from behind."""
     found = Borders.none(len(voxel))
     share = isolated.share
-    turned = (isolated.sigma > 0) & (dot(isolated.towards, towards) < _MOST_TURNED)
+    turned = np.abs(dot(isolated.towards, towards)) < _MOST_TURNED
+    turned &= isolated.sigma * isolated.steepness > f32(0.06)
     some = np.flatnonzero((np.abs(share - f32(0.5)) >= f32(0.5 - _THIN_SHARE)) & ~turned)
     voxel, towards, share, before, behind = (part[some] for part in (voxel, towards, share, before, behind))
     side = np.where(share < 0.5, f32(1), f32(-1))
@@ -199,7 +200,7 @@ class FlatBorders:
             now = plane.at(some)
             at[some] += step[some, None] * _away_from_ends(self.dims, at[some], now)[0]
             found = self.widest(at[some], now.towards, before[some], behind[some], 1.0 if n == 3 else 6.0)
-            known = found.confidence > 0
+            known = found.confidence >= 0.5
             lost = some[~known]
             if n > 0:
                 plane.confidence[lost], active[lost] = 0, False
