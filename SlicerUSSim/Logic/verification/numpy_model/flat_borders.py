@@ -10,6 +10,7 @@ from SlicerUSSim.Logic.verification.numpy_model.smoothed_borders import OF_BOTH,
 _DENSITY = f32(0.39894228)  # of the normal distribution at its centre
 _TAIL = (1.330274429, -1.821255978, 1.781477937, -0.356563782, 0.31938153)  # Abramowitz and Stegun, 26.2.17
 _VIEW, _THIN_SHARE = f32(3.5), 0.35  # voxels from a thin layer to where it is looked at; its share at its walls
+_MOST_TURNED = f32(0.85)  # cosine of the angle between estimates of a layer's normal
 _END_REACH = f32(28)  # voxels to the ends of the volume, along a plane
 _SAMPLES_APART = f32(20)  # voxels
 _WEIGHTS = f32([0.35, 0.7, 1.0, 0.7, 0.35])  # of samples along an axis
@@ -83,7 +84,7 @@ def _layer_ahead(share, gradient) -> tuple[np.ndarray, np.ndarray]:
     return -from_middle, thickness
 
 
-def _view(grid: SmoothGrid, voxel, before, behind, side):
+def _view(grid: SmoothGrid, voxel, before, behind, side, expected):
     """What is seen of a layer: (whether anything, direction ahead, voxels to its middle, thickness, curvature)."""
     found = grid.differences(voxel, before, behind, OF_BOTH)
     seen = ((voxel >= 0) & (voxel <= f32(grid.dims - 1))).all(axis=-1)
@@ -97,23 +98,27 @@ def _view(grid: SmoothGrid, voxel, before, behind, side):
     flat = far * _normal_distribution(far)[1] - near * _normal_distribution(near)[1]
     curvature = f32(0.5) * (laplacian - flat) / np.maximum(gradient, f32(1e-3))
     ahead = -side[:, None] * found.towards
+    seen &= dot(ahead, expected) >= _MOST_TURNED
     return seen, ahead, (middle + curvature) * sigma, thickness * sigma, curvature / sigma
 
 
-def _thin_layer_borders(grid: SmoothGrid, voxel, towards, share, before, behind, farthest) -> Borders:
+def _thin_layer_borders(grid: SmoothGrid, voxel, towards, isolated: Borders, before, behind, farthest) -> Borders:
     """Borders of thin layers, seen from before and from behind."""
     found = Borders.none(len(voxel))
-    some = np.flatnonzero(np.abs(share - f32(0.5)) >= f32(0.5 - _THIN_SHARE))
+    share = isolated.share
+    turned = np.abs(dot(isolated.towards, towards)) < _MOST_TURNED
+    turned &= isolated.sigma * isolated.steepness > f32(0.06)
+    some = np.flatnonzero((np.abs(share - f32(0.5)) >= f32(0.5 - _THIN_SHARE)) & ~turned)
     voxel, towards, share, before, behind = (part[some] for part in (voxel, towards, share, before, behind))
     side = np.where(share < 0.5, f32(1), f32(-1))
     sigma, ahead = np.sqrt(grid.variance), -side[:, None] * towards
-    seen, front, middle, thickness, curvature = _view(grid, voxel - _VIEW * ahead, before, behind, side)
+    seen, front, middle, thickness, curvature = _view(grid, voxel - _VIEW * ahead, before, behind, side, ahead)
     beyond = thickness + _VIEW
     sees, back, other_middle, other_thickness, other_curvature = _view(
-        grid, voxel + np.minimum(beyond, f32(100))[:, None] * ahead, before, behind, side
+        grid, voxel + np.minimum(beyond, f32(100))[:, None] * ahead, before, behind, side, -ahead
     )
     agreement = -dot(front, back)
-    seen &= sees & (thickness <= f32(1.2) * sigma) & (dot(front, ahead) >= f32(0.85)) & (agreement >= f32(0.98))
+    seen &= sees & (thickness <= f32(1.2) * sigma) & (agreement >= f32(0.98))
     from_front = (middle - f32(0.5) * thickness)[:, None] * front - _VIEW * ahead
     from_back = (other_middle + f32(0.5) * other_thickness)[:, None] * back + beyond[:, None] * ahead
     into = unit(front - back)
@@ -137,7 +142,7 @@ def borders_of_layers(grid: SmoothGrid, voxel, towards, isolated: Borders, befor
     some = np.flatnonzero(~np.isnan(isolated.share))
     with np.errstate(all="ignore"):  # a flat field has no layer
         best = _thin_layer_borders(
-            grid, voxel[some], towards[some], isolated.share[some], before[some], behind[some], farthest
+            grid, voxel[some], towards[some], isolated.at(some), before[some], behind[some], farthest
         )
         layer = _layer_borders(isolated.at(some), farthest)
     better = (best.confidence < 1) & (layer.confidence > best.confidence)
@@ -195,7 +200,7 @@ class FlatBorders:
             now = plane.at(some)
             at[some] += step[some, None] * _away_from_ends(self.dims, at[some], now)[0]
             found = self.widest(at[some], now.towards, before[some], behind[some], 1.0 if n == 3 else 6.0)
-            known = found.confidence > 0
+            known = found.confidence >= 0.5
             lost = some[~known]
             if n > 0:
                 plane.confidence[lost], active[lost] = 0, False

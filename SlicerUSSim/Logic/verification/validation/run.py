@@ -88,6 +88,7 @@ def all_checks() -> tuple[Check, ...]:
         artefacts,
         band,
         beams,
+        flat_walls,
         floor,
         heads,
         rays,
@@ -97,7 +98,7 @@ def all_checks() -> tuple[Check, ...]:
         walls,
     )
 
-    groups = (rays, speckle, band, floor, artefacts, beams, transmit, walls, sulci, aberration, heads)
+    groups = (rays, speckle, band, floor, artefacts, beams, transmit, walls, flat_walls, sulci, aberration, heads)
     return tuple(check for group in groups for check in group.CHECKS)
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -32,18 +30,6 @@ _FULL_WAVE = {0.0: 0.0, 4.0: -0.9, 8.0: -6.3, 12.0: -14.3, 15.0: -20.5, 20.0: -3
 _PROBES: dict[str, Probe] = {name: replace(probe, elevation_focus_mm=_DEPTH_MM) for name, probe in PROBES.items()}
 _FULL_WAVE_PROBE = LinearProbe(36.0, 40.0, scan_lines=145, focus_mm=_DEPTH_MM, aperture_mm=12.5, receive_f_number=2.0,
                                elevation_focus_mm=_DEPTH_MM)  # fmt: skip
-
-
-#: Turns of the voxels in degrees, with the loss in dB that is allowed: the steps between voxels are 19 voxels long at 3
-#: degrees, longer than any smoothing
-_TURNS = {3.0: 3.0, 5.0: 1.5, 8.0: 1.5, 15.0: 1.5, 30.0: 1.5}
-
-#: The same of layers, by their thickness in voxels
-_LAYER_TURNS = {
-    6: {3.0: 3.0, 5.0: 3.0, 15.0: 3.0},
-    10: {3.0: 3.0, 5.0: 1.5, 15.0: 1.5},
-    16: {3.0: 3.0, 5.0: 1.5, 15.0: 1.5},
-}
 
 
 def _wall(rotation: np.ndarray, device) -> tuple[UltrasoundSimulator, Phantom]:
@@ -127,55 +113,6 @@ def walls_and_lines(rotation: np.ndarray, device) -> Outcome:
     return Outcome(tuple(rows))
 
 
-def turned_planes(rotation: np.ndarray, device) -> Outcome:
-    """Planes that face the beam, in voxels of 0.5 and 1 mm that are turned further and further against them."""
-    probe = LinearProbe(20.0, 40.0, scan_lines=81, focus_mm=_DEPTH_MM, elevation_focus_mm=_DEPTH_MM)
-    level = 20 * np.log10(reflection_coefficient(FLUID, BEHIND)) + _SETTINGS.interface_gain_db
-    rows, curves = [], []
-    for spacing in (0.5, 1.0):
-        lowest = []
-        for turn, loss in _TURNS.items():
-            turned = rotation @ Rotation.from_euler("xz", [turn, 0.6 * turn], degrees=True).as_matrix()
-            phantom = layered(
-                [FLUID, BEHIND], [_DEPTH_MM], turned, spacing_mm=spacing, half_width_mm=36.0, half_thickness_mm=30.0
-            )
-            simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
-            frame = simulator.simulate(probe, phantom.probe_to_ras)
-            along = 20 * np.log10(np.abs(depth_window(frame, _DEPTH_MM, 3.0)[10:-10]).max(axis=1)) - level
-            lowest.append(float(along.min()))
-            voxels = f"turned by {turn:g} degrees, {spacing:g} mm"
-            rows.append(Row(f"lowest level, {voxels}", "dB", 0.0, lowest[-1], loss, "at least"))
-            rows.append(Row(f"highest level, {voxels}", "dB", 0.0, float(along.max()), 0.5, "at most"))
-        turns = np.array(list(_TURNS))
-        curves.append(Curve(f"{spacing:g} mm", turns, np.array(lowest), turns, 0.0 * turns))
-    plot = Plot("plane facing the beam", "voxels turned by [degrees]", "lowest echo [dB]", curves)
-    return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
-
-
-def flat_layers(rotation: np.ndarray, device) -> Outcome:
-    """Both walls of a layer of one tissue in another, thinner than the smoothing of the borders is wide."""
-    square = 20 * np.log10(reflection_coefficient(FLUID, BEHIND)) + _SETTINGS.interface_gain_db
-    through = 20 * np.log10(1.0 - reflection_coefficient(FLUID, BEHIND) ** 2)
-    probe = LinearProbe(20.0, 40.0, scan_lines=81, focus_mm=_DEPTH_MM, elevation_focus_mm=_DEPTH_MM)
-    rows = []
-    for spacing, voxels in itertools.product((0.5, 1.0), _LAYER_TURNS):
-        thickness = voxels * spacing
-        depths = (_DEPTH_MM - 0.5 * thickness, _DEPTH_MM + 0.5 * thickness)
-        for turn, loss in _LAYER_TURNS[voxels].items():
-            turned = rotation @ Rotation.from_euler("xz", [turn, 0.6 * turn], degrees=True).as_matrix()
-            phantom = layered(
-                [FLUID, BEHIND, FLUID], depths, turned, spacing_mm=spacing, half_width_mm=36.0, half_thickness_mm=30.0
-            )
-            simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
-            lines = simulator.simulate(probe, phantom.probe_to_ras)
-            shown = depths[0] + thickness * phantom.tissues[0].speed_of_sound_m_s / BEHIND.speed_of_sound_m_s
-            for wall, depth, expected in (("front", depths[0], square), ("back", shown, square + through)):
-                along = 20 * np.log10(np.abs(depth_window(lines, depth, 1.5)[10:-10]).max(axis=1)) - expected
-                what = f"{wall} of {voxels} voxels, turned by {turn:g} degrees, {spacing:g} mm"
-                rows.append(Row(f"lowest level, {what}", "dB", 0.0, float(along.min()), loss, "at least"))
-    return Outcome(tuple(rows))
-
-
 def sheets(rotation: np.ndarray, device) -> Outcome:
     """Sheets thinner than the pulse: the echoes of both faces, of opposite sign, interfere."""
     probe = LinearProbe(8.0, 24.0, scan_lines=41, frequency_mhz=2.5, focus_mm=15.0, elevation_focus_mm=15.0)
@@ -203,11 +140,5 @@ CHECKS = (
         oblique_walls,
     ),
     Check("walls and lines", "A wall does not depend on the number of scan lines.", walls_and_lines),
-    Check(
-        "turned planes", "A plane that faces the beam has the same level wherever its voxels are turned.", turned_planes
-    ),
-    Check(
-        "flat layers", "Both walls of a layer have the level of a plane, wherever its voxels are turned.", flat_layers
-    ),
     Check("sheets", "The two borders of a sheet have echoes of opposite sign.", sheets),
 )

@@ -1,0 +1,169 @@
+"""Checks of flat walls: planes and layers turned against the voxels, also near an end of the label map."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from SlicerUSSim.Logic.base.settings import SimulationSettings
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.verification.measurement import depth_window
+from SlicerUSSim.Logic.verification.phantoms import FLUID, Phantom, layered, reflection_coefficient
+from SlicerUSSim.Logic.verification.validation.beams import BEHIND
+from SlicerUSSim.Logic.verification.validation.checks import Check, Outcome, Row
+from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_plots
+
+_DEPTH_MM = 25.0
+_SETTINGS = SimulationSettings(scattering=False, specular_exponent=0.0)
+#: The shipped probe with the widest aperture re wavelength, at 5 MHz: it sees a slope of 2 degrees as 3 dB
+_PROBE = replace(PROBES["linear"], frequency_mhz=5.0, focus_mm=_DEPTH_MM, elevation_focus_mm=_DEPTH_MM)
+#: Turns of the voxels in degrees, with the loss in dB that is allowed: the steps between voxels are 57 voxels long at 1
+#: degree, longer than any smoothing
+_TURNS = {1.0: 3.0, 2.0: 3.0, 3.0: 3.0, 5.0: 1.5, 8.0: 1.5, 15.0: 1.5, 30.0: 1.5}
+#: Planes tilted by so much to the beam: the level along them does not vary by more dB
+_TILT_DEG, _VARIATION_DB = 5.0, 3.0
+
+#: The same of layers, by their thickness in voxels
+_LAYER_TURNS = {
+    2: {5.0: 3.0, 15.0: 3.0},
+    3: {5.0: 1.5, 15.0: 1.5},
+    6: {3.0: 3.0, 5.0: 1.5, 15.0: 1.5},
+    10: {3.0: 3.0, 5.0: 1.5, 15.0: 1.5},
+    16: {3.0: 3.0, 5.0: 1.5, 15.0: 1.5},
+}
+#: Voxels between a wall's point on the axis of the probe and an end of the label map; thickness of layers in voxels,
+#: None: a half space
+_FROM_END, _LAYERS_AT_END = (5, 8, 12, 16, 20), (None, 3, 6, 12)
+
+
+def _levels(frame: Frame, depth_mm: float, half_mm: float, lateral_mm: float = 10.0) -> np.ndarray:
+    """Peak in dB around a depth, of the scan lines within `lateral_mm` of the axis."""
+    lateral = np.linspace(-0.5, 0.5, _PROBE.scan_lines) * _PROBE.width_mm
+    lines = depth_window(frame, depth_mm, half_mm)[np.abs(lateral) <= lateral_mm]
+    return 20 * np.log10(np.abs(lines).max(axis=1) + 1e-12)
+
+
+def _tilt_about(depth_mm: float, tilt_deg: float) -> np.ndarray:
+    """(4, 4) motion of the probe: in the image plane, about a point on its axis."""
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_euler("z", tilt_deg, degrees=True).as_matrix()
+    motion[:3, 3] = [0.0, depth_mm, 0.0] - motion[:3, :3] @ [0.0, depth_mm, 0.0]
+    return motion
+
+
+def turned_planes(rotation: np.ndarray, device) -> Outcome:
+    """Planes that face the beam or are tilted to it, in voxels of 0.5 and 1 mm turned further and further."""
+    level = 20 * np.log10(reflection_coefficient(FLUID, BEHIND)) + _SETTINGS.interface_gain_db
+    rows, curves = [], []
+    for spacing in (0.5, 1.0):
+        lowest = []
+        for turn, loss in _TURNS.items():
+            turned = rotation @ Rotation.from_euler("xz", [turn, 0.6 * turn], degrees=True).as_matrix()
+            phantom = layered(
+                [FLUID, BEHIND], [_DEPTH_MM], turned, spacing_mm=spacing, half_width_mm=36.0, half_thickness_mm=30.0
+            )
+            simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
+            along = _levels(simulator.simulate(_PROBE, phantom.probe_to_ras), _DEPTH_MM, 3.0) - level
+            lowest.append(float(along.min()))
+            voxels = f"turned by {turn:g} degrees, {spacing:g} mm"
+            rows.append(Row(f"lowest level, {voxels}", "dB", 0.0, lowest[-1], loss, "at least"))
+            rows.append(Row(f"highest level, {voxels}", "dB", 0.0, float(along.max()), 0.5, "at most"))
+            tilted = phantom.probe_to_ras @ _tilt_about(_DEPTH_MM, _TILT_DEG)
+            # A line at x meets the plane deeper by x tan(tilt).
+            variation = float(np.ptp(_levels(simulator.simulate(_PROBE, tilted), _DEPTH_MM, 3.0)))
+            what = f"variation along a plane tilted by {_TILT_DEG:g} degrees, {voxels}"
+            rows.append(Row(what, "dB", 0.0, variation, _VARIATION_DB, "at most"))
+        turns = np.array(list(_TURNS))
+        curves.append(Curve(f"{spacing:g} mm", turns, np.array(lowest), turns, 0.0 * turns))
+    plot = Plot("plane facing the beam", "voxels turned by [degrees]", "lowest echo [dB]", curves)
+    return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
+
+
+def flat_layers(rotation: np.ndarray, device) -> Outcome:
+    """Both walls of a layer of one tissue in another, thinner than the smoothing of the borders is wide."""
+    square = 20 * np.log10(reflection_coefficient(FLUID, BEHIND)) + _SETTINGS.interface_gain_db
+    through = 20 * np.log10(1.0 - reflection_coefficient(FLUID, BEHIND) ** 2)
+    rows = []
+    for spacing, voxels in itertools.product((0.5, 1.0), _LAYER_TURNS):
+        thickness = voxels * spacing
+        depths = (_DEPTH_MM - 0.5 * thickness, _DEPTH_MM + 0.5 * thickness)
+        for turn, loss in _LAYER_TURNS[voxels].items():
+            turned = rotation @ Rotation.from_euler("xz", [turn, 0.6 * turn], degrees=True).as_matrix()
+            phantom = layered(
+                [FLUID, BEHIND, FLUID], depths, turned, spacing_mm=spacing, half_width_mm=36.0, half_thickness_mm=30.0
+            )
+            simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
+            frame = simulator.simulate(_PROBE, phantom.probe_to_ras)
+            shown = depths[0] + thickness * phantom.tissues[0].speed_of_sound_m_s / BEHIND.speed_of_sound_m_s
+            for wall, depth, expected in (("front", depths[0], square), ("back", shown, square + through)):
+                along = _levels(frame, depth, min(1.5, 0.4 * thickness)) - expected
+                what = f"{wall} of {voxels} voxels, turned by {turn:g} degrees, {spacing:g} mm"
+                rows.append(Row(f"lowest level, {what}", "dB", 0.0, float(along.min()), loss, "at least"))
+    return Outcome(tuple(rows))
+
+
+def _cut(phantom: Phantom, from_end: int) -> tuple[Volume, TissueTable]:
+    """The labels of a phantom without those beyond an end `from_end` voxels beside the wall's point on the axis."""
+    labels, pose = phantom.labels, phantom.probe_to_ras
+    at = labels.ras_to_ijk @ pose @ [0.0, _DEPTH_MM, 0.0, 1.0]
+    lateral = labels.ras_to_ijk[:3, :3] @ pose[:3, 0]
+    axis = int(np.abs(lateral).argmax())
+    first = int(np.rint(at[axis])) - from_end + 1
+    kept = [slice(None)] * 3
+    kept[2 - axis] = slice(first, None)
+    matrix = labels.ijk_to_ras.copy()
+    matrix[:3, 3] += first * matrix[:3, axis]
+    # The fluid goes on beyond the end.
+    return Volume(np.ascontiguousarray(labels.array[tuple(kept)]), matrix), TissueTable({**phantom.tissues, 0: FLUID})
+
+
+def walls_near_ends(rotation: np.ndarray, device) -> Outcome:
+    """Walls that an end of the label map cuts obliquely, a few voxels beside the beam."""
+    square = 20 * np.log10(reflection_coefficient(FLUID, BEHIND)) + _SETTINGS.interface_gain_db
+    through = 20 * np.log10(1.0 - reflection_coefficient(FLUID, BEHIND) ** 2)
+    turned = rotation @ Rotation.from_euler("xz", [15.0, 9.0], degrees=True).as_matrix()
+    rows = []
+    for spacing, voxels in itertools.product((0.5, 1.0), _LAYERS_AT_END):
+        thickness = (voxels or 0) * spacing
+        borders = [_DEPTH_MM, _DEPTH_MM + thickness] if voxels else [_DEPTH_MM]
+        phantom = layered(
+            [FLUID, BEHIND, FLUID][: len(borders) + 1], borders, turned, spacing_mm=spacing, half_width_mm=36.0,
+            half_thickness_mm=30.0,
+        )  # fmt: skip
+        lowest = np.full((len(_FROM_END), len(borders)), np.inf)
+        shown = _DEPTH_MM + thickness * FLUID.speed_of_sound_m_s / BEHIND.speed_of_sound_m_s
+        for place, from_end in enumerate(_FROM_END):
+            labels, tissues = _cut(phantom, from_end)
+            frame = UltrasoundSimulator(labels, tissues, _SETTINGS, device).simulate(_PROBE, phantom.probe_to_ras)
+            for wall, depth in enumerate((_DEPTH_MM, shown)[: len(borders)]):
+                half = min(1.5, 0.4 * thickness) if voxels else 3.0
+                lowest[place, wall] = (_levels(frame, depth, half, 1.0) - square - wall * through).min()
+        of = f"of a layer of {voxels} voxels" if voxels else "of a half space"
+        for wall, levels in zip(("front", "back"), lowest.T, strict=False):
+            worst = int(levels.argmin())
+            what = f"{wall} {of}, {_FROM_END[0]} to {_FROM_END[-1]} voxels from an end (lowest at {_FROM_END[worst]})"
+            rows.append(Row(f"{what}, {spacing:g} mm", "dB", 0.0, float(levels[worst]), 1.5, "at least"))
+    return Outcome(tuple(rows))
+
+
+CHECKS = (
+    Check(
+        "turned planes", "A plane that faces the beam has the same level wherever its voxels are turned.", turned_planes
+    ),
+    Check(
+        "flat layers", "Both walls of a layer have the level of a plane, wherever its voxels are turned.", flat_layers
+    ),
+    Check(
+        "walls near ends",
+        "A wall has the level of a plane up to where an end of the label map cuts it.",
+        walls_near_ends,
+    ),
+)
