@@ -130,7 +130,7 @@ __kernel void fit_sheets(__global const uchar *bits, int nx, int ny, int nz, int
 }
 
 // Voxels beside a sheet get the nearest plane of the six voxels around them: a scatterer then finds it at the nearest
-// voxel. Work-items of several points write the same value.
+// voxel. The first of these six that has the sheet's label writes.
 __kernel void spread_sheets(__global const uchar *labels, int nx, int ny, int nz, int sheet, __global const int *points,
                             __global uint *planes) {
   const int here = points[get_global_id(0)];
@@ -142,9 +142,13 @@ __kernel void spread_sheets(__global const uchar *labels, int nx, int ny, int nz
     if (i < 1 || j < 1 || k < 1 || i >= nx - 1 || j >= ny - 1 || k >= nz - 1) continue;
     float nearest = 2.0f;
     uint best = 0u;
+    int is_first = 1;
     for (int m = 0; m < 6; m++) {
       const int from = beside + step_to(m, nx, ny);
-      if (labels[from] != sheet || !planes[from]) continue;
+      if (labels[from] != sheet) continue;
+      if (is_first && from != here) break;
+      is_first = 0;
+      if (!planes[from]) continue;
       const uint plane = planes[from];
       const float3 gradient = gradient_of_sheet(plane);
       const float along = m < 2 ? gradient.x : m < 4 ? gradient.y : gradient.z;
@@ -154,6 +158,6 @@ __kernel void spread_sheets(__global const uchar *labels, int nx, int ny, int nz
       nearest = fabs(distance);
       best = (plane & ~(255u << 18)) | ((uint)clamp((int)rint(128.0f + distance / SHEET_DISTANCE_STEP), 1, 255) << 18);
     }
-    planes[beside] = best;
+    if (!is_first) planes[beside] = best;
   }
 }
