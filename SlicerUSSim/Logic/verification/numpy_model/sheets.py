@@ -28,7 +28,7 @@ class Sheets:
         self.label = sheet
         member = (labels == sheet).astype(float)
         inside = _windowed(member, _CORE_SIGMA, _CORE_REACH, np.zeros((1, 3), int))[..., 0]
-        is_thick = ndimage.maximum_filter(inside * member >= _THICK, size=3)
+        is_thick: np.ndarray = ndimage.maximum_filter(inside * member >= _THICK, size=3)
         #: (k, j, i) True in thin sheets
         self.is_thin = (member > 0) & ~is_thick
         #: (k, j, i, 3) gradients in voxels, of length 1, 0 where there is no plane; (k, j, i) distances in voxels; and
@@ -54,7 +54,7 @@ class Sheets:
         ], axis=-1)  # fmt: skip
         variances, vectors = np.linalg.eigh(covariance)
         low, middle, high = (variances + 1e-4).T
-        is_sheet = low * middle + middle * high + high * low >= _LEAST_AREA
+        is_sheet = np.asarray(low * middle + middle * high + high * low >= _LEAST_AREA)
         gradient = vectors[..., 0] * side
         gradient /= np.linalg.norm(gradient, axis=-1, keepdims=True)
         distance = sum(gradient[:, axis] * moment(near, axis) for axis in range(3))
