@@ -54,7 +54,7 @@ class Sheets:
         ], axis=-1)  # fmt: skip
         variances, vectors = np.linalg.eigh(covariance)
         low, middle, high = (variances + 1e-4).T
-        is_sheet = np.asarray(low * middle + middle * high + high * low >= _LEAST_AREA)
+        is_sheet = low * middle + middle * high + high * low >= _LEAST_AREA
         gradient = vectors[..., 0] * side
         gradient /= np.linalg.norm(gradient, axis=-1, keepdims=True)
         distance = sum(gradient[:, axis] * moment(near, axis) for axis in range(3))
@@ -69,7 +69,7 @@ class Sheets:
 
     def _spread(self, member: np.ndarray) -> None:
         """Voxels beside a sheet get the nearest plane of the six around them."""
-        has_plane = self.gradient.any(axis=-1)
+        has_plane = np.abs(self.gradient).sum(axis=-1) > 0.0
         for k, j, i in np.argwhere(ndimage.binary_dilation(member) & ~member)[:, ::1]:
             if min(k, j, i) < 1 or any(n >= size - 1 for n, size in zip((k, j, i), member.shape, strict=True)):
                 continue
