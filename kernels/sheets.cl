@@ -136,10 +136,10 @@ __kernel void spread_sheets(__global const uchar *labels, int nx, int ny, int nz
   const int here = points[get_global_id(0)];
   for (int n = 0; n < 6; n++) {
     const int beside = here + step_to(n, nx, ny);
-    if (labels[beside] == sheet) continue;
-    // (Labels have a margin of one voxel without a sheet, so that only what is in it can be beyond the volume.)
+    if (beside < 0 || beside >= nx * ny * nz) continue;
+    // Voxels at the ends of the volume, its margin, get none: not all six are inside.
     const int k = beside / (nx * ny), j = beside / nx - k * ny, i = beside - (k * ny + j) * nx;
-    if (i < 1 || j < 1 || k < 1 || i >= nx - 1 || j >= ny - 1 || k >= nz - 1) continue;
+    if (i < 1 || j < 1 || k < 1 || i >= nx - 1 || j >= ny - 1 || k >= nz - 1 || labels[beside] == sheet) continue;
     float nearest = 2.0f;
     uint best = 0u;
     int is_first = 1;
