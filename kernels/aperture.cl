@@ -30,6 +30,8 @@ DEFINE_ELEVATION(float8, elevation_sigma8)
 #define MOST_SPREAD 3.0f      // of a beam
 #define BENT_PER_MM 4.0f      // nepers, both ways, that a line loses in strong tissue that bends what goes through
 #define LEAST_PER_MM 1e-3f    // nepers by which strong tissue differs from soft, so that its ends are seen in the sums
+#define MOST_GATHERED 64      // lines whose strips have scatterers in common, ...
+#define LEAST_GATHERED 0.4f   // ... and the least part that is left of their power
 #define LEFT_FOR_MEANS 0.01f  // of the power of a line that strong tissue stops
 #define LEAST_POWER 1e-7f     // of a beam re an undisturbed one
 
@@ -466,14 +468,23 @@ __kernel void keep_levels(__constant const Acquisition *acquisition, __global co
                              mean_passed(acquisition, screens_, node, line, sigma * spread));
 }
 
-// The factor by which the power of speckle would grow where the axes of neighbouring lines come together to the part
-// `ratio` of their distance: a scatterer then counts for several lines, whose phases differ by `turns` from one to the
-// next (docs/physics.md#beams-from-an-aperture).
+// The factor by which the power of speckle would change where the axes of neighbouring lines come together to the part
+// `ratio` of their distance: a scatterer is then in the strips of several lines, which add up with phases that differ
+// by `turns` from one to the next (docs/physics.md#beams-from-an-aperture).
 inline float gathered_power(__constant const Acquisition *acquisition, float path, float ratio, float turns) {
-  const float strip = line_distance(acquisition, path), sigma = lateral_sigma(acquisition, path);
-  const float strip2 = strip * strip / 12.0f, beam2 = sigma * sigma, narrowed2 = ratio * ratio * beam2 + strip2;
-  const float coherent = fmax(sqrt((beam2 + strip2) / narrowed2), 1.0f);
-  return 1.0f + (coherent - 1.0f) * exp_fast(-3.2898681f * turns * turns * beam2 / narrowed2);  // (2 pi)^2 / 12
+  const float apart = 0.5f * line_distance(acquisition, path) / lateral_sigma(acquisition, path);
+  // Their depths differ, too, by a part of the pulse. Its deviation is 2.3548 / (2 pi bandwidth) cycles.
+  const float later = 1.3341168f * acquisition->fractional_bandwidth * turns;
+  const float decay = apart * apart + later * later;
+  float sum = 1.0f;
+  for (int n = 1; n < MOST_GATHERED; n++) {
+    const float common = 1.0f - n * fabs(ratio), weight = exp_fast(-decay * n * n);
+    if (common <= 0.0f || weight < 1e-3f) break;
+    float cosine, sine;
+    turn(n * turns, &cosine, &sine);
+    sum += 2.0f * common * weight * cosine;
+  }
+  return fmax(sum, LEAST_GATHERED);
 }
 
 // The beams of traced lines, interpolated between screens; 0 at the face. Axes that come together must not create

@@ -130,21 +130,25 @@ __kernel void fit_sheets(__global const uchar *bits, int nx, int ny, int nz, int
 }
 
 // Voxels beside a sheet get the nearest plane of the six voxels around them: a scatterer then finds it at the nearest
-// voxel. Work-items of several points write the same value.
+// voxel. The first of these six that has the sheet's label writes.
 __kernel void spread_sheets(__global const uchar *labels, int nx, int ny, int nz, int sheet, __global const int *points,
                             __global uint *planes) {
   const int here = points[get_global_id(0)];
   for (int n = 0; n < 6; n++) {
     const int beside = here + step_to(n, nx, ny);
-    if (labels[beside] == sheet) continue;
-    // (Labels have a margin of one voxel without a sheet, so that only what is in it can be beyond the volume.)
+    if (beside < 0 || beside >= nx * ny * nz) continue;
+    // Voxels at the ends of the volume, its margin, get none: not all six are inside.
     const int k = beside / (nx * ny), j = beside / nx - k * ny, i = beside - (k * ny + j) * nx;
-    if (i < 1 || j < 1 || k < 1 || i >= nx - 1 || j >= ny - 1 || k >= nz - 1) continue;
+    if (i < 1 || j < 1 || k < 1 || i >= nx - 1 || j >= ny - 1 || k >= nz - 1 || labels[beside] == sheet) continue;
     float nearest = 2.0f;
     uint best = 0u;
+    int is_first = 1;
     for (int m = 0; m < 6; m++) {
       const int from = beside + step_to(m, nx, ny);
-      if (labels[from] != sheet || !planes[from]) continue;
+      if (labels[from] != sheet) continue;
+      if (is_first && from != here) break;
+      is_first = 0;
+      if (!planes[from]) continue;
       const uint plane = planes[from];
       const float3 gradient = gradient_of_sheet(plane);
       const float along = m < 2 ? gradient.x : m < 4 ? gradient.y : gradient.z;
@@ -154,6 +158,6 @@ __kernel void spread_sheets(__global const uchar *labels, int nx, int ny, int nz
       nearest = fabs(distance);
       best = (plane & ~(255u << 18)) | ((uint)clamp((int)rint(128.0f + distance / SHEET_DISTANCE_STEP), 1, 255) << 18);
     }
-    planes[beside] = best;
+    if (!is_first) planes[beside] = best;
   }
 }

@@ -256,7 +256,7 @@ def test_the_medium_is_the_same_on_the_host(has_shares):
     assert model.distance is not None and np.abs((voxels >> 8).astype(int) - model.distance).max() <= 1
     planes = download(found.sheet_buffer, shape, np.uint32)
     sheets = model.sheets
-    assert found.sheet_label == sheets.label == 4 and sheets.is_thin.sum() > 500
+    assert sheets is not None and found.sheet_label == sheets.label == 4 and sheets.is_thin.sum() > 500
     has_plane = sheets.gradient.any(axis=-1)
     assert np.array_equal(planes > 0, has_plane)
     beside, distance = planes >> 26, (planes >> 18 & 255).astype(int) - 128

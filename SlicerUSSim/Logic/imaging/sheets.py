@@ -39,7 +39,7 @@ def sheet_planes(device: Device, padded: np.ndarray, sheet: int, spacing_mm: np.
     dims = [np.int32(n) for n in padded.shape[::-1]]
     rows, taps = (device.upload(table) for table in window_tables())
     point_buffer, labels = device.upload(points), device.upload(padded)
-    side = np.float32(spacing_mm / np.cbrt(np.prod(spacing_mm)))
+    side = (spacing_mm / np.cbrt(np.prod(spacing_mm))).astype(np.float32)
     device.run(kernels["find_cores"], (len(points),), bits, *dims, rows, taps, point_buffer, cores)
     device.run(
         kernels["fit_sheets"], (len(points),), bits, *dims, np.int32(sheet), *side, rows, taps, labels, point_buffer,

@@ -32,7 +32,7 @@ CONSTANTS = {
     # Of the sheet's indicator, smoothed by 0.75 voxel: a layer of one voxel reaches 0.5, of two 0.82; from this on a
     # layer is thick and has two borders
     "SHEET_THICK": 0.9,
-    "SHEET_LEAST_AREA": 2.5,  # of a sheet in it: product of the variances along both axes of a plane, voxels^4; whole: 16
+    "SHEET_LEAST_AREA": 2.5,  # of a sheet in it: product of the variances along a plane, voxels^4; of a whole one 16
     "SHEET_DISTANCE_STEP": 0.015625,  # of the stored distance, voxels
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
     "MAX_SEGMENTS": 256,  # per traced line

@@ -28,7 +28,7 @@ class Sheets:
         self.label = sheet
         member = (labels == sheet).astype(float)
         inside = _windowed(member, _CORE_SIGMA, _CORE_REACH, np.zeros((1, 3), int))[..., 0]
-        is_thick = ndimage.maximum_filter(inside * member >= _THICK, size=3)
+        is_thick: np.ndarray = ndimage.maximum_filter(inside * member >= _THICK, size=3)
         #: (k, j, i) True in thin sheets
         self.is_thin = (member > 0) & ~is_thick
         #: (k, j, i, 3) gradients in voxels, of length 1, 0 where there is no plane; (k, j, i) distances in voxels; and
@@ -69,7 +69,7 @@ class Sheets:
 
     def _spread(self, member: np.ndarray) -> None:
         """Voxels beside a sheet get the nearest plane of the six around them."""
-        has_plane = self.gradient.any(axis=-1)
+        has_plane = np.abs(self.gradient).sum(axis=-1) > 0.0
         for k, j, i in np.argwhere(ndimage.binary_dilation(member) & ~member)[:, ::1]:
             if min(k, j, i) < 1 or any(n >= size - 1 for n, size in zip((k, j, i), member.shape, strict=True)):
                 continue

@@ -30,6 +30,7 @@ from SlicerUSSim.Logic.verification.numpy_model.labels import Labels, border_nor
 _NOT_STRONG, _THROUGH, _UNDER = range(3)
 _DARKEST = 7.0  # nepers lost to strong tissue: behind it nothing is left of a beam
 _MOST_COURSES = 16
+_MOST_GATHERED, _LEAST_GATHERED = 64, f32(0.4)  # lines with scatterers in common, and the least part of their power
 _MOST_LOSS = 1.0  # nepers by which strong tissue may change the frequency of what has passed it
 
 
@@ -160,12 +161,13 @@ class Tracer:
         return np.where(number[:, None] == 0, f32(0), beam)
 
     def _gathered_power(self, path: np.ndarray, ratio: np.ndarray, turns: np.ndarray) -> np.ndarray:
-        """How power would grow where axes come together to the part `ratio` of their distance; `turns` per line."""
-        strip, sigma = Beam(self.acquisition).line_distance(path), Beam(self.acquisition).lateral_sigma(path)
-        strip2, beam2 = strip * strip / f32(12), sigma * sigma
-        narrowed2 = ratio * ratio * beam2 + strip2
-        coherent = np.maximum(np.sqrt((beam2 + strip2) / narrowed2), f32(1))
-        return f32(1) + (coherent - f32(1)) * exp(f32(-(np.pi**2) / 3.0) * turns * turns * beam2 / narrowed2)
+        """How power would change where axes come together to the part `ratio` of their distance; `turns` per line."""
+        beam, width = Beam(self.acquisition), f32(1.3341168) * self.acquisition["fractional_bandwidth"]
+        decay = (f32(0.5) * beam.line_distance(path) / beam.lateral_sigma(path)) ** 2 + (width * turns) ** 2
+        n = np.arange(1, _MOST_GATHERED, dtype=np.float32)[:, None]
+        common, weight = np.maximum(f32(1) - n * np.abs(ratio), f32(0)), np.exp(-decay * n * n)
+        terms = common * np.where(weight < 1e-3, f32(0), weight) * np.cos(f32(2 * np.pi) * n * turns)
+        return np.maximum(f32(1) + f32(2) * terms.sum(axis=0), _LEAST_GATHERED)
 
     def _start_pieces(self, rays: Rays, number: np.ndarray) -> Rays:
         """The rays at the start of the pieces `number` of their lines; behind the last one they go straight on."""

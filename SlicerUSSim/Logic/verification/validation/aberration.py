@@ -23,11 +23,13 @@ from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw
 from SlicerUSSim.Logic.verification.wave import speckle_power
 
 _DEPTHS_MM = np.array([32.0, 38.0, 44.0, 50.0])
-_CYST_SPEEDS_M_S = (1440.0, 1500.0, 1640.0)
+#: Speed in m/s and radius in mm
+_CYSTS = {"1440 m/s": (1440.0, 4.0), "1500 m/s": (1500.0, 4.0), "1640 m/s": (1640.0, 4.0),
+          "1440 m/s, 7 mm": (1440.0, 7.0), "1640 m/s, 7 mm": (1640.0, 7.0)}  # fmt: skip
 #: Phantoms by name, for any rotation
 _SCENES: dict[str, Callable[..., Phantom]] = {
     "folds": folds,
-    **{f"{speed:.0f} m/s": partial(speed_cyst, speed) for speed in _CYST_SPEEDS_M_S},
+    **{name: partial(speed_cyst, speed, radius_mm=radius) for name, (speed, radius) in _CYSTS.items()},
 }
 _LINES = slice(12, 150, 4)  # around those beyond, the phantoms end
 _SEEDS = 5  # of scatterers, over which speckle averages
@@ -65,15 +67,15 @@ def beams_behind_cysts(rotation: np.ndarray, device) -> Outcome:
     """Mean power and edge shadow behind cysts of other speeds of sound, against wave propagation."""
     rows, plots = [], []
     place = PROBES["linear"].line_positions()[_LINES]
-    behind = np.abs(place) < 8.0
-    for scene in list(_SCENES)[1:]:
+    for scene, (_, radius) in _CYSTS.items():
+        behind = np.abs(place) < 2.0 * radius
         wave = _wave_levels_db(scene, "linear")
         level = _levels_db(scene, "linear", "aperture", rotation, device)
         means = [float(10 * np.log10(np.mean(10 ** (values[behind] / 10)))) for values in (wave, level)]
-        edges = [float(values[np.abs(np.abs(place) - 4.0) < 1.2].mean()) for values in (wave, level)]
+        edges = [float(values[np.abs(np.abs(place) - radius) < 1.2].mean()) for values in (wave, level)]
         # Of the two edges; a shadow's place moves with depth, and its darkest line with the scatterers.
         darkest = [
-            float(np.mean([values[behind & (side * place > 1.5)].min() for side in (-1, 1)]))
+            float(np.mean([values[behind & (side * place > 0.4 * radius)].min() for side in (-1, 1)]))
             for values in (wave, level)
         ]
         rows += [
