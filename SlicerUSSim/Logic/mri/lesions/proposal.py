@@ -1,0 +1,79 @@
+"""A proposal: masks of a lesion's parts for a person to accept or to correct. Nothing else changes by it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.own_outputs import require_own, write_own_volume
+from SlicerUSSim.Logic.base.volume import Volume
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A lesion that an MRI seems to show."""
+
+    #: uint8 on the grid of the MRI; label n + 1 is part n, 0 is none of them
+    labels: Volume
+    #: Tissue of each part, from outside to inside: "oedema", "tumour", "necrosis", "cyst", "cavity"
+    tissues: tuple[str, ...]
+    #: How it looks: "enhancing", "bright in T2", "dark in T1", "fluid"
+    look: str
+    #: (3,) RAS mm of the point from which it was grown
+    seed_ras_mm: np.ndarray
+    #: What a user should look at, a line each
+    warnings: tuple[str, ...] = ()
+
+    def mask(self, tissue: str) -> Volume:
+        """uint8 mask of a part on the grid of the MRI, as pathology.add_tissue takes it."""
+        return self.labels.with_array((self.labels.array == self.tissues.index(tissue) + 1).astype(np.uint8))
+
+    def volume_ml(self, *tissues: str) -> float:
+        """Of these parts, by default of all."""
+        numbers = [n for n, tissue in enumerate(self.tissues, 1) if not tissues or tissue in tissues]
+        return float(np.isin(self.labels.array, numbers).sum() * self.labels.voxel_ml)
+
+    @property
+    def centre_ras_mm(self) -> np.ndarray:
+        """(3,) centroid."""
+        centre = ndimage.center_of_mass(self.labels.array > 0)
+        return self.labels.ijk_to_ras[:3] @ [*centre[::-1], 1.0]
+
+    @property
+    def message(self) -> str:
+        """One line: "tumour 0.5 ml in oedema 8.1 ml at R 41, A -12, S 20 mm, enhancing; proposed, not applied"."""
+        parts = [f"{tissue} {_millilitres(self.volume_ml(tissue))}" for tissue in reversed(self.tissues)]
+        return f"{', '.join(parts)} at {place(self.centre_ras_mm)}, {self.look}; proposed, not applied"
+
+    def files(self, labels_path: str | os.PathLike) -> dict[str, Path]:
+        """{tissue: file} beside a label map in which write() keeps the masks."""
+        path = Path(labels_path)
+        name = path.name.lower()
+        suffix = next((end for end in (".nii.gz", ".seg.nrrd") if name.endswith(end)), path.suffix)
+        stem = path.name[: len(path.name) - len(suffix)]
+        return {tissue: path.with_name(f"{stem}_proposed_{tissue}{suffix}") for tissue in self.tissues}
+
+    def write(self, labels_path: str | os.PathLike) -> dict[str, Path]:
+        """Write a mask for each part beside a label map; {tissue: file}.
+
+        Raises SimulationError for a file that exists and is not as this program wrote it, as after an edit; none is
+        written then.
+        """
+        files = self.files(labels_path)
+        require_own(*files.values())
+        for tissue, path in files.items():
+            write_own_volume(path, self.mask(tissue))
+        return files
+
+
+def place(ras_mm: np.ndarray) -> str:
+    """ "R 41, A -12, S 20 mm" """
+    return "{} mm".format(", ".join(f"{axis} {round(float(value))}" for axis, value in zip("RAS", ras_mm, strict=True)))
+
+
+def _millilitres(volume: float) -> str:
+    return f"{volume:.1f} ml" if volume >= 1.0 else f"{volume:.2f} ml"
