@@ -14,9 +14,11 @@ from SlicerUSSim.Logic.mri.lesions.looks import Look, Window, brighter_than_whit
 #: Radius of the largest ball in a lesion: vessels and the cortex are thinner
 _LEAST_ENHANCING_MM, _LEAST_WATERY_MM = 1.9, 3.5
 #: Volume in units of that ball's: vessels are long, the cortex is a sheet
-_MOST_ENHANCING_BALLS, _MOST_WATERY_BALLS = 14.0, 14.0
-#: Share of the border at the brain's surface from which on a region is a sinus or a vein on the brain
-_MOST_AT_SURFACE = 0.35
+_MOST_ENHANCING_BALLS, _MOST_WATERY_BALLS = 14.0, 100.0
+#: Share of the shell of 3 mm around that is no tissue, from which on what enhances is a vein, a sinus or choroid plexus
+_MOST_BESIDE_NO_TISSUE, _SHELL_MM = 0.15, 3.0
+#: Share of the border at the brain's surface from which on fluid is that of a sulcus
+_MOST_AT_SURFACE = 0.1
 #: Least mean difference of the likeness from the other hemisphere's
 _LEAST_ASYMMETRY = 0.4
 #: What is nearer to the midline has no counterpart; the two hemispheres differ by this much in place
@@ -35,8 +37,8 @@ def why_no_lesion(evidence: Evidence, look: Look, region: Region, window: Window
     if look.name == "enhancing":
         if region.radius_mm < _LEAST_ENHANCING_MM or balls > _MOST_ENHANCING_BALLS:
             return "like a vessel, long and thin"
-        if _at_surface(evidence, region, window) > _MOST_AT_SURFACE:
-            return "at the surface of the brain, as veins and dura do"
+        if beside_no_tissue(evidence, region, window) > _MOST_BESIDE_NO_TISSUE:
+            return "in CSF or at the surface of the brain, as veins, choroid plexus and dura do"
         if _enhances_on_both_sides(evidence, region, window):
             return "on both sides, as vessels and choroid plexus do"
         return None
@@ -53,7 +55,7 @@ def _why_healthy_fluid(evidence: Evidence, region: Region, window: Window) -> st
     inside = region.inside
     if evidence.expected is None:
         return "without an atlas, it may be a ventricle"
-    if _at_surface(evidence, region, window) > 0.1:
+    if _at_surface(evidence, region, window) > _MOST_AT_SURFACE:
         return "at the surface of the brain"
     if float(evidence.expected[_CSF][window][inside].mean()) > _MOST_EXPECTED:
         return "where a ventricle or a sulcus is expected"
@@ -62,6 +64,13 @@ def _why_healthy_fluid(evidence: Evidence, region: Region, window: Window) -> st
     if mirrored is not None and float((mirrored[inside] > 0.5).mean()) > _MOST_MIRRORED:
         return "on both sides, as ventricles are"
     return None
+
+
+def beside_no_tissue(evidence: Evidence, region: Region, window: Window) -> float:
+    """Share of the shell around a region that is fluid or outside the brain."""
+    apart = cast(np.ndarray, ndimage.distance_transform_edt(~region.inside, sampling=evidence.spacing_mm.tolist()))
+    shell = (apart > 0.0) & (apart <= _SHELL_MM)
+    return float((~evidence.inside | evidence.fluid)[window][shell].mean()) if shell.any() else 1.0
 
 
 def _at_surface(evidence: Evidence, region: Region, window: Window) -> float:

@@ -27,6 +27,9 @@ _TISSUE_SHARE = 0.3
 #: Least abnormality of a seed that is not enhancing, in units of the contrast from white matter to grey
 _LEAST_ABNORMAL = 0.5
 _BALL_MM = 2.5
+#: Where water is bright, by how many deviations of the noise oedema is brighter than white matter at least, and how
+#: many times that a seed counts at most
+_BRIGHT_CONTRASTS, _TYPICAL_NOISES, _MOST_TYPICAL = ("t2", "flair"), 3.0, 1.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +104,22 @@ def watery(evidence: Evidence, window: Window, seed: np.ndarray) -> Look | None:
     if not ball.any():
         return None
     here = np.array([float(np.median(image[ball_window][ball])) for image in evidence.images])
+    # A seed in the brightest part means all of it: in T2 and FLAIR, where grey matter is no brighter than that
+    most = evidence.white + _MOST_TYPICAL * (typically_watery(evidence) - evidence.white)
+    bright = np.isin(evidence.contrasts, _BRIGHT_CONTRASTS)
+    here = np.where(bright, np.minimum(here, most), here)
     weights = watery_weights(evidence, here)
     if weights is None:
         return None
     allowed = evidence.inside[window] & ~evidence.fluid[window] & ~evidence.is_between_hemispheres(window)
     return watery_look(evidence, window, weights, allowed, in_window(seed, window))
+
+
+def typically_watery(evidence: Evidence) -> np.ndarray:
+    """(channels,) intensities of oedema: as dark as grey matter in T1, and clearly brighter than white in others."""
+    bright = np.isin(evidence.contrasts, _BRIGHT_CONTRASTS)
+    step = np.abs(evidence.grey - evidence.white)
+    return evidence.white + np.where(bright, np.maximum(step, _TYPICAL_NOISES * evidence.deviations), -step)
 
 
 def watery_look(evidence: Evidence, window: Window, weights: np.ndarray, allowed: np.ndarray, seed: np.ndarray) -> Look:
@@ -125,7 +139,7 @@ def watery_weights(evidence: Evidence, here: np.ndarray) -> np.ndarray | None:
     Fisher's discriminant of white matter and the seed, with independent channels. None where `here` is no more watery
     than white matter: less than half-way to grey matter.
     """
-    signs = np.array([1.0 if contrast in ("t2", "flair") else -1.0 for contrast in evidence.contrasts])
+    signs = np.where(np.isin(evidence.contrasts, _BRIGHT_CONTRASTS), 1.0, -1.0)
     contrast = np.abs(evidence.grey - evidence.white)
     step = np.maximum(signs * (here - evidence.white), 0.0)
     spread = np.hypot(evidence.deviations, _TISSUE_SHARE * contrast)

@@ -39,8 +39,9 @@ class Proposal:
 
     @property
     def centre_ras_mm(self) -> np.ndarray:
-        """(3,) centroid."""
-        centre = ndimage.center_of_mass(self.labels.array > 0)
+        """(3,) centroid, of the parts without oedema where there are others."""
+        main = [n for n, tissue in enumerate(self.tissues, 1) if tissue != "oedema"] or [1]
+        centre = ndimage.center_of_mass(np.isin(self.labels.array, main))
         return self.labels.ijk_to_ras[:3] @ [*centre[::-1], 1.0]
 
     @property

@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.mri.lesions.looks import (
     Look,
     Window,
     around,
+    brighter_than_white,
     enhancing,
     fluid,
     watery,
@@ -31,11 +32,13 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
 
 #: Reach of the windows in which a region is grown, one after the other: most lesions are small
-_REACHES_MM = (20.0, 45.0)
+_REACHES_MM = (20.0, 70.0)
 #: Tissues that are fluid in an MRI
 FLUIDS = ("cyst", "necrosis", "cavity")
 #: Least volume of a part besides the largest
 _LEAST_PART_ML = 0.1
+#: Voxels around a watery region in which its enhancing part may be, and how many places are tried
+_BORDER_VOXELS, _MOST_BLOBS = 2, 4
 #: Distance from an enhancing region in which oedema begins
 _OEDEMA_MM = 4.0
 
@@ -94,7 +97,7 @@ def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue
 
 def grown_by(look: object, evidence: Evidence, index: np.ndarray) -> Grown | None:
     """The region of one look around a place (k, j, i in the box); None if it does not look so, or has no border."""
-    for reach in _REACHES_MM:
+    for reach in _REACHES_MM[1:] if look is watery else _REACHES_MM:
         window = window_around(evidence, index, reach + 2.0)
         seen = look(evidence, window, index)  # type: ignore[operator]
         if seen is None:
@@ -136,12 +139,20 @@ def proposal_of(segmentation: Segmentation, grown: Grown, seed: np.ndarray, name
     evidence = segmentation.evidence
     inside = grown.in_box(evidence)
     parts: dict[str, np.ndarray] = {}
-    if grown.look.name == "enhancing" and named is None:
-        core = inside & _is_necrotic(evidence, grown)
-        oedema = _oedema_around(evidence, grown, inside)
-        parts = {"oedema": oedema, "tumour": inside & ~core, "necrosis": core}
+    if named is not None:
+        parts[named] = inside
+    elif grown.look.name == "enhancing":
+        core = _necrosis_in(evidence, grown)
+        parts = {"oedema": _oedema_around(evidence, grown, inside), "tumour": inside & ~core, "necrosis": core}
+    elif grown.look.name == "fluid":
+        parts["cyst"] = inside
     else:
-        parts = {named or ("cyst" if grown.look.name == "fluid" else "tumour"): inside}
+        within = _enhancing_in(evidence, inside)
+        if within is None:
+            parts["tumour"] = inside
+        else:
+            core, both = _necrosis_in(evidence, within), within.in_box(evidence)
+            parts = {"oedema": inside & ~both, "tumour": both & ~core, "necrosis": core}
     least = _LEAST_PART_ML / evidence.voxel_ml
     main = max(parts, key=lambda name: int(parts[name].sum()) if name != "oedema" else 0)
     labels, tissues = np.zeros(inside.shape, np.uint8), []
@@ -159,7 +170,7 @@ def proposal_of(segmentation: Segmentation, grown: Grown, seed: np.ndarray, name
     )
 
 
-def _is_necrotic(evidence: Evidence, grown: Grown) -> np.ndarray:
+def _necrosis_in(evidence: Evidence, grown: Grown) -> np.ndarray:
     """(k, j, i) bool: not enhancing, within the rim: darker than half-way to grey matter's contrast."""
     result = np.zeros(evidence.inside.shape, bool)
     likeness, inside = grown.look.likeness, grown.region.inside
@@ -167,6 +178,26 @@ def _is_necrotic(evidence: Evidence, grown: Grown) -> np.ndarray:
     dark = inside & (smoothed(likeness, grown.look.allowed, evidence.spacing_mm) < 0.3) & (depth > 2.0)
     result[grown.window] = ndimage.binary_opening(dark)
     return result
+
+
+def _enhancing_in(evidence: Evidence, inside: np.ndarray) -> Grown | None:
+    """The largest region that enhances in a watery one (k, j, i), or at its border; None if none does."""
+    channel = evidence.channel("t1gd")
+    if channel is None:
+        return None
+    window = ndimage.find_objects(ndimage.binary_dilation(inside, iterations=_BORDER_VOXELS).astype(np.uint8))[0]
+    near = ndimage.binary_dilation(inside[window], iterations=_BORDER_VOXELS) & evidence.inside[window]
+    smooth = smoothed(evidence.images[channel][window], evidence.inside[window], evidence.spacing_mm)
+    parts, count = ndimage.label(near & (smooth > brighter_than_white(evidence, channel)))  # type: ignore[misc]
+    found: Grown | None = None
+    for number in np.argsort(-np.bincount(parts.ravel())[1:], kind="stable")[:_MOST_BLOBS] + 1 if count else ():
+        peak = np.unravel_index(int(np.where(parts == number, smooth, -np.inf).argmax()), parts.shape)
+        grown = grown_by(enhancing, evidence, np.add(peak, [part.start for part in window]))
+        if grown is None or why_no_lesion(evidence, grown.look, grown.region, grown.window) is not None:
+            continue
+        if found is None or grown.region.inside.sum() > found.region.inside.sum():
+            found = grown
+    return found
 
 
 def _oedema_around(evidence: Evidence, grown: Grown, inside: np.ndarray) -> np.ndarray:
