@@ -18,7 +18,7 @@ _LEVELS = np.linspace(0.2, 0.85, 14)
 #: Standard deviation of the smoothing of the likeness
 _SMOOTHING_MM = 1.0
 #: Bridges thinner than this share of the region at the seed are cut, and those thinner than this many millimetres
-_BRIDGE_SHARE, _LEAST_BRIDGE_MM, _MOST_BRIDGE_MM = 0.4, 0.8, 3.0
+_BRIDGE_SHARE, _LEAST_BRIDGE_MM, _MOST_BRIDGE_MM = 0.5, 0.8, 5.0
 #: Windows that reach farther are looked at in blocks of about this size
 _FINE_REACH_MM, _COARSE_MM = 25.0, 2.0
 #: What is this near to the seed is the place that was meant

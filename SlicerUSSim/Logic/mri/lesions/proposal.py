@@ -37,6 +37,11 @@ class Proposal:
         numbers = [n for n, tissue in enumerate(self.tissues, 1) if not tissues or tissue in tissues]
         return float(np.isin(self.labels.array, numbers).sum() * self.labels.voxel_ml)
 
+    def is_mostly_in(self, other: Proposal) -> bool:
+        """Whether more than half of this proposal is in another one, or of the other in this one."""
+        mine, its = self.labels.array > 0, other.labels.array > 0
+        return bool((mine & its).sum() > 0.5 * min(mine.sum(), its.sum()))
+
     @property
     def centre_ras_mm(self) -> np.ndarray:
         """(3,) centroid, of the parts without oedema where there are others."""
@@ -50,25 +55,42 @@ class Proposal:
         parts = [f"{tissue} {_millilitres(self.volume_ml(tissue))}" for tissue in reversed(self.tissues)]
         return f"{', '.join(parts)} at {place(self.centre_ras_mm)}, {self.look}; proposed, not applied"
 
-    def files(self, labels_path: str | os.PathLike) -> dict[str, Path]:
-        """{tissue: file} beside a label map in which write() keeps the masks."""
-        path = Path(labels_path)
-        name = path.name.lower()
-        suffix = next((end for end in (".nii.gz", ".seg.nrrd") if name.endswith(end)), path.suffix)
-        stem = path.name[: len(path.name) - len(suffix)]
-        return {tissue: path.with_name(f"{stem}_proposed_{tissue}{suffix}") for tissue in self.tissues}
+    def files(self, labels_path: str | os.PathLike, number: int = 1) -> dict[str, Path]:
+        """{tissue: file} beside a label map in which write() keeps the masks, of the first or a further proposal."""
+        stem, suffix = _split(Path(labels_path))
+        which = "" if number == 1 else f"{number}_"
+        return {tissue: Path(labels_path).with_name(f"{stem}{which}{tissue}{suffix}") for tissue in self.tissues}
 
-    def write(self, labels_path: str | os.PathLike) -> dict[str, Path]:
+    def write(self, labels_path: str | os.PathLike, number: int = 1) -> dict[str, Path]:
         """Write a mask for each part beside a label map; {tissue: file}.
 
         Raises SimulationError for a file that exists and is not as this program wrote it, as after an edit; none is
         written then.
         """
-        files = self.files(labels_path)
+        files = self.files(labels_path, number)
         require_own(*files.values())
         for tissue, path in files.items():
             write_own_volume(path, self.mask(tissue))
         return files
+
+
+def require_own_proposals(labels_path: str | os.PathLike) -> None:
+    """Raise SimulationError for a proposal beside a label map that was edited since write(), or made by others."""
+    path = Path(labels_path)
+    stem, suffix = _split(path)
+    if path.parent.is_dir():
+        require_own(*(file for file in sorted(path.parent.iterdir()) if _is_called(file.name, stem, suffix)))
+
+
+def _split(path: Path) -> tuple[str, str]:
+    """(beginning, ending) of the names of the proposals beside a label map."""
+    name = path.name.lower()
+    suffix = next((path.name[-len(end) :] for end in (".nii.gz", ".seg.nrrd") if name.endswith(end)), path.suffix)
+    return f"{path.name[: len(path.name) - len(suffix)]}_proposed_", suffix
+
+
+def _is_called(name: str, stem: str, suffix: str) -> bool:
+    return name.startswith(stem) and name.endswith(suffix)
 
 
 def place(ras_mm: np.ndarray) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.lesions.doubts import why_no_lesion
 from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
 from SlicerUSSim.Logic.mri.lesions.growth import Region, grow, smoothed, with_foot
@@ -41,6 +42,12 @@ _LEAST_PART_ML = 0.1
 _BORDER_VOXELS, _MOST_BLOBS = 2, 4
 #: Distance from an enhancing region in which oedema begins
 _OEDEMA_MM = 4.0
+
+
+_WATERY_MEANS = (
+    "what holds more water than white matter may be tumour or oedema: look, and say which (R,A,S=oedema); contrast agent "
+    "would tell more"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,12 +83,8 @@ def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue
     """
     evidence = segmentation.evidence
     named = None if tissue is None else tissue_to_add(tissue)
-    seed = np.asarray(seed_ras_mm, float)
-    require(
-        seed.shape == (3,) and bool(np.isfinite(seed).all()),
-        f"the seed is {seed_ras_mm!r}, expected three finite numbers: R, A and S in mm",
-    )
-    index = require_in_brain(segmentation, seed)
+    seed = require_in_image(segmentation.labels, seed_ras_mm)
+    index = _require_in_brain(evidence, seed)
     doubts = []
     candidates = (fluid,) if named in FLUIDS else (enhancing, watery, fluid) if named is None else (enhancing, watery)
     for look in candidates:
@@ -110,9 +113,13 @@ def grown_by(look: object, evidence: Evidence, index: np.ndarray) -> Grown | Non
     return None
 
 
-def require_in_brain(segmentation: Segmentation, seed: np.ndarray) -> np.ndarray:
-    """(3,) k, j, i of a point in the box of the brain. Raises SimulationError for one outside the image or brain."""
-    evidence, grid = segmentation.evidence, segmentation.labels
+def require_in_image(grid: Volume, seed_ras_mm: Sequence[float]) -> np.ndarray:
+    """(3,) RAS mm of a seed. Raises SimulationError for one outside the grid of an MRI, and for what is no point."""
+    seed = np.asarray(seed_ras_mm, float)
+    require(
+        seed.shape == (3,) and bool(np.isfinite(seed).all()),
+        f"the seed is {seed_ras_mm!r}, expected three finite numbers: R, A and S in mm",
+    )
     ijk = grid.ras_to_ijk[:3] @ [*seed, 1.0]
     size = np.array(grid.array.shape[::-1])
     beyond = float((np.maximum(np.maximum(-0.5 - ijk, ijk - size + 0.5), 0.0) * grid.spacing_mm).max())
@@ -121,6 +128,11 @@ def require_in_brain(segmentation: Segmentation, seed: np.ndarray) -> np.ndarray
         f"the seed {place(seed)} is {max(beyond, 1.0):.0f} mm outside the image, expected a point in the lesion in RAS "
         "mm of the MRI; is it in voxels, or in LPS?",
     )
+    return seed
+
+
+def _require_in_brain(evidence: Evidence, seed: np.ndarray) -> np.ndarray:
+    """(3,) k, j, i in the box of the brain of a point in RAS mm. Raises SimulationError for one outside the brain."""
     index = evidence.index_of(seed)
     nearest = np.rint(index).astype(int)
     within = bool((nearest >= 0).all() and (nearest < evidence.inside.shape).all())
@@ -162,9 +174,11 @@ def proposal_of(segmentation: Segmentation, grown: Grown, seed: np.ndarray, name
             labels[part] = len(tissues)
         elif name != "oedema":
             labels[part] = len(tissues) or 1
-    warnings = [] if evidence.atlas is not None else [
-        "without an atlas, the other hemisphere was not compared: look whether this is healthy grey matter"
-    ]  # fmt: skip
+    warnings = []
+    if evidence.atlas is None:
+        warnings.append("without an atlas, the other hemisphere was not compared: look whether it is healthy tissue")
+    if named is None and grown.look.name not in ("enhancing", "fluid") and "oedema" not in tissues:
+        warnings.append(_WATERY_MEANS)
     return Proposal(
         segmentation.labels.with_array(evidence.to_whole(labels)), tuple(tissues), grown.look.name, seed, tuple(warnings)
     )
