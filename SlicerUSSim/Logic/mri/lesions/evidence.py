@@ -75,13 +75,16 @@ class Evidence:
         return next((n for n, contrast in enumerate(self.contrasts) if contrast in contrasts), None)
 
     def is_fluid(self, images: np.ndarray) -> np.ndarray:
-        """(k, j, i) bool of images (channels, k, j, i): at least half as CSF, in the channel that tells it best."""
-        channel = self.channel("t2", "flair") or 0
-        csf = self.csf[channel]
-        # In T2 oedema is between grey matter and CSF
-        tissue = min((self.grey[channel], self.white[channel]), key=lambda mean: abs(mean - csf))
-        middle = np.float32(csf + _MIDDLE * (tissue - csf))
-        return images[channel] > middle if csf > tissue else images[channel] < middle
+        """(k, j, i) bool of images (channels, k, j, i): at least half as CSF, in every channel.
+
+        In T2 oedema is between grey matter and CSF, and in T1 it is as grey matter.
+        """
+        result = np.ones(images.shape[1:], bool)
+        for image, csf, *tissues in zip(images, self.csf, self.grey, self.white, strict=True):
+            nearest = min(tissues, key=lambda mean, csf=csf: abs(mean - csf))
+            middle = np.float32(csf + _MIDDLE * (nearest - csf))
+            result &= image > middle if csf > nearest else image < middle
+        return result
 
     @cached_property
     def fluid(self) -> np.ndarray:

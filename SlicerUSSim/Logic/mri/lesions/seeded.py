@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
@@ -40,6 +40,8 @@ FLUIDS = ("cyst", "necrosis", "cavity")
 _LEAST_PART_ML = 0.1
 #: Voxels around a watery region in which its enhancing part may be, and how many places are tried
 _BORDER_VOXELS, _MOST_BLOBS = 2, 4
+#: Share of the border of fluid along which it has a rim that enhances, if it is necrosis, and the rim's largest distance
+_LEAST_ENCLOSED, _RIM_MM = 0.5, 4.0
 #: Distance from an enhancing region in which oedema begins
 _OEDEMA_MM = 4.0
 
@@ -88,29 +90,79 @@ def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue
     doubts = []
     candidates = (fluid,) if named in FLUIDS else (enhancing, watery, fluid) if named is None else (enhancing, watery)
     for look in candidates:
-        grown = grown_by(look, evidence, index)
-        if grown is None:
-            continue
-        why = None if named is not None else why_no_lesion(evidence, grown.look, grown.region, grown.window)
-        if why is None:
-            return proposal_of(segmentation, grown, seed, named)
-        doubts.append(why)
+        # A piece of a large rim looks like a vessel; all of it does not
+        for reaches in (_REACHES_MM, _REACHES_MM[1:]) if look is enhancing else (_REACHES_MM,):
+            grown = grown_by(look, evidence, index, reaches)
+            if grown is None:
+                break
+            why = None if named is not None else why_no_lesion(evidence, grown.look, grown.region, grown.window)
+            if why is None:
+                return proposal_of(segmentation, grown, seed, named)
+            doubts.append(why)
     raise SimulationError(f"the seed {place(seed)} is in {_what_is_at(segmentation, index, doubts, named)}")
 
 
-def grown_by(look: object, evidence: Evidence, index: np.ndarray) -> Grown | None:
-    """The region of one look around a place (k, j, i in the box); None if it does not look so, or has no border."""
-    for reach in _REACHES_MM[1:] if look is watery else _REACHES_MM:
+def grown_by(
+    look: Callable[[Evidence, Window, np.ndarray], Look | None], evidence: Evidence, index: np.ndarray,
+    reaches_mm: Sequence[float] = _REACHES_MM,
+) -> Grown | None:  # fmt: skip
+    """The region of one look around a place (k, j, i in the box); None if it does not look so, or has no border.
+
+    Regions that end within the first reach are taken, and otherwise within the next.
+    """
+    for reach in _REACHES_MM[-1:] if look is watery else reaches_mm:
         window = window_around(evidence, index, reach + 2.0)
-        seen = look(evidence, window, index)  # type: ignore[operator]
+        seen = look(evidence, window, index)
         if seen is None:
             return None
         region = grow(seen.likeness, seen.allowed, seen.seed, evidence.spacing_mm, largest_mm=reach)
         if region is not None:
             if seen.name == "enhancing":
                 region = with_foot(region, seen.likeness, seen.allowed, evidence.spacing_mm)
-            return Grown(seen, region, window)
+                region = _with_enclosed_fluid(evidence, region, window)
+            grown = Grown(seen, region, window)
+            return _with_rim(evidence, grown) or grown if seen.name == "fluid" else grown
     return None
+
+
+def _with_enclosed_fluid(evidence: Evidence, region: Region, window: Window) -> Region:
+    """A region that enhances with the necrosis in its rim, also where the rim has gaps."""
+    inside = region.inside
+    parts, count = ndimage.label(evidence.fluid[window] & ~inside)  # type: ignore[misc]
+    near = ndimage.binary_dilation(inside, iterations=_BORDER_VOXELS)
+    touched = np.unique(parts[near & (parts > 0)]) if count else ()
+    for number in touched:
+        part = parts == number
+        around = ndimage.binary_dilation(part, iterations=_BORDER_VOXELS) & ~part
+        if float(near[around].mean()) >= _LEAST_ENCLOSED:
+            inside = inside | part | (around & near)
+    if inside is region.inside:
+        return region
+    inside = cast(np.ndarray, ndimage.binary_fill_holes(ndimage.binary_closing(inside, iterations=_BORDER_VOXELS)))
+    depth = cast(np.ndarray, ndimage.distance_transform_edt(inside, sampling=evidence.spacing_mm.tolist()))
+    return Region(inside, region.level, region.slope, float(depth.max()))
+
+
+def _with_rim(evidence: Evidence, grown: Grown) -> Grown | None:
+    """What enhances around a fluid region, with it; None if it has no such rim."""
+    channel = evidence.channel("t1gd")
+    if channel is None:
+        return None
+    inside = grown.region.inside
+    apart = cast(np.ndarray, ndimage.distance_transform_edt(~inside, sampling=evidence.spacing_mm.tolist()))
+    shell = (apart > 0.0) & (apart <= _RIM_MM) & evidence.inside[grown.window]
+    image = smoothed(evidence.images[channel][grown.window], evidence.inside[grown.window], evidence.spacing_mm)
+    bright = shell & (image > brighter_than_white(evidence, channel))
+    # Of a rim of any thickness, how much of the way around
+    seen = ndimage.binary_dilation(bright, iterations=_BORDER_VOXELS)
+    border = ndimage.binary_dilation(inside) & ~inside
+    if not bright.any() or float(seen[border].mean()) < _LEAST_ENCLOSED:
+        return None
+    peak = np.unravel_index(int(np.where(bright, image, -np.inf).argmax()), image.shape)
+    rim = grown_by(enhancing, evidence, np.add(peak, [part.start for part in grown.window]))
+    if rim is None or (rim.in_box(evidence) & grown.in_box(evidence)).sum() < 0.5 * inside.sum():
+        return None
+    return rim
 
 
 def require_in_image(grid: Volume, seed_ras_mm: Sequence[float]) -> np.ndarray:
