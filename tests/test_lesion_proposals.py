@@ -74,7 +74,7 @@ def brain(kind: str) -> tuple[Segmentation, np.ndarray]:
     if kind == "ring":
         maps, contrast, parts = with_ring_tumour(maps, CENTRE, 12.0), "t1gd", (3, 4)
     elif kind == "low":
-        maps, contrast, parts = with_low_grade_tumour(maps, CENTRE, 14.0), "t2", (5,)
+        maps, contrast, parts = with_low_grade_tumour(maps, CENTRE, 14.0), "flair", (5,)
     else:
         contrast, parts = "t1", ()
     maps = maps.coarser(2)

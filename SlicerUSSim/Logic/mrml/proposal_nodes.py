@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import slicer
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.lesions.detection import propose_lesions
@@ -89,11 +90,18 @@ class LesionProposals:
             lesions_node.SetAndObserveTransformNodeID(proposal_node.GetTransformNodeID())
         else:
             require(not apart, f"{named(lesions_node)} has another parent transform than {named(proposal_node)}")
+        if target.GetNumberOfSegments() == 0:
+            lesions_node.SetSourceRepresentationToBinaryLabelmap()
         names = []
         for segment_id in ids:
-            names.append(source.GetSegment(segment_id).GetName())
-            if not target.CopySegmentFromSegmentation(source, segment_id):
-                raise SimulationError(f"segment {names[-1]!r} could not be moved to {named(lesions_node)}")
+            segment, image = source.GetSegment(segment_id), slicer.vtkOrientedImageData()
+            name = segment.GetName()
+            is_there = proposal_node.GetBinaryLabelmapRepresentation(segment_id, image)
+            require(is_there and min(image.GetDimensions()) > 0, f"segment {name!r} of {named(proposal_node)} is empty")
+            lesions_node.AddSegmentFromBinaryLabelmapRepresentation(
+                image, name, segment.GetColor(), target.GenerateUniqueSegmentID(name)
+            )
+            names.append(name)
         self._scene.RemoveNode(proposal_node)
         return tuple(names)
 

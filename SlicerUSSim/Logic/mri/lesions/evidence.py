@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 
 _CSF, _GREY, _WHITE = range(len(TISSUES))
-#: Of two tissues, the share at which a voxel counts as the second
-_MIDDLE = 0.5
+#: Of two tissues, the share at which a voxel counts as the second; of tissue in CSF that is bright, as in T2, where
+#: oedema may be half-way to it
+_MIDDLE, _MIDDLE_BRIGHT = 0.5, 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class Evidence:
         result = np.ones(images.shape[1:], bool)
         for image, csf, *tissues in zip(images, self.csf, self.grey, self.white, strict=True):
             nearest = min(tissues, key=lambda mean, csf=csf: abs(mean - csf))
-            middle = np.float32(csf + _MIDDLE * (nearest - csf))
+            middle = np.float32(csf + (_MIDDLE_BRIGHT if csf > nearest else _MIDDLE) * (nearest - csf))
             result &= image > middle if csf > nearest else image < middle
         return result
 

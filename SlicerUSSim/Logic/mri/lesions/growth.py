@@ -24,7 +24,7 @@ _FINE_REACH_MM, _COARSE_MM = 25.0, 2.0
 #: What is this near to the seed is the place that was meant
 _NEAR_MM = 2.5
 #: Farthest and lowest at which a border has its foot, and thickness of the shell beyond it that is the surroundings
-_FOOT_MM, _FOOT_LEVEL, _SHELL_MM = 2.5, 0.2, 3.0
+_FOOT_MM, _FOOT_LEVEL, _SHELL_MM = 2.5, 0.25, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +75,10 @@ def grow(
         inside, radius = region
         if distance[inside].max() >= largest_mm:
             continue
+        # On both sides of the border, where tissue is on both
         free = ndimage.binary_dilation(inside) & ~inside & allowed
-        slope = float(steepness[free].mean()) if free.any() else 0.0
+        within = inside & allowed & ndimage.binary_dilation(free)
+        slope = 0.5 * float(steepness[free].mean() + steepness[within].mean()) if free.any() else 0.0
         if best is None or slope > best.slope:
             best = Region(inside, float(level), slope, radius)
     return best

@@ -159,10 +159,11 @@ def _with_rim(evidence: Evidence, grown: Grown) -> Grown | None:
     if not bright.any() or float(seen[border].mean()) < _LEAST_ENCLOSED:
         return None
     peak = np.unravel_index(int(np.where(bright, image, -np.inf).argmax()), image.shape)
-    rim = grown_by(enhancing, evidence, np.add(peak, [part.start for part in grown.window]))
-    if rim is None or (rim.in_box(evidence) & grown.in_box(evidence)).sum() < 0.5 * inside.sum():
-        return None
-    return rim
+    for reaches in (_REACHES_MM, _REACHES_MM[1:]):  # a piece of it, or all
+        rim = grown_by(enhancing, evidence, np.add(peak, [part.start for part in grown.window]), reaches)
+        if rim is not None and (rim.in_box(evidence) & grown.in_box(evidence)).sum() >= 0.5 * inside.sum():
+            return rim
+    return None
 
 
 def require_in_image(grid: Volume, seed_ras_mm: Sequence[float]) -> np.ndarray:
