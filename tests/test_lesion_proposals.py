@@ -150,7 +150,10 @@ def test_proposals_are_files_of_their_own_that_are_not_replaced_once_edited(tmp_
     require_own_proposals(labels)
     write_proposals(segmentation, ["28,-22,28"], False, labels)  # its own file is replaced
     written.with_array((true * 1).astype(np.uint8)).write(mask)
-    for again in (lambda: require_own_proposals(labels), lambda: write_proposals(segmentation, ["28,-22,28"], False, labels)):
+    for again in (
+        lambda: require_own_proposals(labels),
+        lambda: write_proposals(segmentation, ["28,-22,28"], False, labels),
+    ):
         with pytest.raises(SimulationError, match="not replaced"):
             again()
     assert (Volume.read(mask).array == true).all()

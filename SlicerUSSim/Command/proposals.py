@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 
 seed_option = click.option(
     "--seed", "seeds", multiple=True, metavar="R,A,S[=TISSUE]",
-    help="Propose the lesion around a point, RAS mm in the frame of the MRI: masks beside the labels, which stay as they "
-    "are; --add lays them over. With a tissue (tumour, oedema, cyst, cavity, ...) it is proposed as that, also where it "
-    "looks healthy. May be repeated.",
+    help="Propose the lesion around a point, RAS mm in the frame of the MRI: masks beside the labels, which stay as "
+    "they are; --add lays them over. With a tissue (tumour, oedema, cyst, cavity, ...) it is proposed as that, also "
+    "where it looks healthy. May be repeated.",
 )  # fmt: skip
 propose_option = click.option(
-    "--propose", is_flag=True, help="Propose what looks like a lesion in a whole brain, in the same way, without a point."
+    "--propose",
+    is_flag=True,
+    help="Propose what looks like a lesion in a whole brain in the same way, without a point.",
 )
 
 

@@ -38,7 +38,6 @@ from SlicerUSSim.Logic.mrml.label_nodes import (
     write_labels,
 )
 from SlicerUSSim.Logic.mrml.lesion_nodes import padded_for, read_lesions
-from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.live import LiveNodes, LiveUpdate
 from SlicerUSSim.Logic.mrml.nodes import (
     named,
@@ -56,6 +55,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
 from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
 from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_result, require_result
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
+from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_in_slice
 from SlicerUSSim.Logic.tissue.table import TissueTable

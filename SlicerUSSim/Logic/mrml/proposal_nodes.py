@@ -59,7 +59,9 @@ class LesionProposals:
         """As grow, from the last control point of a markups node that is placed."""
         require_node(points_node, "vtkMRMLMarkupsFiducialNode", use="point in the lesion")
         count = points_node.GetNumberOfControlPoints()
-        placed = [n for n in range(count) if points_node.GetNthControlPointPositionStatus(n) == points_node.PositionDefined]
+        placed = [
+            n for n in range(count) if points_node.GetNthControlPointPositionStatus(n) == points_node.PositionDefined
+        ]
         require(bool(placed), f"{named(points_node)} has no point, expected one in the lesion")
         position = [0.0, 0.0, 0.0]
         points_node.GetNthControlPointPositionWorld(placed[-1], position)

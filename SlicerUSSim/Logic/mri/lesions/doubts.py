@@ -59,7 +59,9 @@ def _why_healthy_fluid(evidence: Evidence, region: Region, window: Window) -> st
         return "at the surface of the brain"
     if float(evidence.expected[_CSF][window][inside].mean()) > _MOST_EXPECTED:
         return "where a ventricle or a sulcus is expected"
-    near = ndimage.binary_dilation(evidence.fluid, iterations=max(round(_APART_MM / float(evidence.spacing_mm.max())), 1))
+    near = ndimage.binary_dilation(
+        evidence.fluid, iterations=max(round(_APART_MM / float(evidence.spacing_mm.max())), 1)
+    )
     mirrored = evidence.mirrored(near.astype(np.float32), window)
     if mirrored is not None and float((mirrored[inside] > 0.5).mean()) > _MOST_MIRRORED:
         return "on both sides, as ventricles are"

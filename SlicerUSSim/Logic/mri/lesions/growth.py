@@ -127,7 +127,9 @@ def with_foot(region: Region, likeness: np.ndarray, allowed: np.ndarray, spacing
     return Region(inside, level, region.slope, float(_depth(inside, spacing_mm).max()))
 
 
-def smoothed(values: np.ndarray, where: np.ndarray, spacing_mm: np.ndarray, sigma_mm: float = _SMOOTHING_MM) -> np.ndarray:
+def smoothed(
+    values: np.ndarray, where: np.ndarray, spacing_mm: np.ndarray, sigma_mm: float = _SMOOTHING_MM
+) -> np.ndarray:
     """Means of `values` under a Gaussian, of voxels in `where` alone."""
     deviation = (sigma_mm / spacing_mm).tolist()
     weight = ndimage.gaussian_filter(where.astype(np.float32), deviation)

@@ -233,7 +233,11 @@ def proposal_of(segmentation: Segmentation, grown: Grown, seed: np.ndarray, name
     if named is None and grown.look.name not in ("enhancing", "fluid") and "oedema" not in tissues:
         warnings.append(_WATERY_MEANS)
     return Proposal(
-        segmentation.labels.with_array(evidence.to_whole(labels)), tuple(tissues), grown.look.name, seed, tuple(warnings)
+        segmentation.labels.with_array(evidence.to_whole(labels)),
+        tuple(tissues),
+        grown.look.name,
+        seed,
+        tuple(warnings),
     )
 
 
