@@ -53,7 +53,7 @@ class LesionProposals:
         """
         result = self._segmentation_of(mri_node)
         seed = np.linalg.inv(node_to_world(mri_node)) @ [*np.asarray(seed_world_mm, float), 1.0]
-        return self._written([self._work(lambda: grow_lesion(result, seed[:3], tissue))], mri_node)
+        return self._written([self._work(lambda: grow_lesion(result, seed[:3].tolist(), tissue))], mri_node)
 
     def growFrom(self, mri_node, points_node, tissue: str | None = None):
         """As grow, from the last control point of a markups node that is placed."""

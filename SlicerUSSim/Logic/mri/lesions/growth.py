@@ -76,8 +76,8 @@ def grow(
         if distance[inside].max() >= largest_mm:
             continue
         # On both sides of the border, where tissue is on both
-        free = ndimage.binary_dilation(inside) & ~inside & allowed
-        within = inside & allowed & ndimage.binary_dilation(free)
+        free = cast(np.ndarray, ndimage.binary_dilation(inside)) & ~inside & allowed
+        within = inside & allowed & cast(np.ndarray, ndimage.binary_dilation(free))
         slope = 0.5 * float(steepness[free].mean() + steepness[within].mean()) if free.any() else 0.0
         if best is None or slope > best.slope:
             best = Region(inside, float(level), slope, radius)

@@ -40,15 +40,15 @@ FLUIDS = ("cyst", "necrosis", "cavity")
 _LEAST_PART_ML = 0.1
 #: Voxels around a watery region in which its enhancing part may be, and how many places are tried
 _BORDER_VOXELS, _MOST_BLOBS = 2, 4
-#: Share of the border of fluid along which it has a rim that enhances, if it is necrosis, and the rim's largest distance
+#: Share of the border of fluid along which a rim enhances, if it is necrosis, and the rim's largest distance
 _LEAST_ENCLOSED, _RIM_MM = 0.5, 4.0
 #: Distance from an enhancing region in which oedema begins
 _OEDEMA_MM = 4.0
 
 
 _WATERY_MEANS = (
-    "what holds more water than white matter may be tumour or oedema: look, and say which (R,A,S=oedema); contrast agent "
-    "would tell more"
+    "what holds more water than white matter may be tumour or oedema: look, and say which (R,A,S=oedema); contrast "
+    "agent would tell more"
 )
 
 
@@ -129,11 +129,11 @@ def _with_enclosed_fluid(evidence: Evidence, region: Region, window: Window) -> 
     """A region that enhances with the necrosis in its rim, also where the rim has gaps."""
     inside = region.inside
     parts, count = ndimage.label(evidence.fluid[window] & ~inside)  # type: ignore[misc]
-    near = ndimage.binary_dilation(inside, iterations=_BORDER_VOXELS)
+    near = cast(np.ndarray, ndimage.binary_dilation(inside, iterations=_BORDER_VOXELS))
     touched = np.unique(parts[near & (parts > 0)]) if count else ()
     for number in touched:
         part = parts == number
-        around = ndimage.binary_dilation(part, iterations=_BORDER_VOXELS) & ~part
+        around = cast(np.ndarray, ndimage.binary_dilation(part, iterations=_BORDER_VOXELS)) & ~part
         if float(near[around].mean()) >= _LEAST_ENCLOSED:
             inside = inside | part | (around & near)
     if inside is region.inside:
