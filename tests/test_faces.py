@@ -31,7 +31,9 @@ PUBLIC = {
     "optimize_appearance", "segment_mri", "similarity",
 }  # fmt: skip
 #: What users needed besides
-ALSO_PUBLIC = {"AppearanceResult", "Membrane", "Preset", "Texture", "seed_of_pose"}
+ALSO_PUBLIC = {
+    "AppearanceResult", "Membrane", "Preset", "Proposal", "Texture", "grow_lesion", "propose_lesions", "seed_of_pose",
+}  # fmt: skip
 
 
 def declared(package: str) -> dict[str, str]:

@@ -12,6 +12,7 @@ from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.mri_options import also_option, read_mri, segmented_file, split_also
 from SlicerUSSim.Command.options import check_places, device_option, gathered, mask_option
 from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Command.proposals import propose_option, require_seeds, seed_option, split_seeds, write_proposals
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
@@ -29,13 +30,15 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 @mask_option
 @also_option
 @add_option
+@seed_option
+@propose_option
 @click.option(
     "--overwrite", is_flag=True, help="Replace labels that were made by others, or edited since they were written."
 )
 @device_option
 def segment(
     mri: str, out: Path, settings: SegmentationSettings, mask: str | None, also: tuple[str, ...],
-    additions: tuple[str, ...], overwrite: bool, device: str | None,
+    additions: tuple[str, ...], seeds: tuple[str, ...], propose: bool, overwrite: bool, device: str | None,
 ) -> None:  # fmt: skip
     """Segment an MRI of a head or a brain into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
@@ -48,8 +51,11 @@ def segment(
     if not overwrite:
         require_replaceable(out)
     split_also(also)
+    split_seeds(seeds)
     masks = Additions.read(additions)
     volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip)
+    if seeds or propose:
+        require_seeds(seeds, volume, out)
     start = perf_counter()
     result = segmented_file(
         mri, volume, asdict(settings), mask=mask, also=also, device=device, additions=masks, tell_all=True
@@ -59,6 +65,8 @@ def segment(
     beside = write_label_files(out, added.labels, TissueTable.brain(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")
+    if seeds or propose:
+        write_proposals(result, seeds, propose, out)
 
 
 def _require_no_kept_mask(out: Path, mri: str) -> None:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from .imaging.noise import seed_of_pose as seed_of_pose
     from .imaging.preset import Preset as Preset
     from .imaging.simulator import UltrasoundSimulator as UltrasoundSimulator
+    from .mri.lesions.detection import propose_lesions as propose_lesions
+    from .mri.lesions.proposal import Proposal as Proposal
+    from .mri.lesions.seeded import grow_lesion as grow_lesion
     from .mri.segmentation import Segmentation as Segmentation, segment_mri as segment_mri
     from .opencl.devices import list_devices as list_devices
     from .probe.arrays import ConvexProbe as ConvexProbe, LinearProbe as LinearProbe, PhasedProbe as PhasedProbe

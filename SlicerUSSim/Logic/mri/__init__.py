@@ -10,6 +10,9 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 if TYPE_CHECKING:
     from .addable import require_addable as require_addable
     from .filtering import guided_filter as guided_filter
+    from .lesions.detection import propose_lesions as propose_lesions
+    from .lesions.proposal import Proposal as Proposal
+    from .lesions.seeded import grow_lesion as grow_lesion
     from .masks import read_mask as read_mask
     from .pathology import Added as Added, add_tissue as add_tissue, add_tissues as add_tissues
     from .samples import demo_mri as demo_mri, head_mri as head_mri

@@ -15,6 +15,7 @@ from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
 from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, classify
 from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
+from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
 from SlicerUSSim.Logic.mri.neighbours import less_sure, smoothed_posteriors
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.plausibility import enhancement, require_contrast
@@ -65,6 +66,8 @@ class Segmentation:
     #: Lines for the user: what was recognised and decided, and what should be checked
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
+    #: The images in the box of the brain, on which lesions are proposed
+    evidence: Evidence = field(repr=False)
     _filtered: np.ndarray = field(repr=False)
     #: (classes, voxels of the brain)
     _shares: np.ndarray = field(repr=False)
@@ -275,6 +278,17 @@ def segment_mri(
         brain=brain,
         notes=tuple(notes),
         warnings=tuple(warnings),
+        evidence=Evidence(
+            contrasts,
+            np.stack([image for image, _, _ in filtered]),
+            part.inside,
+            part.images[0].ijk_to_ras,
+            part.start,
+            part.whole_shape,
+            found.mixture.means,
+            np.sqrt(np.diag(found.mixture.covariance)),
+            atlas,
+        ),
         _filtered=part.whole(filtered[0][0]),
         _shares=found.posteriors,
     )

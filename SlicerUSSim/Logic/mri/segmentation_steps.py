@@ -65,6 +65,18 @@ class BrainPart:
             above = low if n == 0 else above
         return lines, above
 
+    @property
+    def start(self) -> tuple[int, int, int]:
+        """First voxel (k, j, i) of the box in the whole grid."""
+        k, j, i = (side.start for side in self._box)
+        return k, j, i
+
+    @property
+    def whole_shape(self) -> tuple[int, int, int]:
+        """(k, j, i) size of the whole grid."""
+        k, j, i = self._shape
+        return k, j, i
+
     def whole(self, array: np.ndarray) -> np.ndarray:
         """An array of the box on the whole grid, 0 elsewhere."""
         result = np.zeros(self._shape, array.dtype)

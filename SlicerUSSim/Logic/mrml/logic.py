@@ -55,6 +55,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
 from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
 from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_result, require_result
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
+from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_in_slice
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -113,6 +114,8 @@ class UltrasoundSceneLogic:
         self._simulators = ReusedSimulator()
         self._patients = PatientReader()
         self._segmented: _Segmented | None = None
+        #: Lesions proposed from the MRI that was segmented last
+        self.proposals = LesionProposals(scene, lambda work: self._work.do(work))
         #: What the last segment() or addTissues() did, and what a user should check, one line each
         self.notes: tuple[str, ...] = ()
         self.warnings: tuple[str, ...] = ()
@@ -202,6 +205,7 @@ class UltrasoundSceneLogic:
         added = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=True)
         write_labels(labels_node, added.labels, added.tissue_names, mri_node)
         mark_as_made(labels_node)
+        self.proposals.segmented(mri_node, result)
         self._segmented = _Segmented(
             labels_version(labels_node), added.labels, added.tissue_names,
             lambda: texture_below(result.texture(), mri, result.labels, added.labels), mri,

@@ -8,6 +8,7 @@ scan, 7 % a poor one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -147,18 +148,7 @@ def with_ring_tumour(
     The oedema reaches 10 mm beyond the rim, only where there is white matter, as it spreads in life. The default
     centre lies in the white matter of the right hemisphere of both brains.
     """
-    k, j, i = np.indices(maps.mask.shape, np.float32)
-    ijk = np.stack([i, j, k], axis=-1)
-    ras = ijk @ maps.ijk_to_ras[:3, :3].T.astype(np.float32) + maps.ijk_to_ras[:3, 3].astype(np.float32)
-    # A lobed outline, so that no method profits from a sphere.
-    offset = ras - np.asarray(centre_ras_mm, np.float32)
-    x, y, z = np.moveaxis(offset, -1, 0)
-    angle, height = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
-    distance = np.linalg.norm(offset, axis=-1) / (1.0 + 0.12 * np.sin(3.0 * angle) * np.cos(2.0 * height))
-
-    def within(radius: float) -> np.ndarray:
-        return np.clip(radius - distance + 0.5, 0.0, 1.0) * maps.mask
-
+    within = _lobed(maps, centre_ras_mm)
     outer, core = within(radius_mm), within(radius_mm - 3.0)
     oedema = np.maximum(within(radius_mm + 10.0) - outer, 0.0) * maps.white
     shares = np.zeros((len(TISSUES), *maps.mask.shape), np.float32)
@@ -167,6 +157,30 @@ def with_ring_tumour(
     shares[3], shares[4], shares[5] = outer - core, core, oedema
     shares = np.where(maps.mask, shares / np.maximum(shares.sum(axis=0), 1e-6), 0.0).astype(np.float32)
     return replace(maps, name=f"{maps.name}, ring tumour", shares=shares)
+
+
+def with_low_grade_tumour(
+    maps: TissueMaps, centre_ras_mm: tuple[float, float, float] = (28.0, -22.0, 28.0), radius_mm: float = 12.0
+) -> TissueMaps:
+    """The same brain with a tumour that does not enhance, as watery as oedema, also where grey matter was."""
+    inside = _lobed(maps, centre_ras_mm)(radius_mm)
+    shares = np.zeros((len(TISSUES), *maps.mask.shape), np.float32)
+    shares[:3] = maps.shares[:3] * (1.0 - inside)
+    shares[5] = inside
+    return replace(maps, name=f"{maps.name}, low-grade tumour", shares=shares)
+
+
+def _lobed(maps: TissueMaps, centre_ras_mm: tuple[float, float, float]) -> Callable[[float], np.ndarray]:
+    """(k, j, i) float32 share of each voxel within a radius, as a function of it; lobed, so that no method profits from
+    a sphere."""
+    k, j, i = np.indices(maps.mask.shape, np.float32)
+    ijk = np.stack([i, j, k], axis=-1)
+    ras = ijk @ maps.ijk_to_ras[:3, :3].T.astype(np.float32) + maps.ijk_to_ras[:3, 3].astype(np.float32)
+    offset = ras - np.asarray(centre_ras_mm, np.float32)
+    x, y, z = np.moveaxis(offset, -1, 0)
+    angle, height = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+    distance = np.linalg.norm(offset, axis=-1) / (1.0 + 0.12 * np.sin(3.0 * angle) * np.cos(2.0 * height))
+    return lambda radius: np.clip(radius - distance + 0.5, 0.0, 1.0) * maps.mask
 
 
 # ---- images ----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,157 @@
+"""What a segmentation knows about every voxel beyond its label: on this, lesions are looked for and grown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.mixture import TISSUES
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
+
+_CSF, _GREY, _WHITE = range(len(TISSUES))
+#: Of two tissues, the share at which a voxel counts as the second; of tissue in CSF that is bright, as in T2, where
+#: oedema may be half-way to it
+_MIDDLE, _MIDDLE_BRIGHT = 0.5, 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The images in the box of the brain, without bias field and noise, and what healthy tissue looks like in them."""
+
+    #: "t1", "t1gd", "t2" or "flair", one for each channel
+    contrasts: tuple[str, ...]
+    #: (channels, k, j, i) float32
+    images: np.ndarray
+    #: (k, j, i) bool: the brain
+    inside: np.ndarray
+    #: (4, 4) voxel (i, j, k, 1) of the box to RAS mm
+    ijk_to_ras: np.ndarray
+    #: First voxel (k, j, i) of the box, and (k, j, i) size of the MRI
+    start: tuple[int, int, int]
+    shape: tuple[int, int, int]
+    #: (3, channels) mean of CSF, grey and white matter; (channels,) standard deviation of what is left of the noise
+    means: np.ndarray
+    deviations: np.ndarray
+    #: The registered atlas; None without one
+    atlas: AtlasFit | None
+
+    @property
+    def grid(self) -> Volume:
+        """The box, with the brain as its array."""
+        return Volume(self.inside.astype(np.uint8), self.ijk_to_ras)
+
+    @property
+    def spacing_mm(self) -> np.ndarray:
+        """(3,) along k, j, i."""
+        return np.linalg.norm(self.ijk_to_ras[:3, :3], axis=0)[::-1]
+
+    @property
+    def voxel_ml(self) -> float:
+        return float(np.prod(self.spacing_mm)) / 1000.0
+
+    @property
+    def csf(self) -> np.ndarray:
+        """(channels,) mean."""
+        return self.means[_CSF]
+
+    @property
+    def grey(self) -> np.ndarray:
+        """(channels,) mean."""
+        return self.means[_GREY]
+
+    @property
+    def white(self) -> np.ndarray:
+        """(channels,) mean."""
+        return self.means[_WHITE]
+
+    def channel(self, *contrasts: str) -> int | None:
+        """The first channel of one of these contrasts."""
+        return next((n for n, contrast in enumerate(self.contrasts) if contrast in contrasts), None)
+
+    def is_fluid(self, images: np.ndarray) -> np.ndarray:
+        """(k, j, i) bool of images (channels, k, j, i): at least half as CSF, in every channel.
+
+        In T2 oedema is between grey matter and CSF, and in T1 it is as grey matter.
+        """
+        result = np.ones(images.shape[1:], bool)
+        for image, csf, *tissues in zip(images, self.csf, self.grey, self.white, strict=True):
+            nearest = min(tissues, key=lambda mean, csf=csf: abs(mean - csf))
+            middle = np.float32(csf + (_MIDDLE_BRIGHT if csf > nearest else _MIDDLE) * (nearest - csf))
+            result &= image > middle if csf > nearest else image < middle
+        return result
+
+    @cached_property
+    def fluid(self) -> np.ndarray:
+        """(k, j, i) bool: the brain's voxels of is_fluid."""
+        return self.is_fluid(self.images) & self.inside
+
+    def to_whole(self, array: np.ndarray) -> np.ndarray:
+        """An array of the box on the grid of the MRI, 0 elsewhere."""
+        result = np.zeros(self.shape, array.dtype)
+        box = tuple(slice(first, first + size) for first, size in zip(self.start, array.shape, strict=True))
+        result[box] = array
+        return result
+
+    def index_of(self, ras_mm: np.ndarray) -> np.ndarray:
+        """(3,) k, j, i in the box, with fractions."""
+        return (np.linalg.inv(self.ijk_to_ras) @ [*np.asarray(ras_mm, float), 1.0])[2::-1]
+
+    def ras_of(self, index: np.ndarray) -> np.ndarray:
+        """(3,) RAS mm of k, j, i in the box."""
+        return (self.ijk_to_ras @ [*np.asarray(index, float)[::-1], 1.0])[:3]
+
+    # ---- by the atlas ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def sideways_mm(self) -> np.ndarray | None:
+        """(k, j, i) float32 distance from the midline in the frame of the atlas, positive to the right."""
+        if self.atlas is None:
+            return None
+        row = (self.atlas.patient_to_atlas @ self.ijk_to_ras)[0]
+        k, j, i = np.ogrid[tuple(map(slice, self.inside.shape))]
+        return (row[0] * i + row[1] * j + row[2] * k + row[3]).astype(np.float32)
+
+    @cached_property
+    def expected(self) -> np.ndarray | None:
+        """(3, k, j, i) float32 share of CSF, grey and white matter that the atlas expects."""
+        if self.atlas is None:
+            return None
+        result = np.zeros((len(TISSUES), *self.inside.shape), np.float32)
+        result[:, self.inside] = self.atlas.prior(self.grid, self.inside)
+        return result
+
+    @cached_property
+    def _to_mirrored(self) -> np.ndarray | None:
+        """(4, 4) from indices k, j, i, 1 of the box to those of the counterpart in the other hemisphere."""
+        if self.atlas is None:
+            return None
+        there = self.atlas.patient_to_atlas
+        ijk = np.linalg.inv(self.ijk_to_ras) @ np.linalg.inv(there) @ np.diag([-1.0, 1.0, 1.0, 1.0])
+        matrix = ijk @ there @ self.ijk_to_ras
+        order = [2, 1, 0, 3]
+        return matrix[np.ix_(order, order)]
+
+    def mirrored(self, array: np.ndarray, window: tuple[slice, slice, slice] | None = None) -> np.ndarray | None:
+        """(k, j, i) float32 values of an array of the box at the counterparts of its voxels in the other hemisphere,
+        0 outside the box; of the voxels of a window alone. None without an atlas."""
+        if self._to_mirrored is None:
+            return None
+        window = window or (slice(0, array.shape[0]), slice(0, array.shape[1]), slice(0, array.shape[2]))
+        linear = self._to_mirrored[:3, :3]
+        offset = self._to_mirrored[:3, 3] + linear @ [part.start for part in window]
+        size = tuple(part.stop - part.start for part in window)
+        return ndimage.affine_transform(array, linear, offset, size, order=1, output=np.float32)  # pyright: ignore
+
+    def is_between_hemispheres(self, window: tuple[slice, slice, slice]) -> np.ndarray:
+        """(k, j, i) bool in a window: at the midline, where the atlas expects no white matter: fissure and falx."""
+        if self.sideways_mm is None or self.expected is None:
+            return np.zeros([part.stop - part.start for part in window], bool)
+        near = np.abs(self.sideways_mm[window]) < max(0.75 * float(self.spacing_mm.max()), 1.0)
+        return near & (self.expected[_WHITE][window] < _MIDDLE)

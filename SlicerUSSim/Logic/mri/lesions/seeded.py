@@ -1,0 +1,318 @@
+"""grow_lesion: what is at a point of an MRI, and the lesion around it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.lesions.doubts import why_no_lesion
+from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
+from SlicerUSSim.Logic.mri.lesions.growth import Region, grow, smoothed, with_foot
+from SlicerUSSim.Logic.mri.lesions.looks import (
+    Look,
+    Window,
+    around,
+    brighter_than_white,
+    enhancing,
+    fluid,
+    watery,
+    watery_look,
+    watery_weights,
+    window_around,
+)
+from SlicerUSSim.Logic.mri.lesions.proposal import Proposal, place
+from SlicerUSSim.Logic.mri.pathology import tissue_to_add
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.mri.segmentation import Segmentation
+
+#: Reach of the windows in which a region is grown, one after the other: most lesions are small
+_REACHES_MM = (20.0, 70.0)
+#: Tissues that are fluid in an MRI
+FLUIDS = ("cyst", "necrosis", "cavity")
+#: Least volume of a part besides the largest
+_LEAST_PART_ML = 0.1
+#: Voxels around a watery region in which its enhancing part may be, and how many places are tried
+_BORDER_VOXELS, _MOST_BLOBS = 2, 4
+#: Share of the border of fluid along which a rim enhances, if it is necrosis, and the rim's largest distance
+_LEAST_ENCLOSED, _RIM_MM = 0.5, 4.0
+#: Distance from an enhancing region in which oedema begins
+_OEDEMA_MM = 4.0
+
+
+_WATERY_MEANS = (
+    "what holds more water than white matter may be tumour or oedema: look, and say which (R,A,S=oedema); contrast "
+    "agent would tell more"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Grown:
+    """A region in a window, and its look."""
+
+    look: Look
+    region: Region
+    window: Window
+
+    def in_box(self, evidence: Evidence) -> np.ndarray:
+        """(k, j, i) bool on the box of the evidence."""
+        result = np.zeros(evidence.inside.shape, bool)
+        result[self.window] = self.region.inside
+        return result
+
+
+def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue: str | None = None) -> Proposal:
+    """The lesion around one point, as a proposal; the segmentation stays as it is.
+
+    Parameters
+    ----------
+    segmentation : of the MRI by segment_mri; with several volumes, all are used.
+    seed_ras_mm : (3,) RAS mm of a point in the lesion. Of what enhances, up to 5 mm beside it.
+    tissue : what it is, where the user knows; default: by its look. What enhances is "tumour" with "necrosis" in it, in
+        "oedema"; what is bright in T2 or FLAIR, or dark in T1, is "tumour". A cyst, a cavity or a necrosis without a
+        rim has to be called so, since it looks like CSF.
+
+    Raises SimulationError, saying what is there, for a point outside the image or the brain, in CSF, in a vessel or in
+    tissue that looks healthy. With `tissue`, only what a lesion cannot be is refused.
+
+    Takes 1 to 2 seconds.
+    """
+    evidence = segmentation.evidence
+    named = None if tissue is None else tissue_to_add(tissue)
+    seed = require_in_image(segmentation.labels, seed_ras_mm)
+    index = _require_in_brain(evidence, seed)
+    doubts = []
+    candidates = (fluid,) if named in FLUIDS else (enhancing, watery, fluid) if named is None else (enhancing, watery)
+    for look in candidates:
+        # A piece of a large rim looks like a vessel; all of it does not
+        for reaches in (_REACHES_MM, _REACHES_MM[1:]) if look is enhancing else (_REACHES_MM,):
+            grown = grown_by(look, evidence, index, reaches)
+            if grown is None:
+                break
+            why = None if named is not None else why_no_lesion(evidence, grown.look, grown.region, grown.window)
+            if why is None:
+                return proposal_of(segmentation, grown, seed, named)
+            doubts.append(why)
+    raise SimulationError(f"the seed {place(seed)} is in {_what_is_at(segmentation, index, doubts, named)}")
+
+
+def grown_by(
+    look: Callable[[Evidence, Window, np.ndarray], Look | None], evidence: Evidence, index: np.ndarray,
+    reaches_mm: Sequence[float] = _REACHES_MM,
+) -> Grown | None:  # fmt: skip
+    """The region of one look around a place (k, j, i in the box); None if it does not look so, or has no border.
+
+    Regions that end within the first reach are taken, and otherwise within the next.
+    """
+    for reach in _REACHES_MM[-1:] if look is watery else reaches_mm:
+        window = window_around(evidence, index, reach + 2.0)
+        seen = look(evidence, window, index)
+        if seen is None:
+            return None
+        region = grow(seen.likeness, seen.allowed, seen.seed, evidence.spacing_mm, largest_mm=reach)
+        if region is not None:
+            if seen.name == "enhancing":
+                region = with_foot(region, seen.likeness, seen.allowed, evidence.spacing_mm)
+                region = _with_enclosed_fluid(evidence, region, window)
+            grown = Grown(seen, region, window)
+            return _with_rim(evidence, grown) or grown if seen.name == "fluid" else grown
+    return None
+
+
+def _with_enclosed_fluid(evidence: Evidence, region: Region, window: Window) -> Region:
+    """A region that enhances with the necrosis in its rim, also where the rim has gaps."""
+    inside = region.inside
+    parts, count = ndimage.label(evidence.fluid[window] & ~inside)  # type: ignore[misc]
+    near = cast(np.ndarray, ndimage.binary_dilation(inside, iterations=_BORDER_VOXELS))
+    touched = np.unique(parts[near & (parts > 0)]) if count else ()
+    for number in touched:
+        part = parts == number
+        around = cast(np.ndarray, ndimage.binary_dilation(part, iterations=_BORDER_VOXELS)) & ~part
+        if float(near[around].mean()) >= _LEAST_ENCLOSED:
+            inside = inside | part | (around & near)
+    if inside is region.inside:
+        return region
+    inside = cast(np.ndarray, ndimage.binary_fill_holes(ndimage.binary_closing(inside, iterations=_BORDER_VOXELS)))
+    depth = cast(np.ndarray, ndimage.distance_transform_edt(inside, sampling=evidence.spacing_mm.tolist()))
+    return Region(inside, region.level, region.slope, float(depth.max()))
+
+
+def _with_rim(evidence: Evidence, grown: Grown) -> Grown | None:
+    """What enhances around a fluid region, with it; None if it has no such rim."""
+    channel = evidence.channel("t1gd")
+    if channel is None:
+        return None
+    inside = grown.region.inside
+    apart = cast(np.ndarray, ndimage.distance_transform_edt(~inside, sampling=evidence.spacing_mm.tolist()))
+    shell = (apart > 0.0) & (apart <= _RIM_MM) & evidence.inside[grown.window]
+    image = smoothed(evidence.images[channel][grown.window], evidence.inside[grown.window], evidence.spacing_mm)
+    bright = shell & (image > brighter_than_white(evidence, channel))
+    # Of a rim of any thickness, how much of the way around
+    seen = ndimage.binary_dilation(bright, iterations=_BORDER_VOXELS)
+    border = ndimage.binary_dilation(inside) & ~inside
+    if not bright.any() or float(seen[border].mean()) < _LEAST_ENCLOSED:
+        return None
+    peak = np.unravel_index(int(np.where(bright, image, -np.inf).argmax()), image.shape)
+    for reaches in (_REACHES_MM, _REACHES_MM[1:]):  # a piece of it, or all
+        rim = grown_by(enhancing, evidence, np.add(peak, [part.start for part in grown.window]), reaches)
+        if rim is not None and (rim.in_box(evidence) & grown.in_box(evidence)).sum() >= 0.5 * inside.sum():
+            return rim
+    return None
+
+
+def require_in_image(grid: Volume, seed_ras_mm: Sequence[float]) -> np.ndarray:
+    """(3,) RAS mm of a seed. Raises SimulationError for one outside the grid of an MRI, and for what is no point."""
+    seed = np.asarray(seed_ras_mm, float)
+    require(
+        seed.shape == (3,) and bool(np.isfinite(seed).all()),
+        f"the seed is {seed_ras_mm!r}, expected three finite numbers: R, A and S in mm",
+    )
+    ijk = grid.ras_to_ijk[:3] @ [*seed, 1.0]
+    size = np.array(grid.array.shape[::-1])
+    beyond = float((np.maximum(np.maximum(-0.5 - ijk, ijk - size + 0.5), 0.0) * grid.spacing_mm).max())
+    require(
+        beyond == 0.0,
+        f"the seed {place(seed)} is {max(beyond, 1.0):.0f} mm outside the image, expected a point in the lesion in RAS "
+        "mm of the MRI; is it in voxels, or in LPS?",
+    )
+    return seed
+
+
+def _require_in_brain(evidence: Evidence, seed: np.ndarray) -> np.ndarray:
+    """(3,) k, j, i in the box of the brain of a point in RAS mm. Raises SimulationError for one outside the brain."""
+    index = evidence.index_of(seed)
+    nearest = np.rint(index).astype(int)
+    within = bool((nearest >= 0).all() and (nearest < evidence.inside.shape).all())
+    if not (within and evidence.inside[tuple(nearest)]):
+        voxels = np.argwhere(evidence.inside)
+        apart = float(np.linalg.norm((voxels - index) * evidence.spacing_mm, axis=1).min())
+        raise SimulationError(
+            f"the seed {place(seed)} is {max(apart, 1.0):.0f} mm outside the brain, expected a point in the lesion; if "
+            "the lesion is outside the brain mask, give it with --add"
+        )
+    return index
+
+
+def proposal_of(segmentation: Segmentation, grown: Grown, seed: np.ndarray, named: str | None) -> Proposal:
+    """The parts of a region, and what belongs to it."""
+    evidence = segmentation.evidence
+    inside = grown.in_box(evidence)
+    parts: dict[str, np.ndarray] = {}
+    if named is not None:
+        parts[named] = inside
+    elif grown.look.name == "enhancing":
+        core = _necrosis_in(evidence, grown)
+        parts = {"oedema": _oedema_around(evidence, grown, inside), "tumour": inside & ~core, "necrosis": core}
+    elif grown.look.name == "fluid":
+        parts["cyst"] = inside
+    else:
+        within = _enhancing_in(evidence, inside)
+        if within is None:
+            parts["tumour"] = inside
+        else:
+            core, both = _necrosis_in(evidence, within), within.in_box(evidence)
+            parts = {"oedema": inside & ~both, "tumour": both & ~core, "necrosis": core}
+    least = _LEAST_PART_ML / evidence.voxel_ml
+    main = max(parts, key=lambda name: int(parts[name].sum()) if name != "oedema" else 0)
+    labels, tissues = np.zeros(inside.shape, np.uint8), []
+    for name, part in parts.items():
+        if name == main or part.sum() >= least:
+            tissues.append(name)
+            labels[part] = len(tissues)
+        elif name != "oedema":
+            labels[part] = len(tissues) or 1
+    warnings = []
+    if evidence.atlas is None:
+        warnings.append("without an atlas, the other hemisphere was not compared: look whether it is healthy tissue")
+    if named is None and grown.look.name not in ("enhancing", "fluid") and "oedema" not in tissues:
+        warnings.append(_WATERY_MEANS)
+    return Proposal(
+        segmentation.labels.with_array(evidence.to_whole(labels)),
+        tuple(tissues),
+        grown.look.name,
+        seed,
+        tuple(warnings),
+    )
+
+
+def _necrosis_in(evidence: Evidence, grown: Grown) -> np.ndarray:
+    """(k, j, i) bool: not enhancing, within the rim: darker than half-way to grey matter's contrast."""
+    result = np.zeros(evidence.inside.shape, bool)
+    likeness, inside = grown.look.likeness, grown.region.inside
+    depth = cast(np.ndarray, ndimage.distance_transform_edt(inside, sampling=evidence.spacing_mm.tolist()))
+    dark = inside & (smoothed(likeness, grown.look.allowed, evidence.spacing_mm) < 0.3) & (depth > 2.0)
+    result[grown.window] = ndimage.binary_opening(dark)
+    return result
+
+
+def _enhancing_in(evidence: Evidence, inside: np.ndarray) -> Grown | None:
+    """The largest region that enhances in a watery one (k, j, i), or at its border; None if none does."""
+    channel = evidence.channel("t1gd")
+    if channel is None:
+        return None
+    window = ndimage.find_objects(ndimage.binary_dilation(inside, iterations=_BORDER_VOXELS).astype(np.uint8))[0]
+    near = ndimage.binary_dilation(inside[window], iterations=_BORDER_VOXELS) & evidence.inside[window]
+    smooth = smoothed(evidence.images[channel][window], evidence.inside[window], evidence.spacing_mm)
+    parts, count = ndimage.label(near & (smooth > brighter_than_white(evidence, channel)))  # type: ignore[misc]
+    found: Grown | None = None
+    for number in np.argsort(-np.bincount(parts.ravel())[1:], kind="stable")[:_MOST_BLOBS] + 1 if count else ():
+        peak = np.unravel_index(int(np.where(parts == number, smooth, -np.inf).argmax()), parts.shape)
+        grown = grown_by(enhancing, evidence, np.add(peak, [part.start for part in window]))
+        if grown is None or why_no_lesion(evidence, grown.look, grown.region, grown.window) is not None:
+            continue
+        if found is None or grown.region.inside.sum() > found.region.inside.sum():
+            found = grown
+    return found
+
+
+def _oedema_around(evidence: Evidence, grown: Grown, inside: np.ndarray) -> np.ndarray:
+    """(k, j, i) bool: the watery region that begins at the border of what enhances; empty if there is none."""
+    empty = np.zeros(inside.shape, bool)
+    centre = np.array(ndimage.center_of_mass(inside))
+    window = window_around(evidence, centre, _REACHES_MM[-1] + 2.0)
+    core = inside[window]
+    apart = cast(np.ndarray, ndimage.distance_transform_edt(~core, sampling=evidence.spacing_mm.tolist()))
+    tissue = evidence.inside[window] & ~evidence.fluid[window]
+    shell = tissue & (apart > 1.0) & (apart <= _OEDEMA_MM)
+    if not shell.any():
+        return empty
+    # Of a shell that is partly healthy, the watery half
+    here = np.array([float(np.median(image[window][shell])) for image in evidence.images])
+    weights = watery_weights(evidence, here)
+    if weights is None:
+        return empty
+    allowed = (tissue | core) & ~evidence.is_between_hemispheres(window)
+    look = watery_look(evidence, window, weights, allowed, centre)
+    likeness = np.where(core, np.float32(1.0), look.likeness)
+    # From the most watery place at the border of the core
+    seed = np.array(np.unravel_index(int(np.where(shell, look.likeness, -np.inf).argmax()), core.shape))
+    region = grow(likeness, allowed, seed, evidence.spacing_mm, largest_mm=_REACHES_MM[-1])
+    if region is None or why_no_lesion(evidence, look, region, window) is not None:
+        return empty
+    empty[window] = region.inside & ~core
+    return empty
+
+
+def _what_is_at(segmentation: Segmentation, index: np.ndarray, doubts: list[str], named: str | None) -> str:
+    """The rest of the sentence "the seed is in ..."."""
+    evidence = segmentation.evidence
+    window, ball = around(evidence, index)
+    if float(evidence.fluid[window][ball].mean()) >= 0.5:
+        return (
+            "fluid that looks like CSF, expected a point in a lesion; for a fluid lesion say what it is: "
+            "R,A,S=cyst, =cavity or =necrosis"
+        )
+    nearest = tuple(int(n) for n in np.rint(index).astype(int) + evidence.start)
+    label = int(segmentation.labels.array[nearest])
+    name = segmentation.tissue_names[label - 1] if label else "the background"
+    if doubts and name == "enhancing":
+        return f"what enhances {doubts[0]}, expected a point in a lesion"
+    why = f" ({doubts[-1]})" if doubts else ""
+    remedy = "" if named is not None else "; if it is a lesion all the same, say what it is, as R,A,S=tumour"
+    return f"{name} that looks healthy{why}, expected a point in a lesion{remedy}"

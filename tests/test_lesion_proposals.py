@@ -1,0 +1,208 @@
+"""Lesions proposed from an MRI: grown from a point, refused with a reason, never applied, never replacing edits."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from SlicerUSSim.Command.proposals import split_seeds, write_proposals
+from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, grow_lesion, propose_lesions, segment_mri
+from SlicerUSSim.Logic.mri.atlas import mni152
+from SlicerUSSim.Logic.mri.lesions.growth import grow
+from SlicerUSSim.Logic.mri.lesions.proposal import Proposal, require_own_proposals
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.verification.brain_phantoms import (
+    phantom,
+    tissue_maps,
+    with_low_grade_tumour,
+    with_ring_tumour,
+)
+
+needs_atlas = pytest.mark.skipif(mni152() is None, reason="the atlas comes with nilearn")
+CENTRE = (28.0, -22.0, 28.0)
+
+
+def dice(a: np.ndarray, b: np.ndarray) -> float:
+    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
+
+
+# ---- the region of a likeness ----------------------------------------------------------------------------------------
+
+
+def ball_in(size: int, centre, radius: float) -> np.ndarray:
+    grid = np.indices((size,) * 3)
+    return np.sqrt(sum((axis - place) ** 2 for axis, place in zip(grid, centre, strict=True))) < radius
+
+
+def test_a_region_ends_at_the_sharpest_border_in_noise():
+    true = ball_in(50, (25, 25, 25), 9.0)
+    likeness = true + np.random.default_rng(0).normal(0.0, 0.25, true.shape).astype(np.float32)
+    region = grow(likeness, np.ones_like(true), np.array([25, 20, 27]), np.ones(3), largest_mm=22.0)
+    assert region is not None and dice(region.inside, true) > 0.93
+    assert region.radius_mm == pytest.approx(9.0, abs=1.5)
+
+
+def test_what_hangs_on_a_region_by_a_thin_bridge_stays_out():
+    true = ball_in(50, (25, 17, 25), 8.0)
+    other = ball_in(50, (25, 38, 25), 7.0)
+    bridge = np.zeros_like(true)
+    bridge[24:27, 17:38, 24:27] = True
+    likeness = (true | other | bridge).astype(np.float32)
+    region = grow(likeness, np.ones_like(true), np.array([25, 17, 25]), np.ones(3), largest_mm=24.0)
+    assert region is not None and (region.inside & other).sum() == 0 and dice(region.inside, true) > 0.9
+
+
+def test_a_region_stays_where_it_is_allowed_and_within_reach():
+    likeness = ball_in(50, (25, 25, 25), 9.0).astype(np.float32)
+    allowed = np.ones(likeness.shape, bool)
+    allowed[:, :, 26:] = False
+    region = grow(likeness, allowed, np.array([25, 25, 22]), np.ones(3), largest_mm=22.0)
+    assert region is not None and not region.inside[:, :, 26:].any()
+    assert grow(np.ones_like(likeness), allowed, np.array([25, 25, 22]), np.ones(3), largest_mm=15.0) is None
+
+
+# ---- brains ----------------------------------------------------------------------------------------------------------
+
+
+@cache
+def brain(kind: str) -> tuple[Segmentation, np.ndarray]:
+    """(segmentation, (k, j, i) bool of the lesion) of an MNI152 phantom of 2 mm."""
+    maps = tissue_maps("mni152")
+    assert maps is not None
+    if kind == "ring":
+        maps, contrast, parts = with_ring_tumour(maps, CENTRE, 12.0), "t1gd", (3, 4)
+    elif kind == "low":
+        maps, contrast, parts = with_low_grade_tumour(maps, CENTRE, 14.0), "flair", (5,)
+    else:
+        contrast, parts = "t1", ()
+    maps = maps.coarser(2)
+    image = phantom(maps, contrast, noise=0.03, bias=0.0)
+    true = sum((maps.shares[part] for part in parts), np.zeros(maps.mask.shape)) > 0.5
+    return segment_mri(image.mri, contrast=contrast, mask=image.mask), true
+
+
+def core(proposal: Proposal) -> np.ndarray:
+    return np.isin(proposal.labels.array, [n for n, name in enumerate(proposal.tissues, 1) if name != "oedema"])
+
+
+@needs_atlas
+@pytest.mark.parametrize("kind", ["ring", "low"])
+def test_one_seed_grows_the_lesion_and_not_what_is_outside(kind):
+    segmentation, true = brain(kind)
+    before = segmentation.labels.array.copy()
+    proposal = grow_lesion(segmentation, CENTRE)
+    assert dice(core(proposal), true) >= 0.75
+    assert 0.6 < core(proposal).sum() / true.sum() < 1.4
+    assert np.linalg.norm(proposal.centre_ras_mm - CENTRE) < 4.0
+    assert (segmentation.labels.array == before).all()
+    assert "proposed, not applied" in proposal.message
+    assert set(proposal.tissues) <= set(TISSUES)
+    assert ("necrosis" in proposal.tissues) == (kind == "ring")
+
+
+@needs_atlas
+def test_a_lesion_is_proposed_without_a_seed_and_none_in_a_healthy_brain():
+    segmentation, true = brain("low")
+    (proposal,) = propose_lesions(segmentation)
+    assert dice(core(proposal), true) >= 0.75
+    assert propose_lesions(brain("healthy")[0]) == ()
+
+
+@needs_atlas
+@pytest.mark.parametrize(
+    ("seed", "words"),
+    [
+        ((28.0, -22.0, 28.0), "white matter that looks healthy"),
+        ((0.0, 0.0, 300.0), "mm outside the image"),
+        ((0.0, 0.0, -70.0), "mm outside the brain"),
+        ((4.0, 8.0, 16.0), "fluid that looks like CSF"),
+        ((-12.0, -20.0, 8.0), "looks healthy"),  # the thalamus
+        ((float("nan"), 0.0, 0.0), "three finite numbers"),
+    ],
+)
+def test_a_seed_in_no_lesion_says_what_is_there(seed, words):
+    with pytest.raises(SimulationError, match=words) as error:
+        grow_lesion(brain("healthy")[0], seed)
+    assert "\n" not in str(error.value)
+
+
+@needs_atlas
+def test_a_tissue_that_the_user_names_is_taken_at_his_word():
+    segmentation, _ = brain("healthy")
+    cavity = grow_lesion(segmentation, (4.0, 8.0, 16.0), "cavity")  # a ventricle, called so by the user
+    assert cavity.tissues == ("cavity",) and cavity.volume_ml() > 0.5
+    with pytest.raises(SimulationError, match="tissue"):
+        grow_lesion(segmentation, CENTRE, "tumuor of sorts")
+
+
+@needs_atlas
+def test_proposals_are_files_of_their_own_that_are_not_replaced_once_edited(tmp_path, capsys):
+    segmentation, true = brain("low")
+    labels = tmp_path / "labels.nii.gz"
+    write_proposals(segmentation, ["28,-22,28"], False, labels)
+    mask = tmp_path / "labels_proposed_tumour.nii.gz"
+    told = capsys.readouterr().err
+    assert "proposed, not applied" in told and f"--add tumour={mask}" in told
+    written = Volume.read(mask)
+    assert dice(written.array > 0, true) >= 0.75
+    require_own_proposals(labels)
+    write_proposals(segmentation, ["28,-22,28"], False, labels)  # its own file is replaced
+    written.with_array((true * 1).astype(np.uint8)).write(mask)
+    for again in (
+        lambda: require_own_proposals(labels),
+        lambda: write_proposals(segmentation, ["28,-22,28"], False, labels),
+    ):
+        with pytest.raises(SimulationError, match="not replaced"):
+            again()
+    assert (Volume.read(mask).array == true).all()
+
+
+@pytest.mark.parametrize("text", ["1,2", "1,2,x", "1,2,3,4", "1,2,3=", ""])
+def test_a_seed_that_is_no_point_is_refused_with_an_example(text):
+    with pytest.raises(SimulationError, match=r"--seed is .*expected R,A,S in mm"):
+        split_seeds([text])
+    assert split_seeds(["1,-2.5,3=Edema"]) == [((1.0, -2.5, 3.0), "oedema")]
+
+
+# ---- scene -----------------------------------------------------------------------------------------------------------
+
+
+@needs_atlas
+def test_a_point_in_a_scene_makes_a_proposal_that_is_applied_when_confirmed():
+    slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
+    from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+    from SlicerUSSim.Logic.mrml.nodes import write_volume
+
+    segmentation, true = brain("low")
+    scene = slicer.vtkMRMLScene()
+    mri, points = (scene.AddNewNodeByClass(f"vtkMRML{kind}Node") for kind in ("ScalarVolume", "MarkupsFiducial"))
+    write_volume(mri, segmentation.labels)
+    logic = UltrasoundSceneLogic(scene)
+    with pytest.raises(SimulationError, match="segment it first"):
+        logic.proposals.grow(mri, CENTRE)
+    logic.proposals.segmented(mri, segmentation)
+    with pytest.raises(SimulationError, match="no point"):
+        logic.proposals.growFrom(mri, points)
+    points.AddControlPoint(list(CENTRE))
+    node = logic.proposals.growFrom(mri, points)
+    assert logic.proposals.notes[0].endswith("proposed, not applied")
+    assert logic.proposals.growFrom(mri, points) is node  # its own proposal is replaced
+    (segment,) = node.GetSegmentation().GetSegmentIDs()
+    node.GetSegmentation().GetSegment(segment).SetName("my tumour")  # an edit
+    other = logic.proposals.growFrom(mri, points)
+    assert other is not node
+
+    lesions = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
+    assert logic.proposals.confirm(other, lesions) == ("tumour",)
+    assert scene.GetNodeByID(other.GetID()) is None
+    from SlicerUSSim.Logic.mrml.label_nodes import write_labels
+    from SlicerUSSim.Logic.mrml.own_labels import mark_as_made
+
+    labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "tissues")
+    write_labels(labels, segmentation.labels, segmentation.tissue_names, mri)
+    mark_as_made(labels)
+    added = logic.addTissues(labels, lesions)
+    laid = added.labels.array == added.tissue_names.index("tumour") + 1
+    assert dice(laid, true) >= 0.75
