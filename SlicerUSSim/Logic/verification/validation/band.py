@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+from typing import Any
+
 import numpy as np
 
 from SlicerUSSim.Logic.base.settings import SimulationSettings
@@ -17,7 +19,7 @@ from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, band_power, unif
 from SlicerUSSim.Logic.verification.validation.checks import Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, draw_plots
 
-_FOCI = {"focus_mm": 50.0, "elevation_focus_mm": 50.0}
+_FOCI: dict[str, Any] = {"focus_mm": 50.0, "elevation_focus_mm": 50.0}
 _PROBES: dict[str, Probe] = {
     "linear": LinearProbe(40.0, 90.0, scan_lines=129, **_FOCI),
     "convex": ConvexProbe(60.0, 36.0, 90.0, scan_lines=129, **_FOCI),
