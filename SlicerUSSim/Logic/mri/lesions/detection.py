@@ -40,8 +40,9 @@ _WATERY_MM, _ENHANCING_MM = 4.0, 1.4
 _LEAST_WATERY_ML, _LEAST_ENHANCING_ML = 2.0, 0.2
 #: What enhances is proposed where it is surrounded by tissue, and no nearer than this to the surface of the brain
 _MOST_BESIDE_NO_TISSUE, _DEEP_MM = 0.08, 5.0
-#: Least mean share of white matter that the atlas expects there: sinuses and veins are elsewhere
-_ENHANCING_IN_WHITE = 0.4
+#: Least mean share of white matter that the atlas expects there, and largest of CSF: sinuses and veins are elsewhere,
+#: and choroid plexus in a ventricle
+_ENHANCING_IN_WHITE, _MOST_CSF = 0.4, 0.2
 #: Most places that are tried for each look
 _MOST_PLACES = 8
 _SIGMA_MM, _OTHER_SIGMA_MM = 1.5, 3.0
@@ -91,9 +92,12 @@ def _is_sure(evidence: Evidence, grown: Grown) -> bool:
     if why_no_lesion(evidence, look, region, window) is not None:
         return False
     if look.name == "enhancing":
-        white = 0.0 if evidence.expected is None else float(evidence.expected[_WHITE][window][region.inside].mean())
+        if evidence.expected is None:
+            return False
+        csf, _, white = (float(share[window][region.inside].mean()) for share in evidence.expected)
         beside = beside_no_tissue(evidence, region, window)
-        return volume >= _LEAST_ENHANCING_ML and beside <= _MOST_BESIDE_NO_TISSUE and white >= _ENHANCING_IN_WHITE
+        is_in_white = white >= _ENHANCING_IN_WHITE and csf <= _MOST_CSF
+        return volume >= _LEAST_ENHANCING_ML and beside <= _MOST_BESIDE_NO_TISSUE and is_in_white
     return volume >= _LEAST_WATERY_ML
 
 
