@@ -34,8 +34,7 @@ _TURNS = {1.0: 3.0, 2.0: 3.0, 3.0: 3.0, 5.0: 1.5, 8.0: 1.5, 15.0: 1.5, 30.0: 1.5
 #: Planes tilted by so much to the beam: the level along them does not vary by more dB
 _TILT_DEG, _VARIATION_DB = 5.0, 3.0
 
-#: The same of layers, by their thickness in voxels. Of two voxels, the labels on a ray can lie a voxel beside the border,
-#: where it is not looked for: single lines are missed.
+#: The same of layers, by their thickness in voxels. Single lines lose up to 7 dB where it is two voxels (physics.md).
 _LAYER_TURNS = {
     2: {5.0: 7.0, 15.0: 7.0},
     3: {5.0: 1.5, 15.0: 1.5},
