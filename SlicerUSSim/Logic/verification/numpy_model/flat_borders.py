@@ -111,24 +111,24 @@ def _thin_layer_borders(grid: SmoothGrid, voxel, towards, isolated: Borders, bef
     some = np.flatnonzero((np.abs(share - f32(0.5)) >= f32(0.5 - _THIN_SHARE)) & ~turned)
     voxel, towards, share, before, behind = (part[some] for part in (voxel, towards, share, before, behind))
     side = np.where(share < 0.5, f32(1), f32(-1))
-    sigma, ahead = np.sqrt(grid.variance), -side[:, None] * towards
+    sigma, ahead = float(np.sqrt(grid.variance)), -side[:, None] * towards
     seen, front, middle, thickness, curvature = _view(grid, voxel - _VIEW * ahead, before, behind, side, ahead)
     beyond = thickness + _VIEW
     sees, back, other_middle, other_thickness, other_curvature = _view(
         grid, voxel + np.minimum(beyond, f32(100))[:, None] * ahead, before, behind, side, -ahead
     )
     agreement = -dot(front, back)
-    seen &= sees & (thickness <= f32(1.2) * sigma) & (agreement >= f32(0.98))
+    seen &= sees & (thickness <= 1.2 * sigma) & (agreement >= f32(0.98))
     from_front = (middle - f32(0.5) * thickness)[:, None] * front - _VIEW * ahead
     from_back = (other_middle + f32(0.5) * other_thickness)[:, None] * back + beyond[:, None] * ahead
     into = unit(front - back)
     depth, other_depth = -dot(from_front, into), -dot(from_back, into)
     overshoot = f32(0.5) * side * (depth + other_depth)
-    bent = sigma * np.maximum(np.abs(curvature), np.abs(other_curvature))
+    bent = f32(sigma) * np.maximum(np.abs(curvature), np.abs(other_curvature))
     sure = (f32(1) - ramp(0.12, 0.25, np.abs(depth - other_depth))) * ramp(0.98, 0.99, agreement)
     sure *= f32(1) - ramp(0.08, 0.15, np.abs(thickness - other_thickness))
-    sure *= (f32(1) - ramp(0.12, 0.2, bent)) * ramp(f32(0.12) * sigma, f32(0.17) * sigma, thickness)
-    sure *= (f32(1) - ramp(sigma, f32(1.2) * sigma, thickness)) * (np.abs(overshoot) <= f32(farthest))
+    sure *= (f32(1) - ramp(0.12, 0.2, bent)) * ramp(0.12 * sigma, 0.17 * sigma, thickness)
+    sure *= (f32(1) - ramp(sigma, 1.2 * sigma, thickness)) * (np.abs(overshoot) <= f32(farthest))
     to = some[seen]
     found.towards[to], found.overshoot[to] = (-side[:, None] * into)[seen], overshoot[seen]
     found.curvature[to] = (f32(0.5) * side * (other_curvature - curvature))[seen]

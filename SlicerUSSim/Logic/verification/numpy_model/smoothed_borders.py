@@ -43,9 +43,11 @@ class Borders:
     @classmethod
     def none(cls, count: int) -> Borders:
         """Without any border."""
-        zeros = np.zeros((7, count), np.float32)
-        share = np.full(count, np.nan, np.float32)
-        return cls(np.zeros((count, 3), np.float32), *zeros[:3], share, *zeros[3:], np.zeros(count, bool))
+        zero, share = np.zeros((7, count), np.float32), np.full(count, np.nan, np.float32)
+        return cls(
+            np.zeros((count, 3), np.float32), zero[0], zero[1], zero[2], share, zero[3], zero[4], zero[5], zero[6],
+            np.zeros(count, bool),
+        )  # fmt: skip
 
     def at(self, index) -> Borders:
         """Those of some positions, copied."""
