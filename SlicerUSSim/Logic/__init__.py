@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .imaging.noise import seed_of_pose as seed_of_pose
     from .imaging.preset import Preset as Preset
     from .imaging.simulator import UltrasoundSimulator as UltrasoundSimulator
+    from .mri.ct import CtSegmentation as CtSegmentation, segment_ct as segment_ct
     from .mri.segmentation import Segmentation as Segmentation, segment_mri as segment_mri
     from .opencl.devices import list_devices as list_devices
     from .probe.arrays import ConvexProbe as ConvexProbe, LinearProbe as LinearProbe, PhasedProbe as PhasedProbe

@@ -9,6 +9,7 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .addable import require_addable as require_addable
+    from .ct import CtSegmentation as CtSegmentation, segment_ct as segment_ct
     from .filtering import guided_filter as guided_filter
     from .masks import read_mask as read_mask
     from .pathology import Added as Added, add_tissue as add_tissue, add_tissues as add_tissues

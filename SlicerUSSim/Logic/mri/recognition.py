@@ -91,19 +91,22 @@ def check_position(mri: Volume, alignment: Alignment) -> None:
     require(message is None, message or "")
 
 
-def check_finite(mri: Volume) -> None:
-    """Raise SimulationError if voxels are not finite, naming how many and the first (i, j, k), or all are equal."""
+def check_finite(mri: Volume, name: str = "MRI", remedy: str = "for example by 0 outside the head") -> None:
+    """Raise SimulationError if voxels are not finite, naming how many and the first (i, j, k), or all are equal.
+
+    `name` is that of the image, and `remedy` by what to replace such voxels.
+    """
     values = mri.array
     if np.issubdtype(values.dtype, np.floating):
         is_bad = ~np.isfinite(values)
         if is_bad.any():
             first = tuple(int(n) for n in np.unravel_index(int(is_bad.argmax()), values.shape)[::-1])
             raise SimulationError(
-                f"MRI has {int(is_bad.sum())} voxels that are not finite numbers, the first at (i, j, k) = {first}, "
-                "expected none; replace them, for example by 0 outside the head"
+                f"{name} has {int(is_bad.sum())} voxels that are not finite numbers, the first at (i, j, k) = {first}, "
+                f"expected none; replace them, {remedy}"
             )
     low, high = float(values.min()), float(values.max())
-    require(high > low, f"MRI is constant ({low:g}), expected different intensities")
+    require(high > low, f"{name} is constant ({low:g}), expected different intensities")
 
 
 def check_intensities(mri: Volume, name: str = "MRI") -> None:
