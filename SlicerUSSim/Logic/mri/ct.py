@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import require, require_between, require_kind
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.ct_body import find_body
 from SlicerUSSim.Logic.mri.ct_classes import BLOOD, NAMES, SKIN_MM, classified, sharpened
@@ -29,6 +29,8 @@ _log = logging.getLogger(__name__)
 LOWEST_HU, HIGHEST_HU = -1024, 3500
 #: Strength of the guided filter, per deviation of the noise
 _EPSILON_PER_NOISE = 2.0
+#: Part of the noise that the filter leaves
+_NOISE_LEFT = 0.5
 #: Voxels that are filtered at once
 _AT_ONCE = 8_000_000
 #: Noise from which on, and voxels from which on, a result is doubtful
@@ -121,9 +123,7 @@ def segment_ct(
     report = progress or (lambda share: None)
     timed, notes, warnings = StepTimes(), [], []
     check_finite(ct, "CT", "by -1000, which is air")
-    why = not_intensities(ct)
-    require(why is None, f"CT {why}".replace("an MRI", "a CT"))
-    offset, note, doubt = hounsfield_offset(ct)
+    offset, note, doubt = _unit_of(ct)
     notes += [] if note is None else [note]
     warnings += [] if doubt is None else [doubt]
     timed("unit")
@@ -136,13 +136,14 @@ def segment_ct(
         epsilon = (_EPSILON_PER_NOISE * noise) ** 2 if filter_epsilon is None else filter_epsilon
         hu = _filtered(hu, filter_radius, epsilon, device, lambda share: report(0.05 + 0.45 * share))
     timed("filter")
-    sharp = sharpened(hu, 0.0 if not filter_radius else 0.5 * noise)
+    left = _NOISE_LEFT * noise if filter_radius else noise
+    sharp = sharpened(hu, left)
     timed("borders")
     report(0.6)
     body = _body(sharp, ct, mask, notes)
     timed("body")
     report(0.7)
-    classes = classified(sharp, hu, body, ct, skin_mm)
+    classes = classified(sharp, hu, left, body, ct, skin_mm)
     timed("classes")
     report(0.85)
     names = NAMES
@@ -165,6 +166,15 @@ def segment_ct(
     return CtSegmentation(
         ct.with_array(labels), names, means, deviations, noise, tuple(notes), tuple(warnings), hu, sharp
     )
+
+
+def _unit_of(ct: Volume) -> tuple[float, str | None, str | None]:
+    """As hounsfield_offset; label maps are called so."""
+    try:
+        return hounsfield_offset(ct)
+    except SimulationError as error:
+        why = not_intensities(ct)
+        raise SimulationError(f"CT: {error}" if why is None else f"CT {why}".replace("an MRI", "a CT")) from None
 
 
 def _slabs(shape: tuple[int, ...], margin: int = 0) -> list[slice]:

@@ -18,6 +18,8 @@ _LEAST_PART = 0.02
 #: Share of air, from which on a space at the side of the image is outside; of lung that is cut by it 0.0
 _OUTSIDE_AIR = 0.3
 _LEAST_ML = 10.0
+#: Lung and bowel are never as near to a couch
+_GAP_MM = 8.0
 #: Share of slices in which a couch is at the same place; how much of it is seen at least on either side of the patient,
 #: and how far from a parabola
 _SAME_IN_SLICES, _SEEN_MM, _MOST_OFF_MM = 0.8, 15.0, 1.5
@@ -105,6 +107,9 @@ def _cut_couch(inside: np.ndarray, hu: np.ndarray, ct: Volume) -> None:
         level = surface(np.arange(beside.shape[1]))
         row = np.arange(len(beside)) if sign < 0 else np.arange(len(beside))[::-1]
         patient[row[:, None] <= np.floor(level + 0.5)[None]] = False
+        near = row[:, None] <= (level + _GAP_MM / size)[None]  # gaps between the skin and the couch
+        values = np.moveaxis(hu, (vertical, across), (0, 1))
+        patient[near] &= values[near] > _TISSUE_HU
 
 
 _BALL = ndimage.generate_binary_structure(3, 2)

@@ -37,6 +37,8 @@ _MARROW_STEPS = 3
 _WHOLE_CORTEX_HU = 1600.0
 #: A difference across a voxel from which on it is on a step (more with noise): less than from fat to muscle
 _LEAST_STEP, _STEP_PER_NOISE, _SHARPENINGS = 90, 5.0, 3
+#: Deviations of the noise, within which a number alone does not tell contrast agent
+_MARGIN_PER_NOISE = 2.0
 #: Voxels of contrast agent among 27 below which it is noise; two by two across a vessel have 12
 _LEAST_TOGETHER = 10
 #: Gas in a smaller space than this is no lung, ml
@@ -83,9 +85,9 @@ def _steepness(hu: np.ndarray) -> np.ndarray:
 
 
 def classified(
-    hu: np.ndarray, filtered: np.ndarray, body: np.ndarray, ct: Volume, skin_mm: float = SKIN_MM
+    hu: np.ndarray, filtered: np.ndarray, noise: float, body: np.ndarray, ct: Volume, skin_mm: float = SKIN_MM
 ) -> np.ndarray:
-    """(k, j, i) uint8 classes, 0 outside the body; `hu` is `filtered` with sharp borders."""
+    """(k, j, i) uint8 classes, 0 outside the body; `hu` is `filtered`, of this noise, with sharp borders."""
     limits = np.array([_AIR_LUNG, _LUNG_FAT, _FAT_SOFT, _SOFT_BRIGHT, _METAL])
     table = np.array([AIR, LUNG, FAT, SOFT, BLOOD, METAL], np.uint8)
     lookup = table[np.searchsorted(limits, np.arange(-1024, 3501), side="right")]
@@ -93,7 +95,7 @@ def classified(
     classes[~body] = 0
     _mark_gas(classes, ct)
     _mark_bone(classes, hu, filtered, ct)
-    _drop_rims(classes)
+    _settle_blood(classes, hu, noise)
     # Gas lies in an organ, whose wall is often too thin to be seen between gas and fat.
     classes[(classes == FAT) & _beside(classes == AIR)] = SOFT
     if skin_mm > 0.0:
@@ -182,28 +184,36 @@ def _shifted(mask: np.ndarray, step: np.ndarray, beyond: bool) -> np.ndarray:
     return result
 
 
-def _drop_rims(classes: np.ndarray) -> None:
-    """Specks of noise, and contrast agent beside bone that is thinner than three voxels, which is what is left of its
-    border, are soft tissue."""
-    blood = classes == BLOOD
-    if not blood.any():
+def _settle_blood(classes: np.ndarray, hu: np.ndarray, noise: float) -> None:
+    """Contrast agent and soft tissue by the mean of both around, where the number alone is within the noise.
+
+    Specks of noise, and contrast agent beside bone that is thinner than three voxels, which is what is left of its
+    border, are soft tissue.
+    """
+    both = (classes == SOFT) | (classes == BLOOD)
+    margin = _MARGIN_PER_NOISE * noise
+    doubtful = both & (hu >= _SOFT_BRIGHT - margin) & (hu < _SOFT_BRIGHT + margin)
+    if not doubtful.any():
         return
-    classes[blood & (_count_around(blood) < _LEAST_TOGETHER)] = SOFT
+    total = _sum_around(np.where(both, np.clip(hu, 0, 2 * _SOFT_BRIGHT), 0).astype(np.int16))
+    is_bright = total >= _SOFT_BRIGHT * _sum_around(both.astype(np.uint8)).astype(np.int16)
+    classes[doubtful] = np.where(is_bright[doubtful], BLOOD, SOFT)
+    blood = classes == BLOOD
+    classes[blood & (_sum_around(blood.astype(np.uint8)) < _LEAST_TOGETHER)] = SOFT
     blood = classes == BLOOD
     near = largest_around(largest_around(np.isin(classes, (BONE, SPONGY, METAL))))
     thick = largest_around(smallest_around(blood))
     classes[blood & near & ~thick] = SOFT
 
 
-def _count_around(where: np.ndarray) -> np.ndarray:
-    """(k, j, i) uint8 how many of the 27 voxels around."""
-    result = where.astype(np.uint8)
+def _sum_around(array: np.ndarray) -> np.ndarray:
+    """(k, j, i) the sum of the 27 voxels around, in the type of the array."""
     for axis in range(3):
-        one, total = np.moveaxis(result, axis, 0), np.moveaxis(result.copy(), axis, 0)
+        one, total = np.moveaxis(array, axis, 0), np.moveaxis(array.copy(), axis, 0)
         total[1:] += one[:-1]
         total[:-1] += one[1:]
-        result = np.moveaxis(total, 0, axis)
-    return result
+        array = np.moveaxis(total, 0, axis)
+    return array
 
 
 def _beside(where: np.ndarray) -> np.ndarray:

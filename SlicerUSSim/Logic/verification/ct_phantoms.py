@@ -174,7 +174,7 @@ def _facing(normal_xy: tuple[float, float], point_xy: tuple[float, float], sign:
 def _vertebra(z: float) -> list[Shape]:
     """Body, arch, spinous, transverse and articular processes of the lumbar vertebra in the middle at z."""
     parts = [
-        _both(_ellipse((23.0, 17.0), 0.0), _box((-25.0, -20.0, z - 13.5), (25.0, 20.0, z + 13.5))),
+        _both(_ellipse((23.0, 17.0), 0.0), _box((-25.0, -20.0, z - 13.3), (25.0, 20.0, z + 13.3))),
         _box((-3.5, -60.0, z - 14.0), (3.5, -38.0, z + 6.0)),
     ]
     for side in (-1.0, 1.0):
@@ -210,7 +210,7 @@ def _phantom(
     counts = np.rint(np.subtract(high, low) / spacing).astype(int)
     matrix = np.diag([*spacing, 1.0])
     matrix[:3, 3] = np.add(low, 0.5 * spacing)
-    parts = [max(2, round(size / 0.5)) for size in spacing]
+    parts = [2 * round(size) + 1 if size > 1.5 else 3 for size in spacing]  # odd: no voxel is half and half
     shape = tuple(counts[::-1])
     hu, votes = np.zeros(shape, np.float32), np.zeros((len(NAMES) + 1, *shape), np.uint8)
     values = np.array([_AIR, *TISSUES.values()], np.float32)
