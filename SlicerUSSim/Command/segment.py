@@ -9,8 +9,9 @@ from time import perf_counter
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, read_mri, segmented_file, split_also
-from SlicerUSSim.Command.options import check_places, device_option, gathered, mask_option
+from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri, segmented_file, split_also
+from SlicerUSSim.Command.options import check_places, ct_option, device_option, gathered, mask_option
+from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
@@ -26,8 +27,11 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
     help="Label map; the tissue table is written to a .json file of the same name.",
 )
 @gathered(settings=SegmentationSettings)
+@ct_option
 @mask_option
 @also_option
+@organs_option
+@map_option
 @add_option
 @click.option(
     "--overwrite", is_flag=True, help="Replace labels that were made by others, or edited since they were written."
@@ -35,10 +39,11 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 @device_option
 def segment(
     mri: str, out: Path, settings: SegmentationSettings, mask: str | None, also: tuple[str, ...],
-    additions: tuple[str, ...], overwrite: bool, device: str | None,
+    organs: str | None, maps: tuple[str, ...], additions: tuple[str, ...], overwrite: bool, device: str | None,
 ) -> None:  # fmt: skip
-    """Segment an MRI of a head or a brain into tissues."""
+    """Segment an MRI of a head or a brain, or a CT (--ct), into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
+    from SlicerUSSim.Logic.mri.modality import has_brain_mask
     from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
     from SlicerUSSim.Logic.tissue.table import TissueTable
 
@@ -49,14 +54,23 @@ def segment(
         require_replaceable(out)
     split_also(also)
     masks = Additions.read(additions)
-    volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip)
+    volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip, contrast=settings.contrast)
     start = perf_counter()
     result = segmented_file(
-        mri, volume, asdict(settings), mask=mask, also=also, device=device, additions=masks, tell_all=True
+        mri,
+        volume,
+        asdict(settings),
+        mask=mask,
+        also=also,
+        organs=organs,
+        maps=maps,
+        device=device,
+        additions=masks,
+        tell_all=True,
     )
     seconds = perf_counter() - start
-    added = masks.on(result.labels, result.tissue_names, has_brain_mask=True)
-    beside = write_label_files(out, added.labels, TissueTable.brain(added.tissue_names))
+    added = masks.on(result.labels, result.tissue_names, has_brain_mask=has_brain_mask(settings.contrast))
+    beside = write_label_files(out, added.labels, TissueTable.brain().for_names(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")
 

@@ -232,14 +232,17 @@ def _body(sharp: np.ndarray, ct: Volume, mask: Volume | None, notes: list[str]) 
 def _doubts(classes: np.ndarray, ct: Volume, noise: float, has_organs: bool) -> list[str]:
     lines = []
     if noise > _NOISY_HU:
-        lines.append(f"noise is {noise:.0f} HU, expected less than {_NOISY_HU:.0f}: fat and muscle cannot be told apart")
+        lines.append(
+            f"noise is {noise:.0f} HU, expected less than {_NOISY_HU:.0f}: fat and muscle cannot be told apart"
+        )
     if ct.spacing_mm.max() > _COARSE_MM:
         lines.append(
             f"slices are {ct.spacing_mm.max():.2g} mm apart, expected up to {_COARSE_MM:g}: borders across them are coarse"
         )
     if not has_organs:
-        from SlicerUSSim.Logic.mri.ct_body import cells, pooled
         from scipy import ndimage
+
+        from SlicerUSSim.Logic.mri.ct_body import cells, pooled
 
         size = cells(ct)
         blood = np.pad(pooled((classes == BLOOD).view(np.uint8), size, np.minimum), 1)

@@ -29,6 +29,8 @@ _AIR, _COUCH = -1000.0, 80.0
 _BLUR_MM, _NOISE_VOXELS = 0.45, 0.6
 _CORTEX_MM, _JOINT_MM = 1.2, 2.0
 
+#: Middles of L5 to L1, z
+_LEVELS = (-72.0, -36.0, 0.0, 36.0, 72.0)
 _EVERYWHERE = ((-1e3, -1e3, -1e3), (1e3, 1e3, 1e3))
 
 
@@ -65,25 +67,28 @@ class CtPhantom:
 
 
 def lumbar_spine(spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0), noise_hu: float = 20.0) -> CtPhantom:
-    """L3 and parts of its neighbours, of a patient who lies on a couch: back muscles, aorta, facet joints 2 mm wide."""
+    """L2 to L4 and parts of their neighbours, of a patient who lies on a couch: back muscles, aorta, facet joints 2 mm wide."""
     septa = [_box((x - 0.8, -62.0, -99.0), (x + 0.8, -30.0, 99.0), 0.0) for x in (-27.0, 27.0)]
     shapes = [
         *_trunk(halves=(120.0, 80.0), centre_y=12.0),
         ("fat", septa, 0.0),  # between the muscles of the back
         ("blood", [_rod((-4.0, 27.5, -99.0), (-4.0, 27.5, 99.0), 10.0)], 0.0),  # it touches the vertebrae
-        *_bones([part for z in (-36.0, 0.0, 36.0) for part in _vertebra(z)]),
+        *_bones([part for z in _LEVELS for part in _vertebra(z)]),
         ("spinal canal", [_rod((0.0, -25.0, -99.0), (0.0, -25.0, 99.0), 8.0)], 0.0),
     ]
-    names = ("vertebrae_L4", "vertebrae_L3", "vertebrae_L2")
-    organs = {name: (z - 18.0, z + 18.0) for name, z in zip(names, (-36.0, 0.0, 36.0), strict=True)}
-    return _phantom(shapes, (-125.0, -82.0, -40.0), (125.0, 97.0, 40.0), spacing_mm, noise_hu, organs)
+    names = (f"vertebrae_L{n}" for n in range(5, 0, -1))
+    organs = {name: (z - 18.0, z + 18.0) for name, z in zip(names, _LEVELS, strict=True)}
+    return _phantom(shapes, (-125.0, -82.0, -60.0), (125.0, 97.0, 60.0), spacing_mm, noise_hu, organs)
 
 
 def lower_chest(spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0), noise_hu: float = 20.0) -> CtPhantom:
     """The right side of a chest: ribs in its wall, lung above the dome of the liver, a kidney in its fat, a trachea."""
     halves, y = (120.0, 85.0), 0.0
     inner = _ellipse((halves[0] - 28.0, halves[1] - 28.0), y)
-    dome, around = _ellipsoid((45.0, 0.0, -45.0), (85.0, 75.0, 80.0)), _ellipsoid((45.0, 0.0, -45.0), (88.0, 78.0, 83.0))
+    dome, around = (
+        _ellipsoid((45.0, 0.0, -45.0), (85.0, 75.0, 80.0)),
+        _ellipsoid((45.0, 0.0, -45.0), (88.0, 78.0, 83.0)),
+    )
     trachea = _rod((-60.0, 20.0, -99.0), (-60.0, 20.0, 99.0), 10.5)
     shapes = [
         *_trunk(halves, y),
@@ -99,7 +104,7 @@ def lower_chest(spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0), noise_
         *_bones([_rib(halves, y, z) for z in np.arange(-75.0, 100.0, 24.0)]),
     ]
     organs = {"liver": None, "kidney_right": None, "lung_lower_lobe_right": None}
-    return _phantom(shapes, (-125.0, -105.0, -50.0), (125.0, 90.0, 50.0), spacing_mm, noise_hu, organs)
+    return _phantom(shapes, (-125.0, -95.0, -50.0), (125.0, 90.0, 75.0), spacing_mm, noise_hu, organs)
 
 
 # ---- shapes ------------------------------------------------------------------------------------------------------
