@@ -23,8 +23,10 @@ SKIN, FAT, SOFT, BLOOD, SPONGY, BONE, METAL, LUNG, AIR = range(1, len(NAMES) + 1
 #: 2011): lung -950 to -500, fat -120 to -80, muscle and organs 20 to 80, 100 to 130 with contrast agent, vessels with
 #: contrast agent 140 to 400, bone from 150 (cancellous) to 2000
 _AIR_LUNG, _LUNG_FAT, _FAT_SOFT, _SOFT_BRIGHT, _METAL = -930, -250, -25, 135, 2900
-#: Cortical bone has a core from the first number on, and goes down to the second within a cell of it
-_CORE_HU, _CORTEX_HU = 550, 300
+#: Only bone is as dense as the first number, or as the second in a sheet; around it cortex goes down to the third
+_DENSE_HU, _CORE_HU, _CORTEX_HU = 700, 450, 300
+#: Thin cortex has less: from this number on, if it stands out so much from what is wider than this, mm
+_SHEET_HU, _STANDS_OUT, _SHEET_MM = 220, 90, 5.5
 #: Marrow with trabeculae from this number on, in what bone encloses to the first share; any in the second
 _MARROW_HU, _ENCLOSED, _WHOLLY_ENCLOSED = 100, 0.84, 0.95
 #: How far away bone may be that encloses, mm
@@ -42,7 +44,7 @@ _MARGIN_PER_NOISE = 2.0
 #: Voxels of contrast agent among 27 below which it is noise; two by two across a vessel have 12
 _LEAST_TOGETHER = 10
 #: Gas in a smaller space than this is no lung, ml
-_LEAST_LUNG_ML = 30.0
+_LEAST_LUNG_ML = 10.0
 #: Thickness of the skin (1.6 to 2.3 mm; Laurent et al., Vaccine 25(34), 2007)
 SKIN_MM = 1.8
 
@@ -119,17 +121,26 @@ def _mark_gas(classes: np.ndarray, ct: Volume) -> None:
 def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Volume) -> None:
     """Cortex where the numbers are high, trabeculae where bone encloses what is brighter than muscle."""
     size = cells(ct)
-    core = pooled(((hu >= _CORE_HU) & (classes > 0)).view(np.uint8), size, np.maximum) > 0
+    above = _above_surroundings(hu, ct)
+    is_core = (classes > 0) & ((hu >= _DENSE_HU) | ((hu >= _CORE_HU) & (above >= _STANDS_OUT)))
+    core = pooled(is_core.view(np.uint8), size, np.maximum) > 0
     if not core.any():
         return
     near = spread(np.asarray(ndimage.binary_dilation(core, np.ones((3, 3, 3)))), size, hu.shape)
-    cortex = near & (hu >= _CORTEX_HU) & (classes == BLOOD)
+    bright = classes == BLOOD
+    cortex = bright & ((near & (hu >= _CORTEX_HU)) | ((hu >= _SHEET_HU) & (above >= _STANDS_OUT)))
+    # Small vessels stand out, too: cortex hangs together with what only bone can be.
+    parts, _ = ndimage.label(pooled(cortex.view(np.uint8), size, np.maximum), np.ones((3, 3, 3)))  # type: ignore[misc]
+    of_bone = np.zeros(parts.max() + 1, bool)
+    of_bone[parts[core]] = True
+    of_bone[0] = False
+    cortex &= spread(of_bone[parts], size, hu.shape)
     wall = pooled(cortex.view(np.uint8), size, np.maximum) > 0
     # The lower the crest of a sheet that is thinner than the blur, the nearer to it its border: at half for thick ones.
     base = np.maximum(smallest_around(filtered)[cortex], 0).astype(np.float32)
     crest = np.maximum(hu[cortex] - base, 1.0)
     part = np.minimum(crest / np.maximum(_WHOLE_CORTEX_HU - base, 1.0), 1.0)
-    cortex[cortex] = filtered[cortex] >= base + crest * (1.0 - 0.5 * part)
+    cortex[cortex] = (base >= _CORTEX_HU) | (filtered[cortex] >= base + crest * (1.0 - 0.5 * part))
     share, is_whole = enclosed_share(wall, np.array(size) * ct.spacing_mm[::-1])
     enclosed, wholly = (
         spread(where, size, hu.shape)
@@ -142,6 +153,20 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
     for _ in range(_MARROW_STEPS):  # into the cells of the cortex itself, which enclosed nothing
         beside = _beside(classes == SPONGY) & (classes == BLOOD)
         classes[beside] = SPONGY
+
+
+def _above_surroundings(hu: np.ndarray, ct: Volume) -> np.ndarray:
+    """(k, j, i) int16 how far a voxel is above what is around on both sides: of a sheet its height, of a vessel that is
+    wider than the sheets of bone nothing (white top-hat)."""
+    opened = hu
+    for extreme in (np.minimum, np.maximum):
+        for axis, mm in enumerate(ct.spacing_mm[::-1]):
+            for _ in range(max(round(0.5 * _SHEET_MM / mm), 1)):
+                narrow, opened = np.moveaxis(opened, axis, 0), opened.copy()
+                wide = np.moveaxis(opened, axis, 0)
+                extreme(wide[1:], narrow[:-1], out=wide[1:])
+                extreme(wide[:-1], narrow[1:], out=wide[:-1])
+    return hu - opened
 
 
 def enclosed_share(wall: np.ndarray, spacing_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -52,9 +52,9 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
         inside.size > 0.001 * values.size or float(np.median(values)) > _AIR_HU[1],
         f"shows air alone ({float(np.mean(values < _NOT_LUNG_HU)):.1%} is below -500 HU), expected a patient",
     )
-    # A part of a body without air: fat is below water, which nothing of an MRI is
+    # A part of a body without air around it, with lung or not: fat is below water, which nothing of an MRI is
     has_fat = float(np.mean(values < -50.0)) > 0.005
-    if is_tissue >= _LEAST_TISSUE and has_fat and low > -400.0:
+    if is_tissue >= _LEAST_TISSUE and has_fat and low > -1100.0:
         return 0.0, None, "no air is in the image, so that it is not checked that its numbers are Hounsfield units"
     darkest = float(np.percentile(values, 5.0))
     require(
