@@ -26,7 +26,9 @@ _AIR_LUNG, _LUNG_FAT, _FAT_SOFT, _SOFT_BRIGHT, _METAL = -930, -250, -25, 135, 29
 #: Only bone is as dense as the first number, or as the second in a sheet; around it cortex goes down to the third
 _DENSE_HU, _CORE_HU, _CORTEX_HU = 700, 450, 300
 #: Thin cortex has less: from this number on, if it stands out so much from what is wider than this, mm
-_SHEET_HU, _STANDS_OUT, _SHEET_MM = 220, 90, 5.5
+_SHEET_HU, _STANDS_OUT, _SHEET_MM = 220, 90, 6.0
+#: A gap between bones that is narrower than the first number, mm, and so much darker than both
+_GAP_MM, _GAP_DEPTH_HU = 3.5, 150
 #: Marrow with trabeculae from this number on, in what bone encloses to the first share; any in the second
 _MARROW_HU, _ENCLOSED, _WHOLLY_ENCLOSED = 100, 0.84, 0.95
 #: How far away bone may be that encloses, mm
@@ -121,7 +123,7 @@ def _mark_gas(classes: np.ndarray, ct: Volume) -> None:
 def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Volume) -> None:
     """Cortex where the numbers are high, trabeculae where bone encloses what is brighter than muscle."""
     size = cells(ct)
-    above = _above_surroundings(hu, ct)
+    above = _beyond_surroundings(hu, ct, _SHEET_MM, is_crest=True)
     is_core = (classes > 0) & ((hu >= _DENSE_HU) | ((hu >= _CORE_HU) & (above >= _STANDS_OUT)))
     core = pooled(is_core.view(np.uint8), size, np.maximum) > 0
     if not core.any():
@@ -136,11 +138,13 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
     of_bone[0] = False
     cortex &= spread(of_bone[parts], size, hu.shape)
     wall = pooled(cortex.view(np.uint8), size, np.maximum) > 0
+    # The space of a joint is bright, too, between two cortices, but a gap; marrow is wider.
+    is_gap = near & (_beyond_surroundings(filtered, ct, _GAP_MM, is_crest=False) >= _GAP_DEPTH_HU)
     # The lower the crest of a sheet that is thinner than the blur, the nearer to it its border: at half for thick ones.
     base = np.maximum(smallest_around(filtered)[cortex], 0).astype(np.float32)
     crest = np.maximum(hu[cortex] - base, 1.0)
     part = np.minimum(crest / np.maximum(_WHOLE_CORTEX_HU - base, 1.0), 1.0)
-    cortex[cortex] = (base >= _CORTEX_HU) | (filtered[cortex] >= base + crest * (1.0 - 0.5 * part))
+    cortex[cortex] = ((base >= _CORTEX_HU) & ~is_gap[cortex]) | (filtered[cortex] >= base + crest * (1.0 - 0.5 * part))
     share, is_whole = enclosed_share(wall, np.array(size) * ct.spacing_mm[::-1])
     enclosed, wholly = (
         spread(where, size, hu.shape)
@@ -150,23 +154,26 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
     is_marrow |= wholly & (classes >= FAT) & (classes <= BLOOD)
     classes[is_marrow] = SPONGY
     classes[cortex] = BONE
+    classes[is_gap & ((classes == BLOOD) | (classes == SPONGY))] = SOFT
     for _ in range(_MARROW_STEPS):  # into the cells of the cortex itself, which enclosed nothing
         beside = _beside(classes == SPONGY) & (classes == BLOOD)
         classes[beside] = SPONGY
 
 
-def _above_surroundings(hu: np.ndarray, ct: Volume) -> np.ndarray:
-    """(k, j, i) int16 how far a voxel is above what is around on both sides: of a sheet its height, of a vessel that is
-    wider than the sheets of bone nothing (white top-hat)."""
-    opened = hu
-    for extreme in (np.minimum, np.maximum):
+def _beyond_surroundings(hu: np.ndarray, ct: Volume, width_mm: float, is_crest: bool) -> np.ndarray:
+    """(k, j, i) int16 how far a voxel is above what is around on both sides, or below if it is no crest but a gap.
+
+    Of a sheet it is the height, of what is wider nothing (white and black top-hat; Meyer 1979).
+    """
+    levelled = hu
+    for extreme in (np.minimum, np.maximum) if is_crest else (np.maximum, np.minimum):
         for axis, mm in enumerate(ct.spacing_mm[::-1]):
-            for _ in range(max(round(0.5 * _SHEET_MM / mm), 1)):
-                narrow, opened = np.moveaxis(opened, axis, 0), opened.copy()
-                wide = np.moveaxis(opened, axis, 0)
+            for _ in range(int(0.5 * width_mm / mm)):
+                narrow, levelled = np.moveaxis(levelled, axis, 0), levelled.copy()
+                wide = np.moveaxis(levelled, axis, 0)
                 extreme(wide[1:], narrow[:-1], out=wide[1:])
                 extreme(wide[:-1], narrow[1:], out=wide[:-1])
-    return hu - opened
+    return hu - levelled if is_crest else levelled - hu
 
 
 def enclosed_share(wall: np.ndarray, spacing_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

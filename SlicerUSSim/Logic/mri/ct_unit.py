@@ -18,6 +18,8 @@ _LEAST_TISSUE, _LEAST_AIR, _MOST_BETWEEN = 0.55, 0.01, 0.15
 _BETWEEN_HU = (-700.0, -250.0)
 #: From this share on, one number that is not air's is a background or the end of a window
 _ONE_NUMBER = 0.2
+#: Least noise of air
+_LEAST_NOISE_HU = 2.0
 _EXPECTED = "expected Hounsfield units (air -1000, water 0, bone 1000)"
 
 
@@ -32,7 +34,7 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
         return 0.0, None, None
     if float(np.mean(values > -0.5)) > 0.999:  # nothing is below 0
         for offset in _OFFSETS:
-            if _is_hounsfield(values - offset) and _air_peak_is_at(values, offset - 1000.0):
+            if _is_offset(values, offset):
                 line = (
                     f"values are {offset:.0f} above Hounsfield units (air is at {offset - 1000.0:.0f}; the rescale "
                     f"intercept was not applied): {offset:.0f} is subtracted"
@@ -40,7 +42,14 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
                 return offset, line, None
     found = f"values are from {low:g} to {high:g}"
     level, share = _most_frequent(values)
-    require(high - low >= 300.0, f"{found}, {_EXPECTED}; multiply them by the slope of the CT's header")
+    require(
+        high > _NOT_LUNG_HU or low < -1100.0,
+        f"shows air alone (values are from {low:g} to {high:g}), expected a patient",
+    )
+    require(
+        high - low >= 300.0,
+        f"{found}, {_EXPECTED}; multiply them by the slope of the CT's header; for an MRI leave --ct out",
+    )
     require(
         share < _ONE_NUMBER or level < _AIR_HU[1],
         f"{found} and {share:.0%} of them are {level:g}, as in an MRI with a background, or in a CT that was cut off or "
@@ -48,10 +57,6 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
     )
     inside = values[values > _NOT_LUNG_HU]
     is_tissue = float(np.mean((inside > _TISSUE_HU[0]) & (inside < _TISSUE_HU[1]))) if inside.size else 0.0
-    require(
-        inside.size > 0.001 * values.size or float(np.median(values)) > _AIR_HU[1],
-        f"shows air alone ({float(np.mean(values < _NOT_LUNG_HU)):.1%} is below -500 HU), expected a patient",
-    )
     # A part of a body without air around it, with lung or not: fat is below water, which nothing of an MRI is
     has_fat = float(np.mean(values < -50.0)) > 0.005
     if is_tissue >= _LEAST_TISSUE and has_fat and low > -1100.0:
@@ -69,7 +74,7 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
 def looks_like_ct(volume: Volume) -> bool:
     """Whether the numbers are a CT's in Hounsfield units, also with an offset; takes some 50 ms."""
     values = _sample(volume.array)
-    return any(_is_hounsfield(values - offset) for offset in (0.0, *_OFFSETS))
+    return _is_hounsfield(values) or any(_is_offset(values, offset) for offset in _OFFSETS)
 
 
 def _is_hounsfield(values: np.ndarray) -> bool:
@@ -83,9 +88,14 @@ def _is_hounsfield(values: np.ndarray) -> bool:
     return tissue >= _LEAST_TISSUE and between <= _MOST_BETWEEN
 
 
-def _air_peak_is_at(values: np.ndarray, level: float) -> bool:
-    near = values[np.abs(values - level) < 60.0]
-    return bool(near.size and abs(float(np.median(near)) - level) < 12.0)
+def _is_offset(values: np.ndarray, offset: float) -> bool:
+    """Whether they are a CT's with this offset: air is at its place, and noisy, where the background of an MRI is 0."""
+    near = values[np.abs(values - offset + 1000.0) < 60.0]
+    return bool(
+        _is_hounsfield(values - offset)
+        and abs(float(np.median(near)) - offset + 1000.0) < 12.0
+        and float(near.std()) > _LEAST_NOISE_HU
+    )
 
 
 def _most_frequent(values: np.ndarray) -> tuple[float, float]:
