@@ -27,8 +27,8 @@ also_option = click.option(
 
 
 organs_option = click.option(
-    "--organs", type=click.Path(), help="Label map of organs of a CT (--ct), such as TotalSegmentator's, whose soft tissues "
-    "replace muscle and blood.",
+    "--organs", type=click.Path(), help="Label map of organs of a CT (--ct), such as TotalSegmentator's, whose soft "
+    "tissues replace muscle and blood.",
 )  # fmt: skip
 
 
@@ -128,7 +128,7 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
 
 
 def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = MRI_CONTRASTS[0]) -> Volume:
-    """Read an MRI or a CT, which is not a label map unless it is segmented all the same, with a mask or without extraction.
+    """Read an MRI or a CT, which is not a label map unless it is segmented all the same
 
     Raises SimulationError, saying what it is, for a label map, a mask or a tracked sequence, and if it is constant.
     """

@@ -32,8 +32,8 @@ device_option = click.option(
     "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
 )
 mask_option = click.option(
-    "--mask", type=click.Path(), help="Brain mask on the MRI's grid (default: found in the MRI, see --skull-strip); of a "
-    "CT: the patient."
+    "--mask", type=click.Path(), help="Brain mask on the MRI's grid (default: found in the MRI, see --skull-strip); "
+    "of a CT: the patient."
 )  # fmt: skip
 ct_option = click.option(
     "--ct", "contrast", flag_value=CT, default=parameter_of(SegmentationSettings, "contrast").default,
@@ -133,8 +133,8 @@ def declared_parameters(
 ) -> Any:
     """A field of a dataclass of options: {name: value} of the parameters of `kind` that have an option.
 
-    `names` selects some of them; `also` are further options for the same values. With `of_preset` it contains only options that were given, and --help refers to the
-    preset for the default.
+    `names` selects some of them; `also` are further options for the same values. With `of_preset` it contains only
+    options that were given, and --help refers to the preset for the default.
     """
     entries = [entry for entry in parameters_of(kind) if entry.option and (names is None or entry.name in names)]
     return field(
@@ -201,7 +201,7 @@ def given_options(*names: str) -> list[str]:
 
 def require_no_mri_options(labels: str, remedy: str) -> None:
     """Raise SimulationError if options for the segmentation of an MRI were given with the label map of this file."""
-    given = given_options("mask", "also", *(entry.name for entry in parameters_of(SegmentationSettings)))
+    given = given_options("mask", "also", "organs", *(entry.name for entry in parameters_of(SegmentationSettings)))
     verb = "is" if len(given) == 1 else "are"
     require(not given, f"{labels}: is a label map, and {' and '.join(given)} {verb} for an MRI; {remedy}")
 

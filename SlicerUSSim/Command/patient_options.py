@@ -169,7 +169,8 @@ def open_examination(patient: PatientOptions) -> Examination:
         )
     if patient.maps and not is_labels and patient.organs is None:
         raise SimulationError(
-            f"{patient.mri_or_labels}: is {'a CT' if is_ct else 'an MRI'}, and --map is for labels; use --labels if it is none"
+            f"{patient.mri_or_labels}: is {'a CT' if is_ct else 'an MRI'}, and --map is for labels; use --labels if it "
+            "is none"
         )
     if is_labels:
         require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.ct_body import find_body
+from SlicerUSSim.Logic.mri.ct_body import cells, find_body, pooled
 from SlicerUSSim.Logic.mri.ct_classes import BLOOD, NAMES, SKIN_MM, classified, sharpened
 from SlicerUSSim.Logic.mri.ct_organs import Organs, laid_over
 from SlicerUSSim.Logic.mri.ct_shares import border_shares
@@ -237,13 +238,10 @@ def _doubts(classes: np.ndarray, ct: Volume, noise: float, has_organs: bool) -> 
         )
     if ct.spacing_mm.max() > _COARSE_MM:
         lines.append(
-            f"slices are {ct.spacing_mm.max():.2g} mm apart, expected up to {_COARSE_MM:g}: borders across them are coarse"
+            f"slices are {ct.spacing_mm.max():.2g} mm apart, expected up to {_COARSE_MM:g}: borders across them are "
+            "coarse"
         )
     if not has_organs:
-        from scipy import ndimage
-
-        from SlicerUSSim.Logic.mri.ct_body import cells, pooled
-
         size = cells(ct)
         blood = np.pad(pooled((classes == BLOOD).view(np.uint8), size, np.minimum), 1)
         spacing = np.array(size) * ct.spacing_mm[::-1]

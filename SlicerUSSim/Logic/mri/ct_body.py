@@ -46,6 +46,11 @@ def spread(array: np.ndarray, size: tuple[int, int, int], shape: tuple[int, ...]
     return array[tuple(slice(0, n) for n in shape)]
 
 
+def components(mask: np.ndarray, structure: np.ndarray | None = None) -> tuple[np.ndarray, int]:
+    """(numbers of the connected parts from 1, how many)"""
+    return cast(tuple[np.ndarray, int], ndimage.label(mask, structure))
+
+
 def find_body(hu: np.ndarray, ct: Volume) -> tuple[np.ndarray | None, int]:
     """((k, j, i) bool, the patient with lungs and gas in it, in how many parts); (None, 0) if there is none.
 
@@ -56,7 +61,7 @@ def find_body(hu: np.ndarray, ct: Volume) -> tuple[np.ndarray | None, int]:
     tissue = coarse > _TISSUE_HU
     core = _eroded(tissue, 2)
     core = ndimage.binary_dilation(core, _BALL, 2) & tissue  # pyright: ignore
-    parts, count = ndimage.label(core)  # type: ignore[misc]
+    parts, count = components(core)
     if not count:
         return None, 0
     volumes = np.bincount(parts.ravel())[1:]
@@ -91,7 +96,7 @@ def _cut_couch(inside: np.ndarray, hu: np.ndarray, ct: Volume) -> None:
     patient = np.moveaxis(inside, (vertical, across), (0, 1))
     size, width = ct.spacing_mm[2 - vertical], ct.spacing_mm[2 - across]
     columns = np.flatnonzero(body.any(axis=0))
-    rows = np.flatnonzero(body.any(axis=1))
+    rows = np.flatnonzero(body.T.any(axis=0))
     middle = columns.mean()
     for part, sign in ((slice(None), -1), (slice(None, None, -1), 1)):  # below the middle row, and above
         seen = beside[part][: len(beside) // 2 + 1][::-1]  # outwards from the middle
@@ -145,7 +150,7 @@ def _filled(body: np.ndarray, coarse: np.ndarray, axis: int) -> np.ndarray:
     ):
         if not inside.any():
             continue
-        around, count = ndimage.label(~inside)  # type: ignore[misc]
+        around, count = components(~inside)
         if not count:
             continue
         sides = np.concatenate([around[0], around[-1], around[:, 0], around[:, -1]])

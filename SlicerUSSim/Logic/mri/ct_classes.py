@@ -1,9 +1,8 @@
 """Tissues of a CT by their Hounsfield units, with borders at half of the step between two tissues.
 
-A voxel on a border has the numbers of neither side: between air and skin lie those of lung and fat, between bone and
-muscle those of contrast agent. So borders are sharpened first: a voxel on a step belongs to the side on which half of
-the step puts it, as edges in CT are measured, and takes the number of that side beyond the step (in the manner of toggle
-mapping; Kramer and Bruckner, Pattern Recognition 7, 1975). What is in between afterwards is a tissue of its own.
+A voxel on a border has the numbers of neither side: between air and skin lie those of lung and fat, between bone
+and muscle those of contrast agent. So borders are sharpened first: a voxel on a step belongs to the side on which half
+of the step puts it, as edges in CT are measured, and takes the number of that side beyond the step (after toggle mapping; Kramer and Bruckner, Pattern Recognition 7, 1975). What is in between afterwards is a tissue of its own.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.neighbourhood import largest_around, smallest_around
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.ct_body import cells, pooled, spread
+from SlicerUSSim.Logic.mri.ct_body import cells, components, pooled, spread
 
 #: Classes in the order of their numbers, as indices from 1; the tissues that the presets have
 NAMES = ("skin", "fat", "muscle", "blood", "cancellous bone", "bone", "metal", "lung", "air")
@@ -111,7 +110,7 @@ def _mark_gas(classes: np.ndarray, ct: Volume) -> None:
     """Lung in small pieces is gas: bowel with contents, the rims of bubbles."""
     size = cells(ct)
     lung = pooled((classes == LUNG).view(np.uint8), size, np.minimum) > 0  # cells that are lung as a whole
-    parts, count = ndimage.label(lung)  # type: ignore[misc]
+    parts, count = components(lung)
     if count:
         cell_ml = float(np.prod(size)) * ct.voxel_ml
         large = np.bincount(parts.ravel()) * cell_ml >= _LEAST_LUNG_ML
@@ -132,7 +131,7 @@ def _mark_bone(classes: np.ndarray, hu: np.ndarray, filtered: np.ndarray, ct: Vo
     bright = classes == BLOOD
     cortex = bright & ((near & (hu >= _CORTEX_HU)) | ((hu >= _SHEET_HU) & (above >= _STANDS_OUT)))
     # Small vessels stand out, too: cortex hangs together with what only bone can be.
-    parts, _ = ndimage.label(pooled(cortex.view(np.uint8), size, np.maximum), np.ones((3, 3, 3)))  # type: ignore[misc]
+    parts, _ = components(pooled(cortex.view(np.uint8), size, np.maximum), np.ones((3, 3, 3)))
     of_bone = np.zeros(parts.max() + 1, bool)
     of_bone[parts[core]] = True
     of_bone[0] = False

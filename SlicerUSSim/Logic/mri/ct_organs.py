@@ -41,7 +41,7 @@ class Organs:
         else:
             to_organs = (volume.ras_to_ijk @ ct.ijk_to_ras)[[2, 1, 0, 3]][:, [2, 1, 0, 3]]
             labels = ndimage.affine_transform(
-                volume.array.astype(np.uint8), to_organs[:3, :3], to_organs[:3, 3], ct.array.shape, order=0
+                volume.array.astype(np.uint8), to_organs[:3, :3], to_organs[:3, 3].tolist(), ct.array.shape, order=0
             )
         require(
             bool(labels.any()),

@@ -1,4 +1,4 @@
-"""The unit of a CT: whether its numbers are Hounsfield units, where air is -1000 and water 0, and what else they are."""
+"""The unit of a CT: whether its numbers are Hounsfield units (air -1000, water 0), and what else they are."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
     )
     require(
         share < _ONE_NUMBER or level < _AIR_HU[1],
-        f"{found} and {share:.0%} of them are {level:g}, as in an MRI with a background, or in a CT that was cut off or "
-        f"masked; {_EXPECTED}, uncut; for an MRI leave --ct out and give its --contrast",
+        f"{found} and {share:.0%} of them are {level:g}, as in an MRI with a background, or in a CT that was cut "
+        f"off or masked; {_EXPECTED}, uncut; for an MRI leave --ct out and give its --contrast",
     )
     inside = values[values > _NOT_LUNG_HU]
     is_tissue = float(np.mean((inside > _TISSUE_HU[0]) & (inside < _TISSUE_HU[1]))) if inside.size else 0.0

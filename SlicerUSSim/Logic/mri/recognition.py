@@ -100,8 +100,8 @@ def _require_no_ct(mri: Volume) -> None:
     """Raise SimulationError for an image that is no head's MRI and has the numbers of a CT, also with an offset."""
     require(
         not looks_like_ct(mri),
-        f"image has values from {float(mri.array.min()):g} to {float(mri.array.max()):g}, with air and soft tissue 1000 "
-        "apart as CT has, expected an MRI; segment a CT with --ct (contrast ct)",
+        f"image has values from {float(mri.array.min()):g} to {float(mri.array.max()):g}, with air and soft tissue "
+        "1000 apart as CT has, expected an MRI; segment a CT with --ct (contrast ct)",
     )
 
 

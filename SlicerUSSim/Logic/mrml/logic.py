@@ -173,8 +173,8 @@ class UltrasoundSceneLogic:
     ) -> Segmentation | CtSegmentation:
         """Label the tissues of a scalar volume into a label map or segmentation node, with names and colours.
 
-        See segmentation.segment_mri, and ct.segment_ct for the contrast "ct"; `mask_node` is a label map on the MRI's grid, or a segmentation; `others` are
-        volume nodes of the same patient by their contrast. The segments of
+        See segmentation.segment_mri, and ct.segment_ct for the contrast "ct". `mask_node` is a label map on the MRI's
+        grid, or a segmentation; `others` are volume nodes of the same patient by their contrast. The segments of
         `lesions_node` are laid over the labels, as by addTissues, but are not in the result. `progress` may raise
         errors.Cancelled; the nodes are then as they were.
         Raises SimulationError for a node with labels that were not made by this method, or edited since; `overwrite`

@@ -1,14 +1,14 @@
 """CT phantoms of a lumbar spine and of the lower chest, whose tissues are known.
 
 A phantom is a list of shapes, painted one over the other. A voxel is the mean of its parts, blurred by the scanner,
-with noise that the reconstruction kernel has made smooth; so borders have the partial volumes of a scan. Sizes are those
-of an adult, rounded (vertebrae: Panjabi et al., Spine 17(3), 1992), not of a person. Coordinates are RAS mm.
+with noise that the reconstruction kernel has made smooth; so borders have the partial volumes of a scan. Sizes are
+those of an adult, rounded (vertebrae: Panjabi et al., Spine 17(3), 1992), not of a person. Coordinates are RAS mm.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +67,7 @@ class CtPhantom:
 
 
 def lumbar_spine(spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0), noise_hu: float = 20.0) -> CtPhantom:
-    """L2 to L4 and parts of their neighbours, of a patient who lies on a couch: back muscles, aorta, facet joints 2 mm wide."""
+    """L2 to L4 and parts of their neighbours, of a patient on a couch: back muscles, aorta, joints 2 mm wide."""
     septa = [_box((x - 0.8, -62.0, -99.0), (x + 0.8, -30.0, 99.0), 0.0) for x in (-27.0, 27.0)]
     shapes = [
         *_trunk(halves=(120.0, 80.0), centre_y=12.0),
@@ -138,7 +138,7 @@ def _ellipsoid(centre, halves) -> Shape:
     return Shape(distance, tuple(np.subtract(centre, reach)), tuple(np.add(centre, reach)))
 
 
-def _rod(start, end, radius: float) -> Shape:
+def _rod(start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
     """A capsule."""
     first, axis = np.array(start, np.float32), np.subtract(end, start).astype(np.float32)
 
@@ -187,10 +187,11 @@ def _vertebra(z: float) -> list[Shape]:
             ((14, -13, 6), (17, -27, 6), 5.0), ((16, -29, 1), (1, -39, -5), 4.0), ((16, -26, 4), (42, -30, 6), 4.5),
             ((17, -29, 2), (14, -34, -6), 5.0),
         ):  # fmt: skip
-            parts.append(_rod(*((side * x, y, z + h) for x, y, h in (start, end)), radius))
+            first, last = ((side * x, y, z + h) for x, y, h in (start, end))
+            parts.append(_rod(first, last, radius))
         for start, end, sign in (((20, -29, 6), (21, -29, 20), 1.0), ((14, -35, -6), (14, -36, -19), -1.0)):
-            process = _rod(*((side * x, y, z + h) for x, y, h in (start, end)), 6.5)
-            parts.append(_both(process, _facing((side * 0.7, 0.7), (side * 17.4, -32.5), sign)))
+            first, last = ((side * x, y, z + h) for x, y, h in (start, end))
+            parts.append(_both(_rod(first, last, 6.5), _facing((side * 0.7, 0.7), (side * 17.4, -32.5), sign)))
     return parts
 
 
@@ -209,7 +210,7 @@ def _rib(halves: tuple[float, float], centre_y: float, z: float) -> Shape:
 
 def _phantom(
     shapes: list[Painted], low, high, spacing_mm, noise_hu: float,
-    organs: dict[str, tuple[float, float] | None],
+    organs: Mapping[str, tuple[float, float] | None],
 ) -> CtPhantom:  # fmt: skip
     spacing = np.array(spacing_mm)
     counts = np.rint(np.subtract(high, low) / spacing).astype(int)
@@ -245,7 +246,7 @@ def _phantom(
     return CtPhantom(Volume(ct, matrix), found, found.with_array(_organ_labels(found, organs)))
 
 
-def _organ_labels(truth: Volume, organs: dict[str, tuple[float, float] | None]) -> np.ndarray:
+def _organ_labels(truth: Volume, organs: Mapping[str, tuple[float, float] | None]) -> np.ndarray:
     from SlicerUSSim.Logic.tissue import totalsegmentator
 
     tissues = {"vertebrae": ("bone", "cancellous bone"), "lung": ("lung",), "liver": ("liver",), "kidney": ("kidney",)}
@@ -255,5 +256,5 @@ def _organ_labels(truth: Volume, organs: dict[str, tuple[float, float] | None]) 
         inside = np.isin(truth.array, [NAMES.index(tissue) + 1 for tissue in tissues[name.split("_")[0]]])
         if between is not None:
             inside &= ((k >= between[0]) & (k < between[1]))[:, None, None]
-        labels[inside] = totalsegmentator.CT.index(name) + 1
+        labels[inside] = list[str](totalsegmentator.CT).index(name) + 1
     return labels
