@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from SlicerUSSim.Command.options import require_no_options_beside_ct
 from SlicerUSSim.Command.progress import Share, note
-from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.settings import CT, MRI_CONTRASTS
 
 if TYPE_CHECKING:
     from SlicerUSSim.Command.additions import Additions
     from SlicerUSSim.Logic.base import Volume
-    from SlicerUSSim.Logic.mri import Segmentation
+    from SlicerUSSim.Logic.mri import CtSegmentation, Segmentation
+    from SlicerUSSim.Logic.tissue import LabelledTissues
 
 also_option = click.option(
     "--also", multiple=True, metavar="CONTRAST=FILE",
@@ -25,9 +26,15 @@ also_option = click.option(
 )  # fmt: skip
 
 
+organs_option = click.option(
+    "--organs", type=click.Path(), help="Label map of organs of a CT (--ct), such as TotalSegmentator's, whose soft "
+    "tissues replace muscle and blood.",
+)  # fmt: skip
+
+
 def split_also(texts: Iterable[str]) -> dict[str, str]:
     """{contrast: file} of the values of --also. Raises SimulationError for another text or contrast, or one twice."""
-    contrasts, found = parameter_of(SegmentationSettings, "contrast").choices, {}
+    contrasts, found = MRI_CONTRASTS, {}
     for text in texts:
         contrast, _, file = text.partition("=")
         require(file, f"--also is {text!r}, expected CONTRAST=FILE, such as t2=t2.nii.gz")
@@ -63,11 +70,15 @@ def segmented_file(
     *,
     mask: str | None = None,
     also: Iterable[str] = (),
+    organs: str | None = None,
+    maps: Iterable[str] = (),
     device: str | None = None,
     additions: Additions | None = None,
     tell_all: bool = False,
-) -> Segmentation:
-    """Segment the MRI of a file; its brain mask is kept beside it.
+) -> Segmentation | CtSegmentation:
+    """Segment the MRI or CT of a file; the brain mask of an MRI is kept beside it.
+
+    `organs` is the file of --organs, `maps` the values of --map for it.
 
     Says how the brain was found, with `tell_all` also what else; what should be checked is logged as warnings.
     Raises SimulationError before the segmentation for `additions` that could not be added after it.
@@ -75,24 +86,49 @@ def segmented_file(
     from SlicerUSSim.Logic.base.errors import about_file
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.kept_mask import mask_beside
-    from SlicerUSSim.Logic.mri.segmentation import segment_mri
+    from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
+    from SlicerUSSim.Logic.mri.segmentation import Segmentation
 
+    is_of_brain = has_brain_mask(settings["contrast"])
+    if not is_of_brain:
+        require_no_options_beside_ct(path)
+    require(organs is None or not is_of_brain, f"--organs is for a CT, expected --ct; {path} is read as an MRI")
     others = read_also(also, path)
     brain = Volume.read(mask) if mask else None
     if additions is not None:
-        additions.require_addable(mri, brain, settings["skull_strip"])
+        additions.require_addable(mri, brain, settings["skull_strip"] if is_of_brain else "none")
+    found = None if organs is None else _read_organs(organs, maps)
     with Share("segment") as progress, about_file(path):
-        result = segment_mri(
-            mri, **settings, others=others, mask=brain, keep_mask_at=mask_beside(path),
+        result = segment_image(
+            mri, **settings, others=others, mask=brain, organs=found, keep_mask_at=mask_beside(path),
             device=device, progress=progress,
         )  # fmt: skip
-    for line in result.notes if tell_all else (result.brain.message,):
+    for line in (result.brain.message,) if isinstance(result, Segmentation) and not tell_all else result.notes:
         note(line)
     return result
 
 
-def read_mri(path: str, *, mask: str | None, skull_strip: str) -> Volume:
-    """Read an MRI, which is not a label map unless it is segmented all the same, with a mask or without extraction.
+def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
+    """The label map of --organs; says what was recognised."""
+    import logging
+
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
+    from SlicerUSSim.Logic.tissue.label_sources import read_label_file
+    from SlicerUSSim.Logic.tissue.table import TissueTable
+
+    table = TissueTable({})
+    found = read_label_file(Path(path), Volume.read(path), LabelMapping.of(maps, table), default=table)
+    note(f"{path}: {found.message}")
+    for warning in found.warnings:
+        if "--map 0=" in warning:  # between organs the CT says what is there
+            continue
+        logging.getLogger(__name__).warning("%s", warning)
+    return found
+
+
+def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = MRI_CONTRASTS[0]) -> Volume:
+    """Read an MRI or a CT, which is not a label map unless it is segmented all the same
 
     Raises SimulationError, saying what it is, for a label map, a mask or a tracked sequence, and if it is constant.
     """
@@ -103,7 +139,7 @@ def read_mri(path: str, *, mask: str | None, skull_strip: str) -> Volume:
 
     require_no_sequence(path)
     volume = Volume.read(path)
-    if mask is not None or skull_strip == "none":
+    if mask is not None or skull_strip == "none" or contrast == CT:
         return volume
     with about_file(path):
         check_finite(volume)

@@ -17,7 +17,7 @@ from click.shell_completion import CompletionItem
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter_of, parameters_of
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
 Command = Callable[..., None]
 Decorator = Callable[[Command], Command]
@@ -32,8 +32,13 @@ device_option = click.option(
     "--device", help='OpenCL device: "platform:device" or part of its name (see `ussim devices`).'
 )
 mask_option = click.option(
-    "--mask", type=click.Path(), help="Brain mask on the MRI's grid (default: found in the MRI, see --skull-strip)."
-)
+    "--mask", type=click.Path(), help="Brain mask on the MRI's grid (default: found in the MRI, see --skull-strip); "
+    "of a CT: the patient."
+)  # fmt: skip
+ct_option = click.option(
+    "--ct", "contrast", flag_value=CT, default=parameter_of(SegmentationSettings, "contrast").default,
+    help="The image is a CT in Hounsfield units: short for --contrast ct.",
+)  # fmt: skip
 
 
 def verbose_option(command: click.Command) -> click.Command:
@@ -123,16 +128,18 @@ def declared(option: Decorator) -> Any:
     return field(metadata={"options": (option,)})
 
 
-def declared_parameters(kind: type, names: Iterable[str] | None = None, *, of_preset: bool = False) -> Any:
+def declared_parameters(
+    kind: type, names: Iterable[str] | None = None, *, of_preset: bool = False, also: Iterable[Decorator] = ()
+) -> Any:
     """A field of a dataclass of options: {name: value} of the parameters of `kind` that have an option.
 
-    `names` selects some of them. With `of_preset` it contains only options that were given, and --help refers to the
-    preset for the default.
+    `names` selects some of them; `also` are further options for the same values. With `of_preset` it contains only
+    options that were given, and --help refers to the preset for the default.
     """
     entries = [entry for entry in parameters_of(kind) if entry.option and (names is None or entry.name in names)]
     return field(
         metadata={
-            "options": tuple(_option(entry, of_preset) for entry in entries),
+            "options": (*(_option(entry, of_preset) for entry in entries), *also),
             "names": tuple(entry.name for entry in entries),
             "flags": {entry.name for entry in entries if entry.type is bool},
         }
@@ -194,9 +201,17 @@ def given_options(*names: str) -> list[str]:
 
 def require_no_mri_options(labels: str, remedy: str) -> None:
     """Raise SimulationError if options for the segmentation of an MRI were given with the label map of this file."""
-    given = given_options("mask", "also", *(entry.name for entry in parameters_of(SegmentationSettings)))
+    given = given_options("mask", "also", "organs", *(entry.name for entry in parameters_of(SegmentationSettings)))
     verb = "is" if len(given) == 1 else "are"
     require(not given, f"{labels}: is a label map, and {' and '.join(given)} {verb} for an MRI; {remedy}")
+
+
+def require_no_options_beside_ct(path: str) -> None:
+    """Raise SimulationError if options that only MRIs have were given with the CT of this file."""
+    names = {entry.name for entry in parameters_of(SegmentationSettings)} - {"contrast", "filter_radius"}
+    given = given_options("also", *sorted(names))
+    verb = "is" if len(given) == 1 else "are"
+    require(not given, f"{path}: is a CT (--ct), and {' and '.join(given)} {verb} for an MRI; leave it out")
 
 
 def require_no_input(*outputs: Path | None) -> None:

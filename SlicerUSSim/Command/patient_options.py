@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, require_no_sequence, segmented_file, split_also
+from SlicerUSSim.Command.mri_options import also_option, organs_option, require_no_sequence, segmented_file, split_also
 from SlicerUSSim.Command.options import (
+    ct_option,
     declared,
     declared_parameters,
     device_option,
@@ -21,9 +22,9 @@ from SlicerUSSim.Command.options import (
 )
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -79,8 +80,10 @@ class PatientOptions:
     maps: tuple[str, ...] = declared(map_option)
     #: {parameter: value}
     segmentation: Mapping[str, Any] = declared_parameters(
-        SegmentationSettings, ("contrast", "skull_strip", "thin_sulci")
+        SegmentationSettings, ("contrast", "skull_strip", "thin_sulci"), also=(ct_option,)
     )
+    #: Label map of organs of a CT
+    organs: str | None = declared(organs_option)
     mask: str | None = declared(mask_option)
     #: CONTRAST=FILE
     also: tuple[str, ...] = declared(also_option)
@@ -151,7 +154,11 @@ def open_examination(patient: PatientOptions) -> Examination:
     preset = patient.changed_preset()
     require_no_sequence(patient.mri_or_labels)
     volume = Volume.read(patient.mri_or_labels)
+    is_ct = patient.segmentation["contrast"] == CT
     is_labels = patient.is_labels
+    require(not (is_ct and is_labels), f"{patient.mri_or_labels}: --labels and --ct are given, expected one of them")
+    if is_labels is None and is_ct:
+        is_labels = False
     if is_labels is None:
         is_labels = is_label_file(Path(patient.mri_or_labels), volume)
         kinds = ("a label map", "--mri") if is_labels else ("an MRI, to be segmented", "--labels")
@@ -160,9 +167,10 @@ def open_examination(patient: PatientOptions) -> Examination:
         raise SimulationError(
             f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need an MRI"
         )
-    if patient.maps and not is_labels:
+    if patient.maps and not is_labels and patient.organs is None:
         raise SimulationError(
-            f"{patient.mri_or_labels}: is an MRI, and --map is for labels; use --labels if it is none"
+            f"{patient.mri_or_labels}: is {'a CT' if is_ct else 'an MRI'}, and --map is for labels; use --labels if it "
+            "is none"
         )
     if is_labels:
         require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")
@@ -186,10 +194,10 @@ def open_examination(patient: PatientOptions) -> Examination:
         changes.to_tissues(additions.with_presets(tissues))
     segmentation = segmented_file(
         patient.mri_or_labels, volume, patient.segmentation, mask=patient.mask, also=patient.also,
-        device=patient.device, additions=additions,
+        organs=patient.organs, maps=patient.maps, device=patient.device, additions=additions,
     )  # fmt: skip
     names = segmentation.tissue_names if table is None else tissues.names_by_label()
-    added = additions.on(segmentation.labels, names, has_brain_mask=True)
+    added = additions.on(segmentation.labels, names, has_brain_mask=not is_ct)
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
@@ -206,6 +214,10 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
     given = None if pose == "auto" else read_pose(pose)
+    require(
+        given is not None or patient.segmentation["contrast"] != CT,
+        "--pose is auto, which is a craniotomy, and the image is a CT (--ct), expected a file with the pose",
+    )
     examination = open_examination(patient)
     if given is not None:
         return examination, given

@@ -9,8 +9,9 @@ from time import perf_counter
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, read_mri, segmented_file, split_also
-from SlicerUSSim.Command.options import check_places, device_option, gathered, mask_option
+from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri, segmented_file, split_also
+from SlicerUSSim.Command.options import check_places, ct_option, device_option, gathered, mask_option
+from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.proposals import propose_option, require_seeds, seed_option, split_seeds, write_proposals
 from SlicerUSSim.Logic.base.errors import require
@@ -27,8 +28,11 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
     help="Label map; the tissue table is written to a .json file of the same name.",
 )
 @gathered(settings=SegmentationSettings)
+@ct_option
 @mask_option
 @also_option
+@organs_option
+@map_option
 @add_option
 @seed_option
 @propose_option
@@ -38,10 +42,13 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 @device_option
 def segment(
     mri: str, out: Path, settings: SegmentationSettings, mask: str | None, also: tuple[str, ...],
-    additions: tuple[str, ...], seeds: tuple[str, ...], propose: bool, overwrite: bool, device: str | None,
+    organs: str | None, maps: tuple[str, ...], additions: tuple[str, ...], seeds: tuple[str, ...], propose: bool,
+    overwrite: bool, device: str | None,
 ) -> None:  # fmt: skip
-    """Segment an MRI of a head or a brain into tissues."""
+    """Segment an MRI of a head or a brain, or a CT (--ct), into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
+    from SlicerUSSim.Logic.mri.modality import has_brain_mask
+    from SlicerUSSim.Logic.mri.segmentation import Segmentation
     from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
     from SlicerUSSim.Logic.tissue.table import TissueTable
 
@@ -53,19 +60,29 @@ def segment(
     split_also(also)
     split_seeds(seeds)
     masks = Additions.read(additions)
-    volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip)
+    volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip, contrast=settings.contrast)
     if seeds or propose:
+        require(has_brain_mask(settings.contrast), "--seed and --propose look for lesions in an MRI, and this is a CT")
         require_seeds(seeds, volume, out)
     start = perf_counter()
     result = segmented_file(
-        mri, volume, asdict(settings), mask=mask, also=also, device=device, additions=masks, tell_all=True
+        mri,
+        volume,
+        asdict(settings),
+        mask=mask,
+        also=also,
+        organs=organs,
+        maps=maps,
+        device=device,
+        additions=masks,
+        tell_all=True,
     )
     seconds = perf_counter() - start
-    added = masks.on(result.labels, result.tissue_names, has_brain_mask=True)
-    beside = write_label_files(out, added.labels, TissueTable.brain(added.tissue_names))
+    added = masks.on(result.labels, result.tissue_names, has_brain_mask=has_brain_mask(settings.contrast))
+    beside = write_label_files(out, added.labels, TissueTable.brain().for_names(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")
-    if seeds or propose:
+    if (seeds or propose) and isinstance(result, Segmentation):
         write_proposals(result, seeds, propose, out)
 
 

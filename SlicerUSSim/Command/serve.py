@@ -12,7 +12,7 @@ import click
 
 from SlicerUSSim.Command.additions import Additions, add_option, split_additions
 from SlicerUSSim.Command.mri_options import also_option, require_other_files, split_also
-from SlicerUSSim.Command.options import device_option, mask_option, parameter_option, require_no_mri_options
+from SlicerUSSim.Command.options import ct_option, device_option, mask_option, parameter_option, require_no_mri_options
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.sequence_options import (
     calibration_option,
@@ -22,7 +22,7 @@ from SlicerUSSim.Command.sequence_options import (
     transform_option,
 )
 from SlicerUSSim.Logic.base.errors import SimulationError
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
 if TYPE_CHECKING:
     from trame_server import Server
@@ -40,6 +40,7 @@ _PORT = 8080
 @to_mri_option
 @click.option("--preset", type=click.Path(), help="Probe, display, settings and tissues as JSON.")
 @parameter_option(SegmentationSettings, "contrast")
+@ct_option
 @parameter_option(SegmentationSettings, "skull_strip")
 @mask_option
 @also_option
@@ -99,6 +100,8 @@ def serve(
         LabelMapping.of(maps)
     if labels is not None and mri is None:
         require_no_mri_options(labels, "give an MRI, too, to segment it")
+    if contrast == CT and others:
+        raise SimulationError("--also is for an MRI, and the contrast is ct (--ct); leave it out")
     if igtl is not None:
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
 
@@ -114,7 +117,9 @@ def serve(
     volumes = {file: Volume.read(file) for file in files}
     checked = Additions.of((tissue, with_label_names(volumes[file], file), file) for tissue, file in added)
     if mri is not None and labels is None:
-        checked.require_addable(volumes[mri], None if mask is None else volumes[mask], skull_strip)
+        checked.require_addable(
+            volumes[mri], None if mask is None else volumes[mask], "none" if contrast == CT else skull_strip
+        )
     masks = tuple((tissue, file) for (tissue, _, _), (_, file) in zip(checked.masks, added, strict=True))
     chosen_preset = Preset.read(preset) if preset else None
     tracked = read_sequence(sequence, calibration) if sequence else None

@@ -9,6 +9,7 @@ import click
 from SlicerUSSim.Command.options import check_output, gathered
 from SlicerUSSim.Command.patient_options import PatientOptions, open_examination_at, pose_option
 from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Logic.mri.settings import CT
 
 
 @click.command()
@@ -29,5 +30,5 @@ def simulate(patient: PatientOptions, pose: str, out: Path) -> None:
         write_png(out, frame.image)
     else:
         write_own_volume(out, frame.to_volume())
-    kind = "labels" if examination.is_labels else "MRI"
+    kind = "labels" if examination.is_labels else "CT" if patient.segmentation["contrast"] == CT else "MRI"
     note(f"wrote {out} ({frame.image.shape[1]}x{frame.image.shape[0]}, from {kind})")

@@ -17,6 +17,7 @@ from typing import Any
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
 from SlicerUSSim.Logic.probe.arrays import PROBES
@@ -198,7 +199,11 @@ class PanelPresenter:
                     mri, labels, mask_node=parameters.mask, others=others, lesions_node=parameters.lesions,
                     keep_mask_at=self.maskFile(mri), progress=progress, **asdict(parameters.segmentation),
                 )  # fmt: skip
-            if parameters.mask is None and result.brain.method not in ("stripped", "none"):
+            if (
+                parameters.mask is None
+                and isinstance(result, Segmentation)  # and not of a CT
+                and result.brain.method not in ("stripped", "none")
+            ):
                 parameters.mask = brain = self.logic.writeBrain(result, mri)
                 told.append(f"the brain mask is {brain.GetName()!r}, which Segment uses from now on; edit it as needed")
             self._notes += [*told, *untold]

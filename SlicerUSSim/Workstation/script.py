@@ -13,6 +13,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.masks import SEVERAL
+from SlicerUSSim.Logic.mri.settings import CT
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 
 _TEMPLATE = '''"""Reproduces an image of a SlicerUSSim workstation."""
@@ -66,7 +67,7 @@ class LabelSource:
 def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray) -> str:
     """A script that simulates an image of these labels with `preset`, whose tissues are by label, at a pose (4, 4)."""
     imports, more, lines = ["UltrasoundSimulator", "seed_of_pose"], "", []
-    is_demo = not source.path
+    is_demo, is_ct = not source.path, source.options.get("contrast") == CT
     if is_demo:
         more = "from SlicerUSSim.Logic.mri.samples import demo_mri\n"
         lines.append("mri, _ = demo_mri()")
@@ -81,8 +82,11 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
                 "labels = labels.with_array(numbers[labels.array.astype(int)])",
             ]
     else:
-        imports.append("segment_mri")
-        options = [f"{name}={value!r}" for name, value in source.options.items()]
+        function, values = "segment_mri", source.options
+        if is_ct:
+            function, values = "segment_ct", {name: values[name] for name in ("filter_radius", "filter_epsilon")}
+        imports.append(function)
+        options = [f"{name}={value!r}" for name, value in values.items()]
         if source.mask is not None:
             imports.append("Volume")
             options.append(f"mask=Volume.read({source.mask!r})")
@@ -90,7 +94,7 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
             imports.append("Volume")
             others = ", ".join(f"{name!r}: Volume.read({path!r})" for name, path in source.others.items())
             options.append(f"others={{{others}}}")
-        lines += [f"segmentation = segment_mri({', '.join(['mri', *options])})", "labels = segmentation.labels"]
+        lines += [f"segmentation = {function}({', '.join(['mri', *options])})", "labels = segmentation.labels"]
     texture = "segmentation.texture()"
     if source.additions:
         more += "from SlicerUSSim.Logic.mri import add_tissues, read_mask\n"
@@ -100,7 +104,9 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         also = [name for name, _ in source.additions if name in own and name not in TISSUES]
         if any(name in SEVERAL for name, _ in source.additions):
             lines.append("# The page has one segment for each tissue of a BraTS map; borders may differ by a voxel.")
-        more_options = (f", also={also!r}" if also else "") + ("" if source.is_labels else ", has_brain_mask=True")
+        more_options = (f", also={also!r}" if also else "") + (
+            "" if source.is_labels or is_ct else ", has_brain_mask=True"
+        )
         lines.append(f"labels = add_tissues(labels, {names}, [{masks}]{more_options}).labels")
         texture = f"texture_below({texture}, mri, segmentation.labels, labels)"
     needs_texture = preset.settings.needs_texture and not source.is_labels

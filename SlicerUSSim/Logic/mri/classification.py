@@ -11,7 +11,7 @@ from SlicerUSSim.Logic.base.declaration import parameter_of
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.histogram import Histogram
 from SlicerUSSim.Logic.mri.mixture import ANY, TISSUES, Points, TissueMixture, fit_mixture
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
 #: Tissues (indices in mixture.TISSUES) from dark to bright
 ORDERS = {"t1": (0, 1, 2), "t1gd": (0, 1, 2), "t2": (2, 1, 0), "flair": (0, 2, 1)}
@@ -69,6 +69,7 @@ def class_names(contrasts: tuple[str, ...], classes: int | None) -> tuple[str, .
     """
     entry = parameter_of(SegmentationSettings, "contrast")
     contrasts = tuple(entry.checked("segmentation", contrast) for contrast in contrasts)
+    require(CT not in contrasts, "contrast is ct, and an MRI was expected; a CT is segmented by segment_ct (--ct)")
     order = ORDERS[contrasts[0]] if len(contrasts) == 1 else range(len(TISSUES))
     names = tuple(TISSUES[n] for n in order)
     bright = next((_BRIGHT_NAMES[contrast] for contrast in contrasts if contrast in _BRIGHT_NAMES), None)

@@ -14,6 +14,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, agreement_by_moments, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
+from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
 from SlicerUSSim.Logic.mri.no_data import edge_value
 from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_symmetric, is_ultrasound
 from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, lies_otherwise, stripped_lies_otherwise, why_refused
@@ -67,7 +68,7 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     if brain is not None:
         return Shown(brain)
     image = CoarseImage.of(mri)
-    _check_size(image)
+    _check_size(image, mri)
     require(
         not is_symmetric(image) or {"bottom", "top"} <= set(cut_ends(mri)),  # a limb, which is called so below
         "image shows an object that looks the same upside down and from the back, as a phantom does and no head; "
@@ -80,12 +81,34 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     is_plausible &= _SIZES[0] <= alignment.size <= _SIZES[1]
     later = lambda share: report(0.7 + 0.3 * share)  # noqa: E731
     if alignment.agreement < LEAST_AGREEMENT or not is_plausible:
+        _require_no_ct(mri)
         raise SimulationError(why_refused(mri, image, alignment, LEAST_AGREEMENT, later))
     if alignment.agreement < _DOUBTFUL_AGREEMENT:
         message = lies_otherwise(mri, image, alignment, LEAST_AGREEMENT, later)
         require(message is None, message or "")
     report(1.0)
     return _head(mri, image, alignment)
+
+
+def require_no_hounsfield(mri: Volume) -> None:
+    """Raise SimulationError for an image with air at -1000, as a CT has."""
+    values = mri.array
+    low, high = float(values.min()), float(values.max())
+    air = float(np.percentile(values[::3, ::3, ::3], 5.0))
+    require(
+        not (low <= -900.0 and air < -500.0),
+        f"image has values from {low:g} to {high:g}, as CT has (Hounsfield units; air is -1000), expected an MRI; "
+        "segment a CT with --ct (contrast ct); if it is an MRI, set its background to 0",
+    )
+
+
+def _require_no_ct(mri: Volume) -> None:
+    """Raise SimulationError for an image that is no head's MRI and has the numbers of a CT, also with an offset."""
+    require(
+        not looks_like_ct(mri),
+        f"image has values from {float(mri.array.min()):g} to {float(mri.array.max()):g}, with air and soft tissue "
+        "1000 apart as CT has, expected an MRI; segment a CT with --ct (contrast ct)",
+    )
 
 
 def check_position(mri: Volume, alignment: Alignment) -> None:
@@ -97,19 +120,22 @@ def check_position(mri: Volume, alignment: Alignment) -> None:
     require(message is None, message or "")
 
 
-def check_finite(mri: Volume) -> None:
-    """Raise SimulationError if voxels are not finite, naming how many and the first (i, j, k), or all are equal."""
+def check_finite(mri: Volume, name: str = "MRI", remedy: str = "for example by 0 outside the head") -> None:
+    """Raise SimulationError if voxels are not finite, naming how many and the first (i, j, k), or all are equal.
+
+    `name` is that of the image, and `remedy` by what to replace such voxels.
+    """
     values = mri.array
     if np.issubdtype(values.dtype, np.floating):
         is_bad = ~np.isfinite(values)
         if is_bad.any():
             first = tuple(int(n) for n in np.unravel_index(int(is_bad.argmax()), values.shape)[::-1])
             raise SimulationError(
-                f"MRI has {int(is_bad.sum())} voxels that are not finite numbers, the first at (i, j, k) = {first}, "
-                "expected none; replace them, for example by 0 outside the head"
+                f"{name} has {int(is_bad.sum())} voxels that are not finite numbers, the first at (i, j, k) = {first}, "
+                f"expected none; replace them, {remedy}"
             )
     low, high = float(values.min()), float(values.max())
-    require(high > low, f"MRI is constant ({low:g}), expected different intensities")
+    require(high > low, f"{name} is constant ({low:g}), expected different intensities")
 
 
 def check_intensities(mri: Volume, name: str = "MRI") -> None:
@@ -126,14 +152,9 @@ def check_intensities(mri: Volume, name: str = "MRI") -> None:
 def _check_values(mri: Volume) -> None:
     check_finite(mri)
     check_intensities(mri)
+    require_no_hounsfield(mri)
     values = mri.array
-    low, high = float(values.min()), float(values.max())
-    air = float(np.percentile(values[::3, ::3, ::3], 5.0))
-    require(
-        not (low <= -900.0 and air < -500.0),
-        f"image has values from {low:g} to {high:g}, as CT has (Hounsfield units; air is -1000), expected an MRI; if "
-        "it is one, set its background to 0",
-    )
+    low = float(values.min())
     border = np.concatenate(
         [np.ravel(face[::3, ::3]) for n in range(3) for face in (values.take(m, n) for m in (0, -1))]
     )
@@ -220,9 +241,11 @@ def _has_tissues(intensity: np.ndarray, shape: np.ndarray) -> bool:
     return bool(notch < 0.25 * profile.max())
 
 
-def _check_size(image: CoarseImage) -> None:
+def _check_size(image: CoarseImage, mri: Volume) -> None:
     inside = image.foreground
     millilitres = inside.sum() * image.spacing_mm**3 / 1000.0
+    if not 900.0 <= millilitres <= 9000.0:
+        _require_no_ct(mri)
     extent = np.ptp(np.argwhere(inside), axis=0)[::-1] * image.spacing_mm
     size = " x ".join(f"{mm:.0f}" for mm in extent)
     require(
@@ -258,7 +281,7 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
     require(
         high - low >= _LEAST_CONTRAST * middle,
         f"the tissues of the brain in this head differ by {(high - low) / max(middle, 1e-9):.0%}, as in CT, expected "
-        f"{_LEAST_CONTRAST:.0%} or more of an MRI; use an MRI",
+        f"{_LEAST_CONTRAST:.0%} or more of an MRI; use an MRI, or segment a CT with --ct (contrast ct)",
     )
     warnings = ()
     if shown < _USUAL_SHOWN:

@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
 from SlicerUSSim.Logic.mri.neighbours import less_sure, smoothed_posteriors
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.plausibility import enhancement, require_contrast
-from SlicerUSSim.Logic.mri.recognition import check_intensities
+from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_hounsfield
 from SlicerUSSim.Logic.mri.segmentation_steps import (
     BrainPart,
     StepTimes,
@@ -184,6 +184,7 @@ def segment_mri(
             progress=lambda share: report(0.2 * share),
         )  # fmt: skip
     else:
+        require_no_hounsfield(mri)
         brain = given_brain(mask, mri)
         require(
             not others or brain.volume_ml >= _LEAST_TO_REGISTER_ML,

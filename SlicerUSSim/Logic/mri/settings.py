@@ -6,14 +6,18 @@ from dataclasses import dataclass
 
 from SlicerUSSim.Logic.base.declaration import Declared, Shown, parameter
 
+#: Contrasts of MRIs, which segment_mri has; and the name of a CT, which is segment_ct's
+MRI_CONTRASTS, CT = ("t1", "t1gd", "t2", "flair"), "ct"
+
 
 @dataclass(frozen=True)
 class SegmentationSettings(Declared):
-    """Parameters of segmentation.segment_mri, other than the MRI and its mask."""
+    """Parameters of segmentation.segment_mri and ct.segment_ct, other than the image and its mask."""
 
     contrast: str = parameter(
-        "t1", "Contrast", "Contrast of the MRI, which gives the order of the tissues by intensity",
-        choices=("t1", "t1gd", "t2", "flair"), shown=True, option="contrast",
+        "t1", "Contrast", "Contrast of the MRI, which gives the order of the tissues by intensity; ct: a CT in "
+        "Hounsfield units", choices=(*MRI_CONTRASTS, CT), shown=True, option="contrast",
+        note="The other parameters but the filter's are of MRIs",
     )  # fmt: skip
     classes: int | None = parameter(
         None, "Classes", "Number of tissues to distinguish by intensity: 3, or 4 with t1gd and flair; none: 3, and 4 "

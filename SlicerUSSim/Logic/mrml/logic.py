@@ -24,8 +24,10 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.addable import require_addable
+from SlicerUSSim.Logic.mri.ct import CtSegmentation
+from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
-from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
+from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot, tracked_images, write_compared
 from SlicerUSSim.Logic.mrml.label_nodes import (
@@ -91,6 +93,8 @@ class _Segmented:
     texture: Callable[[], Texture]
     #: On the grid of the labels
     mri: Volume
+    #: Whether the labels are within a brain mask
+    is_of_brain: bool
 
 
 class UltrasoundSceneLogic:
@@ -169,11 +173,11 @@ class UltrasoundSceneLogic:
         thin_sulci: bool = SegmentationSettings.thin_sulci,
         skull_strip: str = SegmentationSettings.skull_strip,
         progress: Callable[[float], None] | None = None,
-    ) -> Segmentation:
+    ) -> Segmentation | CtSegmentation:
         """Label the tissues of a scalar volume into a label map or segmentation node, with names and colours.
 
-        See segmentation.segment_mri; `mask_node` is a label map on the MRI's grid, or a segmentation; `others` are
-        volume nodes of the same patient by their contrast. The segments of
+        See segmentation.segment_mri, and ct.segment_ct for the contrast "ct". `mask_node` is a label map on the MRI's
+        grid, or a segmentation; `others` are volume nodes of the same patient by their contrast. The segments of
         `lesions_node` are laid over the labels, as by addTissues, but are not in the result. `progress` may raise
         errors.Cancelled; the nodes are then as they were.
         Raises SimulationError for a node with labels that were not made by this method, or edited since; `overwrite`
@@ -193,22 +197,24 @@ class UltrasoundSceneLogic:
         volumes = {contrast: _in_frame_of(node, mri_node) for contrast, node in (others or {}).items()}
         lesions, skipped = ([], []) if lesions_node is None else self._lesions(lesions_node, mri_node)
         own = [tissue.name for tissue in self.preset.tissues.all_tissues()]
-        self._work.do(lambda: require_addable(mri, lesions, mask=mask, skull_strip=skull_strip, also=own))
+        is_of_brain = has_brain_mask(contrast)
+        extraction = skull_strip if is_of_brain else "none"
+        self._work.do(lambda: require_addable(mri, lesions, mask=mask, skull_strip=extraction, also=own))
         result = self._work.do(
-            lambda: segment_mri(
+            lambda: segment_image(
                 mri, classes=classes, contrast=contrast, others=volumes, mask=mask, filter_radius=filter_radius,
                 filter_epsilon=filter_epsilon, bias_correction=bias_correction, thin_sulci=thin_sulci,
                 skull_strip=skull_strip, keep_mask_at=keep_mask_at, device=self.device, progress=progress,
             )
         )  # fmt: skip
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
-        added = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=True)
+        added = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=is_of_brain)
         write_labels(labels_node, added.labels, added.tissue_names, mri_node)
         mark_as_made(labels_node)
         self.proposals.segmented(mri_node, result)
         self._segmented = _Segmented(
             labels_version(labels_node), added.labels, added.tissue_names,
-            lambda: texture_below(result.texture(), mri, result.labels, added.labels), mri,
+            lambda: texture_below(result.texture(), mri, result.labels, added.labels), mri, is_of_brain,
         )  # fmt: skip
         self.notes = (*result.notes, *result.table().splitlines(), *added.messages)
         self.warnings = (*result.warnings, *skipped, *added.warnings)
@@ -273,13 +279,13 @@ class UltrasoundSceneLogic:
         lesions, skipped = self._lesions(lesions_node, labels_node)
         if labels_node.IsA("vtkMRMLSegmentationNode"):
             labels = padded_for(lesions, labels)  # it is cropped to what it holds
-        added = self._with_lesions(labels, names, lesions, has_brain_mask=was is not None)
+        added = self._with_lesions(labels, names, lesions, has_brain_mask=was is not None and was.is_of_brain)
         write_labels(output, added.labels, added.tissue_names, labels_node)
         mark_as_made(output)
         if was is not None and labels is was.labels:
             self._segmented = _Segmented(
                 labels_version(output), added.labels, added.tissue_names,
-                lambda: texture_below(was.texture(), was.mri, was.labels, added.labels), was.mri,
+                lambda: texture_below(was.texture(), was.mri, was.labels, added.labels), was.mri, was.is_of_brain,
             )  # fmt: skip
         self.notes, self.warnings = added.messages, (*skipped, *added.warnings)
         return added

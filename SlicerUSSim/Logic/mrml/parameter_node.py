@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
-from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter, parameter_of, parameters_of
+from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting.settings import FitSettings
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.settings import MRI_CONTRASTS, SegmentationSettings
 
 MODULE_NAME = "USSim"
 _OWNER = "scene"
@@ -30,7 +30,7 @@ class PanelSettings(Declared):
     )  # fmt: skip
     second_contrast: str = parameter(
         "none", "Its contrast", "Contrast of the second MRI, which is classified together with the first",
-        choices=("none", *parameter_of(SegmentationSettings, "contrast").choices), shown=True,
+        choices=("none", *MRI_CONTRASTS), shown=True,
     )  # fmt: skip
     preset: str = parameter("", "Preset", "The JSON text of a Preset; empty: the default")
 

@@ -18,7 +18,7 @@ _ALIASES = {
     "gray matter": "grey matter", "grey": "grey matter", "gray": "grey matter", "white": "white matter",
     "gm": "grey matter", "wm": "white matter", "gtv": "tumour", "gbm": "tumour",
     "ncr": "necrosis", "ed": "oedema", "et": "enhancing",  # of BraTS
-    "tumor": "tumour", "dura": "falx", "skin": "scalp", "vessels": "blood",
+    "tumor": "tumour", "dura": "falx", "vessels": "blood",
     "vessel": "blood", "cortical bone": "bone", "choroid plexus": "enhancing",
 }  # fmt: skip
 
@@ -54,7 +54,10 @@ _WORDS: tuple[tuple[str, str], ...] = (
     ("falx", "falx, tentorium, dura"),
     ("blood", "artery, arteries, arterie, vein, vena, vessel, aorta, sinus, brachiocephalic, blood"),
     ("skull", "skull, cranium, diploe, outer table, inner table"),
-    ("scalp", "scalp, skin, epidermis"),
+    ("scalp", "scalp"),
+    ("skin", "skin, epidermis"),
+    ("cancellous bone", "cancellous, trabecular, spongiosa"),
+    ("metal", "metal, implant, screw, titanium"),
     ("bone", "bone, vertebra, vertebrae, rib, sternum, sacrum, humerus, scapula, clavicula, clavicle, femur, hip"),
     ("bone", "pelvis, tibia, fibula, patella, tarsal, metatarsal, carpal, metacarpal, phalanges, radius, ulna"),
     ("bone", "mandible, teeth"),

@@ -13,6 +13,8 @@ _SELBEKK = "saline, which images the brain behind it too bright: Selbekk et al.,
 _MCGAHAN = "McGahan et al., Radiology 159 (1986)"
 #: Table 3, with ranges from Goss et al. (J. Acoust. Soc. Am. 64, 1978 and 68, 1980), Mast (ARLO 1, 2000) and others
 _RANGES = "ranges in Mech. Mater. 44 (2012) 174-188, table 3"
+_HOFFMAN = "Hoffman et al. 2012, as listed in table I of PMC8243208 (J. Acoust. Soc. Am.)"
+_SENSORS = "table A2 of Sensors 23(13):5942 (2023)"
 _PAPER = "Salehi et al., MICCAI 2015, table 1 (mean after optimisation, rounded)"
 _PAPER_BEFORE = "Salehi et al., MICCAI 2015, table 1 (before optimisation)"
 
@@ -72,6 +74,8 @@ TISSUES: dict[str, Tissue] = {
                 0.50, 0.0, 0.30, _level("masked by its own surface echo")),
         _tissue("scalp", 1624.0, f"skin, {_ITIS}", 1.80, f"skin 1109 kg/m3 {_DENSITY}", 0.80, f"skin, {_DUCK}",
                 0.60, 0.0, 0.30, _level("echogenic skin and fat")),
+        _tissue("skin", 1624.0, f"skin, {_ITIS}", 1.80, f"1109 kg/m3 {_DENSITY}", 0.80, f"skin, {_DUCK}",
+                0.60, 0.0, 0.30, _level("as scalp: echogenic")),
         _tissue("blood", 1584.0, _SZABO, 1.679, f"1060 kg/m3, {_SZABO}", 0.14, _SZABO, 0.03, 0.0, 0.02,
                 _level("flowing, some 20 dB below tissue at 5 MHz")),
         _tissue("haematoma", 1618.0, "34 m/s above flowing blood: Shung et al., J. Clin. Ultrasound 12 (1984), "
@@ -102,6 +106,12 @@ TISSUES: dict[str, Tissue] = {
                 "1209-1216)", 0.50, 0.0, 0.30, _level("masked by its own surface echo")),
         _tissue("bone", 3198.0, _SZABO, 6.364, f"1990 kg/m3, {_SZABO}", 3.54, _SZABO, 0.50, 0.0, 0.30,
                 _level("masked by its own surface echo")),
+        _tissue("cancellous bone", 1675.0, f"fast wave in human calcaneus, {_HOFFMAN}", 1.973,
+                f"1178 kg/m3 ({_ITIS}) x speed of sound", 20.0,
+                f"4 (human calcaneus, {_HOFFMAN}) to 43 (human femur, Anderson et al. 2010, ibid.)",
+                0.50, 0.0, 0.30, _level("masked by the cortex over it")),
+        _tissue("metal", 6522.0, f"titanium alloy, {_SENSORS}", 27.1, f"titanium alloy, {_SENSORS}", 0.42,
+                f"0.15 to 0.70, {_SENSORS}"),
     )
 }
 # fmt: on
@@ -116,6 +126,7 @@ _COLOURS = {
     "scalp": (0.87, 0.72, 0.63), "fat": (0.93, 0.83, 0.45), "muscle": (0.70, 0.33, 0.29), "liver": (0.52, 0.23, 0.19),
     "kidney": (0.65, 0.30, 0.25), "water": (0.30, 0.60, 0.85), "gel": (0.45, 0.75, 0.85),
     "spleen": (0.58, 0.30, 0.42), "heart": (0.72, 0.25, 0.25), "lung": (0.80, 0.85, 0.90), "air": (0.85, 0.95, 1.0),
+    "skin": (0.87, 0.72, 0.63), "cancellous bone": (0.86, 0.76, 0.55), "metal": (0.60, 0.62, 0.70),
 }  # fmt: skip
 _OTHER_COLOUR = (0.3, 0.75, 0.8)
 

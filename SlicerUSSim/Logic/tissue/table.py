@@ -144,7 +144,8 @@ class TissueTable(Mapping[int, Tissue]):
     def for_names(self, names: Iterable[str]) -> TissueTable:
         """A table for labels 1, 2, ... named `names`, with the coupling medium and membrane of this table.
 
-        A tissue is taken from this table, including its membrane, if the name occurs there, or else if it occurs with
+        With skin among the names the coupling medium lies on it and is no fluid of the membrane. A tissue is taken from
+        this table, including its membrane, if the name occurs there, or else if it occurs with
         other case, hyphens or underscores, or else from the presets. Of several tissues with one name, the first is
         taken, as in `label_of` and `tissue`.
 
@@ -163,7 +164,10 @@ class TissueTable(Mapping[int, Tissue]):
             not unknown,
             f"no tissue for {', '.join(map(repr, unknown))}, expected names among: {', '.join(TISSUES)}",
         )
-        return TissueTable(table, self.membrane)
+        membrane = self.membrane
+        if membrane is not None and any(tissue.name == "skin" for tissue in table.values()):
+            membrane = replace(membrane, fluids=tuple(name for name in membrane.fluids if name != "coupling"))
+        return TissueTable(table, membrane)
 
     def with_membrane(self, membrane: Membrane | None) -> TissueTable:
         """A new table with another membrane, or none."""

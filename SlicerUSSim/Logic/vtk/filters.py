@@ -35,8 +35,10 @@ from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.mri.addable import require_addable
+from SlicerUSSim.Logic.mri.ct import CtSegmentation
+from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import add_tissues
-from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
+from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -120,18 +122,18 @@ class _ImageFilter(VTKPythonAlgorithmBase):
 
 
 class SegmentationFilter(_ImageFilter):
-    """From an MRI (port 0), and a brain mask (port 1, optional), to uint8 tissue labels.
+    """From an MRI or a CT (port 0), and a mask of the brain or patient (port 1, optional), to uint8 tissue labels.
 
     Tissues can be laid over the labels from masks (AddTissueData).
 
     The names of the labels are field data "TissueNames" of the output, from which UltrasoundSimulationFilter identifies
-    the tissues. Parameters and defaults are those of SegmentationSettings, errors those of segmentation.segment_mri.
+    the tissues. Parameters and defaults are those of SegmentationSettings, errors those of modality.segment_image.
     """
 
     def __init__(self) -> None:
         super().__init__(nInputPorts=2)
         self._values = asdict(SegmentationSettings())
-        self._segmentation: Segmentation | None = None
+        self._segmentation: Segmentation | CtSegmentation | None = None
         self._others: dict[str, vtkImageData] = {}
         self._added: tuple[tuple[str, vtkImageData], ...] = ()
         self._notes: tuple[str, ...] = ()
@@ -142,7 +144,7 @@ class SegmentationFilter(_ImageFilter):
         self._set("classes", classes)
 
     def SetContrast(self, contrast: str) -> None:
-        """ "t1", "t1gd", "t2" or "flair"."""
+        """ "t1", "t1gd", "t2" or "flair" of an MRI; "ct": a CT."""
         self._set("contrast", contrast)
 
     def SetFilterRadius(self, voxels: int) -> None:
@@ -200,8 +202,8 @@ class SegmentationFilter(_ImageFilter):
         """Set the mask image directly."""
         self.SetInputDataObject(1, mask)
 
-    def GetSegmentation(self) -> Segmentation | None:
-        """The mixture, posteriors and texture of the last update."""
+    def GetSegmentation(self) -> Segmentation | CtSegmentation | None:
+        """The mixture, posteriors and texture of the last update; of a CT its noise and texture."""
         return self._segmentation
 
     def FillInputPortInformation(self, port, info):
@@ -224,14 +226,15 @@ class SegmentationFilter(_ImageFilter):
         masked = inInfo[1].GetNumberOfInformationObjects() > 0
         masks = [(tissue, Volume.from_vtk(image), f"the mask of {tissue}") for tissue, image in self._added]
         image, mask = Volume.from_vtk(mri), Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None
-        require_addable(image, masks, mask=mask, skull_strip=self._values["skull_strip"])
-        found = segment_mri(
+        is_of_brain = has_brain_mask(self._values["contrast"])
+        require_addable(image, masks, mask=mask, skull_strip=self._values["skull_strip"] if is_of_brain else "none")
+        found = segment_image(
             image, others={name: Volume.from_vtk(other) for name, other in self._others.items()}, mask=mask,
             **self._values, device=self._device, progress=self._report,
         )  # fmt: skip
         output = vtkImageData.GetData(outInfo)
         output.CopyStructure(mri)
-        added = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=True)
+        added = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=is_of_brain)
         set_scalars(output, added.labels.array)
         set_tissue_names(output, added.tissue_names)
         self._segmentation = found

@@ -1,0 +1,51 @@
+"""One call for MRIs and CTs: what commands, filters and scenes segment, by its contrast."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.ct import CtSegmentation, segment_ct
+from SlicerUSSim.Logic.mri.segmentation import Segmentation, segment_mri
+from SlicerUSSim.Logic.mri.settings import CT
+from SlicerUSSim.Logic.opencl.device import DeviceChoice
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
+
+
+def segment_image(
+    image: Volume,
+    *,
+    contrast: str,
+    others: Mapping[str, Volume] | None = None,
+    mask: Volume | None = None,
+    organs: LabelledTissues | None = None,
+    filter_radius: int = 1,
+    filter_epsilon: float | None = None,
+    keep_mask_at: Path | None = None,
+    device: DeviceChoice = None,
+    progress: Callable[[float], None] | None = None,
+    **of_mri: Any,
+) -> Segmentation | CtSegmentation:
+    """segment_ct of a CT (contrast "ct"), and segment_mri of an MRI, which alone has `others` and `of_mri`.
+
+    Raises SimulationError as they do, for other images beside a CT, and for organs beside an MRI.
+    """
+    if contrast != CT:
+        require(organs is None, f"organs are for a CT, and contrast is {contrast}; a CT has the contrast ct (--ct)")
+        return segment_mri(
+            image, contrast=contrast, others=others, mask=mask, filter_radius=filter_radius,
+            filter_epsilon=filter_epsilon, keep_mask_at=keep_mask_at, device=device, progress=progress, **of_mri,
+        )  # fmt: skip
+    require(not others, f"{' and '.join(others or ())} cannot be classified together with a CT, expected the CT alone")
+    return segment_ct(
+        image, organs=organs, mask=mask, filter_radius=filter_radius, filter_epsilon=filter_epsilon, device=device,
+        progress=progress,
+    )  # fmt: skip
+
+
+def has_brain_mask(contrast: str) -> bool:
+    """Whether a segmentation is of a brain alone, as of an MRI; see pathology.add_tissue."""
+    return contrast != CT
