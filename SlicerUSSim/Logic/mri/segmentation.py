@@ -11,6 +11,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import about_other_file, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
 from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, classify
 from SlicerUSSim.Logic.mri.coregistration import aligned
@@ -65,6 +66,10 @@ class Segmentation:
     #: Lines for the user: what was recognised and decided, and what should be checked
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
+    #: The registered atlas by which tissues were led; None without one
+    atlas: AtlasFit | None = field(repr=False)
+    #: (k, j, i) float32 the first image without its bias field, before the filter; 0 outside the brain
+    corrected: np.ndarray = field(repr=False)
     _filtered: np.ndarray = field(repr=False)
     #: (classes, voxels of the brain)
     _shares: np.ndarray = field(repr=False)
@@ -275,6 +280,8 @@ def segment_mri(
         brain=brain,
         notes=tuple(notes),
         warnings=tuple(warnings),
+        atlas=atlas,
+        corrected=part.whole(np.where(part.inside, part.images[0].array + np.float32(above), np.float32(0.0))),
         _filtered=part.whole(filtered[0][0]),
         _shares=found.posteriors,
     )
