@@ -12,6 +12,7 @@ from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.mri_options import also_option, read_mri, segmented_file, split_also
 from SlicerUSSim.Command.options import check_places, device_option, gathered, mask_option
 from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Command.sheets import require_sheets, sheet_kind_option, sheets_option, write_sheets
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
@@ -29,13 +30,16 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 @mask_option
 @also_option
 @add_option
+@sheets_option
+@sheet_kind_option
 @click.option(
     "--overwrite", is_flag=True, help="Replace labels that were made by others, or edited since they were written."
 )
 @device_option
 def segment(
     mri: str, out: Path, settings: SegmentationSettings, mask: str | None, also: tuple[str, ...],
-    additions: tuple[str, ...], overwrite: bool, device: str | None,
+    additions: tuple[str, ...], sheets: Path | None, sheet_kinds: tuple[str, ...], overwrite: bool,
+    device: str | None,
 ) -> None:  # fmt: skip
     """Segment an MRI of a head or a brain into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
@@ -47,6 +51,7 @@ def segment(
     _require_no_kept_mask(out, mri)
     if not overwrite:
         require_replaceable(out)
+    require_sheets(sheets, sheet_kinds, settings.contrast)
     split_also(also)
     masks = Additions.read(additions)
     volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip)
@@ -55,7 +60,10 @@ def segment(
         mri, volume, asdict(settings), mask=mask, also=also, device=device, additions=masks, tell_all=True
     )
     seconds = perf_counter() - start
-    added = masks.on(result.labels, result.tissue_names, has_brain_mask=True)
+    labels, names = result.labels, result.tissue_names
+    if sheets is not None:
+        labels, names = write_sheets(sheets, mri, volume, result, settings.contrast, sheet_kinds)
+    added = masks.on(labels, names, has_brain_mask=True)
     beside = write_label_files(out, added.labels, TissueTable.brain(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")

@@ -19,7 +19,7 @@ _WHITE = 0.6
 #: Moves in the midsagittal plane that are tried, and the ring around it that has to be darker, mm
 _MOVES_MM, _RING_MM = 6, 3.0
 #: By how much the template's may differ from the patient's, mm
-_GROWN_MM = 2.0
+_GROWN_MM = 1.0
 
 
 @cache

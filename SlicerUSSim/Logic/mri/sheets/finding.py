@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -17,7 +18,8 @@ from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.sheets.callosum import corpus_callosum
 from SlicerUSSim.Logic.mri.sheets.ependyma import ependyma
 from SlicerUSSim.Logic.mri.sheets.falx import falx
-from SlicerUSSim.Logic.mri.sheets.head import Head
+from SlicerUSSim.Logic.mri.sheets.head import Head, require_contrast
+from SlicerUSSim.Logic.mri.sheets.kept import keep_sheets, key_of, read_kept_sheets
 from SlicerUSSim.Logic.mri.sheets.regions import ventricles
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
@@ -67,6 +69,7 @@ def find_sheets(
     *,
     contrast: str,
     kinds: Iterable[str] = ALL_KINDS,
+    keep_at: Path | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Sheets:
     """Sulci, falx, tentorium and walls of ventricles as surfels; corpus callosum, choroid plexus and vessels as labels.
@@ -77,15 +80,49 @@ def find_sheets(
     segmentation : of the whole brain, led by the atlas.
     contrast : of the MRI: "t1", "t1gd" or "t2".
     kinds : what is looked for, of ALL_KINDS. Without contrast agent no vessels and no choroid plexus are found.
+    keep_at : file in which they are kept and from which they are read again; see kept.sheets_beside.
     progress : called with the completed fraction, 0 to 1; may raise errors.Cancelled, which ends the search.
 
     Raises SimulationError for an unknown kind or contrast, an MRI on another grid than the segmentation, and a
     segmentation that no atlas led.
     """
     wanted = tuple(kinds)
-    for kind in wanted:
+    require_findable(wanted, contrast)
+    require(wanted, f"nothing is to be found, expected some of: {', '.join(ALL_KINDS)}")
+    report = progress or (lambda share: None)
+    report(0.0)
+    key = key_of(mri, segmentation, contrast) if keep_at is not None else ""
+    kept = read_kept_sheets(keep_at, key, wanted) if keep_at is not None else None
+    if kept is not None:
+        surfels, array, place = kept
+        array = np.where(np.isin(array, [n for n, name in enumerate(STRUCTURES, 1) if name in wanted]), array, 0)
+        structures = Volume(array.astype(np.uint8), mri.ijk_to_ras, label_names=dict(enumerate(STRUCTURES, 1)))
+        surfels, first = surfels.of_kind(*(set(KINDS) & set(wanted))), f"the sheets are those kept in {place}"
+    else:
+        surfels, structures = _found(Head.of(mri, segmentation, contrast), mri, wanted, report)
+        first = keep_sheets(keep_at, key, wanted, surfels, structures.array) if keep_at is not None else ""
+    notes = [first] if first else []
+    if contrast != "t1gd" and set(_ENHANCING) & set(wanted):
+        notes.append("no vessels and no choroid plexus are looked for: only a T1 with contrast agent shows them")
+    notes += _lines(surfels, structures, wanted)
+    for line in notes:
+        _log.info("%s", line)
+    report(1.0)
+    return Sheets(surfels, structures, tuple(notes))
+
+
+def require_findable(kinds: Iterable[str], contrast: str) -> None:
+    """Raise SimulationError for a kind that is not in ALL_KINDS, and a contrast in which sheets are not found."""
+    for kind in kinds:
         require(kind in ALL_KINDS, f"nothing of kind {kind!r} can be found, expected some of: {', '.join(ALL_KINDS)}")
-    report, done, start = progress or (lambda share: None), 0.0, perf_counter()
+    require_contrast(contrast)
+
+
+def _found(
+    head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[float], None]
+) -> tuple[Surfels, Volume]:
+    """(surfels, structures) of the wanted kinds, each step after the ones it needs."""
+    done, start = 0.0, perf_counter()
 
     def finished(step: str) -> None:
         nonlocal done, start
@@ -94,13 +131,11 @@ def find_sheets(
         start = now
         report(done)
 
-    report(0.0)
-    head = Head.of(mri, segmentation, contrast)
     finished("head")
     found: dict[str, Surfels] = {}
     masks: dict[str, np.ndarray] = {}
     in_ventricles = np.zeros(head.brain.shape, bool)
-    if {"sulcus", "ependyma", "choroid plexus"} & set(wanted):
+    if {"sulcus", "ependyma", *_ENHANCING} & set(wanted):
         in_ventricles = ventricles(head)
         finished("ventricles")
     if {"falx", "tentorium", "vessels"} & set(wanted):  # the apex of the tentorium is below the falx
@@ -119,22 +154,14 @@ def find_sheets(
     if "corpus callosum" in wanted:
         masks["corpus callosum"] = corpus_callosum(head)
         finished("corpus callosum")
-    notes = []
     if head.is_enhanced and set(_ENHANCING) & set(wanted):
         masks["choroid plexus"] = choroid_plexus(head, in_ventricles)
         finished("choroid plexus")
-    elif set(_ENHANCING) & set(wanted):
-        notes.append("no vessels and no choroid plexus are looked for: only a T1 with contrast agent shows them")
     if head.is_enhanced and "vessels" in wanted:
         masks["vessels"] = vessels(head, dura, masks["choroid plexus"])
         finished("vessels")
     surfels = Surfels.joined([found[kind] for kind in KINDS if kind in found and kind in wanted])
-    structures = _labels(mri, head, {name: mask for name, mask in masks.items() if name in wanted})
-    notes += _lines(surfels, structures, wanted)
-    for line in notes:
-        _log.info("%s", line)
-    report(1.0)
-    return Sheets(surfels, structures, tuple(notes))
+    return surfels, _labels(mri, head, {name: mask for name, mask in masks.items() if name in wanted})
 
 
 def _beside(sulci_: Surfels, dura: Surfels) -> Surfels:

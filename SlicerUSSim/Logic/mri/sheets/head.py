@@ -28,6 +28,15 @@ _FIELD_MM, _FIELD_STEP_MM = 8.0, 4.0
 _CONTRASTS = ("t1", "t1gd", "t2")
 
 
+def require_contrast(contrast: str) -> None:
+    """Raise SimulationError for a contrast in which sheets are not found."""
+    require(
+        contrast in _CONTRASTS,
+        f"sheets are not found in contrast {contrast!r}, expected one of: {', '.join(_CONTRASTS)} (in a FLAIR, "
+        "intensities do not rise or fall from CSF over grey to white matter)",
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Head:
     """What all sheets are found from. Intensities rise from CSF to grey to white matter: those of a T2 are negated."""
@@ -48,11 +57,7 @@ class Head:
     @classmethod
     def of(cls, mri: Volume, segmentation: Segmentation, contrast: str) -> Head:
         """Raises SimulationError for a FLAIR, for an MRI of another grid, and where no atlas led the segmentation."""
-        require(
-            contrast in _CONTRASTS,
-            f"sheets are not found in contrast {contrast!r}, expected one of: {', '.join(_CONTRASTS)}; cortex and "
-            "CSF of a FLAIR are not told apart by order",
-        )
+        require_contrast(contrast)
         require(
             mri.array.shape == segmentation.labels.array.shape
             and bool(np.allclose(mri.ijk_to_ras, segmentation.labels.ijk_to_ras, atol=1e-3)),
