@@ -20,8 +20,9 @@ _THICKEST_MM = 5.0
 _NEIGHBOURS, _SIGMA_MM = 8, 0.7
 #: Neighbours whose normals differ by more belong to another sheet
 _SAME_COSINE = 0.7
-#: A sheet goes on beyond a surfel's place by this much of its radius
-_RIM = 1.5
+#: A sheet goes on beyond a surfel's place by this much of its radius, and this far at least: of ridges in voxels of 1 mm,
+#: no place is farther from a surfel, however the sheet is tilted
+_RIM, _RIM_MM = 1.5, 0.9
 #: Voxels at a time
 _CHUNK = 200_000
 
@@ -119,7 +120,7 @@ def _planes(
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     distance = np.einsum("nk,nkx,nx->n", weight, apart, normal)
     # How far the foot lies outside the leading surfel; a sheet ends where its surfels do.
-    beyond = aside[row, first] - _RIM * radius[row, first]
+    beyond = aside[row, first] - np.maximum(_RIM * radius[row, first], _RIM_MM)
     inside = (np.abs(distance) <= reach_mm) & (beyond <= 0.0)
     values = [(weight * getattr(surfels, name)[nearest]).sum(axis=1)[inside] for name in ("thickness", "confidence")]
     words = _packed(distance[inside] / reach_mm, normal[inside], *values)
