@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from functools import cache
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
-from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, segment_mri
-from SlicerUSSim.Logic.base.errors import Cancelled
-from SlicerUSSim.Logic.mri import demo_mri, head_mri
+from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
+from SlicerUSSim.Logic.mri import head_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets
@@ -19,11 +17,9 @@ from SlicerUSSim.Logic.mri.sheets.ependyma import ependyma
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import settled
 from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, write_surfels
-from SlicerUSSim.Logic.mri.sheets.regions import tentorium_height
 from SlicerUSSim.Logic.mri.sheets.ridges import ridges
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
 from SlicerUSSim.Logic.mri.sheets.voxels import on_voxels
-from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
 
 NORMALS = [(0, 0, 1), (1, 1, 1), (0.3, -0.5, 0.81), (0.1, 0.99, 0.1), (0.7, 0.7, 0.05)]
 
@@ -78,7 +74,7 @@ def test_heights_settle_on_a_ridge_and_stay_where_nothing_is_seen():
 
 
 def folded_head(gap_mm: float, noise: float = 3.0, sign: float = 1.0, matrix: np.ndarray | None = None) -> Head:
-    """Two banks of cortex, 2.5 mm each, that meet on x = 3 sin(y / 12) with fluid of `gap_mm` between, in white matter."""
+    """Two banks of cortex, 2.5 mm each, in white matter; on x = 3 sin(y / 12) between them fluid of `gap_mm`."""
     mm = np.stack(np.indices((70, 80, 80)), -1).astype(np.float32) - np.float32([0, 40, 40])
     x, y, z = mm[..., 2], mm[..., 1], mm[..., 0]
     slope = 0.25 * np.cos(y / 12.0)
@@ -117,7 +113,7 @@ def test_a_sulcus_is_one_sheet_at_its_middle_with_its_width(gap_mm):
     # It is there all along: no holes
     y, z = np.meshgrid(np.arange(15, 65), np.arange(32, 54))
     truth = np.stack([40 + 3.0 * np.sin((y - 40) / 12.0), y, z], -1).reshape(-1, 3)
-    assert cKDTree(inner.place).query(truth)[0].max() < 1.5
+    assert KDTree(inner.place).query(truth)[0].max() < 1.5
 
 
 def test_a_sulcus_too_narrow_to_see_is_less_sure_than_an_open_one():
@@ -279,7 +275,9 @@ def test_a_ray_through_voxels_meets_a_sphere_where_it_is():
     points = steps[None, :, None] * ways[:, None] + rng.uniform(-0.5, 0.5, (400, 1, 3))
     index = np.rint(points @ voxels.entry.ras_to_ijk[:3, :3].T + voxels.entry.ras_to_ijk[:3, 3]).astype(int)
     entry = voxels.entry.array[tuple(np.moveaxis(index[..., ::-1], -1, 0))]
-    distance, found, _, _ = (values.reshape(*entry.shape, *values.shape[1:]) for values in voxels.unpacked(entry.ravel()))
+    distance, found, _, _ = (
+        values.reshape(*entry.shape, *values.shape[1:]) for values in voxels.unpacked(entry.ravel())
+    )
     centre = index @ voxels.entry.ijk_to_ras[:3, :3].T + voxels.entry.ijk_to_ras[:3, 3]
     # Height of a point above the plane stored in its voxel, with normals outwards
     height = ((points - centre) * found).sum(-1) - distance
@@ -306,7 +304,7 @@ def test_two_sheets_near_each_other_stay_apart():
 
 def test_a_grid_too_coarse_for_the_reach_and_no_surfels():
     surfels, _ = plane_surfels((0, 0, 1))
-    with pytest.raises(SimulationError, match="reach_mm is 1, expected at least 2.3"):
+    with pytest.raises(SimulationError, match=r"reach_mm is 1, expected at least 2\.3"):
         on_voxels(surfels, grid(3.0), reach_mm=1.0)
     with pytest.raises(SimulationError, match="finer is 0"):
         on_voxels(surfels, grid(1.0), finer=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.mri.coarse import largest_component
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import patches, settled
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
@@ -50,7 +51,7 @@ def falx(head: Head, use_intensity: bool = True) -> Surfels:
     edge = np.interp(-y, [-corner[0] for corner in FREE_EDGE], [float(corner[1]) for corner in FREE_EDGE])
     above = z[:, None] - edge[None]
     kept = wide & (above > 0.0) & (on_sheet(inside) > 0.5)
-    kept = _largest(ndimage.binary_opening(kept, np.ones((3, 3))))
+    kept = largest_component(np.asarray(ndimage.binary_opening(kept, np.ones((3, 3)))))
     place = head.from_atlas(np.stack([height, *np.broadcast_arrays(y[None], z[:, None])], axis=-1).reshape(-1, 3))
     place = place.reshape(*height.shape, 3)
     normal, area = patches(place)
@@ -67,8 +68,3 @@ def _evidence(head: Head) -> np.ndarray:
     if head.is_enhanced:
         return np.clip((head.image.array - head.white) / (head.white - head.grey), 0.0, 2.0)
     return head.fluid(head.image.array)
-
-
-def _largest(inside: np.ndarray) -> np.ndarray:
-    parts, count = ndimage.label(inside)  # type: ignore[misc]
-    return inside if count < 2 else parts == np.bincount(parts.ravel())[1:].argmax() + 1

@@ -9,7 +9,7 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
@@ -118,9 +118,7 @@ def require_findable(kinds: Iterable[str], contrast: str) -> None:
     require_contrast(contrast)
 
 
-def _found(
-    head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[float], None]
-) -> tuple[Surfels, Volume]:
+def _found(head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[float], None]) -> tuple[Surfels, Volume]:
     """(surfels, structures) of the wanted kinds, each step after the ones it needs."""
     done, start = 0.0, perf_counter()
 
@@ -168,10 +166,10 @@ def _beside(sulci_: Surfels, dura: Surfels) -> Surfels:
     """Sulci without those that are the fissure of the falx or the tentorium, which would be a second sheet there."""
     if not len(dura) or not len(sulci_):
         return sulci_
-    away, nearest = cKDTree(dura.place).query(sulci_.place, distance_upper_bound=_SAME_MM, workers=-1)
+    away, nearest = KDTree(dura.place).query(sulci_.place, distance_upper_bound=_SAME_MM, workers=-1)
     is_near = np.isfinite(away)
     cosine = np.zeros(len(sulci_), np.float32)
-    cosine[is_near] = np.abs((sulci_.normal[is_near] * dura.normal[nearest[is_near]]).sum(axis=1))
+    cosine[is_near] = np.abs((sulci_.normal[is_near] * dura.normal[np.asarray(nearest)[is_near]]).sum(axis=1))
     return sulci_.chosen(cosine < _SAME_COSINE)
 
 

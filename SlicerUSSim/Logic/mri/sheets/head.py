@@ -11,7 +11,7 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.errors import require, required
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
-from SlicerUSSim.Logic.mri.coarse import widened
+from SlicerUSSim.Logic.mri.coarse import largest_component, widened
 from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.refinement import closed, on_grid
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
@@ -85,7 +85,8 @@ class Head:
         if grid is not image:
             inside = on_grid(part.with_array(inside.astype(np.float32)), grid) > 0.5
         noise = float(segmentation.standard_deviations[names.index("white matter")])
-        return cls(grid, inside, *means, noise, contrast == "t1gd", atlas)
+        csf, grey, white = means
+        return cls(grid, inside, csf, grey, white, noise, contrast == "t1gd", atlas)
 
     @property
     def spacing(self) -> np.ndarray:
@@ -119,10 +120,7 @@ class Head:
         """(k, j, i) float32 mm to the white matter, 0 or less in it."""
         smooth = self.smoothed(0.5)
         inside = (smooth > 0.5 * (self.grey + self.white)) & (smooth < self.white + 4.0 * self.noise) & self.brain
-        components, _ = ndimage.label(inside)  # type: ignore[misc]
-        counts = np.bincount(components.ravel())
-        counts[0] = 0
-        return distance_to(components == counts.argmax(), self.image.spacing_mm)
+        return distance_to(largest_component(inside), self.image.spacing_mm)
 
     def around(self, region: np.ndarray, margin_mm: float) -> tuple[Head, np.ndarray]:
         """(the part of the head that holds a region (k, j, i), the region there)."""
@@ -179,7 +177,7 @@ def _without_field(part: Volume, corrected: np.ndarray, inside: np.ndarray) -> n
     """(k, j, i) float32 image without the field that was taken out of the brain, continued beyond it."""
     usable = inside & (part.array > np.percentile(part.array[inside], 5.0)) & (corrected != 0)
     gain = np.divide(corrected, part.array, where=usable, out=np.zeros_like(corrected))
-    step = max(int(round(_FIELD_STEP_MM / float(part.spacing_mm.mean()))), 1)
+    step = max(round(_FIELD_STEP_MM / float(part.spacing_mm.mean())), 1)
     some = (slice(None, None, step),) * 3
     sizes = _FIELD_MM / (step * part.spacing_mm[::-1])
     amount = ndimage.gaussian_filter(usable[some].astype(np.float32), sizes, truncate=8.0)

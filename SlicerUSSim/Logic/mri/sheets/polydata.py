@@ -64,7 +64,7 @@ def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0,
     half = (0.5 * np.sqrt(surfels.area))[:, None]
     corners = [surfels.place + half * (a * first + b * second) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     points = vtkPoints()
-    points.SetData(numpy_to_vtk(np.stack(corners, 1).reshape(-1, 3) * np.float32(signs), deep=1))
+    points.SetData(numpy_to_vtk(np.stack(corners, 1).reshape(-1, 3) * np.array(signs, np.float32), deep=1))
     cells = vtkCellArray()
     offsets, places = np.arange(0, 4 * count + 1, 4), np.arange(4 * count)
     cells.SetData(*(numpy_to_vtkIdTypeArray(array.astype(np.int64), deep=1) for array in (offsets, places)))
@@ -73,7 +73,7 @@ def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0,
     result.SetPolys(cells)
     for entry in fields(surfels):
         values = getattr(surfels, entry.name)
-        values = values * np.float32(signs) if values.ndim == 2 else values
+        values = values * np.array(signs, np.float32) if values.ndim == 2 else values
         array = numpy_to_vtk(np.ascontiguousarray(values), deep=1)
         array.SetName(entry.name)
         result.GetCellData().AddArray(array)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from scipy import ndimage
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas import Atlas
+from SlicerUSSim.Logic.mri.coarse import components
 from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.sheets.head import Head
 
@@ -51,7 +51,7 @@ def hindbrain(head: Head, margin_mm: float = 3.0) -> np.ndarray:
 def _template_ventricles(atlas: Atlas) -> tuple[np.ndarray, np.ndarray]:
     """((k, j, i) lateral ventricles, third and fourth) of the atlas, float32 0 or 1."""
     t1, fluid = atlas.t1, atlas.csf.array > 0.5
-    parts, _ = ndimage.label(fluid & _in_box(t1, *_LATERAL_BOX))  # type: ignore[misc]
+    parts = components(fluid & _in_box(t1, *_LATERAL_BOX))
     seeds = np.array(_LATERAL_SEEDS) @ t1.ras_to_ijk[:3, :3].T + t1.ras_to_ijk[:3, 3]
     found = {int(parts[tuple(np.rint(seed).astype(int)[::-1])]) for seed in seeds} - {0}
     middle = fluid & np.logical_or.reduce([_in_box(t1, *box) for box in _MIDLINE_BOXES])
@@ -78,7 +78,7 @@ def ventricles(head: Head) -> np.ndarray:
     for template, reach in zip(_template_ventricles(head.atlas.atlas), (_REACH_MM, _MIDLINE_REACH_MM), strict=True):
         core = head.carried(template) > 0.5
         region = fluid & (distance_to(core, head.image.spacing_mm) <= reach)
-        parts, _ = ndimage.label(region)  # type: ignore[misc]
+        parts = components(region)
         sizes, common = np.bincount(parts.ravel()), np.bincount(parts[core], minlength=int(parts.max()) + 1)
         kept = (sizes * head.voxel_mm3 > _LEAST_MM3) & (common > 0)
         kept[0] = False

@@ -8,6 +8,8 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.mri.coarse import components
+
 #: First estimates of tops that are improved, in voxels from the middle of one along each axis; and places beside the
 #: estimate at which values are compared, mm
 _FIRST_VOXELS, _ASIDE_MM = 1.2, 0.4
@@ -30,9 +32,7 @@ class Ridges:
 
     def chosen(self, which: np.ndarray) -> Ridges:
         """Some of the points."""
-        return Ridges(
-            self.voxel[which], self.place[which], self.normal[which], self.strength[which], self.area[which]
-        )
+        return Ridges(self.voxel[which], self.place[which], self.normal[which], self.strength[which], self.area[which])
 
 
 def ridges(
@@ -83,7 +83,7 @@ def _at_top(smooth: np.ndarray, voxel: np.ndarray, step: np.ndarray, offset: np.
     `step` (n, 3) is a millimetre along the normal in voxels. The first estimate is of derivatives at the voxel, which
     overshoot where the ridge is not a parabola; at borders of voxels, points would be lost.
     """
-    spline = cast(np.ndarray, ndimage.spline_filter(smooth, output=np.float32))
+    spline = cast(np.ndarray, ndimage.spline_filter(smooth, output=np.float32))  # pyright: ignore[reportArgumentType]
     for _ in range(2):
         before, here, after = (
             ndimage.map_coordinates(
@@ -118,7 +118,6 @@ def large_parts(found: Ridges, shape: tuple[int, ...], least_mm2: float) -> Ridg
     """The points in connected parts of at least this area; voxels connect by faces, edges and corners."""
     crossed = np.zeros(shape, bool)
     crossed[tuple(found.voxel.T)] = True
-    parts, _ = ndimage.label(crossed, np.ones((3, 3, 3)))  # type: ignore[misc]
-    part = parts[tuple(found.voxel.T)]
+    part = components(crossed, corners=True)[tuple(found.voxel.T)]
     areas = np.bincount(part, found.area)
     return found.chosen(areas[part] >= least_mm2)

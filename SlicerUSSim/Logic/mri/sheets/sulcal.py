@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.sheets.head import Head
@@ -70,7 +70,7 @@ def smoothed_over_neighbours(place: np.ndarray, values: np.ndarray) -> np.ndarra
     count = min(_NEIGHBOURS, len(place))
     if count < 2:
         return values
-    _, nearest = cKDTree(place).query(place, count, workers=-1)
+    _, nearest = KDTree(place).query(place, count, workers=-1)
     return values[nearest].mean(axis=1)
 
 

@@ -56,9 +56,11 @@ class Surfels:
     ) -> Surfels:
         """Surfels of one kind; numbers stand for all of them."""
         count = len(place)
-        numbers = (np.broadcast_to(np.asarray(value, np.float32), count).copy() for value in (thickness, confidence, area))
         place, normal = (np.asarray(array, np.float32).reshape(-1, 3) for array in (place, normal))
-        return cls(place, normal, *numbers, np.full(count, KINDS.index(kind), np.uint8))
+        numbers = [
+            np.broadcast_to(np.asarray(value, np.float32), count).copy() for value in (thickness, confidence, area)
+        ]
+        return cls(place, normal, numbers[0], numbers[1], numbers[2], np.full(count, KINDS.index(kind), np.uint8))
 
     @classmethod
     def joined(cls, parts: Sequence[Surfels]) -> Surfels:

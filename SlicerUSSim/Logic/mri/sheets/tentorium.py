@@ -71,7 +71,7 @@ def _relief(values: np.ndarray, head: Head) -> np.ndarray:
 
 
 def straight_sinus(head: Head, y: np.ndarray, falx: Surfels | None) -> tuple[np.ndarray, np.ndarray]:
-    """(x, z) of the straight sinus at each y, mm of the atlas: the template's, or the brightest near it with contrast."""
+    """(x, z) of the straight sinus at each y, mm of the atlas: the template's; with contrast the brightest near it."""
     edge = np.array(FREE_EDGE, float)
     z = np.interp(-y, -edge[:, 0], edge[:, 1])
     x = np.zeros_like(z)
@@ -87,7 +87,8 @@ def straight_sinus(head: Head, y: np.ndarray, falx: Surfels | None) -> tuple[np.
     sides = np.arange(-_SINUS_BESIDE_MM, _SINUS_BESIDE_MM + 1e-6)
     up, side = np.meshgrid(steps, sides, indexing="ij")
     points = np.stack(
-        [x[:, None, None] + side, np.broadcast_to(y[:, None, None], (len(y), *up.shape)), z[:, None, None] + up], axis=-1
+        [x[:, None, None] + side, np.broadcast_to(y[:, None, None], (len(y), *up.shape)), z[:, None, None] + up],
+        axis=-1,
     )
     bright = head.at(head.from_atlas(points.reshape(-1, 3)), head.smoothed(_SIGMA_MM)).reshape(len(y), *up.shape)
     relief = (bright - head.white).max(axis=2) / (4.0 * head.noise)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.mri.coarse import components
 from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.refinement import closed
 from SlicerUSSim.Logic.mri.sheets.head import Head
@@ -51,7 +52,7 @@ def vessels(head: Head, sheets: Surfels, apart: np.ndarray) -> np.ndarray:
     if core.any():
         found &= distance_to(core, head.image.spacing_mm) > 0.5 * _SINUS_MM + _SINUS_RIM_MM
     found &= (head.depth > _SURFACE_MM) & ~apart & ~_near(head, sheets, _DURA_MM)
-    parts, _ = ndimage.label(found, np.ones((3, 3, 3)))  # type: ignore[misc]
+    parts = components(found, corners=True)
     sizes = np.bincount(parts.ravel())
     peaks = ndimage.maximum(head.image.array, parts, np.arange(len(sizes)))
     kept = (sizes * head.voxel_mm3 > _LEAST_VESSEL_MM3) & (np.asarray(peaks) > head.white + _PEAK * head.noise)
@@ -65,7 +66,7 @@ def _tubeness(head: Head) -> np.ndarray:
 
     image, result = head.image.to_sitk(), np.zeros(head.brain.shape, np.float32)
     for sigma in _SIGMAS_MM:
-        smooth = sitk.SmoothingRecursiveGaussian(image, sigma)
+        smooth = sitk.SmoothingRecursiveGaussian(image, [sigma] * 3)
         lines = sitk.ObjectnessMeasure(
             smooth, alpha=0.5, beta=0.5, gamma=20.0, scaleObjectnessMeasure=False, objectDimension=1, brightObject=True
         )
@@ -86,7 +87,7 @@ def _near(head: Head, sheets: Surfels, distance_mm: float) -> np.ndarray:
 
 
 def _large(inside: np.ndarray, voxels: float) -> np.ndarray:
-    parts, _ = ndimage.label(inside)  # type: ignore[misc]
+    parts = components(inside)
     kept = np.bincount(parts.ravel()) > voxels
     kept[0] = False
     return kept[parts]

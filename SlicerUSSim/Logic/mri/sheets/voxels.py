@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
@@ -20,8 +20,8 @@ _THICKEST_MM = 5.0
 _NEIGHBOURS, _SIGMA_MM = 8, 0.7
 #: Neighbours whose normals differ by more belong to another sheet
 _SAME_COSINE = 0.7
-#: A sheet goes on beyond a surfel's place by this much of its radius, and this far at least: of ridges in voxels of 1 mm,
-#: no place is farther from a surfel, however the sheet is tilted
+#: A sheet goes on beyond a surfel's place by this much of its radius, and this far at least: of ridges in voxels of
+#: 1 mm, no place is farther from a surfel, however the sheet is tilted
 _RIM, _RIM_MM = 1.5, 0.9
 #: Voxels at a time
 _CHUNK = 200_000
@@ -79,7 +79,7 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
     if not len(surfels):
         return SheetVoxels(grid.with_array(entry), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), reach_mm)
     near = np.argwhere(_near(surfels, grid, reach_mm))
-    tree = cKDTree(surfels.place)
+    tree = KDTree(surfels.place)
     kept, packed, kinds = [], [], []
     for start in range(0, len(near), _CHUNK):
         voxels = near[start : start + _CHUNK]
@@ -94,7 +94,7 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
 
 
 def _planes(
-    surfels: Surfels, tree: cKDTree, centres: np.ndarray, reach_mm: float
+    surfels: Surfels, tree: KDTree, centres: np.ndarray, reach_mm: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((n,) bool: whether a sheet is in reach, (m, 2) uint32 packed, (m,) uint8 kind) of (n, 3) centres."""
     count = min(_NEIGHBOURS, len(surfels))
@@ -186,4 +186,3 @@ def _finer(grid: Volume, finer: int) -> Volume:
     matrix[:3, 3] += matrix[:3, :3] @ np.full(3, 0.5 - 0.5 * finer)
     shape = tuple(finer * n for n in grid.array.shape)
     return Volume(np.broadcast_to(np.zeros(1, np.uint8), shape), matrix)
-
