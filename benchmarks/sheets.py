@@ -100,10 +100,11 @@ def t2_confirms(head: Head, sulci: Surfels, t2: Volume) -> None:
         f"{seen[(some.confidence >= low) & (some.confidence < high)].mean():.0%} at {low} to {high}"
         for low, high in ((0.4, 0.6), (0.6, 0.8), (0.8, 1.01))
     )
+    weighted = np.average(seen, weights=some.confidence)
+    aside, chance = confirmed(t2, beside, some.normal).mean(), confirmed(t2, anywhere, ways).mean()
     print(
-        f"T2 confirms {seen.mean():.1%} of sulci, weighted by confidence {np.average(seen, weights=some.confidence):.1%}"
-        f" ({sure}); moved 3 to 6 mm {confirmed(t2, beside, some.normal).mean():.1%}, any place and direction in cortex "
-        f"{confirmed(t2, anywhere, ways).mean():.1%}"
+        f"T2 confirms {seen.mean():.1%} of sulci, weighted by confidence {weighted:.1%} ({sure}); moved 3 to 6 mm "
+        f"{aside:.1%}, any place and direction in cortex {chance:.1%}"
     )
 
 
@@ -166,7 +167,8 @@ def remind(arguments) -> None:
     flat = head.to_atlas(here.place) * [0, 1, 1]
     controls = {
         "with contrast": here, "without using it": without, "mirrored": mirrored(head, here),
-        "x = 0 of the atlas": moved(here, head.from_atlas(flat)), "3 mm aside": moved(here, here.place + 3 * here.normal),
+        "x = 0 of the atlas": moved(here, head.from_atlas(flat)),
+        "3 mm aside": moved(here, here.place + 3 * here.normal),
     }  # fmt: skip
     sheet_errors("falx", head, falx_shown(head), controls)
     here = sheets.surfels.of_kind("tentorium")
@@ -189,13 +191,11 @@ def remind(arguments) -> None:
             f"{np.median(disc_distance(aside, one.place)):.2f} mm, {(disc_distance(aside, one.place) < 1).mean():.1%}"
         )
     vessel = sheets.structures.array == 1 + list(STRUCTURES).index("vessels")
-    around = (
-        ndimage.binary_dilation(vessel, iterations=3) & ~np.asarray(ndimage.binary_dilation(vessel)) & (other.array > 0)
-    )
+    away = distance_to(vessel)  # voxels
+    around = (away >= 1.5) & (away <= 3.0) & (other.array > 0)
     dark = 0.75 * np.median(other.array[around])
-    print(
-        f"flow void in T2: {(other.array[vessel] < dark).mean():.0%} of vessels, {(other.array[around] < dark).mean():.0%} around"
-    )
+    void = [(other.array[where] < dark).mean() for where in (vessel, around)]
+    print(f"flow void in T2: {void[0]:.0%} of vessels, {void[1]:.0%} around")
 
 
 def turned(arguments) -> None:
@@ -322,9 +322,8 @@ def mni(arguments) -> None:
     head = Head.of(mri, found, "t1")
     coverage("MNI152", head, sheets.surfels.of_kind("sulcus", "falx", "tentorium"))
     here = sheets.surfels.of_kind("falx")
-    print(
-        f"falx of the symmetric template: |x| median {np.median(np.abs(here.place[:, 0])):.2f} mm, largest {np.abs(here.place[:, 0]).max():.2f}"
-    )
+    x = np.abs(here.place[:, 0])
+    print(f"falx of the symmetric template: |x| median {np.median(x):.2f} mm, largest {x.max():.2f}")
 
 
 def main() -> None:

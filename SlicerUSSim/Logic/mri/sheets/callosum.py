@@ -73,9 +73,8 @@ def _best_move(head: Head, template: np.ndarray) -> np.ndarray:
     share = np.clip((head.smoothed(1.0) - head.grey) / (head.white - head.grey), -1.0, 1.0)
 
     def score(move: tuple[int, ...]) -> float:
-        return float(head.at(head.from_atlas(xyz + [0.0, *move]), share) @ weights) - 0.01 * float(
-            np.hypot(move[0], move[1])
-        )
+        seen = float(head.at(head.from_atlas(xyz + [0.0, *move]), share) @ weights)
+        return seen - 0.01 * float(np.hypot(move[0], move[1]))
 
     steps = range(-_MOVES_MM, _MOVES_MM + 1)
     coarse = max(itertools.product(steps[::2], steps[::2]), key=score)

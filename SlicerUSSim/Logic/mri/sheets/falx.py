@@ -50,7 +50,8 @@ def falx(head: Head, use_intensity: bool = True) -> Surfels:
     wide = ndimage.gaussian_filter(on_sheet(distance), _FISSURE_SIGMA) > _FISSURE_MM
     edge = np.interp(-y, [-corner[0] for corner in FREE_EDGE], [float(corner[1]) for corner in FREE_EDGE])
     above = z[:, None] - edge[None]
-    kept = wide & (above > 0.0) & (on_sheet(inside) > 0.5)
+    # Far above the edge there is no callosum; white matter there is the rim of an enhancing vein.
+    kept = (wide | (above > _EDGE_MM)) & (above > 0.0) & (on_sheet(inside) > 0.5)
     kept = largest_component(np.asarray(ndimage.binary_opening(kept, np.ones((3, 3)))))
     place = head.from_atlas(np.stack([height, *np.broadcast_arrays(y[None], z[:, None])], axis=-1).reshape(-1, 3))
     place = place.reshape(*height.shape, 3)
