@@ -26,7 +26,7 @@ from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
 _PLANES = ((2, 18), (2, 45), (1, -60), (1, 8), (0, 1), (0, 25))
 _LOW, _HIGH, _STEP_MM, _THICK_MM = np.array([-80, -115, -65]), np.array([80, 85, 90]), 0.5, 0.6
 _SHEETS = dict(zip(KINDS, ("#ff8c1a", "#00e5ff", "#5c7cff", "#9dff57"), strict=True))
-_BODIES = dict(zip(STRUCTURES, ("#39e639", "#ff2020", "#ff40ff"), strict=True))
+_BODIES = dict(zip(STRUCTURES, ("#ffe600", "#ff2020", "#ff40ff"), strict=True))
 
 
 def draw(path: Path, head: Head, sheets: Sheets) -> None:

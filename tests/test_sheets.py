@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import fields, replace
+from functools import cache
 
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
-from SlicerUSSim.Logic.mri import head_mri
+from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, segment_mri
+from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.mri import demo_mri, head_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets
 from SlicerUSSim.Logic.mri.sheets.ependyma import ependyma
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import settled
-from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, write_surfels
+from SlicerUSSim.Logic.mri.sheets.kept import key_of, read_kept_sheets
+from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, require_own_surface, write_surfels
+from SlicerUSSim.Logic.mri.sheets.regions import tentorium_height
 from SlicerUSSim.Logic.mri.sheets.ridges import ridges
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
 from SlicerUSSim.Logic.mri.sheets.voxels import on_voxels
+from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
 
 NORMALS = [(0, 0, 1), (1, 1, 1), (0.3, -0.5, 0.81), (0.1, 0.99, 0.1), (0.7, 0.7, 0.05)]
 
@@ -205,6 +211,15 @@ def test_files_that_are_no_sheets_are_named(tmp_path):
     (tmp_path / "text.vtp").write_text("no XML")
     with pytest.raises(SimulationError, match="no VTK surface"):
         read_surfels(tmp_path / "text.vtp")
+    with pytest.raises(SimulationError, match="not as this program wrote it"):
+        require_own_surface(tmp_path / "text.vtp")
+    for name in ("own.vtp", "own.ply"):
+        write_surfels(tmp_path / name, some_surfels())
+        require_own_surface(tmp_path / name)
+    text = (tmp_path / "own.ply").read_bytes().replace(b"ussim_mark", b"other_mark")
+    (tmp_path / "own.ply").write_bytes(text)
+    with pytest.raises(SimulationError, match="not as this program wrote it"):
+        require_own_surface(tmp_path / "own.ply")
 
 
 def test_surfels_are_checked_and_chosen_by_kind():
@@ -329,3 +344,129 @@ def test_what_cannot_be_found_is_said_before_the_search():
         find_sheets(mri, replace(found, atlas=None), contrast="t1")
     with pytest.raises(SimulationError, match="expected the order of t2"):
         find_sheets(mri, found, contrast="t2")
+
+
+@cache
+def template_head() -> tuple[Volume, Segmentation]:
+    """MNI152 without every other voxel, 2 mm, and its segmentation."""
+    mri, source = demo_mri()
+    if "nilearn" not in source:
+        pytest.skip("nilearn is not installed")
+    step = slice(None, None, 2)
+    coarse = Volume(mri.array[step, step, step].astype(np.float32), mri.ijk_to_ras @ np.diag([2.0, 2.0, 2.0, 1.0]))
+    return coarse, segment_mri(coarse)
+
+
+def test_sheets_are_kept_and_each_can_be_switched_off(tmp_path):
+    mri, found = template_head()
+    shares: list[float] = []
+    place = tmp_path / "head.sheets.npz"
+    kinds = ("falx", "tentorium", "ependyma", "corpus callosum")
+    first = find_sheets(mri, found, contrast="t1", kinds=kinds, keep_at=place, progress=shares.append)
+    assert place.is_file()
+    assert shares[0] == 0.0
+    assert shares[-1] == 1.0
+    assert all(before <= after for before, after in itertools.pairwise(shares))
+    assert set(np.unique(first.surfels.kind)) == {KINDS.index(kind) for kind in kinds if kind in KINDS}
+    # A template has its falx in its middle, and a tentorium where the polynomial was fitted to it.
+    there = first.surfels.of_kind("falx")
+    assert np.median(np.abs(there.place[:, 0])) < 0.5
+    assert np.abs(there.normal[:, 0]).min() > 0.8
+    dura = first.surfels.of_kind("tentorium")
+    aside = np.abs(dura.place[:, 0]) > 15
+    away = dura.place[:, 2] - tentorium_height(dura.place[:, 0].astype(float), dura.place[:, 1].astype(float))
+    assert np.median(np.abs(away[aside])) < 2.0
+    assert [(tissue, source) for tissue, _, source in first.masks()] == [("corpus callosum", "corpus callosum")]
+    assert 5.0 < (first.structures.array > 0).sum() * first.structures.voxel_ml < 30.0
+    # Again, from the file: fewer kinds are part of it, others are not.
+    again = find_sheets(mri, found, contrast="t1", kinds=("falx", "ependyma"), keep_at=place)
+    assert "kept in" in again.notes[0]
+    assert len(again.surfels) == len(first.surfels.of_kind("falx", "ependyma"))
+    assert not again.structures.array.any()
+    only = find_sheets(mri, found, contrast="t1", kinds=("falx",))
+    assert np.array_equal(only.surfels.place, there.place)
+    other = Volume(mri.array + np.float32(1.0), mri.ijk_to_ras)
+    assert read_kept_sheets(place, key_of(other, found, "t1"), ("falx",)) is None
+
+
+def test_a_file_of_others_is_not_replaced_and_no_use_as_kept_sheets(tmp_path):
+    mri, found = template_head()
+    place = tmp_path / "head.sheets.npz"
+    place.write_text("mine")
+    sheets = find_sheets(mri, found, contrast="t1", kinds=("falx",), keep_at=place)
+    assert "was not written by ussim" in sheets.notes[0]
+    assert place.read_text() == "mine"
+
+
+def test_a_search_can_be_cancelled():
+    mri, found = template_head()
+
+    def stop(share: float) -> None:
+        if share > 0.1:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        find_sheets(mri, found, contrast="t1", progress=stop)
+
+
+def test_vessels_and_plexus_are_not_invented_without_contrast_agent():
+    mri, found = template_head()
+    sheets = find_sheets(mri, found, contrast="t1", kinds=("vessels", "choroid plexus"))
+    assert not sheets.masks()
+    assert any("only a T1 with contrast agent" in line for line in sheets.notes)
+    assert not len(sheets.surfels)
+
+
+def test_the_command_writes_sheets_and_lays_structures_over_the_labels(tmp_path):
+    from click.testing import CliRunner
+
+    from SlicerUSSim.Command.cli import main
+
+    mri, _ = template_head()
+    head, out, sheets = tmp_path / "head.nii.gz", tmp_path / "labels.nii.gz", tmp_path / "sheets.vtp"
+    mri.write(head)
+    call = ["segment", str(head), "-o", str(out), "--sheets", str(sheets)]
+    refused = CliRunner().invoke(main, [*call[:4], "--sheet", "falx"])
+    assert refused.exit_code != 0
+    assert "give --sheets, too" in refused.output
+    refused = CliRunner().invoke(main, [*call, "--sheet", "dura"])
+    assert "nothing of kind 'dura'" in refused.output
+    refused = CliRunner().invoke(main, [*call, "--contrast", "flair"])
+    assert "not found in contrast 'flair'" in refused.output
+    done = CliRunner().invoke(main, [*call, "--sheet", "falx", "--sheet", "corpus callosum"])
+    assert done.exit_code == 0, done.output
+    assert "corpus callosum" in done.output
+    surfels = read_surfels(sheets)
+    assert set(surfels.kind) == {KINDS.index("falx")}
+    assert (tmp_path / "head.sheets.npz").is_file()
+    assert len(np.unique(Volume.read(out).array)) > 4
+    sheets.write_text("edited")
+    refused = CliRunner().invoke(main, [*call, "--overwrite"])
+    assert refused.exit_code != 0
+    assert "is not as this program wrote it" in refused.output
+
+
+@pytest.mark.slow
+def test_sheets_of_colin27_are_where_its_image_and_aal_show_them():
+    if not (COLIN27 / "ch2bet.nii.gz").exists():
+        pytest.skip("mricron-data is not installed")
+    mri = Volume.read(COLIN27 / "ch2bet.nii.gz")
+    found = segment_mri(mri)
+    sheets = find_sheets(mri, found, contrast="t1")
+    head = Head.of(mri, found, "t1")
+    # Fluid of sulci near a sheet, and near a sheet displaced
+    fluid = head.brain & (head.fluid(head.image.array) > 0.5) & (head.depth > 2.0) & (head.in_atlas[2] > 30)
+    points = head.to_ras(np.argwhere(fluid)[::5].astype(float))
+    there = sheets.surfels.of_kind("sulcus", "falx").place
+    near, displaced = ((KDTree(places).query(points)[0] < 1.5).mean() for places in (there, there + 3.0))
+    assert near > 0.85
+    assert displaced < 0.6
+    # Cerebellum below the tentorium, cerebrum above
+    drawn, tentorium = Volume.read(COLIN27 / "aal.nii.gz"), sheets.surfels.of_kind("tentorium")
+    for labels, sign in ((range(91, 109), -1), ((39, 40, 43, 44, 47, 48, 55, 56), 1)):
+        places = np.argwhere(np.isin(drawn.array, list(labels)))[:, ::-1] @ drawn.ijk_to_ras[:3, :3].T
+        places = places + drawn.ijk_to_ras[:3, 3]
+        away, nearest = KDTree(tentorium.place).query(places)
+        normal = tentorium.normal[nearest] * np.sign(tentorium.normal[nearest][:, 2:])
+        side = ((places - tentorium.place[nearest]) * normal).sum(axis=1)
+        assert (sign * side[away < 8] > 0).mean() > 0.85

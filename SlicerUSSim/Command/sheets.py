@@ -33,11 +33,12 @@ def require_sheets(path: Path | None, kinds: tuple[str, ...], contrast: str) -> 
         return
     from SlicerUSSim.Command.options import check_places
     from SlicerUSSim.Logic.mri.sheets.finding import require_findable
-    from SlicerUSSim.Logic.mri.sheets.polydata import require_surfel_file
+    from SlicerUSSim.Logic.mri.sheets.polydata import require_own_surface, require_surfel_file
 
     require_findable(kinds, contrast)
     require_surfel_file(path)
     check_places(path)
+    require_own_surface(path)
 
 
 def write_sheets(

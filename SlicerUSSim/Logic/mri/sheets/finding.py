@@ -130,6 +130,8 @@ def _found(head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[f
         report(done)
 
     finished("head")
+    if not head.is_enhanced:
+        wanted = tuple(kind for kind in wanted if kind not in _ENHANCING)
     found: dict[str, Surfels] = {}
     masks: dict[str, np.ndarray] = {}
     in_ventricles = np.zeros(head.brain.shape, bool)
@@ -152,10 +154,10 @@ def _found(head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[f
     if "corpus callosum" in wanted:
         masks["corpus callosum"] = corpus_callosum(head)
         finished("corpus callosum")
-    if head.is_enhanced and set(_ENHANCING) & set(wanted):
+    if set(_ENHANCING) & set(wanted):
         masks["choroid plexus"] = choroid_plexus(head, in_ventricles)
         finished("choroid plexus")
-    if head.is_enhanced and "vessels" in wanted:
+    if "vessels" in wanted:
         masks["vessels"] = vessels(head, dura, masks["choroid plexus"])
         finished("vessels")
     surfels = Surfels.joined([found[kind] for kind in KINDS if kind in found and kind in wanted])

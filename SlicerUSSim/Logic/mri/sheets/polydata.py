@@ -11,12 +11,15 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.own_outputs import mark_of
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkPolyData
 
 _SUFFIXES = (".vtp", ".ply")
+#: Array of a .vtp and comment of a .ply with a hash of the surface, by which a file that nobody edited is known
+_MARK = "ussim_mark"
 #: Colours of the kinds, 0 to 255
 COLOURS = ((255, 140, 26), (0, 229, 255), (77, 107, 255), (57, 230, 57))
 
@@ -44,6 +47,7 @@ def write_surfels(path: str | os.PathLike, surfels: Surfels) -> None:
         if is_ply:
             writer = vtkPLYWriter()
             writer.SetArrayName("colour")
+            writer.AddComment(f"{_MARK}={_mark_of(data)}")
         else:
             writer = vtkXMLPolyDataWriter()
         writer.SetInputData(data)
@@ -82,13 +86,48 @@ def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0,
     result.GetPointData().AddArray(colours)
     result.GetPointData().SetActiveScalars("colour")
     # SPACE is what Slicer looks for; without it, it takes a file to be in LPS.
-    for name, texts in (("SPACE", ["RAS" if signs[0] > 0 else "LPS"]), ("kinds", KINDS)):
+    space = "RAS" if signs[0] > 0 else "LPS"
+    for name, texts in (("SPACE", [space]), ("kinds", KINDS), (_MARK, [_mark_of(result)])):
         strings = vtkStringArray()
         strings.SetName(name)
         for text in texts:
             strings.InsertNextValue(text)
         result.GetFieldData().AddArray(strings)
     return result
+
+
+def require_own_surface(path: Path) -> None:
+    """Raise SimulationError for a file that exists and is not as write_surfels wrote it, before it is replaced."""
+    require(
+        not path.exists() or _is_own(path),
+        f"{path}: exists and is not as this program wrote it, so it is not replaced; choose another name, or remove it",
+    )
+
+
+def _is_own(path: Path) -> bool:
+    from vtkmodules.vtkIOPLY import vtkPLYReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    is_ply = path.suffix.lower() == ".ply"
+    reader = vtkPLYReader() if is_ply else vtkXMLPolyDataReader()
+    if not reader.CanReadFile(str(path)):
+        return False
+    reader.SetFileName(str(path))
+    reader.Update()
+    if isinstance(reader, vtkPLYReader):
+        comments = reader.GetComments()
+        texts = [comments.GetValue(n) for n in range(comments.GetNumberOfValues())]
+        return f"{_MARK}={_mark_of(reader.GetOutput())}" in texts
+    array = reader.GetOutput().GetFieldData().GetAbstractArray(_MARK)
+    return array is not None and array.GetValue(0) == _mark_of(reader.GetOutput())
+
+
+def _mark_of(data: vtkPolyData) -> str:
+    """A hash of the corners."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    corners = data.GetPoints()
+    return mark_of(vtk_to_numpy(corners.GetData()) if corners.GetNumberOfPoints() else np.zeros(0, np.float32))
 
 
 def read_surfels(path: str | os.PathLike) -> Surfels:
