@@ -95,16 +95,18 @@ def t2_confirms(head: Head, sulci: Surfels, t2: Volume) -> None:
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     some = sulci.chosen(_RNG.integers(len(sulci), size=20000))
     beside = some.place + _RNG.uniform(3, 6, (20000, 1)) * ways
+    in_cortex = head.at(beside, (head.brain & (head.depth > 2) & (head.white_distance > 1.2)).astype(np.float32)) > 0.5
     seen = confirmed(t2, some.place, some.normal)
     sure = ", ".join(
         f"{seen[(some.confidence >= low) & (some.confidence < high)].mean():.0%} at {low} to {high}"
         for low, high in ((0.4, 0.6), (0.6, 0.8), (0.8, 1.01))
     )
     weighted = np.average(seen, weights=some.confidence)
-    aside, chance = confirmed(t2, beside, some.normal).mean(), confirmed(t2, anywhere, ways).mean()
+    aside = confirmed(t2, beside[in_cortex], some.normal[in_cortex]).mean()
+    chance = confirmed(t2, anywhere, ways).mean()
     print(
         f"T2 confirms {seen.mean():.1%} of sulci, weighted by confidence {weighted:.1%} ({sure}); moved 3 to 6 mm "
-        f"{aside:.1%}, any place and direction in cortex {chance:.1%}"
+        f"within cortex and CSF {aside:.1%}, any place and direction in cortex {chance:.1%}"
     )
 
 
