@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mri import demo_mri, head_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
-from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets
+from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets, on_voxels
 from SlicerUSSim.Logic.mri.sheets.ependyma import ependyma
 from SlicerUSSim.Logic.mri.sheets.head import Head
 from SlicerUSSim.Logic.mri.sheets.heights import settled
@@ -24,7 +24,6 @@ from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels, require_own_surf
 from SlicerUSSim.Logic.mri.sheets.regions import tentorium_height
 from SlicerUSSim.Logic.mri.sheets.ridges import ridges
 from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
-from SlicerUSSim.Logic.mri.sheets.voxels import on_voxels
 from SlicerUSSim.Logic.verification.brain_phantoms import COLIN27
 
 NORMALS = [(0, 0, 1), (1, 1, 1), (0.3, -0.5, 0.81), (0.1, 0.99, 0.1), (0.7, 0.7, 0.05)]
@@ -38,10 +37,10 @@ def plane_ridges(normal, spacing=(1.0, 1.0, 1.0), size_mm: float = 36.0):
     """(ridges of a bright plane through (0.2, 0.1, -0.3) mm of the middle, (k, j, i) mm of voxels, its place)."""
     spacing = np.array(spacing)
     shape = np.ceil(size_mm / spacing).astype(int)
-    mm = (np.stack(np.indices(shape), -1) - (shape - 1) / 2.0) * spacing
+    mm = (np.moveaxis(np.indices(tuple(shape)), 0, -1) - (shape - 1) / 2.0) * spacing
     place = np.array([0.2, 0.1, -0.3])
     values = np.exp(-0.5 * ((mm - place) @ normal / 1.2) ** 2).astype(np.float32)
-    inside = (np.abs(mm) < 13.0).all(axis=-1)
+    inside = np.asarray((np.abs(mm) < 13.0).all(axis=-1))
     return ridges(values, spacing, inside, 0.7, 0.1), (shape - 1) / 2.0, place
 
 
@@ -79,9 +78,9 @@ def test_heights_settle_on_a_ridge_and_stay_where_nothing_is_seen():
     assert np.abs(height).max() == 0.0
 
 
-def folded_head(gap_mm: float, noise: float = 3.0, sign: float = 1.0, matrix: np.ndarray | None = None) -> Head:
+def folded_head(gap_mm: float) -> Head:
     """Two banks of cortex, 2.5 mm each, in white matter; on x = 3 sin(y / 12) between them fluid of `gap_mm`."""
-    mm = np.stack(np.indices((70, 80, 80)), -1).astype(np.float32) - np.float32([0, 40, 40])
+    mm = np.moveaxis(np.indices((70, 80, 80)), 0, -1).astype(np.float32) - np.array([0, 40, 40], np.float32)
     x, y, z = mm[..., 2], mm[..., 1], mm[..., 0]
     slope = 0.25 * np.cos(y / 12.0)
     across = np.abs((x - 3.0 * np.sin(y / 12.0)) / np.sqrt(1.0 + slope**2))
@@ -89,19 +88,19 @@ def folded_head(gap_mm: float, noise: float = 3.0, sign: float = 1.0, matrix: np
     white = np.where(is_sulcus, np.clip(across - 2.5 - gap_mm / 2 + 0.5, 0, 1), 1.0)
     fluid = np.where(is_sulcus, np.clip(gap_mm / 2 - across + 0.5, 0, min(1.0, gap_mm)), 0.0)
     image = 100.0 + 40.0 * white - 80.0 * fluid * (1 - white)
-    image += np.random.default_rng(1).normal(0.0, noise, image.shape)
+    image += np.random.default_rng(1).normal(0.0, 3.0, image.shape)
     brain = (np.hypot(x, y) < 36.0) & (z > 3) & (z < 62)
     atlas = mni152()
     if atlas is None:
         pytest.skip("nilearn is not installed")
     to_atlas = np.eye(4)
     to_atlas[2, 3] = 10.0
-    volume = Volume(image.astype(np.float32), np.diag([1.0, 1, 1, 1]) if matrix is None else matrix)
-    return Head(volume, brain, 20.0, 100.0, 140.0, 4.0, False, AtlasFit(to_atlas @ np.diag([1, 1, 1, 1.0]), 1.0, atlas))
+    volume = Volume(image.astype(np.float32), np.eye(4))
+    return Head(volume, brain, 20.0, 100.0, 140.0, 4.0, False, AtlasFit(to_atlas, 1.0, atlas))
 
 
 def sulcus_error(found: Surfels) -> np.ndarray:
-    place = found.place - np.float32([40, 40, 0])
+    place = found.place - np.array([40, 40, 0], np.float32)
     x, y = place[:, 0], place[:, 1]
     slope = 0.25 * np.cos(y / 12.0)
     return np.abs(x - 3.0 * np.sin(y / 12.0)) / np.sqrt(1.0 + slope**2)
@@ -252,7 +251,7 @@ def grid(spacing: float, half_mm: float = 9.0, turn_deg: float = 0.0) -> Volume:
 
 
 def centres(volume: Volume) -> np.ndarray:
-    kji = np.stack(np.indices(volume.array.shape), -1)
+    kji = np.moveaxis(np.indices(volume.array.shape), 0, -1)
     return kji[..., ::-1] @ volume.ijk_to_ras[:3, :3].T + volume.ijk_to_ras[:3, 3]
 
 
@@ -308,7 +307,7 @@ def test_a_ray_through_voxels_meets_a_sphere_where_it_is():
 
 def test_two_sheets_near_each_other_stay_apart():
     first, _ = plane_surfels((0, 0, 1))
-    second = replace(first, place=first.place + np.float32([2.4, 0, 0]))
+    second = replace(first, place=first.place + np.array([2.4, 0, 0], np.float32))
     voxels = on_voxels(Surfels.joined([first, second]), grid(1.0, 8.0))
     distance, normal, _, _ = voxels.unpacked()
     at = centres(voxels.entry)[voxels.entry.array >= 0]
