@@ -416,6 +416,7 @@ def test_vessels_and_plexus_are_not_invented_without_contrast_agent():
     assert not len(sheets.surfels)
 
 
+@pytest.mark.slow
 def test_the_command_writes_sheets_and_lays_structures_over_the_labels(tmp_path):
     from click.testing import CliRunner
 
