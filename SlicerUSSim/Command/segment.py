@@ -14,6 +14,7 @@ from SlicerUSSim.Command.options import check_places, ct_option, device_option, 
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.proposals import propose_option, require_seeds, seed_option, split_seeds, write_proposals
+from SlicerUSSim.Command.sheets import require_sheets, sheet_kind_option, sheets_option, write_sheets
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 
@@ -36,6 +37,8 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 @add_option
 @seed_option
 @propose_option
+@sheets_option
+@sheet_kind_option
 @click.option(
     "--overwrite", is_flag=True, help="Replace labels that were made by others, or edited since they were written."
 )
@@ -43,7 +46,7 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 def segment(
     mri: str, out: Path, settings: SegmentationSettings, mask: str | None, also: tuple[str, ...],
     organs: str | None, maps: tuple[str, ...], additions: tuple[str, ...], seeds: tuple[str, ...], propose: bool,
-    overwrite: bool, device: str | None,
+    sheets: Path | None, sheet_kinds: tuple[str, ...], overwrite: bool, device: str | None,
 ) -> None:  # fmt: skip
     """Segment an MRI of a head or a brain, or a CT (--ct), into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
@@ -57,6 +60,7 @@ def segment(
     _require_no_kept_mask(out, mri)
     if not overwrite:
         require_replaceable(out)
+    require_sheets(sheets, sheet_kinds, settings.contrast)
     split_also(also)
     split_seeds(seeds)
     masks = Additions.read(additions)
@@ -78,7 +82,10 @@ def segment(
         tell_all=True,
     )
     seconds = perf_counter() - start
-    added = masks.on(result.labels, result.tissue_names, has_brain_mask=has_brain_mask(settings.contrast))
+    labels, names = result.labels, result.tissue_names
+    if sheets is not None and isinstance(result, Segmentation):
+        labels, names = write_sheets(sheets, mri, volume, result, settings.contrast, sheet_kinds)
+    added = masks.on(labels, names, has_brain_mask=has_brain_mask(settings.contrast))
     beside = write_label_files(out, added.labels, TissueTable.brain().for_names(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")

@@ -44,12 +44,17 @@ class Kept:
 
 def mask_beside(mri_path: str | Path) -> Path:
     """The file of an MRI's brain mask: head.nii.gz has head.brain-mask.nrrd, a DICOM folder the same beside it."""
+    return named_beside(mri_path, "brain-mask.nrrd")
+
+
+def named_beside(mri_path: str | Path, ending: str) -> Path:
+    """The file beside an MRI's that has its name and another ending."""
     path = Path(mri_path)
     if path.is_dir():
         path = path.resolve()  # "." has no name
     name = path.name
     suffix = next((end for end in _SUFFIXES if not path.is_dir() and name.lower().endswith(end)), "")
-    return path.with_name(f"{name[: len(name) - len(suffix)]}.brain-mask.nrrd")
+    return path.with_name(f"{name[: len(name) - len(suffix)]}.{ending}")
 
 
 def is_kept_mask(path: Path) -> bool:
@@ -110,10 +115,15 @@ def _hash(array: np.ndarray) -> str:
     return digest.hexdigest()[:32]
 
 
-def _in_cache(path: Path, fingerprint: str) -> Path:
+def cache_folder() -> Path:
+    """Where things are kept that cannot be beside their MRI."""
     import platformdirs
 
-    return Path(platformdirs.user_cache_dir("ussim", appauthor=False)) / "brain-masks" / f"{fingerprint}-{path.name}"
+    return Path(platformdirs.user_cache_dir("ussim", appauthor=False))
+
+
+def _in_cache(path: Path, fingerprint: str) -> Path:
+    return cache_folder() / "brain-masks" / f"{fingerprint}-{path.name}"
 
 
 def _write(path: Path, mask: Volume, entries: dict[str, str]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import about_other_file, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
 from SlicerUSSim.Logic.mri.classification import FILTER_BLUR, class_names, classify
 from SlicerUSSim.Logic.mri.coregistration import aligned
@@ -68,9 +69,16 @@ class Segmentation:
     warnings: tuple[str, ...]
     #: The images in the box of the brain, on which lesions are proposed
     evidence: Evidence = field(repr=False)
+    #: (k, j, i) float32 the first image without its bias field, before the filter; 0 outside the brain
+    corrected: np.ndarray = field(repr=False)
     _filtered: np.ndarray = field(repr=False)
     #: (classes, voxels of the brain)
     _shares: np.ndarray = field(repr=False)
+
+    @property
+    def atlas(self) -> AtlasFit | None:
+        """The registered atlas by which tissues were led; None without one."""
+        return self.evidence.atlas
 
     @property
     def posteriors(self) -> np.ndarray:
@@ -290,6 +298,7 @@ def segment_mri(
             np.sqrt(np.diag(found.mixture.covariance)),
             atlas,
         ),
+        corrected=part.whole(np.where(part.inside, part.images[0].array + np.float32(above), np.float32(0.0))),
         _filtered=part.whole(filtered[0][0]),
         _shares=found.posteriors,
     )

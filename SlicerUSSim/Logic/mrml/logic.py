@@ -211,7 +211,8 @@ class UltrasoundSceneLogic:
         added = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=is_of_brain)
         write_labels(labels_node, added.labels, added.tissue_names, mri_node)
         mark_as_made(labels_node)
-        self.proposals.segmented(mri_node, result)
+        if isinstance(result, Segmentation):  # lesions are proposed on MRIs only
+            self.proposals.segmented(mri_node, result)
         self._segmented = _Segmented(
             labels_version(labels_node), added.labels, added.tissue_names,
             lambda: texture_below(result.texture(), mri, result.labels, added.labels), mri, is_of_brain,

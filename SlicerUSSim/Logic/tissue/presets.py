@@ -53,6 +53,8 @@ TISSUES: dict[str, Tissue] = {
                 f"cortex is below white matter, {_DUCK}", 0.20, 0.0, 0.08, _level("about 5 dB below white matter")),
         _tissue("white matter", 1541.0, f"brain, {_SZABO}", 1.607, f"brain, 1043 kg/m3 {_DENSITY}", 0.54, _PAPER_BEFORE,
                 0.33, 0.0, 0.15, _PAPER),
+        _tissue("corpus callosum", 1541.0, "as white matter", 1.607, "as white matter", 0.54, "as white matter",
+                0.20, 0.0, 0.09, _level("4 dB below white matter: dark between two bright lines, its surfaces")),
         _tissue("enhancing", 1550.0, "within the range for tumours, " + _DUCK, 1.63, "glioma, as for tumour", 0.60,
                 "between brain and tumour", 0.70, 0.0, 0.35, _level("vessels, choroid plexus: 7 dB above white")),
         _tissue("tumour", 1550.0, "within the range for tumours, " + _DUCK, 1.63, "slightly denser than brain", 0.70,
@@ -119,7 +121,8 @@ TISSUES: dict[str, Tissue] = {
 #: Colours of tissues in figures, label maps and segmentations: muted but distinguishable; red, green, blue, 0 to 1.
 _COLOURS = {
     "csf": (0.17, 0.37, 0.54), "grey matter": (0.55, 0.55, 0.55), "white matter": (0.91, 0.89, 0.85),
-    "leptomeninges": (0.78, 0.35, 0.33), "enhancing": (0.85, 0.64, 0.25), "tumour": (0.37, 0.62, 0.43),
+    "corpus callosum": (0.80, 0.76, 0.66), "leptomeninges": (0.78, 0.35, 0.33), "enhancing": (0.85, 0.64, 0.25),
+    "tumour": (0.37, 0.62, 0.43),
     "oedema": (0.72, 0.80, 0.42), "necrosis": (0.40, 0.30, 0.18), "cyst": (0.30, 0.72, 0.72),
     "cavity": (0.24, 0.24, 0.45), "haematoma": (0.48, 0.05, 0.16),
     "falx": (0.56, 0.42, 0.70), "blood": (0.75, 0.10, 0.10), "skull": (0.95, 0.93, 0.75), "bone": (0.95, 0.93, 0.75),

@@ -1,0 +1,71 @@
+"""The falx cerebri: a height field over the midsagittal plane, above the template's free edge."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.mri.coarse import largest_component
+from SlicerUSSim.Logic.mri.sheets.head import Head
+from SlicerUSSim.Logic.mri.sheets.heights import patches, settled
+from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+
+#: y and z of MNI152 in which the falx is looked for, how far from the midsagittal plane, and steps; mm
+_Y_MM, _Z_MM, _X_MM, _STEP_MM = (-112.0, 78.0), (-30.0, 90.0), 16.0, 1.0
+#: Free edge, (y, z) of MNI152 in mm, from the front; its last part is the straight sinus
+FREE_EDGE = (
+    (64, -14), (58, 2), (52, 14), (43, 26), (30, 36), (14, 42), (-4, 44), (-20, 40), (-34, 32), (-41, 22), (-46, 13),
+    (-60, 5), (-78, -3), (-96, -7),
+)  # fmt: skip
+_WINDOWS_MM, _SMOOTHINGS_MM = (6.0, 4.0, 3.0, 2.0), (8.0, 6.0, 5.0, 4.0)
+#: Distance to white matter counts up to this; fluid and enhancement count so many mm of it
+_FARTHEST_MM, _EVIDENCE_MM = 6.0, 1.5
+#: Distance to white matter in the fissure, after smoothing
+_FISSURE_MM, _FISSURE_SIGMA = 1.8, 2.0
+#: Thickness of the falx; and its confidence by its place in the head alone, reached so far above the free edge, mm
+_THICKNESS_MM, _SURE, _EDGE_MM = 1.0, 0.7, 6.0
+
+
+def falx(head: Head, use_intensity: bool = True) -> Surfels:
+    """Surfels 1 mm apart on the falx; without `use_intensity` by the distance to white matter alone."""
+    y, z = (np.arange(low, high + 1e-6, _STEP_MM) for low, high in (_Y_MM, _Z_MM))
+    x = np.arange(-_X_MM, _X_MM + 1e-6, _STEP_MM)
+    points = np.stack(np.meshgrid(z, y, x, indexing="ij")[::-1], axis=-1)
+    flat = head.from_atlas(points.reshape(-1, 3))
+
+    def sampled(array: np.ndarray) -> np.ndarray:
+        return head.at(flat, array).reshape(points.shape[:3])
+
+    distance = sampled(np.maximum(head.white_distance, 0.0))
+    inside = sampled((head.depth > -1.0).astype(np.float32)) > 0.5
+    evidence = sampled(_evidence(head)) if use_intensity else np.zeros_like(distance)
+    relief = np.minimum(distance, _FARTHEST_MM) + _EVIDENCE_MM * np.where(distance > 0.5, evidence, 0.0)
+    height, _ = settled(relief, x, inside, _WINDOWS_MM, _SMOOTHINGS_MM)
+
+    def on_sheet(array: np.ndarray) -> np.ndarray:
+        column = np.clip((height + _X_MM) / _STEP_MM, 0, len(x) - 1)
+        rows = np.indices(height.shape)
+        return ndimage.map_coordinates(array.astype(np.float32), [*rows, column], order=1)
+
+    wide = ndimage.gaussian_filter(on_sheet(distance), _FISSURE_SIGMA) > _FISSURE_MM
+    edge = np.interp(-y, [-corner[0] for corner in FREE_EDGE], [float(corner[1]) for corner in FREE_EDGE])
+    above = z[:, None] - edge[None]
+    # Far above the edge there is no callosum; white matter there is the rim of an enhancing vein.
+    kept = (wide | (above > _EDGE_MM)) & (above > 0.0) & (on_sheet(inside) > 0.5)
+    kept = largest_component(np.asarray(ndimage.binary_opening(kept, np.ones((3, 3)))))
+    place = head.from_atlas(np.stack([height, *np.broadcast_arrays(y[None], z[:, None])], axis=-1).reshape(-1, 3))
+    place = place.reshape(*height.shape, 3)
+    normal, area = patches(place)
+    seen = np.clip(on_sheet(evidence), 0.0, 1.0)
+    confidence = np.clip(above / _EDGE_MM, 0.3, 1.0) * (_SURE + (1.0 - _SURE) * seen)
+    return Surfels.of("falx", place[kept], normal[kept], _THICKNESS_MM, confidence[kept], area[kept])
+
+
+def _evidence(head: Head) -> np.ndarray:
+    """(k, j, i) float32: share of fluid, or with contrast agent enhancement by that of white to grey matter, 0 to 2.
+
+    Where the dura enhances, the fluid beside it is no evidence: it is where the falx is not.
+    """
+    if head.is_enhanced:
+        return np.clip((head.image.array - head.white) / (head.white - head.grey), 0.0, 2.0)
+    return head.fluid(head.image.array)

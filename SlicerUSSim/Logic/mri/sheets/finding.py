@@ -1,0 +1,198 @@
+"""Everything that ultrasound shows and classes of intensity do not: found in a patient's MRI, in one call."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.refinement import on_grid
+from SlicerUSSim.Logic.mri.segmentation import Segmentation
+from SlicerUSSim.Logic.mri.sheets.callosum import corpus_callosum
+from SlicerUSSim.Logic.mri.sheets.ependyma import ependyma
+from SlicerUSSim.Logic.mri.sheets.falx import falx
+from SlicerUSSim.Logic.mri.sheets.head import Head, require_contrast
+from SlicerUSSim.Logic.mri.sheets.kept import keep_sheets, key_of, read_kept_sheets
+from SlicerUSSim.Logic.mri.sheets.regions import ventricles
+from SlicerUSSim.Logic.mri.sheets.sulcal import sulci
+from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
+from SlicerUSSim.Logic.mri.sheets.tentorium import tentorium
+from SlicerUSSim.Logic.mri.sheets.vessels import choroid_plexus, vessels
+
+_log = logging.getLogger(__name__)
+
+#: Structures with a volume and the tissue that stands for each; label n + 1 of Sheets.structures is number n
+STRUCTURES = {"corpus callosum": "corpus callosum", "choroid plexus": "enhancing", "vessels": "enhancing"}
+#: What can be looked for
+ALL_KINDS = (*KINDS, *STRUCTURES)
+#: Those that only contrast agent shows
+_ENHANCING = ("choroid plexus", "vessels")
+#: A sulcus this near to the falx or the tentorium and as parallel to it is the fissure in which that lies, mm
+_SAME_MM, _SAME_COSINE = 2.0, 0.7
+#: About how long each step takes
+_SHARES = {
+    "head": 0.15, "ventricles": 0.12, "falx": 0.1, "tentorium": 0.05, "sulcus": 0.3, "ependyma": 0.08,
+    "corpus callosum": 0.05, "choroid plexus": 0.05, "vessels": 0.1,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Sheets:
+    """What was found in one patient's head."""
+
+    surfels: Surfels
+    #: uint8 on the MRI's grid: label n + 1 is number n of STRUCTURES, 0 elsewhere
+    structures: Volume
+    #: Lines for the user: what was found, and what was not looked for
+    notes: tuple[str, ...]
+
+    def masks(self) -> list[tuple[str, Volume, str]]:
+        """(tissue, mask, source) of every structure that was found, as add_tissues lays them over labels."""
+        result = []
+        for number, (name, tissue) in enumerate(STRUCTURES.items(), 1):
+            inside = self.structures.array == number
+            if inside.any():
+                result.append((tissue, self.structures.with_array(inside.astype(np.uint8)), name))
+        return result
+
+
+def find_sheets(
+    mri: Volume,
+    segmentation: Segmentation,
+    *,
+    contrast: str,
+    kinds: Iterable[str] = ALL_KINDS,
+    keep_at: Path | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Sheets:
+    """Sulci, falx, tentorium and walls of ventricles as surfels; corpus callosum, choroid plexus and vessels as labels.
+
+    Parameters
+    ----------
+    mri : the image from which `segmentation` was made.
+    segmentation : of the whole brain, led by the atlas.
+    contrast : of the MRI: "t1", "t1gd" or "t2".
+    kinds : what is looked for, of ALL_KINDS. Without contrast agent no vessels and no choroid plexus are found.
+    keep_at : file in which they are kept and from which they are read again; see kept.sheets_beside.
+    progress : called with the completed fraction, 0 to 1; may raise errors.Cancelled, which ends the search.
+
+    Raises SimulationError for an unknown kind or contrast, an MRI on another grid than the segmentation, and a
+    segmentation that no atlas led.
+    """
+    wanted = tuple(kinds)
+    require_findable(wanted, contrast)
+    require(wanted, f"nothing is to be found, expected some of: {', '.join(ALL_KINDS)}")
+    report = progress or (lambda share: None)
+    report(0.0)
+    key = key_of(mri, segmentation, contrast) if keep_at is not None else ""
+    kept = read_kept_sheets(keep_at, key, wanted) if keep_at is not None else None
+    if kept is not None:
+        surfels, array, place = kept
+        array = np.where(np.isin(array, [n for n, name in enumerate(STRUCTURES, 1) if name in wanted]), array, 0)
+        structures = Volume(array.astype(np.uint8), mri.ijk_to_ras, label_names=dict(enumerate(STRUCTURES, 1)))
+        surfels, first = surfels.of_kind(*(set(KINDS) & set(wanted))), f"the sheets are those kept in {place}"
+    else:
+        surfels, structures = _found(Head.of(mri, segmentation, contrast), mri, wanted, report)
+        first = keep_sheets(keep_at, key, wanted, surfels, structures.array) if keep_at is not None else ""
+    notes = [first] if first else []
+    if contrast != "t1gd" and set(_ENHANCING) & set(wanted):
+        notes.append("no vessels and no choroid plexus are looked for: only a T1 with contrast agent shows them")
+    notes += _lines(surfels, structures, wanted)
+    for line in notes:
+        _log.info("%s", line)
+    report(1.0)
+    return Sheets(surfels, structures, tuple(notes))
+
+
+def require_findable(kinds: Iterable[str], contrast: str) -> None:
+    """Raise SimulationError for a kind that is not in ALL_KINDS, and a contrast in which sheets are not found."""
+    for kind in kinds:
+        require(kind in ALL_KINDS, f"nothing of kind {kind!r} can be found, expected some of: {', '.join(ALL_KINDS)}")
+    require_contrast(contrast)
+
+
+def _found(head: Head, mri: Volume, wanted: tuple[str, ...], report: Callable[[float], None]) -> tuple[Surfels, Volume]:
+    """(surfels, structures) of the wanted kinds, each step after the ones it needs."""
+    done, start = 0.0, perf_counter()
+
+    def finished(step: str) -> None:
+        nonlocal done, start
+        done, now = min(done + _SHARES[step], 1.0), perf_counter()
+        _log.debug("sheets: %s in %.0f ms", step, (now - start) * 1e3)
+        start = now
+        report(done)
+
+    finished("head")
+    if not head.is_enhanced:
+        wanted = tuple(kind for kind in wanted if kind not in _ENHANCING)
+    found: dict[str, Surfels] = {}
+    masks: dict[str, np.ndarray] = {}
+    in_ventricles = np.zeros(head.brain.shape, bool)
+    if {"sulcus", "ependyma", *_ENHANCING} & set(wanted):
+        in_ventricles = ventricles(head)
+        finished("ventricles")
+    if {"falx", "tentorium", "vessels"} & set(wanted):  # the apex of the tentorium is below the falx
+        found["falx"] = falx(head)
+        finished("falx")
+    if {"tentorium", "vessels"} & set(wanted):
+        found["tentorium"] = tentorium(head, found["falx"])
+        finished("tentorium")
+    dura = Surfels.joined(list(found.values()))
+    if "sulcus" in wanted:
+        found["sulcus"] = _beside(sulci(head, in_ventricles), dura.of_kind(*(set(KINDS) & set(wanted))))
+        finished("sulcus")
+    if "ependyma" in wanted:
+        found["ependyma"] = ependyma(head, in_ventricles)
+        finished("ependyma")
+    if "corpus callosum" in wanted:
+        masks["corpus callosum"] = corpus_callosum(head)
+        finished("corpus callosum")
+    if set(_ENHANCING) & set(wanted):
+        masks["choroid plexus"] = choroid_plexus(head, in_ventricles)
+        finished("choroid plexus")
+    if "vessels" in wanted:
+        masks["vessels"] = vessels(head, dura, masks["choroid plexus"])
+        finished("vessels")
+    surfels = Surfels.joined([found[kind] for kind in KINDS if kind in found and kind in wanted])
+    return surfels, _labels(mri, head, {name: mask for name, mask in masks.items() if name in wanted})
+
+
+def _beside(sulci_: Surfels, dura: Surfels) -> Surfels:
+    """Sulci without those that are the fissure of the falx or the tentorium, which would be a second sheet there."""
+    if not len(dura) or not len(sulci_):
+        return sulci_
+    away, nearest = KDTree(dura.place).query(sulci_.place, distance_upper_bound=_SAME_MM, workers=-1)
+    is_near = np.isfinite(away)
+    cosine = np.zeros(len(sulci_), np.float32)
+    cosine[is_near] = np.abs((sulci_.normal[is_near] * dura.normal[np.asarray(nearest)[is_near]]).sum(axis=1))
+    return sulci_.chosen(cosine < _SAME_COSINE)
+
+
+def _labels(mri: Volume, head: Head, masks: dict[str, np.ndarray]) -> Volume:
+    labels = np.zeros(mri.array.shape, np.uint8)
+    for number, name in enumerate(STRUCTURES, 1):
+        if name in masks:
+            share = on_grid(head.image.with_array(masks[name].astype(np.float32)), mri)
+            labels[share > 0.5] = number
+    names = dict(enumerate(STRUCTURES, 1))
+    return Volume(labels, mri.ijk_to_ras, label_names=names)
+
+
+def _lines(surfels: Surfels, structures: Volume, wanted: tuple[str, ...]) -> list[str]:
+    lines = []
+    for kind in KINDS:
+        if kind in wanted:
+            part = surfels.of_kind(kind)
+            lines.append(f"{kind}: {len(part)} surfels, {part.area.sum() / 100.0:.0f} cm²")
+    for number, name in enumerate(STRUCTURES, 1):
+        count = int((structures.array == number).sum())
+        if name in wanted and (count or name == "corpus callosum"):
+            lines.append(f"{name}: {count * structures.voxel_ml:.1f} ml")
+    return lines

@@ -1,0 +1,208 @@
+"""The head in which sheets are looked for: its MRI around the brain, without bias field, and its place in the atlas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.errors import require, required
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
+from SlicerUSSim.Logic.mri.coarse import largest_component, widened
+from SlicerUSSim.Logic.mri.distances import distance_to
+from SlicerUSSim.Logic.mri.refinement import closed, on_grid
+from SlicerUSSim.Logic.mri.segmentation import Segmentation
+
+#: Voxels of the grid on which sheets are looked for; an image whose voxels differ by less than the share from the
+#: nearest of these stays as it is
+_FINEST_MM, _COARSEST_MM, _NEAR = 0.8, 1.0, 0.15
+#: Around the brain
+_MARGIN_MM = 10.0
+#: Across which sulci are closed, so that depth is counted from the hull of the brain
+_HULL_MM = 8.0
+#: Of the bias field that is continued beyond the brain, and the spacing at which that is done
+_FIELD_MM, _FIELD_STEP_MM = 8.0, 4.0
+_CONTRASTS = ("t1", "t1gd", "t2")
+
+
+def require_contrast(contrast: str) -> None:
+    """Raise SimulationError for a contrast in which sheets are not found."""
+    require(
+        contrast in _CONTRASTS,
+        f"sheets are not found in contrast {contrast!r}, expected one of: {', '.join(_CONTRASTS)} (in a FLAIR, "
+        "intensities do not rise or fall from CSF over grey to white matter)",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Head:
+    """What all sheets are found from. Intensities rise from CSF to grey to white matter: those of a T2 are negated."""
+
+    #: (k, j, i) float32 without the bias field, also around the brain
+    image: Volume
+    #: (k, j, i) True in the brain, on the grid of the image
+    brain: np.ndarray
+    #: Mean intensities of the tissues, and deviation by noise of each
+    csf: float
+    grey: float
+    white: float
+    noise: float
+    #: Whether vessels and dura enhance
+    is_enhanced: bool
+    atlas: AtlasFit
+
+    @classmethod
+    def of(cls, mri: Volume, segmentation: Segmentation, contrast: str) -> Head:
+        """Raises SimulationError for a FLAIR, for an MRI of another grid, and where no atlas led the segmentation."""
+        require_contrast(contrast)
+        require(
+            mri.array.shape == segmentation.labels.array.shape
+            and bool(np.allclose(mri.ijk_to_ras, segmentation.labels.ijk_to_ras, atol=1e-3)),
+            f"the MRI has {mri.array.shape} voxels (k, j, i) and its segmentation {segmentation.labels.array.shape}, "
+            "expected one grid",
+        )
+        atlas = required(
+            segmentation.atlas,
+            "sheets need the atlas, which did not lead this segmentation (see its notes), expected a whole brain and "
+            "nilearn",
+        )
+        sign = -1.0 if contrast == "t2" else 1.0
+        names = segmentation.tissue_names
+        means = [sign * float(segmentation.means[names.index(f)]) for f in ("csf", "grey matter", "white matter")]
+        require(
+            means[0] < means[1] < means[2],
+            f"CSF, grey and white matter have means {', '.join(f'{sign * m:.4g}' for m in means)}, expected the order "
+            f"of {contrast}",
+        )
+        box = _box(segmentation.brain.mask, _MARGIN_MM)
+        part = _part(mri, box)
+        inside = segmentation.brain.mask.array[box] > 0
+        image = part.with_array(np.float32(sign) * _without_field(part, segmentation.corrected[box], inside))
+        grid = _working_grid(image)
+        if grid is not image:
+            inside = on_grid(part.with_array(inside.astype(np.float32)), grid) > 0.5
+        noise = float(segmentation.standard_deviations[names.index("white matter")])
+        csf, grey, white = means
+        return cls(grid, inside, csf, grey, white, noise, contrast == "t1gd", atlas)
+
+    @property
+    def spacing(self) -> np.ndarray:
+        """(3,) mm along k, j, i."""
+        return self.image.spacing_mm[::-1]
+
+    @property
+    def voxel_mm3(self) -> float:
+        return float(np.prod(self.spacing))
+
+    @cached_property
+    def grid_to_atlas(self) -> np.ndarray:
+        """(4, 4) from i, j, k to millimetres of the atlas."""
+        return self.atlas.patient_to_atlas @ self.image.ijk_to_ras
+
+    @cached_property
+    def in_atlas(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(k, j, i) float32 x, y, z of every voxel in millimetres of the atlas."""
+        k, j, i = np.ogrid[tuple(map(slice, self.brain.shape))]
+        x, y, z = ((row[0] * i + row[1] * j + row[2] * k + row[3]).astype(np.float32) for row in self.grid_to_atlas[:3])
+        return x, y, z
+
+    @cached_property
+    def depth(self) -> np.ndarray:
+        """(k, j, i) float32 mm inside the hull of the brain; 0 or less outside."""
+        hull = closed(self.brain, _HULL_MM / float(self.spacing.mean()))
+        return -distance_to(hull, self.image.spacing_mm)
+
+    @cached_property
+    def white_distance(self) -> np.ndarray:
+        """(k, j, i) float32 mm to the white matter, 0 or less in it."""
+        smooth = self.smoothed(0.5)
+        inside = (smooth > 0.5 * (self.grey + self.white)) & (smooth < self.white + 4.0 * self.noise) & self.brain
+        return distance_to(largest_component(inside), self.image.spacing_mm)
+
+    def around(self, region: np.ndarray, margin_mm: float) -> tuple[Head, np.ndarray]:
+        """(the part of the head that holds a region (k, j, i), the region there)."""
+        box = _box(self.image.with_array(region.astype(np.uint8)), margin_mm)
+        return replace(self, image=_part(self.image, box), brain=self.brain[box]), region[box]
+
+    def smoothed(self, deviation_mm: float) -> np.ndarray:
+        """(k, j, i) float32 image after a Gaussian filter."""
+        return ndimage.gaussian_filter(self.image.array, deviation_mm / self.spacing)
+
+    def fluid(self, values: np.ndarray) -> np.ndarray:
+        """Share of CSF in voxels of some intensities, between grey matter and CSF."""
+        return np.clip((self.grey - values) / (self.grey - self.csf), 0.0, 1.0)
+
+    def at(self, points: np.ndarray, array: np.ndarray | None = None, order: int = 1) -> np.ndarray:
+        """(n,) values of an array (k, j, i), or of the image, at (n, 3) RAS mm; 0 outside."""
+        matrix = self.image.ras_to_ijk
+        index = (points @ matrix[:3, :3].T + matrix[:3, 3])[:, ::-1].T
+        source = self.image.array if array is None else array
+        return ndimage.map_coordinates(source, index, order=order, mode="constant", output=np.float32)
+
+    def to_ras(self, kji: np.ndarray) -> np.ndarray:
+        """(n, 3) RAS mm of (n, 3) places k, j, i."""
+        return kji[:, ::-1] @ self.image.ijk_to_ras[:3, :3].T + self.image.ijk_to_ras[:3, 3]
+
+    def to_atlas(self, points: np.ndarray) -> np.ndarray:
+        """(n, 3) millimetres of the atlas of (n, 3) RAS mm."""
+        return points @ self.atlas.patient_to_atlas[:3, :3].T + self.atlas.patient_to_atlas[:3, 3]
+
+    def from_atlas(self, points: np.ndarray) -> np.ndarray:
+        """(n, 3) RAS mm of (n, 3) millimetres of the atlas."""
+        back = np.linalg.inv(self.atlas.patient_to_atlas)
+        return points @ back[:3, :3].T + back[:3, 3]
+
+    def carried(self, array: np.ndarray) -> np.ndarray:
+        """(k, j, i) float32 values of an array on the atlas's grid, by the affine transform."""
+        source = Volume(array, np.linalg.inv(self.atlas.patient_to_atlas) @ self.atlas.atlas.t1.ijk_to_ras)
+        return on_grid(source, self.image)
+
+
+def _box(mask: Volume, margin_mm: float) -> tuple[slice, ...]:
+    found = ndimage.find_objects((mask.array > 0).astype(np.uint8))[0]
+    more = np.ceil(margin_mm / mask.spacing_mm[::-1]).astype(int)
+    return tuple(slice(max(side.start - int(n), 0), side.stop + int(n)) for side, n in zip(found, more, strict=True))
+
+
+def _part(volume: Volume, box: tuple[slice, ...]) -> Volume:
+    matrix = volume.ijk_to_ras.copy()
+    matrix[:3, 3] = (matrix @ [*(side.start for side in reversed(box)), 1.0])[:3]
+    return Volume(np.ascontiguousarray(volume.array[box], np.float32), matrix)
+
+
+def _without_field(part: Volume, corrected: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """(k, j, i) float32 image without the field that was taken out of the brain, continued beyond it."""
+    usable = inside & (part.array > np.percentile(part.array[inside], 5.0)) & (corrected != 0)
+    gain = np.divide(corrected, part.array, where=usable, out=np.zeros_like(corrected))
+    step = max(round(_FIELD_STEP_MM / float(part.spacing_mm.mean())), 1)
+    some = (slice(None, None, step),) * 3
+    sizes = _FIELD_MM / (step * part.spacing_mm[::-1])
+    amount = ndimage.gaussian_filter(usable[some].astype(np.float32), sizes, truncate=8.0)
+    smooth = ndimage.gaussian_filter(gain[some], sizes, truncate=8.0) / np.maximum(amount, 1e-9)
+    smooth = np.where(amount > 1e-6, smooth, np.median(gain[usable]))
+    around = part.array * widened(smooth, step, part.array.shape)
+    return np.where(inside, corrected, around).astype(np.float32)
+
+
+def _working_grid(image: Volume) -> Volume:
+    """The image on voxels of 0.8 to 1 mm, by cubic interpolation where its own are not such."""
+    import SimpleITK as sitk
+
+    spacing = np.clip(image.spacing_mm.min(), _FINEST_MM, _COARSEST_MM)
+    if bool((np.abs(image.spacing_mm / spacing - 1.0) < _NEAR).all()):
+        return image
+    source = image.to_sitk()
+    # Voxels finer than the grid's are averaged.
+    wide = np.where(image.spacing_mm < 0.8 * spacing, 0.4 * spacing, 0.0)
+    for axis, sigma in enumerate(wide):
+        if sigma > 0.0:
+            source = sitk.RecursiveGaussian(source, float(sigma), direction=axis)
+    size = np.floor((np.array(source.GetSize()) - 1) * image.spacing_mm / spacing).astype(int) + 1
+    resampled = sitk.Resample(
+        source, size.tolist(), sitk.Transform(), sitk.sitkBSpline, source.GetOrigin(), [float(spacing)] * 3,
+        source.GetDirection(), 0.0, sitk.sitkFloat32,
+    )  # fmt: skip
+    return Volume.from_sitk(resampled, image.name)

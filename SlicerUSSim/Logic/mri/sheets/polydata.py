@@ -1,0 +1,153 @@
+"""Surfels as a surface file that 3D Slicer and ParaView show: a small square for each."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.own_outputs import mark_of
+from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
+
+if TYPE_CHECKING:
+    from vtkmodules.vtkCommonDataModel import vtkPolyData
+
+_SUFFIXES = (".vtp", ".ply")
+#: Array of a .vtp and comment of a .ply with a hash of the surface, by which a file that nobody edited is known
+_MARK = "ussim_mark"
+#: Colours of the kinds, 0 to 255
+COLOURS = ((255, 140, 26), (0, 229, 255), (77, 107, 255), (57, 230, 57))
+
+
+def require_surfel_file(path: str | os.PathLike) -> None:
+    """Raise SimulationError unless surfels can be written under this name."""
+    require(
+        Path(path).suffix.lower() in _SUFFIXES,
+        f"{path}: sheets are written as {' or '.join(_SUFFIXES)}, expected such a name",
+    )
+
+
+def write_surfels(path: str | os.PathLike, surfels: Surfels) -> None:
+    """Write a .vtp, which read_surfels reads and Slicer shows in RAS, or a .ply with colours, in LPS as Slicer expects.
+
+    Raises SimulationError for another suffix, and if the file cannot be written.
+    """
+    require_surfel_file(path)
+    from vtkmodules.vtkIOPLY import vtkPLYWriter
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    is_ply = Path(path).suffix.lower() == ".ply"
+    data = as_polydata(surfels, (-1.0, -1.0, 1.0) if is_ply else (1.0, 1.0, 1.0))
+    with written_whole(path) as partial:
+        if is_ply:
+            writer = vtkPLYWriter()
+            writer.SetArrayName("colour")
+            writer.AddComment(f"{_MARK}={_mark_of(data)}")
+        else:
+            writer = vtkXMLPolyDataWriter()
+        writer.SetInputData(data)
+        writer.SetFileName(str(partial))
+        require(writer.Write() == 1, f"{path}: cannot be written")
+
+
+def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> vtkPolyData:
+    """A square of its area for each surfel, with every entry as an array of the cells; axes times `signs`."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    count = len(surfels)
+    first = np.cross(surfels.normal, np.eye(3, dtype=np.float32)[np.abs(surfels.normal).argmin(axis=1)])
+    first = first / np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
+    second = np.cross(surfels.normal, first)
+    half = (0.5 * np.sqrt(surfels.area))[:, None]
+    corners = [surfels.place + half * (a * first + b * second) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(np.stack(corners, 1).reshape(-1, 3) * np.array(signs, np.float32), deep=1))
+    cells = vtkCellArray()
+    offsets, places = np.arange(0, 4 * count + 1, 4), np.arange(4 * count)
+    cells.SetData(*(numpy_to_vtkIdTypeArray(array.astype(np.int64), deep=1) for array in (offsets, places)))
+    result = vtkPolyData()
+    result.SetPoints(points)
+    result.SetPolys(cells)
+    for entry in fields(surfels):
+        values = getattr(surfels, entry.name)
+        values = values * np.array(signs, np.float32) if values.ndim == 2 else values
+        array = numpy_to_vtk(np.ascontiguousarray(values), deep=1)
+        array.SetName(entry.name)
+        result.GetCellData().AddArray(array)
+    colours = numpy_to_vtk(np.repeat(np.array(COLOURS, np.uint8)[surfels.kind], 4, axis=0), deep=1)
+    colours.SetName("colour")
+    result.GetPointData().AddArray(colours)
+    result.GetPointData().SetActiveScalars("colour")
+    # SPACE is what Slicer looks for; without it, it takes a file to be in LPS.
+    space = "RAS" if signs[0] > 0 else "LPS"
+    for name, texts in (("SPACE", [space]), ("kinds", KINDS), (_MARK, [_mark_of(result)])):
+        strings = vtkStringArray()
+        strings.SetName(name)
+        for text in texts:
+            strings.InsertNextValue(text)
+        result.GetFieldData().AddArray(strings)
+    return result
+
+
+def require_own_surface(path: Path) -> None:
+    """Raise SimulationError for a file that exists and is not as write_surfels wrote it, before it is replaced."""
+    require(
+        not path.exists() or _is_own(path),
+        f"{path}: exists and is not as this program wrote it, so it is not replaced; choose another name, or remove it",
+    )
+
+
+def _is_own(path: Path) -> bool:
+    from vtkmodules.vtkIOPLY import vtkPLYReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    is_ply = path.suffix.lower() == ".ply"
+    reader = vtkPLYReader() if is_ply else vtkXMLPolyDataReader()
+    if not reader.CanReadFile(str(path)):
+        return False
+    reader.SetFileName(str(path))
+    reader.Update()
+    if isinstance(reader, vtkPLYReader):
+        comments = reader.GetComments()
+        texts = [comments.GetValue(n) for n in range(comments.GetNumberOfValues())]
+        return f"{_MARK}={_mark_of(reader.GetOutput())}" in texts
+    array = reader.GetOutput().GetFieldData().GetAbstractArray(_MARK)
+    return array is not None and array.GetValue(0) == _mark_of(reader.GetOutput())
+
+
+def _mark_of(data: vtkPolyData) -> str:
+    """A hash of the corners."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    corners = data.GetPoints()
+    return mark_of(vtk_to_numpy(corners.GetData()) if corners.GetNumberOfPoints() else np.zeros(0, np.float32))
+
+
+def read_surfels(path: str | os.PathLike) -> Surfels:
+    """The surfels of a .vtp by write_surfels. Raises SimulationError for a file that is none."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    require(Path(path).is_file(), f"{path}: no such file")
+    require(Path(path).suffix.lower() == ".vtp", f"{path}: expected a .vtp that `ussim segment --sheets` has written")
+    reader = vtkXMLPolyDataReader()
+    require(reader.CanReadFile(str(path)) == 1, f"{path}: is no VTK surface")
+    reader.SetFileName(str(path))
+    reader.Update()
+    cells = reader.GetOutput().GetCellData()
+    arrays = []
+    for entry in fields(Surfels):
+        array = cells.GetArray(entry.name)
+        require(
+            array is not None,
+            f"{path}: has no array {entry.name!r} of its cells, expected a file of `ussim segment --sheets`",
+        )
+        arrays.append(np.array(vtk_to_numpy(array)))
+    return Surfels(*arrays)
