@@ -32,7 +32,8 @@ PUBLIC = {
 }  # fmt: skip
 #: What users needed besides
 ALSO_PUBLIC = {
-    "AppearanceResult", "Membrane", "Preset", "Proposal", "Texture", "grow_lesion", "propose_lesions", "seed_of_pose",
+    "AppearanceResult", "CtSegmentation", "Membrane", "Preset", "Proposal", "Texture", "grow_lesion", "propose_lesions",
+    "seed_of_pose", "segment_ct",
 }  # fmt: skip
 
 
