@@ -10,7 +10,7 @@ from SlicerUSSim.Logic.verification.numpy_model.smoothed_borders import OF_BOTH,
 _DENSITY = f32(0.39894228)  # of the normal distribution at its centre
 _TAIL = (1.330274429, -1.821255978, 1.781477937, -0.356563782, 0.31938153)  # Abramowitz and Stegun, 26.2.17
 _VIEW, _THIN_SHARE = f32(3.5), 0.35  # voxels from a thin layer to where it is looked at; its share at its walls
-_MOST_TURNED = f32(0.85)  # cosine of the angle between estimates of a layer's normal
+MOST_TURNED = f32(0.85)  # cosine of the angle between estimates of a layer's normal
 _END_REACH = f32(28)  # voxels to the ends of the volume, along a plane
 _SAMPLES_APART = f32(20)  # voxels
 _WEIGHTS = f32([0.35, 0.7, 1.0, 0.7, 0.35])  # of samples along an axis
@@ -98,7 +98,7 @@ def _view(grid: SmoothGrid, voxel, before, behind, side, expected):
     flat = far * _normal_distribution(far)[1] - near * _normal_distribution(near)[1]
     curvature = f32(0.5) * (laplacian - flat) / np.maximum(gradient, f32(1e-3))
     ahead = -side[:, None] * found.towards
-    seen &= dot(ahead, expected) >= _MOST_TURNED
+    seen &= dot(ahead, expected) >= MOST_TURNED
     return seen, ahead, (middle + curvature) * sigma, thickness * sigma, curvature / sigma
 
 
@@ -106,7 +106,7 @@ def _thin_layer_borders(grid: SmoothGrid, voxel, towards, isolated: Borders, bef
     """Borders of thin layers, seen from before and from behind."""
     found = Borders.none(len(voxel))
     share = isolated.share
-    turned = np.abs(dot(isolated.towards, towards)) < _MOST_TURNED
+    turned = np.abs(dot(isolated.towards, towards)) < MOST_TURNED
     turned &= isolated.sigma * isolated.steepness > f32(0.06)
     some = np.flatnonzero((np.abs(share - f32(0.5)) >= f32(0.5 - _THIN_SHARE)) & ~turned)
     voxel, towards, share, before, behind = (part[some] for part in (voxel, towards, share, before, behind))
@@ -200,7 +200,7 @@ class FlatBorders:
             now = plane.at(some)
             at[some] += step[some, None] * _away_from_ends(self.dims, at[some], now)[0]
             found = self.widest(at[some], now.towards, before[some], behind[some], 1.0 if n == 3 else 6.0)
-            known = found.confidence >= 0.5
+            known = found.confidence > 0
             lost = some[~known]
             if n > 0:
                 plane.confidence[lost], active[lost] = 0, False

@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     ramp,
     sum8,
 )
-from SlicerUSSim.Logic.verification.numpy_model.flat_borders import FlatBorders, borders_of_layers
+from SlicerUSSim.Logic.verification.numpy_model.flat_borders import MOST_TURNED, FlatBorders, borders_of_layers
 from SlicerUSSim.Logic.verification.numpy_model.medium import HostMedium
 from SlicerUSSim.Logic.verification.numpy_model.smoothed_borders import Borders, SmoothGrid, border_place
 
@@ -88,6 +88,9 @@ class Labels:
         near.put(some, fine)
         towards = near.towards / np.maximum(length(near.towards), f32(1e-6))[:, None]
         layer = borders_of_layers(self.widest, halved[less], towards, widest, *sides).doubled()
+        # In most folds the widest Gaussian sees another direction than the nearest voxels.
+        is_fold = (widest.sigma * widest.steepness > f32(0.06)) & (dot(widest.towards, towards) < MOST_TURNED)
+        layer.confidence[is_fold] = 0
         # A layer among others, as in a fold, is not where the nearest voxels are. Those of a thin one know it less
         # well.
         off, turned = np.abs(layer.overshoot - near.overshoot), dot(layer.towards, towards)
