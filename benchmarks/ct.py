@@ -3,8 +3,8 @@
     python benchmarks/ct.py [--picture docs/images/ct-phantoms.png] [--only-picture]
 
 The table has the Dice coefficient of every tissue in voxels of 1 mm and of 0.7 x 0.7 x 2.5 mm, with 20 and 40 HU of
-noise; what the numbers alone cannot tell apart is one tissue (liver is muscle, an enhancing kidney is blood). The picture is
-made with rays (beam="ray").
+noise; what the numbers alone cannot tell apart is one tissue (liver is muscle, an enhancing kidney is blood). The
+picture is made with rays (beam="ray").
 """
 
 from __future__ import annotations

@@ -31,7 +31,9 @@ PUBLIC = {
     "optimize_appearance", "segment_mri", "similarity",
 }  # fmt: skip
 #: What users needed besides
-ALSO_PUBLIC = {"AppearanceResult", "Membrane", "Preset", "Texture", "seed_of_pose"}
+ALSO_PUBLIC = {
+    "AppearanceResult", "CtSegmentation", "Membrane", "Preset", "Texture", "seed_of_pose", "segment_ct",
+}  # fmt: skip
 
 
 def declared(package: str) -> dict[str, str]:
