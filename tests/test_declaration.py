@@ -432,8 +432,8 @@ def test_help_says_label_unit_what_it_does_and_the_default():
     for text in (
         "Gain [dB]: brightness of all echoes (default: the preset's, 0).",
         "(default: the preset's, --hard-labels).",
-        "--contrast [t1|t1gd|t2|flair] Contrast of the MRI, which gives the order of the tissues by intensity "
-        "(default: t1).",
+        "--contrast [t1|t1gd|t2|flair|ct] Contrast of the MRI, which gives the order of the tissues by intensity; ct: a "
+        "CT in Hounsfield units (default: t1).",
     ):
         assert text in said
     said = " ".join(ussim("optimize", "--help").output.split())
@@ -482,7 +482,7 @@ def test_options_go_before_the_preset_and_set_before_them(tmp_path):
         (["--gain", "loud"], "--gain: gain_db is 'loud', expected a number between -200 and 200"),
         (["--gain", "nan"], "--gain: gain_db is nan, expected a number between -200 and 200"),
         (["--seed", "3.0"], "--seed: seed is '3.0', expected a whole number between 0 and 4294967295"),
-        (["--contrast", "ct"], "--contrast: contrast is 'ct', expected one of t1, t1gd, t2, flair"),
+        (["--contrast", "pd"], "--contrast: contrast is 'pd', expected one of t1, t1gd, t2, flair, ct"),
         (["--set", "gain_db"], "--set is 'gain_db', expected NAME=VALUE, such as display.gain_db=3"),
         (["--set", "=3"], "--set is '=3', expected NAME=VALUE"),
         (["--set", "gain_db=3"], "--set: no parameter 'gain_db', expected display.gain_db"),
@@ -511,7 +511,7 @@ def test_an_option_that_is_wrong_is_one_line_that_names_it(options, message):
         (["optimize", "no.nii", "--sequence", "no.mha", "-o", "r.json", "--restarts", "many"],
          "--restarts: restarts is 'many', expected a whole number between 0 and 100"),
         (["demo", "--seed", "x"], "--seed: seed is 'x', expected a whole number"),
-        (["serve", "--contrast", "ct"], "--contrast: contrast is 'ct', expected one of t1, t1gd, t2, flair"),
+        (["serve", "--contrast", "pd"], "--contrast: contrast is 'pd', expected one of t1, t1gd, t2, flair, ct"),
     ],
 )  # fmt: skip
 def test_options_of_other_commands_are_checked_alike(command, message):

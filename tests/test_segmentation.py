@@ -305,7 +305,7 @@ def test_a_brain_of_which_two_thirds_are_white_matter_keeps_its_grey():
 @pytest.mark.parametrize(
     "change, message",
     [
-        (dict(contrast="ct"), "contrast is 'ct', expected one of t1, t1gd, t2, flair"),
+        (dict(contrast="pd"), "contrast is 'pd', expected one of t1, t1gd, t2, flair, ct"),
         (dict(classes=7), "classes is 7, expected 3 for contrast t1"),
         (dict(filter_radius=-1), "filter_radius is -1"),
         (dict(filter_epsilon=float("nan")), "filter_epsilon is nan"),

@@ -320,7 +320,10 @@ def test_segmentation_has_the_declared_defaults_and_refuses_when_it_updates():
             "segmentation: filter_epsilon is -1.0, expected a number between",
         ),
         (lambda: segmentation.SetClasses("3"), "classes is '3', expected 3 for contrast t1"),
-        (lambda: segmentation.SetContrast("ct"), "segmentation: contrast is 'ct', expected one of t1, t1gd, t2, flair"),
+        (
+            lambda: segmentation.SetContrast("pd"),
+            "segmentation: contrast is 'pd', expected one of t1, t1gd, t2, flair, ct",
+        ),
     ):
         time = segmentation.GetMTime()
         change()

@@ -100,6 +100,10 @@ def serve(
         LabelMapping.of(maps)
     if labels is not None and mri is None:
         require_no_mri_options(labels, "give an MRI, too, to segment it")
+    if contrast == CT and mri is None:
+        raise SimulationError(
+            "the contrast is ct (--ct), expected a CT; without a file the demo brain is shown, an MRI"
+        )
     if contrast == CT and others:
         raise SimulationError("--also is for an MRI, and the contrast is ct (--ct); leave it out")
     if igtl is not None:

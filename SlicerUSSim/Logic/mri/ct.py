@@ -218,10 +218,10 @@ def _body(sharp: np.ndarray, ct: Volume, mask: Volume | None, notes: list[str]) 
         return inside
     inside, parts = find_body(sharp, ct)
     if inside is None:
-        share = float(np.mean(sharp > -300))
+        share = float(np.mean(sharp > -250))
         require(
             False,
-            f"CT shows no body: {share * 100:.2g} % of it is denser than -300 HU, and no piece of it is 1 cm thick and "
+            f"CT shows no body: {share * 100:.2g} % of it is denser than -250 HU, and no piece of it is 1 cm thick and "
             "has 10 ml; give the patient's mask (--mask), or check the voxel size",
         )
         raise AssertionError

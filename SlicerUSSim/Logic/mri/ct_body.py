@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 #: Size of the cells in which the patient is looked for; what is thinner than four of them is not: couch, tubes, clothes
 CELL_MM = 2.5
 #: Above: tissue, and not foam; below: air, and not lung
-_TISSUE_HU, _AIR_HU = -300.0, -930.0
+_TISSUE_HU, _AIR_HU = -250.0, -930.0
 #: A part smaller than this share of the largest is no part of the patient
 _LEAST_PART = 0.02
 #: Share of air, from which on a space at the side of the image is outside; of lung that is cut by it 0.0

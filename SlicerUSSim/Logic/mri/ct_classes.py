@@ -1,9 +1,9 @@
 """Tissues of a CT by their Hounsfield units, with borders at half of the step between two tissues.
 
-A voxel on a border has the numbers of neither side: between air and skin lie those of lung and fat, between bone
-and muscle those of contrast agent. So borders are sharpened first: a voxel on a step belongs to the side on which half
-of the step puts it, as edges in CT are measured, and takes the number of that side beyond the step
-(after toggle mapping; Kramer and Bruckner, Pattern Recognition 7, 1975). What is in between afterwards is a tissue of its own.
+A voxel on a border has the numbers of neither side: between air and skin lie those of lung and fat, between bone and
+muscle those of contrast agent. So borders are sharpened first: a voxel on a step belongs to the side on which half of
+the step puts it, as edges in CT are measured, and takes the number of that side beyond the step (after toggle mapping;
+Kramer and Bruckner, Pattern Recognition 7, 1975). What is in between afterwards is a tissue of its own.
 """
 
 from __future__ import annotations
@@ -271,6 +271,7 @@ def _mark_skin(classes: np.ndarray, body: np.ndarray, ct: Volume, skin_mm: float
             wide[1:] |= narrow[:-1]
             wide[:-1] |= narrow[1:]
         outside = grown
-    classes[outside & (classes >= FAT) & (classes <= BLOOD)] = SKIN
+    gas = (classes == LUNG) | (classes == AIR)  # of a crease, or beside the couch
+    classes[outside & ((classes >= FAT) & (classes <= BLOOD) | gas)] = SKIN
     soft = classes == SOFT  # what is left of thicker skin
     classes[soft & largest_around(classes == SKIN) & ~largest_around(smallest_around(soft))] = SKIN
