@@ -19,12 +19,15 @@
 // With VARIED defined, the echoes are written in PARTS parts, each of which has the tissues given for it. So the image
 // of a pose is a linear combination of the parts for all amplitudes of these tissues (appearance.py).
 //
-// With ADDED defined, the echoes are added to those that are there: of the elevational side lobes, which have a record
-// and a coarser lattice of their own (side_lobes.py).
+// With LOBES defined, the echoes are those that elevational side lobes receive, and are added to those that are there.
+// Lobes have a record and a coarser lattice of their own (side_lobes.py), whose cells are wider than the strip of a
+// line: one work-item computes `together` lines, along the path of the one in their middle. A scatterer is weighted by
+// the diffraction pattern (diffraction.py) instead of the main beam's profile. Only segments in dark tissue count.
 //
 // Buffers: voxels, segments as in raytracing.cl; texture uint [k][j][i] (one element without TEXTURE); sites float2
-// [label], the share of cells with a scatterer, in 1/65536, and its amplitude; re, im float [2 traced line +
-// side][stride]; with VARIED also [part] before these, and part_of int [label], -1 for a tissue in none.
+// [label], the share of cells with a scatterer, in 1/65536, and its amplitude, with LOBES behind them whether it is dark; re, im float [2 traced line +
+// side][stride]; with VARIED also [part] before these, and part_of int [label], -1 for a tissue in none; with LOBES
+// lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the distance of the last column [LOBE_DEPTHS].
 
 #include "common.clh"
 
@@ -40,12 +43,14 @@
 #ifndef CHUNK
 #define CHUNK BLOCK
 #endif
-#ifdef ADDED
-#define STORE_ECHO(to, value) to += value
-#else
-#define STORE_ECHO(to, value) to = value
-#endif
 #define PART (CHUNK + 2)  // one extra sample at either end: echoes lie between samples
+#ifdef LOBES
+#define PIECE_BLOCK (4 * BLOCK)  // samples over which gains are assumed linear
+#define LOBE_PARAMETERS , __global const float *lobes, int together
+#else
+#define PIECE_BLOCK BLOCK
+#define LOBE_PARAMETERS
+#endif
 
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
@@ -57,23 +62,84 @@ typedef struct {
   float narrow0, narrow1;                // elevational exponent of two per mm^2 at the near end, and its change
   float gain0, gain1;                    // amplitude as an exponent of two, likewise
   float line0, line1;                    // 1 / distance of traced lines, likewise
+  float edge;                            // of the strip that begins there: distance re its width
   float bend;                            // 1 / (2 radius) of the surfaces of equal range
   float depth0, slope;
   float from_mm, to_mm;  // path lengths whose scatterers belong to this piece
   int u, v, w, first;
+#ifdef LOBES
+  float reach;  // largest elevational distance
+  float path0;  // path length at the near end
+  __global const float *lobes;
+#endif
 } Piece;
+
+#ifdef LOBES
+// Where echoes are added: the strips of `lines` traced lines from `line` on, `last` samples from `first` on.
+typedef struct {
+  __global float *re, *im;
+  int stride, line, traced, lines, first, last;
+} Echoes;
+#else
+typedef float4 Echoes;  // [PARTS][PART] left re, im, right re, im
+#endif
 
 // The hash uses cell indices by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
+#ifdef LOBES
+// The depth of the table for a path length: its row, and the part by which it is deeper.
+inline float row_of_lobes(__constant const Acquisition *acquisition, float path, int *row) {
+  const float place = clamp(path / acquisition->depth_mm * (LOBE_DEPTHS - 1), 0.0f, LOBE_DEPTHS - 1.001f);
+  *row = (int)place;
+  return place - *row;
+}
+
+// The distance from the axis at which lobes are cut off.
+inline float reach_of_lobes(__constant const Acquisition *acquisition, __global const float *lobes, float path) {
+  int row;
+  const float deeper = row_of_lobes(acquisition, path, &row);
+  __global const float *ends = lobes + LOBE_DEPTHS * LOBE_DISTANCES + row;
+  return blend(ends[0], ends[1], deeper);
+}
+
+// The square root of their power per millimetre at a distance from the axis.
+inline float lobe_at(__constant const Acquisition *acquisition, __global const float *lobes, float path,
+                     float distance) {
+  const float at = distance / reach_of_lobes(acquisition, lobes, path) * (LOBE_DISTANCES - 1);
+  if (at >= LOBE_DISTANCES - 1) return 0.0f;
+  int row;
+  const float deeper = row_of_lobes(acquisition, path, &row);
+  const int column = (int)at;
+  __global const float *near = lobes + row * LOBE_DISTANCES + column, *far = near + LOBE_DISTANCES;
+  return blend(blend(near[0], near[1], at - column), blend(far[0], far[1], at - column), deeper);
+}
+
+// Adds an echo of this amplitude to the two edges of its strip. Work-items add to disjoint samples.
+inline void add_echo(Echoes *to, int part, int bin, float between, float right, float strength, float re, float im) {
+  const float place = right * to->lines;
+  const int strip = min((int)place, to->lines - 1);
+  const float to_right = (place - strip) * strength, to_left = strength - to_right;
+  const int left = 2 * (part * to->traced + to->line + strip) * to->stride + LINE_PAD + to->first + bin;
+  for (int after = 0; after < 2; after++) {
+    if (bin + after < 0 || bin + after >= to->last) continue;
+    const float share = after ? between : 1.0f - between;
+    to->re[left + after] += share * to_left * re;
+    to->im[left + after] += share * to_left * im;
+    to->re[left + to->stride + after] += share * to_right * re;
+    to->im[left + to->stride + after] += share * to_right * im;
+  }
+}
+#else
 // Adds an echo of this amplitude to one part.
-inline void add_echo(float4 *sum, int bin, float between, float right, float strength, float re, float im) {
+inline void add_echo(Echoes *sum, int part, int bin, float between, float right, float strength, float re, float im) {
   const float to_right = right * strength, to_left = strength - to_right;
   const float4 echo = (float4)(to_left, to_left, to_right, to_right) * (float4)(re, im, re, im);
   // Bins start at -1, so that the first and last sample of the chunk receive contributions from scatterers beyond them.
-  sum[bin + 1] += echo * (1.0f - between);
-  sum[bin + 2] += echo * between;
+  sum[part * PART + bin + 1] += echo * (1.0f - between);
+  sum[part * PART + bin + 2] += echo * between;
 }
+#endif
 
 // The label of a scatterer at fraction (fx, fy, fz) of the cell of voxels at `corner`, which contains a border or the
 // membrane; `random` are random bits of the scatterer. With TEXTURE, also its gain.
@@ -119,14 +185,16 @@ inline float gain_on_membrane(__constant const Acquisition *acquisition, __globa
          exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 
-// Three passes over a batch, each without unpredictable branches: vectors of all cells; labels of the scatterers that
-// contribute; their echoes, one after the other.
+// Four passes over a batch, each without unpredictable branches: places of all cells' scatterers, in vectors; phases,
+// amplitudes and voxels of those that contribute, in vectors too; their labels; their echoes, one after the other.
 inline void scatter_batch(__constant const Acquisition *acquisition, __global const ushort *voxels,
                           __global const uint *texture, __global const float *sites, const Piece *piece,
                           const int *cell_u, const uint *row_key, const float *row_v, const float *row_w, int count,
-                          float4 *sum VARIED_PARAMETERS) {
+                          Echoes *sum VARIED_PARAMETERS) {
   const float cell = acquisition->cell_mm, grain = cell / 1024.0f;
+#ifndef LOBES
   const float cutoff2 = 0.5f * LOG2_E * acquisition->beam_cutoff * acquisition->beam_cutoff;
+#endif
   const float inverse_sample = 1.0f / acquisition->sample_mm;
   const int nx = acquisition->dims[0], ny = acquisition->dims[1];
   const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, acquisition->dims[2] - 1.001f);
@@ -134,15 +202,13 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   const uint step_u = axis_step(u);
   const float3 d = piece->direction, l = piece->lateral, e = piece->elevational;
 
-  float part_[BATCH], right_[BATCH], re_[BATCH], im_[BATCH], fx_[BATCH], fy_[BATCH], fz_[BATCH];
-  int bin_[BATCH], voxel_[BATCH];
-  uint random_[BATCH];
+  uint key_[BATCH];
+  float pu_[BATCH], pv_[BATCH], pw_[BATCH], t_[BATCH], r2_[BATCH], depth_[BATCH], right_[BATCH];
   ushort chosen[BATCH + 1];
   int n = 0;
   for (int begin = 0; begin < count; begin += LANES) {
     const intn cells = LOAD_LANES(cell_u + begin);
     const uintn key = hash_mixn((LOAD_LANES(row_key + begin) + TO_UINTN(cells) * step_u) ^ acquisition->seed);
-    const uintn random = hash_mixn(key + 0x3C6EF372u);  // 16 bits for its existence, one for its sign, 15 for its label
     // (The seed is not added to the index: seeds would then give the same scatterers, shifted by cells.)
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
@@ -154,22 +220,60 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn aside_l = pu * l.x + pv * l.y + pw * l.z;
     const floatn aside_e = pu * e.x + pv * e.y + pw * e.z;
     const floatn t = (along - piece->low) * piece->span;
-    const floatn right = 0.5f + aside_l * (piece->line0 + t * piece->line1);
-    const floatn r2 = aside_e * aside_e * (piece->narrow0 + t * piece->narrow1);
+    const floatn right = piece->edge + aside_l * (piece->line0 + t * piece->line1);
     const floatn range = along + aside_l * aside_l * piece->bend;
     const floatn depth = piece->depth0 + range * piece->slope;
-    const floatn place = depth * inverse_sample;
-    const floatn bin = floor(place);
-    const intn bins = TO_INTN(bin) - piece->first;
-    const intn counts = (right >= 0.0f) & (right < 1.0f) & (r2 <= cutoff2) & (bins >= -1) & (bins < CHUNK) &
+    const intn bins = TO_INTN(floor(depth * inverse_sample)) - piece->first;
+#ifdef LOBES
+    const floatn r2 = fabs(aside_e);
+    const intn near = r2 <= piece->reach;
+#else
+    const floatn r2 = aside_e * aside_e * (piece->narrow0 + t * piece->narrow1);
+    const intn near = r2 <= cutoff2;
+#endif
+    const intn counts = (right >= 0.0f) & (right < 1.0f) & near & (bins >= -1) & (bins < CHUNK) &
                         (along >= piece->from_mm) & (along < piece->to_mm) & (LANE_INDEX < count - begin);
     SPREAD(int, counts_, counts);
     for (int j = 0; j < LANES; j++) {
       chosen[n] = begin + j;
       n += counts_[j] & 1;
     }
+    STORE_LANES(key, key_ + begin);
+    STORE_LANES(pu, pu_ + begin);
+    STORE_LANES(pv, pv_ + begin);
+    STORE_LANES(pw, pw_ + begin);
+    STORE_LANES(t, t_ + begin);
+    STORE_LANES(r2, r2_ + begin);
+    STORE_LANES(depth, depth_ + begin);
+    STORE_LANES(right, right_ + begin);
+  }
+
+  // Those that contribute come first. (The rest of the last vector is computed too, from other scatterers.)
+  for (int i = 0; i < n; i++) {
+    const int j = chosen[i];
+    key_[i] = key_[j];
+    pu_[i] = pu_[j];
+    pv_[i] = pv_[j];
+    pw_[i] = pw_[j];
+    t_[i] = t_[j];
+    r2_[i] = r2_[j];
+    depth_[i] = depth_[j];
+    right_[i] = right_[j];
+  }
+  float part_[BATCH], re_[BATCH], im_[BATCH], fx_[BATCH], fy_[BATCH], fz_[BATCH];
+  int bin_[BATCH], voxel_[BATCH];
+  for (int begin = 0; begin < n; begin += LANES) {
+    // 16 bits for its existence, one for its sign, 15 for its label
+    const uintn random = hash_mixn(LOAD_LANES(key_ + begin) + 0x3C6EF372u);
+    const floatn pu = LOAD_LANES(pu_ + begin), pv = LOAD_LANES(pv_ + begin), pw = LOAD_LANES(pw_ + begin);
+    const floatn depth = LOAD_LANES(depth_ + begin), place = depth * inverse_sample, bin = floor(place);
+    const floatn gain = piece->gain0 + LOAD_LANES(t_ + begin) * piece->gain1;
+#ifdef LOBES
+    const floatn amplitude = exp2_fast(clamp(gain, (floatn)(-100.0f), (floatn)(100.0f)));
+#else
     const floatn amplitude =
-        exp2_fast(clamp(piece->gain0 + t * piece->gain1 - r2, (floatn)(-100.0f), (floatn)(100.0f)));
+        exp2_fast(clamp(gain - LOAD_LANES(r2_ + begin), (floatn)(-100.0f), (floatn)(100.0f)));
+#endif
     const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
     turn(depth * acquisition->cycles_per_mm, &cosine, &sine);
@@ -178,12 +282,11 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn vy = clamp(at.y + pu * rj.x + pv * rj.y + pw * rj.z, (floatn)(0.0f), (floatn)(voxel_top.y));
     const floatn vz = clamp(at.z + pu * rk.x + pv * rk.y + pw * rk.z, (floatn)(0.0f), (floatn)(voxel_top.z));
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
-    STORE_LANES(bins, bin_ + begin);
+    STORE_LANES(TO_INTN(bin) - piece->first, bin_ + begin);
     STORE_LANES(place - bin, part_ + begin);
-    STORE_LANES(right, right_ + begin);
     STORE_LANES(echo * cosine, re_ + begin);
     STORE_LANES(echo * -sine, im_ + begin);
-    STORE_LANES(random, random_ + begin);
+    STORE_LANES(random, key_ + begin);
     STORE_LANES((iz * ny + iy) * nx + ix, voxel_ + begin);
     STORE_LANES(vx - TO_FLOATN(ix), fx_ + begin);
     STORE_LANES(vy - TO_FLOATN(iy), fy_ + begin);
@@ -194,7 +297,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   ushort mixed[BATCH + 1];
   int several = 0;
   for (int i = 0; i < n; i++) {
-    const int word = voxels[voxel_[chosen[i]]];
+    const int word = voxels[voxel_[i]];
     label_[i] = word & LABEL_MASK;
     mixed[several] = i;
 #ifdef TEXTURE
@@ -204,31 +307,34 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 #endif
   }
   for (int k = 0; k < several; k++) {
-    const int i = mixed[k], j = chosen[i], here = voxel_[j];
+    const int i = mixed[k], here = voxel_[i];
     float gain = 1.0f;
-    label_[i] = drawn_label(acquisition, voxels + here, texture + here, fx_[j], fy_[j], fz_[j], random_[j], &gain);
+    label_[i] = drawn_label(acquisition, voxels + here, texture + here, fx_[i], fy_[i], fz_[i], key_[i], &gain);
 #ifdef TEXTURE
-    re_[j] *= gain;
-    im_[j] *= gain;
+    re_[i] *= gain;
+    im_[i] *= gain;
 #endif
   }
 
-  for (int i = 0; i < n; i++) {
-    const int j = chosen[i], b = bin_[j], label = label_[i];
-    if (label == MEMBRANE_LABEL) {
-      const float gain = gain_on_membrane(acquisition, voxels + voxel_[j], piece, fx_[j], fy_[j], fz_[j]);
-      re_[j] *= gain;
-      im_[j] *= gain;
-    }
-#ifdef VARIED
-    if (part_of[label] < 0) continue;
-    float4 *to = sum + part_of[label] * PART;
-#else
-    float4 *to = sum;
+#ifdef LOBES
+  const float length = 1.0f / piece->span;
 #endif
+  for (int i = 0; i < n; i++) {
+    const int label = label_[i];
     const float2 site = vload2(label, sites);
-    const float strength = (random_[j] >> 16) + 0.5f < site.x ? site.y : 0.0f;
-    add_echo(to, b, part_[j], right_[j], strength, re_[j], im_[j]);
+    float strength = (key_[i] >> 16) + 0.5f < site.x ? site.y : 0.0f;
+#ifdef LOBES
+    if (strength == 0.0f) continue;
+    strength *= lobe_at(acquisition, piece->lobes, piece->path0 + t_[i] * length, r2_[i]);
+#endif
+    if (label == MEMBRANE_LABEL)
+      strength *= gain_on_membrane(acquisition, voxels + voxel_[i], piece, fx_[i], fy_[i], fz_[i]);
+    int part = 0;
+#ifdef VARIED
+    part = part_of[label];
+    if (part < 0) continue;
+#endif
+    add_echo(sum, part, bin_[i], part_[i], right_[i], strength, re_[i], im_[i]);
   }
 }
 
@@ -236,7 +342,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 // start, `low` and `high` are the piece's ends along it, `radius_l` and `radius_e` how far it reaches to either side.
 inline void scatter_piece(__constant const Acquisition *acquisition, __global const ushort *voxels,
                           __global const uint *texture, __global const float *sites, const Piece *piece, float3 start,
-                          float low, float high, float radius_l, float radius_e, float4 *sum VARIED_PARAMETERS) {
+                          float low, float high, float radius_l, float radius_e, Echoes *sum VARIED_PARAMETERS) {
   int cell_u[BATCH + LANES];
   uint row_key[BATCH + LANES];
   float row_v[BATCH + LANES], row_w[BATCH + LANES];
@@ -322,20 +428,32 @@ __attribute__((intel_vec_len_hint(1)))
 __kernel void scatter(__constant const Acquisition *acquisition, __global const ushort *voxels,
                       __global const uint *texture, __global const float *sites, __global const Segment *segments,
                       __global const int *segment_counts, __global float *re, __global float *im,
-                      int stride VARIED_PARAMETERS) {
-  int chunk = get_global_id(0), line = get_global_id(1);
-  int first = chunk * CHUNK;
-  float4 sum[PARTS * PART];  // left re, im, right re, im
+                      int stride VARIED_PARAMETERS LOBE_PARAMETERS) {
+  const int chunk = get_global_id(0), first = chunk * CHUNK;
+#ifdef LOBES
+  const int left_line = get_global_id(1) * together, lines = min(together, acquisition->traced_lines - left_line);
+  const int line = left_line + lines / 2;
+  Echoes echoes = {re, im, stride, left_line, acquisition->traced_lines, lines, first, 0};
+  echoes.last = min(CHUNK, acquisition->samples - first);
+  Echoes *sum = &echoes;
+#else
+  const int line = get_global_id(1), left_line = line, lines = 1;
+  Echoes sum[PARTS * PART];
   for (int i = 0; i < PARTS * PART; i++) sum[i] = (float4)(0.0f);
+#endif
   const float depth_low = (first - 1) * acquisition->sample_mm, depth_high = (first + CHUNK) * acquisition->sample_mm;
-  // Widths and gains are assumed linear over BLOCK samples, of which CHUNK is a part, so that the image does not depend
-  // on the split of the work.
-  const int block = first / BLOCK * BLOCK;
-  const float block_low = (block - 1) * acquisition->sample_mm, block_high = (block + BLOCK) * acquisition->sample_mm;
+  // Widths and gains are assumed linear over a block, of which CHUNK is a part, so that the image does not depend on the
+  // split of the work.
+  const int block = first / PIECE_BLOCK * PIECE_BLOCK;
+  const float block_low = (block - 1) * acquisition->sample_mm;
+  const float block_high = (block + PIECE_BLOCK) * acquisition->sample_mm;
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int index = 0; index < count; index++) {
     __global const Segment *segment = segments + line * MAX_SEGMENTS + index;
+#ifdef LOBES
+    if (sites[2 * MAX_TISSUES + segment->label] == 0.0f) continue;
+#endif
     Piece piece;
     piece.first = first;
     piece.slope = segment->depth_per_mm;
@@ -369,8 +487,12 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
 
     // Widths and gains are assumed linear between the two ends of a piece, so it must be short compared with the beam's
     // waist, and end at most twice as far from the apex as it begins: lines are apart in proportion to that distance.
-    const float waist = fmin(acquisition->transmit_rayleigh, acquisition->elevation_rayleigh);
-    const int pieces = max(1, (int)ceil((segment_high - segment_low) / (0.4f * waist)));
+#ifdef LOBES
+    const float longest = acquisition->transmit_rayleigh;
+#else
+    const float longest = 0.4f * fmin(acquisition->transmit_rayleigh, acquisition->elevation_rayleigh);
+#endif
+    const int pieces = max(1, (int)ceil((segment_high - segment_low) / longest));
     const float to_apex = segment->path_mm + (acquisition->linear ? 1e6f : acquisition->apex_radius_mm);
     float high = segment_low;
     for (int n = 0; n < pieces;) {
@@ -388,10 +510,22 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       piece.low = low;
       piece.span = 1.0f / fmax(high - low, 1e-6f);
       piece.bend = acquisition->linear ? 0.0f : 0.5f / fmax(acquisition->apex_radius_mm + path_low, 1.0f);
-      piece.line0 = 1.0f / apart_low;
-      piece.line1 = 1.0f / apart_high - piece.line0;
+      piece.edge = (line - left_line + 0.5f) / lines;
+      piece.line0 = 1.0f / (lines * apart_low);
+      piece.line1 = 1.0f / (lines * apart_high) - piece.line0;
+#ifdef LOBES
+      // The table has the square root of the power per millimetre, where the main beam has 1 / (sqrt(pi) sigma_e).
+      const float tall_low = 0.56418958f, tall_high = tall_low;
+      piece.lobes = lobes;
+      piece.path0 = path_low;
+      const float radius_e = piece.reach = fmax(reach_of_lobes(acquisition, lobes, path_low),
+                                                reach_of_lobes(acquisition, lobes, path_high));
+#else
+      const float tall_low = sigma_low.y, tall_high = sigma_high.y;
+      const float radius_e = acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y);
       piece.narrow0 = 0.5f * LOG2_E / (sigma_low.y * sigma_low.y);
       piece.narrow1 = 0.5f * LOG2_E / (sigma_high.y * sigma_high.y) - piece.narrow0;
+#endif
       // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
       // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak.
       const float gain = log2(segment->weight * segment->attenuation * acquisition->speckle_scale * 2.50662827f);
@@ -401,28 +535,31 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float4 tube_high = tube_after(vload4(0, segment->tube), high);
       const float band_low = LOG2_E * gain_of_band(acquisition, loss_low);
       const float band_high = LOG2_E * gain_of_band(acquisition, loss_high);
-      piece.gain0 = gain + band_low - decay * low + 0.5f * log2(sigma_low.x / (sigma_low.y * tube_low.x * tube_low.z)) -
+      piece.gain0 = gain + band_low - decay * low + 0.5f * log2(sigma_low.x / (tall_low * tube_low.x * tube_low.z)) -
                     log2(apart_low);
       piece.gain1 = gain + band_high - decay * high +
-                    0.5f * log2(sigma_high.x / (sigma_high.y * tube_high.x * tube_high.z)) - log2(apart_high) -
+                    0.5f * log2(sigma_high.x / (tall_high * tube_high.x * tube_high.z)) - log2(apart_high) -
                     piece.gain0;
 
       // Off the axis of a curved array the same range is reached slightly earlier.
-      const float radius_l = 0.5f * fmax(apart_low, apart_high), early = piece.bend * radius_l * radius_l;
+      const float lines_aside = max(line - left_line, left_line + lines - 1 - line) + 0.5f;
+      const float radius_l = lines_aside * fmax(apart_low, apart_high), early = piece.bend * radius_l * radius_l;
       const float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
       if (begin >= end) continue;
-      scatter_piece(acquisition, voxels, texture, sites, &piece, start, begin, end, radius_l,
-                    acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum VARIED_ARGUMENTS);
+      scatter_piece(acquisition, voxels, texture, sites, &piece, start, begin, end, radius_l, radius_e,
+                    sum VARIED_ARGUMENTS);
     }
   }
+#ifndef LOBES
   for (int part = 0; part < PARTS; part++) {
     const float4 *echoes = sum + part * PART + 1;
     const int left = 2 * (part * (int)get_global_size(1) + line) * stride + LINE_PAD + first, right = left + stride;
     for (int i = 0; i < CHUNK; i++) {
-      STORE_ECHO(re[left + i], echoes[i].x);
-      STORE_ECHO(im[left + i], echoes[i].y);
-      STORE_ECHO(re[right + i], echoes[i].z);
-      STORE_ECHO(im[right + i], echoes[i].w);
+      re[left + i] = echoes[i].x;
+      im[left + i] = echoes[i].y;
+      re[right + i] = echoes[i].z;
+      im[right + i] = echoes[i].w;
     }
   }
+#endif
 }

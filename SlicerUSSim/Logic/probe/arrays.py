@@ -7,6 +7,7 @@ Probe frame (millimetres): origin at the centre of the probe face, +x lateral (l
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -43,7 +44,8 @@ class Probe(Declared):
     product of a transmit beam focused once at `focus_mm` and a receive beam that is focused at every depth, with an
     aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both ways at one
     depth.
-    Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
+    Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number. With
+    `receive_apodization` the receive beam is wider, as much as the main lobe of its aperture (`widening`).
 
     >>> from dataclasses import replace
     >>> from SlicerUSSim.Logic.probe import PROBES
@@ -76,8 +78,13 @@ class Probe(Declared):
         note="The receive aperture grows with depth up to the full aperture",
     )  # fmt: skip
     receive_apodization: float = parameter(
-        0.0, "Apodisation", "Weights of the receive aperture, for its side lobes: 0 uniform, 1 Hann", bounds=(0, 1),
-        note="Power of the side lobes re the main beam: -27 dB with 0, -32 dB with 0.5",
+        0.0, "Apodisation", "Weights of the receive aperture: 0 uniform, 1 Hann; lower side lobes, a wider beam",
+        bounds=(0, 1),
+    )  # fmt: skip
+    clutter_db: float = parameter(
+        -38.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, re the main beam",
+        unit="dB", bounds=(-100, 0),
+        note="They and the side lobes fill cysts; spread evenly over 24 wavelengths x f-number to either side",
     )  # fmt: skip
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
@@ -244,7 +251,7 @@ class Probe(Declared):
 
     def receive_beam(self) -> tuple[float, float]:
         """(least sigma in mm, sigma per mm of depth) of the one-way lateral receive beam, focused at every depth."""
-        per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
+        per_f_number = MAIN_LOBE * widening(self.receive_apodization) * self.wavelength_mm / FWHM_PER_SIGMA
         return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
 
     def transmit_waist(self) -> tuple[float, float, float]:
@@ -271,6 +278,23 @@ class Probe(Declared):
     def to_dict(self) -> dict:
         """Plain values, with the kind of probe under "kind"; probe_from_dict reads it back."""
         return {"kind": self.kind, **asdict(self)}
+
+
+def apodized_pattern(u: np.ndarray, apodization: float) -> np.ndarray:
+    """The amplitude, 1 at u = 0, at u wavelengths x f-number from the axis of an aperture with weights, at its focus.
+
+    The weights are 1 - a + a cos(pi x)^2 for x from -1/2 to 1/2: the transform of a constant and of a cosine.
+    """
+    half = 0.5 * apodization
+    return np.sinc(u) + 0.5 * half / (1.0 - half) * (np.sinc(u - 1.0) + np.sinc(u + 1.0))
+
+
+@cache
+def widening(apodization: float) -> float:
+    """The -6 dB width of the main lobe of an aperture with weights (apodized_pattern) re that of a uniform one."""
+    u = np.linspace(0.5, 1.1, 1201)  # half widths: 0.603 with 0, 1 with 1
+    uniform, weighted = (float(np.interp(-0.5, -apodized_pattern(u, a), u)) for a in (0.0, apodization))
+    return weighted / uniform
 
 
 def _own(label: str, tip: str, unit: str, bounds: tuple[float, float], shown: Shown) -> Any:

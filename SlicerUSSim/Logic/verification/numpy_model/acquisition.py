@@ -7,7 +7,7 @@ it takes names and number formats, but no values.
 from __future__ import annotations
 
 import numpy as np
-from scipy import special
+from scipy import optimize, special
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.settings import SimulationSettings
@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.verification.numpy_model.medium import HostMedium
 
 _DESIGN_SPEED_M_S = 1540.0  # for wavelengths and focus widths of an array
 _FWHM = np.sqrt(8.0 * np.log(2.0))  # of a Gaussian, in standard deviations
+_HALF_OF_SINC = 0.6033545644016142  # sin(pi x) = pi x / 2
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -59,8 +60,8 @@ def acquisition_record(
         "transmit_sigma": transmit,
         "transmit_focus": probe.focus_mm,
         "transmit_rayleigh": _rayleigh_mm(probe, transmit),
-        "receive_sigma_min": _one_way_sigma(probe, probe.receive_f_number),
-        "receive_sigma_slope": _one_way_sigma(probe, 1.0 / probe.aperture_mm),
+        "receive_sigma_min": _receive_sigma(probe, probe.receive_f_number),
+        "receive_sigma_slope": _receive_sigma(probe, 1.0 / probe.aperture_mm),
         "elevation_sigma": elevational / np.sqrt(2.0),
         "elevation_focus": probe.elevation_focus_mm,
         "elevation_rayleigh": _rayleigh_mm(probe, elevational),
@@ -103,7 +104,7 @@ def _automatic_density(probe: Probe) -> float:
         return sigma * np.hypot(1.0, (depth - focus) / _rayleigh_mm(probe, sigma))
 
     transmit = beam(probe.focus_mm, probe.aperture_mm)
-    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
+    receive = _receive_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
     across = beam(probe.elevation_focus_mm, probe.elevation_aperture_mm) / np.sqrt(2.0)
     axial = 1e-3 * _DESIGN_SPEED_M_S * _FWHM / (4.0 * np.pi * probe.fractional_bandwidth * probe.frequency_mhz)
     cell = (2.0 * np.pi) ** 1.5 * axial * across / np.sqrt(transmit**-2.0 + receive**-2.0)
@@ -213,6 +214,16 @@ def _one_way_sigma(probe: Probe, f_number: float) -> float:
     return 1.21 * _wavelength_mm(probe) * f_number / _FWHM
 
 
+def _receive_sigma(probe: Probe, f_number: float) -> float:
+    """Of an aperture of the weights 1 - a / 2 + a / 2 cos(2 pi x): as much wider as its pattern at half its peak."""
+    half = 0.5 * probe.receive_apodization
+
+    def above_half(u: float) -> float:
+        return (1.0 - half) * (np.sinc(u) - 0.5) + 0.5 * half * (np.sinc(u - 1.0) + np.sinc(u + 1.0))
+
+    return _one_way_sigma(probe, f_number) * optimize.brentq(above_half, 0.5, 1.1) / _HALF_OF_SINC
+
+
 def _rayleigh_mm(probe: Probe, sigma_mm: float) -> float:
     return 2.0 * np.pi * sigma_mm * sigma_mm / _wavelength_mm(probe)
 
@@ -222,7 +233,7 @@ def _traced_lines(probe: Probe, settings: SimulationSettings) -> tuple[int, int]
     depth = np.linspace(0.0, probe.depth_mm, 65)
     waist = _one_way_sigma(probe, max(probe.focus_mm / probe.aperture_mm, 0.5))
     transmit = waist * np.hypot(1.0, (depth - probe.focus_mm) / _rayleigh_mm(probe, waist))
-    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
+    receive = _receive_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
     lateral = (transmit**-2.0 + receive**-2.0) ** -0.5
     _, spacing, radius = _geometry(probe)
     apart = spacing * (np.ones_like(depth) if isinstance(probe, LinearProbe) else radius + depth)

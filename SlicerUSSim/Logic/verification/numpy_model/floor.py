@@ -3,85 +3,71 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import integrate, special
 
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, hash_mix
+from SlicerUSSim.Logic.verification.numpy_model.lobes import lateral_table
 
-_COARSER = 3.0
+_COARSER = 4.0
 #: Samples with one width of the lobes
 _TOGETHER = 16
 _WAVELENGTH = 1.54  # mm at 1 MHz
-_SIGMA = 1.21 / np.sqrt(8.0 * np.log(2.0))  # of a one-way beam, in wavelengths x f-number
 
 
-def elevational_lobes(acquisition: np.ndarray, probe: Probe) -> np.ndarray:
-    """The record for what elevational side lobes receive: a wider beam, a coarser lattice with its own scatterers."""
+def lobe_lattice(acquisition: np.ndarray) -> np.ndarray:
+    """The record for what elevational side lobes receive: a coarser lattice with its own scatterers."""
     record = acquisition.copy()
-    power, sigma = lobes(0.0)
-    focus, rayleigh = float(acquisition["elevation_focus"]), float(acquisition["elevation_rayleigh"])
-    waist, growth = (
-        float(acquisition["elevation_sigma"]),
-        sigma * _WAVELENGTH / (probe.frequency_mhz * probe.elevation_aperture_mm),
-    )
-    # waist^2 (1 + ((z - focus) / rayleigh)^2) + (growth z)^2, about where it is least
-    divergence = np.hypot(waist / rayleigh, growth)
-    at = focus * (waist / rayleigh / divergence) ** 2
-    width = np.sqrt(waist**2 * (1.0 + ((at - focus) / rayleigh) ** 2) + (growth * at) ** 2)
-    record["elevation_sigma"], record["elevation_focus"] = width, at
-    record["elevation_rayleigh"] = width / divergence
     record["cell_mm"] = _COARSER * float(acquisition["cell_mm"])
     record["seed"] = hash_mix(np.array([acquisition["seed"] ^ np.uint32(0x51DE10BE)], np.uint32))[0]
-    record["speckle_scale"] = float(acquisition["speckle_scale"]) * _COARSER**1.5 * np.sqrt(power)
+    record["speckle_scale"] = float(acquisition["speckle_scale"]) * _COARSER**1.5
     return record
 
 
-def lobes(apodization: float) -> tuple[float, float]:
-    """(power, sigma in wavelengths x f-number) of a Gaussian with the pattern's power beyond 2 and 3 of these.
+def quiet_labels(tissues: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """(labels,) bool: less than a quarter of the variance that echoes of the volume come from on average."""
+    variance = tissues["scatterer_variance"].astype(float)
+    echoes = variance[labels.ravel()]
+    return variance < 0.25 * (echoes**2).sum() / max(echoes.sum(), 1e-30)
 
-    The pattern of weights 1 - a + a cos^2 = (1 - a / 2) + (a / 2) cos(2 pi x) is sinc functions at -1, 0 and 1.
-    """
-    half = 0.5 * apodization
 
-    def pattern(u: float) -> float:
-        shifted = np.sinc(u - 1.0) + np.sinc(u + 1.0)
-        return float((np.sinc(u) * ((1.0 - half) * np.sinc(u) + 0.5 * half * shifted) / (1.0 - half)) ** 2)
-
-    def power(low: float) -> float:
-        return sum(integrate.quad(pattern, a, a + 1.0)[0] for a in np.arange(low, 64.0))
-
-    near, far = power(2.0) / power(0.0), power(3.0) / power(0.0)
-    widths = np.geomspace(0.3, 4.0, 200_001)
-    ratios = special.erfc(3.0 / widths) / special.erfc(2.0 / widths)
-    sigma = float(np.interp(far / near, ratios, widths))
-    return near / float(special.erfc(2.0 / sigma)), sigma
+def lines_of_a_path(acquisition: np.ndarray, probe: Probe) -> int:
+    """Neighbouring lines within three sigmas of the beam in the middle of the image, whose lobes have one path."""
+    middle = 0.5 * probe.depth_mm
+    apart = float(probe.line_distance_mm(middle)) / int(acquisition["lateral_rays"])
+    return min(max(round(3.0 * float(probe.beam_sigma_mm(middle)[0]) / apart), 1), 9)
 
 
 def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray) -> np.ndarray:
-    """(scan lines, samples) complex64: with a broad Gaussian of the lines, in quadrature and of the lobes' power."""
-    beam = Beam(acquisition)
-    power, sigma = lobes(probe.receive_apodization)
+    """(scan lines, samples) complex64: with the lobes in quadrature, and the power of the main beam before."""
+    beam, (table, powers) = Beam(acquisition), lateral_table(probe)
     lines, samples = scanned.shape
-    result = scanned.astype(np.complex128)
+    result = np.empty(scanned.shape, np.complex128)
+    line = np.arange(lines)
     for first in range(0, samples, _TOGETHER):
         s = f32((first + 0.5 * _TOGETHER) * acquisition["sample_mm"])
         apart = float(beam.line_distance(s)) * int(acquisition["lateral_rays"])
         main = float(beam.lateral_sigma(s))
-        receive = max(float(acquisition["receive_sigma_min"]), float(acquisition["receive_sigma_slope"]) * float(s))
-        wide = sigma / _SIGMA * receive
-        rest = np.sqrt(max(wide**2 - main**2, 0.25 * wide**2))
-        step = max(1, int(2.0 * main / apart))
-        reach = int(np.ceil(float(acquisition["beam_cutoff"]) * rest / (step * apart)))
-        places = np.arange(-reach, reach + 1)
-        weights = np.exp(-0.5 * (places * step * apart / rest) ** 2)
-        weights *= np.sqrt(power * np.hypot(main, rest) / main) / weights.sum()
-        block = scanned[:, first : first + _TOGETHER]
-        for place, weight in zip(places * step, weights, strict=True):
-            to = slice(max(-place, 0), lines - max(place, 0))
-            of = slice(max(place, 0), lines + min(place, 0))
-            if abs(place) < lines:
-                result[to, first : first + _TOGETHER] += 1j * weight * block[of]
+        unit = _WAVELENGTH / probe.frequency_mhz * max(probe.receive_f_number, float(s) / probe.aperture_mm)
+        together = int(np.clip(int(0.8 * unit / apart), -(-lines // CONSTANTS["LOBE_NODES"]), lines))
+        nodes = -(-lines // together)
+        averaging = (np.arange(nodes)[:, None] == line // together) / together
+        steps = np.arange(together)
+        correlation = np.exp(-0.25 * ((steps[:, None] - steps) * apart / main) ** 2)
+        distance = np.abs(np.subtract.outer(np.arange(nodes), np.arange(nodes)))
+        weights = table.at(np.full(distance.shape, float(s)), distance * together * apart / unit)
+        weights *= np.sqrt(together * apart / unit / correlation.mean()) * np.where(distance % 4 < 2, 1.0, -1.0)
+        of_nodes = weights @ averaging @ scanned[:, first : first + _TOGETHER]
+        place = (line + 0.5) / together - 0.5
+        before = np.floor(place).astype(int)
+        part = (place - before)[:, None]
+        left, right = (of_nodes[np.clip(before + n, 0, nodes - 1)] for n in (0, 1))
+        between = ((1.0 - part) * left + part * right) / np.sqrt((1.0 - part) ** 2 + part**2)
+        power = np.interp(float(s), np.linspace(0.0, probe.depth_mm, len(powers)), powers)
+        result[:, first : first + _TOGETHER] = (scanned[:, first : first + _TOGETHER] + 1j * between) / np.sqrt(
+            1 + power
+        )
     return result.astype(np.complex64)
 
 
