@@ -25,9 +25,10 @@
 // the diffraction pattern (diffraction.py) instead of the main beam's profile. Only segments in dark tissue count.
 //
 // Buffers: voxels, segments as in raytracing.cl; texture uint [k][j][i] (one element without TEXTURE); sites float2
-// [label], the share of cells with a scatterer, in 1/65536, and its amplitude, with LOBES behind them whether it is dark; re, im float [2 traced line +
-// side][stride]; with VARIED also [part] before these, and part_of int [label], -1 for a tissue in none; with LOBES
-// lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the distance of the last column [LOBE_DEPTHS].
+// [label], the share of cells with a scatterer, in 1/65536, and its amplitude, with LOBES behind them whether it is
+// dark; re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and part_of int [label], -1
+// for a tissue in none; with LOBES lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the distance of the last
+// column [LOBE_DEPTHS].
 
 #include "common.clh"
 
@@ -271,8 +272,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 #ifdef LOBES
     const floatn amplitude = exp2_fast(clamp(gain, (floatn)(-100.0f), (floatn)(100.0f)));
 #else
-    const floatn amplitude =
-        exp2_fast(clamp(gain - LOAD_LANES(r2_ + begin), (floatn)(-100.0f), (floatn)(100.0f)));
+    const floatn amplitude = exp2_fast(clamp(gain - LOAD_LANES(r2_ + begin), (floatn)(-100.0f), (floatn)(100.0f)));
 #endif
     const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
@@ -442,8 +442,8 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
   for (int i = 0; i < PARTS * PART; i++) sum[i] = (float4)(0.0f);
 #endif
   const float depth_low = (first - 1) * acquisition->sample_mm, depth_high = (first + CHUNK) * acquisition->sample_mm;
-  // Widths and gains are assumed linear over a block, of which CHUNK is a part, so that the image does not depend on the
-  // split of the work.
+  // Widths and gains are assumed linear over a block, of which CHUNK is a part, so that the image does not depend on
+  // the split of the work.
   const int block = first / PIECE_BLOCK * PIECE_BLOCK;
   const float block_low = (block - 1) * acquisition->sample_mm;
   const float block_high = (block + PIECE_BLOCK) * acquisition->sample_mm;
@@ -518,8 +518,8 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float tall_low = 0.56418958f, tall_high = tall_low;
       piece.lobes = lobes;
       piece.path0 = path_low;
-      const float radius_e = piece.reach = fmax(reach_of_lobes(acquisition, lobes, path_low),
-                                                reach_of_lobes(acquisition, lobes, path_high));
+      const float radius_e = piece.reach =
+          fmax(reach_of_lobes(acquisition, lobes, path_low), reach_of_lobes(acquisition, lobes, path_high));
 #else
       const float tall_low = sigma_low.y, tall_high = sigma_high.y;
       const float radius_e = acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y);

@@ -2,11 +2,11 @@
 // (docs/physics.md#side-lobes-and-ring-down).
 //
 // One work-item computes LANES samples of all scan lines; global size (samples / LANES). The lobes are as broad as
-// several beams, so neighbouring lines are averaged to nodes, which are convolved with the square root of the power that
-// the diffraction pattern has at each distance; what comes out is interpolated between nodes. Lines have the main beam
-// already. Lobes of an aperture have alternating signs: on average they do not interfere with the main beam, to which
-// they are added in quadrature, and add up to little along a wall, for which signs change every two nodes. Main beam and
-// lobes together have the power of the main beam before.
+// several beams, so neighbouring lines are averaged to nodes, which are convolved with the square root of the power
+// that the diffraction pattern has at each distance; what comes out is interpolated between nodes. Lines have the main
+// beam already. Lobes of an aperture have alternating signs: on average they do not interfere with the main beam, to
+// which they are added in quadrature, and add up to little along a wall, for which signs change every two nodes. Main
+// beam and lobes together have the power of the main beam before.
 //
 // Buffers: lobes float [LOBE_DEPTHS][LOBE_DISTANCES] of diffraction.py, and behind them the lobes' power [LOBE_DEPTHS];
 // re, im float [scan line][stride].
@@ -47,7 +47,8 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
   // (Neighbouring nodes have one sign as often as the other, and their correlation does not matter.)
   const float fall = 0.25f * LOG2_E * (apart / main_beam) * (apart / main_beam);
   float mean_power = 1.0f;
-  for (int n = 1; n < step; n++) mean_power += 2.0f * (1.0f - (float)n / step) * exp2_scalar(fmax(-fall * n * n, -100.0f));
+  for (int n = 1; n < step; n++)
+    mean_power += 2.0f * (1.0f - (float)n / step) * exp2_scalar(fmax(-fall * n * n, -100.0f));
   mean_power /= step;
   const float per_node = step * apart / unit, scale = sqrt(per_node / mean_power);
   const float place = fmin(s / acquisition->depth_mm, 1.0f) * (LOBE_DEPTHS - 1);

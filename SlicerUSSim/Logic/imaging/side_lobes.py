@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 #: How many times larger, along each axis, cells of the lattice are for elevational lobes, which are as much wider
 COARSER = 4.0
-#: Elevational lobes are computed where tissue scatters less than this part of the typical power: elsewhere they are lost
-#: in its own echoes
+#: Elevational lobes are computed where tissue scatters less than this part of the typical power: elsewhere its own
+#: echoes hide them
 DARK = 0.25
 #: Elevational lobes follow one path for as many traced lines as are within so many sigmas of the beam
 _TOGETHER_SIGMAS, _MOST_TOGETHER = 3.0, 9

@@ -82,7 +82,7 @@ class Probe(Declared):
         bounds=(0, 1),
     )  # fmt: skip
     clutter_db: float = parameter(
-        -38.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, re the main beam",
+        -38.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, re its own",
         unit="dB", bounds=(-100, 0),
         note="They and the side lobes fill cysts; spread evenly over 24 wavelengths x f-number to either side",
     )  # fmt: skip

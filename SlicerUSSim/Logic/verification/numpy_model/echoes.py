@@ -117,10 +117,8 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     start = segment["start"][order]
     d, side, e = (segment[name][order] for name in ("direction", "lateral", "elevational"))
     aside = (max(strips.before, strips.lines - 1 - strips.before) + 0.5) * apart.max()
-    if strips.table is None:
-        height = acquisition["beam_cutoff"] * elevation.max()
-    else:
-        height = strips.table.end(path).max()
+    widest = acquisition["beam_cutoff"] * elevation.max()
+    height = widest if strips.table is None else strips.table.end(path).max()
     cells = _cells_of_box(acquisition, start, d, side, e, low, high, aside, height)
 
     key = hash_mix((cells.astype(np.uint32) * _AXIS_STEPS[order]).sum(axis=1, dtype=np.uint32) ^ acquisition["seed"])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, hash_mix
 from SlicerUSSim.Logic.verification.numpy_model.lobes import lateral_table
 
 _COARSER = 4.0
+_MOST_NODES = 128
 #: Samples with one width of the lobes
 _TOGETHER = 16
 _WAVELENGTH = 1.54  # mm at 1 MHz
@@ -34,14 +34,13 @@ def quiet_labels(tissues: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 def lines_of_a_path(acquisition: np.ndarray, probe: Probe) -> int:
     """Neighbouring lines within three sigmas of the beam in the middle of the image, whose lobes have one path."""
-    middle = 0.5 * probe.depth_mm
-    apart = float(probe.line_distance_mm(middle)) / int(acquisition["lateral_rays"])
-    return min(max(round(3.0 * float(probe.beam_sigma_mm(middle)[0]) / apart), 1), 9)
+    beam, middle = Beam(acquisition), f32(0.5 * probe.depth_mm)
+    return min(max(round(3.0 * float(beam.lateral_sigma(middle) / beam.line_distance(middle))), 1), 9)
 
 
 def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray) -> np.ndarray:
     """(scan lines, samples) complex64: with the lobes in quadrature, and the power of the main beam before."""
-    beam, (table, powers) = Beam(acquisition), lateral_table(probe)
+    beam, (table, powers) = Beam(acquisition), lateral_table(acquisition, probe)
     lines, samples = scanned.shape
     result = np.empty(scanned.shape, np.complex128)
     line = np.arange(lines)
@@ -50,7 +49,7 @@ def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray
         apart = float(beam.line_distance(s)) * int(acquisition["lateral_rays"])
         main = float(beam.lateral_sigma(s))
         unit = _WAVELENGTH / probe.frequency_mhz * max(probe.receive_f_number, float(s) / probe.aperture_mm)
-        together = int(np.clip(int(0.8 * unit / apart), -(-lines // CONSTANTS["LOBE_NODES"]), lines))
+        together = int(np.clip(int(0.8 * unit / apart), -(-lines // _MOST_NODES), lines))
         nodes = -(-lines // together)
         averaging = (np.arange(nodes)[:, None] == line // together) / together
         steps = np.arange(together)

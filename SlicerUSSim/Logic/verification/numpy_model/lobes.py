@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import integrate, special
 
-from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 
-_ROWS, _COLUMNS = CONSTANTS["LOBE_DEPTHS"], CONSTANTS["LOBE_DISTANCES"]
+_ROWS, _COLUMNS = 33, 33  # depths and distances
 _WAVELENGTH = 1.54  # mm at 1 MHz
 
 
@@ -46,31 +46,31 @@ class Table:
         return np.where(place < _COLUMNS - 1, (1.0 - deeper) * within(row) + deeper * within(row + 1), 0.0)
 
 
-def lateral_table(probe: Probe) -> tuple[Table, np.ndarray]:
+def lateral_table(acquisition: np.ndarray, probe: Probe) -> tuple[Table, np.ndarray]:
     """(the lateral lobes by distance in wavelengths x receive f-number; their power by depth, with the clutter)."""
-    rows, powers, half = [], [], 0.5 * probe.receive_apodization
-    farthest = CONSTANTS["LOBE_STEP"] * (_COLUMNS - 1)
+    beam, rows, powers, half = Beam(acquisition), [], [], 0.5 * probe.receive_apodization
+    farthest = 0.75 * (_COLUMNS - 1)
     clutter = np.exp(probe.clutter_db * np.log(10.0) / 10.0)
     for depth in _depths(probe):
         unit = _wavelength(probe) * max(probe.receive_f_number, depth / probe.aperture_mm)
         x, transmitted = _uniform(probe, probe.aperture_mm, probe.focus_mm, depth)
         u = x / unit
         received = (1.0 - half) * np.sinc(u) + 0.5 * half * (np.sinc(u - 1.0) + np.sinc(u + 1.0))
-        excess = _excess(x, transmitted**2 * received**2, float(probe.beam_sigma_mm(depth)[0]))
+        excess = _excess(x, transmitted**2 * received**2, float(beam.lateral_sigma(depth)))
         density = _averaged(u, excess, np.linspace(0.0, farthest, _COLUMNS), 1.0)
         rows.append(np.sqrt(density + 0.5 * clutter / farthest))
         powers.append(clutter + excess[0])
     return Table(probe.depth_mm, np.array(rows), np.full(_ROWS, farthest)), np.array(powers)
 
 
-def elevational_table(probe: Probe) -> Table:
+def elevational_table(acquisition: np.ndarray, probe: Probe) -> Table:
     """The elevational lobes by distance in millimetres."""
-    rows, ends = [], []
+    beam, rows, ends = Beam(acquisition), [], []
     for depth in _depths(probe):
         lobe = _wavelength(probe) * depth / probe.elevation_aperture_mm
         end = max(5.0 * lobe, 26.0 * _wavelength(probe))
         x, amplitude = _uniform(probe, probe.elevation_aperture_mm, probe.elevation_focus_mm, depth)
-        excess = _excess(x, amplitude**4, float(probe.beam_sigma_mm(depth)[1]))
+        excess = _excess(x, amplitude**4, float(beam.elevation_sigma(depth)))
         window = max(lobe, end / (_COLUMNS - 1))
         rows.append(np.sqrt(_averaged(x, excess, np.linspace(0.0, end, _COLUMNS), window)))
         ends.append(end)

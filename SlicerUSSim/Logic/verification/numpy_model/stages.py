@@ -89,7 +89,7 @@ def scatterers(frame: TwinFrame) -> None:
         quiet = quiet_labels(frame.tissues, frame.labels.given)[frame.segments["label"]]
         frame.traced += lobe_lines(
             lobe_lattice(record), *of_all, frame.segments[quiet], frame.segment_lines[quiet],
-            elevational_table(frame.probe), lines_of_a_path(record, frame.probe),
+            elevational_table(record, frame.probe), lines_of_a_path(record, frame.probe),
         )  # fmt: skip
 
 
