@@ -5,6 +5,7 @@ J. W. Goodman, Introduction to Fourier Optics, sections 4.2 and 4.4 (docs/physic
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -62,18 +63,18 @@ def lobes_of(probe: Probe) -> Lobes:
     tails = _tails(x, pattern, sigma[0])
     clutter = 10.0 ** (probe.clutter_db / 10.0)
     lateral = [
-        _density(*row, _STEP * scale * column, scale) * scale + 0.5 * clutter / (_STEP * (_DISTANCES - 1))
-        for row, scale in zip(tails, unit, strict=True)
+        _density(tail, _STEP * scale * column, scale) * scale + 0.5 * clutter / (_STEP * (_DISTANCES - 1))
+        for tail, scale in zip(tails, unit, strict=True)
     ]
 
     lobe = probe.wavelength_mm * depth / probe.elevation_aperture_mm
     reach = np.maximum(_REACH_LOBES * lobe, _REACH_WAVELENGTHS * probe.wavelength_mm)
     x, amplitude = _focused_once(probe.wavelength_mm, probe.elevation_aperture_mm, probe.elevation_focus_mm, depth)
     elevational = [
-        _density(*row, far / (_DISTANCES - 1) * column, max(wide, far / (_DISTANCES - 1)))
-        for row, far, wide in zip(_tails(x, amplitude**4, sigma[1]), reach, lobe, strict=True)
+        _density(tail, far / (_DISTANCES - 1) * column, max(wide, far / (_DISTANCES - 1)))
+        for tail, far, wide in zip(_tails(x, amplitude**4, sigma[1]), reach, lobe, strict=True)
     ]
-    power = [clutter + float(row[1][0]) for row in tails]
+    power = [clutter + float(tail(np.zeros(1))[0]) for tail in tails]
     return Lobes(*(np.array(values, np.float32) for values in (np.sqrt(lateral), power, np.sqrt(elevational), reach)))
 
 
@@ -86,19 +87,31 @@ def _focused_once(wavelength: float, aperture: float, focus: float, depth: np.nd
     return step[:, None] * np.arange(_PADDED // 2), np.abs(field).astype(float)
 
 
-def _tails(x: np.ndarray, pattern: np.ndarray, sigma: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For each depth distances, and by how much the power of a pattern beyond them exceeds that of a Gaussian.
+def _tails(x: np.ndarray, pattern: np.ndarray, sigma: np.ndarray) -> list[Callable[[np.ndarray], np.ndarray]]:
+    """For each depth a function of distances: by how much a pattern has more power beyond them than a Gaussian.
 
-    `sigma` (depths,) is that of the Gaussian's amplitude. The excess falls with the distance, to 0.
+    `sigma` (depths,) is that of the Gaussian's amplitude. The excess falls with the distance, to 0; what is near the
+    axis belongs to the main beam.
     """
     inside = np.cumsum(pattern, axis=1) - 0.5 * (pattern + pattern[:, :1])
-    excess = 1.0 - inside / inside[:, -1:] - erfc(x / sigma[:, None])
-    excess[x < _BEYOND_SIGMAS * sigma[:, None]] = 0.0
+    inside -= np.gradient(pattern, axis=1) / 12.0  # Euler and Maclaurin's correction of the sums
+    beyond, density = 1.0 - inside / inside[:, -1:], pattern / inside[:, -1:]
+    excess = beyond - erfc(x / sigma[:, None])
+    # The last point before the nearest distance that counts moves there, along a cubic.
+    nearest, row = _BEYOND_SIGMAS * sigma, np.arange(len(x))
+    n = np.minimum((nearest / x[:, 1]).astype(int), x.shape[1] - 2)
+    t, rise = nearest / x[:, 1] - n, beyond[row, n + 1] - beyond[row, n]
+    bent = (1.0 - t) * (-density[row, n] - rise) + t * (density[row, n + 1] + rise)
+    at_nearest = beyond[row, n] + t * rise + t * (1.0 - t) * bent
+    x, excess[row, n] = x.copy(), at_nearest - erfc(_BEYOND_SIGMAS)
+    x[row, n] = nearest
     excess = np.maximum.accumulate(np.maximum(excess, 0.0)[:, ::-1], axis=1)[:, ::-1]
-    return list(zip(x, excess, strict=True))
+    return [
+        lambda at, of=of, power=power, least=least: np.interp(np.maximum(at, least), of, power)
+        for of, power, least in zip(x, excess, nearest, strict=True)
+    ]
 
 
-def _density(x: np.ndarray, tail: np.ndarray, at: np.ndarray, window: float) -> np.ndarray:
+def _density(tail: Callable[[np.ndarray], np.ndarray], at: np.ndarray, window: float) -> np.ndarray:
     """The power per millimetre on either side at distances `at`, averaged over a window."""
-    inner, outer = np.maximum(at - 0.5 * window, 0.0), at + 0.5 * window
-    return 0.5 * (np.interp(inner, x, tail) - np.interp(outer, x, tail)) / window
+    return 0.5 * (tail(np.maximum(at - 0.5 * window, 0.0)) - tail(at + 0.5 * window)) / window

@@ -56,10 +56,10 @@ def lateral_table(acquisition: np.ndarray, probe: Probe) -> tuple[Table, np.ndar
         x, transmitted = _uniform(probe, probe.aperture_mm, probe.focus_mm, depth)
         u = x / unit
         received = (1.0 - half) * np.sinc(u) + 0.5 * half * (np.sinc(u - 1.0) + np.sinc(u + 1.0))
-        excess = _excess(x, transmitted**2 * received**2, float(beam.lateral_sigma(depth)))
-        density = _averaged(u, excess, np.linspace(0.0, farthest, _COLUMNS), 1.0)
+        beyond = _Beyond.of(u, transmitted**2 * received**2, float(beam.lateral_sigma(depth)) / unit)
+        density = beyond.averaged(np.linspace(0.0, farthest, _COLUMNS), 1.0)
         rows.append(np.sqrt(density + 0.5 * clutter / farthest))
-        powers.append(clutter + excess[0])
+        powers.append(clutter + beyond.at(0.0))
     return Table(probe.depth_mm, np.array(rows), np.full(_ROWS, farthest)), np.array(powers)
 
 
@@ -70,9 +70,9 @@ def elevational_table(acquisition: np.ndarray, probe: Probe) -> Table:
         lobe = _wavelength(probe) * depth / probe.elevation_aperture_mm
         end = max(5.0 * lobe, 26.0 * _wavelength(probe))
         x, amplitude = _uniform(probe, probe.elevation_aperture_mm, probe.elevation_focus_mm, depth)
-        excess = _excess(x, amplitude**4, float(beam.elevation_sigma(depth)))
+        beyond = _Beyond.of(x, amplitude**4, float(beam.elevation_sigma(depth)))
         window = max(lobe, end / (_COLUMNS - 1))
-        rows.append(np.sqrt(_averaged(x, excess, np.linspace(0.0, end, _COLUMNS), window)))
+        rows.append(np.sqrt(beyond.averaged(np.linspace(0.0, end, _COLUMNS), window)))
         ends.append(end)
     return Table(probe.depth_mm, np.array(rows), np.array(ends))
 
@@ -90,7 +90,7 @@ def _wavelength(probe: Probe) -> float:
 def _uniform(probe: Probe, aperture: float, focus: float, depth: float) -> tuple[np.ndarray, np.ndarray]:
     """(distances from the axis, amplitude there) of the field of a uniform aperture with one focus."""
     wavelength = _wavelength(probe)
-    x = np.linspace(0.0, 256.0 * wavelength * depth / aperture, 4097)
+    x = np.linspace(0.0, 256.0 * wavelength * depth / aperture, 16385)
     bend = (1.0 / depth - 1.0 / focus) / wavelength
     if abs(bend) * aperture**2 < 1e-4:
         return x, np.abs(np.sinc(x * aperture / (wavelength * depth)))
@@ -100,16 +100,23 @@ def _uniform(probe: Probe, aperture: float, focus: float, depth: float) -> tuple
     return x, np.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1])
 
 
-def _excess(x: np.ndarray, pattern: np.ndarray, sigma: float) -> np.ndarray:
-    """The power of a pattern beyond each distance less that of the main beam; beyond two sigmas, not rising."""
-    within = integrate.cumulative_trapezoid(pattern, x, initial=0.0)
-    more = np.where(x < 2.0 * sigma, 0.0, 1.0 - within / within[-1] - special.erfc(x / sigma))
-    return np.maximum.accumulate(np.maximum(more, 0.0)[::-1])[::-1]
+@dataclass(frozen=True)
+class _Beyond:
+    """The power of a pattern beyond each distance less that of the main beam; as at `nearest` there and nearer."""
 
+    x: np.ndarray
+    power: np.ndarray
+    nearest: float
 
-def _averaged(x: np.ndarray, beyond: np.ndarray, at: np.ndarray, window: float) -> np.ndarray:
-    low, high = (
-        np.interp(np.abs(at - 0.5 * window) * (at > 0.5 * window), x, beyond),
-        np.interp(at + 0.5 * window, x, beyond),
-    )
-    return (low - high) / (2.0 * window)
+    @classmethod
+    def of(cls, x: np.ndarray, pattern: np.ndarray, sigma: float) -> _Beyond:
+        within = integrate.cumulative_trapezoid(pattern, x, initial=0.0)
+        more = np.maximum(1.0 - within / within[-1] - special.erfc(x / sigma), 0.0)
+        return cls(x, np.maximum.accumulate(more[::-1])[::-1], 2.0 * sigma)
+
+    def at(self, distance: np.ndarray | float) -> np.ndarray:
+        return np.interp(np.maximum(distance, self.nearest), self.x, self.power)
+
+    def averaged(self, at: np.ndarray, window: float) -> np.ndarray:
+        """The power per distance on either side, averaged over a window."""
+        return (self.at(np.maximum(at - 0.5 * window, 0.0)) - self.at(at + 0.5 * window)) / (2.0 * window)
