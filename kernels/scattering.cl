@@ -22,7 +22,8 @@
 // With LOBES defined, the echoes are those that elevational side lobes receive, and are added to those that are there.
 // Lobes have a record and a coarser lattice of their own (side_lobes.py), whose cells are wider than the strip of a
 // line: one work-item computes `together` lines, along the path of the one in their middle. A scatterer is weighted by
-// the diffraction pattern (diffraction.py) instead of the main beam's profile. Only segments in dark tissue count.
+// the diffraction pattern (diffraction.py) instead of the main beam's profile. Only pieces of the path in dark tissue
+// count.
 //
 // Buffers: voxels, segments as in raytracing.cl; texture uint [k][j][i] (one element without TEXTURE); sites float2
 // [label], the share of cells with a scatterer, in 1/65536, and its amplitude, with LOBES behind them whether it is
@@ -338,6 +339,32 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   }
 }
 
+#ifdef LOBES
+// From where to where along a piece there is dark tissue in the middle or near the edges of its strip, a step farther
+// to both sides; (high, low) if there is none.
+inline float2 dark_part(__constant const Acquisition *acquisition, __global const ushort *voxels,
+                        __global const float *is_dark, const Piece *piece, float low, float high, float radius_l) {
+  const int nx = acquisition->dims[0], ny = acquisition->dims[1], steps = max(1, (int)ceil(high - low));
+  const float3 most = (float3)(nx - 1, ny - 1, acquisition->dims[2] - 1);
+  const float step = (high - low) / steps;
+  int first = steps, last = -1;
+  for (int n = 0; n < steps; n++) {
+    const float along = low + (n + 0.5f) * step;
+    for (int side = -1; side <= 1; side++) {
+      const float3 p = along * piece->direction + (0.8f * side * radius_l) * piece->lateral;
+      const float3 voxel =
+          piece->at_start + (float3)(dot3(p, piece->row_i), dot3(p, piece->row_j), dot3(p, piece->row_k)) + 0.5f;
+      const int3 at = convert_int3(clamp(voxel, (float3)(0.0f), most));
+      if (is_dark[voxels[(at.z * ny + at.y) * nx + at.x] & LABEL_MASK] == 0.0f) continue;
+      first = min(first, n);
+      last = n;
+    }
+  }
+  if (last < 0) return (float2)(high, low);
+  return (float2)(fmax(low, low + (first - 1) * step), fmin(high, low + (last + 2) * step));
+}
+#endif
+
 // The scatterers of one piece: finds the lattice cells beside it and computes them in batches. `start` is the segment's
 // start, `low` and `high` are the piece's ends along it, `radius_l` and `radius_e` how far it reaches to either side.
 inline void scatter_piece(__constant const Acquisition *acquisition, __global const ushort *voxels,
@@ -451,9 +478,6 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
   int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int index = 0; index < count; index++) {
     __global const Segment *segment = segments + line * MAX_SEGMENTS + index;
-#ifdef LOBES
-    if (sites[2 * MAX_TISSUES + segment->label] == 0.0f) continue;
-#endif
     Piece piece;
     piece.first = first;
     piece.slope = segment->depth_per_mm;
@@ -544,7 +568,13 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       // Off the axis of a curved array the same range is reached slightly earlier.
       const float lines_aside = max(line - left_line, left_line + lines - 1 - line) + 0.5f;
       const float radius_l = lines_aside * fmax(apart_low, apart_high), early = piece.bend * radius_l * radius_l;
-      const float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
+      float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
+#ifdef LOBES
+      const float2 dark = dark_part(acquisition, voxels, sites + 2 * MAX_TISSUES, &piece, low, high, radius_l);
+      begin = fmax(begin, dark.x), end = fmin(end, dark.y);
+      if (dark.x > low) piece.from_mm = dark.x;
+      if (dark.y < high) piece.to_mm = dark.y;
+#endif
       if (begin >= end) continue;
       scatter_piece(acquisition, voxels, texture, sites, &piece, start, begin, end, radius_l, radius_e,
                     sum VARIED_ARGUMENTS);

@@ -32,6 +32,7 @@ class _Strips:
     before: int = 0
     block: int = CONSTANTS["BLOCK"]  # samples with linear interpolation of widths and gains
     table: Table | None = None
+    quiet: np.ndarray | None = None  # (labels,) bool
 
 
 def scatterer_lines(
@@ -45,16 +46,23 @@ def scatterer_lines(
 
 
 def lobe_lines(
-    acquisition: np.ndarray, labels: Labels, tissues: np.ndarray, segments, segment_lines, table: Table, together: int
+    acquisition: np.ndarray,
+    labels: Labels,
+    tissues: np.ndarray,
+    segments,
+    segment_lines,
+    table: Table,
+    together: int,
+    quiet: np.ndarray,
 ) -> np.ndarray:
-    """The same for elevational lobes: `together` lines have the path of the middle one of them."""
+    """The same for elevational lobes, near quiet tissue: `together` lines have the path of the middle one of them."""
     traced = int(acquisition["traced_lines"])
     lines = np.zeros((2 * traced, int(acquisition["samples"])), np.complex128)
     for segment, line in zip(segments, segment_lines, strict=True):
         first = line // together * together
         count = min(together, traced - first)
         if line == first + count // 2:
-            strips = _Strips(count, line - first, 4 * CONSTANTS["BLOCK"], table)
+            strips = _Strips(count, line - first, 4 * CONSTANTS["BLOCK"], table, quiet)
             _add_segment(acquisition, labels, tissues, segment, lines[2 * first : 2 * (first + count)], strips)
     return lines.astype(np.complex64)
 
@@ -119,6 +127,9 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     aside = (max(strips.before, strips.lines - 1 - strips.before) + 0.5) * apart.max()
     widest = acquisition["beam_cutoff"] * elevation.max()
     height = widest if strips.table is None else strips.table.end(path).max()
+    if strips.quiet is not None:
+        from_mm, to_mm = _quiet_part(acquisition, labels, strips.quiet, segment, low, high, aside)
+        belongs = from_mm if from_mm > low else belongs[0], to_mm if to_mm < high else belongs[1]
     cells = _cells_of_box(acquisition, start, d, side, e, low, high, aside, height)
 
     key = hash_mix((cells.astype(np.uint32) * _AXIS_STEPS[order]).sum(axis=1, dtype=np.uint32) ^ acquisition["seed"])
@@ -166,6 +177,21 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
             here = bins + ahead
             inside = (here >= 0) & (here < samples)
             np.add.at(sums, ((2 * strip + edge)[inside], here[inside]), (echo * of_edge * of_sample)[inside])
+
+
+def _quiet_part(acquisition, labels, quiet, segment, low, high, aside) -> tuple[np.float32, np.float32]:
+    """From where to where along a piece, with a step more, there is quiet tissue on the axis or beside it."""
+    steps = max(1, int(np.ceil(high - low)))
+    step = (high - low) / f32(steps)
+    along = low + (np.arange(steps, dtype=np.float32) + f32(0.5)) * step
+    across = f32(0.8) * aside * np.array([-1, 0, 1], np.float32)
+    point = segment["start"] + along[:, None, None] * segment["direction"] + across[:, None] * segment["lateral"]
+    voxel = affine_point(acquisition["ras_to_voxel"], point) + f32(0.5)
+    index = np.clip(voxel, f32(0), f32(labels.dims) - f32(1)).astype(np.int64) @ labels.steps
+    found = np.flatnonzero(quiet[labels.label[index]].any(axis=1))
+    if len(found) == 0:
+        return high, low
+    return max(low, low + f32(found[0] - 1) * step), min(high, low + f32(found[-1] + 2) * step)
 
 
 def _site_statistics(tissues: np.ndarray, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:

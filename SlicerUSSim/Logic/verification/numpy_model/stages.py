@@ -86,10 +86,9 @@ def scatterers(frame: TwinFrame) -> None:
     of_all = frame.labels, frame.tissues
     frame.traced += scatterer_lines(record, *of_all, frame.segments, frame.segment_lines)
     if frame.settings.side_lobes:
-        quiet = quiet_labels(frame.tissues, frame.labels.given)[frame.segments["label"]]
         frame.traced += lobe_lines(
-            lobe_lattice(record), *of_all, frame.segments[quiet], frame.segment_lines[quiet],
-            elevational_table(record, frame.probe), lines_of_a_path(record, frame.probe),
+            lobe_lattice(record), *of_all, frame.segments, frame.segment_lines, elevational_table(record, frame.probe),
+            lines_of_a_path(record, frame.probe), quiet_labels(frame.tissues, frame.labels.given),
         )  # fmt: skip
 
 
