@@ -187,8 +187,8 @@ inline float gain_on_membrane(__constant const Acquisition *acquisition, __globa
          exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 
-// Four passes over a batch, each without unpredictable branches: places of all cells' scatterers, in vectors; phases,
-// amplitudes and voxels of those that contribute, in vectors too; their labels; their echoes, one after the other.
+// Three passes over a batch, each without unpredictable branches: vectors of all cells; labels of the scatterers that
+// contribute; their echoes, one after the other.
 inline void scatter_batch(__constant const Acquisition *acquisition, __global const ushort *voxels,
                           __global const uint *texture, __global const float *sites, const Piece *piece,
                           const int *cell_u, const uint *row_key, const float *row_v, const float *row_w, int count,
@@ -204,13 +204,18 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   const uint step_u = axis_step(u);
   const float3 d = piece->direction, l = piece->lateral, e = piece->elevational;
 
-  uint key_[BATCH];
-  float pu_[BATCH], pv_[BATCH], pw_[BATCH], t_[BATCH], r2_[BATCH], depth_[BATCH], right_[BATCH];
+  float part_[BATCH], right_[BATCH], re_[BATCH], im_[BATCH], fx_[BATCH], fy_[BATCH], fz_[BATCH];
+  int bin_[BATCH], voxel_[BATCH];
+  uint random_[BATCH];
+#ifdef LOBES
+  float away_[BATCH], path_[BATCH];
+#endif
   ushort chosen[BATCH + 1];
   int n = 0;
   for (int begin = 0; begin < count; begin += LANES) {
     const intn cells = LOAD_LANES(cell_u + begin);
     const uintn key = hash_mixn((LOAD_LANES(row_key + begin) + TO_UINTN(cells) * step_u) ^ acquisition->seed);
+    const uintn random = hash_mixn(key + 0x3C6EF372u);  // 16 bits for its existence, one for its sign, 15 for its label
     // (The seed is not added to the index: seeds would then give the same scatterers, shifted by cells.)
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
@@ -223,16 +228,20 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn aside_e = pu * e.x + pv * e.y + pw * e.z;
     const floatn t = (along - piece->low) * piece->span;
     const floatn right = piece->edge + aside_l * (piece->line0 + t * piece->line1);
-    const floatn range = along + aside_l * aside_l * piece->bend;
-    const floatn depth = piece->depth0 + range * piece->slope;
-    const intn bins = TO_INTN(floor(depth * inverse_sample)) - piece->first;
 #ifdef LOBES
-    const floatn r2 = fabs(aside_e);
-    const intn near = r2 <= piece->reach;
+    const floatn r2 = 0.0f;
+    const intn near = fabs(aside_e) <= piece->reach;
+    STORE_LANES(fabs(aside_e), away_ + begin);
+    STORE_LANES(piece->path0 + (along - piece->low), path_ + begin);
 #else
     const floatn r2 = aside_e * aside_e * (piece->narrow0 + t * piece->narrow1);
     const intn near = r2 <= cutoff2;
 #endif
+    const floatn range = along + aside_l * aside_l * piece->bend;
+    const floatn depth = piece->depth0 + range * piece->slope;
+    const floatn place = depth * inverse_sample;
+    const floatn bin = floor(place);
+    const intn bins = TO_INTN(bin) - piece->first;
     const intn counts = (right >= 0.0f) & (right < 1.0f) & near & (bins >= -1) & (bins < CHUNK) &
                         (along >= piece->from_mm) & (along < piece->to_mm) & (LANE_INDEX < count - begin);
     SPREAD(int, counts_, counts);
@@ -240,41 +249,8 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
       chosen[n] = begin + j;
       n += counts_[j] & 1;
     }
-    STORE_LANES(key, key_ + begin);
-    STORE_LANES(pu, pu_ + begin);
-    STORE_LANES(pv, pv_ + begin);
-    STORE_LANES(pw, pw_ + begin);
-    STORE_LANES(t, t_ + begin);
-    STORE_LANES(r2, r2_ + begin);
-    STORE_LANES(depth, depth_ + begin);
-    STORE_LANES(right, right_ + begin);
-  }
-
-  // Those that contribute come first. (The rest of the last vector is computed too, from other scatterers.)
-  for (int i = 0; i < n; i++) {
-    const int j = chosen[i];
-    key_[i] = key_[j];
-    pu_[i] = pu_[j];
-    pv_[i] = pv_[j];
-    pw_[i] = pw_[j];
-    t_[i] = t_[j];
-    r2_[i] = r2_[j];
-    depth_[i] = depth_[j];
-    right_[i] = right_[j];
-  }
-  float part_[BATCH], re_[BATCH], im_[BATCH], fx_[BATCH], fy_[BATCH], fz_[BATCH];
-  int bin_[BATCH], voxel_[BATCH];
-  for (int begin = 0; begin < n; begin += LANES) {
-    // 16 bits for its existence, one for its sign, 15 for its label
-    const uintn random = hash_mixn(LOAD_LANES(key_ + begin) + 0x3C6EF372u);
-    const floatn pu = LOAD_LANES(pu_ + begin), pv = LOAD_LANES(pv_ + begin), pw = LOAD_LANES(pw_ + begin);
-    const floatn depth = LOAD_LANES(depth_ + begin), place = depth * inverse_sample, bin = floor(place);
-    const floatn gain = piece->gain0 + LOAD_LANES(t_ + begin) * piece->gain1;
-#ifdef LOBES
-    const floatn amplitude = exp2_fast(clamp(gain, (floatn)(-100.0f), (floatn)(100.0f)));
-#else
-    const floatn amplitude = exp2_fast(clamp(gain - LOAD_LANES(r2_ + begin), (floatn)(-100.0f), (floatn)(100.0f)));
-#endif
+    const floatn amplitude =
+        exp2_fast(clamp(piece->gain0 + t * piece->gain1 - r2, (floatn)(-100.0f), (floatn)(100.0f)));
     const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
     turn(depth * acquisition->cycles_per_mm, &cosine, &sine);
@@ -283,11 +259,12 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn vy = clamp(at.y + pu * rj.x + pv * rj.y + pw * rj.z, (floatn)(0.0f), (floatn)(voxel_top.y));
     const floatn vz = clamp(at.z + pu * rk.x + pv * rk.y + pw * rk.z, (floatn)(0.0f), (floatn)(voxel_top.z));
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
-    STORE_LANES(TO_INTN(bin) - piece->first, bin_ + begin);
+    STORE_LANES(bins, bin_ + begin);
     STORE_LANES(place - bin, part_ + begin);
+    STORE_LANES(right, right_ + begin);
     STORE_LANES(echo * cosine, re_ + begin);
     STORE_LANES(echo * -sine, im_ + begin);
-    STORE_LANES(random, key_ + begin);
+    STORE_LANES(random, random_ + begin);
     STORE_LANES((iz * ny + iy) * nx + ix, voxel_ + begin);
     STORE_LANES(vx - TO_FLOATN(ix), fx_ + begin);
     STORE_LANES(vy - TO_FLOATN(iy), fy_ + begin);
@@ -298,7 +275,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   ushort mixed[BATCH + 1];
   int several = 0;
   for (int i = 0; i < n; i++) {
-    const int word = voxels[voxel_[i]];
+    const int word = voxels[voxel_[chosen[i]]];
     label_[i] = word & LABEL_MASK;
     mixed[several] = i;
 #ifdef TEXTURE
@@ -308,34 +285,31 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 #endif
   }
   for (int k = 0; k < several; k++) {
-    const int i = mixed[k], here = voxel_[i];
+    const int i = mixed[k], j = chosen[i], here = voxel_[j];
     float gain = 1.0f;
-    label_[i] = drawn_label(acquisition, voxels + here, texture + here, fx_[i], fy_[i], fz_[i], key_[i], &gain);
+    label_[i] = drawn_label(acquisition, voxels + here, texture + here, fx_[j], fy_[j], fz_[j], random_[j], &gain);
 #ifdef TEXTURE
-    re_[i] *= gain;
-    im_[i] *= gain;
+    re_[j] *= gain;
+    im_[j] *= gain;
 #endif
   }
 
-#ifdef LOBES
-  const float length = 1.0f / piece->span;
-#endif
   for (int i = 0; i < n; i++) {
-    const int label = label_[i];
+    const int j = chosen[i], label = label_[i];
     const float2 site = vload2(label, sites);
-    float strength = (key_[i] >> 16) + 0.5f < site.x ? site.y : 0.0f;
+    float strength = (random_[j] >> 16) + 0.5f < site.x ? site.y : 0.0f;
 #ifdef LOBES
     if (strength == 0.0f) continue;
-    strength *= lobe_at(acquisition, piece->lobes, piece->path0 + t_[i] * length, r2_[i]);
+    strength *= lobe_at(acquisition, piece->lobes, path_[j], away_[j]);
 #endif
     if (label == MEMBRANE_LABEL)
-      strength *= gain_on_membrane(acquisition, voxels + voxel_[i], piece, fx_[i], fy_[i], fz_[i]);
+      strength *= gain_on_membrane(acquisition, voxels + voxel_[j], piece, fx_[j], fy_[j], fz_[j]);
     int part = 0;
 #ifdef VARIED
     part = part_of[label];
     if (part < 0) continue;
 #endif
-    add_echo(sum, part, bin_[i], part_[i], right_[i], strength, re_[i], im_[i]);
+    add_echo(sum, part, bin_[j], part_[j], right_[j], strength, re_[j], im_[j]);
   }
 }
 

@@ -8,7 +8,7 @@
 // which they are added in quadrature, and add up to little along a wall, for which signs change every two nodes. Main
 // beam and lobes together have the power of the main beam before.
 //
-// Buffers: lobes float [LOBE_DEPTHS][LOBE_DISTANCES] of diffraction.py, and behind them the lobes' power [LOBE_DEPTHS];
+// Buffers: lobes float [LOBE_DEPTHS][LOBE_DISTANCES] of diffraction.py;
 // re, im float [scan line][stride].
 
 #include "common.clh"
@@ -54,9 +54,8 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
   const float place = fmin(s / acquisition->depth_mm, 1.0f) * (LOBE_DEPTHS - 1);
   const int depth = min((int)place, LOBE_DEPTHS - 2);
   const float deeper = place - depth;
-  __global const float *row = lobes + depth * LOBE_DISTANCES, *power = lobes + LOBE_DEPTHS * LOBE_DISTANCES + depth;
-  const float kept = rsqrt(1.0f + blend(power[0], power[1], deeper));
-  float weights[LOBE_NODES];
+  __global const float *row = lobes + depth * LOBE_DISTANCES;
+  float weights[LOBE_NODES], power[LOBE_NODES];  // the power up to each node, on one side
   int reach = 0;
   for (int n = 0; n < nodes; n++) {
     const float at = n * per_node / LOBE_STEP;
@@ -64,7 +63,8 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
     const int column = (int)at;
     const float near = blend(row[column], row[column + 1], at - column);
     const float far = blend(row[LOBE_DISTANCES + column], row[LOBE_DISTANCES + column + 1], at - column);
-    weights[n] = (n & 2 ? -kept : kept) * scale * blend(near, far, deeper);
+    weights[n] = (n & 2 ? -scale : scale) * blend(near, far, deeper);
+    power[n] = mean_power * weights[n] * weights[n] + (n > 1 ? power[n - 1] : 0.0f);
     reach = n;
   }
 
@@ -80,23 +80,28 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
   }
 
   floatn before_re, before_im;
+  float before_kept = 1.0f;
   int line = 0;
   for (int node = 0; node <= nodes; node++) {
     const int last = min(node, nodes - 1);
     const floatn lobe_re = at_node(node_re, weights, last, nodes, reach);
     const floatn lobe_im = at_node(node_im, weights, last, nodes, reach);
-    if (node == 0) before_re = lobe_re, before_im = lobe_im;
+    // Of those that there are: beyond the image nothing is known.
+    const int left = min(last, reach), right = min(nodes - 1 - last, reach);
+    const float kept = rsqrt(1.0f + power[0] + (left > 0 ? power[left] : 0.0f) + (right > 0 ? power[right] : 0.0f));
+    if (node == 0) before_re = lobe_re, before_im = lobe_im, before_kept = kept;
     // Up to the middle of the lines of this node
     const int end = node == nodes ? lines : min(lines, node * step + step / 2);
     for (; line < end; line++) {
       const float part = (line + 0.5f) / step + 0.5f - node;
       const float even = rsqrt(1.0f - 2.0f * part * (1.0f - part));  // nodes are independent: equal power between them
       floatn x = LOAD_LANES(re + line * stride + here), y = LOAD_LANES(im + line * stride + here);
-      x = kept * x - even * (before_im + part * (lobe_im - before_im));
-      y = kept * y + even * (before_re + part * (lobe_re - before_re));
+      const float whole = blend(before_kept, kept, part);
+      x = whole * (x - even * (before_im + part * (lobe_im - before_im)));
+      y = whole * (y + even * (before_re + part * (lobe_re - before_re)));
       STORE_LANES(x, re + line * stride + here);
       STORE_LANES(y, im + line * stride + here);
     }
-    before_re = lobe_re, before_im = lobe_im;
+    before_re = lobe_re, before_im = lobe_im, before_kept = kept;
   }
 }

@@ -38,8 +38,6 @@ class Lobes:
     #: (depths, distances) float32, per wavelength x receive f-number at that depth; distances are LOBE_STEP of
     #: these apart
     lateral: np.ndarray
-    #: (depths,) float32 power of all lateral lobes
-    lateral_power: np.ndarray
     #: (depths, distances) float32, per millimetre, at distances evenly from 0 to ...
     elevational: np.ndarray
     #: ... (depths,) float32 millimetres, where they are cut off
@@ -74,8 +72,7 @@ def lobes_of(probe: Probe) -> Lobes:
         _density(tail, far / (_DISTANCES - 1) * column, max(wide, far / (_DISTANCES - 1)))
         for tail, far, wide in zip(_tails(x, amplitude**4, sigma[1]), reach, lobe, strict=True)
     ]
-    power = [clutter + float(tail(np.zeros(1))[0]) for tail in tails]
-    return Lobes(*(np.array(values, np.float32) for values in (np.sqrt(lateral), power, np.sqrt(elevational), reach)))
+    return Lobes(*(np.array(values, np.float32) for values in (np.sqrt(lateral), np.sqrt(elevational), reach)))
 
 
 def _focused_once(wavelength: float, aperture: float, focus: float, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -46,12 +46,12 @@ class SideLobes(Stage):
         """Enqueue the side lobes of one frame, which are added to `scanned`, unless they are off."""
         if not frame.settings.side_lobes:
             return
-        probe, lobes = frame.probe, lobes_of(frame.probe)
+        probe = frame.probe
         self.device.run(
             self.kernel,
             (frame.line_shape[1] // self.device.lanes,),
             frame.acquisition_buffer,
-            self.tables.get(probe, np.append(lobes.lateral, lobes.lateral_power)),
+            self.tables.get(probe, lobes_of(probe).lateral),
             frame.scanned.re,
             frame.scanned.im,
             np.int32(frame.scanned.stride),

@@ -40,7 +40,7 @@ def lines_of_a_path(acquisition: np.ndarray, probe: Probe) -> int:
 
 def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray) -> np.ndarray:
     """(scan lines, samples) complex64: with the lobes in quadrature, and the power of the main beam before."""
-    beam, (table, powers) = Beam(acquisition), lateral_table(acquisition, probe)
+    beam, table = Beam(acquisition), lateral_table(acquisition, probe)
     lines, samples = scanned.shape
     result = np.empty(scanned.shape, np.complex128)
     line = np.arange(lines)
@@ -63,10 +63,10 @@ def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray
         part = (place - before)[:, None]
         left, right = (of_nodes[np.clip(before + n, 0, nodes - 1)] for n in (0, 1))
         between = ((1.0 - part) * left + part * right) / np.sqrt((1.0 - part) ** 2 + part**2)
-        power = np.interp(float(s), np.linspace(0.0, probe.depth_mm, len(powers)), powers)
-        result[:, first : first + _TOGETHER] = (scanned[:, first : first + _TOGETHER] + 1j * between) / np.sqrt(
-            1 + power
-        )
+        kept = 1.0 / np.sqrt(1.0 + correlation.mean() * (weights**2).sum(axis=1))
+        near, far = (kept[np.clip(before + n, 0, nodes - 1), None] for n in (0, 1))
+        both = scanned[:, first : first + _TOGETHER] + 1j * between
+        result[:, first : first + _TOGETHER] = ((1.0 - part) * near + part * far) * both
     return result.astype(np.complex64)
 
 

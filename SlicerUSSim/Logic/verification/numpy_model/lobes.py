@@ -46,9 +46,9 @@ class Table:
         return np.where(place < _COLUMNS - 1, (1.0 - deeper) * within(row) + deeper * within(row + 1), 0.0)
 
 
-def lateral_table(acquisition: np.ndarray, probe: Probe) -> tuple[Table, np.ndarray]:
-    """(the lateral lobes by distance in wavelengths x receive f-number; their power by depth, with the clutter)."""
-    beam, rows, powers, half = Beam(acquisition), [], [], 0.5 * probe.receive_apodization
+def lateral_table(acquisition: np.ndarray, probe: Probe) -> Table:
+    """The lateral lobes, with the clutter, by distance in wavelengths x receive f-number."""
+    beam, rows, half = Beam(acquisition), [], 0.5 * probe.receive_apodization
     farthest = 0.75 * (_COLUMNS - 1)
     clutter = np.exp(probe.clutter_db * np.log(10.0) / 10.0)
     for depth in _depths(probe):
@@ -59,8 +59,7 @@ def lateral_table(acquisition: np.ndarray, probe: Probe) -> tuple[Table, np.ndar
         beyond = _Beyond.of(u, transmitted**2 * received**2, float(beam.lateral_sigma(depth)) / unit)
         density = beyond.averaged(np.linspace(0.0, farthest, _COLUMNS), 1.0)
         rows.append(np.sqrt(density + 0.5 * clutter / farthest))
-        powers.append(clutter + beyond.at(0.0))
-    return Table(probe.depth_mm, np.array(rows), np.full(_ROWS, farthest)), np.array(powers)
+    return Table(probe.depth_mm, np.array(rows), np.full(_ROWS, farthest))
 
 
 def elevational_table(acquisition: np.ndarray, probe: Probe) -> Table:
