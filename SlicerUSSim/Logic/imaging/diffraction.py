@@ -31,8 +31,8 @@ _REACH_LOBES, _REACH_WAVELENGTHS = 5.0, 26.0
 class Lobes:
     """The lobes of a two-way beam, at LOBE_DEPTHS depths evenly from the face to the image depth.
 
-    Amplitudes are square roots of the power per distance, on either side, re that of the main beam, averaged over one
-    lobe.
+    Amplitudes are square roots of the power per distance, on either side, re that of the main beam; the lateral power is
+    averaged over one lobe, since it is sampled at intervals.
     """
 
     #: (depths, distances) float32, per wavelength x receive f-number at that depth; distances are LOBE_STEP of
@@ -69,8 +69,8 @@ def lobes_of(probe: Probe) -> Lobes:
     reach = np.maximum(_REACH_LOBES * lobe, _REACH_WAVELENGTHS * probe.wavelength_mm)
     x, amplitude = _focused_once(probe.wavelength_mm, probe.elevation_aperture_mm, probe.elevation_focus_mm, depth)
     elevational = [
-        _density(tail, far / (_DISTANCES - 1) * column, max(wide, far / (_DISTANCES - 1)))
-        for tail, far, wide in zip(_tails(x, amplitude**4, sigma[1]), reach, lobe, strict=True)
+        _density(tail, step * column, step)
+        for tail, step in zip(_tails(x, amplitude**4, sigma[1]), reach / (_DISTANCES - 1), strict=True)
     ]
     return Lobes(*(np.array(values, np.float32) for values in (np.sqrt(lateral), np.sqrt(elevational), reach)))
 

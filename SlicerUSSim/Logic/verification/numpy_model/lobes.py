@@ -70,8 +70,7 @@ def elevational_table(acquisition: np.ndarray, probe: Probe) -> Table:
         end = max(5.0 * lobe, 26.0 * _wavelength(probe))
         x, amplitude = _uniform(probe, probe.elevation_aperture_mm, probe.elevation_focus_mm, depth)
         beyond = _Beyond.of(x, amplitude**4, float(beam.elevation_sigma(depth)))
-        window = max(lobe, end / (_COLUMNS - 1))
-        rows.append(np.sqrt(beyond.averaged(np.linspace(0.0, end, _COLUMNS), window)))
+        rows.append(np.sqrt(beyond.averaged(np.linspace(0.0, end, _COLUMNS), end / (_COLUMNS - 1))))
         ends.append(end)
     return Table(probe.depth_mm, np.array(rows), np.array(ends))
 
