@@ -31,8 +31,8 @@ _REACH_LOBES, _REACH_WAVELENGTHS = 5.0, 26.0
 class Lobes:
     """The lobes of a two-way beam, at LOBE_DEPTHS depths evenly from the face to the image depth.
 
-    Amplitudes are square roots of the power per distance, on either side, re that of the main beam; the lateral power is
-    averaged over one lobe, since it is sampled at intervals.
+    Amplitudes are square roots of the power per distance, on either side, re that of the main beam; the lateral power
+    is averaged over one lobe, since it is sampled at intervals.
     """
 
     #: (depths, distances) float32, per wavelength x receive f-number at that depth; distances are LOBE_STEP of
