@@ -93,6 +93,69 @@ def test_apodisation_lowers_the_lobes_by_as_much_as_the_pattern():
     assert found[0] - found[1] > 8.0
 
 
+def power_beyond(table: np.ndarray, apart_mm: float, unit_mm: float, least_mm: float) -> float:
+    """dB of a row of a table, with columns `apart_mm` apart and its power per `unit_mm`, on both sides."""
+    amplitude = np.interp(X, apart_mm * np.arange(len(table)), table, right=0.0)
+    return float(10.0 * np.log10(2.0 * (amplitude[least_mm < X] ** 2).sum() * (X[1] - X[0]) / unit_mm))
+
+
+def plane_waves(probe: Probe) -> np.ndarray:
+    """(X,) amplitude of the coherent sum of plane waves under all angles of a probe."""
+    sines = np.sin(np.deg2rad(probe.largest_angle_deg)) * np.linspace(-1.0, 1.0, probe.transmit_angles)
+    return np.abs(np.exp(2j * np.pi / probe.wavelength_mm * np.outer(X, sines)).sum(axis=1))
+
+
+PLAIN = replace(PROBE, clutter_db=-100.0)
+PULSE = replace(PLAIN, frequency_mhz=0.5 * PLAIN.frequency_mhz)  # whose second harmonic has the frequency of PLAIN
+#: name: (probe, depth, amplitude of the field on transmission); foci of the zones at 8, 24 and 40 mm, 8 mm is nearer
+MODES = {
+    "zones, behind the first": (replace(PLAIN, transmit="zones"), 15.0, lambda: field(PLAIN, 8.0 / 3.0, 8.0, 15.0)),
+    "harmonic, in focus": (replace(PULSE, harmonic=True), 25.0, lambda: field(PULSE, 12.0, 24.0, 25.0) ** 2),
+    "harmonic, out of focus": (replace(PULSE, harmonic=True), 12.5, lambda: field(PULSE, 12.0, 24.0, 12.5) ** 2),
+    "angles": (
+        replace(PLAIN, transmit="angles", transmit_angles=41), 15.0,
+        lambda: plane_waves(replace(PLAIN, transmit_angles=41)),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_lobes_are_those_of_the_field_of_each_kind_of_transmission(mode):
+    probe, depth, sent = MODES[mode]
+    receive = min(probe.aperture_mm, depth / probe.receive_f_number)
+    power = (sent() * field(PLAIN, receive, depth, depth)) ** 2
+    row = round(depth / probe.depth_mm * (CONSTANTS["LOBE_DEPTHS"] - 1))
+    unit = probe.wavelength_mm * max(probe.receive_f_number, depth / probe.aperture_mm)
+    for least in (2.5, 4.0):
+        expected = 10.0 * np.log10(power[least < X].sum() / power.sum())
+        found = power_beyond(lobes_of(probe).lateral[row], CONSTANTS["LOBE_STEP"] * unit, unit, least)
+        assert found == pytest.approx(expected, abs=3.0), least
+
+
+def test_elevational_lobes_of_the_harmonic_are_of_the_squared_field_of_the_pulse():
+    probe, depth, row = replace(PULSE, harmonic=True), 25.0, 20
+    height = probe.elevation_aperture_mm
+    power = (field(PULSE, height, 24.0, depth) ** 2 * field(PLAIN, height, 24.0, depth)) ** 2
+    lobes = lobes_of(probe)
+    apart = float(lobes.reach_mm[row]) / (CONSTANTS["LOBE_DISTANCES"] - 1)
+    for least in (2.5, 4.0):
+        expected = 10.0 * np.log10(power[(least < X) & (lobes.reach_mm[row] > X)].sum() / power.sum())
+        assert power_beyond(lobes.elevational[row], apart, 1.0, least) == pytest.approx(expected, abs=3.0)
+
+
+@pytest.mark.parametrize("angles", [{"steering_deg": 20.0}, {"trapezoid_deg": 20.0}])
+def test_lobes_of_steered_lines_are_those_at_the_same_distance_from_the_face(angles):
+    """Depths count from behind the face: the table reaches farther, and has the same values at the same path."""
+    steered = replace(PLAIN, **angles)
+    place = np.linspace(0.0, 1.0, CONSTANTS["LOBE_DEPTHS"])
+    for path in (10.0, 30.0):
+        rows = [
+            [np.interp(path, place * reach, column) for column in lobes_of(probe).lateral[:, 1:12].T]
+            for probe, reach in ((steered, steered.displayed_mm), (PLAIN, PLAIN.depth_mm))
+        ]
+        assert rows[0] == pytest.approx(rows[1], rel=0.15)
+
+
 @pytest.mark.parametrize("name", list(PROBES))
 def test_preset_probes_have_uniform_apertures(name):
     assert PROBES[name].receive_apodization == 0.0

@@ -415,14 +415,17 @@ def clutter_power(probe: Probe, depth_mm: float, radius_mm: float) -> float:
 
     By diffraction (Goodman, Introduction to Fourier Optics, section 3.4): the sum of the waves of 512 points of each
     aperture, by their exact distances. The transmit aperture and the elements are focused once, the receive aperture at
-    the depth, with its weights. To this comes the probe's clutter.
+    the depth, with its weights. The second harmonic is fed by the square of what is transmitted at half its frequency.
+    To this comes the probe's clutter.
     """
     across = np.linspace(0.0, 60.0, 2401)
     unit = probe.wavelength_mm * max(probe.receive_f_number, depth_mm / probe.aperture_mm)
     receive = probe.wavelength_mm * depth_mm / unit
-    lateral = _pressure(probe, probe.aperture_mm, probe.focus_mm, across, depth_mm)
+    order, pulse = (2, replace(probe, harmonic=False)) if probe.harmonic else (1, probe)
+    lateral = _pressure(pulse, probe.aperture_mm, probe.focus_mm, across, depth_mm) ** order
     lateral *= _pressure(probe, receive, depth_mm, across, depth_mm, probe.receive_apodization)
-    elevational = _pressure(probe, probe.elevation_aperture_mm, probe.elevation_focus_mm, across, depth_mm) ** 2
+    lens = probe.elevation_aperture_mm, probe.elevation_focus_mm, across, depth_mm
+    elevational = _pressure(pulse, *lens) ** order * _pressure(probe, *lens)
     reach = np.sqrt(np.maximum(radius_mm**2 - across**2, 0.0))
     seen = np.interp(reach, across, np.cumsum(elevational**2) - 0.5 * elevational**2)
     beyond = 1.0 - float((lateral**2 * seen).sum() / ((lateral**2).sum() * (elevational**2).sum()))
