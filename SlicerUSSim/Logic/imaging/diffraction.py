@@ -100,12 +100,16 @@ def _focused_once(
 ) -> tuple[np.ndarray, np.ndarray]:
     """((depths, n) distances from the axis in mm, from 0 on; amplitude there) of a uniform aperture, by Fresnel.
 
-    The field is that of a frequency `octaves` lower, at the distances of this wavelength. All but it are (depths,).
+    The field is that of a frequency `octaves` lower, at the distances of this wavelength; the others are (depths,). So
+    near the face that points are too far apart, it is the shadow of the aperture: that of farther away, as much wider.
     """
+    nearest = 1.0 / (1.0 / focus + 0.5 * _POINTS * wavelength / aperture**2)
+    far = np.maximum(depth, nearest)
+    wider = np.where(depth < nearest, (focus - depth) / (focus - nearest), 1.0)
     point = ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5) * aperture[:, None]
-    phase = np.pi / (2**octaves * wavelength) * (1.0 / depth - 1.0 / focus)[:, None] * point**2
+    phase = np.pi / (2**octaves * wavelength) * (1.0 / far - 1.0 / focus)[:, None] * point**2
     field = fft.fft(np.exp(1j * phase).astype(np.complex64), 2**octaves * _PADDED, axis=1)[:, : _PADDED // 2]
-    step = wavelength * depth * _POINTS / (aperture * _PADDED)
+    step = wider * wavelength * far * _POINTS / (aperture * _PADDED)
     return step[:, None] * np.arange(_PADDED // 2), np.abs(field).astype(float)
 
 

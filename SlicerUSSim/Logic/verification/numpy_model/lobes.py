@@ -70,7 +70,7 @@ def elevational_table(acquisition: np.ndarray, probe: Probe) -> Table:
     for depth in _depths(acquisition):
         lobe = wavelength * depth / aperture
         end = max(5.0 * lobe, 26.0 * wavelength)
-        x = _distances(lobe)
+        x = _distances(lobe, aperture)
         received = _uniform(x, wavelength, aperture, focus, depth)
         sent = _uniform(x, 2.0 * wavelength, aperture, focus, depth) ** 2 if probe.harmonic else received
         beyond = _Beyond.of(x, (sent * received) ** 2, float(beam.elevation_sigma(depth)))
@@ -85,9 +85,9 @@ def _depths(acquisition: np.ndarray) -> np.ndarray:
     return depths
 
 
-def _distances(lobe: float) -> np.ndarray:
-    """Distances from the axis, a sixty-fourth of a lobe apart."""
-    return np.linspace(0.0, 256.0 * lobe, 16385)
+def _distances(lobe: float, aperture: float = 0.0) -> np.ndarray:
+    """Distances from the axis, a sixty-fourth of a lobe apart; at least up to the aperture's size."""
+    return np.linspace(0.0, max(256.0 * lobe, aperture), 16385)
 
 
 def _transmitted(beam: Beam, probe: Probe, depth: float, unit: float) -> tuple[np.ndarray, np.ndarray]:
@@ -101,7 +101,7 @@ def _transmitted(beam: Beam, probe: Probe, depth: float, unit: float) -> tuple[n
     aperture = probe.aperture_mm
     if probe.transmit == "zones":
         aperture = min(aperture, focus / probe.receive_f_number)
-    x = _distances(wavelength * depth / aperture)
+    x = _distances(wavelength * depth / aperture, aperture)
     if not probe.harmonic:
         return x, _uniform(x, wavelength, aperture, focus, depth)
     return x, _uniform(x, 2.0 * wavelength, aperture, focus, depth) ** 2
