@@ -19,13 +19,17 @@
 // With VARIED defined, the echoes are written in PARTS parts, each of which has the tissues given for it. So the image
 // of a pose is a linear combination of the parts for all amplitudes of these tissues (appearance.py).
 //
-// With ADDED defined, the echoes are added to those that are there: of the elevational side lobes, which have a record
-// and a coarser lattice of their own (side_lobes.py).
+// With LOBES defined, the echoes are those that elevational side lobes receive, and are added to those that are there.
+// Lobes have a record and a coarser lattice of their own (side_lobes.py), whose cells are wider than the strip of a
+// line: one work-item computes `together` lines, along the path of the one in their middle. A scatterer is weighted by
+// the diffraction pattern (diffraction.py) instead of the main beam's profile. Only pieces of the path in dark tissue
+// count.
 //
 // Buffers: voxels, segments as in raytracing.cl; planes uint [k][j][i] of sheets.cl (one element without sheets);
 // texture uint [k][j][i] (one element without TEXTURE); sites float2 [label], the share of cells with a scatterer, in
-// 1/65536, and its amplitude; re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and
-// part_of int [label], -1 for a tissue in none.
+// 1/65536, and its amplitude, with LOBES behind them whether it is dark; re, im float [2 traced line + side][stride];
+// with VARIED also [part] before these, and part_of int [label], -1 for a tissue in none; with LOBES lobes float
+// [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the distance of the last column [LOBE_DEPTHS].
 
 #include "common.clh"
 #include "sheets.clh"
@@ -42,12 +46,14 @@
 #ifndef CHUNK
 #define CHUNK BLOCK
 #endif
-#ifdef ADDED
-#define STORE_ECHO(to, value) to += value
-#else
-#define STORE_ECHO(to, value) to = value
-#endif
 #define PART (CHUNK + 2)  // one extra sample at either end: echoes lie between samples
+#ifdef LOBES
+#define PIECE_BLOCK (4 * BLOCK)  // samples over which gains are assumed linear
+#define LOBE_PARAMETERS , __global const float *lobes, int together
+#else
+#define PIECE_BLOCK BLOCK
+#define LOBE_PARAMETERS
+#endif
 
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
@@ -59,23 +65,84 @@ typedef struct {
   float narrow0, narrow1;                // elevational exponent of two per mm^2 at the near end, and its change
   float gain0, gain1;                    // amplitude as an exponent of two, likewise
   float line0, line1;                    // 1 / distance of traced lines, likewise
+  float edge;                            // of the strip that begins there: distance re its width
   float bend;                            // 1 / (2 radius) of the surfaces of equal range
   float depth0, slope;
   float from_mm, to_mm;  // path lengths whose scatterers belong to this piece
   int u, v, w, first;
+#ifdef LOBES
+  float reach;  // largest elevational distance
+  float path0;  // path length at the near end
+  __global const float *lobes;
+#endif
 } Piece;
+
+#ifdef LOBES
+// Where echoes are added: the strips of `lines` traced lines from `line` on, `last` samples from `first` on.
+typedef struct {
+  __global float *re, *im;
+  int stride, line, traced, lines, first, last;
+} Echoes;
+#else
+typedef float4 Echoes;  // [PARTS][PART] left re, im, right re, im
+#endif
 
 // The hash uses cell indices by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
+#ifdef LOBES
+// The depth of the table for a path length: its row, and the part by which it is deeper.
+inline float row_of_lobes(__constant const Acquisition *acquisition, float path, int *row) {
+  const float place = clamp(path / acquisition->depth_mm * (LOBE_DEPTHS - 1), 0.0f, LOBE_DEPTHS - 1.001f);
+  *row = (int)place;
+  return place - *row;
+}
+
+// The distance from the axis at which lobes are cut off.
+inline float reach_of_lobes(__constant const Acquisition *acquisition, __global const float *lobes, float path) {
+  int row;
+  const float deeper = row_of_lobes(acquisition, path, &row);
+  __global const float *ends = lobes + LOBE_DEPTHS * LOBE_DISTANCES + row;
+  return blend(ends[0], ends[1], deeper);
+}
+
+// The square root of their power per millimetre at a distance from the axis.
+inline float lobe_at(__constant const Acquisition *acquisition, __global const float *lobes, float path,
+                     float distance) {
+  const float at = distance / reach_of_lobes(acquisition, lobes, path) * (LOBE_DISTANCES - 1);
+  if (at >= LOBE_DISTANCES - 1) return 0.0f;
+  int row;
+  const float deeper = row_of_lobes(acquisition, path, &row);
+  const int column = (int)at;
+  __global const float *near = lobes + row * LOBE_DISTANCES + column, *far = near + LOBE_DISTANCES;
+  return blend(blend(near[0], near[1], at - column), blend(far[0], far[1], at - column), deeper);
+}
+
+// Adds an echo of this amplitude to the two edges of its strip. Work-items add to disjoint samples.
+inline void add_echo(Echoes *to, int part, int bin, float between, float right, float strength, float re, float im) {
+  const float place = right * to->lines;
+  const int strip = min((int)place, to->lines - 1);
+  const float to_right = (place - strip) * strength, to_left = strength - to_right;
+  const int left = 2 * (part * to->traced + to->line + strip) * to->stride + LINE_PAD + to->first + bin;
+  for (int after = 0; after < 2; after++) {
+    if (bin + after < 0 || bin + after >= to->last) continue;
+    const float share = after ? between : 1.0f - between;
+    to->re[left + after] += share * to_left * re;
+    to->im[left + after] += share * to_left * im;
+    to->re[left + to->stride + after] += share * to_right * re;
+    to->im[left + to->stride + after] += share * to_right * im;
+  }
+}
+#else
 // Adds an echo of this amplitude to one part.
-inline void add_echo(float4 *sum, int bin, float between, float right, float strength, float re, float im) {
+inline void add_echo(Echoes *sum, int part, int bin, float between, float right, float strength, float re, float im) {
   const float to_right = right * strength, to_left = strength - to_right;
   const float4 echo = (float4)(to_left, to_left, to_right, to_right) * (float4)(re, im, re, im);
   // Bins start at -1, so that the first and last sample of the chunk receive contributions from scatterers beyond them.
-  sum[bin + 1] += echo * (1.0f - between);
-  sum[bin + 2] += echo * between;
+  sum[part * PART + bin + 1] += echo * (1.0f - between);
+  sum[part * PART + bin + 2] += echo * between;
 }
+#endif
 
 // The sheet (sheets.clh) at the voxel nearest to a scatterer at fraction `at` of a cell, or 0; and the offset from it
 inline uint nearest_sheet(__constant const Acquisition *acquisition, __global const uint *planes, float3 at,
@@ -161,9 +228,11 @@ inline float gain_on_membrane(__constant const Acquisition *acquisition, __globa
 inline void scatter_batch(__constant const Acquisition *acquisition, __global const ushort *voxels,
                           __global const uint *planes, __global const uint *texture, __global const float *sites,
                           const Piece *piece, const int *cell_u, const uint *row_key, const float *row_v,
-                          const float *row_w, int count, float4 *sum VARIED_PARAMETERS) {
+                          const float *row_w, int count, Echoes *sum VARIED_PARAMETERS) {
   const float cell = acquisition->cell_mm, grain = cell / 1024.0f;
+#ifndef LOBES
   const float cutoff2 = 0.5f * LOG2_E * acquisition->beam_cutoff * acquisition->beam_cutoff;
+#endif
   const float inverse_sample = 1.0f / acquisition->sample_mm;
   const int nx = acquisition->dims[0], ny = acquisition->dims[1];
   const float3 voxel_top = (float3)(nx - 1.001f, ny - 1.001f, acquisition->dims[2] - 1.001f);
@@ -174,6 +243,9 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   float part_[BATCH], right_[BATCH], re_[BATCH], im_[BATCH], fx_[BATCH], fy_[BATCH], fz_[BATCH];
   int bin_[BATCH], voxel_[BATCH];
   uint random_[BATCH];
+#ifdef LOBES
+  float away_[BATCH], path_[BATCH];
+#endif
   ushort chosen[BATCH + 1];
   int n = 0;
   for (int begin = 0; begin < count; begin += LANES) {
@@ -191,14 +263,22 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn aside_l = pu * l.x + pv * l.y + pw * l.z;
     const floatn aside_e = pu * e.x + pv * e.y + pw * e.z;
     const floatn t = (along - piece->low) * piece->span;
-    const floatn right = 0.5f + aside_l * (piece->line0 + t * piece->line1);
+    const floatn right = piece->edge + aside_l * (piece->line0 + t * piece->line1);
+#ifdef LOBES
+    const floatn r2 = 0.0f;
+    const intn near = fabs(aside_e) <= piece->reach;
+    STORE_LANES(fabs(aside_e), away_ + begin);
+    STORE_LANES(piece->path0 + (along - piece->low), path_ + begin);
+#else
     const floatn r2 = aside_e * aside_e * (piece->narrow0 + t * piece->narrow1);
+    const intn near = r2 <= cutoff2;
+#endif
     const floatn range = along + aside_l * aside_l * piece->bend;
     const floatn depth = piece->depth0 + range * piece->slope;
     const floatn place = depth * inverse_sample;
     const floatn bin = floor(place);
     const intn bins = TO_INTN(bin) - piece->first;
-    const intn counts = (right >= 0.0f) & (right < 1.0f) & (r2 <= cutoff2) & (bins >= -1) & (bins < CHUNK) &
+    const intn counts = (right >= 0.0f) & (right < 1.0f) & near & (bins >= -1) & (bins < CHUNK) &
                         (along >= piece->from_mm) & (along < piece->to_mm) & (LANE_INDEX < count - begin);
     SPREAD(int, counts_, counts);
     for (int j = 0; j < LANES; j++) {
@@ -252,33 +332,59 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   }
 
   for (int i = 0; i < n; i++) {
-    const int j = chosen[i], b = bin_[j], label = label_[i];
+    const int j = chosen[i], label = label_[i];
+    const float2 site = vload2(label, sites);
+    float strength = (random_[j] >> 16) + 0.5f < site.x ? site.y : 0.0f;
+#ifdef LOBES
+    if (strength == 0.0f) continue;
+    strength *= lobe_at(acquisition, piece->lobes, path_[j], away_[j]);
+#endif
     if (label == MEMBRANE_LABEL) {
       const int here = voxel_[j];
-      const float gain =
-          gain_on_membrane(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : here), piece,
-                           (float3)(fx_[j], fy_[j], fz_[j]));
-      re_[j] *= gain;
-      im_[j] *= gain;
+      strength *= gain_on_membrane(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : here),
+                                   piece, (float3)(fx_[j], fy_[j], fz_[j]));
     }
+    int part = 0;
 #ifdef VARIED
-    if (part_of[label] < 0) continue;
-    float4 *to = sum + part_of[label] * PART;
-#else
-    float4 *to = sum;
+    part = part_of[label];
+    if (part < 0) continue;
 #endif
-    const float2 site = vload2(label, sites);
-    const float strength = (random_[j] >> 16) + 0.5f < site.x ? site.y : 0.0f;
-    add_echo(to, b, part_[j], right_[j], strength, re_[j], im_[j]);
+    add_echo(sum, part, bin_[j], part_[j], right_[j], strength, re_[j], im_[j]);
   }
 }
+
+#ifdef LOBES
+// From where to where along a piece there is dark tissue in the middle or near the edges of its strip, a step farther
+// to both sides; (high, low) if there is none.
+inline float2 dark_part(__constant const Acquisition *acquisition, __global const ushort *voxels,
+                        __global const float *is_dark, const Piece *piece, float low, float high, float radius_l) {
+  const int nx = acquisition->dims[0], ny = acquisition->dims[1], steps = max(1, (int)ceil(high - low));
+  const float3 most = (float3)(nx - 1, ny - 1, acquisition->dims[2] - 1);
+  const float step = (high - low) / steps;
+  int first = steps, last = -1;
+  for (int n = 0; n < steps; n++) {
+    const float along = low + (n + 0.5f) * step;
+    for (int side = -1; side <= 1; side++) {
+      const float3 p = along * piece->direction + (0.8f * side * radius_l) * piece->lateral;
+      const float3 voxel =
+          piece->at_start + (float3)(dot3(p, piece->row_i), dot3(p, piece->row_j), dot3(p, piece->row_k)) + 0.5f;
+      const int3 at = convert_int3(clamp(voxel, (float3)(0.0f), most));
+      if (is_dark[voxels[(at.z * ny + at.y) * nx + at.x] & LABEL_MASK] == 0.0f) continue;
+      first = min(first, n);
+      last = n;
+    }
+  }
+  if (last < 0) return (float2)(high, low);
+  return (float2)(fmax(low, low + (first - 1) * step), fmin(high, low + (last + 2) * step));
+}
+#endif
 
 // The scatterers of one piece: finds the lattice cells beside it and computes them in batches. `start` is the segment's
 // start, `low` and `high` are the piece's ends along it, `radius_l` and `radius_e` how far it reaches to either side.
 inline void scatter_piece(__constant const Acquisition *acquisition, __global const ushort *voxels,
                           __global const uint *planes, __global const uint *texture, __global const float *sites,
                           const Piece *piece, float3 start, float low, float high, float radius_l, float radius_e,
-                          float4 *sum VARIED_PARAMETERS) {
+                          Echoes *sum VARIED_PARAMETERS) {
   int cell_u[BATCH + LANES];
   uint row_key[BATCH + LANES];
   float row_v[BATCH + LANES], row_w[BATCH + LANES];
@@ -364,16 +470,25 @@ __attribute__((intel_vec_len_hint(1)))
 __kernel void scatter(__constant const Acquisition *acquisition, __global const ushort *voxels,
                       __global const uint *planes, __global const uint *texture, __global const float *sites,
                       __global const Segment *segments, __global const int *segment_counts, __global float *re,
-                      __global float *im, int stride VARIED_PARAMETERS) {
-  int chunk = get_global_id(0), line = get_global_id(1);
-  int first = chunk * CHUNK;
-  float4 sum[PARTS * PART];  // left re, im, right re, im
+                      __global float *im, int stride VARIED_PARAMETERS LOBE_PARAMETERS) {
+  const int chunk = get_global_id(0), first = chunk * CHUNK;
+#ifdef LOBES
+  const int left_line = get_global_id(1) * together, lines = min(together, acquisition->traced_lines - left_line);
+  const int line = left_line + lines / 2;
+  Echoes echoes = {re, im, stride, left_line, acquisition->traced_lines, lines, first, 0};
+  echoes.last = min(CHUNK, acquisition->samples - first);
+  Echoes *sum = &echoes;
+#else
+  const int line = get_global_id(1), left_line = line, lines = 1;
+  Echoes sum[PARTS * PART];
   for (int i = 0; i < PARTS * PART; i++) sum[i] = (float4)(0.0f);
+#endif
   const float depth_low = (first - 1) * acquisition->sample_mm, depth_high = (first + CHUNK) * acquisition->sample_mm;
-  // Widths and gains are assumed linear over BLOCK samples, of which CHUNK is a part, so that the image does not depend
-  // on the split of the work.
-  const int block = first / BLOCK * BLOCK;
-  const float block_low = (block - 1) * acquisition->sample_mm, block_high = (block + BLOCK) * acquisition->sample_mm;
+  // Widths and gains are assumed linear over a block, of which CHUNK is a part, so that the image does not depend on
+  // the split of the work.
+  const int block = first / PIECE_BLOCK * PIECE_BLOCK;
+  const float block_low = (block - 1) * acquisition->sample_mm;
+  const float block_high = (block + PIECE_BLOCK) * acquisition->sample_mm;
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int index = 0; index < count; index++) {
@@ -411,8 +526,12 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
 
     // Widths and gains are assumed linear between the two ends of a piece, so it must be short compared with the beam's
     // waist, and end at most twice as far from the apex as it begins: lines are apart in proportion to that distance.
-    const float waist = fmin(acquisition->transmit_waist, acquisition->elevation_rayleigh);
-    const int pieces = max(1, (int)ceil((segment_high - segment_low) / (0.4f * waist)));
+#ifdef LOBES
+    const float longest = acquisition->transmit_waist;
+#else
+    const float longest = 0.4f * fmin(acquisition->transmit_waist, acquisition->elevation_rayleigh);
+#endif
+    const int pieces = max(1, (int)ceil((segment_high - segment_low) / longest));
     const float to_apex = segment->path_mm + (acquisition->linear ? 1e6f : acquisition->apex_radius_mm);
     float high = segment_low;
     for (int n = 0; n < pieces;) {
@@ -430,10 +549,22 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       piece.low = low;
       piece.span = 1.0f / fmax(high - low, 1e-6f);
       piece.bend = acquisition->linear ? 0.0f : 0.5f / fmax(acquisition->apex_radius_mm + path_low, 1.0f);
-      piece.line0 = 1.0f / apart_low;
-      piece.line1 = 1.0f / apart_high - piece.line0;
+      piece.edge = (line - left_line + 0.5f) / lines;
+      piece.line0 = 1.0f / (lines * apart_low);
+      piece.line1 = 1.0f / (lines * apart_high) - piece.line0;
+#ifdef LOBES
+      // The table has the square root of the power per millimetre, where the main beam has 1 / (sqrt(pi) sigma_e).
+      const float tall_low = 0.56418958f, tall_high = tall_low;
+      piece.lobes = lobes;
+      piece.path0 = path_low;
+      const float radius_e = piece.reach =
+          fmax(reach_of_lobes(acquisition, lobes, path_low), reach_of_lobes(acquisition, lobes, path_high));
+#else
+      const float tall_low = sigma_low.y, tall_high = sigma_high.y;
+      const float radius_e = acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y);
       piece.narrow0 = 0.5f * LOG2_E / (sigma_low.y * sigma_low.y);
       piece.narrow1 = 0.5f * LOG2_E / (sigma_high.y * sigma_high.y) - piece.narrow0;
+#endif
       // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
       // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak.
       const float gain = log2(segment->weight * segment->attenuation * acquisition->speckle_scale * 2.50662827f);
@@ -443,28 +574,37 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float4 tube_high = tube_after(vload4(0, segment->tube), high);
       const float band_low = LOG2_E * gain_of_band(acquisition, loss_low);
       const float band_high = LOG2_E * gain_of_band(acquisition, loss_high);
-      piece.gain0 = gain + band_low - decay * low + 0.5f * log2(sigma_low.x / (sigma_low.y * tube_low.x * tube_low.z)) -
+      piece.gain0 = gain + band_low - decay * low + 0.5f * log2(sigma_low.x / (tall_low * tube_low.x * tube_low.z)) -
                     log2(apart_low);
       piece.gain1 = gain + band_high - decay * high +
-                    0.5f * log2(sigma_high.x / (sigma_high.y * tube_high.x * tube_high.z)) - log2(apart_high) -
+                    0.5f * log2(sigma_high.x / (tall_high * tube_high.x * tube_high.z)) - log2(apart_high) -
                     piece.gain0;
 
       // Off the axis of a curved array the same range is reached slightly earlier.
-      const float radius_l = 0.5f * fmax(apart_low, apart_high), early = piece.bend * radius_l * radius_l;
-      const float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
+      const float lines_aside = max(line - left_line, left_line + lines - 1 - line) + 0.5f;
+      const float radius_l = lines_aside * fmax(apart_low, apart_high), early = piece.bend * radius_l * radius_l;
+      float begin = fmax(low, chunk_low - early), end = fmin(high, chunk_high);
+#ifdef LOBES
+      const float2 dark = dark_part(acquisition, voxels, sites + 2 * MAX_TISSUES, &piece, low, high, radius_l);
+      begin = fmax(begin, dark.x), end = fmin(end, dark.y);
+      if (dark.x > low) piece.from_mm = dark.x;
+      if (dark.y < high) piece.to_mm = dark.y;
+#endif
       if (begin >= end) continue;
-      scatter_piece(acquisition, voxels, planes, texture, sites, &piece, start, begin, end, radius_l,
-                    acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y), sum VARIED_ARGUMENTS);
+      scatter_piece(acquisition, voxels, planes, texture, sites, &piece, start, begin, end, radius_l, radius_e,
+                    sum VARIED_ARGUMENTS);
     }
   }
+#ifndef LOBES
   for (int part = 0; part < PARTS; part++) {
     const float4 *echoes = sum + part * PART + 1;
     const int left = 2 * (part * (int)get_global_size(1) + line) * stride + LINE_PAD + first, right = left + stride;
     for (int i = 0; i < CHUNK; i++) {
-      STORE_ECHO(re[left + i], echoes[i].x);
-      STORE_ECHO(im[left + i], echoes[i].y);
-      STORE_ECHO(re[right + i], echoes[i].z);
-      STORE_ECHO(im[right + i], echoes[i].w);
+      re[left + i] = echoes[i].x;
+      im[left + i] = echoes[i].y;
+      re[right + i] = echoes[i].z;
+      im[right + i] = echoes[i].w;
     }
   }
+#endif
 }

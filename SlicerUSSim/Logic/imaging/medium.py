@@ -66,6 +66,7 @@ class Medium:
         self.labels = labels
         array = as_labels(labels.array)
         counts = np.bincount(array.ravel(), minlength=256)
+        self._counts = counts[: CONSTANTS["MAX_TISSUES"]]
         #: Labels that occur, the most frequent first
         self.present = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
         self.dims = np.array(array.shape[::-1]) + 2 * _PAD
@@ -116,6 +117,15 @@ class Medium:
         if not self.has_texture:
             return None
         return self.device.download(self.texture_buffer, tuple(self.dims[::-1]), np.uint32)
+
+    def quieter(self, factor: float) -> np.ndarray:
+        """(labels,) bool: scatterers' variance below `factor` times the typical one.
+
+        Typical is the mean over the volume, weighted by the variance itself: of what echoes come from.
+        """
+        variance = self.rows["scatterer_variance"].astype(float)
+        power = self._counts * variance
+        return variance < factor * float((power * variance).sum() / max(power.sum(), 1e-30))
 
     def set_tissues(self, tissues: TissueTable) -> None:
         """Change tissue parameters; voxels are uploaded only for a new membrane position or new acoustic groups."""

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.integrate import trapezoid
 
-from SlicerUSSim.Logic.imaging.side_lobes import elevational_lobe_record
+from SlicerUSSim.Logic.imaging.diffraction import lobes_of
+from SlicerUSSim.Logic.imaging.side_lobes import DARK, Tables, elevational_lobe_record, lines_together
 from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
@@ -30,6 +31,7 @@ _PER_EDGE_PAIR = 16  # for the lateral beam, per sample
 PAPER_SITES_PER_MM3 = 0.02**-3
 # In the probe's smallest resolution cell, for developed speckle; thin structures need some too, whatever the probe
 _SITES_PER_CELL, _LEAST_PER_MM3 = 8.0, 4.0
+_LOBE_CHUNKS = 4  # samples of a work-item for elevational side lobes re those for the main beam
 _SLICES = 16  # of a scan line for the interfaces on GPUs, which have more work-items than scan lines
 
 
@@ -41,8 +43,9 @@ class Scatterers(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.lines = EchoLines(device)
-        self._sites = [device.empty(8 * CONSTANTS["MAX_TISSUES"]) for _ in range(2)]
+        self._sites = [device.empty(12 * CONSTANTS["MAX_TISSUES"]) for _ in range(2)]
         self._lobes = device.empty(ACQUISITION.itemsize)
+        self._tables = Tables(device)
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the speckle of one frame: its `traced` impulses, zero if scattering is off."""
@@ -59,24 +62,35 @@ class Scatterers(Stage):
         With `part_of`, a device buffer (MAX_TISSUES,) int32, it comes in CONSTANTS["PARTS"] consecutive parts: see
         kernels/scattering.cl and appearance.py.
         """
-        self._scatter(frame, lines, frame.acquisition, frame.acquisition_buffer, tissues, part_of)
+        samples, traced = frame.line_shape[1], int(frame.acquisition["traced_lines"])
+        end = [] if part_of is None else [part_of]
+        variant = (["TEXTURE"] if frame.medium.has_texture else []) + (["VARIED"] if part_of is not None else [])
+        self.device.write(self._sites[0], lattice_sites(tissues, frame.acquisition))
+        self._enqueue(
+            frame, lines, frame.acquisition_buffer, self._sites[0],
+            [*variant, f"CHUNK={self.device.chunk}"], (samples // self.device.chunk, traced), end,
+        )  # fmt: skip
         if frame.settings.side_lobes:
-            record = elevational_lobe_record(frame.acquisition, frame.probe)
+            record, lobes = elevational_lobe_record(frame.acquisition), lobes_of(frame.probe)
             self.device.write(self._lobes, record)
-            self._scatter(frame, lines, record, self._lobes, tissues, part_of, is_added=True)
+            chunk, together = _LOBE_CHUNKS * self.device.chunk, lines_together(record, frame.probe)
+            table = self._tables.get(frame.probe, np.append(lobes.elevational, lobes.reach_mm))
+            dark = frame.medium.quieter(DARK).astype(np.float32)
+            self.device.write(self._sites[1], np.append(lattice_sites(tissues, record), dark))
+            self._enqueue(
+                frame, lines, self._lobes, self._sites[1], [*variant, "LOBES", f"CHUNK={chunk}"],
+                (-(-samples // chunk), -(-traced // together)), [*end, table, np.int32(together)],
+            )  # fmt: skip
 
-    def _scatter(
-        self, frame: DeviceFrame, lines: EchoLines, acquisition: np.ndarray, acquisition_buffer: Buffer,
-        tissues: np.ndarray, part_of: Buffer | None, *, is_added: bool = False,
+    def _enqueue(
+        self, frame: DeviceFrame, lines: EchoLines, record: Buffer, sites: Buffer, variant: list[str],
+        size: tuple[int, int], end: list,
     ) -> None:  # fmt: skip
-        medium, sites = frame.medium, self._sites[is_added]
-        self.device.write(sites, lattice_sites(tissues, acquisition))
-        variant = (["TEXTURE"] if medium.has_texture else []) + (["VARIED"] if part_of is not None else [])
-        variant += [f"CHUNK={self.device.chunk}", *(["ADDED"] if is_added else [])]
+        medium = frame.medium
         self.device.run(
             self.device.kernels("scattering.cl", self.device.lanes, *variant)["scatter"],
-            (frame.line_shape[1] // self.device.chunk, int(frame.acquisition["traced_lines"])),
-            acquisition_buffer,
+            size,
+            record,
             medium.voxel_buffer,
             medium.sheet_buffer,
             medium.texture_buffer,
@@ -86,16 +100,17 @@ class Scatterers(Stage):
             lines.re,
             lines.im,
             np.int32(lines.stride),
-            *([] if part_of is None else [part_of]),
+            *end,
             heavy=True,
         )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
-        traced, (_, samples) = int(frame.acquisition["traced_lines"]), frame.line_shape
+        probe, traced, (_, samples) = frame.probe, int(frame.acquisition["traced_lines"]), frame.line_shape
         inside, looked_at = scatterer_counts(frame, tree.segments, self.device.chunk)
         if frame.settings.side_lobes:
-            lobes = replace(frame, acquisition=elevational_lobe_record(frame.acquisition, frame.probe))
-            counts = scatterer_counts(lobes, tree.segments, self.device.chunk)
+            lobes = replace(frame, acquisition=elevational_lobe_record(frame.acquisition))
+            together = lines_together(frame.acquisition, probe)
+            counts = scatterer_counts(lobes, tree.segments, _LOBE_CHUNKS * self.device.chunk, together)
             inside, looked_at = inside + counts[0], looked_at + counts[1]
         return Work(2 * inside + 2 * traced * samples * SAMPLE_BYTES, _PER_CELL * looked_at + _PER_SCATTERER * inside)
 
@@ -205,17 +220,24 @@ def lattice_sites(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
     return np.stack([share, amplitude], axis=1).astype(np.float32)
 
 
-def scatterer_counts(frame: FrameInputs, segments: np.ndarray, chunk: int) -> tuple[float, float]:
+def scatterer_counts(
+    frame: FrameInputs, segments: np.ndarray, chunk: int, together: int | None = None
+) -> tuple[float, float]:
     """(number of scatterers inside the strips of all ray segments, number of lattice cells to examine for them).
 
-    `segments` are records of layout.SEGMENT, `chunk` the number of samples of a work-item.
+    `segments` are records of layout.SEGMENT, `chunk` the number of samples of a work-item. With `together`, those of
+    elevational side lobes, for so many traced lines at once.
     """
     acquisition, probe, settings = frame.acquisition, frame.probe, frame.settings
     ends = segments["path_mm"], segments["path_mm"] + segments["length_mm"]
     path = np.linspace(*ends, 17)  # (17, segments)
-    width = probe.line_distance_mm(path) / float(acquisition["lateral_rays"])
-    away = (path - float(acquisition["elevation_focus"])) / float(acquisition["elevation_rayleigh"])
-    height = 2.0 * settings.beam_cutoff * float(acquisition["elevation_sigma"]) * np.hypot(1.0, away)
+    width = (together or 1) * probe.line_distance_mm(path) / float(acquisition["lateral_rays"])
+    if together is None:
+        away = (path - float(acquisition["elevation_focus"])) / float(acquisition["elevation_rayleigh"])
+        height = 2.0 * settings.beam_cutoff * float(acquisition["elevation_sigma"]) * np.hypot(1.0, away)
+    else:
+        reach = lobes_of(probe).reach_mm
+        height = 2.0 * np.interp(path, np.linspace(0.0, probe.displayed_mm, len(reach)), reach)
     # A scatterer is up to half a cell from its cell's centre along each axis of the lattice.
     slack = {
         name: float(acquisition["cell_mm"]) * np.abs(segments[name]).sum(axis=1) for name in ("lateral", "elevational")
@@ -226,4 +248,4 @@ def scatterer_counts(frame: FrameInputs, segments: np.ndarray, chunk: int) -> tu
     density = float(acquisition["cell_mm"]) ** -3
     inside = trapezoid(width * height, path, axis=0)
     looked_at = along * trapezoid((width + slack["lateral"]) * (height + slack["elevational"]), path, axis=0)
-    return float(density * inside.sum()), float(density * looked_at.sum())
+    return float(density * inside.sum() / (together or 1)), float(density * looked_at.sum() / (together or 1))

@@ -1,34 +1,34 @@
-"""Side lobes of the beam: the records and the host code of kernels/side_lobes.cl.
+"""Side lobes of the beam: host code of kernels/side_lobes.cl, and what scattering.cl needs for those in elevation.
 
-The main lobe of a beam is a Gaussian. What an aperture of finite size has beside it is one broad, weak Gaussian more,
-of as much power as the diffraction pattern of the aperture has at the distances from which cysts and shadows are filled
-(J. W. Goodman, Introduction to Fourier Optics, section 4.4; docs/physics.md#side-lobes-and-ring-down).
+The main lobe of a beam is a Gaussian. What an aperture of finite size has beside it is as in its diffraction pattern
+(diffraction.py; docs/physics.md#side-lobes-and-ring-down).
 """
 
 from __future__ import annotations
 
-from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import erfc
 
+from SlicerUSSim.Logic.imaging.diffraction import lobes_of
 from SlicerUSSim.Logic.imaging.noise import stirred
-from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
+from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
 from SlicerUSSim.Logic.opencl.device import Device
-from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, MAIN_LOBE
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.probe.arrays import Probe
 
 if TYPE_CHECKING:
-    from SlicerUSSim.Logic.probe.arrays import Probe
+    from pyopencl import Buffer
 
 #: How many times larger, along each axis, cells of the lattice are for elevational lobes, which are as much wider
-COARSER = 3.0
-#: Distances from the axis, in wavelengths x f-number, beyond which the lobes have the power of the diffraction pattern
-MATCHED = (2.0, 3.0)
-#: Lobes that hardly fall, as those of a Hamming window, are cut off here
-_WIDEST = 4.0
-_PER_LINE = 6  # operations per sample and scan line that contributes
+COARSER = 4.0
+#: Elevational lobes are computed where tissue scatters less than this part of the typical power: elsewhere its own
+#: echoes hide them
+DARK = 0.25
+#: Elevational lobes follow one path for as many traced lines as are within so many sigmas of the beam
+_TOGETHER_SIGMAS, _MOST_TOGETHER = 3.0, 9
+_PER_NODE = 4  # operations per sample and pair of nodes
 _SEED = 0x51DE10BE
 
 
@@ -40,27 +40,24 @@ class SideLobes(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.kernel = device.kernels("side_lobes.cl", device.lanes)["side_lobes"]
-        self.lines = EchoLines(device)
+        self.tables = Tables(device)
 
     def run(self, frame: DeviceFrame) -> None:
-        """Enqueue the side lobes of one frame: a new `scanned`, unless they are off."""
+        """Enqueue the side lobes of one frame, which are added to `scanned`, unless they are off."""
         if not frame.settings.side_lobes:
             return
-        lines, samples = frame.line_shape
-        before, frame.scanned = frame.scanned, self.lines
-        self.lines.prepare(lines, samples)
-        power, sigma = lateral_lobes(frame.probe)
+        probe = frame.probe
         self.device.run(
             self.kernel,
-            (samples // self.device.lanes, lines),
+            (frame.line_shape[1] // self.device.lanes,),
             frame.acquisition_buffer,
-            before.re,
-            before.im,
-            self.lines.re,
-            self.lines.im,
-            np.int32(before.stride),
-            np.float32(sigma),
-            np.float32(power),
+            self.tables.get(probe, lobes_of(probe).lateral),
+            frame.scanned.re,
+            frame.scanned.im,
+            np.int32(frame.scanned.stride),
+            np.float32(probe.wavelength_mm * probe.receive_f_number),
+            np.float32(probe.wavelength_mm / probe.aperture_mm),
+            heavy=True,
         )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
@@ -68,58 +65,39 @@ class SideLobes(Stage):
             return Work(0.0, 0.0)
         lines, samples = frame.line_shape
         depth = np.arange(samples) * float(frame.acquisition["sample_mm"])
-        main, (least, slope) = frame.probe.beam_sigma_mm(depth)[0], frame.probe.receive_beam()
-        sigma = lateral_lobes(frame.probe)[1] * np.maximum(least, slope * depth)
-        step = np.maximum(2.0 * main, frame.probe.line_distance_mm(depth))
-        others = np.minimum(2.0 * frame.settings.beam_cutoff * sigma / step, lines)
-        return Work(2 * lines * samples * SAMPLE_BYTES, _PER_LINE * lines * float(others.sum()))
+        unit = frame.probe.wavelength_mm * np.maximum(frame.probe.receive_f_number, depth / frame.probe.aperture_mm)
+        apart = np.maximum(frame.probe.line_distance_mm(depth), 1e-4)
+        nodes = np.minimum(lines * np.minimum(apart / (0.8 * unit), 1.0) + 1.0, CONSTANTS["LOBE_NODES"])
+        return Work(2 * lines * samples * SAMPLE_BYTES, samples * lines * 8.0 + _PER_NODE * float((nodes**2).sum()))
 
 
-def lateral_lobes(probe: Probe) -> tuple[float, float]:
-    """(power re the main lobe, sigma of the amplitude re that of the receive beam) of a probe's lateral side lobes."""
-    power, sigma = side_lobes_of(probe.receive_apodization, probe.harmonic)
-    return power, sigma * FWHM_PER_SIGMA / MAIN_LOBE
+class Tables:
+    """The table of the last probe on a device."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._probe: Probe | None = None
+        self._buffer: Buffer
+
+    def get(self, probe: Probe, values: np.ndarray) -> Buffer:
+        """A buffer with `values`, which are the same whenever `probe` is."""
+        if probe != self._probe:
+            self._buffer, self._probe = self._device.upload(values.astype(np.float32)), probe
+        return self._buffer
 
 
-def elevational_lobe_record(acquisition: np.ndarray, probe: Probe) -> np.ndarray:
-    """The record (layout.ACQUISITION) with which scattering.cl computes what elevational side lobes receive.
-
-    Elements have no apodisation in this direction, and one height. To the square of the main beam's width comes that of
-    the lobes of the aperture in its far field, which grow with depth: this is one Gaussian beam again. Its lattice is
-    COARSER, with scatterers of its own.
-    """
+def elevational_lobe_record(acquisition: np.ndarray) -> np.ndarray:
+    """The record (layout.ACQUISITION) for what elevational side lobes receive: a COARSER lattice of its own."""
     record = acquisition.copy()
-    power, sigma = side_lobes_of(0.0, probe.harmonic)
-    waist, focus, rayleigh = (float(acquisition[f"elevation_{name}"]) for name in ("sigma", "focus", "rayleigh"))
-    # The square of the width is a z^2 - 2 b z + c.
-    a = (waist / rayleigh) ** 2 + (sigma * probe.wavelength_mm / probe.elevation_aperture_mm) ** 2
-    b, c = focus * (waist / rayleigh) ** 2, waist**2 * (1.0 + (focus / rayleigh) ** 2)
-    least = np.sqrt(c - b**2 / a)
-    record["elevation_sigma"], record["elevation_focus"] = least, b / a
-    record["elevation_rayleigh"] = least / np.sqrt(a)
     record["cell_mm"] = COARSER * float(acquisition["cell_mm"])
     record["seed"] = stirred(int(acquisition["seed"]) ^ _SEED)
-    record["speckle_scale"] = float(acquisition["speckle_scale"]) * np.sqrt(COARSER**3 * power)
+    record["speckle_scale"] = float(acquisition["speckle_scale"]) * COARSER**1.5
     return record
 
 
-@cache
-def side_lobes_of(receive_apodization: float, harmonic: bool = False) -> tuple[float, float]:
-    """(power re the main lobe, sigma in received wavelengths x f-number) of the lobes of a two-way beam.
-
-    The transmit aperture is uniform, the receive aperture has the weights 1 - a + a cos(pi x)^2, x from -1/2 to 1/2,
-    with a from 0, uniform, to 1, Hann. The power beyond MATCHED is that of the diffraction pattern. The second harmonic
-    has the square of the pattern of half its frequency.
-    """
-    x = (np.arange(512) + 0.5) / 512 - 0.5
-    u = np.linspace(0.0, 64.0, 16_385)  # wavelengths x f-number
-    weights = 1.0 - receive_apodization + receive_apodization * np.cos(np.pi * x) ** 2
-    receive = np.cos(2.0 * np.pi * np.outer(u, x)) @ weights / weights.sum()
-    sent = np.sinc(0.5 * u) ** 2 if harmonic else np.sinc(u)
-    pattern = (sent * receive) ** 2
-    beyond = [float(pattern[u > at].sum() / pattern.sum()) for at in MATCHED]
-    # The power of a Gaussian amplitude of this sigma beyond u is erfc(u / sigma).
-    ratio = beyond[1] / beyond[0]
-    widths = np.geomspace(0.3, _WIDEST, 4096)
-    sigma = float(np.interp(ratio, erfc(MATCHED[1] / widths) / erfc(MATCHED[0] / widths), widths))
-    return beyond[0] / float(erfc(MATCHED[0] / sigma)), sigma
+def lines_together(acquisition: np.ndarray, probe: Probe) -> int:
+    """Traced lines whose elevational lobes follow the path of the one in the middle."""
+    middle = 0.5 * probe.depth_mm
+    apart = float(probe.line_distance_mm(middle)) / int(acquisition["lateral_rays"])
+    lines = _TOGETHER_SIGMAS * float(probe.beam_sigma_mm(middle)[0]) / apart
+    return int(np.clip(round(lines), 1, _MOST_TOGETHER))

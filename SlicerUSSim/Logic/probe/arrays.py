@@ -37,7 +37,8 @@ class Probe(Beam):
     product of a transmit beam, by default focused once at `focus_mm`, and a receive beam that is focused at every
     depth, with an aperture that grows at constant f-number until it is fully open; elevationally the lens focuses both
     ways at one depth.
-    Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number.
+    Each one-way beam has the width of a uniform aperture at its focus: FWHM = 1.21 x wavelength x f-number. With
+    `receive_apodization` the receive beam is wider, as much as the main lobe of its aperture (beam.widening).
 
     >>> from dataclasses import replace
     >>> from SlicerUSSim.Logic.probe import PROBES

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -74,8 +75,13 @@ class Beam(Declared):
         note="The receive aperture grows with depth up to the full aperture",
     )  # fmt: skip
     receive_apodization: float = parameter(
-        0.0, "Apodisation", "Weights of the receive aperture, for its side lobes: 0 uniform, 1 Hann", bounds=(0, 1),
-        note="Power of the side lobes re the main beam: -27 dB with 0, -32 dB with 0.5",
+        0.0, "Apodisation", "Weights of the receive aperture: 0 uniform, 1 Hann; lower side lobes, a wider beam",
+        bounds=(0, 1),
+    )  # fmt: skip
+    clutter_db: float = parameter(
+        -38.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, re its own",
+        unit="dB", bounds=(-100, 0),
+        note="They and the side lobes fill cysts; spread evenly over 24 wavelengths x f-number to either side",
     )  # fmt: skip
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
@@ -144,7 +150,7 @@ class Beam(Declared):
 
     def receive_beam(self) -> tuple[float, float]:
         """(least sigma in mm, sigma per mm of depth) of the one-way lateral receive beam, focused at every depth."""
-        per_f_number = MAIN_LOBE * self.wavelength_mm / FWHM_PER_SIGMA
+        per_f_number = MAIN_LOBE * widening(self.receive_apodization) * self.wavelength_mm / FWHM_PER_SIGMA
         return per_f_number * self.receive_f_number, per_f_number / self.aperture_mm
 
     def elevation_beam(self) -> tuple[float, float, float]:
@@ -185,12 +191,20 @@ class Beam(Declared):
 
         Zones are at the odd multiples of focus_mm / focal_zones. At every depth the narrowest is used.
         """
+        return [self._sent(*zone) for zone in self.transmit_apertures()]
+
+    def transmit_apertures(self) -> list[tuple[float, float]]:
+        """(focus, lateral size) in mm of the aperture of each of transmit_zones."""
         if self.transmit == "angles":
             return []
         if self.transmit == "focus":
-            return [self.transmit_waist()]
+            return [(self.focus_mm, self.aperture_mm)]
         foci = self.focus_mm * (2.0 * np.arange(self.focal_zones) + 1.0) / self.focal_zones
-        return [self._sent(focus, min(self.aperture_mm, focus / self.receive_f_number)) for focus in foci.tolist()]
+        return [(focus, min(self.aperture_mm, focus / self.receive_f_number)) for focus in foci.tolist()]
+
+    def zone_at(self, depth_mm: np.ndarray) -> np.ndarray:
+        """Which of transmit_zones is used at `depth_mm`, the narrowest; there must be one."""
+        return np.argmin([self._gaussian_beam(depth_mm, *zone) for zone in self.transmit_zones()], axis=0)
 
     def compounded_beam(self) -> tuple[float, float]:
         """(least sigma in mm, sigma per mm of depth) of the lateral transmit beam of compounded waves.
@@ -238,6 +252,23 @@ class Beam(Declared):
     @staticmethod
     def _gaussian_beam(depth, sigma, focus, rayleigh):
         return sigma * np.sqrt(1.0 + ((depth - focus) / rayleigh) ** 2)
+
+
+def apodized_pattern(u: np.ndarray, apodization: float) -> np.ndarray:
+    """The amplitude, 1 at u = 0, at u wavelengths x f-number from the axis of an aperture with weights, at its focus.
+
+    The weights are 1 - a + a cos(pi x)^2 for x from -1/2 to 1/2: the transform of a constant and of a cosine.
+    """
+    half = 0.5 * apodization
+    return np.sinc(u) + 0.5 * half / (1.0 - half) * (np.sinc(u - 1.0) + np.sinc(u + 1.0))
+
+
+@cache
+def widening(apodization: float) -> float:
+    """The -6 dB width of the main lobe of an aperture with weights (apodized_pattern) re that of a uniform one."""
+    u = np.linspace(0.5, 1.1, 1201)  # half widths: 0.603 with 0, 1 with 1
+    uniform, weighted = (float(np.interp(-0.5, -apodized_pattern(u, a), u)) for a in (0.0, apodization))
+    return weighted / uniform
 
 
 def _running_integral(values: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -411,21 +411,37 @@ def round_cyst(rotation: np.ndarray | None = None, *, depth_mm: float = 40.0, ra
 
 
 def clutter_power(probe: Probe, depth_mm: float, radius_mm: float) -> float:
-    """Power received from outside a disc across the beam at its focus, re that of everything; without apodisation.
+    """Power received from outside a disc across the beam at a depth, re that of everything; without attenuation.
 
-    By diffraction at uniform apertures (Goodman, Introduction to Fourier Optics, section 4.4): the two-way amplitude is
-    sinc(x / a) sinc(x / b) sinc(y / c)^2 with a, b, c wavelengths x f-number on transmission, reception and in
-    elevation.
+    By diffraction (Goodman, Introduction to Fourier Optics, section 3.4): the sum of the waves of 512 points of each
+    aperture, by their exact distances. The transmit aperture and the elements are focused once, the receive aperture at
+    the depth, with its weights. The second harmonic is fed by the square of what is transmitted at half its frequency.
+    To this comes the probe's clutter.
     """
-    across = np.linspace(0.0, 60.0, 6001)
-    per_f_number = probe.wavelength_mm * depth_mm
-    transmit = per_f_number / probe.aperture_mm
-    receive = max(transmit, probe.receive_f_number * probe.wavelength_mm)
-    lateral = (np.sinc(across / transmit) * np.sinc(across / receive)) ** 2
-    elevational = np.sinc(across / (per_f_number / probe.elevation_aperture_mm)) ** 4
+    across = np.linspace(0.0, 60.0, 2401)
+    unit = probe.wavelength_mm * max(probe.receive_f_number, depth_mm / probe.aperture_mm)
+    receive = probe.wavelength_mm * depth_mm / unit
+    order, pulse = (2, replace(probe, harmonic=False)) if probe.harmonic else (1, probe)
+    lateral = _pressure(pulse, probe.aperture_mm, probe.focus_mm, across, depth_mm) ** order
+    lateral *= _pressure(probe, receive, depth_mm, across, depth_mm, probe.receive_apodization)
+    lens = probe.elevation_aperture_mm, probe.elevation_focus_mm, across, depth_mm
+    elevational = _pressure(pulse, *lens) ** order * _pressure(probe, *lens)
     reach = np.sqrt(np.maximum(radius_mm**2 - across**2, 0.0))
-    seen = np.interp(reach, across, np.cumsum(elevational) - 0.5 * elevational)
-    return float(1.0 - (lateral * seen).sum() / (lateral.sum() * elevational.sum()))
+    seen = np.interp(reach, across, np.cumsum(elevational**2) - 0.5 * elevational**2)
+    beyond = 1.0 - float((lateral**2 * seen).sum() / ((lateral**2).sum() * (elevational**2).sum()))
+    clutter = 10.0 ** (probe.clutter_db / 10.0)
+    return (beyond + clutter * max(1.0 - radius_mm / (24.0 * unit), 0.0)) / (1.0 + clutter)
+
+
+def _pressure(
+    probe: Probe, aperture: float, focus: float, across: np.ndarray, depth: float, apodization: float = 0.0
+) -> np.ndarray:
+    """(across,) amplitude of an aperture's field at distances from the axis, of cylindrical waves."""
+    point = ((np.arange(512) + 0.5) / 512 - 0.5) * aperture
+    weight = 1.0 - apodization + apodization * np.cos(np.pi * point / aperture) ** 2
+    distance = np.hypot(across[:, None] - point, depth)
+    phase = 2.0 * np.pi / probe.wavelength_mm * (distance - np.hypot(point, focus))
+    return np.abs((np.exp(1j * phase) * depth * distance**-1.5) @ weight)
 
 
 def uniform_speckle(tissue: Tissue = BACKGROUND, rotation: np.ndarray | None = None) -> Phantom[Level]:

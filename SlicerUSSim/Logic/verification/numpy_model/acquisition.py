@@ -7,7 +7,7 @@ it takes names and number formats, but no values.
 from __future__ import annotations
 
 import numpy as np
-from scipy import special
+from scipy import optimize, special
 
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.settings import SimulationSettings
@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.verification.numpy_model.medium import HostMedium
 
 _DESIGN_SPEED_M_S = 1540.0  # for wavelengths and focus widths of an array
 _FWHM = np.sqrt(8.0 * np.log(2.0))  # of a Gaussian, in standard deviations
+_HALF_OF_SINC = 0.6033545644016142  # sin(pi x) = pi x / 2
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -59,8 +60,8 @@ def acquisition_record(
         "samples": int(np.ceil(samples / CONSTANTS["BLOCK"])) * CONSTANTS["BLOCK"],
         **_transmit(probe),
         "wavefront_curvature": 0.6 if settings.wavefront_curvature else 0.0,
-        "receive_sigma_min": _one_way_sigma(probe, probe.receive_f_number),
-        "receive_sigma_slope": _one_way_sigma(probe, 1.0 / probe.aperture_mm),
+        "receive_sigma_min": _receive_sigma(probe, probe.receive_f_number),
+        "receive_sigma_slope": _receive_sigma(probe, 1.0 / probe.aperture_mm),
         "elevation_sigma": elevational,
         "elevation_focus": probe.elevation_focus_mm,
         "elevation_rayleigh": elevational_length,
@@ -145,7 +146,7 @@ def _lateral_sigma(probe: Probe, depth: np.ndarray) -> np.ndarray:
         transmit = np.min(
             [sigma * np.hypot(1.0, (depth - at) / _rayleigh_mm(probe, sigma)) for sigma, at in _zones(probe)], axis=0
         )
-    receive = _one_way_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
+    receive = _receive_sigma(probe, 1.0) * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
     return 1.0 / np.sqrt(transmit**-2.0 + receive**-2.0)
 
 
@@ -337,7 +338,8 @@ def _steering(probe: Probe) -> dict[str, float]:
     }
 
 
-def _wavelength_mm(probe: Probe) -> float:
+def received_wavelength_mm(probe: Probe) -> float:
+    """Of the echoes, at the speed of sound that arrays are designed for."""
     return 1e-3 * _DESIGN_SPEED_M_S / _received_mhz(probe)
 
 
@@ -347,11 +349,21 @@ def _cycles_per_mm(probe: Probe, settings: SimulationSettings) -> float:
 
 def _one_way_sigma(probe: Probe, f_number: float) -> float:
     """At a focus: FWHM = 1.21 wavelength x f-number."""
-    return 1.21 * _wavelength_mm(probe) * f_number / _FWHM
+    return 1.21 * received_wavelength_mm(probe) * f_number / _FWHM
+
+
+def _receive_sigma(probe: Probe, f_number: float) -> float:
+    """Of an aperture of the weights 1 - a / 2 + a / 2 cos(2 pi x): as much wider as its pattern at half its peak."""
+    half = 0.5 * probe.receive_apodization
+
+    def above_half(u: float) -> float:
+        return (1.0 - half) * (np.sinc(u) - 0.5) + 0.5 * half * (np.sinc(u - 1.0) + np.sinc(u + 1.0))
+
+    return _one_way_sigma(probe, f_number) * optimize.brentq(above_half, 0.5, 1.1) / _HALF_OF_SINC
 
 
 def _rayleigh_mm(probe: Probe, sigma_mm: float) -> float:
-    return 2.0 * np.pi * sigma_mm * sigma_mm / _wavelength_mm(probe)
+    return 2.0 * np.pi * sigma_mm * sigma_mm / received_wavelength_mm(probe)
 
 
 def _traced_lines(probe: Probe, settings: SimulationSettings) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,9 +19,20 @@ from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     turn,
 )
 from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
+from SlicerUSSim.Logic.verification.numpy_model.lobes import Table
 
-_BLOCK = CONSTANTS["BLOCK"]  # samples with linear interpolation of widths and gains
 _AXIS_STEPS = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint32)
+
+
+@dataclass(frozen=True)
+class _Strips:
+    """The lines whose echoes follow one path: `lines`, of which `before` are left of it; for lobes, their table."""
+
+    lines: int = 1
+    before: int = 0
+    block: int = CONSTANTS["BLOCK"]  # samples with linear interpolation of widths and gains
+    table: Table | None = None
+    quiet: np.ndarray | None = None  # (labels,) bool
 
 
 def scatterer_lines(
@@ -29,29 +41,54 @@ def scatterer_lines(
     """(2 traced lines, samples) complex64 impulses of all scatterers, on the left and right edges of every strip."""
     lines = np.zeros((2 * int(acquisition["traced_lines"]), int(acquisition["samples"])), np.complex128)
     for segment, line in zip(segments, segment_lines, strict=True):
-        slope, start = segment["depth_per_mm"], segment["depth_mm"]
-        end = start + segment["length_mm"] * slope
-        for block in range(
-            max(int(start / acquisition["sample_mm"]) - 1, 0) // _BLOCK, int(acquisition["samples"]) // _BLOCK
-        ):
-            first = block * _BLOCK
-            if (first - 1) * acquisition["sample_mm"] > end:
-                break
-            _add_block(
-                acquisition, labels, tissues, segment, first, lines[2 * line : 2 * line + 2, first : first + _BLOCK]
-            )
+        _add_segment(acquisition, labels, tissues, segment, lines[2 * line : 2 * line + 2], _Strips())
     return lines.astype(np.complex64)
 
 
-def _add_block(acquisition, labels, tissues, segment, first: int, sums: np.ndarray) -> None:
-    """Add the scatterers of one segment to the samples of one block, (2, block) from sample `first` on."""
+def lobe_lines(
+    acquisition: np.ndarray,
+    labels: Labels,
+    tissues: np.ndarray,
+    segments,
+    segment_lines,
+    table: Table,
+    together: int,
+    quiet: np.ndarray,
+) -> np.ndarray:
+    """The same for elevational lobes, near quiet tissue: `together` lines have the path of the middle one of them."""
+    traced = int(acquisition["traced_lines"])
+    lines = np.zeros((2 * traced, int(acquisition["samples"])), np.complex128)
+    for segment, line in zip(segments, segment_lines, strict=True):
+        first = line // together * together
+        count = min(together, traced - first)
+        if line == first + count // 2:
+            strips = _Strips(count, line - first, 4 * CONSTANTS["BLOCK"], table, quiet)
+            _add_segment(acquisition, labels, tissues, segment, lines[2 * first : 2 * (first + count)], strips)
+    return lines.astype(np.complex64)
+
+
+def _add_segment(acquisition, labels, tissues, segment, lines: np.ndarray, strips: _Strips) -> None:
+    """Add the scatterers of one segment to (2 lines, samples)."""
+    slope, start = segment["depth_per_mm"], segment["depth_mm"]
+    end, size = start + segment["length_mm"] * slope, strips.block
+    for first in range(
+        max(int(start / acquisition["sample_mm"]) - 1, 0) // size * size, int(acquisition["samples"]), size
+    ):
+        if (first - 1) * acquisition["sample_mm"] > end:
+            break
+        _add_block(acquisition, labels, tissues, segment, first, lines[:, first : first + size], strips)
+
+
+def _add_block(acquisition, labels, tissues, segment, first: int, sums: np.ndarray, strips: _Strips) -> None:
+    """Add the scatterers of one segment to the samples of one block, (2 lines, block) from sample `first` on."""
     slope, depth0 = segment["depth_per_mm"], segment["depth_mm"]
     low = np.maximum(f32(0), (f32(first - 1) * acquisition["sample_mm"] - depth0) / slope)
-    high = np.minimum(segment["length_mm"], (f32(first + _BLOCK) * acquisition["sample_mm"] - depth0) / slope)
+    high = np.minimum(segment["length_mm"], (f32(first + strips.block) * acquisition["sample_mm"] - depth0) / slope)
     if low >= high:
         return
-    waist = np.minimum(acquisition["transmit_waist"], acquisition["elevation_rayleigh"])
-    pieces = max(1, int(np.ceil((high - low) / (f32(0.4) * waist))))
+    waist = acquisition["transmit_waist"]
+    longest = waist if strips.table is not None else f32(0.4) * np.minimum(waist, acquisition["elevation_rayleigh"])
+    pieces = max(1, int(np.ceil((high - low) / longest)))
     to_apex = segment["path_mm"] + (f32(1e6) if acquisition["linear"] else acquisition["apex_radius_mm"])
     ends = [low]
     for n in range(1, pieces + 1):
@@ -61,10 +98,10 @@ def _add_block(acquisition, labels, tissues, segment, first: int, sums: np.ndarr
     last = len(ends) - 2
     for n, (begin, end) in enumerate(itertools.pairwise(ends)):
         belongs = f32(0) if n == 0 else begin, segment["length_mm"] if n == last else end
-        _add_piece(acquisition, labels, tissues, segment, first, begin, end, belongs, sums)
+        _add_piece(acquisition, labels, tissues, segment, first, begin, end, belongs, sums, strips)
 
 
-def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs, sums) -> None:
+def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs, sums, strips) -> None:
     beam = Beam(acquisition)
     path = segment["path_mm"] + np.array([low, high])
     loss = segment["loss"] + segment["loss_per_mm"] * np.array([low, high])
@@ -75,7 +112,8 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     along_tube = [segment["tube"][w] + segment["tube"][w + 1] * np.array([low, high]) for w in (0, 2)]
     strength = np.log2(segment["weight"] * segment["attenuation"] * acquisition["speckle_scale"] * f32(2.50662827))
     gain = strength - LOG2_E * segment["decay_per_mm"] * np.array([low, high]) + LOG2_E * beam.gain_of_band(loss)
-    gain = gain + f32(0.5) * np.log2(lateral / (elevation * along_tube[0] * along_tube[1])) - np.log2(apart)
+    tall = elevation if strips.table is None else f32(1.0 / np.sqrt(np.pi))
+    gain = gain + f32(0.5) * np.log2(lateral / (tall * along_tube[0] * along_tube[1])) - np.log2(apart)
 
     # Lattice axes in the kernel's order, for the same rounding of sums.
     u = int(np.abs(segment["elevational"]).argmax())
@@ -85,7 +123,13 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     order = [u, v, w]
     start = segment["start"][order]
     d, side, e = (segment[name][order] for name in ("direction", "lateral", "elevational"))
-    cells = _cells_of_box(acquisition, start, d, side, e, low, high, 0.5 * apart.max(), elevation.max())
+    aside = (max(strips.before, strips.lines - 1 - strips.before) + 0.5) * apart.max()
+    widest = acquisition["beam_cutoff"] * elevation.max()
+    height = widest if strips.table is None else strips.table.end(path).max()
+    if strips.quiet is not None:
+        from_mm, to_mm = _quiet_part(acquisition, labels, strips.quiet, segment, low, high, aside)
+        belongs = from_mm if from_mm > low else belongs[0], to_mm if to_mm < high else belongs[1]
+    cells = _cells_of_box(acquisition, start, d, side, e, low, high, aside, height)
 
     key = hash_mix((cells.astype(np.uint32) * _AXIS_STEPS[order]).sum(axis=1, dtype=np.uint32) ^ acquisition["seed"])
     random = hash_mix(key + np.uint32(0x3C6EF372))
@@ -97,17 +141,19 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     ]
     along, aside_l, aside_e = (p[0] * x[0] + p[1] * x[1] + p[2] * x[2] for x in (d, side, e))
     t = (along - low) * (f32(1) / np.maximum(high - low, f32(1e-6)))
-    one_over = f32(1) / apart
-    right = f32(0.5) + aside_l * (one_over[0] + t * (one_over[1] - one_over[0]))
+    one_over = f32(1) / (strips.lines * apart)
+    right = f32((strips.before + 0.5) / strips.lines) + aside_l * (one_over[0] + t * (one_over[1] - one_over[0]))
     r2 = aside_e * aside_e * (narrow[0] + t * (narrow[1] - narrow[0]))
     bend = f32(0) if acquisition["linear"] else f32(0.5) / np.maximum(acquisition["apex_radius_mm"] + path[0], f32(1))
     depth = segment["depth_mm"] + (along + aside_l * aside_l * bend) * segment["depth_per_mm"]
     place = depth * (f32(1) / acquisition["sample_mm"])
     bins = np.floor(place).astype(int) - first
     cutoff2 = f32(0.5) * LOG2_E * acquisition["beam_cutoff"] * acquisition["beam_cutoff"]
-    counts = (right >= 0) & (right < 1) & (r2 <= cutoff2) & (bins >= -1) & (bins < _BLOCK)
+    near = r2 <= cutoff2 if strips.table is None else np.abs(aside_e) <= height
+    counts = (right >= 0) & (right < 1) & near & (bins >= -1) & (bins < strips.block)
     counts &= (along >= belongs[0]) & (along < belongs[1])
     p, t, r2, right, depth = [x[counts] for x in p], t[counts], r2[counts], right[counts], depth[counts]
+    away, profile = np.abs(aside_e[counts]), r2
     bins, part, random = bins[counts], (place - np.floor(place))[counts], random[counts]
 
     at = affine_point(acquisition["ras_to_voxel"], segment["start"])
@@ -117,16 +163,34 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     share, level = (of_label[label] for of_label in _site_statistics(tissues, float(cell)))
     exists = (random >> np.uint32(16)).astype(np.float32) + f32(0.5) < share
     strength = np.where(exists, level, f32(0)) * np.where((random >> np.uint32(15)) & np.uint32(1), f32(-1), f32(1))
-    amplitude = exp2(np.clip(gain[0] + t * (gain[1] - gain[0]) - r2, f32(-100), f32(100)))
+    if strips.table is not None:
+        strength, profile = strength * strips.table.at(path[0] + t * (high - low), away), f32(0)
+    amplitude = exp2(np.clip(gain[0] + t * (gain[1] - gain[0]) - profile, f32(-100), f32(100)))
     cosine, sine = turn(depth * acquisition["cycles_per_mm"])
     echo = of_sheet * strength * amplitude * (cosine - 1j * sine)
+    strip = np.minimum((right * strips.lines).astype(int), strips.lines - 1)
+    right = right * strips.lines - strip
+    samples = sums.shape[1]
     for edge, of_edge in enumerate((f32(1) - right, right)):
         for ahead, of_sample in enumerate((f32(1) - part, part)):
             here = bins + ahead
-            inside = (here >= 0) & (here < _BLOCK)
-            value = (echo * of_edge * of_sample)[inside]
-            for quadrature, component in ((1, value.real), (1j, value.imag)):
-                sums[edge] += quadrature * np.bincount(here[inside], component, _BLOCK)
+            inside = (here >= 0) & (here < samples)
+            np.add.at(sums, ((2 * strip + edge)[inside], here[inside]), (echo * of_edge * of_sample)[inside])
+
+
+def _quiet_part(acquisition, labels, quiet, segment, low, high, aside) -> tuple[np.float32, np.float32]:
+    """From where to where along a piece, with a step more, there is quiet tissue on the axis or beside it."""
+    steps = max(1, int(np.ceil(high - low)))
+    step = (high - low) / f32(steps)
+    along = low + (np.arange(steps, dtype=np.float32) + f32(0.5)) * step
+    across = f32(0.8) * aside * np.array([-1, 0, 1], np.float32)
+    point = segment["start"] + along[:, None, None] * segment["direction"] + across[:, None] * segment["lateral"]
+    voxel = affine_point(acquisition["ras_to_voxel"], point) + f32(0.5)
+    index = np.clip(voxel, f32(0), f32(labels.dims) - f32(1)).astype(np.int64) @ labels.steps
+    found = np.flatnonzero(quiet[labels.label[index]].any(axis=1))
+    if len(found) == 0:
+        return high, low
+    return max(low, low + f32(found[0] - 1) * step), min(high, low + f32(found[-1] + 2) * step)
 
 
 def _site_statistics(tissues: np.ndarray, cell_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -138,10 +202,10 @@ def _site_statistics(tissues: np.ndarray, cell_mm: float) -> tuple[np.ndarray, n
     return count.astype(np.float32), np.where(count > 0, amplitude, 0.0).astype(np.float32)
 
 
-def _cells_of_box(acquisition, start, d, side, e, low, high, radius_l, sigma_e) -> np.ndarray:
+def _cells_of_box(acquisition, start, d, side, e, low, high, radius_l, radius_e) -> np.ndarray:
     """(n, 3) indices of the lattice cells in the box around a piece, in the order of the axes given."""
     ends = start + np.outer([low, high], d)
-    reach = radius_l * np.abs(side) + acquisition["beam_cutoff"] * sigma_e * np.abs(e) + acquisition["cell_mm"]
+    reach = radius_l * np.abs(side) + radius_e * np.abs(e) + acquisition["cell_mm"]
     first = np.floor((ends.min(axis=0) - reach) / acquisition["cell_mm"]).astype(np.int64)
     last = np.floor((ends.max(axis=0) + reach) / acquisition["cell_mm"]).astype(np.int64)
     return np.stack(np.meshgrid(*map(np.arange, first, last + 1), indexing="ij"), axis=-1).reshape(-1, 3)

@@ -2,99 +2,74 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
-from scipy import integrate, special
 
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.verification.numpy_model.acquisition import harmonic_level
+from SlicerUSSim.Logic.verification.numpy_model.acquisition import harmonic_level, received_wavelength_mm
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, hash_mix
+from SlicerUSSim.Logic.verification.numpy_model.lobes import lateral_table
 
-_COARSER = 3.0
+_COARSER = 4.0
+_MOST_NODES = 128
 #: Samples with one width of the lobes
 _TOGETHER = 16
-_WAVELENGTH = 1.54  # mm at 1 MHz
-_SIGMA = 1.21 / np.sqrt(8.0 * np.log(2.0))  # of a one-way beam, in wavelengths x f-number
 
 
-def elevational_lobes(acquisition: np.ndarray, probe: Probe) -> np.ndarray:
-    """The record for what elevational side lobes receive: a wider beam, a coarser lattice with its own scatterers."""
+def lobe_lattice(acquisition: np.ndarray) -> np.ndarray:
+    """The record for what elevational side lobes receive: a coarser lattice with its own scatterers."""
     record = acquisition.copy()
-    power, sigma = lobes(0.0, probe.harmonic)
-    focus, rayleigh = float(acquisition["elevation_focus"]), float(acquisition["elevation_rayleigh"])
-    waist, growth = (
-        float(acquisition["elevation_sigma"]),
-        sigma * _WAVELENGTH / (probe.frequency_mhz * (1 + probe.harmonic) * probe.elevation_aperture_mm),
-    )
-    # waist^2 (1 + ((z - focus) / rayleigh)^2) + (growth z)^2, about where it is least
-    divergence = np.hypot(waist / rayleigh, growth)
-    at = focus * (waist / rayleigh / divergence) ** 2
-    width = np.sqrt(waist**2 * (1.0 + ((at - focus) / rayleigh) ** 2) + (growth * at) ** 2)
-    record["elevation_sigma"], record["elevation_focus"] = width, at
-    record["elevation_rayleigh"] = width / divergence
     record["cell_mm"] = _COARSER * float(acquisition["cell_mm"])
     record["seed"] = hash_mix(np.array([acquisition["seed"] ^ np.uint32(0x51DE10BE)], np.uint32))[0]
-    record["speckle_scale"] = float(acquisition["speckle_scale"]) * _COARSER**1.5 * np.sqrt(power)
+    record["speckle_scale"] = float(acquisition["speckle_scale"]) * _COARSER**1.5
     return record
 
 
-@cache
-def lobes(apodization: float, harmonic: bool) -> tuple[float, float]:
-    """(power, sigma in wavelengths x f-number) of a Gaussian with the pattern's power beyond 2 and 3 of these.
+def quiet_labels(tissues: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """(labels,) bool: less than a quarter of the variance that echoes of the volume come from on average."""
+    variance = tissues["scatterer_variance"].astype(float)
+    echoes = variance[labels.ravel()]
+    return variance < 0.25 * (echoes**2).sum() / max(echoes.sum(), 1e-30)
 
-    The pattern of weights 1 - a + a cos^2 = (1 - a / 2) + (a / 2) cos(2 pi x) is sinc functions at -1, 0 and 1.
-    """
-    half = 0.5 * apodization
 
-    def pattern(u: float) -> float:
-        shifted = np.sinc(u - 1.0) + np.sinc(u + 1.0)
-        sent = np.sinc(u / 2.0) ** 2 if harmonic else np.sinc(u)
-        return float((sent * ((1.0 - half) * np.sinc(u) + 0.5 * half * shifted) / (1.0 - half)) ** 2)
-
-    def power(low: float) -> float:
-        return sum(integrate.quad(pattern, a, a + 1.0)[0] for a in np.arange(low, 64.0))
-
-    near, far = power(2.0) / power(0.0), power(3.0) / power(0.0)
-    widths = np.geomspace(0.3, 4.0, 200_001)
-    ratios = special.erfc(3.0 / widths) / special.erfc(2.0 / widths)
-    sigma = float(np.interp(far / near, ratios, widths))
-    return near / float(special.erfc(2.0 / sigma)), sigma
+def lines_of_a_path(acquisition: np.ndarray, probe: Probe) -> int:
+    """Neighbouring lines within three sigmas of the beam in the middle of the image, whose lobes have one path."""
+    beam, middle = Beam(acquisition), f32(0.5 * probe.depth_mm)
+    return min(max(round(3.0 * float(beam.lateral_sigma(middle) / beam.line_distance(middle))), 1), 9)
 
 
 def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray) -> np.ndarray:
-    """(scan lines, samples) complex64: with a broad Gaussian of the lines, in quadrature and of the lobes' power."""
-    beam = Beam(acquisition)
+    """(scan lines, samples) complex64: with the lobes in quadrature, and the power of the main beam before."""
+    beam, table = Beam(acquisition), lateral_table(acquisition, probe)
     lines, samples = scanned.shape
-    result = scanned.astype(np.complex128)
-    starts = beam.line_start(np.arange(lines))
+    result = np.empty(scanned.shape, np.complex128)
+    line, start = np.arange(lines), beam.line_start(f32(0.5 * (lines - 1)))
     for first in range(0, samples, _TOGETHER):
-        block = scanned[:, first : first + _TOGETHER]
-        paths = np.maximum(f32((first + 0.5 * _TOGETHER) * acquisition["sample_mm"]) - starts, f32(0))
-        for path in np.unique(paths):  # one, unless lines are steered
-            here = np.flatnonzero(paths == path)
-            for place, weight in zip(*_lobe_weights(acquisition, probe, beam, np.array(path)), strict=True):
-                to = here[(here + place >= 0) & (here + place < lines)]
-                result[to, first : first + _TOGETHER] += 1j * weight * block[to + place]
+        s = np.maximum(f32((first + 0.5 * _TOGETHER) * acquisition["sample_mm"]) - start, f32(0))
+        apart = float(beam.line_distance(s)) * int(acquisition["lateral_rays"])
+        main = float(beam.lateral_sigma(s))
+        unit = received_wavelength_mm(probe) * max(probe.receive_f_number, float(s) / probe.aperture_mm)
+        together = int(np.clip(int(0.8 * unit / apart), -(-lines // _MOST_NODES), lines))
+        nodes = -(-lines // together)
+        averaging = (np.arange(nodes)[:, None] == line // together) / together
+        steps = np.arange(together)
+        # Of exp(-y^2 / 2 main^2 + i curvature y^2 / 2) with itself
+        narrow = main**-2 + (float(beam.lateral_curvature(s)) * main) ** 2
+        correlation = np.exp(-0.25 * narrow * ((steps[:, None] - steps) * apart) ** 2)
+        distance = np.abs(np.subtract.outer(np.arange(nodes), np.arange(nodes)))
+        weights = table.at(np.full(distance.shape, float(s)), distance * together * apart / unit)
+        weights *= np.sqrt(together * apart / unit / correlation.mean()) * np.where(distance % 4 < 2, 1.0, -1.0)
+        of_nodes = weights @ averaging @ scanned[:, first : first + _TOGETHER]
+        place = (line + 0.5) / together - 0.5
+        before = np.floor(place).astype(int)
+        part = (place - before)[:, None]
+        left, right = (of_nodes[np.clip(before + n, 0, nodes - 1)] for n in (0, 1))
+        between = ((1.0 - part) * left + part * right) / np.sqrt((1.0 - part) ** 2 + part**2)
+        kept = 1.0 / np.sqrt(1.0 + correlation.mean() * (weights**2).sum(axis=1))
+        near, far = (kept[np.clip(before + n, 0, nodes - 1), None] for n in (0, 1))
+        both = scanned[:, first : first + _TOGETHER] + 1j * between
+        result[:, first : first + _TOGETHER] = ((1.0 - part) * near + part * far) * both
     return result.astype(np.complex64)
-
-
-def _lobe_weights(acquisition: np.ndarray, probe: Probe, beam: Beam, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(distances in scan lines, weights) of the lateral lobes at path length s."""
-    power, sigma = lobes(probe.receive_apodization, probe.harmonic)
-    apart = float(beam.line_distance(s)) * int(acquisition["lateral_rays"])
-    main = float(beam.lateral_sigma(s))
-    receive = max(float(acquisition["receive_sigma_min"]), float(acquisition["receive_sigma_slope"]) * float(s))
-    wide = sigma / _SIGMA * receive
-    rest = np.sqrt(max(wide**2 - main**2, 0.25 * wide**2))
-    step = max(1, int(2.0 * main / apart))
-    reach = int(np.ceil(float(acquisition["beam_cutoff"]) * rest / (step * apart)))
-    places = np.arange(-reach, reach + 1)
-    weights = np.exp(-0.5 * (places * step * apart / rest) ** 2)
-    # A beam with a curved phase has less left of its sum.
-    turned = 1.0 + (float(beam.lateral_curvature(s)) * main**2) ** 2
-    return places * step, weights * np.sqrt(power * np.hypot(main, rest) / main) / weights.sum() * turned**0.25
 
 
 def ring_down(acquisition: np.ndarray, probe: Probe, axial_sigma_mm: float) -> np.ndarray:

@@ -32,6 +32,7 @@ class Labels:
         self.steps = np.array([1, self.dims[0], self.dims[0] * self.dims[1]])
         self.corner_steps = _CORNERS @ self.steps
         self.label = medium.label.ravel()
+        self.given = medium.label[1:-1, 1:-1, 1:-1]
         # Whether the eight voxels of the cell at (k, j, i) + {0, 1}^3 have one label
         lowest, highest = (f(medium.label, 2, origin=-1) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
         self.one_label = (lowest == highest).ravel()

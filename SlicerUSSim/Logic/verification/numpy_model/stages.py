@@ -25,12 +25,20 @@ from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.echoes import (
     add_interfaces,
     lateral_beam,
+    lobe_lines,
     losses_along,
     scatterer_lines,
 )
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, gaussian, hash_mix
-from SlicerUSSim.Logic.verification.numpy_model.floor import add_lateral_lobes, elevational_lobes, ring_down
+from SlicerUSSim.Logic.verification.numpy_model.floor import (
+    add_lateral_lobes,
+    lines_of_a_path,
+    lobe_lattice,
+    quiet_labels,
+    ring_down,
+)
 from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
+from SlicerUSSim.Logic.verification.numpy_model.lobes import elevational_table
 from SlicerUSSim.Logic.verification.numpy_model.tracing import Tracer
 
 
@@ -75,9 +83,15 @@ def scatterers(frame: TwinFrame) -> None:
     """Impulses of speckle on the edges of the traced lines' strips, also of the elevational side lobes."""
     record = frame.acquisition
     frame.traced = np.zeros((2 * int(record["traced_lines"]), int(record["samples"])), np.complex64)
-    records = [record, elevational_lobes(record, frame.probe)] if frame.settings.side_lobes else [record]
-    for each in records if frame.settings.scattering else []:
-        frame.traced += scatterer_lines(each, frame.labels, frame.tissues, frame.segments, frame.segment_lines)
+    if not frame.settings.scattering:
+        return
+    of_all = frame.labels, frame.tissues
+    frame.traced += scatterer_lines(record, *of_all, frame.segments, frame.segment_lines)
+    if frame.settings.side_lobes:
+        frame.traced += lobe_lines(
+            lobe_lattice(record), *of_all, frame.segments, frame.segment_lines, elevational_table(record, frame.probe),
+            lines_of_a_path(record, frame.probe), quiet_labels(frame.tissues, frame.labels.given),
+        )  # fmt: skip
 
 
 def interfaces(frame: TwinFrame) -> None:
