@@ -108,7 +108,8 @@ def _focused_once(
     wider = np.where(depth < nearest, (focus - depth) / (focus - nearest), 1.0)
     point = ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5) * aperture[:, None]
     phase = np.pi / (2**octaves * wavelength) * (1.0 / far - 1.0 / focus)[:, None] * point**2
-    field = fft.fft(np.exp(1j * phase).astype(np.complex64), 2**octaves * _PADDED, axis=1)[:, : _PADDED // 2]
+    field = np.asarray(fft.fft(np.exp(1j * phase).astype(np.complex64), 2**octaves * _PADDED, axis=1))
+    field = field[:, : _PADDED // 2]
     step = wider * wavelength * far * _POINTS / (aperture * _PADDED)
     return step[:, None] * np.arange(_PADDED // 2), np.abs(field).astype(float)
 
