@@ -79,7 +79,7 @@ def _focused_once(wavelength: float, aperture: float, focus: float, depth: np.nd
     """((depths, n) distances from the axis in mm, from 0 on; amplitude there) of a uniform aperture, by Fresnel."""
     point = ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5) * aperture
     phase = np.pi / wavelength * np.outer(1.0 / depth - 1.0 / focus, point**2)
-    field = fft.fft(np.exp(1j * phase).astype(np.complex64), _PADDED, axis=1)[:, : _PADDED // 2]
+    field = np.asarray(fft.fft(np.exp(1j * phase).astype(np.complex64), _PADDED, axis=1))[:, : _PADDED // 2]
     step = wavelength * depth * _POINTS / (aperture * _PADDED)
     return step[:, None] * np.arange(_PADDED // 2), np.abs(field).astype(float)
 

@@ -221,7 +221,11 @@ def _receive_sigma(probe: Probe, f_number: float) -> float:
     def above_half(u: float) -> float:
         return (1.0 - half) * (np.sinc(u) - 0.5) + 0.5 * half * (np.sinc(u - 1.0) + np.sinc(u + 1.0))
 
-    return _one_way_sigma(probe, f_number) * optimize.brentq(above_half, 0.5, 1.1) / _HALF_OF_SINC
+    return (
+        _one_way_sigma(probe, f_number)
+        * float(optimize.root_scalar(above_half, bracket=(0.5, 1.1)).root)
+        / _HALF_OF_SINC
+    )
 
 
 def _rayleigh_mm(probe: Probe, sigma_mm: float) -> float:
