@@ -7,7 +7,8 @@ represents them for all values of mu0, mu1 and sigma0:
     iq = [ base + sum over varied tissues sqrt(Var) B ] exp(-sum over tissues (alpha - alpha_0) path)
 
 - B has the scatterers that the anchor's mu1 has. As long as sites without any are rare, as for every mu1 that a fit
-  tries, this is exact; sparser tissue is as sparse as at the anchor.
+  tries, this is exact; sparser tissue is as sparse as at the anchor. Elevational side lobes are computed where tissue
+  is dark at the anchor (side_lobes.py).
 - Another attenuation changes the amplitude of each sample by the loss along the direct path. This is an approximation
   where the beam covers the edge of a shadow, and for echoes of reflected rays. At the anchor alpha_0 the model is
   exact; `anchor` changes it.
