@@ -432,8 +432,8 @@ def test_help_says_label_unit_what_it_does_and_the_default():
     for text in (
         "Gain [dB]: brightness of all echoes (default: the preset's, 0).",
         "(default: the preset's, --hard-labels).",
-        "--contrast [t1|t1gd|t2|flair|ct] Contrast of the MRI, which gives the order of the tissues by intensity; ct: a "
-        "CT in Hounsfield units (default: t1).",
+        "--contrast [t1|t1gd|t2|flair|ct] Contrast of the MRI, which gives the order of the tissues by intensity; ct: "
+        "a CT in Hounsfield units (default: t1).",
     ):
         assert text in said
     said = " ".join(ussim("optimize", "--help").output.split())
