@@ -93,7 +93,7 @@ def picture(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(description="Agreement of segment_ct with phantoms")
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--only-picture", action="store_true")
     options = parser.parse_args()

@@ -432,8 +432,8 @@ def test_help_says_label_unit_what_it_does_and_the_default():
     for text in (
         "Gain [dB]: brightness of all echoes (default: the preset's, 0).",
         "(default: the preset's, --hard-labels).",
-        "--contrast [t1|t1gd|t2|flair|ct] Contrast of the MRI, which gives the order of the tissues by intensity; "
-        "ct: a CT in Hounsfield units (default: t1).",
+        "--contrast [t1|t1gd|t2|flair|ct] Contrast of the MRI, which gives the order of the tissues by intensity; ct: "
+        "a CT in Hounsfield units (default: t1).",
     ):
         assert text in said
     said = " ".join(ussim("optimize", "--help").output.split())
@@ -487,7 +487,7 @@ def test_options_go_before_the_preset_and_set_before_them(tmp_path):
         (["--set", "=3"], "--set is '=3', expected NAME=VALUE"),
         (["--set", "gain_db=3"], "--set: no parameter 'gain_db', expected display.gain_db"),
         (["--set", "display.gian_db=3"], "--set: no parameter 'display.gian_db', expected display.gain_db"),
-        (["--set", "probe.colour=3"], "--set: no parameter 'probe.colour', expected probe.kind, probe.frequency_mhz"),
+        (["--set", "probe.colour=3"], "--set: no parameter 'probe.colour', expected probe.kind, probe.scan_lines"),
         (["--set", "white matter.mu=3"], "--set: no parameter 'white matter.mu', expected white matter.mu1"),
         (["--set", "foo.bar=3"], "--set: no parameter 'foo.bar', expected probe, display, settings, membrane or"),
         (["--set", "settings.seed=3.0"], "--set settings.seed: seed is '3.0', expected a whole number between 0 and"),
