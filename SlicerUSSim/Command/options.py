@@ -192,11 +192,12 @@ def _value(entry: Field, given: dict[str, Any]) -> Any:
 def given_options(*names: str) -> list[str]:
     """Those of the running command's options with these names of parameters that the user gave, as "--mask"."""
     context = click.get_current_context()
-    return [
-        parameter.opts[0]
-        for parameter in context.command.params
-        if parameter.name in names and context.get_parameter_source(parameter.name) is ParameterSource.COMMANDLINE
-    ]
+    given = {
+        parameter.name: parameter.opts[0]  # the first of several options of one parameter, as --contrast and --ct
+        for parameter in reversed(context.command.params)
+        if parameter.name in names and context.get_parameter_source(parameter.name or "") is ParameterSource.COMMANDLINE
+    }
+    return list(reversed(given.values()))
 
 
 def require_no_mri_options(labels: str, remedy: str) -> None:

@@ -33,7 +33,7 @@ _SEED = 0x51DE10BE
 
 
 class SideLobes(Stage):
-    """Adds the echoes that lateral side lobes receive, of scatterers and interfaces."""
+    """Adds the echoes that lateral side lobes receive of scatterers; those of walls cancel."""
 
     name = "side lobes"
 

@@ -17,6 +17,6 @@ from SlicerUSSim.Logic.imaging.stage import Stage
 IMPULSE_STAGES: tuple[type[Stage], ...] = (Aperture, RayTracer, Scatterers)
 #: From there to the baseband signal. They are linear, so the appearance model applies them to each of its bases, and
 #: adds the interfaces to the one of the fixed tissues
-LINEAR_STAGES: tuple[type[Stage], ...] = (LateralBeam, InterfaceEchoes, SideLobes, PulseFilter)
+LINEAR_STAGES: tuple[type[Stage], ...] = (LateralBeam, SideLobes, InterfaceEchoes, PulseFilter)
 #: From the baseband signal to pixels
 DISPLAY_STAGES: tuple[type[Stage], ...] = (Compressor, ScanConverter)
