@@ -5,8 +5,8 @@
 // several beams, so neighbouring lines are averaged to nodes, which are convolved with the square root of the power
 // that the diffraction pattern has at each distance; what comes out is interpolated between nodes. Lines have the main
 // beam already. Lobes of an aperture have alternating signs: on average they do not interfere with the main beam, to
-// which they are added in quadrature, and add up to little along a wall, for which signs change every two nodes. Main
-// beam and lobes together have the power of the main beam before.
+// which they are added in quadrature; signs change every two nodes. Main beam and lobes together have the power of the
+// main beam before. Walls are added to the lines afterwards.
 //
 // Buffers: lobes float [LOBE_DEPTHS][LOBE_DISTANCES] of diffraction.py;
 // re, im float [scan line][stride].

@@ -424,7 +424,7 @@ def test_a_scene_made_by_hand_with_a_wrong_value_is_shown_and_can_be_mended(sess
     session.parameters.node.SetParameter("contrast", "T3")
     assert session.ui.contrastComboBox.currentText() == "t1"
     session.ui.segmentButton.click()
-    assert session.app.errors == ["scene: contrast is 'T3', expected one of t1, t1gd, t2, flair"]
+    assert session.app.errors == ["scene: contrast is 'T3', expected one of t1, t1gd, t2, flair, ct"]
     session.ui.contrastComboBox.setCurrentText("t2")
     assert session.parameters.segmentation.contrast == "t2"
 

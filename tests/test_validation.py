@@ -169,13 +169,13 @@ def test_the_command_replaces_only_its_own_reports(tmp_path):
     def run_it(*only):
         return CliRunner().invoke(main, ["validate", "--out", str(tmp_path), *(f"--only={text}" for text in only)])
 
-    assert run_it("thin").exit_code == 0
+    assert run_it("thin sheet").exit_code == 0
     (picture,) = tmp_path.glob("*.png")
     assert run_it("sub-voxel").exit_code == 0
-    assert run_it("thin").exit_code == 0  # its picture is known, also after a run of other checks
+    assert run_it("thin sheet").exit_code == 0  # its picture is known, also after a run of other checks
     table = tmp_path / "report.md"
     table.write_text(table.read_text() + "checked by hand")
-    result = run_it("thin")
+    result = run_it("thin sheet")
     assert result.exit_code == 2 and f"{table}: exists and is not as this command wrote it" in result.stderr
     assert table.read_text().endswith("by hand") and picture.exists()
 
@@ -183,7 +183,7 @@ def test_the_command_replaces_only_its_own_reports(tmp_path):
 def test_a_report_that_cannot_be_written_is_one_clear_error(tmp_path):
     (tmp_path / "taken").write_text("a file")
     with pytest.raises(SimulationError, match="taken: cannot be created"):
-        validate(tmp_path / "taken", only=["thin"])
+        validate(tmp_path / "taken", only=["thin sheet"])
 
 
 # ---- phantoms and measurements --------------------------------------------------------------------------------------
