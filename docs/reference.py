@@ -145,7 +145,7 @@ def write_pages(folder: Path, group: click.Group) -> None:
 
 def _entry(room: str, module: str, name: str) -> str:
     """The directive that describes a public name, in reST."""
-    text = (LOGIC / room / f"{module}.py").read_text(encoding="utf-8")
+    text = (LOGIC / room / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
     body = ast.parse(text).body
     for node in body:
         if isinstance(node, ast.ClassDef) and node.name == name:

@@ -298,6 +298,18 @@ def levels_db(phantom_found, probe, face, target, lateral) -> tuple[np.ndarray, 
     return 20.0 * np.log10(np.maximum(frame.envelope, 1e-9)), frame.sample_interval_mm
 
 
+def test_lossy_marrow_is_traced_with_single_rays_and_that_is_said(spine, caplog):
+    """As beams, whose losses are spread over pieces, echoes in front of marrow grew without bounds."""
+    simulator = UltrasoundSimulator(spine.truth, TissueTable.named([BY_NUMBER.get(name, name) for name in NAMES]))
+    probe = ConvexProbe(radius_mm=50, field_of_view_deg=64, depth_mm=110, frequency_mhz=4.0, focus_mm=50)
+    frame = simulator.simulate(probe, pose_looking_at((8.0, -69.0, 0.0), (0.0, -35.0, 0.0), (1.0, 0.0, 0.3)))
+    assert frame.envelope.max() < 100.0
+    assert "cancellous bone attenuates too much for beams: lines are traced as single rays" in caplog.text
+    simulator.settings = SimulationSettings(beam="ray")
+    again = simulator.simulate(probe, frame.probe_to_ras)
+    np.testing.assert_array_equal(again.envelope, frame.envelope)
+
+
 def test_ribs_are_bright_lines_with_shadows_and_lung_a_bright_line_between_them(chest_found):
     probe = LinearProbe(width_mm=48, depth_mm=50, frequency_mhz=6.0, focus_mm=25)
     level, mm = levels_db(chest_found, probe, (120.5, 0.0, 46.0), (0.0, 0.0, 46.0), (0.0, 0.0, -1.0))
