@@ -109,7 +109,7 @@ class Membrane(Declared):
         unit="dB", bounds=(-100, 40),
     )  # fmt: skip
     diffuse_exponent: float = parameter(
-        4.0, "Diffuse exponent", "Exponent n of cosⁿ of the angle of incidence, for the scatterers of the sheet",
+        1.5, "Diffuse exponent", "Exponent n of cosⁿ of the angle of incidence, for the scatterers of the sheet",
         bounds=(0, 20), note="1 is Lambert's law; 0 a sheet that is equally bright on all sides",
     )  # fmt: skip
 
