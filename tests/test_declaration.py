@@ -487,7 +487,7 @@ def test_options_go_before_the_preset_and_set_before_them(tmp_path):
         (["--set", "=3"], "--set is '=3', expected NAME=VALUE"),
         (["--set", "gain_db=3"], "--set: no parameter 'gain_db', expected display.gain_db"),
         (["--set", "display.gian_db=3"], "--set: no parameter 'display.gian_db', expected display.gain_db"),
-        (["--set", "probe.colour=3"], "--set: no parameter 'probe.colour', expected probe.kind, probe.scan_lines"),
+        (["--set", "probe.colour=3"], "--set: no parameter 'probe.colour', expected probe.kind, probe.frequency_mhz"),
         (["--set", "white matter.mu=3"], "--set: no parameter 'white matter.mu', expected white matter.mu1"),
         (["--set", "foo.bar=3"], "--set: no parameter 'foo.bar', expected probe, display, settings, membrane or"),
         (["--set", "settings.seed=3.0"], "--set settings.seed: seed is '3.0', expected a whole number between 0 and"),
