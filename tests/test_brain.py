@@ -321,6 +321,24 @@ def test_a_tiny_object_is_too_small_for_a_head():
         find_brain(Volume(mri.array, mri.ijk_to_ras @ np.diag([0.3, 0.3, 0.3, 1.0])))
 
 
+def test_half_a_brain_is_called_so(head):
+    image, brain = head
+    left = brain & (np.arange(image.array.shape[2]) < np.median(np.nonzero(brain)[2]))
+    with pytest.raises(SimulationError, match="too little for a whole brain: it may be half a brain"):
+        find_brain(image.with_array(np.where(left, image.array, 0.0)))
+
+
+def test_ultrasound_is_refused_whatever_the_method():
+    j, i = np.indices((100, 160))
+    angle, depth = np.arctan2(i - 80.0, j + 20.0), np.hypot(i - 80.0, j + 20.0)
+    fan = (np.abs(angle) < 0.6) & (depth > 30) & (depth < 110)
+    noise = np.random.default_rng(0).rayleigh(40.0, (60, 100, 160))
+    volume = Volume(np.where(fan, 1.0 + noise, 0.0).astype(np.float32), np.eye(4))
+    for method in ("auto", "none"):
+        with pytest.raises(SimulationError, match="as ultrasound does, expected an MRI"):
+            find_brain(volume, method)
+
+
 def test_a_body_is_refused_at_once():
     """Not searched for a brain, which takes longer the more there is."""
     k, j, i = np.indices((40, 30, 44))

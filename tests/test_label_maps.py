@@ -17,6 +17,7 @@ from SlicerUSSim.Logic import SimulationError, TissueTable, Volume
 from SlicerUSSim.Logic.mri import segment_mri
 from SlicerUSSim.Logic.tissue import LabelMapping, names_of_file, read_label_file, read_label_map
 from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
+from SlicerUSSim.Logic.tissue.interpolated_labels import is_smoothed
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -802,6 +803,32 @@ def test_an_mri_whose_background_is_a_whole_number_is_no_interpolated_label_map(
     scaled = np.where(inside, t1.array / 104.3 - 1.0, background).astype(np.float32)
     scaled[inside & (np.indices(inside.shape).sum(axis=0) % 9 == 0)] = 1.0  # clipped
     assert not is_label_file(Path("t1.nii.gz"), t1.with_array(scaled))
+
+
+@pytest.mark.parametrize("change", ["smoothed by half a voxel", "smoothed by a voxel", "cubic spline"])
+def test_a_label_map_that_was_smoothed_is_called_so(change, tmp_path):
+    """Its left half, whose numbers are smaller, was called cut off."""
+    volume = head(2.0)
+    labels = volume.array.astype(np.float32)
+    smooth = {
+        "smoothed by half a voxel": lambda: ndimage.gaussian_filter(labels, 0.5),
+        "smoothed by a voxel": lambda: ndimage.gaussian_filter(labels, 1.0),
+        "cubic spline": lambda: ndimage.shift(labels, (0.4, 0.3, 0.2), order=3),
+    }[change]()
+    path = tmp_path / "aseg.nii.gz"
+    volume.with_array(smooth).write(path)
+    message = refused("segment", path, "-o", tmp_path / "o.nii.gz")
+    assert "as a label map that was" in message and "resampled with interpolation" in message, message
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.7, 2.0])
+@pytest.mark.parametrize("levels", [None, 255])
+def test_a_smoothed_mri_or_tissue_map_is_no_smoothed_label_map(sigma, levels, mni):
+    for volume in mni:
+        image = volume.array.astype(np.float32)
+        if levels is not None:
+            image = np.rint(levels * image / image.max())
+        assert not is_smoothed(ndimage.gaussian_filter(image, sigma) if sigma else image)
 
 
 def test_a_head_of_freesurfer_is_simulated_as_float_and_whole_numbers(tmp_path):

@@ -924,6 +924,7 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
         (["{head}", "--add", "tumuor={head}"], "no tissue is called 'tumuor', expected tumour"),
         (["{head}", "--add", "tumour={far}"], "far.nii.gz: lies "),
         (["--labels", "{head}", "--contrast", "t2"], "head.nii.gz: is a label map, and --contrast is for an MRI"),
+        (["--labels", "{head}", "--ct"], "head.nii.gz: is a label map, and --ct is for a CT"),
         (["{head}", "--map", "24=csf"], "--map is for a label map, expected --labels too"),
     ],
 )

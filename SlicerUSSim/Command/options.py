@@ -190,29 +190,39 @@ def _value(entry: Field, given: dict[str, Any]) -> Any:
 
 
 def given_options(*names: str) -> list[str]:
-    """Those of the running command's options with these names of parameters that the user gave, as "--mask"."""
+    """Those of the running command's options with these names of parameters that the user gave, as "--mask".
+
+    Of several options of one parameter, as --contrast and --ct, it is the one that stands for the value.
+    """
     context = click.get_current_context()
-    given = {
-        parameter.name: parameter.opts[0]  # the first of several options of one parameter, as --contrast and --ct
-        for parameter in reversed(context.command.params)
-        if parameter.name in names and context.get_parameter_source(parameter.name or "") is ParameterSource.COMMANDLINE
-    }
-    return list(reversed(given.values()))
+    given = dict[str, str]()
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        if name not in names or context.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
+            continue
+        stands_for = getattr(parameter, "flag_value", None) if getattr(parameter, "is_flag", False) else None
+        if name not in given or (isinstance(stands_for, str) and stands_for == context.params.get(name)):
+            given[name] = parameter.opts[0]
+    return list(given.values())
 
 
 def require_no_mri_options(labels: str, remedy: str) -> None:
     """Raise SimulationError if options for the segmentation of an MRI were given with the label map of this file."""
-    given = given_options("mask", "also", "organs", *(entry.name for entry in parameters_of(SegmentationSettings)))
-    verb = "is" if len(given) == 1 else "are"
-    require(not given, f"{labels}: is a label map, and {' and '.join(given)} {verb} for an MRI; {remedy}")
+    names = (entry.name for entry in parameters_of(SegmentationSettings))
+    _require_not_given(f"{labels}: is a label map", remedy, "mask", "also", "organs", *names)
 
 
 def require_no_options_beside_ct(path: str) -> None:
     """Raise SimulationError if options that only MRIs have were given with the CT of this file."""
     names = {entry.name for entry in parameters_of(SegmentationSettings)} - {"contrast", "filter_radius"}
-    given = given_options("also", *sorted(names))
+    _require_not_given(f"{path}: is a CT (--ct)", "leave it out", "also", *sorted(names))
+
+
+def _require_not_given(what: str, remedy: str, *names: str) -> None:
+    given = given_options(*names)
+    kind = "a CT" if given == ["--ct"] else "an MRI"
     verb = "is" if len(given) == 1 else "are"
-    require(not given, f"{path}: is a CT (--ct), and {' and '.join(given)} {verb} for an MRI; leave it out")
+    require(not given, f"{what}, and {' and '.join(given)} {verb} for {kind}; {remedy}")
 
 
 def require_no_input(*outputs: Path | None) -> None:

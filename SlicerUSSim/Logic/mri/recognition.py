@@ -39,6 +39,8 @@ _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
 #: Between the 5th and 95th percentile of the inner brain, relative to its median. T1 and T2 had 0.46 to 0.82;
 #: CT whose air is stored as 0 has 0.01 to 0.05 (25 to 50 HU on 1000).
 _LEAST_CONTRAST = 0.1
+#: What one hemisphere may have: its extents in ascending order, and its volume
+_HALF_A_BRAIN_MM, _HALF_A_BRAIN_ML = ((50.0, 95.0), (85.0, 150.0), (130.0, 210.0)), (350.0, 900.0)
 #: More different values are an image.
 _MOST_LABELS = 12
 
@@ -58,11 +60,7 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     """What the image shows. Raises SimulationError, saying what was found, if it is neither a brain nor a head."""
     report = progress or (lambda share: None)
     _check_values(mri)
-    require(
-        not is_ultrasound(mri),
-        "image shows a fan on a constant background, as ultrasound does, expected an MRI; "
-        "use the MRI of this patient (the command sweep takes tracked ultrasound as --sequence)",
-    )
+    require_no_ultrasound(mri)
     brain = stripped_brain(mri)
     report(0.1)
     if brain is not None:
@@ -88,6 +86,15 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
         require(message is None, message or "")
     report(1.0)
     return _head(mri, image, alignment)
+
+
+def require_no_ultrasound(mri: Volume) -> None:
+    """Raise SimulationError for an image that is a fan."""
+    require(
+        not is_ultrasound(mri),
+        "image shows a fan on a constant background, as ultrasound does, expected an MRI; "
+        "use the MRI of this patient (the command sweep takes tracked ultrasound as --sequence)",
+    )
 
 
 def require_no_hounsfield(mri: Volume) -> None:
@@ -248,9 +255,12 @@ def _check_size(image: CoarseImage, mri: Volume) -> None:
         _require_no_ct(mri)
     extent = np.ptp(np.argwhere(inside), axis=0)[::-1] * image.spacing_mm
     size = " x ".join(f"{mm:.0f}" for mm in extent)
+    is_half = all(low <= mm <= high for mm, (low, high) in zip(np.sort(extent), _HALF_A_BRAIN_MM, strict=True))
+    is_half &= _HALF_A_BRAIN_ML[0] <= millilitres <= _HALF_A_BRAIN_ML[1]
+    known = "a whole brain: it may be half a brain" if is_half else "a head"
     require(
         millilitres >= 900.0 and extent.max() >= 110.0,
-        f"image shows {millilitres:.0f} ml of tissue in {size} mm, too little for a head; "
+        f"image shows {millilitres:.0f} ml of tissue in {size} mm, too little for {known}; "
         "correct the voxel size in its header, or use an image of the whole head",
     )
     # A head with neck has 4 to 6 litres. Nothing of a body is searched for a brain, which would take minutes.

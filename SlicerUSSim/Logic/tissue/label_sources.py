@@ -12,6 +12,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.label_numbers import has_uniform_fractions
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tissue.interpolated_labels import is_interpolated, is_smoothed
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
 from SlicerUSSim.Logic.tissue.label_files import names_of_file
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
@@ -25,9 +26,6 @@ from SlicerUSSim.Logic.tissue.probability_maps import CombinedMaps, combined_pro
 from SlicerUSSim.Logic.tissue.table import TissueTable, tissues_beside
 
 _log = logging.getLogger(__name__)
-
-#: Share of whole numbers in an interpolated label map, and of equal neighbours among them: 0.76 and more, in MRIs 0.14
-_MOSTLY, _UNIFORM = 0.3, 0.65
 
 
 def is_label_file(path: Path, volume: Volume) -> bool:
@@ -62,6 +60,12 @@ def not_intensities(volume: Volume) -> str | None:
             "is uniform regions of few values with fractions, as a label map that was scaled or shifted, expected an "
             "MRI or labels; save the labels as whole numbers"
         )
+    if is_smoothed(volume.array):
+        return (
+            "is uniform regions of whole numbers with smooth transitions, as a label map that was smoothed or "
+            "resampled with interpolation (or a phantom without noise), expected an MRI or labels; use the original "
+            "label map, and resample it with nearest neighbours"
+        )
     return None
 
 
@@ -71,23 +75,6 @@ def _without_labels(path: Path, volume: Volume) -> CombinedMaps | None:
     if maps is not None or (is_interpolated(volume.array) and not is_as_cat12_writes(path, volume.array)):
         return maps
     return partial_volume_labels(path, volume)
-
-
-def is_interpolated(array: np.ndarray) -> bool:
-    """Whether most voxels have whole numbers, in uniform regions, and others fractions. An MRI is noisy everywhere.
-
-    The background, which is the most frequent whole number, is uniform in both and not counted.
-    """
-    is_whole = array == np.rint(array)
-    if not np.issubdtype(array.dtype, np.floating) or not is_whole.any():
-        return False
-    values, counts = np.unique(array[is_whole], return_counts=True)
-    inside = array != values[np.argmax(counts)]
-    is_whole &= inside
-    if not inside.any() or not _MOSTLY <= is_whole.sum() / inside.sum() < 1.0:
-        return False
-    pairs = is_whole[..., 1:] & inside[..., :-1]
-    return bool(pairs.any() and (array[..., 1:] == array[..., :-1])[pairs].mean() > _UNIFORM)
 
 
 def read_label_file(

@@ -1,0 +1,73 @@
+"""Label maps that were resampled with interpolation, or smoothed: their numbers no longer are those of tissues."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+#: Share of whole numbers in an interpolated label map, and of equal neighbours among them: 0.76 and more, in MRIs 0.14
+_MOSTLY, _UNIFORM = 0.3, 0.65
+#: Variation among 27 neighbours, relative to the range of the image, up to which they are a plateau, and the share of
+#: the voxels in plateaus from which these are regions of labels. FreeSurfer's and SynthSeg's labels of 1 mm smoothed by
+#: Gaussians of 0.5, 1 and 2 voxels 0.13 to 0.20, 0.05 to 0.08, 0.014 to 0.02, cubic splines 0.03 to 0.04; MRIs and
+#: tissue maps, also smoothed and with 256 levels, 0.002 at most
+_FLAT, _PLATEAUS = 1e-4, 0.01
+#: Least number of plateaus' values, and their share of the plateaus: an MRI may have a second background
+_VALUES, _OF_PLATEAUS = 2, 0.02
+#: Deviation of a plateau from a whole number, and the share of the plateaus that are so near to one
+_WHOLE, _MOSTLY_WHOLE = 0.01, 0.9
+#: Steps of the range in which values are counted, and the least distance of the foreground from the background
+_STEP, _FOREGROUND = 1e-3, 1e-2
+#: Voxels along each side of the part of a volume that is examined
+_EXAMINED = 128
+
+
+def is_interpolated(array: np.ndarray) -> bool:
+    """Whether most voxels have whole numbers, in uniform regions, and others fractions. An MRI is noisy everywhere.
+
+    The background, which is the most frequent whole number, is uniform in both and not counted.
+    """
+    is_whole = array == np.rint(array)
+    if not np.issubdtype(array.dtype, np.floating) or not is_whole.any():
+        return False
+    values, counts = np.unique(array[is_whole], return_counts=True)
+    inside = array != values[np.argmax(counts)]
+    is_whole &= inside
+    if not inside.any() or not _MOSTLY <= is_whole.sum() / inside.sum() < 1.0:
+        return False
+    pairs = is_whole[..., 1:] & inside[..., :-1]
+    return bool(pairs.any() and (array[..., 1:] == array[..., :-1])[pairs].mean() > _UNIFORM)
+
+
+def is_smoothed(array: np.ndarray) -> bool:
+    """Whether an image of fractions (k, j, i) has plateaus at several whole numbers, as smoothing leaves of labels.
+
+    Examined are the middle 128 voxels along each axis. An MRI varies everywhere, by its noise.
+    """
+    if not np.issubdtype(array.dtype, np.floating) or min(array.shape) < 3:
+        return False
+    part = array[tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)]
+    if not np.isfinite(part).all():
+        return False
+    low, high = float(part.min()), float(np.percentile(part, 99.9))
+    if not high > low:
+        return False
+    levels = (part - low) / (high - low)
+    background = _frequent(levels)
+    inside = np.abs(levels - background) > _FOREGROUND
+    spread = ndimage.maximum_filter(levels, 3) - ndimage.minimum_filter(levels, 3)
+    is_flat = inside & (spread <= _FLAT)
+    flat = levels[is_flat]
+    if not len(flat) >= max(_PLATEAUS * inside.sum(), 1):
+        return False
+    numbers = part[is_flat].astype(np.float64)
+    if (np.abs(numbers - np.rint(numbers)) > max(_WHOLE, 2.0 * _FLAT * (high - low))).mean() > 1.0 - _MOSTLY_WHOLE:
+        return False
+    counts = np.bincount(np.rint(flat / _STEP).astype(np.int64) + 1)  # levels below 0 by rounding
+    return int((counts >= _OF_PLATEAUS * len(flat)).sum()) >= _VALUES
+
+
+def _frequent(levels: np.ndarray) -> float:
+    """The most frequent value, to a step."""
+    steps = np.rint(levels.ravel() / _STEP).astype(np.int64)
+    return float(np.argmax(np.bincount(steps)) * _STEP)
