@@ -310,10 +310,11 @@ inline float2 correction(__constant const Acquisition *acquisition, __global con
                          const Ray *ray, float path, float depth, float log_attenuation, float depth_per_mm,
                          float decay, float more) {
   const float4 beam = vload4(ray->piece + 1, beams);
+  // A border may turn out to lie a little beyond the end; no ray is corrected by more than it lacks at the end.
   const float end = (ray->piece + 1) * acquisition->screen_step, rest = end - path;
   return (float2)(start + end + beam.y - (depth + rest * depth_per_mm),
                   -beam.x - more - (log_attenuation - rest * decay)) /
-         fmax(end - ray->from, 1e-3f);
+         fmax(fmax(end, path) - ray->from, 1e-3f);
 }
 
 // Whether strong tissue leaves nothing of a beam from piece `piece` on.
@@ -323,10 +324,13 @@ inline int is_dark(__constant const Acquisition *acquisition, __global const flo
   return 1;
 }
 
+// Length over which a ray at `path` is corrected. Strong tissue may end a little beyond its piece.
+inline float corrected_length(float path, float from) { return fmax(path - from, 0.0f); }
+
 // Correct what a ray has written since the start of its piece.
 inline void correct_segments(__global Segment *segments, int count, float2 per_mm, float start) {
   for (int n = 0; n < count; n++) {
-    const float along = segments[n].path_mm - start;
+    const float along = corrected_length(segments[n].path_mm, start);
     segments[n].depth_mm += per_mm.x * along;
     segments[n].depth_per_mm += per_mm.x;
     segments[n].attenuation *= exp_fast(per_mm.y * along);
@@ -336,7 +340,7 @@ inline void correct_segments(__global Segment *segments, int count, float2 per_m
 
 inline void correct_hits(__global Hit *hits, int count, float2 per_mm, float start) {
   for (int n = 0; n < count; n++) {
-    const float along = hits[n].path_mm - start, factor = exp_fast(per_mm.y * along);
+    const float along = corrected_length(hits[n].path_mm, start), factor = exp_fast(per_mm.y * along);
     hits[n].depth_mm += per_mm.x * along;
     hits[n].attenuation *= factor;
     hits[n].echo *= factor;
@@ -463,8 +467,8 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
           break;
         }
         ray.path += until;
-        ray.depth += until * depth_per_mm + per_mm.x * (ray.path - ray.from);
-        ray.log_attenuation += per_mm.y * (ray.path - ray.from) - spent;
+        ray.depth += until * depth_per_mm + per_mm.x * corrected_length(ray.path, ray.from);
+        ray.log_attenuation += per_mm.y * corrected_length(ray.path, ray.from) - spent;
         ray.loss += spent;
         if (goes_dark) {  // but the beam may go on behind this tissue
           cut_weight += ray.weight;
@@ -522,8 +526,8 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
             acquisition, my_beams, start, &ray, path, depth, log_attenuation,
             is_bent || is_under || leaves ? depth_per_mm : acquisition->reference_speed_m_s / behind.speed_of_sound_m_s,
             own_decay, ray.excess + (leaves ? 0.0f : ray.shade - my_shades[ray.piece + 1]));
-      const float corrected_depth = depth + per_mm.x * (path - ray.from);
-      const float corrected_log = log_attenuation + per_mm.y * (path - ray.from);
+      const float corrected_depth = depth + per_mm.x * corrected_length(path, ray.from);
+      const float corrected_log = log_attenuation + per_mm.y * corrected_length(path, ray.from);
       Ray under = ray;                                                   // where the beam goes on below strong tissue
       if (is_beam && (leaves || is_bent || (is_under && !is_strong))) {  // this course of the beam ends here
         if (on_axis)

@@ -36,8 +36,6 @@ _FARTHEST_SIGMAS = 2.2  # limit of the stored distance
 _MOST_SMOOTHED_GROUPS = 6
 _SMOOTHED_VOXELS = 100_000_000
 _TISSUE_ATTRIBUTES = tuple(name for name in TISSUE.names or () if name not in ("group", "is_fluid"))
-#: Speeds (m/s), impedance (MRayl) and attenuation (dB/(cm MHz)) of tissue that beams do not go through
-_SOFT_SPEEDS, _SOFT_IMPEDANCE, _LOSSY = (1380.0, 1720.0), 3.0, 15.0
 _PAD = 1  # one voxel of coupling medium around the volume, for clamped look-ups outside
 
 
@@ -119,20 +117,6 @@ class Medium:
         if not self.has_texture:
             return None
         return self.device.download(self.texture_buffer, tuple(self.dims[::-1]), np.uint32)
-
-    @property
-    def too_lossy_for_beams(self) -> str:
-        """Name of a tissue that is soft by its speed and impedance and attenuates as bone marrow does; "" if none.
-
-        Beams spread what a ray loses evenly over pieces of 8 mm (docs/physics.md#beams-from-an-aperture); such a tissue
-        takes 15 nepers of it at one end.
-        """
-        for label in sorted(self.present):
-            tissue = self.tissues[int(label)]
-            is_soft = _SOFT_SPEEDS[0] < tissue.speed_of_sound_m_s < _SOFT_SPEEDS[1]
-            if is_soft and tissue.impedance_mrayl < _SOFT_IMPEDANCE and tissue.attenuation_db_cm_mhz > _LOSSY:
-                return tissue.name
-        return ""
 
     def quieter(self, factor: float) -> np.ndarray:
         """(labels,) bool: scatterers' variance below `factor` times the typical one.

@@ -6,7 +6,6 @@ import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -92,7 +91,6 @@ class UltrasoundSimulator:
         require_kind("labels", labels, Volume, "Volume.read reads a file")
         require_kind("tissues", tissues, TissueTable, "TissueTable.brain makes one")
         self.settings = SimulationSettings() if settings is None else settings
-        self._told_lossy = ""
         require(
             isinstance(self.settings, SimulationSettings),
             f"settings are {self.settings!r:.80}, expected SimulationSettings",
@@ -344,12 +342,6 @@ class UltrasoundSimulator:
     def acquisition(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
         """The record (layout.ACQUISITION) of the constants of one frame."""
         settings, medium = self.settings, self.medium
-        lossy = medium.too_lossy_for_beams
-        if lossy and settings.beam == "aperture":
-            settings = replace(settings, beam="ray")
-            if lossy != self._told_lossy:
-                _log.warning("%s attenuates too much for beams: lines are traced as single rays (beam=ray)", lossy)
-                self._told_lossy = lossy
         block = CONSTANTS["BLOCK"]
         axial_sigma = self.axial_sigma_mm(probe)
         acquisition = np.zeros((), ACQUISITION)

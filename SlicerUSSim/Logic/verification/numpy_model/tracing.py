@@ -204,7 +204,7 @@ class Tracer:
         rest = end - path
         depth_left = self._starts(rays.line) + end + beam[:, 1] - (depth + rest * depth_per_mm)
         log_left = -beam[:, 0] - more - (log_attenuation - rest * self.decay[self._front(rays)])
-        along = np.maximum(end - rays.since_path, f32(1e-3))[:, None]
+        along = np.maximum(np.maximum(end, path) - rays.since_path, f32(1e-3))[:, None]
         return np.where((rays.piece >= 0)[:, None], np.stack([depth_left, log_left], -1) / along, f32(0))
 
     def _keep_correction(self, rays: Rays, per_mm: np.ndarray) -> None:
