@@ -47,7 +47,8 @@ typedef struct {
 #define THROUGH 1       // strong tissue that does not bend
 #define UNDER 2         // strong tissue that does: nothing is written of it, since it is a matter of the refracted ray
 #define MOST_LOSS 1.0f  // nepers by which strong tissue may change the frequency of what has passed it
-#define DARKEST 7.0f    // nepers lost to strong tissue: behind it nothing is left of a beam
+#define MOST_BEFORE_STRONG 0.35f  // nepers by which a piece of a beam in front of bone may differ from its ray
+#define DARKEST 7.0f              // nepers lost to strong tissue: behind it nothing is left of a beam
 
 // The label at fraction f of the cell of voxels at index `here`: the acoustic group with the largest trilinear weight,
 // so that borders are smooth at the sub-voxel scale, and within the group the label of the nearest corner. Voting by
@@ -505,16 +506,17 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       spent -= back * (is_under ? front_decay : decay_in(acquisition, here));
       if (on_axis && !is_under && count > 0 && count <= room)
         my_segments[count - 1].length_mm = fmax(my_segments[count - 1].length_mm - back, 0.0f);
+      const float front_speed = beam_speed(front.speed_of_sound_m_s, front_decay);
+      const float behind_speed = beam_speed(behind.speed_of_sound_m_s, decay_in(acquisition, behind));
       const int is_strong_border =
-          !acquisition->aperture_beams ||
-          !is_soft(here.speed_of_sound_m_s, here.impedance_mrayl, behind.speed_of_sound_m_s, behind.impedance_mrayl);
+          !acquisition->aperture_beams || !is_soft(beam_speed(here.speed_of_sound_m_s, decay_in(acquisition, here)),
+                                                   here.impedance_mrayl, behind_speed, behind.impedance_mrayl);
       // Strong tissue ends where there is soft tissue again, as compared with what lies in front of it.
-      const int is_strong = ray.strong == NOT_STRONG ? is_strong_border
-                                                     : !is_soft(front.speed_of_sound_m_s, front.impedance_mrayl,
-                                                                behind.speed_of_sound_m_s, behind.impedance_mrayl);
+      const int is_strong = ray.strong == NOT_STRONG
+                                ? is_strong_border
+                                : !is_soft(front_speed, front.impedance_mrayl, behind_speed, behind.impedance_mrayl);
       const int is_beam = ray.piece >= 0;
-      const int is_bent =
-          !is_under && is_strong && !(is_beam && !bends(front.speed_of_sound_m_s, behind.speed_of_sound_m_s));
+      const int is_bent = !is_under && is_strong && !(is_beam && !bends(front_speed, behind_speed));
       const float path = ray.path + border;
       float depth = ray.depth + border * depth_per_mm, log_attenuation = ray.log_attenuation - spent;
       const int leaves = depth >= acquisition->depth_mm;
@@ -526,6 +528,9 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
             acquisition, my_beams, start, &ray, path, depth, log_attenuation,
             is_bent || is_under || leaves ? depth_per_mm : acquisition->reference_speed_m_s / behind.speed_of_sound_m_s,
             own_decay, ray.excess + (leaves ? 0.0f : ray.shade - my_shades[ray.piece + 1]));
+      // What lies behind bone is not in front of it: of the beam's loss up to the piece's end, it is what phases take.
+      const float most = MOST_BEFORE_STRONG / acquisition->screen_step;
+      if (is_bent) per_mm.y = clamp(per_mm.y, -most, most);
       const float corrected_depth = depth + per_mm.x * corrected_length(path, ray.from);
       const float corrected_log = log_attenuation + per_mm.y * corrected_length(path, ray.from);
       Ray under = ray;                                                   // where the beam goes on below strong tissue

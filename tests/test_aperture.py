@@ -94,6 +94,42 @@ def test_there_is_no_seam_at_the_first_strong_border():
     np.testing.assert_allclose(20 * np.log10(steel["attenuation"]), -(0.3 * 9.0 + 0.6 * 12.5), atol=0.1)
 
 
+@pytest.mark.parametrize("attenuation", [0.5, 4.0, 10.0, 20.0, 40.0])
+def test_bone_is_as_bright_whatever_lies_behind_it(attenuation):
+    """The loss of a beam up to the next depth at which it is known is not one in front of bone."""
+    bone = Tissue("bone", 3198.0, 6.364, 3.54)
+    layers = [PLAIN, bone, lossy("marrow", 1600.0, attenuation)]
+    phantom = layered(layers, [9.0, 11.0])
+    found = UltrasoundSimulator(phantom.labels, phantom.tissues, SimulationSettings(reflections=False))
+    hits = found.trace(PROBES["linear"], phantom.probe_to_ras).hits
+    first = hits[hits["label_behind"] == 2]
+    np.testing.assert_allclose(20 * np.log10(first["attenuation"]), 0.0, atol=0.5)
+    assert hits["attenuation"].max() < 1.1
+
+
+@pytest.mark.parametrize("attenuation", [2.0, 5.0, 9.0, 14.0])
+@pytest.mark.parametrize("thick_mm", [3.0, 6.5])
+def test_behind_a_lossy_layer_speckle_has_lost_what_the_layer_takes(attenuation, thick_mm):
+    """Of the same speed and impedance, on both sides of the loss from which it is as bone to beams."""
+    layers = [PLAIN, lossy("lossy", PLAIN.speed_of_sound_m_s, attenuation), replace(PLAIN, name="behind")]
+    levels = []
+    for middle in (layers[1], replace(layers[1], attenuation_db_cm_mhz=0.0)):
+        phantom = layered([layers[0], middle, layers[2]], [9.0, 9.0 + thick_mm])
+        found = UltrasoundSimulator(
+            phantom.labels, phantom.tissues, SimulationSettings(side_lobes=False, frequency_downshift=False)
+        )
+        power = []
+        for seed in range(4):
+            found.settings = replace(found.settings, seed=seed)
+            frame = found.simulate(PROBES["linear"], phantom.probe_to_ras)
+            deep = slice(*(int(depth / frame.sample_interval_mm) for depth in (20.0, 28.0)))
+            power.append(np.mean(np.abs(frame.iq[20:-20, deep]) ** 2))
+        levels.append(10.0 * np.log10(np.mean(power)))
+    loss = 2.0 * attenuation * PROBES["linear"].frequency_mhz * thick_mm / 10.0
+    if loss < 60.0:
+        assert levels[0] - levels[1] == pytest.approx(-loss, abs=1.0 + 0.05 * loss)
+
+
 def test_soft_borders_neither_bend_nor_split_a_ray_and_strong_ones_do():
     """A wall inclined by 60 degrees: 2600 m/s reflects totally from 36 degrees on, 1600 m/s from 74 degrees on."""
 

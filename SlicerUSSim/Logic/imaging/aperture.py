@@ -52,9 +52,10 @@ class Aperture(Stage):
         if not fields["aperture_beams"]:
             return
         acoustics = get("acoustics", len(frame.medium.rows) * 16)
-        self.device.write(acoustics, acoustic_rows(frame.medium.rows, fields))
+        rows = acoustic_rows(frame.medium.rows, fields)
+        self.device.write(acoustics, rows)
         sums = get("sums", int(np.prod(fan)) * int(fields["fan_depths"]) * 16)
-        all_soft = np.int32(are_soft(frame.medium.rows[frame.medium.present]))
+        all_soft = np.int32(are_soft(rows[frame.medium.present]))
         self.device.run(self._fans, fan, frame.acquisition_buffer, frame.medium.voxel_buffer, acoustics, all_soft, sums)
         self.device.run(
             self._screens, (depths, lines), frame.acquisition_buffer, sums, np.int32(with_level), frame.screens,
@@ -76,27 +77,26 @@ class Aperture(Stage):
 def acoustic_rows(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
     """(labels, 4) float32 of layout.TISSUE records: extra path per mm, nepers per mm both ways, m/s, MRayl.
 
-    The extra path is what a length adds to the displayed depth beyond itself, c_ref / c - 1.
+    The extra path is what a length adds to the displayed depth beyond itself, c_ref / c - 1. The speed is that by which
+    beams tell what they go through (beam_speed in kernels/common.clh).
     """
     speed = tissues["speed_of_sound_m_s"]
     with np.errstate(divide="ignore"):
         extra = np.where(speed > 0.0, acquisition["reference_speed_m_s"] / speed - 1.0, 0.0)
     nepers = tissues["attenuation_db_cm_mhz"] * acquisition["frequency_mhz"] * 0.2 * _NEPERS_PER_DB
+    speed = np.where(nepers > CONSTANTS["LOSSY_PER_MM"], CONSTANTS["LOSSY_SPEED"], speed)
     return np.stack([extra, nepers, speed, tissues["impedance_mrayl"]], axis=1).astype(np.float32)
 
 
-def are_soft(tissues: np.ndarray) -> bool:
-    """Whether the borders between all layout.TISSUE records are soft (is_soft in kernels/common.clh)."""
+def are_soft(acoustics: np.ndarray) -> bool:
+    """Whether borders between all of acoustic_rows (labels, 4) are soft (is_soft in kernels/common.clh)."""
 
-    def contrast(name: str) -> float:
-        low, high = float(tissues[name].min()), float(tissues[name].max())
+    def contrast(column: int) -> float:
+        low, high = float(acoustics[:, column].min()), float(acoustics[:, column].max())
         return (high - low) / (high + low)
 
     # A little less, since the kernels round.
-    return (
-        contrast("speed_of_sound_m_s") < 0.4999 * CONSTANTS["SOFT_SPEED"]
-        and contrast("impedance_mrayl") < 0.9999 * CONSTANTS["SOFT_REFLECTION"]
-    )
+    return contrast(2) < 0.4999 * CONSTANTS["SOFT_SPEED"] and contrast(3) < 0.9999 * CONSTANTS["SOFT_REFLECTION"]
 
 
 def aperture_fields(

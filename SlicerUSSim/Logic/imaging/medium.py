@@ -36,6 +36,8 @@ _FARTHEST_SIGMAS = 2.2  # limit of the stored distance
 _MOST_SMOOTHED_GROUPS = 6
 _SMOOTHED_VOXELS = 100_000_000
 _TISSUE_ATTRIBUTES = tuple(name for name in TISSUE.names or () if name not in ("group", "is_fluid"))
+#: Attenuation (dB/(cm MHz)) from which tissues may be LOSSY_PER_MM at some frequency and have borders by that alone
+_LOSSY = 2.0
 _PAD = 1  # one voxel of coupling medium around the volume, for clamped look-ups outside
 
 
@@ -156,9 +158,9 @@ class Medium:
         members = {int(label): tissues[label] for label in self.present} | dict(tissues)
         if tissues.membrane is not None:
             members[CONSTANTS["MEMBRANE_LABEL"]] = tissues.membrane.tissue
-        groups: dict[tuple[float, float], int] = {}
+        groups: dict[tuple[float, float, bool], int] = {}
         for label, tissue in members.items():
-            acoustics = (tissue.speed_of_sound_m_s, tissue.impedance_mrayl)
+            acoustics = (tissue.speed_of_sound_m_s, tissue.impedance_mrayl, tissue.attenuation_db_cm_mhz > _LOSSY)
             for name in _TISSUE_ATTRIBUTES:
                 rows[label][name] = getattr(tissue, name)
             rows[label]["group"] = groups.setdefault(acoustics, len(groups))

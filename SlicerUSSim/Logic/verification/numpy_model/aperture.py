@@ -14,7 +14,16 @@ _BENT = 4.0  # nepers both ways per millimetre of strong tissue that bends what 
 _LEAST = 1e-3  # nepers by which strong tissue differs from soft
 _MOST_SPREAD = 3.0  # of a beam
 _SOFT_SPEED, _SOFT_REFLECTION = 0.105, 0.12  # largest contrasts of a soft border
+_LOSSY_PER_MM, _LOSSY_SPEED = 0.8, 5000.0  # nepers both ways, and m/s
 _STRAIGHT_SPEED = 0.2  # and of strong tissue in which paths go straight on
+
+
+def as_beams_see(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
+    """The layout.TISSUE records with the speeds for is_soft and bends: those of bone where tissue is very lossy."""
+    seen = tissues.copy()
+    decay = tissues["attenuation_db_cm_mhz"] * f32(acquisition["frequency_mhz"]) * f32(0.2) * LN10_OVER_20
+    seen["speed_of_sound_m_s"][decay > f32(_LOSSY_PER_MM)] = _LOSSY_SPEED
+    return seen
 
 
 def is_soft(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -105,8 +114,9 @@ class Screens:
             np.where(tissues["speed_of_sound_m_s"] > 0, fields["reference_speed_m_s"] / speed - 1.0, 0.0),
             tissues["attenuation_db_cm_mhz"] * fields["frequency_mhz"] * 0.2 * LN10_OVER_20,
         ])  # fmt: skip
-        self.soft = is_soft(tissues[:, None], tissues[None])  # (label, label)
-        self.bent = bends(tissues[:, None], tissues[None])
+        seen = as_beams_see(tissues, self.acquisition)
+        self.soft = is_soft(seen[:, None], seen[None])  # (label, label)
+        self.bent = bends(seen[:, None], seen[None])
         impedance = tissues["impedance_mrayl"]
         sums = np.maximum(impedance[:, None] + impedance, 1e-9)  # labels without a tissue have none
         reflected = ((impedance[:, None] - impedance) / sums) ** 2

@@ -12,6 +12,7 @@ from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 from SlicerUSSim.Logic.verification.numpy_model.sheets import Sheets
 
 WIDE_SIGMA, HALVED_SIGMA = 3.0, 4.0  # of the Gaussians for smoothing the indicators, voxels of their grids
+_LOSSY = 2.0  # dB/(cm MHz) of tissues that are groups of their own
 _FARTHEST = 2.2  # limit of the fluid distance in standard deviations; it has eight bits
 _SHARES = 4095  # quantisation steps of the smoothed indicator for the fluid distance
 _MOST_GROUPS, _MOST_VALUES = 6, 100_000_000  # of the smoothed indicators of acoustic groups
@@ -112,7 +113,7 @@ class HostMedium:
 
 
 def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
-    """Tissues of equal speed and impedance form a group; groups are numbered by decreasing frequency of labels."""
+    """Tissues of equal speed and impedance form a group, very lossy ones another, by decreasing frequency of labels."""
     members = {label: tissues[label] for label in present}
     members.update((label, tissue) for label, tissue in tissues.items() if label not in members)
     fluids: tuple[str, ...] = ()
@@ -120,9 +121,9 @@ def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:
         members[CONSTANTS["MEMBRANE_LABEL"]] = tissues.membrane.tissue
         fluids = tissues.membrane.fluids
     rows = np.zeros(CONSTANTS["MAX_TISSUES"], TISSUE)
-    known: list[tuple[float, float]] = []
+    known: list[tuple[float, float, bool]] = []
     for label, tissue in members.items():
-        acoustics = tissue.speed_of_sound_m_s, tissue.impedance_mrayl
+        acoustics = tissue.speed_of_sound_m_s, tissue.impedance_mrayl, tissue.attenuation_db_cm_mhz > _LOSSY
         if acoustics not in known:
             known.append(acoustics)
         row = rows[label]

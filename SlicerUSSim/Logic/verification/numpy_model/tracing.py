@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from SlicerUSSim.Logic.opencl.layout import HIT, SEGMENT
-from SlicerUSSim.Logic.verification.numpy_model.aperture import bends, is_soft
+from SlicerUSSim.Logic.verification.numpy_model.aperture import as_beams_see, bends, is_soft
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     LN10_OVER_20,
@@ -31,6 +31,7 @@ _NOT_STRONG, _THROUGH, _UNDER = range(3)
 _DARKEST = 7.0  # nepers lost to strong tissue: behind it nothing is left of a beam
 _MOST_COURSES = 16
 _MOST_GATHERED, _LEAST_GATHERED = 64, f32(0.4)  # lines with scatterers in common, and the least part of their power
+_MOST_BEFORE_STRONG = f32(0.35)  # nepers by which a piece of a beam in front of bone may differ from its ray
 _MOST_LOSS = 1.0  # nepers by which strong tissue may change the frequency of what has passed it
 
 
@@ -102,6 +103,7 @@ class Tracer:
         self.elevation_sigma = Beam(acquisition).elevation_sigma
         self.to_voxel = acquisition["ras_to_voxel"]
         self.voxel_mm = acquisition["voxel_mm"]
+        self.seen = as_beams_see(tissues, acquisition)
         self.decay = tissues["attenuation_db_cm_mhz"] * acquisition["frequency_mhz"] * f32(0.2) * LN10_OVER_20
 
     def run(self, roots: np.ndarray, quantiles: np.ndarray):
@@ -245,7 +247,7 @@ class Tracer:
         for records, pieces in ((self._segments, self._segment_pieces), (self._hits, self._hit_pieces)):
             for record, key in zip(records, pieces, strict=True):
                 depth, log_amplitude, start = table[key].T
-                along = record["path_mm"] - start
+                along = _corrected_length(record["path_mm"], start)
                 factor = exp(log_amplitude * along)
                 record["depth_mm"] += depth * along
                 record["attenuation"] *= factor
@@ -360,7 +362,7 @@ class Tracer:
         more = rays.excess + np.where(goes_dark, rays.shade - self._next_shade(rays), f32(0))
         per_mm = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rays.depth_per_mm, more)
         self._keep_correction(rays, per_mm)
-        along = (path - rays.since_path)[:, None]
+        along = _corrected_length(path, rays.since_path)[:, None]
         rays.depth, rays.log_attenuation = depth, rays.log_attenuation - rays.spent
         rays.depth, rays.log_attenuation = np.stack([rays.depth, rays.log_attenuation]) + (per_mm * along).T
         rays.path, rays.loss = path, rays.loss + rays.spent
@@ -432,11 +434,12 @@ class Tracer:
         lengths = self._segments[-1]["length_mm"]
         lengths[written[shortened]] = np.maximum(lengths[written[shortened]] - back[shortened], f32(0))
         keep = rays.depth + border * rays.depth_per_mm < acquisition["depth_mm"]
-        strong_border = ~(is_soft(tissues[rays.label], tissues[other]) & bool(acquisition["aperture_beams"]))
-        front = tissues[self._front(rays)]
-        strong = np.where(rays.strong == _NOT_STRONG, strong_border, ~is_soft(front, tissues[other]))
+        seen = self.seen
+        strong_border = ~(is_soft(seen[rays.label], seen[other]) & bool(acquisition["aperture_beams"]))
+        front = seen[self._front(rays)]
+        strong = np.where(rays.strong == _NOT_STRONG, strong_border, ~is_soft(front, seen[other]))
         under, beam = rays.strong == _UNDER, rays.piece >= 0
-        bent = ~under & strong & ~(beam & ~bends(front, tissues[other]))
+        bent = ~under & strong & ~(beam & ~bends(front, seen[other]))
         path, depth = rays.path + border, rays.depth + border * rays.depth_per_mm
         rays.excess = self._excess(rays, border)
         leaves, next_shade = ~keep, self._next_shade(rays)
@@ -444,7 +447,9 @@ class Tracer:
         rate = np.where(bent | under | leaves, rays.depth_per_mm, behind_rate)
         more = rays.excess + np.where(leaves, f32(0), rays.shade - next_shade)
         per_mm = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rate, more)
-        corrected = (path - rays.since_path)[:, None] * per_mm
+        most = np.where(bent, _MOST_BEFORE_STRONG / acquisition["screen_step"], f32(np.inf))
+        per_mm[:, 1] = np.clip(per_mm[:, 1], -most, most)
+        corrected = _corrected_length(path, rays.since_path)[:, None] * per_mm
         # A beam ends where it is bent, and where it leaves the field; below strong tissue it begins again.
         ends = np.flatnonzero(beam & (leaves | bent | (under & ~strong)))
         self._keep_correction(rays.of(ends), per_mm[ends])
@@ -618,6 +623,11 @@ class Tracer:
         self._hits.append(hit[beside])
         self._hit_pieces.append(self._piece_keys(rays)[beside])
         self._hit_lines.append(rays.line[beside])
+
+
+def _corrected_length(path: np.ndarray, since: np.ndarray) -> np.ndarray:
+    """Lengths over which rays are corrected: none where strong tissue ends a little beyond its piece."""
+    return np.maximum(path - since, f32(0))
 
 
 def _tube_after(tube: np.ndarray, along: np.ndarray) -> np.ndarray:
