@@ -166,7 +166,12 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
   }
 }
 
-// The sums of a point's fan in the direction `place` (in rays) at distance `far` (in stored depths).
+// The amplitude that is left after these nepers (both ways) in strong tissue.
+inline float passed_strong(float nepers) { return nepers == 0.0f ? 1.0f : exp(-0.5f * fmax(nepers, -4.0f)); }
+
+// The sums of a point's fan in the direction `place` (in rays) at distance `far` (in stored depths); of strong tissue
+// the amplitude that passes it. Between a ray in bone and one beside it that is half, where the mean of the nepers is
+// dark.
 inline float4 sums_at(__constant const Acquisition *acquisition, __global const float *sums, int row, int point,
                       float place, float far) {
   const int ray = (int)place, depth = (int)far, depths = acquisition->fan_depths;
@@ -176,7 +181,9 @@ inline float4 sums_at(__constant const Acquisition *acquisition, __global const 
   __global const float *next = near + depths * 4;
   const float4 a = vload4(0, near) + u * (vload4(1, near) - vload4(0, near));
   const float4 b = vload4(0, next) + u * (vload4(1, next) - vload4(0, next));
-  return a + t * (b - a);
+  float4 result = a + t * (b - a);
+  result.z = passed_strong(a.z) + t * (passed_strong(b.z) - passed_strong(a.z));
+  return result;
 }
 
 // Adds `share` times the autocorrelation of the wave from `count` points to `sum`. It is the spectrum of the intensity
@@ -284,7 +291,7 @@ inline void find_lines(__constant const Acquisition *acquisition, __global const
       const float ratio = path / at.z;  // per length of the axis: a homogeneous medium changes nothing but the mean
       lines->delay[row][i] = ratio * found.x;
       lines->loss[row][i] = ratio * found.y;
-      lines->passed[row][i] = exp(-0.5f * fmax(found.z, -4.0f));
+      lines->passed[row][i] = found.z;
       lines->lift[row][i] = ratio * found.w;
     }
   }

@@ -161,13 +161,16 @@ class Screens:
         return place, np.clip(away / fields["fan_step"], 0.0, fields["fan_depths"] - 1.001), away
 
     def _sums_at(self, sums: np.ndarray, used: np.ndarray, target: np.ndarray, path: float) -> np.ndarray:
-        """(4, rows, used points) sums on the straight lines to a point; but by strong tissue, for its axis' length."""
+        """(4, rows, used points) sums on the straight lines to a point; the amplitude that passes strong tissue."""
         place, far, away = self._places(used, target)
         ray, depth = place.astype(int), far.astype(int)
         result = 0.0
         for next_ray, of_ray in ((0, 1.0 - place + ray), (1, place - ray)):
+            on_ray = 0.0
             for next_depth, of_depth in ((0, 1.0 - far + depth), (1, far - depth)):
-                result += sums[:, used, ray + next_ray, depth + next_depth] * (of_ray * of_depth)[:, None]
+                on_ray += sums[:, used, ray + next_ray, depth + next_depth] * of_depth[:, None]
+            on_ray[..., 2] = np.exp(-0.5 * np.maximum(on_ray[..., 2], -4))
+            result += on_ray * of_ray[:, None]
         result[..., [0, 1, 3]] *= (path / away)[:, None]
         return np.moveaxis(result, -1, 0)
 
@@ -218,13 +221,13 @@ class Screens:
             away = np.abs(self.along - centre)
             used = np.flatnonzero(away <= reach + 0.5 * pitch * (1.0 + 1e-6))
             open_ = np.clip((reach - away[used]) / pitch + 0.5, 0.0, 1.0)
-            delay, loss, strong, lift = self._sums_at(sums, used, origin + depth * direction, depth)
+            delay, loss, passed, lift = self._sums_at(sums, used, origin + depth * direction, depth)
             return (
                 (self.points[used] - origin) @ across,
                 open_,
                 delay,
                 loss,
-                np.exp(-0.5 * np.maximum(strong, -4)),
+                passed,
                 lift,
             )
 
