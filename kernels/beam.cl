@@ -14,8 +14,12 @@
 // Where tissue has disturbed the phases of the aperture, the beam is wider (aperture.cl), of the same power of speckle:
 // the level has what it loses. Its phase then turns as much over its width as before.
 //
-// Buffers: from_re, from_im float [2 traced line + side][stride]; spreads float2 [screen line][depth]; losses as in
-// downshift.cl; to_re, to_im float [scan line][stride].
+// Each edge lies between two strips, of which both have echoes there. Scan lines read the sum of the two (join_edges),
+// since every edge is read by all scan lines whose beam covers it.
+//
+// Buffers: from_re, from_im float [2 traced line + side][stride]; edge_re, edge_im float [edge][stride]: the edge before
+// each traced line, without that before the first; spreads float2 [screen line][depth]; losses as in downshift.cl;
+// to_re, to_im float [scan line][stride].
 
 #include "common.clh"
 
@@ -39,8 +43,17 @@ inline void find_spread(__constant const Acquisition *acquisition, __global cons
   *factor = found.y + t * (found.w - found.y);
 }
 
-__kernel void lateral_beam(__constant const Acquisition *acquisition, __global const float *from_re,
-                           __global const float *from_im, __global const float *spreads, __global const float *losses,
+// One work-item adds up LANES samples of one edge. Global size (samples / LANES, traced lines - 1).
+__kernel void join_edges(__global const float *from_re, __global const float *from_im, __global float *edge_re,
+                         __global float *edge_im, int stride) {
+  const int edge = get_global_id(1) + 1, here = LINE_PAD + get_global_id(0) * LANES;
+  const int before = (2 * edge - 1) * stride + here, behind = before + stride, to = edge * stride + here;
+  STORE_LANES(LOAD_LANES(from_re + before) + LOAD_LANES(from_re + behind), edge_re + to);
+  STORE_LANES(LOAD_LANES(from_im + before) + LOAD_LANES(from_im + behind), edge_im + to);
+}
+
+__kernel void lateral_beam(__constant const Acquisition *acquisition, __global const float *edge_re,
+                           __global const float *edge_im, __global const float *spreads, __global const float *losses,
                            __global float *to_re, __global float *to_im, int stride) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int centre = acquisition->guard_lines + line * acquisition->lateral_rays;
@@ -76,8 +89,7 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   const float across = line_distance(acquisition, middle) / spread_[0];
   const float curved = lateral_curvature(acquisition, middle, 1.0f / frequency) * across * across;
   const float turns = curved / (2.0f * TWO_PI);
-  // Edge `edge` is half a step before traced line `edge`; the strips on both sides of it contribute. Edges come in
-  // pairs, n + 1/2 lines to either side. Their weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
+  // Edge `edge` is half a step before traced line `edge`. Edges come in pairs, n + 1/2 lines to either side. Their weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
   const floatn fall = exp2_fast(max(2.0f * exponent, -60.0f));
   floatn weight = exp2_fast(max(0.25f * exponent, -60.0f)), ratio = fall;
   int here = LINE_PAD + sample;
@@ -93,9 +105,8 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
       const int edges[2] = {centre - n, centre + n + 1};
       for (int side = 0; side < 2; side++) {
         if (n > whole && (edges[side] < 1 || edges[side] >= acquisition->traced_lines)) continue;
-        const int before = (2 * edges[side] - 1) * stride + here, behind = before + stride;
-        pair_re += LOAD_LANES(from_re + before) + LOAD_LANES(from_re + behind);
-        pair_im += LOAD_LANES(from_im + before) + LOAD_LANES(from_im + behind);
+        pair_re += LOAD_LANES(edge_re + edges[side] * stride + here);
+        pair_im += LOAD_LANES(edge_im + edges[side] * stride + here);
       }
       if (n > whole) weight = (float)n <= reach ? weight : (floatn)(0.0f);
       const float phase_re = cosine_[n - first], phase_im = sine_[n - first];

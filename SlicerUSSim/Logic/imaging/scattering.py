@@ -26,7 +26,7 @@ _PER_CELL = 130  # per examined lattice cell: two hashes, position, pulse phase,
 _PER_SCATTERER = 40  # per contributing scatterer: label, amplitude, four impulses
 _PER_HIT = 80
 _PER_ECHO = 40  # of a hit on a scan line
-_PER_EDGE_PAIR = 16  # for the lateral beam, per sample
+_PER_EDGE_PAIR = 12  # for the lateral beam, per sample
 #: Of the paper's lattice of scatterers
 PAPER_SITES_PER_MM3 = 0.02**-3
 # In the probe's smallest resolution cell, for developed speckle; thin structures need some too, whatever the probe
@@ -165,25 +165,32 @@ class LateralBeam(Stage):
 
     def __init__(self, device: Device) -> None:
         super().__init__(device)
-        self.kernel = device.kernels("beam.cl", device.lanes)["lateral_beam"]
-        self.lines = EchoLines(device)
+        kernels = device.kernels("beam.cl", device.lanes)
+        self._join, self._spread = kernels["join_edges"], kernels["lateral_beam"]
+        self.lines, self._edges = EchoLines(device), EchoLines(device)
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the lateral convolution of one frame: its `scanned` impulses."""
         scan_lines, samples = frame.line_shape
         scanned = frame.scanned = self.lines
         scanned.prepare(scan_lines, samples)
+        traced, vectors = int(frame.acquisition["traced_lines"]), samples // self.device.lanes
+        edges, stride = self._edges, np.int32(frame.traced.stride)
+        edges.prepare(traced, samples)
+        if traced > 1:
+            echoes = frame.traced.re, frame.traced.im
+            self.device.run(self._join, (vectors, traced - 1), *echoes, edges.re, edges.im, stride)
         self.device.run(
-            self.kernel,
-            (samples // self.device.lanes, scan_lines),
+            self._spread,
+            (vectors, scan_lines),
             frame.acquisition_buffer,
-            frame.traced.re,
-            frame.traced.im,
+            edges.re,
+            edges.im,
             frame.spreads,
             frame.losses,
             scanned.re,
             scanned.im,
-            np.int32(frame.traced.stride),
+            stride,
         )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
