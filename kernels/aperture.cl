@@ -33,6 +33,8 @@ DEFINE_ELEVATION(float8, elevation_sigma8)
 #define MOST_GATHERED 64      // lines whose strips have scatterers in common, ...
 #define LEAST_GATHERED 0.4f   // ... and the least part that is left of their power
 #define LEFT_FOR_MEANS 0.01f  // of the power of a line that strong tissue stops
+#define EDGE_OF_BONE 0.75f    // part of a cell from which lines are lost in it by their length
+#define LEAST_OPEN 0.05f      // amplitude that is left by the part that bone covers
 #define LEAST_POWER 1e-7f     // of a beam re an undisturbed one
 
 // Position along the face (mm) and angle of the normal of a point of the array.
@@ -46,22 +48,24 @@ inline float2 point_on_face(__constant const Acquisition *acquisition, float alo
 }
 
 // Extra path and nepers per mm of tissue beside `soft`, of which strong tissue has the attenuation, and also the extra
-// path if it bends what goes through.
-inline float2 rates_beside(float4 soft, float4 tissue) {
-  if (is_soft(soft.z, soft.w, tissue.z, tissue.w)) return tissue.xy;
-  return (float2)(bends(soft.z, tissue.z) ? soft.x : tissue.x, soft.y);
+// path if it bends what goes through; and whether it does.
+inline float3 rates_beside(float4 soft, float4 tissue) {
+  if (is_soft(soft.z, soft.w, tissue.z, tissue.w)) return (float3)(tissue.xy, 0.0f);
+  const int is_bent = bends(soft.z, tissue.z);
+  return (float3)(is_bent ? soft.x : tissue.x, soft.y, is_bent);
 }
 
-// Extra path and nepers per mm at the fraction f of a cell of voxels, linear between its eight labels.
-inline float2 rates_in_cell(__global const float4 *acoustics, __global const ushort *cell, int nx, int nxy, float3 f,
+// Extra path and nepers per mm at the fraction f of a cell of voxels, and its part that is tissue which bends: linear
+// between the eight labels.
+inline float3 rates_in_cell(__global const float4 *acoustics, __global const ushort *cell, int nx, int nxy, float3 f,
                             float4 soft, int all_soft) {
-  float2 along_y[2], along_z[2];
+  float3 along_y[2], along_z[2];
   for (int z = 0; z < 2; z++) {
     for (int y = 0; y < 2; y++) {
       __global const ushort *row = cell + y * nx + z * nxy;
       const float4 left = acoustics[row[0] & LABEL_MASK], right = acoustics[row[1] & LABEL_MASK];
-      const float2 a = all_soft ? left.xy : rates_beside(soft, left);
-      const float2 b = all_soft ? right.xy : rates_beside(soft, right);
+      const float3 a = all_soft ? (float3)(left.xy, 0.0f) : rates_beside(soft, left);
+      const float3 b = all_soft ? (float3)(right.xy, 0.0f) : rates_beside(soft, right);
       along_y[y] = a + f.x * (b - a);
     }
     along_z[z] = along_y[0] + f.y * (along_y[1] - along_y[0]);
@@ -101,6 +105,7 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
       (ROW_SIGMA * (row - 1));
   const float length = acquisition->fan_step;
 
+  float covered = 0.0f;           // the largest part of a cell that was bone
   int label = 0, was_strong = 0;  // of the last soft tissue; whether there was strong tissue behind it
   float4 soft = acoustics[0];
   float impedance = 0.0f;
@@ -129,7 +134,7 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
     }
     for (int n = 0; n < min(8, depths - depth); n++) {
       float2 rate = soft.xy;
-      float strong = 0.0f;
+      float strong = 0.0f, bone = 0.0f;
       int is_strong = 0;
       if (differs) {
         __global const ushort *cell = voxels + here[n];
@@ -144,15 +149,31 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
           soft = found;
           label = nearest;
         }
-        rate = is_mixed ? rates_in_cell(acoustics, cell, nx, nxy, f, soft, all_soft) : soft.xy;
+        if (is_mixed) {
+          const float3 in_cell = rates_in_cell(acoustics, cell, nx, nxy, f, soft, all_soft);
+          rate = in_cell.xy;
+          bone = in_cell.z;
+        } else {
+          rate = soft.xy;
+        }
         is_strong = !goes_on;
         if (is_strong || was_strong) strong = border_nepers(was_strong ? impedance : soft.w, found.w);
         impedance = found.w;
         if (is_strong) {
           const float excess = found.y - soft.y;
           const int is_bent = bends(soft.z, found.z);
-          strong += length * (is_bent ? BENT_PER_MM : fabs(excess) < LEAST_PER_MM ? LEAST_PER_MM : excess);
-          if (!is_bent && !is_mixed) rate.x = found.x;
+          if (is_bent) {
+            if (!is_mixed) bone = 1.0f;
+            strong += length * fmax(BENT_PER_MM * ramp(EDGE_OF_BONE, 1.0f, bone), LEAST_PER_MM);
+          } else {
+            strong += length * (fabs(excess) < LEAST_PER_MM ? LEAST_PER_MM : excess);
+            if (!is_mixed) rate.x = found.x;
+          }
+        }
+        // Beside bone a line is covered in part, as its neighbours are in whole: no step as the edge comes to it.
+        if (bone > covered) {
+          strong += 2.0f * log((1.0f - covered) / fmax(1.0f - bone, LEAST_OPEN));
+          covered = fmin(bone, 1.0f - LEAST_OPEN);
         }
       } else if (was_strong) {
         strong = border_nepers(impedance, soft.w);

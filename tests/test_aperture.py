@@ -107,6 +107,41 @@ def test_bone_is_as_bright_whatever_lies_behind_it(attenuation):
     assert hits["attenuation"].max() < 1.1
 
 
+@pytest.mark.parametrize("kind", PROBES)
+def test_the_penumbra_of_bone_is_that_of_its_aperture_and_has_no_steps(kind):
+    """Behind the straight edge of a plate, as the probe slides past it: the visible part u of the aperture leaves u^3.
+
+    The power of speckle is the integral of two intensities of an aperture u times as wide. Frames 0.1 mm apart differed
+    by up to 16 dB: the nepers of rays in bone and beside it were averaged, where it has to be their amplitudes.
+    """
+    bone, top, bottom, depth = Tissue("bone", 3198.0, 6.364, 3.54), 20.0, 25.0, 40.0
+
+    def plate(x, y, z):
+        return 1 + ((x < 0) & (y > top - 22.0) & (y < bottom - 22.0))
+
+    found = simulator(block(plate, (40, 44, 12), 0.5), PLAIN, bone, coupling=PLAIN, reflections=False)
+    probe = replace(PROBES[kind], depth_mm=43.0)
+    reach = 0.5 * min(probe.aperture_mm, depth / probe.receive_f_number)
+    aside, levels, predicted = np.arange(-0.4, 4.01, 0.1), [], []
+    for x in aside:
+        pose = FACE.copy()
+        pose[0, 3] = x
+        tree = found.trace(probe, pose)
+        level = 0.0
+        for piece in axis_segments(tree, 30):
+            along = (depth - piece["depth_mm"]) / piece["depth_per_mm"]
+            if 0.0 <= along < piece["length_mm"] and piece["label"] == 1 and piece["weight"] > 0.9:
+                level = 20.0 * np.log10(piece["attenuation"]) - 20.0 / np.log(10) * piece["decay_per_mm"] * along
+        levels.append(level)
+        least = x - x / (1.0 - (bottom if x < 0 else top) / depth)  # of the points that see past the edge
+        visible = np.clip((x + reach - least) / (2.0 * reach), 1e-3, 1.0)
+        predicted.append(30.0 * np.log10(visible))
+    levels, predicted = np.array(levels), np.array(predicted)
+    assert np.abs(np.diff(levels)).max() < 1.5
+    clear = predicted > -12.0
+    assert np.abs(levels - predicted)[clear].max() < 2.5, (levels.round(1), predicted.round(1))
+
+
 @pytest.mark.parametrize("attenuation", [2.0, 5.0, 9.0, 14.0])
 @pytest.mark.parametrize("thick_mm", [3.0, 6.5])
 def test_behind_a_lossy_layer_speckle_has_lost_what_the_layer_takes(attenuation, thick_mm):

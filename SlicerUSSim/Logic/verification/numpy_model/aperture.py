@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
-from SlicerUSSim.Logic.verification.numpy_model.elementary import LN10_OVER_20, affine_point, affine_vector, f32
+from SlicerUSSim.Logic.verification.numpy_model.elementary import LN10_OVER_20, affine_point, affine_vector, f32, ramp
 from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
 
 # Gauss-Hermite rule for the power of a beam across, in its standard deviations
 _ROWS, _WEIGHTS = np.sqrt(1.5) * np.array([-1.0, 0.0, 1.0]), np.array([1.0, 4.0, 1.0]) / 6.0
 _BENT = 4.0  # nepers both ways per millimetre of strong tissue that bends what goes through
+_EDGE_OF_BONE = 0.75  # part of a cell from which lines are lost in it by their length
+_LEAST_OPEN = 0.05  # amplitude that is left by the part that bone covers
 _LEAST = 1e-3  # nepers by which strong tissue differs from soft
 _MOST_SPREAD = 3.0  # of a beam
 _SOFT_SPEED, _SOFT_REFLECTION = 0.105, 0.12  # largest contrasts of a soft border
@@ -124,6 +126,7 @@ class Screens:
         self.current = np.full(count, -1)  # the last soft tissue
         self.last = np.zeros(count, int)  # the tissue of the last step, and whether it was strong
         self.was_strong = np.zeros(count, bool)
+        self.covered = np.zeros(count)  # the largest part of a cell that was bone
         self.total = np.zeros((3, count), np.float32)
         self.lean = np.zeros(count, np.float32)
 
@@ -144,11 +147,17 @@ class Screens:
         for kind, stays in enumerate((self.bent[current, corners], ~self.soft[current, corners])):
             rate[kind, mixed] = (self.rates[kind, np.where(stays, current, corners)] * weights).sum(axis=-1)
         self.total[:2] += length * rate
+        bone = bent.astype(float)
+        bone[mixed] = (self.bent[current, corners] * weights).sum(axis=-1)
         excess = self.rates[1, nearest] - self.rates[1, self.current]
-        excess = np.where(bent, _BENT, np.where(np.abs(excess) < _LEAST, _LEAST, excess))
+        in_bone = np.maximum(_BENT * ramp(_EDGE_OF_BONE, 1.0, bone), _LEAST)
+        excess = np.where(bent, in_bone, np.where(np.abs(excess) < _LEAST, _LEAST, excess))
         before = np.where(self.was_strong, self.last, self.current)
         self.total[2] += np.where(soft, 0.0, length * excess)
         self.total[2] += np.where(~soft | self.was_strong, self.border[before, nearest], 0.0)
+        more = np.log((1.0 - self.covered) / np.maximum(1.0 - bone, _LEAST_OPEN))
+        self.total[2] += np.where(bone > self.covered, 2.0 * more, 0.0)
+        self.covered = np.maximum(self.covered, np.minimum(bone, 1.0 - _LEAST_OPEN))
         self.last, self.was_strong = nearest, ~soft
 
     def _places(self, used: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
