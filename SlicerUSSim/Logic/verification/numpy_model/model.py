@@ -31,6 +31,9 @@ class NumpyModel:
         require(
             not settings.needs_texture, "NumpyModel has no texture, expected partial_volume and mri_modulation_db 0"
         )
+        require(
+            simulator.medium.sheets is None, "NumpyModel has no sheets found in an MRI, expected a simulator without"
+        )
         self.simulator = simulator
         self._twins = {stage.name: twin_of(stage) for stage in simulator.stages}
         self._read_medium()
