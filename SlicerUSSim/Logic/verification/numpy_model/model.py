@@ -31,9 +31,6 @@ class NumpyModel:
         require(
             not settings.needs_texture, "NumpyModel has no texture, expected partial_volume and mri_modulation_db 0"
         )
-        require(
-            simulator.medium.sheets is None, "NumpyModel has no sheets found in an MRI, expected a simulator without"
-        )
         self.simulator = simulator
         self._twins = {stage.name: twin_of(stage) for stage in simulator.stages}
         self._read_medium()
@@ -42,7 +39,7 @@ class NumpyModel:
 
     def _read_medium(self) -> None:
         given = self.simulator.medium
-        self.medium = HostMedium(given.labels, given.tissues, given.membership)
+        self.medium = HostMedium(given.labels, given.tissues, given.membership, given.sheets)
         self._labels = Labels(self.medium)
 
     def simulate(
