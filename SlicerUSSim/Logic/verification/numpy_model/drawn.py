@@ -1,7 +1,7 @@
 """Sheets found in an MRI, as rays and scatterers meet them (kernels/sheet_hits.cl, kernels/scattering.cl).
 
-Which voxels have a plane, and which gaps are closed, is taken from imaging/found_sheets.py, which works on the host; what
-its words mean is decoded here.
+Which voxels have a plane, and which gaps are closed, is taken from imaging/found_sheets.py, which works on the host;
+what its words mean is decoded here.
 """
 
 from __future__ import annotations
