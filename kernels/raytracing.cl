@@ -348,11 +348,6 @@ inline void correct_hits(__global Hit *hits, int count, float2 per_mm, float sta
   }
 }
 
-// Length along the ray per millimetre of its offset at which a surface lies beside the ray, by the surface's normal.
-inline float slope_along(float3 offset, float3 direction, float3 normal) {
-  return -dot3(normal, offset) / fmin(dot3(normal, direction), -0.05f);
-}
-
 // Coherent part of the echo of a border that carries the membrane, a surface of random heights: the mean of
 // exp(i 2 k h cos i) over normal heights h (Ogilvy 1991, eq. 4.12). Its scatterers return the rest.
 inline float membrane_coherence(__constant const Acquisition *acquisition, Tissue here, Tissue behind, float cos_in) {

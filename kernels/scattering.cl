@@ -25,6 +25,9 @@
 // the diffraction pattern (diffraction.py) instead of the main beam's profile. Only pieces of the path in dark tissue
 // count.
 //
+// With FOUND defined, planes have two words: some are of sheets that were found in the MRI (sheets.clh). Beside these
+// nothing else is membrane.
+//
 // Buffers: voxels, segments as in raytracing.cl; planes uint [k][j][i] of sheets.cl (one element without sheets);
 // texture uint [k][j][i] (one element without TEXTURE); sites float2 [label], the share of cells with a scatterer, in
 // 1/65536, and its amplitude, with LOBES behind them whether it is dark; re, im float [2 traced line + side][stride];
@@ -53,6 +56,12 @@
 #else
 #define PIECE_BLOCK BLOCK
 #define LOBE_PARAMETERS
+#endif
+
+#ifdef FOUND
+#define PLANE_WORDS 2
+#else
+#define PLANE_WORDS 1
 #endif
 
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
@@ -144,23 +153,43 @@ inline void add_echo(Echoes *sum, int part, int bin, float between, float right,
 }
 #endif
 
-// The sheet (sheets.clh) at the voxel nearest to a scatterer at fraction `at` of a cell, or 0; and the offset from it
-inline uint nearest_sheet(__constant const Acquisition *acquisition, __global const uint *planes, float3 at,
-                          float3 *offset) {
+// The sheet (sheets.clh) at the voxel nearest to a scatterer at fraction `at` of a cell, its plane 0 for none; and the
+// offset from it
+typedef struct {
+  uint plane;
+#ifdef FOUND
+  uint look;
+#endif
+} Sheet;
+
+inline Sheet nearest_sheet(__constant const Acquisition *acquisition, __global const uint *planes, float3 at,
+                           float3 *offset) {
   const int x = at.x > 0.5f, y = at.y > 0.5f, z = at.z > 0.5f;
   *offset = at - (float3)(x, y, z);
-  return planes[x + acquisition->dims[0] * (y + acquisition->dims[1] * z)];
+  __global const uint *words = planes + PLANE_WORDS * (x + acquisition->dims[0] * (y + acquisition->dims[1] * z));
+  Sheet sheet;
+  sheet.plane = words[0];
+#ifdef FOUND
+  sheet.look = words[1];
+#endif
+  return sheet;
 }
 
 // Whether a scatterer is in a sheet, at this offset from its voxel; and the normal, of the length of a gradient
-inline int is_in_sheet(__constant const Acquisition *acquisition, const Piece *piece, uint plane, float3 offset,
+inline int is_in_sheet(__constant const Acquisition *acquisition, const Piece *piece, Sheet sheet, float3 offset,
                        float3 *normal) {
-  const float3 gradient = gradient_of_sheet(plane);
-  const float away = fabs(dot3(gradient, offset) - length3(gradient) * distance_of_sheet(plane));
+  const float3 gradient = gradient_of_sheet(sheet.plane);
+#ifdef FOUND
+  const float distance = sheet.look ? distance_of_look(sheet.look) : distance_of_sheet(sheet.plane);
+  const float reach = sheet.look ? half_of_look(sheet.look) : acquisition->sheet_reach_mm;
+#else
+  const float distance = distance_of_sheet(sheet.plane), reach = acquisition->sheet_reach_mm;
+#endif
+  const float away = fabs(dot3(gradient, offset) - length3(gradient) * distance);
   // A gradient's length in millimetres is at most 1 / voxel_mm of that in voxels; this is seldom true.
-  if (away * acquisition->voxel_mm >= acquisition->sheet_reach_mm) return 0;
+  if (away * acquisition->voxel_mm >= reach) return 0;
   *normal = gradient.x * piece->row_i + gradient.y * piece->row_j + gradient.z * piece->row_k;
-  return away < acquisition->sheet_reach_mm * length3(*normal);
+  return away < reach * length3(*normal);
 }
 
 // The label of a scatterer at fraction `at` of the cell of voxels at `corner`, which contains a border, a sheet or the
@@ -184,10 +213,14 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
   int is_membrane = 0;
   if (acquisition->sheet_label >= 0) {
     float3 offset, normal;
-    const uint plane = nearest_sheet(acquisition, planes, at, &offset);
-    is_membrane = plane && is_in_sheet(acquisition, piece, plane, offset, &normal);
+    const Sheet sheet = nearest_sheet(acquisition, planes, at, &offset);
+    is_membrane = sheet.plane && is_in_sheet(acquisition, piece, sheet, offset, &normal);
     // Voxels are thicker than the sheet.
-    if (label == acquisition->sheet_label && planes[drawn]) label = label_beside_sheet(planes[drawn]);
+    const uint drawn_plane = planes[PLANE_WORDS * drawn];
+    if (label == acquisition->sheet_label && drawn_plane) label = label_beside_sheet(drawn_plane);
+#ifdef FOUND
+    if (sheet.look && !is_membrane) return label;
+#endif
   }
   if (!is_membrane) {
     const float near_z = blend(blend((float)(corner[0] >> 8), (float)(corner[1] >> 8), at.x),
@@ -207,8 +240,11 @@ inline int drawn_label(__constant const Acquisition *acquisition, __global const
 inline float gain_on_membrane(__constant const Acquisition *acquisition, __global const ushort *corner,
                               __global const uint *planes, const Piece *piece, float3 at) {
   float3 normal, offset;
-  const uint plane = acquisition->sheet_label < 0 ? 0u : nearest_sheet(acquisition, planes, at, &offset);
-  if (!plane || !is_in_sheet(acquisition, piece, plane, offset, &normal)) {
+  float level = acquisition->membrane_gain;
+  Sheet sheet;
+  sheet.plane = 0u;
+  if (acquisition->sheet_label >= 0) sheet = nearest_sheet(acquisition, planes, at, &offset);
+  if (!sheet.plane || !is_in_sheet(acquisition, piece, sheet, offset, &normal)) {
     const int nx = acquisition->dims[0], nxy = nx * acquisition->dims[1];
     const float4 from = (float4)(corner[0] >> 8, corner[nx] >> 8, corner[nxy] >> 8, corner[nxy + nx] >> 8);
     const float4 to = (float4)(corner[1] >> 8, corner[nx + 1] >> 8, corner[nxy + 1] >> 8, corner[nxy + nx + 1] >> 8);
@@ -217,10 +253,13 @@ inline float gain_on_membrane(__constant const Acquisition *acquisition, __globa
     const float gy = blend(lines.y - lines.x, lines.w - lines.z, at.z);
     const float gz = blend(lines.z, lines.w, at.y) - blend(lines.x, lines.y, at.y);
     normal = gx * piece->row_i + gy * piece->row_j + gz * piece->row_k;
+#ifdef FOUND
+  } else if (sheet.look) {
+    level *= level_of_look(sheet.look);
+#endif
   }
   const float cosine = fabs(dot3(normal, piece->direction)) / fmax(length3(normal), 1e-6f);
-  return acquisition->membrane_gain *
-         exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
+  return level * exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 
 // Three passes over a batch, each without unpredictable branches: vectors of all cells; labels of the scatterers that
@@ -323,8 +362,9 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
   for (int k = 0; k < several; k++) {
     const int i = mixed[k], j = chosen[i], here = voxel_[j];
     float gain = 1.0f;
-    label_[i] = drawn_label(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : here),
-                            texture + here, piece, (float3)(fx_[j], fy_[j], fz_[j]), random_[j], &gain);
+    label_[i] =
+        drawn_label(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : PLANE_WORDS * here),
+                    texture + here, piece, (float3)(fx_[j], fy_[j], fz_[j]), random_[j], &gain);
 #ifdef TEXTURE
     re_[j] *= gain;
     im_[j] *= gain;
@@ -341,8 +381,9 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 #endif
     if (label == MEMBRANE_LABEL) {
       const int here = voxel_[j];
-      strength *= gain_on_membrane(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : here),
-                                   piece, (float3)(fx_[j], fy_[j], fz_[j]));
+      strength *=
+          gain_on_membrane(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : PLANE_WORDS * here),
+                           piece, (float3)(fx_[j], fy_[j], fz_[j]));
     }
     int part = 0;
 #ifdef VARIED

@@ -420,9 +420,9 @@ def test_an_mri_gives_its_simulator_the_shares_of_voxels_and_labels_have_none(he
     textures = []
 
     class Seen(UltrasoundSimulator):
-        def __init__(self, labels, tissues, settings=None, device=None, texture=None):
+        def __init__(self, labels, tissues, settings=None, device=None, texture=None, sheets=None):
             textures.append(texture)
-            super().__init__(labels, tissues, settings, device, texture)
+            super().__init__(labels, tissues, settings, device, texture, sheets)
 
     monkeypatch.setattr("SlicerUSSim.Logic.imaging.simulator.UltrasoundSimulator", Seen)
     for source in (head, labels):

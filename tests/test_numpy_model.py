@@ -24,6 +24,7 @@ from SlicerUSSim.Logic import (
     seed_of_pose,
 )
 from SlicerUSSim.Logic.imaging import bmode, medium, noise, raytracing
+from SlicerUSSim.Logic.mri.sheets import Surfels
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import PROBES as STANDARD_PROBES
 from SlicerUSSim.Logic.tissue.tissue import Membrane
@@ -85,6 +86,28 @@ def test_the_kernels_draw_what_numpy_draws(kind, turn):
     assert set(model.timings_ms) >= {
         "ray tree", "scatterers", "interfaces", "beam", "pulse", "B-mode", "scan conversion"
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 25.0])
+def test_numpy_meets_the_sheets_that_were_found(turn_deg):
+    """A falx that has a coherent echo and an oblique sulcus, beside the sheets of the labels."""
+    labels, tissues = scene()
+    across = np.stack(np.meshgrid(np.arange(-9.0, 9.0, 0.7), np.arange(-9.0, 9.0, 0.7)), -1).reshape(-1, 2)
+    cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    place = np.stack([across[:, 0], 9.3 + sine * across[:, 0], across[:, 1]], axis=1)
+    normal = np.tile([-sine, cosine, 0.0], (len(place), 1))
+    falx = Surfels.of("falx", place, normal, 0.7, 0.9, 0.5)
+    sulcus = Surfels.of("sulcus", place + [0.0, 8.0, 0.0], normal, 1.2, 0.6, 0.5)
+    simulator = UltrasoundSimulator(labels, tissues, sheets=Surfels.joined([falx, sulcus]))
+    pose, display = rigid(np.eye(3), [1.0, -4.0, 0.5]), DisplaySettings(image_size=(240, 200))
+    image = simulator.simulate(PROBES["linear"], pose, display).image
+    model = NumpyModel(simulator)
+    difference = np.abs(image.astype(int) - model.simulate(PROBES["linear"], pose, display))
+    assert (difference <= 1).mean() > 0.97
+    plain = UltrasoundSimulator(labels, tissues).simulate(PROBES["linear"], pose, display).image
+    assert (np.abs(image.astype(int) - plain) > 10).mean() > 0.03  # the sheets are in it
+    tree = simulator.tracer.download()
+    assert (tree.hits["label_before"] == tree.hits["label_behind"]).any() or turn_deg > 0.0
 
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k != "phased")) for k in PROBES])

@@ -22,6 +22,7 @@ from SlicerUSSim.Command.options import (
 )
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
+from SlicerUSSim.Command.sheets import DrawnSheets, drawn_sheets_option, no_sheet_option
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
@@ -89,6 +90,10 @@ class PatientOptions:
     also: tuple[str, ...] = declared(also_option)
     #: TISSUE=FILE
     additions: tuple[str, ...] = declared(add_option)
+    #: A file, auto or none
+    sheets: str = declared(drawn_sheets_option)
+    #: Kinds that are not drawn
+    no_sheets: tuple[str, ...] = declared(no_sheet_option)
     #: {parameter: value} of the options that were given
     display: Mapping[str, Any] = declared_parameters(DisplaySettings, of_preset=True)
     settings: Mapping[str, Any] = declared_parameters(SimulationSettings, of_preset=True)
@@ -146,6 +151,7 @@ def open_examination(patient: PatientOptions) -> Examination:
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
     from SlicerUSSim.Logic.mri.pathology import texture_below
+    from SlicerUSSim.Logic.mri.segmentation import Segmentation
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file
     from SlicerUSSim.Logic.tissue.presets import TISSUES
     from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -175,6 +181,9 @@ def open_examination(patient: PatientOptions) -> Examination:
     if is_labels:
         require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")
     split_also(patient.also)
+    sheets = DrawnSheets.of(
+        patient.sheets, patient.no_sheets, is_labels=is_labels, contrast=patient.segmentation["contrast"]
+    )
     changes = Changes.of(patient.changes)
     table = TissueTable.read(patient.tissues) if patient.tissues else None
     if is_labels:
@@ -183,7 +192,7 @@ def open_examination(patient: PatientOptions) -> Examination:
             labels, tissues.names_by_label(), has_brain_mask=False
         )
         tissues = changes.to_tissues(added.table(tissues))
-        simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device)
+        simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device, sheets=sheets.read)
         return Examination(simulator, preset.probe, preset.display, is_labels, added.centre_ras(labels))
     log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
     tissues = preset.tissues if table is None else table
@@ -196,12 +205,16 @@ def open_examination(patient: PatientOptions) -> Examination:
         patient.mri_or_labels, volume, patient.segmentation, mask=patient.mask, also=patient.also,
         organs=patient.organs, maps=patient.maps, device=patient.device, additions=additions,
     )  # fmt: skip
-    names = segmentation.tissue_names if table is None else tissues.names_by_label()
-    added = additions.on(segmentation.labels, names, has_brain_mask=not is_ct)
+    labels, names, surfels = segmentation.labels, segmentation.tissue_names, sheets.read
+    if isinstance(segmentation, Segmentation):
+        drawn = sheets.found(patient.mri_or_labels, volume, segmentation, patient.segmentation["contrast"])
+        labels, names, surfels = drawn.labels, drawn.names, drawn.surfels
+    names = names if table is None else tissues.names_by_label()
+    added = additions.on(labels, names, has_brain_mask=not is_ct)
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
-    simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device, texture)
+    simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device, texture, surfels)
     return Examination(simulator, preset.probe, preset.display, is_labels, added.centre_ras(segmentation.labels))
 
 

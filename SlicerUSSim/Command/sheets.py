@@ -1,7 +1,8 @@
-"""--sheets and --sheet: thin sheets and small structures that are looked for after a segmentation."""
+"""--sheets, --sheet and --no-sheet: thin sheets and small structures found after a segmentation, and in images."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from SlicerUSSim.Logic.base.errors import require
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import Segmentation
+    from SlicerUSSim.Logic.mri.sheets import Surfels
 
 sheets_option = click.option(
     "--sheets", type=click.Path(path_type=Path), metavar="FILE",
@@ -24,6 +26,79 @@ sheet_kind_option = click.option(
     help="What --sheets looks for: sulcus, falx, tentorium, ependyma, corpus callosum, choroid plexus or vessels; may "
     "be repeated (default: all).",
 )  # fmt: skip
+#: Values of --sheets that are no file
+AUTO, NONE = "auto", "none"
+drawn_sheets_option = click.option(
+    "--sheets", default=NONE, metavar="FILE|auto|none", show_default=True,
+    help="Draw sulci, falx, tentorium and walls of ventricles as thin sheets: those in FILE, a .vtp of `ussim segment "
+    "--sheets`; auto: found in the MRI and kept beside it, with corpus callosum, choroid plexus and vessels as labels.",
+)  # fmt: skip
+no_sheet_option = click.option(
+    "--no-sheet", "no_sheets", multiple=True, metavar="KIND",
+    help="What --sheets leaves as the labels have it: sulcus, falx, tentorium, ependyma, corpus callosum, choroid "
+    "plexus or vessels; may be repeated.",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnSheets:
+    """What --sheets and --no-sheet ask for in images."""
+
+    #: AUTO, NONE, or a file
+    source: str
+    #: Of ALL_KINDS
+    kinds: tuple[str, ...]
+    #: Of the file
+    read: Surfels | None = None
+
+    @classmethod
+    def of(cls, source: str, without: tuple[str, ...], *, is_labels: bool, contrast: str) -> DrawnSheets:
+        """Reads and checks, before anything slow. Raises SimulationError for what cannot be met."""
+        require(source != NONE or not without, "--no-sheet leaves out some of --sheets; give --sheets, too")
+        if source == NONE:
+            return cls(source, ())
+        from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS, require_findable
+        from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels
+        from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
+
+        for kind in without:
+            require(kind in ALL_KINDS, f"--no-sheet is {kind!r}, expected one of: {', '.join(ALL_KINDS)}")
+        kinds = tuple(kind for kind in ALL_KINDS if kind not in without)
+        if source != AUTO:
+            return cls(source, kinds, read_surfels(source).of_kind(*(set(KINDS) & set(kinds))))
+        require(not is_labels, "--sheets is auto, and a label map has no sheets, expected a .vtp or an MRI")
+        require_findable(kinds, contrast)
+        return cls(source, kinds)
+
+    def found(self, mri_path: str, mri: Volume, segmentation: Segmentation, contrast: str) -> _Drawn:
+        """The sheets of an MRI, and its labels with the structures on top. Looked for once: everything is kept."""
+        if self.source != AUTO:
+            return _Drawn(self.read, segmentation.labels, segmentation.tissue_names)
+        from SlicerUSSim.Logic.base.errors import about_file
+        from SlicerUSSim.Logic.mri.pathology import add_tissues
+        from SlicerUSSim.Logic.mri.sheets.finding import STRUCTURES, find_sheets
+        from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
+        from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
+
+        with Share("sheets") as progress, about_file(mri_path):
+            sheets = find_sheets(
+                mri, segmentation, contrast=contrast, keep_at=sheets_beside(mri_path), progress=progress
+            )
+        for line in sheets.notes:
+            note(line)
+        labels, names = segmentation.labels, segmentation.tissue_names
+        masks = [mask for mask in sheets.masks() if mask[2] in set(STRUCTURES) & set(self.kinds)]
+        if masks:
+            added = add_tissues(labels, names, masks, has_brain_mask=True)
+            labels, names = added.labels, added.tissue_names
+        return _Drawn(sheets.surfels.of_kind(*(set(KINDS) & set(self.kinds))), labels, names)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    surfels: Surfels | None
+    labels: Volume
+    names: tuple[str, ...]
 
 
 def require_sheets(path: Path | None, kinds: tuple[str, ...], contrast: str) -> None:

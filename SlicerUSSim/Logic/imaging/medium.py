@@ -5,7 +5,8 @@ corners agree, so that most look-ups need one load. The high byte has the *fluid
 of the membrane's fluids, positive inside. It is computed from their indicator, smoothed by a Gaussian: for a planar
 border at distance d this is Phi(d / sigma), so d = sigma Phi^-1 of it. With linear interpolation between voxels, a
 layer thinner than a voxel is located without steps. Thin layers of the membrane's own tissue, as of a sulcus whose two
-borders meet, are sheets instead: planes fitted to their voxels (sheets.py).
+borders meet, are sheets instead: planes fitted to their voxels (sheets.py). Sheets that were found in the MRI are such
+planes, too (found_sheets.py).
 """
 
 from __future__ import annotations
@@ -20,9 +21,12 @@ from scipy import ndimage, special
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.borders import smoothed_indicators
+from SlicerUSSim.Logic.imaging.found_sheets import FoundSheets, cells_around, found_sheets
 from SlicerUSSim.Logic.imaging.sheets import sheet_planes
+from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.opencl.device import Device
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
+from SlicerUSSim.Logic.tissue.sheet_looks import looks_of
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Membrane
 
@@ -51,6 +55,7 @@ class Medium:
     texture : (k, j, i) uint32 of Texture.packed, if scatterers depend on more than labels.
     membership : (second label, the part of a voxel that it fills in 1/255), (k, j, i) uint8 each, as from
         Texture.membership, for borders between voxels.
+    sheets : thin sheets that were found in the MRI, drawn where there is a membrane; None or none: those of the labels.
 
     Raises SimulationError for labels that are not whole numbers or have no tissue.
     """
@@ -62,6 +67,7 @@ class Medium:
         device: Device,
         texture: np.ndarray | None = None,
         membership: tuple[np.ndarray, np.ndarray] | None = None,
+        sheets: Surfels | None = None,
     ) -> None:
         started = perf_counter()
         self.device = device
@@ -73,7 +79,8 @@ class Medium:
         self.present = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
         self.dims = np.array(array.shape[::-1]) + 2 * _PAD
         self._check(tissues)
-        padded = np.pad(array, _PAD)
+        #: As given, or None
+        self.sheets = sheets if sheets is not None and len(sheets) else None
         #: uint16 [k][j][i]: label, flags and fluid distance; uint8 [k][j][i]: acoustic groups; and their indicators
         self.voxel_buffer: Buffer
         self.group_buffer: Buffer
@@ -82,13 +89,17 @@ class Medium:
         self.smooth_groups: int
         #: Half the membrane in the unit of the fluid distance; negative: none
         self.membrane_reach: float
-        #: uint32 [k][j][i] planes of thin sheets (sheets.cl), or one element if there are none; and their label or -1
+        #: uint32 [k][j][i] planes of thin sheets (sheets.cl), two words each if some were found in the MRI, or one
+        #: element if there are none; and the label of those of labels, 64 without such, -1 for no sheets
         self.sheet_buffer: Buffer
         self.sheet_label: int
+        #: The sheets found in the MRI on this grid; None without
+        self.found: FoundSheets | None
         #: layout.TISSUE per label, as on the device
         self.rows = self._tissue_rows(tissues)
         #: As given
         self.membership = membership
+        padded = self._laid_over(tissues)
         self._upload(padded, tissues)
         self._upload_groups(padded)
         self.has_texture = texture is not None
@@ -134,12 +145,19 @@ class Medium:
         self._check(tissues)
         if _membrane_shape(tissues) != _membrane_shape(self.tissues):
             _log.debug("the membrane has changed: voxels are uploaded again")
-            self._upload(np.pad(as_labels(self.labels.array), _PAD), tissues)
+            closed_before = self.found
+            padded = self._laid_over(tissues)
+            self._upload(padded, tissues)
+            if self.found is not None or closed_before is not None:
+                self._upload_groups(padded)
+        elif self.sheets is not None and looks_of(tissues) != looks_of(self.tissues):
+            _log.debug("what sheets are made of has changed: voxels are uploaded again")
+            self._upload(self._laid_over(tissues), tissues)
         groups_before = self.rows["group"]
         self.rows = self._tissue_rows(tissues)
         if not np.array_equal(self.rows["group"], groups_before):
             _log.debug("the acoustic groups have changed: voxels are uploaded again")
-            self._upload_groups(np.pad(as_labels(self.labels.array), _PAD))
+            self._upload_groups(self._laid_over(tissues))
         self.device.write(self.tissue_buffer, self.rows)
         self.version += 1
         self.tissues = tissues
@@ -168,10 +186,31 @@ class Medium:
             rows["is_fluid"][list(_fluid_labels(tissues, tissues.membrane))] = 1
         return rows
 
+    def _laid_over(self, tissues: TissueTable) -> np.ndarray:
+        """(k, j, i) uint8 labels with a margin, whose narrow gaps are closed where a sheet that was found stands for
+        them."""
+        padded = np.pad(as_labels(self.labels.array), _PAD)
+        membrane, self.found = tissues.membrane, None
+        if self.sheets is None or membrane is None or membrane.thickness_mm == 0:
+            return padded
+        fluids = tuple(label for label in _fluid_labels(tissues, membrane) if label)
+        found = found_sheets(self.sheets, padded, self.labels, fluids, looks_of(tissues))
+        if not len(found.voxels):
+            _log.debug("no sheet that was found lies in the volume")
+            return padded
+        self.found = found
+        _log.debug(
+            "found sheets: planes beside %d voxels, %d voxels of narrow gaps closed", len(found.voxels),
+            np.count_nonzero(found.closed),
+        )  # fmt: skip
+        return found.labels
+
     def _upload(self, padded: np.ndarray, tissues: TissueTable) -> None:
         label = _sheet_label(tissues)
         self.sheet_buffer, sheets = sheet_planes(self.device, padded, label, self.labels.spacing_mm)
         self.sheet_label = label if len(sheets) else -1
+        if self.found is not None:
+            self._add_planes(padded.shape, self.found, bool(len(sheets)))
         distance, self.membrane_reach = self._fluid_distance(padded, tissues, sheets)
         words = padded.astype(np.uint16)
         lowest, highest = _cell_extremes(padded)
@@ -182,8 +221,21 @@ class Medium:
             no_membrane = (lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach)
             for k, j, i in np.ndindex(2, 2, 2):  # the cells around these voxels
                 no_membrane.ravel()[sheets - np.ravel_multi_index((k, j, i), padded.shape)] = False
+        if self.found is not None:
+            no_membrane = np.broadcast_to(no_membrane, padded.shape).copy()
+            no_membrane.ravel()[cells_around(self.found.voxels[self.found.is_near], padded.shape)] = False
         words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["NO_MEMBRANE"]) * no_membrane
         self.voxel_buffer = self.device.upload(words)
+
+    def _add_planes(self, shape: tuple[int, ...], found: FoundSheets, has_fitted: bool) -> None:
+        """Lay the planes of sheets that were found over those fitted to labels, which get a second word of 0."""
+        words = np.zeros((int(np.prod(shape)), 2), np.uint32)
+        if has_fitted:
+            words[:, 0] = self.device.download(self.sheet_buffer, len(words), np.uint32)
+        words[found.voxels] = found.words
+        self.sheet_buffer = self.device.upload(words)
+        if not has_fitted:
+            self.sheet_label = CONSTANTS["MAX_TISSUES"]
 
     def _upload_groups(self, padded: np.ndarray) -> None:
         """The acoustic group of every voxel, and smoothed indicators of the first groups, which give the most accurate
@@ -201,6 +253,8 @@ class Medium:
         membership = None
         if self.membership is not None:
             second, share = (np.pad(part, _PAD, mode="edge") for part in self.membership)
+            if self.found is not None:
+                share = np.where(self.found.closed, 0, share).astype(share.dtype)
             membership = group_of[second], share
             groups |= {int(group) for group in np.unique(membership[0][share > 0])}
         inside = tuple(slice(_PAD, -_PAD) for _ in range(3))

@@ -1,4 +1,4 @@
-"""Host code of kernels/raytracing.cl: the ray tree of every scan line."""
+"""Host code of kernels/raytracing.cl and sheet_hits.cl: the ray tree of every scan line."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ class RayTracer(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.kernel = device.kernels("raytracing.cl")["trace"]
+        self._sheet_hits = device.kernels("sheet_hits.cl")["sheet_hits"]
         self._losses = device.kernels("downshift.cl", device.lanes)["losses"]
         self.workspace = Workspace(device)
         self._quantile_key: tuple | None = None
@@ -83,6 +84,11 @@ class RayTracer(Stage):
             self._overflown,
             heavy=True,
         )
+        if medium.found is not None and medium.found.reflects:
+            self.device.run(
+                self._sheet_hits, (traced, rays), frame.acquisition_buffer, medium.sheet_buffer, self._quantiles,
+                tree.segments, tree.segment_counts, tree.hits, tree.hit_counts, heavy=True,
+            )  # fmt: skip
         lines, samples = frame.line_shape
         frame.losses = get("losses", lines * (samples // CONSTANTS["LOSS_STEP"] + 1) * 8)
         self.device.run(

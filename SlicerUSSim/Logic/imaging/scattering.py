@@ -65,6 +65,7 @@ class Scatterers(Stage):
         samples, traced = frame.line_shape[1], int(frame.acquisition["traced_lines"])
         end = [] if part_of is None else [part_of]
         variant = (["TEXTURE"] if frame.medium.has_texture else []) + (["VARIED"] if part_of is not None else [])
+        variant += ["FOUND"] if frame.medium.found is not None else []
         self.device.write(self._sites[0], lattice_sites(tissues, frame.acquisition))
         self._enqueue(
             frame, lines, frame.acquisition_buffer, self._sites[0],

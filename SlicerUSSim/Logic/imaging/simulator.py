@@ -27,6 +27,7 @@ from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
 from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
+from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.opencl.device import Device, DeviceChoice
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import Probe
@@ -65,6 +66,8 @@ class UltrasoundSimulator:
     device : see opencl.devices.choose_device.
     texture : data from the MRI in addition to labels (Segmentation.texture, Texture.from_mri). Its probabilities place
         borders between voxels; scatterers use it with the settings partial_volume or mri_modulation_db.
+    sheets : thin sheets found in the MRI (mri.sheets.find_sheets, .surfels), of the kinds that are to be drawn. They
+        replace the lines that labels have in their place; None or none: the lines of the labels.
 
     Raises SimulationError for labels without a tissue, if a required texture is missing or has another shape, and if no
     device can be used.
@@ -87,6 +90,7 @@ class UltrasoundSimulator:
         settings: SimulationSettings | None = None,
         device: DeviceChoice = None,
         texture: Texture | None = None,
+        sheets: Surfels | None = None,
     ) -> None:
         require_kind("labels", labels, Volume, "Volume.read reads a file")
         require_kind("tissues", tissues, TissueTable, "TissueTable.brain makes one")
@@ -98,7 +102,7 @@ class UltrasoundSimulator:
         self.device = Device.get(device)
         packed = _packed_texture(texture, labels, self.settings)
         membership = None if texture is None else texture.membership()
-        self.medium = Medium(labels, tissues, self.device, packed, membership)
+        self.medium = Medium(labels, tissues, self.device, packed, membership, sheets)
         #: The stages of stages.py, also for the appearance model and verification
         self.impulse_stages = [stage(self.device) for stage in stages.IMPULSE_STAGES]
         self.linear_stages = [stage(self.device) for stage in stages.LINEAR_STAGES]

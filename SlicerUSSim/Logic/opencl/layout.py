@@ -34,6 +34,10 @@ CONSTANTS = {
     "SHEET_THICK": 0.9,
     "SHEET_LEAST_AREA": 2.5,  # of a sheet in it: product of the variances along a plane, voxels^4; of a whole one 16
     "SHEET_DISTANCE_STEP": 0.015625,  # of the stored distance, voxels
+    # Of sheets found in the MRI (found_sheets.py): half the thickness in mm, level in dB, reflection coefficient
+    "SHEET_HALF_STEP": 0.0078125,
+    "SHEET_LEVEL_STEP_DB": 0.25,
+    "SHEET_REFLECTION_STEP": 0.008,
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
@@ -68,7 +72,10 @@ ACQUISITION = np.dtype(
         ("voxel_mm", _FLOAT),  # smallest spacing
         ("smooth_groups", _INT),  # acoustic groups with a smoothed indicator
         ("membrane_reach", _FLOAT),  # half the membrane in units of the fluid distance (0..255); negative: none
-        ("sheet_label", _INT),  # of the membrane's own tissue, which is a sheet where it is thin; -1: none
+        (
+            "sheet_label",
+            _INT,
+        ),  # of the membrane's own tissue, a sheet where it is thin; -1: no sheets; 64: none of labels
         ("sheet_reach_mm", _FLOAT),  # half the thickness of such a sheet
         ("membrane_gain", _FLOAT),  # of the amplitude of its scatterers at normal incidence
         ("membrane_exponent", _FLOAT),  # of the cosine of incidence by which it falls

@@ -34,6 +34,8 @@ STRUCTURES = {"corpus callosum": "corpus callosum", "choroid plexus": "enhancing
 ALL_KINDS = (*KINDS, *STRUCTURES)
 #: Those that only contrast agent shows
 _ENHANCING = ("choroid plexus", "vessels")
+#: Those that are found without an atlas, in a part of a brain
+_WITHOUT_ATLAS = ("sulcus", "ependyma")
 #: A sulcus this near to the falx or the tentorium and as parallel to it is the fissure in which that lies, mm
 _SAME_MM, _SAME_COSINE = 2.0, 0.7
 #: About how long each step takes
@@ -77,18 +79,26 @@ def find_sheets(
     Parameters
     ----------
     mri : the image from which `segmentation` was made.
-    segmentation : of the whole brain, led by the atlas.
+    segmentation : led by the atlas. Without, as of a part of a brain, only sulci and walls of wide deep fluid are
+        found.
     contrast : of the MRI: "t1", "t1gd" or "t2".
     kinds : what is looked for, of ALL_KINDS. Without contrast agent no vessels and no choroid plexus are found.
     keep_at : file in which they are kept and from which they are read again; see kept.sheets_beside.
     progress : called with the completed fraction, 0 to 1; may raise errors.Cancelled, which ends the search.
 
-    Raises SimulationError for an unknown kind or contrast, an MRI on another grid than the segmentation, and a
-    segmentation that no atlas led.
+    Raises SimulationError for an unknown kind or contrast, an MRI on another grid than the segmentation, and
+    where nothing of what is wanted can be found without an atlas.
     """
     wanted = tuple(kinds)
     require_findable(wanted, contrast)
     require(wanted, f"nothing is to be found, expected some of: {', '.join(ALL_KINDS)}")
+    notes, asked = [], wanted
+    if segmentation.atlas is None:
+        wanted = tuple(kind for kind in wanted if kind in _WITHOUT_ATLAS)
+        lacking = "without an atlas, which needs a whole brain and nilearn"
+        require(wanted, f"{', '.join(asked)} cannot be found {lacking}")
+        if len(wanted) < len(asked):
+            notes.append(f"only {' and '.join(wanted)} are looked for {lacking}")
     report = progress or (lambda share: None)
     report(0.0)
     key = key_of(mri, segmentation, contrast) if keep_at is not None else ""
@@ -101,7 +111,7 @@ def find_sheets(
     else:
         surfels, structures = _found(Head.of(mri, segmentation, contrast), mri, wanted, report)
         first = keep_sheets(keep_at, key, wanted, surfels, structures.array) if keep_at is not None else ""
-    notes = [first] if first else []
+    notes += [first] if first else []
     if contrast != "t1gd" and set(_ENHANCING) & set(wanted):
         notes.append("no vessels and no choroid plexus are looked for: only a T1 with contrast agent shows them")
     notes += _lines(surfels, structures, wanted)

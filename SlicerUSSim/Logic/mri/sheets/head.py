@@ -52,22 +52,18 @@ class Head:
     noise: float
     #: Whether vessels and dura enhance
     is_enhanced: bool
-    atlas: AtlasFit
+    #: None of a part of a brain: what the atlas does not lead is looked for without it
+    registered: AtlasFit | None
 
     @classmethod
     def of(cls, mri: Volume, segmentation: Segmentation, contrast: str) -> Head:
-        """Raises SimulationError for a FLAIR, for an MRI of another grid, and where no atlas led the segmentation."""
+        """Raises SimulationError for a FLAIR, and for an MRI of another grid."""
         require_contrast(contrast)
         require(
             mri.array.shape == segmentation.labels.array.shape
             and bool(np.allclose(mri.ijk_to_ras, segmentation.labels.ijk_to_ras, atol=1e-3)),
             f"the MRI has {mri.array.shape} voxels (k, j, i) and its segmentation {segmentation.labels.array.shape}, "
             "expected one grid",
-        )
-        atlas = required(
-            segmentation.atlas,
-            "sheets need the atlas, which did not lead this segmentation (see its notes), expected a whole brain and "
-            "nilearn",
         )
         sign = -1.0 if contrast == "t2" else 1.0
         names = segmentation.tissue_names
@@ -86,7 +82,16 @@ class Head:
             inside = on_grid(part.with_array(inside.astype(np.float32)), grid) > 0.5
         noise = float(segmentation.standard_deviations[names.index("white matter")])
         csf, grey, white = means
-        return cls(grid, inside, csf, grey, white, noise, contrast == "t1gd", atlas)
+        return cls(grid, inside, csf, grey, white, noise, contrast == "t1gd", segmentation.atlas)
+
+    @property
+    def atlas(self) -> AtlasFit:
+        """Raises SimulationError without one."""
+        return required(
+            self.registered,
+            "this needs the atlas, which did not lead the segmentation (see its notes), expected a whole brain and "
+            "nilearn",
+        )
 
     @property
     def spacing(self) -> np.ndarray:
@@ -111,9 +116,16 @@ class Head:
 
     @cached_property
     def depth(self) -> np.ndarray:
-        """(k, j, i) float32 mm inside the hull of the brain; 0 or less outside."""
-        hull = closed(self.brain, _HULL_MM / float(self.spacing.mean()))
-        return -distance_to(hull, self.image.spacing_mm)
+        """(k, j, i) float32 mm inside the hull of the brain; 0 or less outside.
+
+        Where the image cuts the brain, it goes on as at the cut.
+        """
+        radius = _HULL_MM / float(self.spacing.mean())
+        n = 2 * int(radius) + 2
+        # On another grid than the image's, the outermost voxels are outside.
+        inner = self.brain[1:-1, 1:-1, 1:-1]
+        hull = closed(np.pad(inner, n + 1, mode="edge"), radius)
+        return -distance_to(hull, self.image.spacing_mm)[n:-n, n:-n, n:-n]
 
     @cached_property
     def white_distance(self) -> np.ndarray:

@@ -21,6 +21,8 @@ _MIDLINE_BOXES = (((-4, -28, -14), (4, 3, 7)), ((-12, -48, -42), (12, -36, -22))
 _REACH_MM, _MIDLINE_REACH_MM = 8.0, 2.0
 #: Parts of ventricles that are kept
 _LEAST_MM3 = 30.0
+#: Without an atlas: fluid as wide as this, so deep below the hull, in parts of this size, mm
+_WIDE_MM, _DEEP_MM, _LEAST_WIDE_MM3 = 4.0, 15.0, 500.0
 
 
 def tentorium_height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -38,7 +40,12 @@ def in_tentorium(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def hindbrain(head: Head, margin_mm: float = 3.0) -> np.ndarray:
-    """(k, j, i) True in cerebellum, brain stem and the cisterns around, up to a margin above the tentorium."""
+    """(k, j, i) True in cerebellum, brain stem and the cisterns around, up to a margin above the tentorium.
+
+    Nowhere without an atlas.
+    """
+    if head.registered is None:
+        return np.zeros(head.brain.shape, bool)
     x, y, z = head.in_atlas
     is_behind = y < -12.0 - 0.35 * np.maximum(np.abs(x) - 12.0, 0.0)
     is_notch = ((x / 24.0) ** 2 + ((y + 20.0) / 30.0) ** 2 < 1.0) & (z < 2.0)
@@ -72,8 +79,13 @@ def lateral_ventricles_of_atlas(head: Head) -> np.ndarray:
 
 
 def ventricles(head: Head) -> np.ndarray:
-    """(k, j, i) True in the fluid of the patient's ventricles, found from where the atlas has them."""
+    """(k, j, i) True in the fluid of the patient's ventricles, found from where the atlas has them.
+
+    Without an atlas in wide fluid deep in the brain, to which cisterns at its base belong.
+    """
     fluid = (head.fluid(head.smoothed(0.4)) > 0.5) & head.brain
+    if head.registered is None:
+        return _wide_and_deep(head, fluid)
     result = np.zeros(fluid.shape, bool)
     for template, reach in zip(_template_ventricles(head.atlas.atlas), (_REACH_MM, _MIDLINE_REACH_MM), strict=True):
         core = head.carried(template) > 0.5
@@ -84,3 +96,15 @@ def ventricles(head: Head) -> np.ndarray:
         kept[0] = False
         result |= kept[parts]
     return result
+
+
+def _wide_and_deep(head: Head, fluid: np.ndarray) -> np.ndarray:
+    """(k, j, i) True in parts of fluid that are wide somewhere; their narrow ends belong to them."""
+    deep = fluid & (head.depth > _DEEP_MM)
+    wide = distance_to(~deep, head.image.spacing_mm) >= 0.5 * _WIDE_MM
+    region = deep & (distance_to(wide, head.image.spacing_mm) <= _WIDE_MM) if wide.any() else wide
+    parts = components(region)
+    sizes = np.bincount(parts.ravel()) * head.voxel_mm3
+    kept = sizes > _LEAST_WIDE_MM3
+    kept[0] = False
+    return kept[parts]

@@ -30,13 +30,18 @@ _BRIGHT = 3.0
 def sulci(head: Head, ventricles: np.ndarray) -> Surfels:
     """Surfels on the middles of sulci: ridges of min(D, 7 mm) + 4 mm fluid, where D is the distance to white matter.
 
-    None in and beside the `ventricles` (k, j, i), and none below the tentorium.
+    None in and beside the `ventricles` (k, j, i), and none below the tentorium. Without an atlas, as of a part of a
+    brain, darkness alone counts: the distance to white matter is not that of the whole, and a lesion may fill most of
+    it.
     """
-    relief = np.minimum(head.white_distance, _FARTHEST_MM) + _DARK_MM * head.fluid(head.image.array)
+    is_whole = head.registered is not None
+    relief = _DARK_MM * head.fluid(head.image.array)
+    if is_whole:
+        relief += np.minimum(head.white_distance, _FARTHEST_MM)
     near_ventricle = distance_to(ventricles, head.image.spacing_mm) < 2.0
     where = (
         (head.depth > _LEAST_DEPTH_MM)
-        & (head.white_distance > _LEAST_DISTANCE_MM)
+        & ((head.white_distance > _LEAST_DISTANCE_MM) | (not is_whole))
         & (head.image.array < head.white + _BRIGHT * head.noise)
         & ~hindbrain(head)
         & ~near_ventricle

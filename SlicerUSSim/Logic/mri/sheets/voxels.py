@@ -79,6 +79,8 @@ def on_voxels(surfels: Surfels, grid: Volume, *, reach_mm: float = 2.0, finer: i
     if not len(surfels):
         return SheetVoxels(grid.with_array(entry), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), reach_mm)
     near = np.argwhere(_near(surfels, grid, reach_mm))
+    if not len(near):
+        return SheetVoxels(grid.with_array(entry), np.zeros((0, 2), np.uint32), np.zeros(0, np.uint8), reach_mm)
     tree = KDTree(surfels.place)
     kept, packed, kinds = [], [], []
     for start in range(0, len(near), _CHUNK):

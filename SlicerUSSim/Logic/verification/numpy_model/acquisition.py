@@ -42,7 +42,11 @@ def acquisition_record(
         "voxel_mm": medium.voxel_mm,
         "smooth_groups": medium.smooth_groups,
         "membrane_reach": medium.membrane_reach,
-        "sheet_label": medium.sheets.label if medium.sheets and medium.sheets.is_thin.any() else -1,
+        "sheet_label": medium.sheets.label
+        if medium.sheets and medium.sheets.is_thin.any()
+        else 64
+        if medium.drawn
+        else -1,
         "sheet_reach_mm": membrane.thickness_mm / 2.0 if membrane else 0.0,
         "membrane_gain": np.exp(membrane.diffuse_db * np.log(10.0) / 20.0) if membrane else 0.0,
         "membrane_exponent": membrane.diffuse_exponent if membrane else 0.0,

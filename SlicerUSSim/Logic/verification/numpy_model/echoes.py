@@ -223,9 +223,13 @@ def drawn_labels(
     corner = here + (f * f32(32) > threshold) @ labels.steps
     label = labels.label[corner].astype(int)
     gain = np.ones(len(label), np.float32)
-    if labels.distance is None:
+    drawn = labels.drawn
+    if labels.distance is None and drawn is None:
         return label, gain
-    corners = labels.distance[here[:, None] + labels.corner_steps].astype(np.float32)
+    if labels.distance is None:
+        corners = np.zeros((len(here), 8), np.float32)  # far outside
+    else:
+        corners = labels.distance[here[:, None] + labels.corner_steps].astype(np.float32)
 
     def derived(along: int | None) -> np.ndarray:
         """The trilinear distance, or its derivative along one axis."""
@@ -255,11 +259,26 @@ def drawn_labels(
         beside = near_cell & (label == acquisition["sheet_label"])
         beside &= labels.sheets.gradient.reshape(-1, 3)[corner].any(axis=1)
         label[beside] = labels.sheets.beside.ravel()[corner[beside]]
+    level = np.ones(len(label), np.float32)
+    if drawn is not None:
+        # Where the kernel looks: the cells that the device flags
+        looked_at = drawn.near_cell[here] | _has_membrane(acquisition, corners)
+        at = here + (f > f32(0.5)).astype(np.int64) @ labels.steps
+        gradient = drawn.gradient[at]
+        across = gradient @ to_voxel
+        away = np.abs((gradient * (f - (f > f32(0.5)))).sum(axis=1) - drawn.distance[at])
+        inside = away < drawn.half[at] * np.sqrt((across**2).sum(axis=1))
+        has_plane = looked_at & drawn.is_drawn[at]
+        thin[has_plane] = inside[has_plane]
+        normal[has_plane] = across[has_plane]
+        level[has_plane] = drawn.level[at][has_plane]
+        beside = looked_at & (label == acquisition["sheet_label"]) & drawn.is_drawn[corner]
+        label[beside] = drawn.beside[corner[beside]].astype(int)
     label[thin] = CONSTANTS["MEMBRANE_LABEL"]
     normal = normal[thin]
     size = np.maximum(np.sqrt((normal**2).sum(axis=1)), f32(1e-6))
     cosine = np.maximum(np.abs(normal @ direction) / size, f32(1e-6))
-    gain[thin] = acquisition["membrane_gain"] * cosine ** acquisition["membrane_exponent"]
+    gain[thin] = level[thin] * acquisition["membrane_gain"] * cosine ** acquisition["membrane_exponent"]
     return label, gain
 
 

@@ -45,6 +45,7 @@ class Labels:
         self.flat = FlatBorders(self.widest, self.dims)
         self.distance = None if medium.distance is None else medium.distance.ravel()
         self.sheets = medium.sheets
+        self.drawn = medium.drawn
 
     def cells(self, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(index of the cell, fraction (..., 3) inside it) of (..., 3) voxel positions, clamped to the volume."""

@@ -6,9 +6,11 @@ import numpy as np
 from scipy import ndimage, special
 
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
+from SlicerUSSim.Logic.verification.numpy_model.drawn import DrawnPlanes
 from SlicerUSSim.Logic.verification.numpy_model.sheets import Sheets
 
 WIDE_SIGMA, HALVED_SIGMA = 3.0, 4.0  # of the Gaussians for smoothing the indicators, voxels of their grids
@@ -25,15 +27,23 @@ class HostMedium:
     ----------
     labels : Volume of tissue labels.
     tissues : TissueTable with a tissue for every label.
-    membership : as in Medium.
+    membership, sheets : as in Medium.
     """
 
     def __init__(
-        self, labels: Volume, tissues: TissueTable, membership: tuple[np.ndarray, np.ndarray] | None = None
+        self,
+        labels: Volume,
+        tissues: TissueTable,
+        membership: tuple[np.ndarray, np.ndarray] | None = None,
+        sheets: Surfels | None = None,
     ) -> None:
         self.tissues = tissues
         #: (k, j, i) with a voxel of coupling medium on every side
         self.label = np.pad(labels.array.astype(np.uint8), 1)
+        #: The sheets found in the MRI; None without
+        self.drawn = DrawnPlanes.of(sheets, labels, self.label, tissues)
+        if self.drawn is not None:
+            self.label = self.drawn.label
         self.dims = np.array(self.label.shape[::-1])
         columns = labels.ijk_to_ras[:3, :3]
         spacing = np.sqrt((columns**2).sum(axis=0))
@@ -54,6 +64,8 @@ class HostMedium:
         else:
             second = self.rows["group"].astype(np.uint8)[np.pad(membership[0], 1, mode="edge")]
             part = np.pad(membership[1], 1, mode="edge") / 255.0
+            if self.drawn is not None:
+                part[self.drawn.closed] = 0.0
         groups = np.union1d(self.group, second[part > 0.0])
         self.smooth_groups = int(min(groups.max() + 1, _MOST_GROUPS, max(_MOST_VALUES // self.label.size, 2)))
         #: (groups, k, j, i) uint16, 65535 for 1; and at half the resolution

@@ -39,7 +39,7 @@ class NumpyModel:
 
     def _read_medium(self) -> None:
         given = self.simulator.medium
-        self.medium = HostMedium(given.labels, given.tissues, given.membership)
+        self.medium = HostMedium(given.labels, given.tissues, given.membership, given.sheets)
         self._labels = Labels(self.medium)
 
     def simulate(

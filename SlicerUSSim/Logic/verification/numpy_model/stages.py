@@ -22,6 +22,7 @@ from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
 )
 from SlicerUSSim.Logic.verification.numpy_model.aperture import Screens
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
+from SlicerUSSim.Logic.verification.numpy_model.drawn import sheet_hits
 from SlicerUSSim.Logic.verification.numpy_model.echoes import (
     add_interfaces,
     lateral_beam,
@@ -76,6 +77,9 @@ def ray_tree(frame: TwinFrame) -> None:
     tracer = Tracer(record, frame.labels, frame.tissues, frame.screens)
     quantiles = elevational_quantiles(int(record["traced_lines"]), int(record["elevational_rays"]))
     frame.segments, frame.segment_lines, frame.hits, frame.hit_lines = tracer.run(line_roots(record), quantiles)
+    if frame.labels.drawn is not None:
+        hits, lines = sheet_hits(record, frame.labels.drawn, quantiles, frame.segments, frame.segment_lines)
+        frame.hits, frame.hit_lines = np.concatenate([frame.hits, hits]), np.concatenate([frame.hit_lines, lines])
     frame.losses = losses_along(record, frame.segments, frame.segment_lines)
 
 

@@ -1,0 +1,195 @@
+"""Sheets that were found in the MRI (mri/sheets), as the kernels meet them: a plane beside every voxel near one.
+
+A plane has two words (kernels/sheets.clh): that of sheets.cl, and its look: distance, thickness, level, reflection.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
+from SlicerUSSim.Logic.mri.sheets.voxels import on_voxels
+from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.tissue.sheet_looks import SheetLook
+
+#: Fluid around a sheet, along its normal, is a gap as narrow as a sheet up to here on either side; from here on it is
+#: a cistern, whose walls are two lines. A sheet of labels may lie this far beside a sheet that was found.
+_WIDE_MM, _STEP_MM, _BESIDE_MM = 2.0, 0.5, 1.0
+#: Least distance from a sheet within which nothing else draws a line, mm
+_OWN_MM = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSheets:
+    """The planes of sheets on a label map, whose narrow gaps of fluid are closed."""
+
+    #: (k, j, i) labels; where a sheet stands for a narrow gap of fluid, that of the tissue beside it
+    labels: np.ndarray
+    #: (n,) flat indices of voxels with a plane, and (n, 2) uint32, its two words
+    voxels: np.ndarray
+    words: np.ndarray
+    #: (n,) bool: whether scatterers around the voxel may lie in the sheet
+    is_near: np.ndarray
+    #: (k, j, i) bool: gaps that were closed
+    closed: np.ndarray
+
+    @property
+    def reflects(self) -> bool:
+        """Whether any sheet has a coherent echo of its own."""
+        return bool((self.words[:, 1] >> np.uint32(28)).any())
+
+
+def found_sheets(
+    surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...], looks: dict[str, SheetLook]
+) -> FoundSheets:
+    """Lay sheets over a label map.
+
+    Parameters
+    ----------
+    surfels : in RAS mm.
+    padded : (k, j, i) uint8 labels with a margin of one voxel around `grid`.
+    fluids : labels of which gaps consist, without the coupling medium.
+    looks : by kind.
+    """
+    grid = _with_margin(grid)
+    extent = _fluid_beside(surfels, padded, grid, fluids)
+    is_gap = np.isin(surfels.kind, [KINDS.index(kind) for kind in ("sulcus", "falx", "tentorium")])
+    is_wide = is_gap & (extent >= _WIDE_MM - 1e-6).any(axis=1)
+    # Walls of a cistern are drawn as such; a line in its middle is that of a sheet only if it is dura.
+    kept = ~(is_wide & (surfels.kind == KINDS.index("sulcus")))
+    surfels, extent, closes = surfels.chosen(kept), extent[kept], (is_gap & ~is_wide)[kept]
+    labels, closed = _closed(surfels.chosen(closes), extent[closes], padded, grid, fluids)
+    half_diagonal = 0.5 * float(np.linalg.norm(grid.spacing_mm))
+    most = max((look.most_thickness_mm for look in looks.values()), default=0.0)
+    reach = max(_OWN_MM, 0.5 * most + half_diagonal)
+    planes = on_voxels(surfels, grid, reach_mm=reach)
+    voxels = np.flatnonzero(planes.entry.array >= 0)
+    entry = planes.entry.array.ravel()[voxels]
+    distance, normal, thickness, confidence = planes.unpacked(entry)
+    words, half = _words(planes.kind[entry], distance, normal, thickness, confidence, grid, looks)
+    words[:, 0] |= tissue_beside(labels, voxels, fluids).astype(np.uint32) << np.uint32(26)
+    return FoundSheets(labels, voxels, words, np.abs(distance) <= half + half_diagonal, closed)
+
+
+def _with_margin(grid: Volume) -> Volume:
+    matrix = grid.ijk_to_ras.copy()
+    matrix[:3, 3] -= matrix[:3, :3].sum(axis=1)
+    return Volume(np.broadcast_to(np.zeros(1, np.uint8), tuple(n + 2 for n in grid.array.shape)), matrix)
+
+
+def _fluid_beside(surfels: Surfels, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...]) -> np.ndarray:
+    """(n, 2) mm along and against the normals, up to _WIDE_MM, to which fluid goes on; -1 where there is none."""
+    extent = np.full((len(surfels), 2), -1.0)
+    steps = np.arange(0.0, _WIDE_MM + 1e-6, _STEP_MM)
+    for side, sign in enumerate((1.0, -1.0)):
+        goes_on = np.ones(len(surfels), bool)
+        for step in steps:
+            index = _index(grid, surfels.place + sign * step * surfels.normal, padded.shape)
+            is_fluid = np.isin(padded.ravel()[index], fluids)
+            extent[goes_on & is_fluid, side] = step
+            # Labels may have the gap beside the sheet.
+            goes_on &= is_fluid | ((step <= _BESIDE_MM) & (extent[:, side] < 0.0))
+    return extent
+
+
+def _index(grid: Volume, places: np.ndarray, shape: tuple[int, ...], corner: np.ndarray | None = None) -> np.ndarray:
+    """(n,) flat indices of the voxels nearest to places, or of one corner (3,) of the cells around them."""
+    matrix = grid.ras_to_ijk
+    at = places @ matrix[:3, :3].T + matrix[:3, 3]
+    whole = np.rint(at) if corner is None else np.floor(at) + corner
+    inside = np.clip(whole.astype(np.int64), 0, np.array(shape[::-1]) - 1)
+    return (inside[:, 2] * shape[1] + inside[:, 1]) * shape[2] + inside[:, 0]
+
+
+def _closed(
+    surfels: Surfels, extent: np.ndarray, padded: np.ndarray, grid: Volume, fluids: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """((k, j, i) labels with the tissue beside in narrow gaps around these sheets, (k, j, i) True there)."""
+    gap = np.zeros(padded.shape, bool)
+    for side, sign in enumerate((1.0, -1.0)):
+        for step in np.arange(0.0, _WIDE_MM + 1e-6, _STEP_MM):
+            here = surfels.chosen(extent[:, side] >= step - 1e-6)
+            places = here.place + sign * step * here.normal
+            for corner in np.ndindex(2, 2, 2):
+                gap.ravel()[_index(grid, places, padded.shape, np.array(corner))] = True
+    gap &= np.isin(padded, fluids)
+    voxels = np.flatnonzero(gap)
+    result = padded.copy()
+    result.ravel()[voxels] = tissue_beside(padded, voxels, fluids)
+    return result, gap
+
+
+def tissue_beside(labels: np.ndarray, voxels: np.ndarray, fluids: tuple[int, ...]) -> np.ndarray:
+    """(n,) uint8: the label of tissue, not of fluid or the coupling medium, nearest to voxels (flat indices).
+
+    Their own where no tissue is within four voxels.
+    """
+    shape = labels.shape
+    outside = (0, *fluids)
+    flat, result = labels.ravel(), labels.ravel()[voxels].copy()
+    open_ = np.flatnonzero(np.isin(result, outside))
+    steps = sorted(
+        (offset for offset in np.ndindex(9, 9, 9) if 0 < _square(offset) <= 16),
+        key=lambda offset: (_square(offset), offset),
+    )
+    k, j, i = np.unravel_index(voxels, shape)
+    for dk, dj, di in steps:
+        if not len(open_):
+            break
+        at = [
+            np.clip(index[open_] + step - 4, 0, size - 1)
+            for index, step, size in zip((k, j, i), (dk, dj, di), shape, strict=True)
+        ]
+        found = flat[(at[0] * shape[1] + at[1]) * shape[2] + at[2]]
+        is_tissue = ~np.isin(found, outside)
+        result[open_[is_tissue]] = found[is_tissue]
+        open_ = open_[~is_tissue]
+    return result
+
+
+def _square(offset: tuple[int, ...]) -> int:
+    return sum((step - 4) ** 2 for step in offset)
+
+
+def _words(
+    kind: np.ndarray, distance: np.ndarray, normal: np.ndarray, thickness: np.ndarray, confidence: np.ndarray,
+    grid: Volume, looks: dict[str, SheetLook],
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """((n, 2) uint32 of kernels/sheets.clh, without the label beside; (n,) half the thickness as stored, mm)."""
+    of_kind = [looks[name] for name in KINDS]
+    least, most, level, reflection = (
+        np.array([getattr(look, name) for look in of_kind])[kind]
+        for name in ("least_thickness_mm", "most_thickness_mm", "level_db", "reflection")
+    )
+    # From millimetres of distance along the normal to voxels along the gradient in voxels
+    gradient = normal.astype(float) @ grid.ijk_to_ras[:3, :3]
+    size = np.linalg.norm(gradient, axis=1)
+    octahedral = gradient / np.abs(gradient).sum(axis=1, keepdims=True)
+    u, v = octahedral[:, 0], octahedral[:, 1]
+    below = octahedral[:, 2] < 0.0
+    turned_u, turned_v = np.copysign(1.0 - np.abs(v), u), np.copysign(1.0 - np.abs(u), v)
+    u, v = np.where(below, turned_u, u), np.where(below, turned_v, v)
+    steps = distance / size / CONSTANTS["SHEET_DISTANCE_STEP"]
+    first = _bits(256.0 + 255.0 * u, 0, 511) | _bits(256.0 + 255.0 * v, 9, 511) | _bits(128.0 + steps, 18, 255)
+    first = np.where(first >> 18 & 255, first, first | 1 << 18)  # 0 stands for no plane
+    half = 0.5 * np.clip(thickness, least, most)
+    halves = np.clip(np.rint(half / CONSTANTS["SHEET_HALF_STEP"]), 1, 255)
+    with np.errstate(divide="ignore"):
+        amplitude = level + 20.0 * np.log10(confidence)
+    second = _bits(1024.0 + steps, 0, 2047) | _bits(halves, 11, 255)
+    second |= _bits(192.0 + amplitude / CONSTANTS["SHEET_LEVEL_STEP_DB"], 19, 255)
+    # A wall of a ventricle is a border, too, which has the coherent echo.
+    second |= _bits(np.abs(reflection) * confidence / CONSTANTS["SHEET_REFLECTION_STEP"], 28, 15)
+    return np.stack([first, second], axis=1).astype(np.uint32), halves * CONSTANTS["SHEET_HALF_STEP"]
+
+
+def _bits(value: np.ndarray, shift: int, most: int) -> np.ndarray:
+    return np.rint(np.clip(value, 0.0, most)).astype(np.int64) << shift
+
+
+def cells_around(voxels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """(8 n,) flat indices of the cells that have these voxels (flat indices, none at the first faces) as corners."""
+    return np.concatenate([voxels - (k * shape[1] + j) * shape[2] - i for k, j, i in np.ndindex(2, 2, 2)])

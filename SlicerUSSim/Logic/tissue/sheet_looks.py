@@ -1,0 +1,62 @@
+"""What thin sheets of each kind are made of, and so how they echo (docs/physics.md#sheets-found-in-the-mri)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+
+
+@dataclass(frozen=True)
+class SheetLook:
+    """How sheets of one kind echo."""
+
+    #: Of the layer of scatterers, mm
+    least_thickness_mm: float
+    most_thickness_mm: float
+    #: Their level re those of the membrane, dB
+    level_db: float
+    #: Amplitude reflection coefficient of the layer where the beam meets it squarely and it is smooth
+    reflection: float
+
+
+#: The tissue of each kind; None: that of the membrane
+_TISSUES = {"sulcus": None, "falx": "falx", "tentorium": "falx", "ependyma": None}
+#: Most of a layer that is drawn, mm: dura is 0.3 to 0.8 mm (Protasoni et al., J. Neurosurg. 114(6), 2011); a sulcus is
+#: as wide as it was found, up to the fluid that voxels of 1 mm show as such
+_MOST_MM = {"sulcus": 1.5, "falx": 0.8, "tentorium": 0.8, "ependyma": 0.0}
+_OWN_VARIANCE = TISSUES["leptomeninges"].scatterer_variance
+
+
+def looks_of(tissues: TissueTable) -> dict[str, SheetLook]:
+    """By kind of sheet, for a table with a membrane."""
+    membrane = tissues.membrane
+    if membrane is None:
+        return {}
+    around = _tissue(tissues, "grey matter")
+    result = {}
+    for kind, name in _TISSUES.items():
+        tissue = membrane.tissue if name is None else _tissue(tissues, name)
+        # Re the membrane's by the presets: where a fit changes the membrane's level, that of the dura follows.
+        level_db = 0.0 if name is None else 10.0 * np.log10(TISSUES[name].scatterer_variance / _OWN_VARIANCE)
+        most = max(_MOST_MM[kind], membrane.thickness_mm)
+        result[kind] = SheetLook(membrane.thickness_mm, most, float(level_db), _of_layer(tissue, around))
+    return result
+
+
+def _tissue(tissues: TissueTable, name: str) -> Tissue:
+    try:
+        return tissues.tissue(name)
+    except SimulationError:
+        return TISSUES[name]
+
+
+def _of_layer(tissue: Tissue, around: Tissue) -> float:
+    """Of a layer of unknown thickness: its two faces, of opposite sign, have echoes of independent phase."""
+    inside, outside = tissue.impedance_mrayl, around.impedance_mrayl
+    return float(np.sqrt(2.0) * (inside - outside) / (inside + outside))

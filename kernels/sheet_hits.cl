@@ -1,0 +1,84 @@
+// sheet_hits: where the elevational rays meet sheets that were found in the MRI and have a coherent echo, as dura has
+// (found_sheets.py, docs/physics.md#sheets-found-in-the-mri). They are added to the hits of raytracing.cl.
+//
+// One work-item follows one elevational ray along the segments of its traced line, half a voxel at a time, and looks up
+// the plane at the nearest voxel. Planes of neighbouring voxels differ a little: a crossing may lie slightly outside
+// the step, and counts once per voxel. Global size (traced lines, elevational rays).
+//
+// Buffers: planes uint2 [k][j][i] (sheets.clh); quantiles, segments, segment_counts, hits, hit_counts as in
+// raytracing.cl.
+
+#include "common.clh"
+#include "sheets.clh"
+
+#define SLACK 0.75f  // of a step, from its middle, in which a crossing counts
+
+__kernel void sheet_hits(__constant const Acquisition *acquisition, __global const uint *planes,
+                         __global const float *quantiles, __global const Segment *segments,
+                         __global const int *segment_counts, __global Hit *hits, __global int *hit_counts) {
+  const int line = get_global_id(0), ray = get_global_id(1), rays = acquisition->elevational_rays;
+  const int slot = line * rays + ray, nx = acquisition->dims[0], ny = acquisition->dims[1], nz = acquisition->dims[2];
+  const float quantile = quantiles[slot], stride = 0.5f * acquisition->voxel_mm;
+  __constant const float *m = acquisition->ras_to_voxel;
+  const int segments_of_line = min(segment_counts[line], MAX_SEGMENTS);
+  int count = hit_counts[slot];
+  for (int index = 0; index < segments_of_line; index++) {
+    __global const Segment *segment = segments + line * MAX_SEGMENTS + index;
+    const float3 start = vload3(0, segment->start), direction = vload3(0, segment->direction);
+    const float3 lateral = vload3(0, segment->lateral), elevational = vload3(0, segment->elevational);
+    const float3 at_start = affine_point(m, start), step = affine_vector(m, direction);
+    const float3 aside = quantile * affine_vector(m, elevational);
+    const int steps = (int)ceil(segment->length_mm / stride);
+    float last = -1e6f;
+    for (int n = 0; n < steps; n++) {
+      const float middle = (n + 0.5f) * stride;
+      const float3 place = at_start + middle * step + elevation_sigma(acquisition, segment->path_mm + middle) * aside;
+      const int3 nearest = convert_int3_rtn(place + 0.5f);
+      if (nearest.x < 0 || nearest.y < 0 || nearest.z < 0 || nearest.x >= nx || nearest.y >= ny || nearest.z >= nz)
+        continue;
+      const uint2 words = vload2((nearest.z * ny + nearest.y) * nx + nearest.x, planes);
+      if (!(words.y >> 28)) continue;
+      const float3 gradient = gradient_of_sheet(words.x);
+      const float away =
+          dot3(gradient, place - convert_float3(nearest)) - length3(gradient) * distance_of_look(words.y);
+      const float rate = dot3(gradient, step);
+      const float ahead = -away / (fabs(rate) < 1e-6f ? 1e-6f : rate), along = middle + ahead;
+      if (fabs(ahead) > SLACK * stride || along < last + acquisition->voxel_mm || along < 0.0f ||
+          along > segment->length_mm)
+        continue;
+      last = along;
+      float3 normal = (float3)(gradient.x * m[0] + gradient.y * m[4] + gradient.z * m[8],
+                               gradient.x * m[1] + gradient.y * m[5] + gradient.z * m[9],
+                               gradient.x * m[2] + gradient.y * m[6] + gradient.z * m[10]);
+      normal *= (dot3(normal, direction) > 0.0f ? -1.0f : 1.0f) / length3(normal);
+      const float cos_in = clamp(-dot3(normal, direction), 0.01f, 1.0f), path = segment->path_mm + along;
+      const float4 tube = tube_after(vload4(0, segment->tube), along);
+      const float reflection = reflection_of_look(words.y), phase = acquisition->membrane_phase * cos_in;
+      const float offset = quantile * elevation_sigma(acquisition, path);
+      if (count < MAX_HITS) {
+        Hit hit;
+        vstore3(start + along * direction + offset * elevational, 0, hit.position);
+        vstore3(normal, 0, hit.normal);
+        hit.path_mm = path;
+        hit.depth_mm = segment->depth_mm + along * segment->depth_per_mm;
+        hit.weight = segment->weight;
+        hit.attenuation = segment->attenuation * exp_fast(-segment->decay_per_mm * along);
+        hit.loss = segment->loss + segment->loss_per_mm * along;
+        hit.cos_incidence = cos_in;
+        hit.reflectance = reflection * reflection;
+        hit.lateral_slope = segment->depth_per_mm * tube.x * slope_along(lateral, direction, normal);
+        hit.elevational_slope = segment->depth_per_mm * tube.z * slope_along(elevational, direction, normal);
+        hit.curvature = 0.0f;
+        hit.elevational_mm = offset;
+        hit.echo = hit.weight * hit.attenuation * (acquisition->interface_is_energy ? hit.reflectance : reflection) *
+                   exp2_scalar(max(acquisition->specular_exponent * log2_scalar(cos_in), -100.0f)) *
+                   acquisition->interface_gain / (rays * tube.x * tube.z) * exp_fast(-0.5f * phase * phase);
+        hit.reflections = segment->reflections;
+        hit.label_before = hit.label_behind = segment->label;
+        hits[slot * MAX_HITS + count] = hit;
+      }
+      count++;
+    }
+  }
+  hit_counts[slot] = count;
+}
