@@ -29,7 +29,7 @@ from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.mask_check import cut_off, ends_at_edge
 from SlicerUSSim.Logic.mri.no_data import no_data, without_blank
 from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_symmetric, is_ultrasound
-from SlicerUSSim.Logic.mri.recognition import recognise
+from SlicerUSSim.Logic.mri.recognition import recognise, stripped_brain
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from tests.conftest import SHARED, needs_shared
@@ -319,6 +319,17 @@ def test_a_tiny_object_is_too_small_for_a_head():
     mri = head_mri(3.0)
     with pytest.raises(SimulationError, match="too little for a head; correct the voxel size"):
         find_brain(Volume(mri.array, mri.ijk_to_ras @ np.diag([0.3, 0.3, 0.3, 1.0])))
+
+
+@pytest.mark.parametrize("size", [0.8, 0.9])
+def test_a_small_head_on_zeros_is_not_taken_for_a_stripped_brain(head, size):
+    """Its scalp and skull became tissue: shrunk, a head has the size and the shape of a brain."""
+    image = head[0]
+    shown = np.asarray(ndimage.binary_closing(image.array > 20.0, iterations=4))
+    empty = Volume(np.where(shown, image.array, 0.0), image.ijk_to_ras @ np.diag([size, size, size, 1.0]))
+    assert stripped_brain(empty) is None
+    brain = Volume(np.where(head[1], image.array, 0.0), image.ijk_to_ras)
+    assert stripped_brain(brain) is not None
 
 
 def test_half_a_brain_is_called_so(head):

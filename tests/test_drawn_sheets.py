@@ -145,7 +145,9 @@ def test_options_of_the_command(tmp_path):
     labels.write(tmp_path / "labels.nii.gz")
     (tmp_path / "pose.txt").write_text("1 0 0 17 0 0 1 17 0 -1 0 31 0 0 0 1")
     across = np.stack(np.meshgrid(np.arange(3.0, 30.0), np.arange(3.0, 30.0), [20.0]), -1).reshape(-1, 3)
-    write_surfels(tmp_path / "s.vtp", Surfels.of("sulcus", across, np.tile([0.0, 0.0, 1.0], (len(across), 1)), 1.0, 1.0, 1.0))
+    write_surfels(
+        tmp_path / "s.vtp", Surfels.of("sulcus", across, np.tile([0.0, 0.0, 1.0], (len(across), 1)), 1.0, 1.0, 1.0)
+    )
     images = {}
     for name, more in {
         "none": [], "file": ["--sheets", tmp_path / "s.vtp"],

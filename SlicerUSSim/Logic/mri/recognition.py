@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
 from SlicerUSSim.Logic.mri.no_data import edge_value
 from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_symmetric, is_ultrasound
 from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, lies_otherwise, stripped_lies_otherwise, why_refused
+from SlicerUSSim.Logic.mri.scalp import skull_share
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
 USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
@@ -39,8 +40,16 @@ _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
 #: Between the 5th and 95th percentile of the inner brain, relative to its median. T1 and T2 had 0.46 to 0.82;
 #: CT whose air is stored as 0 has 0.01 to 0.05 (25 to 50 HU on 1000).
 _LEAST_CONTRAST = 0.1
+_ULTRASOUND = (
+    "image shows a fan on a constant background, as ultrasound does, expected an MRI; "
+    "use the MRI of this patient (the command sweep takes tracked ultrasound as --sequence)"
+)
+#: Volume of what may be a head
+_LEAST_HEAD_ML, _MOST_HEAD_ML = 900.0, 9000.0
 #: What one hemisphere may have: its extents in ascending order, and its volume
 _HALF_A_BRAIN_MM, _HALF_A_BRAIN_ML = ((50.0, 95.0), (85.0, 150.0), (130.0, 210.0)), (350.0, 900.0)
+#: Share of the directions in which what has the shape of a brain has a skull
+_LEAST_SKULL = 0.5
 #: More different values are an image.
 _MOST_LABELS = 12
 
@@ -60,12 +69,13 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     """What the image shows. Raises SimulationError, saying what was found, if it is neither a brain nor a head."""
     report = progress or (lambda share: None)
     _check_values(mri)
-    require_no_ultrasound(mri)
+    is_fan = is_ultrasound(mri)  # but in some views so are the neck and the jaws of a head
     brain = stripped_brain(mri)
     report(0.1)
     if brain is not None:
         return Shown(brain)
     image = CoarseImage.of(mri)
+    require(not is_fan or (_may_be_head(image) and mni152() is not None), _ULTRASOUND)
     _check_size(image, mri)
     require(
         not is_symmetric(image) or {"bottom", "top"} <= set(cut_ends(mri)),  # a limb, which is called so below
@@ -75,6 +85,7 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     if mni152() is None:
         return Shown(None, warnings=("without nilearn it is not checked that the image shows a head",))
     alignment = align_coarse(image, lambda share: report(0.1 + 0.6 * share))
+    require(not is_fan or alignment.agreement >= _DOUBTFUL_AGREEMENT, _ULTRASOUND)  # heads 0.7 and more, fans 0.05
     is_plausible = alignment.turn_deg <= MOST_TURN_DEG and alignment.stretch <= _MOST_STRETCH
     is_plausible &= _SIZES[0] <= alignment.size <= _SIZES[1]
     later = lambda share: report(0.7 + 0.3 * share)  # noqa: E731
@@ -89,12 +100,16 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
 
 
 def require_no_ultrasound(mri: Volume) -> None:
-    """Raise SimulationError for an image that is a fan."""
-    require(
-        not is_ultrasound(mri),
-        "image shows a fan on a constant background, as ultrasound does, expected an MRI; "
-        "use the MRI of this patient (the command sweep takes tracked ultrasound as --sequence)",
-    )
+    """Raise SimulationError for an image that is a fan, and no head."""
+    if is_ultrasound(mri):
+        image = CoarseImage.of(mri)
+        if not _may_be_head(image) or mni152() is None or align_coarse(image).agreement < _DOUBTFUL_AGREEMENT:
+            raise SimulationError(_ULTRASOUND)
+
+
+def _may_be_head(image: CoarseImage) -> bool:
+    millilitres = image.foreground.sum() * image.spacing_mm**3 / 1000.0
+    return bool(_LEAST_HEAD_ML <= millilitres <= _MOST_HEAD_ML)
 
 
 def require_no_hounsfield(mri: Volume) -> None:
@@ -195,6 +210,8 @@ def stripped_brain(mri: Volume) -> np.ndarray | None:
     shape = coarse.array > 0.5
     if not (_is_brain_shaped(shape) and _has_tissues(intensity.array, shape)):
         return None
+    if skull_share(mri, inside) > _LEAST_SKULL:  # a small head has the size and the shape of a brain
+        return None
     if mni152() is None:
         return inside
     upright = agreement_by_moments(intensity, shape, np.eye(3))
@@ -251,7 +268,7 @@ def _has_tissues(intensity: np.ndarray, shape: np.ndarray) -> bool:
 def _check_size(image: CoarseImage, mri: Volume) -> None:
     inside = image.foreground
     millilitres = inside.sum() * image.spacing_mm**3 / 1000.0
-    if not 900.0 <= millilitres <= 9000.0:
+    if not _LEAST_HEAD_ML <= millilitres <= _MOST_HEAD_ML:
         _require_no_ct(mri)
     extent = np.ptp(np.argwhere(inside), axis=0)[::-1] * image.spacing_mm
     size = " x ".join(f"{mm:.0f}" for mm in extent)
@@ -259,13 +276,13 @@ def _check_size(image: CoarseImage, mri: Volume) -> None:
     is_half &= _HALF_A_BRAIN_ML[0] <= millilitres <= _HALF_A_BRAIN_ML[1]
     known = "a whole brain: it may be half a brain" if is_half else "a head"
     require(
-        millilitres >= 900.0 and extent.max() >= 110.0,
+        millilitres >= _LEAST_HEAD_ML and extent.max() >= 110.0,
         f"image shows {millilitres:.0f} ml of tissue in {size} mm, too little for {known}; "
         "correct the voxel size in its header, or use an image of the whole head",
     )
     # A head with neck has 4 to 6 litres. Nothing of a body is searched for a brain, which would take minutes.
     require(
-        millilitres <= 9000.0,
+        millilitres <= _MOST_HEAD_ML,
         f"image shows {millilitres / 1000.0:.0f} litres of tissue in {size} mm, too much for a head, as a body has; "
         "use an MRI of the head, or correct the voxel size in its header",
     )
