@@ -23,7 +23,7 @@ def skull_share(mri: Volume, inside: np.ndarray) -> float:
     strides = [max(1, round(_VOXEL_MM / mm)) for mm in mri.spacing_mm[::-1]]
     every = tuple(slice(None, None, stride) for stride in strides)
     mm = np.array(strides) * mri.spacing_mm[::-1]
-    values = ndimage.uniform_filter(mri.array.astype(np.float32) - float(mri.array.min()), strides)[every]
+    values = ndimage.uniform_filter(mri.array.astype(np.float32) - float(mri.array.min()), strides)[every]  # type: ignore[arg-type]
     shown = inside[every]
     depth = ndimage.distance_transform_edt(np.pad(shown, 1), sampling=mm)[1:-1, 1:-1, 1:-1]  # type: ignore[index]
     scale = float(np.cbrt(shown.sum() * mm.prod() / 1000.0 / _WHOLE_ML))
