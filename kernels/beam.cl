@@ -17,9 +17,9 @@
 // Each edge lies between two strips, of which both have echoes there. Scan lines read the sum of the two (join_edges),
 // since every edge is read by all scan lines whose beam covers it.
 //
-// Buffers: from_re, from_im float [2 traced line + side][stride]; edge_re, edge_im float [edge][stride]: the edge before
-// each traced line, without that before the first; spreads float2 [screen line][depth]; losses as in downshift.cl;
-// to_re, to_im float [scan line][stride].
+// Buffers: from_re, from_im float [2 traced line + side][stride]; edge_re, edge_im float [edge][stride]: the edge
+// before each traced line, without that before the first; spreads float2 [screen line][depth]; losses as in
+// downshift.cl; to_re, to_im float [scan line][stride].
 
 #include "common.clh"
 
@@ -89,7 +89,8 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   const float across = line_distance(acquisition, middle) / spread_[0];
   const float curved = lateral_curvature(acquisition, middle, 1.0f / frequency) * across * across;
   const float turns = curved / (2.0f * TWO_PI);
-  // Edge `edge` is half a step before traced line `edge`. Edges come in pairs, n + 1/2 lines to either side. Their weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
+  // Edge `edge` is half a step before traced line `edge`. Edges come in pairs, n + 1/2 lines to either side. Their
+  // weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
   const floatn fall = exp2_fast(max(2.0f * exponent, -60.0f));
   floatn weight = exp2_fast(max(0.25f * exponent, -60.0f)), ratio = fall;
   int here = LINE_PAD + sample;
