@@ -173,6 +173,7 @@ def test_numpy_has_no_texture_and_says_so():
 #: What files of the numpy model may take from the rooms of what they check: the simulator as the one who knows label
 #: map, tissues, settings and the names of the stages; what a stage is; names and formats of records.
 MAY_SHARE = {
+    "imaging.found_sheets.found_sheets",  # which voxels have planes of given sheets; what is drawn there is checked
     "imaging.simulator.UltrasoundSimulator", "imaging.stage.HostFrame", "imaging.stage.Stage",
     "opencl.layout.ACQUISITION", "opencl.layout.CONSTANTS", "opencl.layout.HIT", "opencl.layout.SEGMENT",
     "opencl.layout.TISSUE",
