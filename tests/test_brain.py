@@ -189,6 +189,47 @@ def test_a_phantom_as_large_as_a_brain_on_a_background_of_0_is_refused_as_one():
 
 
 @needs_nilearn
+def test_a_phantom_of_noisy_shells_as_large_as_a_brain_on_a_background_of_0_is_said():
+    empty, radius = ellipsoid((62, 84, 60), spacing=2.0)
+    values = np.select([radius < 0.4, radius < 0.7, radius < 0.9, radius < 1.0], [130.0, 100.0, 85.0, 110.0], 0.0)
+    noise = np.random.default_rng(1).normal(0.0, 12.0, radius.shape)
+    found = find_brain(empty.with_array(np.where(radius < 1, values + noise, 0.0).astype(np.float32)))
+    assert any("looks the same upside down and from the back, as a phantom does" in line for line in found.warnings)
+    assert not any("phantom" in line for line in find_brain(mni152().t1).warnings)
+
+
+@needs_nilearn
+@pytest.mark.parametrize("value", [60.0, 500.0])
+def test_a_border_as_bright_as_tissue_is_named(head, value):
+    """It was taken for 16 litres of tissue."""
+    mri, _ = head
+    array = np.pad(mri.array, 20, constant_values=value)
+    matrix = mri.ijk_to_ras.copy()
+    matrix[:3, 3] -= matrix[:3, :3] @ (20.0, 20.0, 20.0)
+    bright = "or it has a bright border" if value > 300.0 else "a border of one value .* that is as bright as tissue"
+    with pytest.raises(SimulationError, match=rf"\({value:g}\).*{bright}|{bright}"):
+        find_brain(Volume(array, matrix))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_half_of_an_ellipsoid_is_no_ultrasound(axis):
+    """Halves of MNI152 were called so: a cut has a straight side, and the hull of the brain another."""
+    empty, radius = ellipsoid((66, 86, 62))
+    array = np.where(radius < 1, 100.0, 0.0).astype(np.float32)
+    half = [slice(None)] * 3
+    half[axis] = slice(0, array.shape[axis] // 2)
+    array[tuple(half)] = 0.0
+    assert not is_ultrasound(empty.with_array(array))
+
+
+@needs_nilearn
+def test_a_program_that_is_not_needed_is_said(monkeypatch):
+    monkeypatch.setattr("SlicerUSSim.Logic.mri.extractors.has_deepbet", lambda: True)
+    message = find_brain(mni152().t1, "deepbet").message
+    assert message.startswith("skull-stripped brain") and "deepbet is not asked, as there is no skull" in message
+
+
+@needs_nilearn
 @pytest.mark.parametrize("size", [0.7, 0.76])
 def test_a_small_head_is_no_skull_stripped_brain(head, size):
     """The atlas was spread over the whole of it, and its scalp became grey and white matter."""
@@ -198,7 +239,8 @@ def test_a_small_head_is_no_skull_stripped_brain(head, size):
     try:
         shown = recognise(Volume(mri.array, matrix))
     except SimulationError as error:
-        assert "wrong size" in str(error) or "neither a head" in str(error)
+        reasons = ("times as large as an adult's, expected 0.74 or more", "wrong size", "neither a head")
+        assert any(reason in str(error) for reason in reasons)
     else:
         assert shown.stripped is None and shown.alignment.size == pytest.approx(0.93 * size, rel=0.06)
 
@@ -823,7 +865,7 @@ def test_a_mask_may_be_a_probability_and_an_image_is_none():
 @needs_nilearn
 def test_inverted_intensities_are_refused_at_once(head):
     mri = head[0]
-    with pytest.raises(SimulationError, match="the intensities are inverted, expected an MRI with a dark background"):
+    with pytest.raises(SimulationError, match=r"the intensities are inverted.*expected an MRI with a dark background"):
         find_brain(mri.with_array(mri.array.max() - np.maximum(mri.array, 5.0)))
 
 
@@ -969,7 +1011,7 @@ def test_dark_gyri_in_wide_csf_stay_in_the_mask(monkeypatch):
 # ---- DICOM -----------------------------------------------------------------------------------------------------------
 
 
-def write_series(folder, count, uid, number, description, skip=(), tilt=0.0, patient="1"):
+def write_series(folder, count, uid, number, description, skip=(), tilt=0.0, patient="1", first_patient="1"):
     import SimpleITK as sitk
 
     folder.mkdir(exist_ok=True)
@@ -986,7 +1028,7 @@ def write_series(folder, count, uid, number, description, skip=(), tilt=0.0, pat
             "0008|0060": "MR", "0020|000d": "1.2.3", "0020|000e": uid, "0008|0018": f"{uid}.{k + 1}",
             "0008|0016": "1.2.840.10008.5.1.4.1.1.4", "0020|0011": number, "0020|0013": str(k + 1),
             "0008|103e": description, "0020|0037": "1\\0\\0\\0\\1\\0", "0020|0032": f"0\\{tilt * k}\\{2.0 * k}",
-            "0018|0050": "2", "0010|0020": patient if k else "1",
+            "0018|0050": "2", "0010|0020": patient if k else first_patient,
         }  # fmt: skip
         for key, value in tags.items():
             image.SetMetaData(key, value)
@@ -1009,6 +1051,13 @@ def test_several_volumes_are_listed_and_one_is_chosen_by_one_of_its_images(tmp_p
     with pytest.raises(SimulationError, match=r"give the path of one image.*5 't1': 12 images.*6 't2': 11 images"):
         Volume.read(tmp_path / "d")
     assert np.array_equal(Volume.read(tmp_path / "d" / "s6_004.dcm").array, voxels)
+
+
+def test_volumes_of_different_patients_in_one_folder_are_said(tmp_path):
+    write_series(tmp_path / "d", 12, "1.2.3.5", "5", "t1")
+    write_series(tmp_path / "d", 11, "1.2.3.6", "6", "t2", patient="2", first_patient="2")
+    with pytest.raises(SimulationError, match="has 2 DICOM series of 2 different patients, 2 of them with 10 or more"):
+        Volume.read(tmp_path / "d")
 
 
 def test_a_missing_slice_and_a_tilted_stack_are_refused(tmp_path):

@@ -222,6 +222,7 @@ def bad_inputs(folder):
         (["segment", mri, "-o", folder / "l.NII.GZ"], "in small letters"),
         (["segment", mri, "-o", folder / "nowhere" / "l.nii.gz"], "does not exist"),
         (["segment", mri, "-o", folder / "l.nii.gz", "--classes", 9], "classes is 9"),
+        (["segment", mri, "-o", folder / "l.nii.gz", "--map", "24=csf"], "--map is for a label map"),
         (["segment", mri, "-o", folder / "l.nii.gz", "--mask", folder / "nine.nrrd"], "same grid"),
         (["simulate", mri, "--pose", folder / "none.txt", "-o", out], "none.txt: no such file"),
         (["simulate", mri, "--pose", folder / "three.txt", "-o", out], "9 numbers"),
@@ -241,11 +242,11 @@ def bad_inputs(folder):
     ]
 
 
-@pytest.mark.parametrize("number", range(26))
+@pytest.mark.parametrize("number", range(27))
 def test_a_mistake_is_one_line_and_writes_nothing(number, head, tmp_path):
     (tmp_path / "head.nii.gz").write_bytes(head.read_bytes())
     cases = bad_inputs(tmp_path)
-    assert len(cases) == 26
+    assert len(cases) == 27
     arguments, message = cases[number]
     before = sorted(tmp_path.rglob("*"))
     result = ussim(*arguments)

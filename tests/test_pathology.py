@@ -84,6 +84,14 @@ def test_a_mask_on_the_grid_of_the_labels_is_taken_voxel_by_voxel():
     assert not result.warnings and BRAIN.array.max() == 1  # the labels given are as they were
 
 
+def test_a_box_without_an_outside_is_said():
+    result = added(Volume(np.ones((12, 10, 8), np.uint8), np.eye(4)))
+    assert result.warnings == (
+        "lesion.nii.gz: every voxel of its image is inside, so that a box of 8 x 10 x 12 mm is added; a mask is 0 "
+        "outside the lesion",
+    )
+
+
 TURNED = rigid(np.linalg.qr(np.array([[1.0, 0.4, 0.2], [-0.3, 1.0, 0.5], [0.1, -0.6, 1.0]]))[0], [0, 0, 0])[:3, :3]
 
 

@@ -353,6 +353,27 @@ def test_the_parts_of_one_brain_lie_in_the_same_places_in_any_contrast_and_those
     assert share_in_place(first, first.with_array(np.zeros_like(first.array)), inside) is None
 
 
+@pytest.mark.parametrize("is_cropped", [False, True])
+def test_a_second_mri_may_lack_a_part_of_the_brain_and_what_it_lacks_is_said(mni, is_cropped):
+    """Whether it was cropped there, or has zeros."""
+    t1 = mni[0]
+    j = np.flatnonzero((t1.array > 0).any(axis=(0, 2)))
+
+    def without(share: float) -> Volume:
+        end = int(j[0] + (1.0 - share) * len(j))
+        if is_cropped:
+            return Volume(t1.array[:, :end].copy(), t1.ijk_to_ras)
+        array = t1.array.copy()
+        array[:, end:] = 0
+        return t1.with_array(array)
+
+    found = segment_mri(t1, contrast="t1", others={"t1gd": without(0.25)})
+    assert any(re.search(r"t1gd: has no data in (1\d|[89])% of the brain", line) for line in found.warnings)
+    refusal = r"has data in [67]\d% of the brain of the" if is_cropped else r"is 0 in \d+% of the brain.*with a gap"
+    with pytest.raises(SimulationError, match=f"t1gd: {refusal}"):
+        segment_mri(t1, contrast="t1", others={"t1gd": without(0.4)})
+
+
 @pytest.mark.skipif(not COLIN27.exists(), reason="Debian's mricron-data is not installed")
 def test_the_brain_of_another_patient_is_refused_as_second_mri(mni):
     """Both are skull-stripped, in one space, and alike as wholes."""
@@ -380,6 +401,14 @@ def test_the_map_of_one_tissue_is_refused_as_second_mri(mni):
     bent = t1.with_array(ndimage.shift(np.digitize(t1.array, [20, 60, 90]).astype(np.float32), (0.4, 0.3, 0), order=1))
     with pytest.raises(SimulationError, match="t2 is mostly uniform regions"):
         segment_mri(t1, contrast="t1", others={"t2": bent})
+
+
+def test_a_small_whole_brain_is_led_by_the_atlas(mni):
+    matrix = mni[0].ijk_to_ras.copy()
+    matrix[:3, :3] *= (620.0 / 1886.0) ** (1.0 / 3.0)
+    found = segment_mri(Volume(mni[0].array, matrix), contrast="t1")
+    assert any("led by the MNI152 atlas" in line for line in found.notes)
+    assert any("expected 1000 to 1900 ml of an adult" in line for line in found.warnings)
 
 
 @pytest.mark.parametrize("axis", [0, 2])

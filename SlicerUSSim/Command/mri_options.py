@@ -92,6 +92,7 @@ def segmented_file(
     is_of_brain = has_brain_mask(settings["contrast"])
     if not is_of_brain:
         require_no_options_beside_ct(path)
+    require(not maps or organs is not None, f"{path}: is read as an image, and --map is for a label map")
     require(organs is None or not is_of_brain, f"--organs is for a CT, expected --ct; {path} is read as an MRI")
     others = read_also(also, path)
     brain = Volume.read(mask) if mask else None

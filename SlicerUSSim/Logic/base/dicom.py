@@ -31,6 +31,8 @@ class Series:
     number: str
     description: str
     size: str
+    #: PatientID and PatientName, only compared and never shown
+    patient: tuple[str, str] = ("", "")
 
     @classmethod
     def of(cls, folder: Path, uid: str, recursive: bool = False) -> Series:
@@ -40,7 +42,8 @@ class Series:
         files = tuple(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), uid, False, recursive))
         header = _header(files[0])
         size = f"{_value(header, '0028|0011') or '?'}x{_value(header, '0028|0010') or '?'}"
-        return cls(uid, files, _value(header, "0020|0011"), _value(header, "0008|103e"), size)
+        patient = _value(header, "0010|0020"), _value(header, "0010|0010")
+        return cls(uid, files, _value(header, "0020|0011"), _value(header, "0008|103e"), size, patient)
 
     def __str__(self) -> str:
         name = " ".join(part for part in (self.number, repr(self.description) if self.description else "") if part)
@@ -78,9 +81,11 @@ def read_dicom_folder(folder: Path):
     stacks = found if len(found) == 1 else [series for series in found if series.is_stack]
     if len(stacks) != 1:
         many = "; ".join(map(str, found[:12])) + ("; ..." if len(found) > 12 else "")
+        patients = len({series.patient for series in found})
+        of_whom = f" of {patients} different patients" if patients > 1 else ""
         raise SimulationError(
-            f"{folder}: has {len(found)} DICOM series, {len(stacks) or 'none'} of them with {_LEAST_IMAGES} or more "
-            f"parallel images; give the path of one image of the required series: {many}"
+            f"{folder}: has {len(found)} DICOM series{of_whom}, {len(stacks) or 'none'} of them with {_LEAST_IMAGES} "
+            f"or more parallel images; give the path of one image of the required series: {many}"
         )
     if len(found) > 1:
         _log.warning("%s: has %d DICOM series; the only volume is read: %s", folder, len(found), stacks[0])

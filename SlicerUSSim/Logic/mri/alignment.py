@@ -20,6 +20,8 @@ from SlicerUSSim.Logic.mri.template import TEMPLATE_MM, Points, agreement, binne
 _PITCHES, _SIZES = (-30.0, -15.0, 0.0, 15.0, 30.0), (-10.0, 4.0)
 #: Expected size: brains of adults have 1000 to 1900 ml, the template (with its CSF) 1886 ml.
 _EXPECTED_SIZE, _SIZE_SPREAD = -5.0, 12.0
+#: The same of small heads, as of children and of wrong voxel sizes, and where the search for them starts
+_SMALL_SIZE, _SMALL_SIZES = -28.0, (-34.0, -22.0)
 #: Agreement of rigid fits below which no affine one is tried
 _HOPELESS = 0.11
 #: Size of the brain where many turns compete, and how many starts are then improved
@@ -63,12 +65,18 @@ def align_template(mri: Volume, progress: Callable[[float], None] | None = None)
     return align_coarse(CoarseImage.of(mri), progress)
 
 
-def align_coarse(image: CoarseImage, progress: Callable[[float], None] | None = None) -> Alignment:
-    """See align_template. Where the best rigid fit is hopeless, it is returned without the affine one."""
+def align_coarse(
+    image: CoarseImage, progress: Callable[[float], None] | None = None, *, is_small: bool = False
+) -> Alignment:
+    """See align_template. Where the best rigid fit is hopeless, it is returned without the affine one.
+
+    An adult's head is expected, or with `is_small` one of 0.65 to 0.85 times its size.
+    """
     brain, report = template(), progress or (lambda share: None)
-    search = _Search(image, np.eye(3))
+    search = _Search(image, np.eye(3), _SMALL_SIZE if is_small else _EXPECTED_SIZE)
     blurred = search.of(image.smoothed(4.0))
-    starts = [start for _, start in blurred.starts(_PITCHES, _SIZES, 14.0, 30)]
+    sizes = _SMALL_SIZES if is_small else _SIZES
+    starts = [start for _, start in blurred.starts(_PITCHES, sizes, 14.0, 30)]
     report(0.15)
     found = []
     for number, start in enumerate(starts):
@@ -135,9 +143,11 @@ def agreement_by_moments(image: CoarseImage, inside: np.ndarray, turn: np.ndarra
 class _Search:
     image: CoarseImage
     turn: np.ndarray
+    #: Log percent of the template's size
+    expected_size: float = _EXPECTED_SIZE
 
     def of(self, image: CoarseImage) -> _Search:
-        return _Search(image, self.turn)
+        return _Search(image, self.turn, self.expected_size)
 
     def aligned(self, p: np.ndarray) -> Alignment:
         """The alignment by parameters, with its agreement."""
@@ -165,7 +175,7 @@ class _Search:
 
     def cost(self, p: np.ndarray, points: Points) -> float:
         values = self.image.at(points.from_centre @ self.linear(p).T + p[:3])
-        return 0.01 * ((p[6] - _EXPECTED_SIZE) / _SIZE_SPREAD) ** 2 - points.information(values)
+        return 0.01 * ((p[6] - self.expected_size) / _SIZE_SPREAD) ** 2 - points.information(values)
 
     def improved(self, start, points: Points, scale: float, iterations: int, ftol=1e-4) -> tuple[np.ndarray, float]:
         from scipy.optimize import minimize

@@ -26,7 +26,7 @@ _PRIOR_SIGMA_MM, _PRIOR_FLOOR = 3.0, 0.02
 #: Overlap of the two brain masks from which the atlas counts as found
 _LEAST_DICE = 0.85
 #: A whole brain's mask in millilitres
-WHOLE_BRAIN_ML = (700.0, 2300.0)
+WHOLE_BRAIN_ML = (500.0, 2300.0)
 #: Results of the last registrations, by content: a patient is segmented again and again, with other settings.
 _known: dict[bytes, tuple[np.ndarray, float]] = {}
 _MOST_KNOWN = 8

@@ -12,6 +12,8 @@ from SlicerUSSim.Logic.mri.no_data import edge_value
 #: A fan's two sides have 0.17 to 0.28 of the perimeter of its outline and open by 45 to 92 degrees. A third straight
 #: side as long as that, or one parallel to either, is of a box: an image resampled along other axes.
 _LEAST_SIDE, _PARALLEL_SIDE, _OPENING_DEG = 0.165, 0.12, (25.0, 130.0)
+#: The shorter of a fan's sides, relative to the longer; halves of a brain that were cut have less
+_EQUAL_SIDES = 0.8
 #: Deviation from a straight side, as a share of the perimeter
 _STRAIGHT = 0.006
 #: Share of the inner object that varies by less than 3 % within 20 mm: heads 0.00 to 0.01 (proton density), phantoms
@@ -121,7 +123,9 @@ def _is_fan(outline: np.ndarray) -> bool:
     inner = [side for side in sides if not side[2] and side[0] >= _LEAST_SIDE]
     if len(inner) != 2:
         return False
-    (_, first, _), (_, second, _) = inner
+    (one, first, _), (other, second, _) = inner
+    if min(one, other) < _EQUAL_SIDES * max(one, other):
+        return False
     opening = abs((first - second + 180.0 + 180.0) % 360.0 - 180.0)  # the outline runs along them in opposite ways
     others = [direction for share, direction, _ in sides if share >= _PARALLEL_SIDE]
     is_box = any(abs((other - side) % 360.0 - 180.0) < 6.0 for other in others for side in (first, second))

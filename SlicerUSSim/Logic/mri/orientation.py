@@ -15,6 +15,8 @@ from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_noise, is_phantom
 _ENDS = ("RL", "AP", "SI")
 #: A patient in a scanner nods by up to 40 degrees.
 MOST_TURN_DEG = 48.0
+#: Brains of adults differ by less than this in size; relative to the template, in one direction.
+SIZES = (0.74, 1.15)
 _TURN_IT = (
     "correct the orientation in its header, for example in 3D Slicer: turn it in the module Transforms, "
     "harden the transform and save it"
@@ -100,6 +102,11 @@ def why_refused(
         return (
             f"the object in this {size} mm image goes through it from the bottom to the top, as a limb or a body does, "
             f"expected a head; {_WHOLE}"
+        )
+    if alignment.agreement >= least and alignment.turn_deg <= MOST_TURN_DEG and alignment.size < SIZES[0]:
+        return (
+            f"the brain in this head is {alignment.size:.2f} times as large as an adult's, expected {SIZES[0]:g} or "
+            "more: a small child, or a wrong voxel size in its header; correct it, or give a brain mask (--mask)"
         )
     message = lies_otherwise(mri, image, alignment, least, progress)
     if message is not None:

@@ -291,6 +291,12 @@ def _warnings(masks: Masks, covered: np.ndarray, lost: float, volume_ml: float, 
             f"{masks.source}: has {masks.volume_ml:.0f} ml, expected a lesion of up to {_LARGEST_LESION_ML:.0f} ml; is "
             "it the map of a tissue, or a part of the brain?"
         )
+    if masks.inside.all():
+        mm = " x ".join(f"{length:.0f}" for length in masks.inside.shape[::-1] * masks.union.spacing_mm)
+        yield (
+            f"{masks.source}: every voxel of its image is inside, so that a box of {mm} mm is added; a mask is 0 "
+            "outside the lesion"
+        )
     left_out = float((covered == 0).mean())
     if left_out >= _LEAST_LEFT_OUT:
         where = f"the brain mask leaves out {left_out * 100:.0f} % of {masks.source}"

@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
 from SlicerUSSim.Logic.mri.no_data import edge_value
 from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_symmetric, is_ultrasound
-from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, lies_otherwise, stripped_lies_otherwise, why_refused
+from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, SIZES, lies_otherwise, stripped_lies_otherwise, why_refused
 from SlicerUSSim.Logic.mri.scalp import skull_share
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
@@ -28,13 +28,15 @@ LEAST_AGREEMENT = 0.16
 #: Up to this agreement it is asked whether the head fits better in another orientation: back to front, a T1 had 0.23,
 #: and 0.31 with twice its height.
 _DOUBTFUL_AGREEMENT = 0.4
+#: Ratio of agreements from which a small head was found where an adult's was looked for: such had 1.8 to 4
+_CLEARLY_BETTER = 1.15
 #: Where the agreement is doubtful, least overlap (Dice) of a brain on a background with noise with the template: brains
 #: had 0.94 to 0.96; whole heads of 0.7 to 0.78 times their size, over which the template was spread, 0.85 to 0.90
 _STRIPPED_OVERLAP = 0.915
 #: Agreement from which a skull-stripped brain surely lies as its header says: T1 that do had 0.40 to 0.97, T2 0.24
 _SURELY_RIGHT = 0.3
-#: Brains of adults differ by less than this in shape and size.
-_MOST_STRETCH, _SIZES = 1.25, (0.74, 1.15)
+#: Brains of adults differ by less than this in shape.
+_MOST_STRETCH = 1.25
 #: Share of the template's brain that must show tissue, and below which a user should look
 _LEAST_SHOWN, _USUAL_SHOWN = 0.75, 0.95
 #: Between the 5th and 95th percentile of the inner brain, relative to its median. T1 and T2 had 0.46 to 0.82;
@@ -44,6 +46,16 @@ _ULTRASOUND = (
     "image shows a fan on a constant background, as ultrasound does, expected an MRI; "
     "use the MRI of this patient (the command sweep takes tracked ultrasound as --sequence)"
 )
+_SYMMETRIC_BRAIN = (
+    "the object has the size and the shape of a brain, but looks the same upside down and from the back, as a phantom "
+    "does and no brain: tissues mean nothing if it is one"
+)
+_SYMMETRIC = (
+    "image shows an object that looks the same upside down and from the back, as a phantom does and no head; "
+    "use an MRI of a head, or --skull-strip none to take everything brighter than the background"
+)
+#: Share of the voxels at the edges of an image from which their most frequent value is its border
+_LEAST_BORDER = 0.5
 #: Volume of what may be a head
 _LEAST_HEAD_ML, _MOST_HEAD_ML = 900.0, 9000.0
 #: What one hemisphere may have: its extents in ascending order, and its volume
@@ -73,21 +85,26 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     brain = stripped_brain(mri)
     report(0.1)
     if brain is not None:
-        return Shown(brain)
+        shown = CoarseImage.of(mri.with_array(np.where(brain, mri.array - mri.array.min(), 0).astype(np.float32)))
+        return Shown(brain, warnings=(_SYMMETRIC_BRAIN,) if is_symmetric(shown) else ())
+    _require_dark_border(mri)
     image = CoarseImage.of(mri)
     require(not is_fan or (_may_be_head(image) and mni152() is not None), _ULTRASOUND)
     _check_size(image, mri)
     require(
         not is_symmetric(image) or {"bottom", "top"} <= set(cut_ends(mri)),  # a limb, which is called so below
-        "image shows an object that looks the same upside down and from the back, as a phantom does and no head; "
-        "use an MRI of a head, or --skull-strip none to take everything brighter than the background",
+        _SYMMETRIC,
     )
     if mni152() is None:
         return Shown(None, warnings=("without nilearn it is not checked that the image shows a head",))
-    alignment = align_coarse(image, lambda share: report(0.1 + 0.6 * share))
+    alignment = align_coarse(image, lambda share: report(0.1 + 0.5 * share))
+    if alignment.agreement < _DOUBTFUL_AGREEMENT or not SIZES[0] <= alignment.size <= SIZES[1]:
+        small = align_coarse(image, lambda share: report(0.6 + 0.1 * share), is_small=True)
+        if small.agreement > _CLEARLY_BETTER * alignment.agreement:
+            alignment = small
     require(not is_fan or alignment.agreement >= _DOUBTFUL_AGREEMENT, _ULTRASOUND)  # heads 0.7 and more, fans 0.05
     is_plausible = alignment.turn_deg <= MOST_TURN_DEG and alignment.stretch <= _MOST_STRETCH
-    is_plausible &= _SIZES[0] <= alignment.size <= _SIZES[1]
+    is_plausible &= SIZES[0] <= alignment.size <= SIZES[1]
     later = lambda share: report(0.7 + 0.3 * share)  # noqa: E731
     if alignment.agreement < LEAST_AGREEMENT or not is_plausible:
         _require_no_ct(mri)
@@ -184,7 +201,24 @@ def _check_values(mri: Volume) -> None:
     require(
         not (around >= bright and around > low),
         f"the background ({around:g}) is as bright as the brightest tissue ({bright:g}): the intensities are inverted, "
-        "expected an MRI with a dark background",
+        "or it has a bright border; expected an MRI with a dark background",
+    )
+
+
+def _require_dark_border(mri: Volume) -> None:
+    """Raise SimulationError for an image within a border of one value that is as bright as tissue."""
+    from skimage.filters import threshold_otsu
+
+    values = mri.array
+    around, share = edge_value(values)
+    within = values[values != around]
+    if share < _LEAST_BORDER or within.size < 1000:
+        return
+    low, bright = np.percentile(within, (1.0, 99.0))
+    require(
+        around <= low + 0.25 * (threshold_otsu(within[:: max(1, within.size // 500_000)]) - low),
+        f"image has a border of one value ({around:g}) that is as bright as tissue (the rest has {low:g} to "
+        f"{bright:g}), expected a dark background; crop it, or set it to {low:g}",
     )
 
 

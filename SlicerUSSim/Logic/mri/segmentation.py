@@ -40,6 +40,8 @@ _log = logging.getLogger(__name__)
 
 #: Least volume of a mask in which several images are compared
 _LEAST_TO_REGISTER_ML = 100.0
+#: Share of the time in which the brain is looked for in a whole head
+_SHARE_OF_BRAIN = 0.6
 #: Means from which on the table has two decimals, and three digits below
 _LARGE = 10.0
 
@@ -171,7 +173,9 @@ def segment_mri(
     dtype('uint8')
     """
     require_kind("mri", mri, Volume, "Volume.read reads a file")
-    report = progress or (lambda share: None)
+    told = progress or (lambda share: None)
+    begin = _SHARE_OF_BRAIN if mask is None else 0.0
+    report = lambda share: told(begin + (1.0 - begin) * share)  # noqa: E731
     others = dict(others or {})
     require(
         contrast not in others,
@@ -189,7 +193,7 @@ def segment_mri(
     if mask is None:
         brain = find_brain(
             mri.with_array(intensity), settings.skull_strip, keep_at=keep_mask_at,
-            progress=lambda share: report(0.2 * share),
+            progress=lambda share: told(begin * share),
         )  # fmt: skip
     else:
         require_no_hounsfield(mri)
@@ -201,7 +205,7 @@ def segment_mri(
         )
     foreground = brain.mask.array > 0
     timed("brain")
-    report(0.2)
+    report(0.05)
     notes, warnings = [brain.message], [*brain.warnings]
     images = [mri.with_array(intensity)]
     for name, other in others.items():

@@ -92,7 +92,7 @@ def atlas_of(part: BrainPart, report: Callable[[float], None]) -> tuple[AtlasFit
     atlas = mni152()
     if atlas is None:
         return None, 'without an atlas; install "SlicerUSSim[demo]" for one'
-    fit = register_atlas(part.images[0], part.inside, atlas, lambda share: report(0.2 + 0.2 * share))
+    fit = register_atlas(part.images[0], part.inside, atlas, lambda share: report(0.05 + 0.35 * share))
     if not fit.is_good:
         return None, f"without an atlas, since MNI152 covers the brain with a Dice of {fit.dice:.2f} only"
     return fit, f"led by the MNI152 atlas, whose brain covers this one with a Dice of {fit.dice:.2f}"
