@@ -32,7 +32,7 @@ class Series:
     description: str
     size: str
     #: PatientID and PatientName, only compared and never shown
-    patient: tuple[str, str] = ("", "")
+    patient: tuple[str, str]
 
     @classmethod
     def of(cls, folder: Path, uid: str, recursive: bool = False) -> Series:

@@ -102,8 +102,8 @@ def find_brain(
         _require_program(method, mri)
         if method == "robex":  # takes more than a minute, on one core: the image is recognised meanwhile
             robex = ahead.enter_context(extractors.Ahead(robex, mri))
-        ahead_of = 0.05 if method == "robex" else 0.4  # the atlas takes about as long as the recognition
-        shown = recognise(mri, lambda share: report(ahead_of * share))
+        recognised_at = 0.05 if method == "robex" else 0.4  # the atlas takes about as long as the recognition
+        shown = recognise(mri, lambda share: report(recognised_at * share))
         if shown.stripped is not None:
             mask = mri.with_array(shown.stripped.astype(np.uint8))
             millilitres = _millilitres(shown.stripped, mri)
@@ -112,7 +112,9 @@ def find_brain(
             if method != "auto":
                 message += f"; {_NAMES[method]} is not asked, as there is no skull to strip"
             return BrainMask(mask, "stripped", message, warnings, perf_counter() - start)
-        found = _extracted(mri, shown, method, robex, lambda share: report(ahead_of + (0.95 - ahead_of) * share))
+        found = _extracted(
+            mri, shown, method, robex, lambda share: report(recognised_at + (0.95 - recognised_at) * share)
+        )
     inside, blank = without_blank(mri, found.inside)
     millilitres = _millilitres(inside, mri)
     warnings = (

@@ -13,6 +13,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.alignment import Alignment, agreement_by_moments, align_coarse
 from SlicerUSSim.Logic.mri.atlas import mni152
+from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML
 from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
 from SlicerUSSim.Logic.mri.no_data import edge_value
@@ -82,10 +83,10 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     report = progress or (lambda share: None)
     _check_values(mri)
     is_fan = is_ultrasound(mri)  # but in some views so are the neck and the jaws of a head
-    brain = stripped_brain(mri)
+    stripped = _stripped_brain(mri)
     report(0.1)
-    if brain is not None:
-        shown = CoarseImage.of(mri.with_array(np.where(brain, mri.array - mri.array.min(), 0).astype(np.float32)))
+    if stripped is not None:
+        brain, shown = stripped
         return Shown(brain, warnings=(_SYMMETRIC_BRAIN,) if is_symmetric(shown) else ())
     _require_dark_border(mri)
     image = CoarseImage.of(mri)
@@ -211,8 +212,10 @@ def _require_dark_border(mri: Volume) -> None:
 
     values = mri.array
     around, share = edge_value(values)
+    if share < _LEAST_BORDER or around <= values.min():  # as around most heads: nothing is darker
+        return
     within = values[values != around]
-    if share < _LEAST_BORDER or within.size < 1000:
+    if within.size < 1000:
         return
     low, bright = np.percentile(within, (1.0, 99.0))
     require(
@@ -228,6 +231,12 @@ def stripped_brain(mri: Volume) -> np.ndarray | None:
     Its background has exactly one value, and its foreground the volume and the shape of a brain, without a skull.
     Raises SimulationError if the brain does not lie as its header says.
     """
+    found = _stripped_brain(mri)
+    return None if found is None else found[0]
+
+
+def _stripped_brain(mri: Volume) -> tuple[np.ndarray, CoarseImage] | None:
+    """(stripped_brain, its intensities above the least one and 0 around it)."""
     values = mri.array
     background, share = edge_value(values)
     if share < 0.5 or (values == background).mean() < 0.15:
@@ -237,7 +246,7 @@ def stripped_brain(mri: Volume) -> np.ndarray | None:
         return None
     inside = cast(np.ndarray, ndimage.binary_fill_holes(inside))
     millilitres = inside.sum() * mri.voxel_ml
-    if not POSSIBLE_ML[0] <= millilitres <= 2300.0:
+    if not WHOLE_BRAIN_ML[0] <= millilitres <= WHOLE_BRAIN_ML[1]:
         return None
     coarse = CoarseImage.of(mri.with_array(np.where(inside, 1.0, 0.0).astype(np.float32)))
     intensity = CoarseImage.of(mri.with_array(np.where(inside, values - values.min(), 0).astype(np.float32)))
@@ -247,7 +256,7 @@ def stripped_brain(mri: Volume) -> np.ndarray | None:
     if skull_share(mri, inside) > _LEAST_SKULL:  # a small head has the size and the shape of a brain
         return None
     if mni152() is None:
-        return inside
+        return inside, intensity
     upright = agreement_by_moments(intensity, shape, np.eye(3))
     if upright < _SURELY_RIGHT:
         require(
@@ -257,7 +266,7 @@ def stripped_brain(mri: Volume) -> np.ndarray | None:
         )
         wrong = stripped_lies_otherwise(intensity, shape, upright, LEAST_AGREEMENT)
         require(wrong is None, wrong or "")
-    return inside
+    return inside, intensity
 
 
 def _is_cut(inside: np.ndarray) -> bool:
