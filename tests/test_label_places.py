@@ -431,3 +431,51 @@ def test_a_mirrored_freesurfer_map_of_few_structures_says_so():
     assert "check the orientation in its header" in message and "--map freesurfer" in message
     known = read_label_map(labels, mapping=LabelMapping.of(["freesurfer"]))
     assert any("labels of the left side are on the right" in line for line in known.warnings)
+
+
+# ---- parts of a brain ------------------------------------------------------------------------------------------------
+
+
+def kept(volume: Volume, axis: int, low: float, high: float) -> Volume:
+    """What lies between two coordinates (RAS mm) along an axis; the rest is 0."""
+    ijk = np.indices(volume.array.shape)[::-1].reshape(3, -1)
+    place = (volume.ijk_to_ras[axis, :3] @ ijk + volume.ijk_to_ras[axis, 3]).reshape(volume.array.shape)
+    return volume.with_array(np.where((place >= low) & (place <= high), volume.array, 0))
+
+
+@pytest.mark.parametrize(
+    ("axis", "low", "high", "sides"),
+    [
+        (0, -80, 4, "the right"), (0, -4, 80, "the left"), (1, 0, 80, "the back"), (1, -80, 0, "the front"),
+        (2, 10, 80, "the bottom"), (2, -80, 10, "the top"), (1, -30, 30, "the back and the front"),
+    ],
+)  # fmt: skip
+def test_a_brain_that_was_cut_is_said_to_be_a_part_and_where_it_was_cut(axis, low, high, sides):
+    assert not read_label_map(whole_head()).warnings
+    part = kept(whole_head(), axis, low, high)
+    cropped = part.array[tuple(slice(n.min(), n.max() + 1) for n in np.nonzero(part.array))]
+    for volume in (part, Volume(cropped, part.ijk_to_ras)):
+        warnings = read_label_map(volume, mapping=LabelMapping.of("freesurfer")).warnings
+        assert any("a part of a brain of" in line and f"cut off at {sides}: what" in line for line in warnings), warnings
+
+
+def test_one_hemisphere_by_the_names_of_its_labels_is_said_however_its_medial_face_lies():
+    turned = moved(whole_head(), turned=(0, 0, 30))
+    left = turned.with_array(np.where(np.isin(turned.array, [2, 3, 4, 8, 10]), turned.array, 0))
+    (warning,) = read_label_map(left, mapping=LabelMapping.of("freesurfer")).warnings
+    assert "cut off at the right" in warning
+
+
+def test_a_left_hemisphere_is_not_read_as_organs_whose_numbers_and_places_fit_by_chance():
+    """Cortex (3) is left of white matter (2), putamen (12) of caudate (11), amygdala (18) below fluid (24).
+
+    Such are left and right kidney, left and right adrenal gland, and the vertebrae L5 and T11 of TotalSegmentator.
+    """
+    labels = [2, 3, 4, 8, 10, 11, 12, 13, 16, 17, 18, 24]
+    volume = Volume(np.zeros((60, 60, 60), np.int16), np.diag([3.0, 3.0, 3.0, 1.0]))
+    places = {3: (20, 8), 2: (20, 20), 12: (20, 24), 11: (20, 36), 18: (8, 28), 24: (40, 28)}  # (k, i)
+    for n, label in enumerate(labels):
+        k, i = places.get(label, (20, 28))
+        volume.array[k : k + 4, 4 * n : 4 * n + 4, i : i + 4] = label
+    message = str(refusal_of(volume))
+    assert "fit FreeSurfer and TotalSegmentator" in message and message.endswith("with --map freesurfer"), message

@@ -10,6 +10,8 @@ from pathlib import PurePath
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, either
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.tissue.cut_brain import cut_sides
 from SlicerUSSim.Logic.tissue.freesurfer import missing_structures
 from SlicerUSSim.Logic.tissue.label_advice import Advice
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
@@ -38,9 +40,9 @@ class Findings:
 
     #: The label map in messages
     source: str
-    #: Voxels of label 0, 1, 2, ... and the volume of one
+    #: The label map, and its voxels of label 0, 1, 2, ...
+    labels: Volume
     counts: np.ndarray
-    voxel_ml: float
     #: {label: name}, None for one without
     names: Mapping[int, str | None]
     #: {label: tissue}, None for an unknown one
@@ -55,7 +57,7 @@ class Findings:
         """Whether the user gave every label a tissue."""
         return all(self.mapping.tissue_of(label, name) for label, name in self.names.items())
 
-    def labels(self) -> str:
+    def number(self) -> str:
         """Their number in words: "41 labels"."""
         return f"{len(self.names)} label{'s' * (len(self.names) > 1)}"
 
@@ -63,7 +65,7 @@ class Findings:
         """Raise SimulationError for a mask or lesion, which is no patient, unless the user gave it a tissue."""
         if self.is_mapped:
             return
-        size = f"{self.labels()}, {self._size(self.names)}"
+        size = f"{self.number()}, {self._size(self.names)}"
         known = [None if tissue is None else tissue.name for tissue in self.found.values()]
         names = [str(name) for name in self.names.values() if name is not None]
         if len(known) == 1 and (known[0] is None or any(map(_is_nearest, names))):
@@ -142,6 +144,7 @@ class Findings:
                     f"{self.source}: a part of a brain, without {', '.join(missing)}: they are the coupling medium; "
                     "a whole one is in aseg and aparc+aseg"
                 )
+        doubts += self._brain_that_was_cut()
         if not is_part:
             doubts += self._brain_of_another_size()
         is_body = self.scheme is not None and self.scheme.key.startswith("totalsegmentator")
@@ -153,14 +156,28 @@ class Findings:
             )
         return doubts
 
-    def _brain_of_another_size(self) -> list[str]:
-        brain = [label for label, tissue in self.found.items() if tissue and tissue.name in _BRAIN]
+    def _brain(self) -> list[int]:
+        """Labels of grey and white matter, if there are both."""
         has_both = {tissue.name for tissue in self.found.values() if tissue} >= set(_BRAIN)
-        if not has_both or _BRAIN_ML[0] < self._millilitres(brain) < _BRAIN_ML[1]:
+        return [label for label, tissue in self.found.items() if has_both and tissue and tissue.name in _BRAIN]
+
+    def _brain_that_was_cut(self) -> list[str]:
+        brain = self._brain()
+        sides = cut_sides(self.labels, {label: self.names[label] for label in brain}, self.counts) if brain else []
+        if not sides:
+            return []
+        return [
+            f"{self.source}: a part of a brain of {self._size(brain)}, cut off at the {' and the '.join(sides)}: what is "
+            "missing there is the coupling medium"
+        ]
+
+    def _brain_of_another_size(self) -> list[str]:
+        brain = self._brain()
+        if not brain or _BRAIN_ML[0] < self._millilitres(brain) < _BRAIN_ML[1]:
             return []
         return [
             f"{self.source}: grey and white matter have {self._size(brain)}, an adult's 900 to 1500 ml: if it is a "
-            f"whole brain, check the size of the voxels in its header ({1e3 * self.voxel_ml:.3g} mm3)"
+            f"whole brain, check the size of the voxels in its header ({1e3 * self.labels.voxel_ml:.3g} mm3)"
         ]
 
     def _described(self, label: int) -> str:
@@ -171,7 +188,7 @@ class Findings:
         return f"{name!r} ({label}, {self._size([label])})" if name else f"label {label} ({self._size([label])})"
 
     def _millilitres(self, labels: Iterable[int]) -> float:
-        return float(self.counts[list(labels)].sum() * self.voxel_ml)
+        return float(self.counts[list(labels)].sum() * self.labels.voxel_ml)
 
     def _size(self, labels: Iterable[int]) -> str:
         size_ml = self._millilitres(labels)

@@ -164,7 +164,7 @@ class _Reading:
         names = {label: self._names.get(label, scheme.names.get(label) if scheme else None) for label in self._present}
         found = {label: self._tissue(label, name) for label, name in names.items()}
         findings = Findings(
-            self._source, self._counts, self._volume.voxel_ml, names, found,
+            self._source, self._volume, self._counts, names, found,
             scheme or scheme_with_names(self._names), self._mapping, self._tissues, self._advice,
         )  # fmt: skip
         findings.require_patient()
@@ -193,7 +193,7 @@ class _Reading:
         table = TissueTable({0: coupling, **dict(enumerate(order, 1))}, self._tissues.membrane)
         labels = self._volume.with_array(lookup[self._volume.array])
         tissues = f"{len(order)} tissue{'s' * (len(order) > 1)}"
-        message = f"{self._title(findings)}: {findings.labels()} to {tissues}"
+        message = f"{self._title(findings)}: {findings.number()} to {tissues}"
         return LabelledTissues(labels, table, relabelled, message, (*self._warnings, *findings.doubts()))
 
     def _require_background(self) -> None:

@@ -107,6 +107,7 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
     """
     centres = label_centres(labels)
     possible = None
+    may_be_freesurfers = False
     fits: list[tuple[int, Scheme]] = []
     for scheme in schemes().values():
         known = np.mean([value in scheme.names for value in values])
@@ -118,6 +119,7 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
             if recognition is not None:
                 return recognition
             usual = np.mean([freesurfer.is_usual(value) for value in values])
+            may_be_freesurfers = len(values) > 1 and known == 1 and usual >= _KNOWN and holds >= _AGREEING * count
             if len(values) > 1 and min(known, usual) == 1 and holds >= _AGREEING * count:
                 possible = Recognition(None, possible=scheme, doubt="structures of both sides are too few to be sure")
             elif count > 1 and min(known, usual) == 1:
@@ -130,6 +132,8 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
         return possible if possible and brain.scheme is None else brain
     most = max(holds for holds, _ in fits)
     best = [scheme for holds, scheme in fits if holds == most]
+    if may_be_freesurfers:  # one hemisphere, whose numbers a few organs have as well
+        best = [schemes()["freesurfer"], *best]
     if len({tuple(scheme.names.get(value) for value in values) for scheme in best}) > 1:
         return Recognition(None, tuple(best))
     return Recognition(best[0])

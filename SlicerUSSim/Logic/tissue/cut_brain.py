@@ -1,0 +1,65 @@
+"""Where a labelled brain was cut off: its sides that are flat, and the side of which little is there.
+
+A brain is round, so that its outermost slice along any axis is small; that of a half, or of a crop, is not.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.volume import Volume
+
+#: Share of the largest slice that the outermost has where a brain was cut; of whole ones it is below 0.1, at slices of
+#: 3 mm. In thicker slices than this, it tells nothing.
+_FLAT, _THICKEST_MM = 0.3, 5.0
+#: Smaller pieces are not judged, and none that fill less of their box, which a brain fills by half
+_LEAST_ML, _LEAST_FILLED = 100.0, 0.2
+#: Share of one side's volume that the other has at least, by names
+_LEAST_SIDE = 0.5
+_SIDES = (("left", "right"), ("back", "front"), ("bottom", "top"))
+_LEFT, _RIGHT = (re.compile(rf"(^|[-_ ])({words})([-_ ]|$)", re.IGNORECASE) for words in ("left|lh", "right|rh"))
+
+
+def cut_sides(labels: Volume, names: Mapping[int, str | None], counts: np.ndarray) -> list[str]:
+    """At which sides a brain was cut off, or which side is mostly missing: of left, right, back, front, bottom, top.
+
+    Parameters
+    ----------
+    labels : (k, j, i) whole numbers, the labels.
+    names : {label: name} of the labels that are brain; None for one without a name.
+    counts : voxels of label 0, 1, 2, ...
+    """
+    if counts[list(names)].sum() * labels.voxel_ml < _LEAST_ML:
+        return []
+    lookup = np.zeros(len(counts), bool)
+    lookup[list(names)] = True
+    inside = lookup[labels.array]
+    found = set(_flat_sides(inside, labels))
+    left, right = (
+        sum(int(counts[label]) for label, name in names.items() if name and side.search(name))
+        for side in (_LEFT, _RIGHT)
+    )
+    if min(left, right) < _LEAST_SIDE * max(left, right):
+        found.add("left" if left < right else "right")
+    return [side for sides in _SIDES for side in sides if side in found]
+
+
+def _flat_sides(inside: np.ndarray, labels: Volume) -> list[str]:
+    boxes = [np.flatnonzero(inside.any(axis=tuple(other for other in range(3) if other != axis))) for axis in range(3)]
+    if inside.sum() < _LEAST_FILLED * np.prod([float(np.ptp(box) + 1) for box in boxes]):
+        return []
+    sides = []
+    for axis, column in enumerate((2, 1, 0)):  # of (k, j, i), and of the matrix
+        if labels.spacing_mm[column] > _THICKEST_MM:
+            continue
+        areas = inside.sum(axis=tuple(other for other in range(3) if other != axis))
+        occupied = np.flatnonzero(areas)
+        direction = labels.ijk_to_ras[:3, column]
+        ras = int(np.abs(direction).argmax())
+        for end, way in ((occupied[0], -1), (occupied[-1], 1)):
+            if areas[end] > _FLAT * areas.max():
+                sides.append(_SIDES[ras][int(way * direction[ras] > 0)])
+    return sides
