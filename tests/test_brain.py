@@ -332,7 +332,7 @@ def test_a_limb_is_refused_as_going_through_the_image():
     limb = np.where(x**2 + y**2 < 70**2, 400.0 + 0.3 * texture, 0.0)
     limb[x**2 + y**2 < 15**2] = 900.0
     image = np.abs(limb + rng.normal(0, 20, limb.shape)).astype(np.float32)
-    with pytest.raises(SimulationError, match="from the bottom to the top, as a limb or a body does"):
+    with pytest.raises(SimulationError, match="cut off at its bottom and its top, as a limb, a body or a part of"):
         find_brain(Volume(image, np.diag([3.0, 3.0, 3.0, 1.0])))
 
 
@@ -345,6 +345,9 @@ def test_where_a_head_is_cut_is_found_also_with_its_axes_stored_in_another_order
     part = np.take(mri.array, np.arange(n) if half == 0 else np.arange(n, mri.array.shape[axis]), axis)
     cut = Volume(part, mri.ijk_to_ras)
     assert cut_ends(cut) == (end,)
+    emptied = np.zeros_like(mri.array)
+    emptied[(slice(None),) * axis + (slice(None, n) if half == 0 else slice(n, None),)] = part
+    assert cut_ends(mri.with_array(emptied)) == (end,)
     assert cut_ends(Volume.from_sitk(sitk.DICOMOrient(cut.to_sitk(), "PIR"), "turned")) == (end,)
 
 
@@ -412,7 +415,7 @@ def test_a_body_is_refused_at_once():
 def test_half_a_head_is_refused_with_the_part_that_is_missing(head):
     mri = head[0]
     half = Volume(mri.array[:, :, : mri.array.shape[2] // 2], mri.ijk_to_ras)
-    with pytest.raises(SimulationError, match=r"only \d+% of a brain, its right half is cut off|object, at its right;"):
+    with pytest.raises(SimulationError, match=r"only \d+% of a brain, its right half is cut off|the object is cut off at its right;"):
         find_brain(half)
 
 

@@ -508,3 +508,12 @@ def test_the_demo_refuses_a_label_map_as_segment_does(labels, tmp_path):
     result = ussim("demo", "--mri", labels, "--out", tmp_path / "demo")
     assert result.exit_code == 2 and "is a label map" in result.stderr and "expected an MRI" in result.stderr
     assert not (tmp_path / "demo").exists()
+
+
+def test_the_demo_leaves_nothing_behind_of_an_image_that_it_refuses(tmp_path):
+    pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
+    noise = tmp_path / "noise.nrrd"
+    values = np.random.default_rng(0).normal(100, 20, (60, 60, 60)).astype(np.float32)
+    Volume(values, np.diag([3.0, 3.0, 3.0, 1.0])).write(noise)
+    result = ussim("demo", "--mri", noise, "--out", tmp_path / "new" / "demo")
+    assert result.exit_code == 2 and "noise" in result.stderr and not (tmp_path / "new").exists()

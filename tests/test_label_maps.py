@@ -446,7 +446,7 @@ def test_labels_are_no_mri_also_with_fractions_and_noise_and_in_python(changed, 
 def test_a_mapping_of_an_mri_is_refused(tmp_path):
     path = tmp_path / "mri.nii.gz"
     Volume(np.random.default_rng(0).normal(100, 9, (20, 20, 20)).astype(np.float32), np.eye(4)).write(path)
-    assert "is an MRI, and --map is for labels" in refused(
+    assert "is read as an image, and --map is for a label map" in refused(
         "simulate", path, "--map", "1=csf", "--pose", "auto", "-o", tmp_path / "o.png"
     )
 

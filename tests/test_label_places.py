@@ -456,7 +456,9 @@ def test_a_brain_that_was_cut_is_said_to_be_a_part_and_where_it_was_cut(axis, lo
     cropped = part.array[tuple(slice(n.min(), n.max() + 1) for n in np.nonzero(part.array))]
     for volume in (part, Volume(cropped, part.ijk_to_ras)):
         warnings = read_label_map(volume, mapping=LabelMapping.of("freesurfer")).warnings
-        assert any("a part of a brain of" in line and f"cut off at {sides}: what" in line for line in warnings), warnings
+        assert any("a part of a brain of" in line and f"cut off at {sides}: what" in line for line in warnings), (
+            warnings
+        )
 
 
 def test_one_hemisphere_by_the_names_of_its_labels_is_said_however_its_medial_face_lies():
@@ -479,3 +481,22 @@ def test_a_left_hemisphere_is_not_read_as_organs_whose_numbers_and_places_fit_by
         volume.array[k : k + 4, 4 * n : 4 * n + 4, i : i + 4] = label
     message = str(refusal_of(volume))
     assert "fit FreeSurfer and TotalSegmentator" in message and message.endswith("with --map freesurfer"), message
+
+
+def test_labels_that_were_interpolated_and_rounded_are_said_and_nearest_neighbours_are_not():
+    whole = whole_head()
+    turn = Rotation.from_euler("z", 10, degrees=True).as_matrix()
+    middle = np.array(whole.array.shape) / 2
+    nearest, linear = (
+        whole.with_array(
+            np.rint(ndimage.affine_transform(whole.array.astype(float), turn, middle - turn @ middle, order=order))
+        )
+        for order in (0, 1)
+    )
+    assert not read_label_map(nearest).warnings
+    message = str(refusal_of(linear))  # 2 and 41 have any number between them, some of which FreeSurfer has not
+    assert "resampled with interpolation and rounded" in message and "nearest neighbours" in message
+    known = np.isin(linear.array, list(freesurfer_names()))
+    linear = linear.with_array(np.where(known, linear.array, 0))
+    warnings = read_label_map(linear, mapping=LabelMapping.of("freesurfer")).warnings
+    assert any("resampled with interpolation and rounded" in line for line in warnings), warnings

@@ -39,6 +39,15 @@ def test_a_tumours_rim_that_enhances_in_a_t1_without_contrast_agent_is_said_with
     assert not any("t1gd" in line for line in segment_mri(case.mri, contrast="t1gd", mask=case.mask).warnings)
 
 
+def test_a_t1_in_which_nothing_enhances_is_said_not_to_be_after_contrast_agent():
+    case = phantom(brain(), "t1")
+    told = segment_mri(case.mri, contrast="t1gd", mask=case.mask).warnings
+    assert any("of the brain enhance, expected 0.05% or more" in line and "choose t1 instead" in line for line in told)
+    second = phantom(brain(), "t2", seed=1)
+    told = segment_mri(second.mri, contrast="t2", others={"t1gd": case.mri}, mask=case.mask).warnings
+    assert any("choose t1 instead" in line for line in told)
+
+
 def test_a_healthy_t1_is_not_taken_for_one_with_contrast_agent():
     case = phantom(brain(), "t1", noise=0.07)
     assert not segment_mri(case.mri, contrast="t1", mask=case.mask).warnings

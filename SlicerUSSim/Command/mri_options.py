@@ -63,6 +63,11 @@ def require_other_files(mri: str | None, also: Mapping[str, str]) -> None:
         known.append((f"--also {contrast}", Path(file)))
 
 
+def require_no_map(path: str, maps: Iterable[str], organs: str | None) -> None:
+    """Raise SimulationError for --map of an image; with --organs it is for that label map."""
+    require(not tuple(maps) or organs is not None, f"{path}: is read as an image, and --map is for a label map")
+
+
 def segmented_file(
     path: str,
     mri: Volume,
@@ -92,7 +97,7 @@ def segmented_file(
     is_of_brain = has_brain_mask(settings["contrast"])
     if not is_of_brain:
         require_no_options_beside_ct(path)
-    require(not maps or organs is not None, f"{path}: is read as an image, and --map is for a label map")
+    require_no_map(path, maps, organs)
     require(organs is None or not is_of_brain, f"--organs is for a CT, expected --ct; {path} is read as an MRI")
     others = read_also(also, path)
     brain = Volume.read(mask) if mask else None

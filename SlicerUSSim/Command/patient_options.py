@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
-from SlicerUSSim.Command.mri_options import also_option, organs_option, require_no_sequence, segmented_file, split_also
+from SlicerUSSim.Command.mri_options import (
+    also_option,
+    organs_option,
+    require_no_map,
+    require_no_sequence,
+    segmented_file,
+    split_also,
+)
 from SlicerUSSim.Command.options import (
     ct_option,
     declared,
@@ -173,11 +180,8 @@ def open_examination(patient: PatientOptions) -> Examination:
         raise SimulationError(
             f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need an MRI"
         )
-    if patient.maps and not is_labels and patient.organs is None:
-        raise SimulationError(
-            f"{patient.mri_or_labels}: is {'a CT' if is_ct else 'an MRI'}, and --map is for labels; use --labels if it "
-            "is none"
-        )
+    if not is_labels:
+        require_no_map(patient.mri_or_labels, patient.maps, patient.organs)
     if is_labels:
         require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")
     split_also(patient.also)

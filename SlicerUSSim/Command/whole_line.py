@@ -13,7 +13,7 @@ import numpy as np
 from SlicerUSSim.Command.additions import Additions
 from SlicerUSSim.Command.own_folder import require_own_results, results_of
 from SlicerUSSim.Logic.base.errors import about_file
-from SlicerUSSim.Logic.base.files import make_folder
+from SlicerUSSim.Logic.base.files import require_folder
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.figures import draw_views, require_matplotlib, write_png
@@ -56,7 +56,7 @@ def run_whole_line(
     Raises SimulationError for errors that the caller can correct.
     """
     require_matplotlib()  # before the computation, not after it
-    make_folder(out)
+    require_folder(out)  # created with the results: a refused image leaves nothing behind
     require_own_results(out, _RESULTS, SUMMARY)
     timings: dict[str, float] = {}
 

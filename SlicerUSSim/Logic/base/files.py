@@ -44,6 +44,16 @@ def _files_of_voxels(path: Path) -> list[Path]:
     return [path.with_suffix(suffix) for suffix in (".raw", ".zraw", ".raw.gz")] if is_header else []
 
 
+def require_folder(path: str | os.PathLike) -> None:
+    """Raise SimulationError unless the folder is there, or can be created, and can be written to."""
+    folder = Path(path)
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    why = "" if there.is_dir() else f"{there} is a file"
+    if not why and not os.access(there, os.W_OK):
+        why = f"no permission in {there}"
+    require(not why, f"{folder}: cannot be {'written to' if there == folder else 'created'} ({why})")
+
+
 def make_folder(path: str | os.PathLike) -> Path:
     """The folder, created if necessary. Raises SimulationError if it cannot be created."""
     folder = Path(path)

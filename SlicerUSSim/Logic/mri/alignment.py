@@ -22,6 +22,13 @@ _PITCHES, _SIZES = (-30.0, -15.0, 0.0, 15.0, 30.0), (-10.0, 4.0)
 _EXPECTED_SIZE, _SIZE_SPREAD = -5.0, 12.0
 #: The same of small heads, as of children and of wrong voxel sizes, and where the search for them starts
 _SMALL_SIZE, _SMALL_SIZES = -28.0, (-34.0, -22.0)
+#: Brains of adults differ by less than this in size; relative to the template, in one direction.
+SIZES = (0.74, 1.15)
+#: Up to this agreement it is asked whether the head is small, or fits better in another orientation: back to front, a
+#: T1 had 0.23, and 0.31 with twice its height.
+DOUBTFUL_AGREEMENT = 0.4
+#: Ratio of agreements from which a small head was found where an adult's was looked for: such had 1.8 to 4
+_CLEARLY_BETTER = 1.15
 #: Agreement of rigid fits below which no affine one is tried
 _HOPELESS = 0.11
 #: Size of the brain where many turns compete, and how many starts are then improved
@@ -65,14 +72,23 @@ def align_template(mri: Volume, progress: Callable[[float], None] | None = None)
     return align_coarse(CoarseImage.of(mri), progress)
 
 
-def align_coarse(
-    image: CoarseImage, progress: Callable[[float], None] | None = None, *, is_small: bool = False
-) -> Alignment:
+def align_coarse(image: CoarseImage, progress: Callable[[float], None] | None = None) -> Alignment:
     """See align_template. Where the best rigid fit is hopeless, it is returned without the affine one.
 
-    An adult's head is expected, or with `is_small` one of 0.65 to 0.85 times its size.
+    An adult's head is looked for, and where none is found, one of 0.65 to 0.85 times its size.
     """
-    brain, report = template(), progress or (lambda share: None)
+    report = progress or (lambda share: None)
+    found = _aligned(image, lambda share: report(0.75 * share), is_small=False)
+    if found.agreement < DOUBTFUL_AGREEMENT or not SIZES[0] <= found.size <= SIZES[1]:
+        small = _aligned(image, lambda share: report(0.75 + 0.25 * share), is_small=True)
+        if small.agreement > _CLEARLY_BETTER * found.agreement:
+            found = small
+    report(1.0)
+    return found
+
+
+def _aligned(image: CoarseImage, progress: Callable[[float], None], *, is_small: bool) -> Alignment:
+    brain, report = template(), progress
     search = _Search(image, np.eye(3), _SMALL_SIZE if is_small else _EXPECTED_SIZE)
     blurred = search.of(image.smoothed(4.0))
     sizes = _SMALL_SIZES if is_small else _SIZES

@@ -24,7 +24,7 @@ _NOISE_CORRELATION = 0.2
 #: Least correlation with the mirror images along the three axes: heads and brains 0.30 to 0.63 (a macaque's 0.75), as
 #: left and right alone are alike; phantoms of shells, with and without noise, 0.87 to 1.00
 _SYMMETRIC = 0.85
-#: Cross-section at an end of the image, relative to the largest, from which the object is cut there. The neck is cut in
+#: Cross-section at an end of the object, relative to the largest, from which it is cut there. The neck is cut in
 #: most images of a head, so that the bottom has to be cut through the head itself.
 _CUT, _CUT_AT_BOTTOM = 0.5, 0.85
 _ENDS = (("left", "right"), ("back", "front"), ("bottom", "top"))
@@ -98,7 +98,10 @@ def is_phantom(image: CoarseImage, looks_like_a_head: bool = True) -> bool:
 
 
 def cut_ends(mri: Volume) -> tuple[str, ...]:
-    """Ends of the image, along the axes of its voxels, at which the object is cut off in the middle: "front", ..."""
+    """Ends, along the axes of the voxels, at which the object is cut off in the middle: "front", ...
+
+    By the image's edge, or before it, with nothing beyond.
+    """
     from skimage.filters import threshold_otsu
 
     step = tuple(slice(None, None, max(1, round(4.0 / size))) for size in mri.spacing_mm[::-1])
@@ -108,7 +111,7 @@ def cut_ends(mri: Volume) -> tuple[str, ...]:
     inside = np.stack([np.asarray(ndimage.binary_fill_holes(part)) for part in inside])
     ends = []
     for axis in range(3):
-        areas = inside.sum(axis=tuple(other for other in range(3) if other != axis))
+        areas = np.trim_zeros(inside.sum(axis=tuple(other for other in range(3) if other != axis)))
         towards = mri.ijk_to_ras[:3, 2 - axis]
         row = int(np.abs(towards).argmax())
         names = _ENDS[row] if towards[row] > 0 else _ENDS[row][::-1]

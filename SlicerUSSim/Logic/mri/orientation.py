@@ -8,15 +8,13 @@ from collections.abc import Callable
 import numpy as np
 
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.alignment import Alignment, agreement_by_moments, align_coarse, align_turned
+from SlicerUSSim.Logic.mri.alignment import SIZES, Alignment, agreement_by_moments, align_coarse, align_turned
 from SlicerUSSim.Logic.mri.coarse import CoarseImage
 from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_noise, is_phantom
 
 _ENDS = ("RL", "AP", "SI")
 #: A patient in a scanner nods by up to 40 degrees.
 MOST_TURN_DEG = 48.0
-#: Brains of adults differ by less than this in size; relative to the template, in one direction.
-SIZES = (0.74, 1.15)
 _TURN_IT = (
     "correct the orientation in its header, for example in 3D Slicer: turn it in the module Transforms, "
     "harden the transform and save it"
@@ -49,8 +47,8 @@ def lies_otherwise(
     is_cut = set(ends) - {"bottom"}  # where the neck leaves the image
     upside_down = " (if that is the neck, the head is upside down)" if is_cut == {"top"} else ""
     where = (
-        f"the image ends in the middle of the object, at its {' and '.join(ends)}{upside_down}; {_WHOLE}, or correct "
-        "the orientation in its header if it is whole"
+        f"the object is cut off at its {' and '.join(ends)}{upside_down}; {_WHOLE}, or correct the orientation in its "
+        "header if it is whole"
     )
     if is_cut and alignment.agreement < least:
         return where
@@ -100,8 +98,8 @@ def why_refused(
         )
     if {"bottom", "top"} <= set(cut_ends(mri)):
         return (
-            f"the object in this {size} mm image goes through it from the bottom to the top, as a limb or a body does, "
-            f"expected a head; {_WHOLE}"
+            f"the object in this {size} mm image is cut off at its bottom and its top, as a limb, a body or a part of "
+            f"a head is, expected a whole head; {_WHOLE}"
         )
     if alignment.agreement >= least and alignment.turn_deg <= MOST_TURN_DEG and alignment.size < SIZES[0]:
         return (

@@ -29,6 +29,8 @@ _APART, _FAR_APART = 0.25, 0.5
 #: enhances. Largest pieces: 19.5 ml in a T1 with contrast agent (ReMIND-022), 0.65 ml in one with bright arteries, and
 #: 0.01 ml in the others
 _ENHANCED, _ENHANCED_ML, _LARGEST_ENHANCED_ML = 1.5, 2.0, 300.0
+#: Share of a brain that enhances at least after contrast agent: 2.1 % in ReMIND-022, 0.0 % in T1s without it
+_LEAST_ENHANCING = 0.0005
 #: Share of one tissue from which the rest is noise
 _ONE_TISSUE = 0.97
 #: Contrast of grey and white matter in units of the noise: 1.1 in a T2 whose labels are blobs, 3 and more in T1s
@@ -148,6 +150,19 @@ def enhancement(image: np.ndarray, inside: np.ndarray, grey: float, white: float
     return [
         f"contrast is t1, but {largest:.1f} ml in one piece are far brighter than white matter, as vessels and tumour "
         "rims after contrast agent: if it was given, choose t1gd (--contrast t1gd)"
+    ]
+
+
+def without_enhancement(found: Classes, contrasts: tuple[str, ...]) -> list[str]:
+    """A warning where an image is said to be after contrast agent, and nothing enhances as veins and plexus do."""
+    if "t1gd" not in contrasts or "enhancing" not in found.names:
+        return []
+    share = float(found.shares[found.names.index("enhancing")])
+    if share >= _LEAST_ENHANCING:
+        return []
+    return [
+        f"{share:.2%} of the brain enhance, expected {_LEAST_ENHANCING:.2%} or more (veins, choroid plexus) after "
+        "contrast agent: if none was given, choose t1 instead of t1gd"
     ]
 
 

@@ -11,14 +11,20 @@ from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.alignment import Alignment, agreement_by_moments, align_coarse
+from SlicerUSSim.Logic.mri.alignment import (
+    DOUBTFUL_AGREEMENT,
+    SIZES,
+    Alignment,
+    agreement_by_moments,
+    align_coarse,
+)
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML
 from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
 from SlicerUSSim.Logic.mri.no_data import edge_value
 from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_symmetric, is_ultrasound
-from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, SIZES, lies_otherwise, stripped_lies_otherwise, why_refused
+from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, lies_otherwise, stripped_lies_otherwise, why_refused
 from SlicerUSSim.Logic.mri.scalp import skull_share
 
 #: Volumes of a brain, millilitres: outside the first range a user should look, outside the second it is no brain.
@@ -26,11 +32,6 @@ USUAL_ML, POSSIBLE_ML = (1000.0, 1900.0), (500.0, 2600.0)
 #: Least agreement with the template (Alignment.agreement). Heads and brains that were tried had 0.19 (proton density)
 #: to 0.88; CT, bodies, phantoms, and heads that lie wrongly 0.00 to 0.14.
 LEAST_AGREEMENT = 0.16
-#: Up to this agreement it is asked whether the head fits better in another orientation: back to front, a T1 had 0.23,
-#: and 0.31 with twice its height.
-_DOUBTFUL_AGREEMENT = 0.4
-#: Ratio of agreements from which a small head was found where an adult's was looked for: such had 1.8 to 4
-_CLEARLY_BETTER = 1.15
 #: Where the agreement is doubtful, least overlap (Dice) of a brain on a background with noise with the template: brains
 #: had 0.94 to 0.96; whole heads of 0.7 to 0.78 times their size, over which the template was spread, 0.85 to 0.90
 _STRIPPED_OVERLAP = 0.915
@@ -98,19 +99,15 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     )
     if mni152() is None:
         return Shown(None, warnings=("without nilearn it is not checked that the image shows a head",))
-    alignment = align_coarse(image, lambda share: report(0.1 + 0.5 * share))
-    if alignment.agreement < _DOUBTFUL_AGREEMENT or not SIZES[0] <= alignment.size <= SIZES[1]:
-        small = align_coarse(image, lambda share: report(0.6 + 0.1 * share), is_small=True)
-        if small.agreement > _CLEARLY_BETTER * alignment.agreement:
-            alignment = small
-    require(not is_fan or alignment.agreement >= _DOUBTFUL_AGREEMENT, _ULTRASOUND)  # heads 0.7 and more, fans 0.05
+    alignment = align_coarse(image, lambda share: report(0.1 + 0.6 * share))
+    require(not is_fan or alignment.agreement >= DOUBTFUL_AGREEMENT, _ULTRASOUND)  # heads 0.7 and more, fans 0.05
     is_plausible = alignment.turn_deg <= MOST_TURN_DEG and alignment.stretch <= _MOST_STRETCH
     is_plausible &= SIZES[0] <= alignment.size <= SIZES[1]
     later = lambda share: report(0.7 + 0.3 * share)  # noqa: E731
     if alignment.agreement < LEAST_AGREEMENT or not is_plausible:
         _require_no_ct(mri)
         raise SimulationError(why_refused(mri, image, alignment, LEAST_AGREEMENT, later))
-    if alignment.agreement < _DOUBTFUL_AGREEMENT:
+    if alignment.agreement < DOUBTFUL_AGREEMENT:
         message = lies_otherwise(mri, image, alignment, LEAST_AGREEMENT, later)
         require(message is None, message or "")
     report(1.0)
@@ -121,7 +118,7 @@ def require_no_ultrasound(mri: Volume) -> None:
     """Raise SimulationError for an image that is a fan, and no head."""
     if is_ultrasound(mri):
         image = CoarseImage.of(mri)
-        if not _may_be_head(image) or mni152() is None or align_coarse(image).agreement < _DOUBTFUL_AGREEMENT:
+        if not _may_be_head(image) or mni152() is None or align_coarse(image).agreement < DOUBTFUL_AGREEMENT:
             raise SimulationError(_ULTRASOUND)
 
 
@@ -364,7 +361,7 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
         covered = alignment.brain_on(mri) < 0.0
         overlap = float(2.0 * (inside & covered).sum() / (inside.sum() + covered.sum()))
         require(
-            alignment.agreement >= _DOUBTFUL_AGREEMENT or overlap >= _STRIPPED_OVERLAP,
+            alignment.agreement >= DOUBTFUL_AGREEMENT or overlap >= _STRIPPED_OVERLAP,
             "image shows neither a head, with a scalp around the brain, nor the outline of a brain alone (agreement "
             f"with the atlas {alignment.agreement:.2f}, Dice of the outlines {overlap:.2f}): a small head, a wrong "
             "voxel size in its header, or no head; correct the header, or give a brain mask (--mask)",

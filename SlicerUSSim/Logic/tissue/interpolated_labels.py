@@ -18,6 +18,10 @@ _VALUES, _OF_PLATEAUS = 2, 0.02
 _WHOLE, _MOSTLY_WHOLE = 0.01, 0.9
 #: Steps of the range in which values are counted, and the least distance of the foreground from the background
 _STEP, _FOREGROUND = 1e-3, 1e-2
+#: Share of labelled voxels without a neighbour of their label from which whole numbers were interpolated, in
+#: maps of so many labels. SynthSeg's, AAL and Brodmann's of mricron 0.0000 to 0.0016, by nearest neighbours at 3 mm up
+#: to 0.014; interpolated, at 0.7 to 3 mm, 0.048 to 0.24; more in an image
+_ALONE, _LEAST_LABELS = (0.04, 0.5), 8
 #: Voxels along each side of the part of a volume that is examined
 _EXAMINED = 128
 
@@ -65,6 +69,27 @@ def is_smoothed(array: np.ndarray) -> bool:
         return False
     counts = np.bincount(np.rint(flat / _STEP).astype(np.int64) + 1)  # levels below 0 by rounding
     return int((counts >= _OF_PLATEAUS * len(flat)).sum()) >= _VALUES
+
+
+def share_alone(array: np.ndarray) -> float:
+    """Share of the labelled voxels, of whole numbers (k, j, i), in which none of six neighbours has the same label."""
+    part = array[tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)]
+    has_equal = np.zeros(part.shape, bool)
+    for axis in range(3):
+        along, found = np.moveaxis(part, axis, 0), np.moveaxis(has_equal, axis, 0)
+        same = along[1:] == along[:-1]
+        found[1:] |= same
+        found[:-1] |= same
+    labelled = part != 0
+    return float((labelled & ~has_equal).sum() / max(1, labelled.sum()))
+
+
+def are_interpolated_numbers(array: np.ndarray, n_labels: int) -> bool:
+    """Whether whole numbers (k, j, i) with so many labels were interpolated and rounded.
+
+    Between two labels are then numbers of others, each in a few voxels.
+    """
+    return n_labels >= _LEAST_LABELS and _ALONE[0] <= share_alone(array) <= _ALONE[1]
 
 
 def _frequent(levels: np.ndarray) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import PurePath
 
 import numpy as np
@@ -13,6 +14,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, either
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.cut_brain import cut_sides
 from SlicerUSSim.Logic.tissue.freesurfer import missing_structures
+from SlicerUSSim.Logic.tissue.interpolated_labels import are_interpolated_numbers
 from SlicerUSSim.Logic.tissue.label_advice import Advice
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, same_name, tissue_named
@@ -30,6 +32,11 @@ _MOST_LABELS = 100
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
 #: Tissues of every brain, and the least and largest volume of both that is not remarkable
 _BRAIN, _BRAIN_ML = ("grey matter", "white matter"), (30.0, 2500.0)
+_INTERPOLATED = (
+    "many voxels have a label that none of their neighbours has, as where a label map was resampled with interpolation "
+    "and rounded, so that there are wrong labels between two others: use the original, or resample it with nearest "
+    "neighbours"
+)
 #: A larger binary mask is that of a brain or a head.
 _LARGEST_LESION_ML = 500.0
 
@@ -60,6 +67,10 @@ class Findings:
     def number(self) -> str:
         """Their number in words: "41 labels"."""
         return f"{len(self.names)} label{'s' * (len(self.names) > 1)}"
+
+    @cached_property
+    def _are_interpolated(self) -> bool:
+        return are_interpolated_numbers(self.labels.array, len(self.names))
 
     def require_patient(self) -> None:
         """Raise SimulationError for a mask or lesion, which is no patient, unless the user gave it a tissue."""
@@ -102,7 +113,9 @@ class Findings:
             remedy = f"{self.advice.leave_out.format(maps=maps)}; or {remedy}"
         if nothing:
             remedy = f"{self._if_of_a_program(unknown)}{remedy}"
-        if nothing and len(unknown) > _MOST_LABELS:
+        if self._are_interpolated:
+            remedy = f"{_INTERPOLATED}; or {remedy}"
+        elif nothing and len(unknown) > _MOST_LABELS:
             remedy = f"if these are intensities of an MRI, its file may be incomplete; {remedy}"
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
@@ -144,6 +157,8 @@ class Findings:
                     f"{self.source}: a part of a brain, without {', '.join(missing)}: they are the coupling medium; "
                     "a whole one is in aseg and aparc+aseg"
                 )
+        if self._are_interpolated:
+            doubts.append(f"{self.source}: {_INTERPOLATED}")
         doubts += self._brain_that_was_cut()
         if not is_part:
             doubts += self._brain_of_another_size()
@@ -166,9 +181,10 @@ class Findings:
         sides = cut_sides(self.labels, {label: self.names[label] for label in brain}, self.counts) if brain else []
         if not sides:
             return []
+        where = " and the ".join(sides)
         return [
-            f"{self.source}: a part of a brain of {self._size(brain)}, cut off at the {' and the '.join(sides)}: what is "
-            "missing there is the coupling medium"
+            f"{self.source}: a part of a brain of {self._size(brain)}, cut off at the {where}: what is missing is "
+            "the coupling medium"
         ]
 
     def _brain_of_another_size(self) -> list[str]:
