@@ -415,7 +415,9 @@ def test_a_body_is_refused_at_once():
 def test_half_a_head_is_refused_with_the_part_that_is_missing(head):
     mri = head[0]
     half = Volume(mri.array[:, :, : mri.array.shape[2] // 2], mri.ijk_to_ras)
-    with pytest.raises(SimulationError, match=r"only \d+% of a brain, its right half is cut off|the object is cut off at its right;"):
+    with pytest.raises(
+        SimulationError, match=r"only \d+% of a brain, its right half is cut off|the object is cut off at its right;"
+    ):
         find_brain(half)
 
 
