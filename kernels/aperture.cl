@@ -13,9 +13,10 @@
 // mm (both ways), speed of sound, impedance; sums float4 [row][point][angle][depth]: extra path in mm, nepers, nepers
 // that strong tissue takes, and the sheet's part in the elevational deflection in mm; screens float4 [screen
 // line][depth], depths from screen_step on: nepers lost both ways, extra path in mm, deflection in the lateral and in
-// the elevational direction in mm; shades float [screen line][depth]: the nepers of them that strong tissue takes;
-// spreads float2 [screen line][depth]: width of the beam and a factor of its echoes, both re an undisturbed one; beams
-// float4 [traced line][1 + depth] as screens, followed by float [traced line][1 + depth] as shades.
+// the elevational direction in mm; shades float2 [screen line][depth]: the nepers of them that strong tissue takes, and
+// those that soft tissue has taken from what arrives, on the mean; spreads float2 [screen line][depth]: width of the
+// beam and a factor of its echoes, both re an undisturbed one; beams float4 [traced line][1 + depth] as screens,
+// followed by float2 [traced line][1 + depth] as shades.
 
 #include "common.clh"
 
@@ -36,6 +37,8 @@ DEFINE_ELEVATION(float8, elevation_sigma8)
 #define EDGE_OF_BONE 0.75f    // part of a cell from which lines are lost in it by their length
 #define LEAST_OPEN 0.05f      // amplitude that is left by the part that bone covers
 #define LEAST_POWER 1e-7f     // of a beam re an undisturbed one
+#define LEAST_UNEVEN 0.02f    // nepers, both ways, by which soft tissue may take more from one line than from another
+#define MOST_UNEVEN 0.7f      // ... and up to which that belongs to the width of the beam
 
 // Position along the face (mm) and angle of the normal of a point of the array.
 inline float point_angle(__constant const Acquisition *acquisition, float along) {
@@ -290,6 +293,8 @@ typedef struct {
   // Sums along the lines, per length of the axis: extra path, nepers, elevational deflection; and the amplitude that
   // passes strong tissue
   float delay[ROWS][MOST_POINTS], loss[ROWS][MOST_POINTS], lift[ROWS][MOST_POINTS], passed[ROWS][MOST_POINTS];
+  // The amplitude that soft tissue leaves, re that of the line of the least loss, and by how much losses differ
+  float kept[ROWS][MOST_POINTS], least_loss, uneven;
 } Lines;
 
 // The lines to the depth `path` of the axis from `origin` in a direction, whose aperture is around `centre` on the
@@ -301,6 +306,7 @@ inline void find_lines(__constant const Acquisition *acquisition, __global const
   const int low = max((int)ceil((centre - reach - 0.5f * pitch - acquisition->fan_first) / pitch), 0);
   const int high = (int)floor((centre + reach + 0.5f * pitch - acquisition->fan_first) / pitch);
   lines->count = clamp(high - low + 1, 1, min(MOST_POINTS, acquisition->fan_points - low));
+  float least = 1e30f, most = 0.0f;
   for (int i = 0; i < lines->count; i++) {
     const float along = acquisition->fan_first + (low + i) * pitch;
     const float2 point = point_on_face(acquisition, along);
@@ -314,8 +320,16 @@ inline void find_lines(__constant const Acquisition *acquisition, __global const
       lines->loss[row][i] = ratio * found.y;
       lines->passed[row][i] = found.z;
       lines->lift[row][i] = ratio * found.w;
+      least = fmin(least, lines->loss[row][i]);
+      most = fmax(most, lines->loss[row][i]);
     }
   }
+  lines->least_loss = least;
+  lines->uneven = most - least;
+  for (int row = 0; row < ROWS; row++)
+    for (int i = 0; i < lines->count; i++)
+      lines->kept[row][i] =
+          lines->uneven < LEAST_UNEVEN ? 1.0f : exp_fast(-0.5f * (lines->loss[row][i] - lines->least_loss));
 }
 
 // The integral of the square of that product. Its spectrum is the convolution of the two autocorrelations.
@@ -339,10 +353,6 @@ typedef struct {
   float2 received[MOST_POINTS], transmitted[MOST_POINTS];
 } Waves;
 
-#define UNDISTURBED 0
-#define BY_PHASE 1   // with the phases of soft tissue
-#define BY_TISSUE 2  // and with what strong tissue stops
-
 // The transmit focus of the zone that is used at the depth `path`; `path` itself where all depths are in focus.
 inline float transmit_focus_at(__constant const Acquisition *acquisition, float path) {
   float focus = path, least = 1e30f;
@@ -355,22 +365,45 @@ inline float transmit_focus_at(__constant const Acquisition *acquisition, float 
   return focus;
 }
 
-// The waves at the depth `path`, which is a receive focus.
-inline void find_waves(__constant const Acquisition *acquisition, const Lines *lines, float path, float mean_delay,
-                       int kind, Waves *waves) {
+// The parts of the wave that lines bring to a depth, without amplitudes: `turned` by the phases of soft tissue, and
+// `focus`, the phase of the transmitted wave that is focused elsewhere. They are those of all levels.
+typedef struct {
+  float2 turned[ROWS][MOST_POINTS], focus[MOST_POINTS];
+} Phases;
+
+inline void find_phases(__constant const Acquisition *acquisition, const Lines *lines, float path, float mean_delay,
+                        Phases *phases) {
   const float cycles = 0.5f * acquisition->cycles_per_mm;  // per millimetre of path, one way
   const float focusing = 0.5f * cycles * (1.0f / path - 1.0f / transmit_focus_at(acquisition, path));  // turns per mm^2
+  float c, s;
+  for (int i = 0; i < lines->count; i++) {
+    turn(focusing * lines->x[i] * lines->x[i], &c, &s);
+    phases->focus[i] = (float2)(c, s);
+    for (int row = 0; row < ROWS; row++) {
+      turn(cycles * (lines->delay[row][i] - mean_delay), &c, &s);
+      phases->turned[row][i] = (float2)(c, s);
+    }
+  }
+}
+
+inline float2 times(float2 a, float2 b) { return (float2)(a.x * b.x - a.y * b.y, a.x * b.y + a.y * b.x); }
+
+#define UNDISTURBED 0
+#define BY_PHASE 1   // with the phases of soft tissue
+#define BY_LOSS 2    // and with the amplitudes that it leaves
+#define BY_TISSUE 3  // and with what strong tissue stops
+
+// The waves at a depth, which is a receive focus.
+inline void find_waves(const Lines *lines, const Phases *phases, int kind, Waves *waves) {
   for (int i = 0; i < lines->count; i++) waves->received[i] = waves->transmitted[i] = (float2)(0.0f);
   for (int row = 0; row < (kind == UNDISTURBED ? 1 : ROWS); row++) {
     float2 wave[MOST_POINTS], focused[MOST_POINTS];
     for (int i = 0; i < lines->count; i++) {
-      const float amplitude = lines->weight[i] * (kind == BY_TISSUE ? lines->passed[row][i] : 1.0f);
-      const float turns = kind == UNDISTURBED ? 0.0f : cycles * (lines->delay[row][i] - mean_delay);
-      float c, s;
-      turn(turns, &c, &s);
-      wave[i] = amplitude * (float2)(c, s);
-      turn(turns + focusing * lines->x[i] * lines->x[i], &c, &s);
-      focused[i] = amplitude * (float2)(c, s);
+      float amplitude = lines->weight[i];
+      if (kind >= BY_LOSS) amplitude *= lines->kept[row][i];
+      if (kind == BY_TISSUE) amplitude *= lines->passed[row][i];
+      wave[i] = kind == UNDISTURBED ? (float2)(amplitude, 0.0f) : amplitude * phases->turned[row][i];
+      focused[i] = times(wave[i], phases->focus[i]);
     }
     const float share = kind == UNDISTURBED ? 1.0f : ROW_WEIGHT(row);
     add_correlation(wave, lines->count, share, waves->received);
@@ -385,29 +418,46 @@ inline float width_of(const Waves *waves, int count) {
   return power * power / fmax(squared_overlap(waves->received, waves->transmitted, count), 1e-20f);
 }
 
-// Relative to an undisturbed beam: (nepers of the amplitude of speckle lost by phases, nepers lost to strong tissue,
-// width). The power of speckle is the integral over the beam of the transmitted times the received intensity. A shift
-// of both beams changes nothing.
+// Relative to a beam that nothing disturbs and that has lost `loss` nepers: (nepers of the amplitude of speckle lost by
+// the phases and the uneven losses of soft tissue, nepers lost to strong tissue, width). The power of speckle is the
+// integral over the beam of the transmitted times the received intensity. A shift of both beams changes nothing.
 inline float3 level_and_spread(__constant const Acquisition *acquisition, const Lines *lines, float path,
-                               float mean_delay) {
+                               float mean_delay, float loss) {
   const int count = lines->count;
+  Phases phases;
   Waves waves;
-  find_waves(acquisition, lines, path, mean_delay, UNDISTURBED, &waves);
+  find_phases(acquisition, lines, path, mean_delay, &phases);
+  find_waves(lines, &phases, UNDISTURBED, &waves);
   const float still = overlap(waves.received, waves.transmitted, count), own_width = width_of(&waves, count);
-  find_waves(acquisition, lines, path, mean_delay, BY_PHASE, &waves);
-  // Strong tissue takes parts of the aperture away. That is in the level; the line's neighbours are taken away by it
-  // too, so that a wider beam would brighten its shadow.
+  // Strong and very lossy tissue takes parts of the aperture away. That is in the level; the line's neighbours are
+  // taken away by it too, so that a wider beam would brighten its shadow.
+  find_waves(lines, &phases, lines->uneven < MOST_UNEVEN ? BY_LOSS : BY_PHASE, &waves);
   const float spread = clamp(width_of(&waves, count) / own_width, 1.0f, MOST_SPREAD);
-  const float by_phase = fmax(overlap(waves.received, waves.transmitted, count) / still, 1e-4f);
+  if (lines->uneven >= MOST_UNEVEN) find_waves(lines, &phases, BY_LOSS, &waves);
+  const float by_soft = fmax(overlap(waves.received, waves.transmitted, count) / still, LEAST_POWER);
   float differs = 0.0f;
   for (int row = 0; row < ROWS; row++)
     for (int i = 0; i < count; i++) differs = fmax(differs, fabs(lines->passed[row][i] - 1.0f));
-  float level = by_phase;
+  float level = by_soft;
   if (differs > 0.0f) {
-    find_waves(acquisition, lines, path, mean_delay, BY_TISSUE, &waves);
-    level = fmax(overlap(waves.received, waves.transmitted, count) / still, LEAST_POWER);
+    find_waves(lines, &phases, BY_TISSUE, &waves);
+    level = fmax(overlap(waves.received, waves.transmitted, count) / still, LEAST_POWER * by_soft);
   }
-  return (float3)(-0.5f * log(by_phase), 0.5f * log(by_phase / level), spread);
+  const float own = lines->uneven < LEAST_UNEVEN ? loss : lines->least_loss;  // that of a line which is `kept`
+  return (float3)(own - loss - 0.5f * log(by_soft), 0.5f * log(by_soft / level), spread);
+}
+
+// Of lines that soft tissue alone disturbs: the mean loss of what arrives.
+inline float mean_loss(const Lines *lines) {
+  float all = 0.0f, losses = 0.0f;
+  for (int row = 0; row < ROWS; row++)
+    for (int i = 0; i < lines->count; i++) {
+      const float amplitude = lines->kept[row][i];
+      const float power = ROW_WEIGHT(row) * lines->weight[i] * amplitude * amplitude;
+      all += power;
+      losses += power * lines->loss[row][i];
+    }
+  return losses / fmax(all, 1e-6f);
 }
 
 // One work-item computes one depth of one screen line. Global size (depths, screen lines).
@@ -436,8 +486,8 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
     float row_power = 0.0f;
     row_lift[row] = 0.0f;
     for (int i = 0; i < lines.count; i++) {
-      const float passed = lines.passed[row][i], x = lines.x[i], delay = lines.delay[row][i];
-      // A little is left of what strong tissue stops, so that there is always a mean.
+      const float passed = lines.passed[row][i] * lines.kept[row][i], x = lines.x[i], delay = lines.delay[row][i];
+      // A little is left of what tissue stops, so that there is always a mean.
       const float power = ROW_WEIGHT(row) * (lines.weight[i] * (passed * passed + LEFT_FOR_MEANS) + 1e-6f);
       row_power += power;
       row_lift[row] += power * lines.lift[row][i];
@@ -459,11 +509,11 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
     // In strong tissue, a beam has the level that it has before it: what this tissue takes is a matter of its ray.
     const float depth = depth_before_strong(acquisition, sums, path, origin, direction, centre);
     if (depth < path) find_lines(acquisition, sums, depth, origin, direction, centre, &lines);
-    found = level_and_spread(acquisition, &lines, depth, mean_delay);
+    found = level_and_spread(acquisition, &lines, depth, mean_delay, depth < path ? mean_loss(&lines) : losses / all);
   }
   const float4 screen = (float4)(losses / all + found.x + found.y, mean_delay - slope * mean_x, slope * path, rise);
   vstore4(screen, line * nodes + node, screens_);
-  shades[line * nodes + node] = found.y;
+  vstore2((float2)(found.y, losses / all), line * nodes + node, shades);
   vstore2((float2)(found.z, 1.0f), line * nodes + node, spreads);
 }
 
@@ -521,10 +571,10 @@ __kernel void beams(__constant const Acquisition *acquisition, __global const fl
                     __global const float *shades, __global float *beams_) {
   const int number = get_global_id(0), line = get_global_id(1), depths = acquisition->screen_depths;
   const int to = line * (1 + depths) + number;
-  __global float *shade = beams_ + 4 * acquisition->traced_lines * (1 + depths) + to;
+  __global float *shade = beams_ + 4 * acquisition->traced_lines * (1 + depths);
   if (number == 0) {
     vstore4((float4)(0.0f), to, beams_);
-    *shade = 0.0f;
+    vstore2((float2)(0.0f), to, shade);
     return;
   }
   const float per_line = (acquisition->screen_lines - 1.0f) / (acquisition->traced_lines - 1);
@@ -533,7 +583,9 @@ __kernel void beams(__constant const Acquisition *acquisition, __global const fl
   const float4 left = vload4(before * depths + number - 1, screens_);
   const float4 right = vload4((before + 1) * depths + number - 1, screens_);
   float4 beam = left + (place - before) * (right - left);
-  *shade = blend(shades[before * depths + number - 1], shades[(before + 1) * depths + number - 1], place - before);
+  const float2 left_shade = vload2(before * depths + number - 1, shades);
+  const float2 right_shade = vload2((before + 1) * depths + number - 1, shades);
+  vstore2(left_shade + (place - before) * (right_shade - left_shade), to, shade);
   const float path = number * acquisition->screen_step;
   const float4 per_strip = (right - left) * per_line;  // from line to line
   const float apart = line_distance(acquisition, path), tilt = beam.z / path;

@@ -47,8 +47,8 @@ class Aperture(Stage):
         lines, depths, traced = (int(fields[name]) for name in ("screen_lines", "screen_depths", "traced_lines"))
         fan = int(fields["fan_angles"]), int(fields["fan_points"]), ROWS
         frame.screens, frame.spreads = get("screens", lines * depths * 16), get("spreads", lines * depths * 8)
-        frame.beams = get("beams", traced * (1 + depths) * 20)
-        shades = get("shades", lines * depths * 4)
+        frame.beams = get("beams", traced * (1 + depths) * 24)
+        shades = get("shades", lines * depths * 8)
         if not fields["aperture_beams"]:
             return
         acoustics = get("acoustics", len(frame.medium.rows) * 16)

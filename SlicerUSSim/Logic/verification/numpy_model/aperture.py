@@ -15,6 +15,7 @@ _EDGE_OF_BONE = 0.75  # part of a cell from which lines are lost in it by their 
 _LEAST_OPEN = 0.05  # amplitude that is left by the part that bone covers
 _LEAST = 1e-3  # nepers by which strong tissue differs from soft
 _MOST_SPREAD = 3.0  # of a beam
+_LEAST_UNEVEN, _MOST_UNEVEN = 0.02, 0.7  # nepers by which soft tissue takes more from one line than from another
 _SOFT_SPEED, _SOFT_REFLECTION = 0.105, 0.12  # largest contrasts of a soft border
 _LOSSY_PER_MM, _LOSSY_SPEED = 0.8, 5000.0  # nepers both ways, and m/s
 _STRAIGHT_SPEED = 0.2  # and of strong tissue in which paths go straight on
@@ -60,22 +61,23 @@ class Screens:
         self.points = np.stack([self.along, 0.0 * self.along], -1) if self.is_flat else bent
 
     def run(self) -> tuple[np.ndarray, np.ndarray]:
-        """((screen lines, depths, 5) float32 nepers lost both ways, extra path and two deflections in mm; widths).
+        """((screen lines, depths, 6) float32 nepers lost both ways, extra path and two deflections in mm; widths).
 
-        The last of the five is the nepers of the first that strong tissue takes.
+        The last of the six are the nepers of the first that strong tissue takes, and those that soft tissue has taken
+        from what arrives, on the mean.
         Widths (screen lines, depths, 2) are those of the beam re an undisturbed one, and factors of its echoes.
         """
         fields = self.fields
         count, depths = fields["screen_lines"], fields["screen_depths"]
         if not fields["aperture_beams"]:
-            return np.zeros((count, depths, 5), np.float32), np.ones((count, depths, 2), np.float32)
+            return np.zeros((count, depths, 6), np.float32), np.ones((count, depths, 2), np.float32)
         sums = self._fans()
         traced = np.arange(count) * (fields["traced_lines"] - 1) / (count - 1) - fields["guard_lines"]
         position = fields["first_line"] + fields["line_spacing"] * traced / fields["lateral_rays"]
         paths = fields["screen_step"] * np.arange(1, depths + 1)
         found = np.array([[self._beam(sums, line, path) for path in paths] for line in position], np.float32)
-        factors = self._kept_levels(found[..., 0], found[..., 5], f32(paths))
-        return found[..., :5], np.stack([found[..., 5], factors], -1)
+        factors = self._kept_levels(found[..., 0], found[..., 6], f32(paths))
+        return found[..., :6], np.stack([found[..., 6], factors], -1)
 
     def _fans(self) -> np.ndarray:
         """(rows, points, angles, depths, 4) sums: extra path, nepers, by strong tissue, elevational deflection."""
@@ -215,7 +217,7 @@ class Screens:
         return np.sqrt(passed(sigma) / passed(sigma * widths)).astype(np.float32)
 
     def _beam(self, sums: np.ndarray, position: float, path: float) -> tuple[float, ...]:
-        """Nepers lost, extra path, two deflections, nepers lost to strong tissue, width: at one depth of one line."""
+        """Nepers lost, extra path, two deflections, nepers lost to strong and to soft tissue, width: at one depth."""
         fields = self.fields
         angle = np.arcsin(fields["steering_sin"]) if fields["linear"] else position
         direction, across = np.array([np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
@@ -231,17 +233,12 @@ class Screens:
             used = np.flatnonzero(away <= reach + 0.5 * pitch * (1.0 + 1e-6))
             open_ = np.clip((reach - away[used]) / pitch + 0.5, 0.0, 1.0)
             delay, loss, passed, lift = self._sums_at(sums, used, origin + depth * direction, depth)
-            return (
-                (self.points[used] - origin) @ across,
-                open_,
-                delay,
-                loss,
-                passed,
-                lift,
-            )
+            uneven = np.ptp(loss) >= _LEAST_UNEVEN
+            kept = np.exp(-0.5 * (loss - loss.min())) if uneven else np.ones_like(loss)
+            return (self.points[used] - origin) @ across, open_, delay, loss, kept, passed, lift
 
-        x, open_, delay, loss, passed, lift = lines_to(path)
-        power = _WEIGHTS[:, None] * (open_ * (passed**2 + 0.01) + 1e-6)
+        x, open_, delay, loss, kept, passed, lift = lines_to(path)
+        power = _WEIGHTS[:, None] * (open_ * ((kept * passed) ** 2 + 0.01) + 1e-6)
         share = power / power.sum()
         mean_x, mean_delay = (share * x).sum(), (share * delay).sum()
         spread, common = (share * x**2).sum() - mean_x**2, (share * x * delay).sum() - mean_x * mean_delay
@@ -251,16 +248,23 @@ class Screens:
         lost = (share * loss).sum()
 
         depth = self._depth_before_strong(sums, centre, origin + path * direction, path)
-        x, open_, delay, _, passed, _ = lines_to(depth)
+        mean_loss = lost
+        if depth < path:
+            x, open_, delay, loss, kept, passed, _ = lines_to(depth)
+            mean_loss = np.average(loss, weights=_WEIGHTS[:, None] * open_ * kept**2)
         cycles = 0.5 * fields["cycles_per_mm"]
         focus = np.exp(1j * np.pi * cycles * (1.0 / depth - 1.0 / Beam(self.acquisition).transmit_focus(depth)) * x**2)
         wave = open_ * np.exp(2j * np.pi * cycles * (delay - mean_delay))
-        still, bent, stopped = (_two_way(each, focus) for each in (open_[None], wave, wave * passed))
-        by_phase = max(bent.sum() / still.sum(), 1e-4)
-        level = max(stopped.sum() / still.sum(), 1e-7) if (passed != 1.0).any() else by_phase
-        shade = 0.5 * np.log(by_phase / level)
-        spread = np.clip(_width(bent) / _width(still), 1.0, _MOST_SPREAD)
-        return lost - 0.5 * np.log(level), mean_delay - slope * mean_x, slope * path, rise, shade, spread
+        waves = open_[None], wave, wave * kept, wave * kept * passed
+        still, bent, soft, stopped = (_two_way(each, focus) for each in waves)
+        by_soft = max(soft.sum() / still.sum(), 1e-7)
+        level = max(stopped.sum() / still.sum(), 1e-7 * by_soft) if (passed != 1.0).any() else by_soft
+        shade = 0.5 * np.log(by_soft / level)
+        own = loss.min() if np.ptp(loss) >= _LEAST_UNEVEN else mean_loss  # of a line that is `kept`
+        width = _width(soft if np.ptp(loss) < _MOST_UNEVEN else bent)
+        spread = np.clip(width / _width(still), 1.0, _MOST_SPREAD)
+        nepers = lost + own - mean_loss - 0.5 * np.log(level)
+        return nepers, mean_delay - slope * mean_x, slope * path, rise, shade, lost, spread
 
 
 def _intensity(wave: np.ndarray) -> np.ndarray:

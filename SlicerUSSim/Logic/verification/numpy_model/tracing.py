@@ -33,6 +33,8 @@ _MOST_COURSES = 16
 _MOST_GATHERED, _LEAST_GATHERED = 64, f32(0.4)  # lines with scatterers in common, and the least part of their power
 _MOST_BEFORE_STRONG = f32(0.35)  # nepers by which a piece of a beam in front of bone may differ from its ray
 _MOST_LOSS = 1.0  # nepers by which strong tissue may change the frequency of what has passed it
+_LEAST_GIVEN = f32(0.2)  # nepers lost to a layer which are given back behind it, not along the whole piece
+_NO_DECAY = f32(1e9)  # in front of a piece: what it starts in lies in front of nothing
 
 
 @dataclass
@@ -63,6 +65,10 @@ class Rays:
     front: np.ndarray
     front_weight: np.ndarray
     excess: np.ndarray  # nepers by which strong tissue has attenuated more
+    taken: np.ndarray  # nepers lost to soft tissue since the start of the piece
+    given_from: np.ndarray  # path from which losses are given back, ...
+    given: np.ndarray  # ... and the nepers lost to that layer
+    decay_before: np.ndarray  # in front of the tissue that the ray is in
     # The node, set by Tracer._begin: course in voxels, its end, state since its start
     start: np.ndarray = field(init=False)
     step: np.ndarray = field(init=False)
@@ -139,6 +145,7 @@ class Tracer:
             piece=np.full(count, 0 if self.acquisition["aperture_beams"] else -1),
             since_path=zero, course=np.zeros(count, int), shade=zero, strong=np.zeros(count, int),
             front=np.zeros(count, int), front_weight=one, excess=zero,
+            taken=zero, given_from=zero, given=zero, decay_before=zero,
         )  # fmt: skip
 
     def _starts(self, line: np.ndarray) -> np.ndarray:
@@ -149,7 +156,7 @@ class Tracer:
     # ---- pieces of a beam ------------------------------------------------------------------------------------------
 
     def _beams_at(self, line: np.ndarray, number: np.ndarray) -> np.ndarray:
-        """(n, 5) beams of traced lines at the ends `number` of pieces, as in aperture.Screens."""
+        """(n, 6) beams of traced lines at the ends `number` of pieces, as in aperture.Screens."""
         acquisition, count = self.acquisition, len(self.screens)
         per_line = f32(count - 1) / f32(acquisition["traced_lines"] - 1)
         place = line.astype(np.float32) * per_line
@@ -187,6 +194,7 @@ class Tracer:
         )
         rays.piece[at] = np.where(number < depths, number, -1)
         rays.since_path[at], rays.course[at], rays.shade[at] = path, 0, beam[:, 4]
+        rays.taken[at], rays.given[at], rays.given_from[at], rays.decay_before[at] = 0, 0, path, _NO_DECAY
         has_next = number < depths
         at, root, beam = at[has_next], root.of(has_next), beam[has_next]
         turn = self._beams_at(rays.line[at], number[has_next] + 1) - beam
@@ -197,22 +205,45 @@ class Tracer:
         return rays
 
     def _correction(self, rays: Rays, path, depth, log_attenuation, depth_per_mm, more) -> np.ndarray:
-        """(n, 2) changes of depth and of log amplitude per mm by which rays agree with their beams at a piece's end.
+        """(n, 4) by which rays agree with their beams at a piece's end, where they have lost `more` nepers.
 
-        There they have lost `more` nepers; 0 where a line is a ray.
+        Changes per mm of depth since the start of the piece, and of log amplitude and loss since the path that is the
+        fourth; 0 where a line is a ray.
         """
-        beam = self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))
+        beam, started = (self._beams_at(rays.line, np.maximum(rays.piece + n, 0)) for n in (1, 0))
         end = f32(rays.piece + 1) * self.acquisition["screen_step"]
-        rest = end - path
+        rest, last = end - path, np.maximum(end, path)
+        decay = self.decay[self._front(rays)]
         depth_left = self._starts(rays.line) + end + beam[:, 1] - (depth + rest * depth_per_mm)
-        log_left = -beam[:, 0] - more - (log_attenuation - rest * self.decay[self._front(rays)])
-        along = np.maximum(np.maximum(end, path) - rays.since_path, f32(1e-3))[:, None]
-        return np.where((rays.piece >= 0)[:, None], np.stack([depth_left, log_left], -1) / along, f32(0))
+        log_left = -beam[:, 0] - more - (log_attenuation - rest * decay)
+        spared = rays.taken + rest * decay - (beam[:, 5] - started[:, 5])
+        spared = np.clip(spared, np.minimum(log_left, f32(0)), np.maximum(log_left, f32(0)))
+        since = np.where(log_left > 0, np.maximum(rays.since_path, rays.given_from), rays.since_path)
+        along, of_piece = (np.maximum(last - start, f32(1e-3)) for start in (since, rays.since_path))
+        found = np.stack([depth_left / of_piece, log_left / along, -spared / along, since], -1)
+        return np.where((rays.piece >= 0)[:, None], found, f32(0))
 
-    def _keep_correction(self, rays: Rays, per_mm: np.ndarray) -> None:
+    def _keep_correction(self, rays: Rays, correction: np.ndarray) -> None:
         """Keep a correction for what was written in the piece."""
         written = rays.strong != _UNDER
-        self._corrections.append((self._piece_keys(rays)[written], per_mm[written], rays.since_path[written]))
+        kept = np.concatenate([correction, rays.since_path[:, None]], axis=1)
+        self._corrections.append((self._piece_keys(rays)[written], kept[written]))
+
+    @staticmethod
+    def _corrections_at(rays: Rays, path: np.ndarray, correction: np.ndarray) -> tuple[np.ndarray, ...]:
+        """(n,) changes of depth, log amplitude and loss of rays at a path."""
+        along = _corrected_length(path, correction[:, 3])
+        depth = correction[:, 0] * _corrected_length(path, rays.since_path)
+        return depth, correction[:, 1] * along, correction[:, 2] * along
+
+    @staticmethod
+    def _give_back(rays: Rays, which: np.ndarray, lost: np.ndarray, path: np.ndarray) -> np.ndarray:
+        """Which of these rays give back losses from `path` on: of the layer in which most is lost. Noted in rays."""
+        gives = which & (rays.piece >= 0) & (rays.strong == _NOT_STRONG)
+        gives &= lost > np.maximum(rays.given, _LEAST_GIVEN)
+        rays.given = np.where(gives, lost, rays.given)
+        rays.given_from = np.where(gives, path, rays.given_from)
+        return gives
 
     @staticmethod
     def _front(rays: Rays) -> np.ndarray:
@@ -240,22 +271,25 @@ class Tracer:
         """Apply the corrections to the segments and hits of the pieces."""
         if not self.acquisition["aperture_beams"]:
             return
-        keys, per_mm, since = (np.concatenate(parts) for parts in zip(*self._corrections, strict=True))
+        keys, kept = (np.concatenate(parts) for parts in zip(*self._corrections, strict=True))
         courses = len(self._root) * self.screens.shape[1] * _MOST_COURSES
-        table = np.zeros((courses + 1, 3), np.float32)
-        table[keys[keys >= 0]] = np.concatenate([per_mm, since[:, None]], axis=1)[keys >= 0]
+        table = np.zeros((courses + 1, 5), np.float32)
+        table[keys[keys >= 0]] = kept[keys >= 0]
         for records, pieces in ((self._segments, self._segment_pieces), (self._hits, self._hit_pieces)):
             for record, key in zip(records, pieces, strict=True):
-                depth, log_amplitude, start = table[key].T
-                along = _corrected_length(record["path_mm"], start)
+                depth, log_amplitude, loss, since, start = table[key].T
+                along = _corrected_length(record["path_mm"], since)
                 factor = exp(log_amplitude * along)
-                record["depth_mm"] += depth * along
+                record["depth_mm"] += depth * _corrected_length(record["path_mm"], start)
                 record["attenuation"] *= factor
+                record["loss"] += loss * along
                 if "echo" in (record.dtype.names or ()):
                     record["echo"] *= factor
-                else:
+                else:  # segments end where losses are given back
+                    behind = record["path_mm"] + f32(0.5) * record["length_mm"] >= since
                     record["depth_per_mm"] += depth
-                    record["decay_per_mm"] -= log_amplitude
+                    record["decay_per_mm"] -= np.where(behind, log_amplitude, f32(0))
+                    record["loss_per_mm"] += np.where(behind, loss, f32(0))
 
     # ---- nodes -----------------------------------------------------------------------------------------------------
 
@@ -342,11 +376,14 @@ class Tracer:
         until = np.where(border < 0, longest, border)
         spent_until = rays.spent + decay * (until - rays.since)
         ends = (border < 0) | (group[other] != group[rays.label])
-        written = self._write_segments(rays, decay, until, spent_until, ends)
+        lost = (decay - self.decay[other]) * (until - rays.since)
+        gives = self._give_back(rays, ~ends, lost, rays.path + until)
+        written = self._write_segments(rays, decay, until, spent_until, ends, gives)
 
         on = rays.of(~ends)
         on.since = until[~ends]
         on.spent, on.label, on.inside = spent_until[~ends], other[~ends], border[~ends]
+        on.decay_before = decay[~ends]
         met = ends & (border >= 0)
         rays.spent = spent_until
         branches = self._branch(rays.of(met), border[met], other[met], written[met])
@@ -358,14 +395,15 @@ class Tracer:
     def _next_pieces(self, rays: Rays, until: np.ndarray, goes_dark: np.ndarray) -> list[Rays]:
         """End the pieces of rays that met no more border; returns those that go on, at the next piece or below."""
         path, depth = rays.path + until, rays.depth + until * rays.depth_per_mm
-        rays.excess = self._excess(rays, until)
+        lost = (self.decay[self._front(rays)] - rays.decay_before) * (until - rays.since)
+        self._give_back(rays, np.ones(len(rays), bool), lost, rays.path + rays.since)
+        rays.excess, rays.taken = self._excess(rays, until), self._taken(rays, until)
         more = rays.excess + np.where(goes_dark, rays.shade - self._next_shade(rays), f32(0))
-        per_mm = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rays.depth_per_mm, more)
-        self._keep_correction(rays, per_mm)
-        along = _corrected_length(path, rays.since_path)[:, None]
-        rays.depth, rays.log_attenuation = depth, rays.log_attenuation - rays.spent
-        rays.depth, rays.log_attenuation = np.stack([rays.depth, rays.log_attenuation]) + (per_mm * along).T
-        rays.path, rays.loss = path, rays.loss + rays.spent
+        by = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rays.depth_per_mm, more)
+        self._keep_correction(rays, by)
+        deeper, louder, less = self._corrections_at(rays, path, by)
+        rays.depth, rays.log_attenuation = depth + deeper, rays.log_attenuation - rays.spent + louder
+        rays.path, rays.loss = path, rays.loss + rays.spent + less
 
         below = rays.of(goes_dark)  # the beam may go on behind this tissue
         below.axis = below.axis + until[goes_dark][:, None] * below.direction
@@ -373,6 +411,7 @@ class Tracer:
         below.strong[:], below.weight = _UNDER, below.front_weight
         below.log_attenuation, below.loss = below.log_attenuation + below.excess, below.loss - below.excess
         below.excess, below.since_path, below.blind_until = 0.0 * below.excess, below.path, below.path
+        below.given_from = below.path
 
         on = rays.of((until == rays.to_piece) & ~goes_dark)
         on = self._start_pieces(on, on.piece + 1)
@@ -384,7 +423,12 @@ class Tracer:
         more = rays.spent - until * self.decay[self._front(rays)]
         return np.where(rays.strong == _THROUGH, rays.excess + more, rays.excess)
 
-    def _write_segments(self, rays: Rays, decay, until, spent_until, ends) -> np.ndarray:
+    def _taken(self, rays: Rays, until: np.ndarray) -> np.ndarray:
+        """The nepers that soft tissue has taken since the start of the piece, at lengths of the nodes."""
+        own = np.where(rays.strong == _THROUGH, until * self.decay[self._front(rays)], rays.spent)
+        return rays.taken + own
+
+    def _write_segments(self, rays: Rays, decay, until, spent_until, ends, gives) -> np.ndarray:
         """Write the segments of the axis rays; returns the index of each ray's last segment (-1: none)."""
         earlier = rays.since - rays.open
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -394,10 +438,12 @@ class Tracer:
         self._segment_of(rays, closes, rays.open, rays.since, rays.spent_open, rays.spent)
         rays.open = np.where(closes, rays.since, rays.open)
         rays.spent_open = np.where(closes, rays.spent, rays.spent_open)
-        last = on_axis & ends & (until > rays.open)
+        last = on_axis & (ends | gives) & (until > rays.open)
         self._segment_of(rays, last, rays.open, until, rays.spent_open, spent_until)
         written = np.full(len(rays), -1)
         written[last] = np.arange(last.sum())  # in the last written block
+        rays.open = np.where(last, until, rays.open)
+        rays.spent_open = np.where(last, spent_until, rays.spent_open)
         return written
 
     def _segment_of(self, rays: Rays, which, begin, end, spent_begin, spent_end) -> None:
@@ -441,20 +487,23 @@ class Tracer:
         under, beam = rays.strong == _UNDER, rays.piece >= 0
         bent = ~under & strong & ~(beam & ~bends(front, seen[other]))
         path, depth = rays.path + border, rays.depth + border * rays.depth_per_mm
-        rays.excess = self._excess(rays, border)
+        lost = (self.decay[rays.label] - self.decay[other]) * (border - rays.since)
+        self._give_back(rays, ~strong_border, lost, path)
+        rays.excess, rays.taken = self._excess(rays, border), self._taken(rays, border)
         leaves, next_shade = ~keep, self._next_shade(rays)
         behind_rate = acquisition["reference_speed_m_s"] / tissues["speed_of_sound_m_s"][other]
         rate = np.where(bent | under | leaves, rays.depth_per_mm, behind_rate)
         more = rays.excess + np.where(leaves, f32(0), rays.shade - next_shade)
-        per_mm = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rate, more)
-        most = np.where(bent, _MOST_BEFORE_STRONG / acquisition["screen_step"], f32(np.inf))
-        per_mm[:, 1] = np.clip(per_mm[:, 1], -most, most)
-        corrected = _corrected_length(path, rays.since_path)[:, None] * per_mm
+        by = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rate, more)
+        most = np.where(bent, _MOST_BEFORE_STRONG / acquisition["screen_step"], f32(np.inf))[:, None]
+        by[:, 1:3] = np.clip(by[:, 1:3], -most, most)
+        corrected = np.stack(self._corrections_at(rays, path, by), -1)
         # A beam ends where it is bent, and where it leaves the field; below strong tissue it begins again.
         ends = np.flatnonzero(beam & (leaves | bent | (under & ~strong)))
-        self._keep_correction(rays.of(ends), per_mm[ends])
+        self._keep_correction(rays.of(ends), by[ends])
         rays.depth[ends] += corrected[ends, 0]
         rays.log_attenuation[ends] += corrected[ends, 1]
+        rays.loss[ends] += corrected[ends, 2]
         corrected[ends] = 0.0
         below = rays.of(keep)  # where the beam goes on below strong tissue
         ended = rays.of(bent)
@@ -506,6 +555,7 @@ class Tracer:
         child.reflections = child.reflections + 1
         child.path, child.depth = path[reflects], depth[reflects] + corrected[reflects, 0]
         child.log_attenuation = log_attenuation[reflects] + corrected[reflects, 1]
+        child.loss = child.loss + corrected[reflects, 2]
         child.piece[:], child.strong[:] = -1, _NOT_STRONG
 
         bent_rays = rays.of(refracts)
@@ -536,6 +586,7 @@ class Tracer:
         below.weight, below.log_attenuation = below.front_weight, log_attenuation[goes_below] + below.excess
         below.strong[:], below.excess = _UNDER, 0.0 * below.excess
         below.loss, below.since_path = rays.loss[goes_below], path_of_all[goes_below]
+        below.given_from = below.since_path
 
         ahead = np.flatnonzero(~bent)
         on = rays.of(ahead)
@@ -543,6 +594,7 @@ class Tracer:
         on.front, on.front_weight = np.where(enters, on.label, on.front), np.where(enters, on.weight, on.front_weight)
         on.strong = np.where(enters, _THROUGH, on.strong)
         on.weight, on.log_attenuation = on.weight - lost[ahead], log_attenuation[ahead]
+        on.decay_before = self.decay[np.where(under[ahead], on.front, on.label)]
         for course, some in ((on, ahead), (below, goes_below)):
             course.axis, course.tube, course.path = point[some] - aside[some], tube[some], path_of_all[some]
             course.depth, course.label, course.blind_until = depth[some], other[some], blind_until[some]
@@ -565,6 +617,7 @@ class Tracer:
         rays.shade, rays.excess = np.where(out, next_shade, rays.shade), np.where(out, f32(0), rays.excess)
         again = out & (rays.strong == _UNDER)
         rays.since_path = np.where(again, rays.path, rays.since_path)
+        rays.given_from = np.where(again, rays.path, rays.given_from)
         rays.course, rays.strong = rays.course + again, np.where(out, _NOT_STRONG, rays.strong)
         return rays.of(~(out & self._are_dark(rays)))
 
