@@ -40,7 +40,7 @@ typedef struct {
   int piece_has;  // number of segments or hits written before this piece
   float from;     // path length from which the piece is corrected: its start, or the end of strong tissue in it
   float shade;    // nepers lost there to strong tissue beside the axis or in front
-  float soft;     // nepers lost to soft tissue since the start of the piece
+  float soft;     // the part of the loss that is of soft tissue
   float given_from, given;  // path length from which losses are given back, and the nepers lost to that layer
   float decay_before;       // in front of the tissue that it is in
   // Strong tissue in which a beam goes straight on; the last soft tissue, the weight there, and the nepers since then
@@ -299,7 +299,7 @@ inline void start_piece(__constant const Acquisition *acquisition, __global cons
   ray->piece_has = count;
   ray->from = ray->given_from = number * acquisition->screen_step;
   ray->shade = shades[2 * number];
-  ray->soft = ray->given = 0.0f;
+  ray->given = 0.0f;
   ray->decay_before = 1e9f;  // what it starts in lies in front of nothing
   const float4 here = vload4(number, beams);
   const float path = number * acquisition->screen_step;
@@ -320,8 +320,8 @@ typedef struct {
 } Correction;
 
 // The correction by which a ray agrees with its beam at the end of the piece, which has lost `more` nepers there. The
-// ray is at `path`, with `soft` nepers lost to soft tissue in this piece; from there on it is continued with these
-// rates of depth and decay.
+// ray is at `path`, with `soft` nepers lost to soft tissue; from there on it is continued with these rates of depth and
+// decay.
 inline Correction correction(__constant const Acquisition *acquisition, __global const float *beams,
                              __global const float *shades, float start, const Ray *ray, float path, float depth,
                              float log_attenuation, float soft, float depth_per_mm, float decay, float more) {
@@ -329,14 +329,14 @@ inline Correction correction(__constant const Acquisition *acquisition, __global
   // A border may turn out to lie a little beyond the end; no ray is corrected by more than it lacks at the end.
   const float end = (ray->piece + 1) * acquisition->screen_step, rest = end - path, last = fmax(end, path);
   const float lack = -beam.x - more - (log_attenuation - rest * decay);
-  // Of what the ray lacks, the part that soft tissue has taken from it and not from the beam
-  const float spared = soft + rest * decay - (shades[2 * ray->piece + 3] - shades[2 * ray->piece + 1]);
+  // What soft tissue has taken from it and not, on the mean, from the lines of which something arrives
+  const float spared = soft + rest * decay - shades[2 * ray->piece + 3];
   Correction result;
-  result.since = lack > 0.0f ? fmax(ray->from, ray->given_from) : ray->from;
+  result.since = lack > 0.0f || spared > 0.0f ? fmax(ray->from, ray->given_from) : ray->from;
   const float per_mm = 1.0f / fmax(last - result.since, 1e-3f);
   result.depth = (start + end + beam.y - (depth + rest * depth_per_mm)) / fmax(last - ray->from, 1e-3f);
   result.amplitude = lack * per_mm;
-  result.loss = -clamp(spared, fmin(lack, 0.0f), fmax(lack, 0.0f)) * per_mm;
+  result.loss = -spared * per_mm;
   return result;
 }
 
@@ -510,6 +510,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         ray.depth += until * depth_per_mm + by.depth * corrected_length(ray.path, ray.from);
         ray.log_attenuation += by.amplitude * corrected_length(ray.path, by.since) - spent;
         ray.loss += by.loss * corrected_length(ray.path, by.since) + spent;
+        ray.soft += by.loss * corrected_length(ray.path, by.since);
         if (goes_dark) {  // but the beam may go on behind this tissue
           cut_weight += ray.weight;
           ray.axis += until * ray.direction;

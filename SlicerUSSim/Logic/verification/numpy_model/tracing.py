@@ -65,7 +65,7 @@ class Rays:
     front: np.ndarray
     front_weight: np.ndarray
     excess: np.ndarray  # nepers by which strong tissue has attenuated more
-    taken: np.ndarray  # nepers lost to soft tissue since the start of the piece
+    taken: np.ndarray  # the part of the loss that is of soft tissue
     given_from: np.ndarray  # path from which losses are given back, ...
     given: np.ndarray  # ... and the nepers lost to that layer
     decay_before: np.ndarray  # in front of the tissue that the ray is in
@@ -194,7 +194,7 @@ class Tracer:
         )
         rays.piece[at] = np.where(number < depths, number, -1)
         rays.since_path[at], rays.course[at], rays.shade[at] = path, 0, beam[:, 4]
-        rays.taken[at], rays.given[at], rays.given_from[at], rays.decay_before[at] = 0, 0, path, _NO_DECAY
+        rays.given[at], rays.given_from[at], rays.decay_before[at] = 0, path, _NO_DECAY
         has_next = number < depths
         at, root, beam = at[has_next], root.of(has_next), beam[has_next]
         turn = self._beams_at(rays.line[at], number[has_next] + 1) - beam
@@ -210,15 +210,14 @@ class Tracer:
         Changes per mm of depth since the start of the piece, and of log amplitude and loss since the path that is the
         fourth; 0 where a line is a ray.
         """
-        beam, started = (self._beams_at(rays.line, np.maximum(rays.piece + n, 0)) for n in (1, 0))
+        beam = self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))
         end = f32(rays.piece + 1) * self.acquisition["screen_step"]
         rest, last = end - path, np.maximum(end, path)
         decay = self.decay[self._front(rays)]
         depth_left = self._starts(rays.line) + end + beam[:, 1] - (depth + rest * depth_per_mm)
         log_left = -beam[:, 0] - more - (log_attenuation - rest * decay)
-        spared = rays.taken + rest * decay - (beam[:, 5] - started[:, 5])
-        spared = np.clip(spared, np.minimum(log_left, f32(0)), np.maximum(log_left, f32(0)))
-        since = np.where(log_left > 0, np.maximum(rays.since_path, rays.given_from), rays.since_path)
+        spared = rays.taken + rest * decay - beam[:, 5]
+        since = np.where((log_left > 0) | (spared > 0), np.maximum(rays.since_path, rays.given_from), rays.since_path)
         along, of_piece = (np.maximum(last - start, f32(1e-3)) for start in (since, rays.since_path))
         found = np.stack([depth_left / of_piece, log_left / along, -spared / along, since], -1)
         return np.where((rays.piece >= 0)[:, None], found, f32(0))
@@ -403,7 +402,7 @@ class Tracer:
         self._keep_correction(rays, by)
         deeper, louder, less = self._corrections_at(rays, path, by)
         rays.depth, rays.log_attenuation = depth + deeper, rays.log_attenuation - rays.spent + louder
-        rays.path, rays.loss = path, rays.loss + rays.spent + less
+        rays.path, rays.loss, rays.taken = path, rays.loss + rays.spent + less, rays.taken + less
 
         below = rays.of(goes_dark)  # the beam may go on behind this tissue
         below.axis = below.axis + until[goes_dark][:, None] * below.direction
@@ -424,7 +423,7 @@ class Tracer:
         return np.where(rays.strong == _THROUGH, rays.excess + more, rays.excess)
 
     def _taken(self, rays: Rays, until: np.ndarray) -> np.ndarray:
-        """The nepers that soft tissue has taken since the start of the piece, at lengths of the nodes."""
+        """The nepers that soft tissue has taken, at lengths of the nodes."""
         own = np.where(rays.strong == _THROUGH, until * self.decay[self._front(rays)], rays.spent)
         return rays.taken + own
 
