@@ -39,7 +39,7 @@ typedef struct {
   int piece;      // of the beam, that starts at path piece x screen_step; -1 where the line is a ray
   int piece_has;  // number of segments or hits written before this piece
   float from;     // path length from which the piece is corrected: its start, or the end of strong tissue in it
-  float shade;    // nepers lost there to strong tissue beside the axis or in front
+  float shade;    // nepers lost to strong tissue beside the axis or in front: there, or where it entered such tissue
   float soft;     // the part of the loss that is of soft tissue
   float given_from, given;  // path length from which losses are given back, and the nepers lost to that layer
   float decay_before;       // in front of the tissue that it is in
@@ -298,7 +298,7 @@ inline void start_piece(__constant const Acquisition *acquisition, __global cons
   ray->piece = number < acquisition->screen_depths ? number : -1;
   ray->piece_has = count;
   ray->from = ray->given_from = number * acquisition->screen_step;
-  ray->shade = shades[2 * number];
+  if (ray->strong == NOT_STRONG) ray->shade = shades[4 * number];
   ray->given = 0.0f;
   ray->decay_before = 1e9f;  // what it starts in lies in front of nothing
   const float4 here = vload4(number, beams);
@@ -330,7 +330,7 @@ inline Correction correction(__constant const Acquisition *acquisition, __global
   const float end = (ray->piece + 1) * acquisition->screen_step, rest = end - path, last = fmax(end, path);
   const float lack = -beam.x - more - (log_attenuation - rest * decay);
   // What soft tissue has taken from it and not, on the mean, from the lines of which something arrives
-  const float spared = soft + rest * decay - shades[2 * ray->piece + 3];
+  const float spared = soft + rest * decay - shades[4 * ray->piece + 6];
   Correction result;
   result.since = lack > 0.0f || spared > 0.0f ? fmax(ray->from, ray->given_from) : ray->from;
   const float per_mm = 1.0f / fmax(last - result.since, 1e-3f);
@@ -353,7 +353,7 @@ inline int gives_back(Ray *ray, float decay, float decay_beside, float length, f
 // Whether strong tissue leaves nothing of a beam from piece `piece` on.
 inline int is_dark(__constant const Acquisition *acquisition, __global const float *shades, int piece) {
   for (int n = piece + 1; n <= acquisition->screen_depths; n++)
-    if (shades[2 * n] < DARKEST) return 0;
+    if (shades[4 * n] < DARKEST) return 0;
   return 1;
 }
 
@@ -407,8 +407,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
   __global Segment *my_segments = segments + line * MAX_SEGMENTS;
   __global Hit *my_hits = hits + max(slot, 0) * MAX_HITS;
   __global const float *my_beams = beams + line * (1 + acquisition->screen_depths) * 4;
-  __global const float *my_shades =
-      beams + (4 * acquisition->traced_lines + 2 * line) * (1 + acquisition->screen_depths);
+  __global const float *my_shades = beams + 4 * (acquisition->traced_lines + line) * (1 + acquisition->screen_depths);
   const int room = on_axis ? MAX_SEGMENTS : MAX_HITS;
   int count = 0;  // of segments or hits; a value above `room` means that some are missing
   float cut_weight = 0.0f;
@@ -499,7 +498,8 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         if (ray.piece >= 0)
           by = correction(acquisition, my_beams, my_shades, start, &ray, ray.path + until,
                           ray.depth + until * depth_per_mm, ray.log_attenuation - spent, ray.soft, depth_per_mm,
-                          own_decay, ray.excess + (goes_dark ? ray.shade - my_shades[2 * ray.piece + 2] : 0.0f));
+                          own_decay,
+                          ray.excess + (ray.strong != NOT_STRONG ? ray.shade - my_shades[4 * ray.piece + 4] : 0.0f));
         if (ray.piece >= 0 && on_axis) correct_segments(my_segments + ray.piece_has, written, by, ray.from);
         if (ray.piece >= 0 && !on_axis) correct_hits(my_hits + ray.piece_has, written, by, ray.from);
         if (!piece_ends && !goes_dark) {
@@ -570,7 +570,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         by = correction(
             acquisition, my_beams, my_shades, start, &ray, path, depth, log_attenuation, ray.soft,
             is_bent || is_under || leaves ? depth_per_mm : acquisition->reference_speed_m_s / behind.speed_of_sound_m_s,
-            own_decay, ray.excess + (leaves ? 0.0f : ray.shade - my_shades[2 * ray.piece + 2]));
+            own_decay, ray.excess + (leaves ? 0.0f : ray.shade - my_shades[4 * ray.piece + 4]));
       // What lies behind bone is not in front of it: of the beam's loss up to the piece's end, it is what phases take.
       const float most = MOST_BEFORE_STRONG / acquisition->screen_step;
       if (is_bent) {
@@ -581,8 +581,9 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       const float corrected_log = log_attenuation + by.amplitude * corrected_length(path, by.since);
       float loss = ray.loss + spent;
       const float corrected_loss = loss + by.loss * corrected_length(path, by.since);
-      Ray under = ray;                                                   // where the beam goes on below strong tissue
-      if (is_beam && (leaves || is_bent || (is_under && !is_strong))) {  // this course of the beam ends here
+      Ray under = ray;  // where the beam goes on below strong tissue
+      if (is_beam &&
+          (leaves || is_bent || (ray.strong != NOT_STRONG && !is_strong))) {  // this course of the beam ends here
         if (on_axis)
           correct_segments(my_segments + ray.piece_has, written, by, ray.from);
         else
@@ -684,7 +685,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         if (count > room) break;
         if (!is_strong && ray.strong != NOT_STRONG) {
           // What this and other strong tissue has taken from the beam is in the level of its aperture.
-          const float shade = my_shades[2 * ray.piece + 2];
+          const float shade = my_shades[4 * ray.piece + 5];
           ray.log_attenuation += ray.excess - (shade - ray.shade);
           // Of the pulse, the frequency falls by attenuation. Behind opaque tissue it is what has come past that.
           ray.loss -= ray.excess - clamp(shade - ray.shade, fmin(ray.excess, 0.0f), clamp(ray.excess, 0.0f, MOST_LOSS));
@@ -692,10 +693,8 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
           ray.shade = shade;
           ray.excess = 0.0f;
           ray.strong = NOT_STRONG;
-          if (is_under) {
-            ray.from = ray.given_from = path;
-            ray.piece_has = count;
-          }
+          ray.from = ray.given_from = path;
+          ray.piece_has = count;
           if (is_dark(acquisition, my_shades, ray.piece)) {
             cut_weight += ray.weight;
             break;

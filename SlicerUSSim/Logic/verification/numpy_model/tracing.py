@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from SlicerUSSim.Logic.opencl.layout import HIT, SEGMENT
-from SlicerUSSim.Logic.verification.numpy_model.aperture import as_beams_see, bends, is_soft
+from SlicerUSSim.Logic.verification.numpy_model.aperture import Lit, as_beams_see, bends, is_soft
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     LN10_OVER_20,
@@ -60,7 +60,7 @@ class Rays:
     piece: np.ndarray  # of the beam, from path piece x screen_step on; -1 where the line is a ray
     since_path: np.ndarray  # path from which the piece is corrected
     course: np.ndarray  # how often the piece was begun again behind strong tissue
-    shade: np.ndarray  # nepers lost to strong tissue there
+    shade: np.ndarray  # nepers lost to strong tissue there, or where the beam entered such tissue
     strong: np.ndarray  # what the beam goes through, since the soft tissue `front`
     front: np.ndarray
     front_weight: np.ndarray
@@ -109,6 +109,7 @@ class Tracer:
         self.elevation_sigma = Beam(acquisition).elevation_sigma
         self.to_voxel = acquisition["ras_to_voxel"]
         self.voxel_mm = acquisition["voxel_mm"]
+        self._lit = Lit(acquisition, screens)
         self.seen = as_beams_see(tissues, acquisition)
         self.decay = tissues["attenuation_db_cm_mhz"] * acquisition["frequency_mhz"] * f32(0.2) * LN10_OVER_20
 
@@ -156,7 +157,7 @@ class Tracer:
     # ---- pieces of a beam ------------------------------------------------------------------------------------------
 
     def _beams_at(self, line: np.ndarray, number: np.ndarray) -> np.ndarray:
-        """(n, 6) beams of traced lines at the ends `number` of pieces, as in aperture.Screens."""
+        """(n, 8) beams of traced lines at the ends `number` of pieces, as in aperture.Screens."""
         acquisition, count = self.acquisition, len(self.screens)
         per_line = f32(count - 1) / f32(acquisition["traced_lines"] - 1)
         place = line.astype(np.float32) * per_line
@@ -166,6 +167,9 @@ class Tracer:
         path, per_strip = f32(np.maximum(number, 1)) * acquisition["screen_step"], (right - left) * per_line
         apart = Beam(acquisition).line_distance(path)
         turns = acquisition["cycles_per_mm"] * (per_strip[:, 1] - (apart + per_strip[:, 2]) * (beam[:, 2] / path))
+        shades = self._lit.shades(place, np.maximum(number - 1, 0))
+        beam[:, 0] += shades[:, 0] - beam[:, 4]
+        beam[:, 4:6] = shades
         beam[:, 0] += f32(0.5) * log(self._gathered_power(path, f32(1) + per_strip[:, 2] / apart, turns))
         return np.where(number[:, None] == 0, f32(0), beam)
 
@@ -193,7 +197,8 @@ class Tracer:
             root.axis + path[:, None] * root.direction + beam[:, 2:3] * root.lateral + beam[:, 3:4] * root.elevational
         )
         rays.piece[at] = np.where(number < depths, number, -1)
-        rays.since_path[at], rays.course[at], rays.shade[at] = path, 0, beam[:, 4]
+        rays.since_path[at], rays.course[at] = path, 0
+        rays.shade[at] = np.where(rays.strong[at] == _NOT_STRONG, beam[:, 4], rays.shade[at])
         rays.given[at], rays.given_from[at], rays.decay_before[at] = 0, path, _NO_DECAY
         has_next = number < depths
         at, root, beam = at[has_next], root.of(has_next), beam[has_next]
@@ -216,7 +221,7 @@ class Tracer:
         decay = self.decay[self._front(rays)]
         depth_left = self._starts(rays.line) + end + beam[:, 1] - (depth + rest * depth_per_mm)
         log_left = -beam[:, 0] - more - (log_attenuation - rest * decay)
-        spared = rays.taken + rest * decay - beam[:, 5]
+        spared = rays.taken + rest * decay - beam[:, 6]
         since = np.where((log_left > 0) | (spared > 0), np.maximum(rays.since_path, rays.given_from), rays.since_path)
         along, of_piece = (np.maximum(last - start, f32(1e-3)) for start in (since, rays.since_path))
         found = np.stack([depth_left / of_piece, log_left / along, -spared / along, since], -1)
@@ -249,9 +254,9 @@ class Tracer:
         """Labels of the soft tissue that rays are in, or that lies in front of strong tissue."""
         return np.where(rays.strong == _NOT_STRONG, rays.label, rays.front)
 
-    def _next_shade(self, rays: Rays) -> np.ndarray:
-        """Nepers lost to strong tissue at the ends of pieces."""
-        return np.where(rays.piece >= 0, self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))[:, 4], f32(0))
+    def _next_shade(self, rays: Rays, kind: int = 4) -> np.ndarray:
+        """Nepers lost to strong tissue at the ends of pieces, or (kind 5) behind its last end in them."""
+        return np.where(rays.piece >= 0, self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))[:, kind], f32(0))
 
     def _are_dark(self, rays: Rays) -> np.ndarray:
         """Whether strong tissue leaves nothing of beams from their piece on."""
@@ -397,7 +402,7 @@ class Tracer:
         lost = (self.decay[self._front(rays)] - rays.decay_before) * (until - rays.since)
         self._give_back(rays, np.ones(len(rays), bool), lost, rays.path + rays.since)
         rays.excess, rays.taken = self._excess(rays, until), self._taken(rays, until)
-        more = rays.excess + np.where(goes_dark, rays.shade - self._next_shade(rays), f32(0))
+        more = rays.excess + np.where(rays.strong != _NOT_STRONG, rays.shade - self._next_shade(rays), f32(0))
         by = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rays.depth_per_mm, more)
         self._keep_correction(rays, by)
         deeper, louder, less = self._corrections_at(rays, path, by)
@@ -489,7 +494,7 @@ class Tracer:
         lost = (self.decay[rays.label] - self.decay[other]) * (border - rays.since)
         self._give_back(rays, ~strong_border, lost, path)
         rays.excess, rays.taken = self._excess(rays, border), self._taken(rays, border)
-        leaves, next_shade = ~keep, self._next_shade(rays)
+        leaves, next_shade, end_shade = ~keep, self._next_shade(rays), self._next_shade(rays, 5)
         behind_rate = acquisition["reference_speed_m_s"] / tissues["speed_of_sound_m_s"][other]
         rate = np.where(bent | under | leaves, rays.depth_per_mm, behind_rate)
         more = rays.excess + np.where(leaves, f32(0), rays.shade - next_shade)
@@ -498,19 +503,21 @@ class Tracer:
         by[:, 1:3] = np.clip(by[:, 1:3], -most, most)
         corrected = np.stack(self._corrections_at(rays, path, by), -1)
         # A beam ends where it is bent, and where it leaves the field; below strong tissue it begins again.
-        ends = np.flatnonzero(beam & (leaves | bent | (under & ~strong)))
+        ends = np.flatnonzero(beam & (leaves | bent | ((rays.strong != _NOT_STRONG) & ~strong)))
         self._keep_correction(rays.of(ends), by[ends])
         rays.depth[ends] += corrected[ends, 0]
         rays.log_attenuation[ends] += corrected[ends, 1]
         rays.loss[ends] += corrected[ends, 2]
         corrected[ends] = 0.0
+        settled = np.isin(np.arange(len(rays)), ends)  # what is written here is corrected
         below = rays.of(keep)  # where the beam goes on below strong tissue
         ended = rays.of(bent)
         ended.piece[:], ended.strong[:] = -1, _NOT_STRONG
         for name, values in vars(ended).items():
             vars(rays)[name][bent] = values
         under, beam, bent, strong = under[keep], beam[keep], bent[keep], strong[keep]
-        strong_border, corrected, next_shade = strong_border[keep], corrected[keep], next_shade[keep]
+        strong_border, corrected, end_shade = strong_border[keep], corrected[keep], end_shade[keep]
+        settled = settled[keep]
         rays, border, other, normal, overshoot = rays.of(keep), border[keep], other[keep], normal[keep], overshoot[keep]
         before, behind, curvature = before[keep], behind[keep], curvature[keep]
 
@@ -529,7 +536,9 @@ class Tracer:
         z_in, z_out = tissues["impedance_mrayl"][rays.label] * cos_out, tissues["impedance_mrayl"][other] * cos_in
         pressure = np.where(is_total, f32(1), (z_out - z_in) / (z_out + z_in))
         reflectance = pressure * pressure
-        self._write_hits(rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature)
+        self._write_hits(
+            rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature, settled
+        )
 
         reflected_weight, refracted_weight = rays.weight * reflectance, rays.weight * (f32(1) - reflectance)
         reflects = np.flatnonzero(
@@ -602,22 +611,21 @@ class Tracer:
             self._begin(child),
             self._begin(bent_rays),
             self._begin(below),
-            self._begin(self._left(on, strong[ahead], next_shade[ahead])),
+            self._begin(self._left(on, strong[ahead], end_shade[ahead])),
         ]
 
-    def _left(self, rays: Rays, strong: np.ndarray, next_shade: np.ndarray) -> Rays:
+    def _left(self, rays: Rays, strong: np.ndarray, end_shade: np.ndarray) -> Rays:
         """Rays behind borders, without the dark ones: those out of strong tissue have again the level of their beam."""
         out = ~strong & (rays.strong != _NOT_STRONG)
-        taken = next_shade - rays.shade
+        taken = end_shade - rays.shade
         kept = np.clip(taken, np.minimum(rays.excess, f32(0)), np.clip(rays.excess, f32(0), f32(_MOST_LOSS)))
         rays.log_attenuation = np.where(out, rays.log_attenuation + rays.excess - taken, rays.log_attenuation)
         rays.loss = np.where(out, rays.loss - rays.excess + kept, rays.loss)
         rays.weight = np.where(out, rays.front_weight, rays.weight)
-        rays.shade, rays.excess = np.where(out, next_shade, rays.shade), np.where(out, f32(0), rays.excess)
-        again = out & (rays.strong == _UNDER)
-        rays.since_path = np.where(again, rays.path, rays.since_path)
-        rays.given_from = np.where(again, rays.path, rays.given_from)
-        rays.course, rays.strong = rays.course + again, np.where(out, _NOT_STRONG, rays.strong)
+        rays.shade, rays.excess = np.where(out, end_shade, rays.shade), np.where(out, f32(0), rays.excess)
+        rays.since_path = np.where(out, rays.path, rays.since_path)
+        rays.given_from = np.where(out, rays.path, rays.given_from)
+        rays.course, rays.strong = rays.course + out, np.where(out, _NOT_STRONG, rays.strong)
         return rays.of(~(out & self._are_dark(rays)))
 
     def _normals(self, rays: Rays, border, before, behind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -649,7 +657,7 @@ class Tracer:
         return tube
 
     def _write_hits(
-        self, rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature
+        self, rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature, settled
     ) -> None:
         acquisition, beside = self.acquisition, (rays.ray > 0) & (rays.strong != _UNDER)
         count = acquisition["elevational_rays"].astype(np.float32)
@@ -673,7 +681,7 @@ class Tracer:
         gain = acquisition["interface_gain"] / (count * tube[:, 0] * tube[:, 2])
         hit["echo"] = rays.weight * attenuation * strength * specular * gain * coherence
         self._hits.append(hit[beside])
-        self._hit_pieces.append(self._piece_keys(rays)[beside])
+        self._hit_pieces.append(np.where(settled, -1, self._piece_keys(rays))[beside])
         self._hit_lines.append(rays.line[beside])
 
 
