@@ -13,9 +13,11 @@
 // mm (both ways), speed of sound, impedance; sums float4 [row][point][angle][depth]: extra path in mm, nepers, nepers
 // that strong tissue takes, and the sheet's part in the elevational deflection in mm; screens float4 [screen
 // line][depth], depths from screen_step on: nepers lost both ways, extra path in mm, deflection in the lateral and in
-// the elevational direction in mm; shades float [screen line][depth]: the nepers of them that strong tissue takes;
-// spreads float2 [screen line][depth]: width of the beam and a factor of its echoes, both re an undisturbed one; beams
-// float4 [traced line][1 + depth] as screens, followed by float [traced line][1 + depth] as shades.
+// the elevational direction in mm; shades float4 [screen line][depth]: the nepers of them that strong tissue takes;
+// those that it takes right behind its last end between the depth before and this one; those that soft tissue has taken
+// from what arrives, on the mean; and the distance from that end in mm, NO_END if there is none. spreads float2 [screen
+// line][depth]: width of the beam and a factor of its echoes, both re an undisturbed one; beams float4 [traced line][1
+// + depth] as screens, followed by float4 [traced line][1 + depth] as shades.
 
 #include "common.clh"
 
@@ -36,6 +38,9 @@ DEFINE_ELEVATION(float8, elevation_sigma8)
 #define EDGE_OF_BONE 0.75f    // part of a cell from which lines are lost in it by their length
 #define LEAST_OPEN 0.05f      // amplitude that is left by the part that bone covers
 #define LEAST_POWER 1e-7f     // of a beam re an undisturbed one
+#define NO_END 1e3f
+#define LEAST_UNEVEN 0.02f  // nepers, both ways, by which soft tissue may take more from one line than from another
+#define MOST_UNEVEN 0.7f    // ... and up to which that belongs to the width of the beam
 
 // Position along the face (mm) and angle of the normal of a point of the array.
 inline float point_angle(__constant const Acquisition *acquisition, float along) {
@@ -236,15 +241,59 @@ inline float3 place_in_fan(__constant const Acquisition *acquisition, float alon
                   clamp(away / acquisition->fan_step, 0.0f, acquisition->fan_depths - 1.001f), away);
 }
 
-// How much of the axis is in strong tissue at the stored depth `depth`: of the rays beside it, at `places` in the fans
-// of the two points beside it.
-inline float share_strong(__constant const Acquisition *acquisition, __global const float *sums, int before, float part,
-                          const float *places, int depth) {
+// The axis of a screen line: where it leaves the face, its direction, and its place along the face.
+typedef struct {
+  float2 origin, direction;
+  float centre;
+} Axis;
+
+inline Axis axis_of(__constant const Acquisition *acquisition, int line) {
+  const float traced = (float)line * (acquisition->traced_lines - 1) / (acquisition->screen_lines - 1);
+  const float position = acquisition->first_line +
+                         acquisition->line_spacing * (traced - acquisition->guard_lines) / acquisition->lateral_rays;
+  const float radius = acquisition->apex_radius_mm;
+  Axis axis;
+  axis.direction = acquisition->linear ? (float2)(acquisition->steering_sin, acquisition->steering_cos)
+                                       : (float2)(sin(position), cos(position));
+  axis.centre = acquisition->linear ? position / acquisition->steering_cos : radius * position;
+  if (acquisition->steered && !acquisition->linear) axis.centre = radius * axis.direction.x / axis.direction.y;
+  axis.origin = acquisition->flat_face ? (float2)(axis.centre, 0.0f)
+                                       : radius * (float2)(axis.direction.x, axis.direction.y - 1.0f);
+  return axis;
+}
+
+// The rays beside the axis at the depth `path`: the point before it, the part of the way to the next one, the places in
+// the fans of both, and the stored depth.
+typedef struct {
+  int before, depth;
+  float part, places[2];
+} Beside;
+
+inline Beside rays_beside(__constant const Acquisition *acquisition, Axis axis, float path) {
+  const float place =
+      clamp((axis.centre - acquisition->fan_first) / acquisition->fan_pitch, 0.0f, acquisition->fan_points - 1.0f);
+  Beside beside;
+  beside.before = (int)place;
+  beside.part = place - beside.before;
+  for (int n = 0; n < 2; n++) {
+    const int point = min(beside.before + n, acquisition->fan_points - 1);
+    const float3 at = place_in_fan(acquisition, acquisition->fan_first + point * acquisition->fan_pitch,
+                                   axis.origin + path * axis.direction);
+    beside.places[n] = at.x;
+    beside.depth = (int)at.y;
+  }
+  return beside;
+}
+
+// How much of the axis is in strong tissue in the step behind the stored depth `depth`: of the rays beside it.
+inline float share_strong(__constant const Acquisition *acquisition, __global const float *sums, const Beside *beside,
+                          int depth) {
   float strong = 0.0f;
   for (int n = 0; n < 2; n++) {
-    const int point = min(before + n, acquisition->fan_points - 1), ray = (int)places[n];
+    const int point = min(beside->before + n, acquisition->fan_points - 1), ray = (int)beside->places[n];
+    const float aside = beside->places[n] - ray;
     for (int m = 0; m < 2; m++) {
-      const float share = (n ? part : 1.0f - part) * (m ? places[n] - ray : 1.0f - places[n] + ray);
+      const float share = (n ? beside->part : 1.0f - beside->part) * (m ? aside : 1.0f - aside);
       __global const float *at = sums + 4 * (((acquisition->fan_points + point) * acquisition->fan_angles + ray + m) *
                                                  acquisition->fan_depths +
                                              depth);
@@ -254,32 +303,57 @@ inline float share_strong(__constant const Acquisition *acquisition, __global co
   return strong;
 }
 
-// The last depth on the axis, up to `path`, that is not in strong tissue or a step before it.
-inline float depth_before_strong(__constant const Acquisition *acquisition, __global const float *sums, float path,
-                                 float2 origin, float2 direction, float centre) {
-  const float place =
-      clamp((centre - acquisition->fan_first) / acquisition->fan_pitch, 0.0f, acquisition->fan_points - 1.0f);
-  const int before = (int)place;
-  float places[2], depth;
-  for (int n = 0; n < 2; n++) {
-    const float along = acquisition->fan_first + min(before + n, acquisition->fan_points - 1) * acquisition->fan_pitch;
-    const float3 at = place_in_fan(acquisition, along, origin + path * direction);
-    places[n] = at.x;
-    depth = at.y;
-  }
+// The path on an axis of which the step behind the stored depth `depth` is the last in strong tissue, or has its
+// border: half a step behind it, where all lines have left it.
+inline float path_behind(__constant const Acquisition *acquisition, int depth) {
+  return (depth + 1.5f) * acquisition->fan_step;
+}
+
+// The depth on the axis at which a beam is as at `path`: there, unless it is in strong tissue or a step before it; then
+// the last depth before that, and behind it, if it ends in this step or its border is in the next one. (Of a ray that
+// is still in it, raytracing.cl takes what it had before.)
+inline float depth_outside(__constant const Acquisition *acquisition, __global const float *sums, float path,
+                           Axis axis) {
+  const Beside beside = rays_beside(acquisition, axis, path);
   // Lines are interpolated between rays, and labels found at the middle of a step: they seem to enter strong tissue up
   // to four steps before the axis does.
-  const int own = clamp((int)depth, 2, acquisition->fan_depths - 6);
-  const float own_share = share_strong(acquisition, sums, before, place - before, places, own);
-  float in_front = 0.0f, beyond = own_share;
+  const int own = clamp(beside.depth, 2, acquisition->fan_depths - 6);
+  const float own_share = share_strong(acquisition, sums, &beside, own);
+  float in_front = 0.0f, beyond = own_share, most = own_share;
+  int ends = 0;  // the last step in strong tissue, from this one on
   for (int n = 1; n <= 4; n++) {
-    beyond += share_strong(acquisition, sums, before, place - before, places, own + n);
-    if (n <= 2) in_front += share_strong(acquisition, sums, before, place - before, places, own - n);
+    const float share = share_strong(acquisition, sums, &beside, own + n);
+    beyond += share;
+    most = fmax(most, share);
+    if (share <= 0.5f && n <= 2 && own_share > 0.5f && ends == 0) ends = own + n - 1;
+    if (n <= 2) in_front += share_strong(acquisition, sums, &beside, own - n);
   }
-  if (own_share <= 0.5f && beyond <= 2.0f * in_front) return path;  // not in it, nor before it: behind it
+  // Not in it, nor before it: beside it, or behind it
+  if (most <= 0.5f || (own_share <= 0.5f && beyond <= 2.0f * in_front)) return path;
+  if (ends > 0) return fmax(path, path_behind(acquisition, ends));
   int last = own;
-  while (last > 4 && share_strong(acquisition, sums, before, place - before, places, last) > 0.0f) last--;
+  while (last > 4 && share_strong(acquisition, sums, &beside, last) > 0.0f) last--;
   return fmin(fmax(last - 3.0f, 1.0f) * acquisition->fan_step, path);
+}
+
+// The path on the axis behind the last step between `start` and `end` in which strong tissue ends; 0 if there is none.
+inline float exit_between(__constant const Acquisition *acquisition, __global const float *sums, float start, float end,
+                          Axis axis) {
+  const Beside beside = rays_beside(acquisition, axis, end);
+  const int last = min(beside.depth + 1, acquisition->fan_depths - 3);  // as in depth_outside
+  const int first = max(beside.depth - (int)ceil((end - start) / acquisition->fan_step) - 1, 0);
+  __global const float *on_axis =
+      sums +
+      4 * ((acquisition->fan_points + beside.before) * acquisition->fan_angles + (int)(beside.places[0] + 0.5f)) *
+          acquisition->fan_depths;
+  if (on_axis[4 * last + 6] == on_axis[4 * first + 2]) return 0.0f;
+  float behind = share_strong(acquisition, sums, &beside, last + 1);
+  for (int depth = last; depth >= first; depth--) {
+    const float share = share_strong(acquisition, sums, &beside, depth);
+    if (share > 0.5f && behind <= 0.5f) return path_behind(acquisition, depth);
+    behind = share;
+  }
+  return 0.0f;
 }
 
 // Straight lines from the points of an aperture to a point on its axis.
@@ -290,17 +364,20 @@ typedef struct {
   // Sums along the lines, per length of the axis: extra path, nepers, elevational deflection; and the amplitude that
   // passes strong tissue
   float delay[ROWS][MOST_POINTS], loss[ROWS][MOST_POINTS], lift[ROWS][MOST_POINTS], passed[ROWS][MOST_POINTS];
+  // The amplitude that soft tissue leaves, re that of the line of the least loss, and by how much losses differ
+  float kept[ROWS][MOST_POINTS], least_loss, uneven;
 } Lines;
 
-// The lines to the depth `path` of the axis from `origin` in a direction, whose aperture is around `centre` on the
-// face.
-inline void find_lines(__constant const Acquisition *acquisition, __global const float *sums, float path, float2 origin,
-                       float2 direction, float centre, Lines *lines) {
-  const float pitch = acquisition->fan_pitch;
+// The lines to the depth `path` of an axis.
+inline void find_lines(__constant const Acquisition *acquisition, __global const float *sums, float path, Axis axis,
+                       Lines *lines) {
+  const float pitch = acquisition->fan_pitch, centre = axis.centre;
+  const float2 origin = axis.origin, direction = axis.direction;
   const float reach = 0.5f * fmin(acquisition->aperture_mm, path / acquisition->receive_f_number);
   const int low = max((int)ceil((centre - reach - 0.5f * pitch - acquisition->fan_first) / pitch), 0);
   const int high = (int)floor((centre + reach + 0.5f * pitch - acquisition->fan_first) / pitch);
   lines->count = clamp(high - low + 1, 1, min(MOST_POINTS, acquisition->fan_points - low));
+  float least = 1e30f, most = 0.0f;
   for (int i = 0; i < lines->count; i++) {
     const float along = acquisition->fan_first + (low + i) * pitch;
     const float2 point = point_on_face(acquisition, along);
@@ -314,8 +391,16 @@ inline void find_lines(__constant const Acquisition *acquisition, __global const
       lines->loss[row][i] = ratio * found.y;
       lines->passed[row][i] = found.z;
       lines->lift[row][i] = ratio * found.w;
+      least = fmin(least, lines->loss[row][i]);
+      most = fmax(most, lines->loss[row][i]);
     }
   }
+  lines->least_loss = least;
+  lines->uneven = most - least;
+  for (int row = 0; row < ROWS; row++)
+    for (int i = 0; i < lines->count; i++)
+      lines->kept[row][i] =
+          lines->uneven < LEAST_UNEVEN ? 1.0f : exp_fast(-0.5f * (lines->loss[row][i] - lines->least_loss));
 }
 
 // The integral of the square of that product. Its spectrum is the convolution of the two autocorrelations.
@@ -339,10 +424,6 @@ typedef struct {
   float2 received[MOST_POINTS], transmitted[MOST_POINTS];
 } Waves;
 
-#define UNDISTURBED 0
-#define BY_PHASE 1   // with the phases of soft tissue
-#define BY_TISSUE 2  // and with what strong tissue stops
-
 // The transmit focus of the zone that is used at the depth `path`; `path` itself where all depths are in focus.
 inline float transmit_focus_at(__constant const Acquisition *acquisition, float path) {
   float focus = path, least = 1e30f;
@@ -355,22 +436,45 @@ inline float transmit_focus_at(__constant const Acquisition *acquisition, float 
   return focus;
 }
 
-// The waves at the depth `path`, which is a receive focus.
-inline void find_waves(__constant const Acquisition *acquisition, const Lines *lines, float path, float mean_delay,
-                       int kind, Waves *waves) {
+// The parts of the wave that lines bring to a depth, without amplitudes: `turned` by the phases of soft tissue, and
+// `focus`, the phase of the transmitted wave that is focused elsewhere. They are those of all levels.
+typedef struct {
+  float2 turned[ROWS][MOST_POINTS], focus[MOST_POINTS];
+} Phases;
+
+inline void find_phases(__constant const Acquisition *acquisition, const Lines *lines, float path, float mean_delay,
+                        Phases *phases) {
   const float cycles = 0.5f * acquisition->cycles_per_mm;  // per millimetre of path, one way
   const float focusing = 0.5f * cycles * (1.0f / path - 1.0f / transmit_focus_at(acquisition, path));  // turns per mm^2
+  float c, s;
+  for (int i = 0; i < lines->count; i++) {
+    turn(focusing * lines->x[i] * lines->x[i], &c, &s);
+    phases->focus[i] = (float2)(c, s);
+    for (int row = 0; row < ROWS; row++) {
+      turn(cycles * (lines->delay[row][i] - mean_delay), &c, &s);
+      phases->turned[row][i] = (float2)(c, s);
+    }
+  }
+}
+
+inline float2 times(float2 a, float2 b) { return (float2)(a.x * b.x - a.y * b.y, a.x * b.y + a.y * b.x); }
+
+#define UNDISTURBED 0
+#define BY_PHASE 1   // with the phases of soft tissue
+#define BY_LOSS 2    // and with the amplitudes that it leaves
+#define BY_TISSUE 3  // and with what strong tissue stops
+
+// The waves at a depth, which is a receive focus.
+inline void find_waves(const Lines *lines, const Phases *phases, int kind, Waves *waves) {
   for (int i = 0; i < lines->count; i++) waves->received[i] = waves->transmitted[i] = (float2)(0.0f);
   for (int row = 0; row < (kind == UNDISTURBED ? 1 : ROWS); row++) {
     float2 wave[MOST_POINTS], focused[MOST_POINTS];
     for (int i = 0; i < lines->count; i++) {
-      const float amplitude = lines->weight[i] * (kind == BY_TISSUE ? lines->passed[row][i] : 1.0f);
-      const float turns = kind == UNDISTURBED ? 0.0f : cycles * (lines->delay[row][i] - mean_delay);
-      float c, s;
-      turn(turns, &c, &s);
-      wave[i] = amplitude * (float2)(c, s);
-      turn(turns + focusing * lines->x[i] * lines->x[i], &c, &s);
-      focused[i] = amplitude * (float2)(c, s);
+      float amplitude = lines->weight[i];
+      if (kind >= BY_LOSS) amplitude *= lines->kept[row][i];
+      if (kind == BY_TISSUE) amplitude *= lines->passed[row][i];
+      wave[i] = kind == UNDISTURBED ? (float2)(amplitude, 0.0f) : amplitude * phases->turned[row][i];
+      focused[i] = times(wave[i], phases->focus[i]);
     }
     const float share = kind == UNDISTURBED ? 1.0f : ROW_WEIGHT(row);
     add_correlation(wave, lines->count, share, waves->received);
@@ -385,49 +489,56 @@ inline float width_of(const Waves *waves, int count) {
   return power * power / fmax(squared_overlap(waves->received, waves->transmitted, count), 1e-20f);
 }
 
-// Relative to an undisturbed beam: (nepers of the amplitude of speckle lost by phases, nepers lost to strong tissue,
-// width). The power of speckle is the integral over the beam of the transmitted times the received intensity. A shift
-// of both beams changes nothing.
+// Relative to a beam that nothing disturbs and that has lost `loss` nepers: (nepers of the amplitude of speckle lost by
+// the phases and the uneven losses of soft tissue, nepers lost to strong tissue, width). The power of speckle is the
+// integral over the beam of the transmitted times the received intensity. A shift of both beams changes nothing.
 inline float3 level_and_spread(__constant const Acquisition *acquisition, const Lines *lines, float path,
-                               float mean_delay) {
+                               float mean_delay, float loss) {
   const int count = lines->count;
+  Phases phases;
   Waves waves;
-  find_waves(acquisition, lines, path, mean_delay, UNDISTURBED, &waves);
+  find_phases(acquisition, lines, path, mean_delay, &phases);
+  find_waves(lines, &phases, UNDISTURBED, &waves);
   const float still = overlap(waves.received, waves.transmitted, count), own_width = width_of(&waves, count);
-  find_waves(acquisition, lines, path, mean_delay, BY_PHASE, &waves);
-  // Strong tissue takes parts of the aperture away. That is in the level; the line's neighbours are taken away by it
-  // too, so that a wider beam would brighten its shadow.
+  // Strong and very lossy tissue takes parts of the aperture away. That is in the level; the line's neighbours are
+  // taken away by it too, so that a wider beam would brighten its shadow.
+  find_waves(lines, &phases, lines->uneven < MOST_UNEVEN ? BY_LOSS : BY_PHASE, &waves);
   const float spread = clamp(width_of(&waves, count) / own_width, 1.0f, MOST_SPREAD);
-  const float by_phase = fmax(overlap(waves.received, waves.transmitted, count) / still, 1e-4f);
+  if (lines->uneven >= MOST_UNEVEN) find_waves(lines, &phases, BY_LOSS, &waves);
+  const float by_soft = fmax(overlap(waves.received, waves.transmitted, count) / still, LEAST_POWER);
   float differs = 0.0f;
   for (int row = 0; row < ROWS; row++)
     for (int i = 0; i < count; i++) differs = fmax(differs, fabs(lines->passed[row][i] - 1.0f));
-  float level = by_phase;
+  float level = by_soft;
   if (differs > 0.0f) {
-    find_waves(acquisition, lines, path, mean_delay, BY_TISSUE, &waves);
-    level = fmax(overlap(waves.received, waves.transmitted, count) / still, LEAST_POWER);
+    find_waves(lines, &phases, BY_TISSUE, &waves);
+    level = fmax(overlap(waves.received, waves.transmitted, count) / still, LEAST_POWER * by_soft);
   }
-  return (float3)(-0.5f * log(by_phase), 0.5f * log(by_phase / level), spread);
+  const float own = lines->uneven < LEAST_UNEVEN ? loss : lines->least_loss;  // that of a line which is `kept`
+  return (float3)(own - loss - 0.5f * log(by_soft), 0.5f * log(by_soft / level), spread);
+}
+
+// Of lines that soft tissue alone disturbs: the mean loss of what arrives.
+inline float mean_loss(const Lines *lines) {
+  float all = 0.0f, losses = 0.0f;
+  for (int row = 0; row < ROWS; row++)
+    for (int i = 0; i < lines->count; i++) {
+      const float amplitude = lines->kept[row][i];
+      const float power = ROW_WEIGHT(row) * lines->weight[i] * amplitude * amplitude;
+      all += power;
+      losses += power * lines->loss[row][i];
+    }
+  return losses / fmax(all, 1e-6f);
 }
 
 // One work-item computes one depth of one screen line. Global size (depths, screen lines).
 __kernel void screens(__constant const Acquisition *acquisition, __global const float *sums, int with_level,
-                      __global float *screens_, __global float *shades, __global float *spreads) {
+                      int all_soft, __global float *screens_, __global float *shades, __global float *spreads) {
   const int node = get_global_id(0), line = get_global_id(1), nodes = acquisition->screen_depths;
-  const float path = (node + 1) * acquisition->screen_step;
-  const float traced = (float)line * (acquisition->traced_lines - 1) / (acquisition->screen_lines - 1);
-  const float position = acquisition->first_line +
-                         acquisition->line_spacing * (traced - acquisition->guard_lines) / acquisition->lateral_rays;
-  const float radius = acquisition->apex_radius_mm, pitch = acquisition->fan_pitch;
-  const float2 direction = acquisition->linear ? (float2)(acquisition->steering_sin, acquisition->steering_cos)
-                                               : (float2)(sin(position), cos(position));
-  // Where the line leaves the face, and its place along the face
-  float centre = acquisition->linear ? position / acquisition->steering_cos : radius * position;
-  if (acquisition->steered && !acquisition->linear) centre = radius * direction.x / direction.y;
-  const float2 origin =
-      acquisition->flat_face ? (float2)(centre, 0.0f) : radius * (float2)(direction.x, direction.y - 1.0f);
+  const float path = (node + 1) * acquisition->screen_step, pitch = acquisition->fan_pitch;
+  const Axis axis = axis_of(acquisition, line);
   Lines lines;
-  find_lines(acquisition, sums, path, origin, direction, centre, &lines);
+  find_lines(acquisition, sums, path, axis, &lines);
 
   // Means over the aperture by power, and the slope of the delay across it.
   float all = 0.0f, first = 0.0f, second = 0.0f, delays = 0.0f, moments = 0.0f, losses = 0.0f;
@@ -436,8 +547,8 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
     float row_power = 0.0f;
     row_lift[row] = 0.0f;
     for (int i = 0; i < lines.count; i++) {
-      const float passed = lines.passed[row][i], x = lines.x[i], delay = lines.delay[row][i];
-      // A little is left of what strong tissue stops, so that there is always a mean.
+      const float passed = lines.passed[row][i] * lines.kept[row][i], x = lines.x[i], delay = lines.delay[row][i];
+      // A little is left of what tissue stops, so that there is always a mean.
       const float power = ROW_WEIGHT(row) * (lines.weight[i] * (passed * passed + LEFT_FOR_MEANS) + 1e-6f);
       row_power += power;
       row_lift[row] += power * lines.lift[row][i];
@@ -455,15 +566,30 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
   const float slope = clamp(common / (spread + 0.02f * pitch * pitch), -STEEPEST, STEEPEST);
   const float rise = clamp(row_lift[2] - row_lift[0], -STEEPEST * path, STEEPEST * path);
   float3 found = (float3)(0.0f, 0.0f, 1.0f);
+  float exit_shade = 0.0f, away = NO_END;
   if (with_level) {
     // In strong tissue, a beam has the level that it has before it: what this tissue takes is a matter of its ray.
-    const float depth = depth_before_strong(acquisition, sums, path, origin, direction, centre);
-    if (depth < path) find_lines(acquisition, sums, depth, origin, direction, centre, &lines);
-    found = level_and_spread(acquisition, &lines, depth, mean_delay);
+    const float depth = all_soft ? path : depth_outside(acquisition, sums, path, axis);
+    if (depth != path) find_lines(acquisition, sums, depth, axis, &lines);
+    const float loss = depth != path ? mean_loss(&lines) : losses / all;
+    found = level_and_spread(acquisition, &lines, depth, mean_delay, loss);
+    exit_shade = found.y;
+    // Behind the last end of strong tissue on this axis, or on one beside it, between which lines may meet it
+    float behind = 0.0f;
+    for (int n = 0; n < 3 && behind == 0.0f && !all_soft; n++) {
+      const int beside = line + (n == 1 ? -1 : n == 2 ? 1 : 0);
+      if (beside >= 0 && beside < acquisition->screen_lines)
+        behind = exit_between(acquisition, sums, path - acquisition->screen_step, path, axis_of(acquisition, beside));
+    }
+    if (behind != 0.0f) {
+      find_lines(acquisition, sums, behind, axis, &lines);
+      exit_shade = level_and_spread(acquisition, &lines, behind, mean_delay, loss).y;
+      away = fmax(path - behind, 0.0f);
+    }
   }
   const float4 screen = (float4)(losses / all + found.x + found.y, mean_delay - slope * mean_x, slope * path, rise);
   vstore4(screen, line * nodes + node, screens_);
-  shades[line * nodes + node] = found.y;
+  vstore4((float4)(found.y, exit_shade, losses / all, away), line * nodes + node, shades);
   vstore2((float2)(found.z, 1.0f), line * nodes + node, spreads);
 }
 
@@ -515,16 +641,77 @@ inline float gathered_power(__constant const Acquisition *acquisition, float pat
   return fmax(sum, LEAST_GATHERED);
 }
 
+// The lines of an aperture seem to meet in a point on the axis, but out of its focus the transmitted beam is wide, and
+// a part of it passes beside strong tissue that is right in front of this point: the variance of its intensity, in
+// mm^2, by which it is wider than the received one. (Over the width of that, images average by the lateral beam.)
+inline float extra_variance(__constant const Acquisition *acquisition, float path) {
+  const float receive = fmax(path * acquisition->receive_sigma_slope, acquisition->receive_sigma_min);
+  return 0.5f * fmax(transmit_variance(acquisition, path, 1.0f) - receive * receive, 0.0f);
+}
+
+// A place between two screen lines
+typedef struct {
+  int left;
+  float part;
+} Between;
+
+inline Between between_lines(__constant const Acquisition *acquisition, float place) {
+  Between between;
+  const float inside = clamp(place, 0.0f, acquisition->screen_lines - 1.001f);
+  between.left = (int)inside;
+  between.part = inside - between.left;
+  return between;
+}
+
+// The amplitude that strong tissue lets through at the depth `node`, at a place among the screen lines: of one of the
+// two `kinds` of shades. It is averaged over a deviation `sigma` in screen lines, by a Gauss-Hermite rule of three
+// points.
+inline float mean_lit(__constant const Acquisition *acquisition, __global const float *shades, int kind, int node,
+                      float place, float sigma) {
+  const int nodes = acquisition->screen_depths;
+  float sum = 0.0f;
+  for (int side = -1; side <= 1; side++) {
+    const Between at = between_lines(acquisition, place + side * 1.7320508f * sigma);
+    const float left = exp_fast(-shades[4 * (at.left * nodes + node) + kind]);
+    const float right = exp_fast(-shades[4 * ((at.left + 1) * nodes + node) + kind]);
+    sum += (side == 0 ? 0.6666667f : 0.1666667f) * blend(left, right, at.part);
+  }
+  return sum;
+}
+
+// The nepers that strong tissue takes at a depth, and behind its last end before.
+inline float2 mean_shades(__constant const Acquisition *acquisition, __global const float *shades, int node,
+                          float place, float path, float lines_per_mm) {
+  const int nodes = acquisition->screen_depths;
+  const float extra = extra_variance(acquisition, path);
+  const float reach = sqrt(extra) * lines_per_mm;
+  float away = NO_END;
+  for (int side = -1; side <= 1; side++) {
+    const Between at = between_lines(acquisition, place + side * 1.7320508f * reach);
+    away = fmin(away, fmin(shades[4 * (at.left * nodes + node) + 3], shades[4 * ((at.left + 1) * nodes + node) + 3]));
+  }
+  if (away == NO_END) {
+    const float lit = mean_lit(acquisition, shades, 0, node, place, 0.0f);
+    return (float2)(-log_fast(lit), -log_fast(lit));
+  }
+  // The lines come together from a distance in a cone, over whose width they average themselves.
+  const float cone = away / acquisition->receive_f_number;
+  const float sigma = sqrt(fmax(extra - cone * cone / 12.0f, 0.0f)) * lines_per_mm;
+  return (float2)(-log_fast(mean_lit(acquisition, shades, 0, node, place, sigma)),
+                  -log_fast(mean_lit(acquisition, shades, 1, node, place,
+                                     sqrt(extra_variance(acquisition, path - away)) * lines_per_mm)));
+}
+
 // The beams of traced lines, interpolated between screens; 0 at the face. Axes that come together must not create
 // energy. One work-item computes one depth of one traced line. Global size (1 + depths, traced lines).
 __kernel void beams(__constant const Acquisition *acquisition, __global const float *screens_,
-                    __global const float *shades, __global float *beams_) {
+                    __global const float *shades, int all_soft, __global float *beams_) {
   const int number = get_global_id(0), line = get_global_id(1), depths = acquisition->screen_depths;
   const int to = line * (1 + depths) + number;
-  __global float *shade = beams_ + 4 * acquisition->traced_lines * (1 + depths) + to;
+  __global float *shade = beams_ + 4 * acquisition->traced_lines * (1 + depths);
   if (number == 0) {
     vstore4((float4)(0.0f), to, beams_);
-    *shade = 0.0f;
+    vstore4((float4)(0.0f), to, shade);
     return;
   }
   const float per_line = (acquisition->screen_lines - 1.0f) / (acquisition->traced_lines - 1);
@@ -533,8 +720,17 @@ __kernel void beams(__constant const Acquisition *acquisition, __global const fl
   const float4 left = vload4(before * depths + number - 1, screens_);
   const float4 right = vload4((before + 1) * depths + number - 1, screens_);
   float4 beam = left + (place - before) * (right - left);
-  *shade = blend(shades[before * depths + number - 1], shades[(before + 1) * depths + number - 1], place - before);
+  const float4 left_shade = vload4(before * depths + number - 1, shades);
+  const float4 right_shade = vload4((before + 1) * depths + number - 1, shades);
+  float4 own = left_shade + (place - before) * (right_shade - left_shade);
   const float path = number * acquisition->screen_step;
+  if (!all_soft) {
+    const float lines_per_mm = per_line / line_distance(acquisition, path);
+    const float2 mean = mean_shades(acquisition, shades, number - 1, place, path, lines_per_mm);
+    beam.x += mean.x - own.x;
+    own.xy = mean;
+  }
+  vstore4(own, to, shade);
   const float4 per_strip = (right - left) * per_line;  // from line to line
   const float apart = line_distance(acquisition, path), tilt = beam.z / path;
   const float turns = acquisition->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);

@@ -9,6 +9,9 @@
 // With aperture_beams, rays go straight through soft borders (is_soft), and up to the first strong one a line follows
 // the beam: its axis consists of pieces between the depths of aperture.cl, deflected as the beam is. Delay and
 // attenuation are those of the ray itself, corrected linearly over each piece so that at its ends they are the beam's.
+// What is given back of the ray's own losses is given back behind the layer that takes them, or inside if the piece
+// ends there, so that nothing is brighter than in front of it; and with it the change of frequency, since lines that
+// have not met this layer have none.
 //
 // Buffers: voxels ushort [k][j][i], groups uchar [k][j][i] and smooth ushort [group][k][j][i] (medium.py); tissues
 // Tissue [label]; roots float4 [traced line], origin and direction (x, y) in the probe frame; beams as in
@@ -36,7 +39,10 @@ typedef struct {
   int piece;      // of the beam, that starts at path piece x screen_step; -1 where the line is a ray
   int piece_has;  // number of segments or hits written before this piece
   float from;     // path length from which the piece is corrected: its start, or the end of strong tissue in it
-  float shade;    // nepers lost there to strong tissue beside the axis or in front
+  float shade;    // nepers lost to strong tissue beside the axis or in front: there, or where it entered such tissue
+  float soft;     // the part of the loss that is of soft tissue
+  float given_from, given;  // path length from which losses are given back, and the nepers lost to that layer
+  float decay_before;       // in front of the tissue that it is in
   // Strong tissue in which a beam goes straight on; the last soft tissue, the weight there, and the nepers since then
   // by which this tissue attenuates more.
   int strong, front;
@@ -49,6 +55,7 @@ typedef struct {
 #define MOST_LOSS 1.0f  // nepers by which strong tissue may change the frequency of what has passed it
 #define MOST_BEFORE_STRONG 0.35f  // nepers by which a piece of a beam in front of bone may differ from its ray
 #define DARKEST 7.0f              // nepers lost to strong tissue: behind it nothing is left of a beam
+#define LEAST_GIVEN 0.2f          // nepers lost to a layer which are given back behind it, not along the whole piece
 
 // The label at fraction f of the cell of voxels at index `here`: the acoustic group with the largest trilinear weight,
 // so that borders are smooth at the sub-voxel scale, and within the group the label of the nearest corner. Voting by
@@ -280,7 +287,7 @@ inline Ray root_of(__constant const Acquisition *acquisition, float4 origin_and_
   root.label = -1;  // looked up at its start
   root.piece = -1;
   root.piece_has = root.strong = root.front = 0;
-  root.from = root.shade = root.excess = 0.0f;
+  root.from = root.shade = root.excess = root.soft = root.given_from = root.given = root.decay_before = 0.0f;
   root.front_weight = 1.0f;
   return root;
 }
@@ -290,8 +297,10 @@ inline void start_piece(__constant const Acquisition *acquisition, __global cons
                         __global const float *shades, Ray root, int number, int count, Ray *ray) {
   ray->piece = number < acquisition->screen_depths ? number : -1;
   ray->piece_has = count;
-  ray->from = number * acquisition->screen_step;
-  ray->shade = shades[number];
+  ray->from = ray->given_from = number * acquisition->screen_step;
+  if (ray->strong == NOT_STRONG) ray->shade = shades[4 * number];
+  ray->given = 0.0f;
+  ray->decay_before = 1e9f;  // what it starts in lies in front of nothing
   const float4 here = vload4(number, beams);
   const float path = number * acquisition->screen_step;
   ray->axis = root.axis + path * root.direction + here.z * root.lateral + here.w * root.elevational;
@@ -304,47 +313,74 @@ inline void start_piece(__constant const Acquisition *acquisition, __global cons
   ray->elevational = carry(root.elevational, root.direction, ray->direction);
 }
 
-// The changes of depth and of the logarithm of amplitude per mm, by which a ray agrees with its beam at the end of the
-// piece, which has lost `more` nepers there. The ray is at `path`; from there on it is continued with these rates of
-// depth and decay.
-inline float2 correction(__constant const Acquisition *acquisition, __global const float *beams, float start,
-                         const Ray *ray, float path, float depth, float log_attenuation, float depth_per_mm,
-                         float decay, float more) {
+// How a ray is corrected: changes of depth per mm since the start of the piece, and of the logarithm of amplitude and
+// of the loss by which the frequency falls, since the path length `since`.
+typedef struct {
+  float depth, amplitude, loss, since;
+} Correction;
+
+// The correction by which a ray agrees with its beam at the end of the piece, which has lost `more` nepers there. The
+// ray is at `path`, with `soft` nepers lost to soft tissue; from there on it is continued with these rates of depth and
+// decay.
+inline Correction correction(__constant const Acquisition *acquisition, __global const float *beams,
+                             __global const float *shades, float start, const Ray *ray, float path, float depth,
+                             float log_attenuation, float soft, float depth_per_mm, float decay, float more) {
   const float4 beam = vload4(ray->piece + 1, beams);
   // A border may turn out to lie a little beyond the end; no ray is corrected by more than it lacks at the end.
-  const float end = (ray->piece + 1) * acquisition->screen_step, rest = end - path;
-  return (float2)(start + end + beam.y - (depth + rest * depth_per_mm),
-                  -beam.x - more - (log_attenuation - rest * decay)) /
-         fmax(fmax(end, path) - ray->from, 1e-3f);
+  const float end = (ray->piece + 1) * acquisition->screen_step, rest = end - path, last = fmax(end, path);
+  const float lack = -beam.x - more - (log_attenuation - rest * decay);
+  // What soft tissue has taken from it and not, on the mean, from the lines of which something arrives
+  const float spared = soft + rest * decay - shades[4 * ray->piece + 6];
+  Correction result;
+  result.since = lack > 0.0f || spared > 0.0f ? fmax(ray->from, ray->given_from) : ray->from;
+  const float per_mm = 1.0f / fmax(last - result.since, 1e-3f);
+  result.depth = (start + end + beam.y - (depth + rest * depth_per_mm)) / fmax(last - ray->from, 1e-3f);
+  result.amplitude = lack * per_mm;
+  result.loss = -spared * per_mm;
+  return result;
+}
+
+// Whether what a ray loses over a length in a layer, more than it would beside it, is to be given back from `path` on:
+// it is of the layer of the piece in which most is lost. That is noted in the ray.
+inline int gives_back(Ray *ray, float decay, float decay_beside, float length, float path) {
+  const float lost = (decay - decay_beside) * length;
+  if (ray->piece < 0 || ray->strong != NOT_STRONG || lost <= fmax(ray->given, LEAST_GIVEN)) return 0;
+  ray->given = lost;
+  ray->given_from = path;
+  return 1;
 }
 
 // Whether strong tissue leaves nothing of a beam from piece `piece` on.
 inline int is_dark(__constant const Acquisition *acquisition, __global const float *shades, int piece) {
   for (int n = piece + 1; n <= acquisition->screen_depths; n++)
-    if (shades[n] < DARKEST) return 0;
+    if (shades[4 * n] < DARKEST) return 0;
   return 1;
 }
 
 // Length over which a ray at `path` is corrected. Strong tissue may end a little beyond its piece.
 inline float corrected_length(float path, float from) { return fmax(path - from, 0.0f); }
 
-// Correct what a ray has written since the start of its piece.
-inline void correct_segments(__global Segment *segments, int count, float2 per_mm, float start) {
+// Correct what a ray has written since the start of its piece. Segments end where losses are given back.
+inline void correct_segments(__global Segment *segments, int count, Correction by, float start) {
   for (int n = 0; n < count; n++) {
-    const float along = corrected_length(segments[n].path_mm, start);
-    segments[n].depth_mm += per_mm.x * along;
-    segments[n].depth_per_mm += per_mm.x;
-    segments[n].attenuation *= exp_fast(per_mm.y * along);
-    segments[n].decay_per_mm -= per_mm.y;
+    segments[n].depth_mm += by.depth * corrected_length(segments[n].path_mm, start);
+    segments[n].depth_per_mm += by.depth;
+    if (segments[n].path_mm + 0.5f * segments[n].length_mm < by.since) continue;
+    const float along = corrected_length(segments[n].path_mm, by.since);
+    segments[n].attenuation *= exp_fast(by.amplitude * along);
+    segments[n].decay_per_mm -= by.amplitude;
+    segments[n].loss += by.loss * along;
+    segments[n].loss_per_mm += by.loss;
   }
 }
 
-inline void correct_hits(__global Hit *hits, int count, float2 per_mm, float start) {
+inline void correct_hits(__global Hit *hits, int count, Correction by, float start) {
   for (int n = 0; n < count; n++) {
-    const float along = corrected_length(hits[n].path_mm, start), factor = exp_fast(per_mm.y * along);
-    hits[n].depth_mm += per_mm.x * along;
+    const float along = corrected_length(hits[n].path_mm, by.since), factor = exp_fast(by.amplitude * along);
+    hits[n].depth_mm += by.depth * corrected_length(hits[n].path_mm, start);
     hits[n].attenuation *= factor;
     hits[n].echo *= factor;
+    hits[n].loss += by.loss * along;
   }
 }
 
@@ -371,7 +407,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
   __global Segment *my_segments = segments + line * MAX_SEGMENTS;
   __global Hit *my_hits = hits + max(slot, 0) * MAX_HITS;
   __global const float *my_beams = beams + line * (1 + acquisition->screen_depths) * 4;
-  __global const float *my_shades = beams + (4 * acquisition->traced_lines + line) * (1 + acquisition->screen_depths);
+  __global const float *my_shades = beams + 4 * (acquisition->traced_lines + line) * (1 + acquisition->screen_depths);
   const int room = on_axis ? MAX_SEGMENTS : MAX_HITS;
   int count = 0;  // of segments or hits; a value above `room` means that some are missing
   float cut_weight = 0.0f;
@@ -424,6 +460,8 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         const float spent_until = spent + decay * (until - since);
         if (border >= 0.0f) behind = tissues[other];
         const int node_ends = border < 0.0f || behind.group != here.group;
+        const int gives =
+            !node_ends && gives_back(&ray, decay, decay_in(acquisition, behind), until - since, ray.path + until);
         if (on_axis && !is_under) {
           // A segment has one decay, its mean. If the error inside would exceed 0.02 neper (0.17 dB), the segment is
           // closed at the last change of tissue.
@@ -434,13 +472,16 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
             open = since;
             spent_open = spent;
           }
-          if (node_ends && until > open) {
+          if ((node_ends || gives) && until > open) {
             if (count < room) my_segments[count] = segment_of(ray, open, until, spent_open, spent_until, depth_per_mm);
             count++;
+            open = until;
+            spent_open = spent_until;
           }
         }
         spent = spent_until;
         if (node_ends) break;
+        ray.decay_before = decay;
         since = until;
         here = behind;
         ray.label = other;
@@ -449,23 +490,27 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       const float own_decay = ray.strong == NOT_STRONG ? decay_in(acquisition, here) : front_decay;
       const int written = is_under ? 0 : min(count, room) - ray.piece_has;  // in this piece
       if (border < 0.0f) {
-        float2 per_mm = (float2)(0.0f);
+        Correction by = {0.0f, 0.0f, 0.0f, 0.0f};
+        gives_back(&ray, own_decay, ray.decay_before, until - since, ray.path + since);
         const int goes_dark = is_silenced && ray.strong == THROUGH;
+        ray.soft += ray.strong == THROUGH ? until * front_decay : spent;
         if (ray.strong == THROUGH) ray.excess += spent - until * front_decay;
         if (ray.piece >= 0)
-          per_mm = correction(acquisition, my_beams, start, &ray, ray.path + until, ray.depth + until * depth_per_mm,
-                              ray.log_attenuation - spent, depth_per_mm, own_decay,
-                              ray.excess + (goes_dark ? ray.shade - my_shades[ray.piece + 1] : 0.0f));
-        if (ray.piece >= 0 && on_axis) correct_segments(my_segments + ray.piece_has, written, per_mm, ray.from);
-        if (ray.piece >= 0 && !on_axis) correct_hits(my_hits + ray.piece_has, written, per_mm, ray.from);
+          by = correction(acquisition, my_beams, my_shades, start, &ray, ray.path + until,
+                          ray.depth + until * depth_per_mm, ray.log_attenuation - spent, ray.soft, depth_per_mm,
+                          own_decay,
+                          ray.excess + (ray.strong != NOT_STRONG ? ray.shade - my_shades[4 * ray.piece + 4] : 0.0f));
+        if (ray.piece >= 0 && on_axis) correct_segments(my_segments + ray.piece_has, written, by, ray.from);
+        if (ray.piece >= 0 && !on_axis) correct_hits(my_hits + ray.piece_has, written, by, ray.from);
         if (!piece_ends && !goes_dark) {
           if (is_silenced) cut_weight += ray.weight;
           break;
         }
         ray.path += until;
-        ray.depth += until * depth_per_mm + per_mm.x * corrected_length(ray.path, ray.from);
-        ray.log_attenuation += per_mm.y * corrected_length(ray.path, ray.from) - spent;
-        ray.loss += spent;
+        ray.depth += until * depth_per_mm + by.depth * corrected_length(ray.path, ray.from);
+        ray.log_attenuation += by.amplitude * corrected_length(ray.path, by.since) - spent;
+        ray.loss += by.loss * corrected_length(ray.path, by.since) + spent;
+        ray.soft += by.loss * corrected_length(ray.path, by.since);
         if (goes_dark) {  // but the beam may go on behind this tissue
           cut_weight += ray.weight;
           ray.axis += until * ray.direction;
@@ -475,7 +520,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
           ray.log_attenuation += ray.excess;
           ray.loss -= ray.excess;
           ray.excess = 0.0f;
-          ray.from = ray.blind_until = ray.path;
+          ray.from = ray.given_from = ray.blind_until = ray.path;
           continue;
         }
         start_piece(acquisition, my_beams, my_shades, root, ray.piece + 1, count, &ray);
@@ -515,34 +560,44 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       const float path = ray.path + border;
       float depth = ray.depth + border * depth_per_mm, log_attenuation = ray.log_attenuation - spent;
       const int leaves = depth >= acquisition->depth_mm;
+      if (!is_strong_border)
+        gives_back(&ray, decay_in(acquisition, here), decay_in(acquisition, behind), border - since, path);
+      ray.soft += ray.strong == THROUGH ? border * front_decay : spent;
       if (ray.strong == THROUGH) ray.excess += spent - border * front_decay;
-      float2 per_mm = (float2)(0.0f);
+      Correction by = {0.0f, 0.0f, 0.0f, 0.0f};
       // At a border that is not soft, as if the beam had up to the piece's end what strong tissue has left of it here.
       if (is_beam)
-        per_mm = correction(
-            acquisition, my_beams, start, &ray, path, depth, log_attenuation,
+        by = correction(
+            acquisition, my_beams, my_shades, start, &ray, path, depth, log_attenuation, ray.soft,
             is_bent || is_under || leaves ? depth_per_mm : acquisition->reference_speed_m_s / behind.speed_of_sound_m_s,
-            own_decay, ray.excess + (leaves ? 0.0f : ray.shade - my_shades[ray.piece + 1]));
+            own_decay, ray.excess + (leaves ? 0.0f : ray.shade - my_shades[4 * ray.piece + 4]));
       // What lies behind bone is not in front of it: of the beam's loss up to the piece's end, it is what phases take.
       const float most = MOST_BEFORE_STRONG / acquisition->screen_step;
-      if (is_bent) per_mm.y = clamp(per_mm.y, -most, most);
-      const float corrected_depth = depth + per_mm.x * corrected_length(path, ray.from);
-      const float corrected_log = log_attenuation + per_mm.y * corrected_length(path, ray.from);
-      Ray under = ray;                                                   // where the beam goes on below strong tissue
-      if (is_beam && (leaves || is_bent || (is_under && !is_strong))) {  // this course of the beam ends here
+      if (is_bent) {
+        by.amplitude = clamp(by.amplitude, -most, most);
+        by.loss = clamp(by.loss, -most, most);
+      }
+      const float corrected_depth = depth + by.depth * corrected_length(path, ray.from);
+      const float corrected_log = log_attenuation + by.amplitude * corrected_length(path, by.since);
+      float loss = ray.loss + spent;
+      const float corrected_loss = loss + by.loss * corrected_length(path, by.since);
+      Ray under = ray;  // where the beam goes on below strong tissue
+      if (is_beam &&
+          (leaves || is_bent || (ray.strong != NOT_STRONG && !is_strong))) {  // this course of the beam ends here
         if (on_axis)
-          correct_segments(my_segments + ray.piece_has, written, per_mm, ray.from);
+          correct_segments(my_segments + ray.piece_has, written, by, ray.from);
         else
-          correct_hits(my_hits + ray.piece_has, written, per_mm, ray.from);
+          correct_hits(my_hits + ray.piece_has, written, by, ray.from);
         depth = corrected_depth;
         log_attenuation = corrected_log;
+        loss = corrected_loss;
         if (is_bent) {
           ray.piece = -1;
           ray.strong = NOT_STRONG;
         }
       }
       if (leaves) break;  // without the overshoot, the border lies beyond the field
-      const float attenuation = exp_fast(log_attenuation), loss = ray.loss + spent;
+      const float attenuation = exp_fast(log_attenuation);
       const float3 aside = quantile * elevation_sigma(acquisition, path) * ray.elevational;
       const float3 hit_point = ray.axis + border * ray.direction + aside;
       const float4 tube = tube_after(ray.tube, border);
@@ -593,7 +648,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
           child.path = path;
           child.depth = corrected_depth;
           child.log_attenuation = corrected_log;
-          child.loss = loss;
+          child.loss = corrected_loss;
           child.weight = reflected_weight;
           child.blind_until = path + acquisition->voxel_mm;
           child.reflections = ray.reflections + 1;
@@ -626,10 +681,11 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         ray.loss = loss;
         ray.label = other;
         ray.blind_until = blind_until;
+        ray.decay_before = is_under ? front_decay : decay_in(acquisition, here);
         if (count > room) break;
         if (!is_strong && ray.strong != NOT_STRONG) {
           // What this and other strong tissue has taken from the beam is in the level of its aperture.
-          const float shade = my_shades[ray.piece + 1];
+          const float shade = my_shades[4 * ray.piece + 5];
           ray.log_attenuation += ray.excess - (shade - ray.shade);
           // Of the pulse, the frequency falls by attenuation. Behind opaque tissue it is what has come past that.
           ray.loss -= ray.excess - clamp(shade - ray.shade, fmin(ray.excess, 0.0f), clamp(ray.excess, 0.0f, MOST_LOSS));
@@ -637,10 +693,8 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
           ray.shade = shade;
           ray.excess = 0.0f;
           ray.strong = NOT_STRONG;
-          if (is_under) {
-            ray.from = path;
-            ray.piece_has = count;
-          }
+          ray.from = ray.given_from = path;
+          ray.piece_has = count;
           if (is_dark(acquisition, my_shades, ray.piece)) {
             cut_weight += ray.weight;
             break;
@@ -664,7 +718,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
         under.log_attenuation = log_attenuation + under.excess;
         under.excess = 0.0f;
         under.loss = loss;
-        under.from = path;
+        under.from = under.given_from = path;
         under.label = other;
         under.blind_until = blind_until;
         stack[waiting++] = under;

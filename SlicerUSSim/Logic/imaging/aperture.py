@@ -47,8 +47,8 @@ class Aperture(Stage):
         lines, depths, traced = (int(fields[name]) for name in ("screen_lines", "screen_depths", "traced_lines"))
         fan = int(fields["fan_angles"]), int(fields["fan_points"]), ROWS
         frame.screens, frame.spreads = get("screens", lines * depths * 16), get("spreads", lines * depths * 8)
-        frame.beams = get("beams", traced * (1 + depths) * 20)
-        shades = get("shades", lines * depths * 4)
+        frame.beams = get("beams", traced * (1 + depths) * 32)
+        shades = get("shades", lines * depths * 16)
         if not fields["aperture_beams"]:
             return
         acoustics = get("acoustics", len(frame.medium.rows) * 16)
@@ -58,11 +58,13 @@ class Aperture(Stage):
         all_soft = np.int32(are_soft(rows[frame.medium.present]))
         self.device.run(self._fans, fan, frame.acquisition_buffer, frame.medium.voxel_buffer, acoustics, all_soft, sums)
         self.device.run(
-            self._screens, (depths, lines), frame.acquisition_buffer, sums, np.int32(with_level), frame.screens,
-            shades, frame.spreads,
+            self._screens, (depths, lines), frame.acquisition_buffer, sums, np.int32(with_level), all_soft,
+            frame.screens, shades, frame.spreads,
         )  # fmt: skip
         self.device.run(self._keep_levels, (depths, lines), frame.acquisition_buffer, frame.screens, frame.spreads)
-        self.device.run(self._beams, (1 + depths, traced), frame.acquisition_buffer, frame.screens, shades, frame.beams)
+        self.device.run(
+            self._beams, (1 + depths, traced), frame.acquisition_buffer, frame.screens, shades, all_soft, frame.beams
+        )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
         fields = frame.acquisition

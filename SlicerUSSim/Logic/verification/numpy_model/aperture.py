@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
@@ -15,6 +17,8 @@ _EDGE_OF_BONE = 0.75  # part of a cell from which lines are lost in it by their 
 _LEAST_OPEN = 0.05  # amplitude that is left by the part that bone covers
 _LEAST = 1e-3  # nepers by which strong tissue differs from soft
 _MOST_SPREAD = 3.0  # of a beam
+_NO_END = 1e3  # mm: no strong tissue ends in front
+_LEAST_UNEVEN, _MOST_UNEVEN = 0.02, 0.7  # nepers by which soft tissue takes more from one line than from another
 _SOFT_SPEED, _SOFT_REFLECTION = 0.105, 0.12  # largest contrasts of a soft border
 _LOSSY_PER_MM, _LOSSY_SPEED = 0.8, 5000.0  # nepers both ways, and m/s
 _STRAIGHT_SPEED = 0.2  # and of strong tissue in which paths go straight on
@@ -43,6 +47,16 @@ def bends(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.abs(speeds[0] - speeds[1]) > f32(0.5 * _STRAIGHT_SPEED) * (speeds[0] + speeds[1])
 
 
+@dataclass
+class Axis:
+    """The axis of a line: where it leaves the face, its direction, across it (2,), and its place along the face."""
+
+    origin: np.ndarray
+    direction: np.ndarray
+    across: np.ndarray
+    centre: float
+
+
 class Screens:
     """Beams of an acquisition; `run` gives what soft tissue does to them."""
 
@@ -60,22 +74,29 @@ class Screens:
         self.points = np.stack([self.along, 0.0 * self.along], -1) if self.is_flat else bent
 
     def run(self) -> tuple[np.ndarray, np.ndarray]:
-        """((screen lines, depths, 5) float32 nepers lost both ways, extra path and two deflections in mm; widths).
+        """((screen lines, depths, 8) float32 nepers lost both ways, extra path and two deflections in mm; widths).
 
-        The last of the five is the nepers of the first that strong tissue takes.
+        The last of the eight are the nepers of the first that strong tissue takes, those that it takes right behind its
+        last end after the depth before, those that soft tissue has taken from what arrives, on the mean, and the
+        distance from that end in mm.
         Widths (screen lines, depths, 2) are those of the beam re an undisturbed one, and factors of its echoes.
         """
         fields = self.fields
         count, depths = fields["screen_lines"], fields["screen_depths"]
         if not fields["aperture_beams"]:
-            return np.zeros((count, depths, 5), np.float32), np.ones((count, depths, 2), np.float32)
+            return np.zeros((count, depths, 8), np.float32), np.ones((count, depths, 2), np.float32)
         sums = self._fans()
         traced = np.arange(count) * (fields["traced_lines"] - 1) / (count - 1) - fields["guard_lines"]
         position = fields["first_line"] + fields["line_spacing"] * traced / fields["lateral_rays"]
         paths = fields["screen_step"] * np.arange(1, depths + 1)
-        found = np.array([[self._beam(sums, line, path) for path in paths] for line in position], np.float32)
-        factors = self._kept_levels(found[..., 0], found[..., 5], f32(paths))
-        return found[..., :5], np.stack([found[..., 5], factors], -1)
+        axes = [self._axis(line) for line in position]
+        found = np.zeros((count, depths, 9), np.float32)
+        for n, axis in enumerate(axes):
+            beside = [axis, *axes[n - 1 : n], *axes[n + 1 : n + 2]] if n else [axis, *axes[1:2]]
+            for depth, path in enumerate(paths):
+                found[n, depth] = self._beam(sums, axis, beside, path)
+        factors = self._kept_levels(found[..., 0], found[..., 8], f32(paths))
+        return found[..., :8], np.stack([found[..., 8], factors], -1)
 
     def _fans(self) -> np.ndarray:
         """(rows, points, angles, depths, 4) sums: extra path, nepers, by strong tissue, elevational deflection."""
@@ -183,23 +204,56 @@ class Screens:
         result[..., [0, 1, 3]] *= (path / away)[:, None]
         return np.moveaxis(result, -1, 0)
 
-    def _depth_before_strong(self, sums: np.ndarray, centre: float, target: np.ndarray, path: float) -> float:
-        """The last depth on the axis, up to `path`, that is not in strong tissue or shortly before it."""
+    def _axis(self, position: float) -> Axis:
+        """The axis of a line at this position (radians or millimetres)."""
+        fields = self.fields
+        angle = np.arcsin(fields["steering_sin"]) if fields["linear"] else position
+        direction, across = np.array([np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
+        centre = position / np.cos(angle) if fields["linear"] else fields["apex_radius_mm"] * position
+        if fields["steered"] and not fields["linear"]:
+            centre = fields["apex_radius_mm"] * np.tan(position)
+        flat = np.array([centre, 0.0])
+        origin = flat if self.is_flat else fields["apex_radius_mm"] * (direction - [0.0, 1.0])
+        return Axis(origin, direction, across, float(centre))
+
+    def _shares(self, sums: np.ndarray, axis: Axis, path: float) -> tuple[np.ndarray, int, np.ndarray]:
+        """((steps,) how much of the axis is in strong tissue, the step at `path`, (depths,) nepers of one ray)."""
         fields, count = self.fields, self.fields["fan_points"]
-        at = float(np.clip((centre - fields["fan_first"]) / fields["fan_pitch"], 0.0, count - 1.0))
+        at = float(np.clip((axis.centre - fields["fan_first"]) / fields["fan_pitch"], 0.0, count - 1.0))
         points = np.minimum(int(at) + np.arange(2), count - 1)
-        place, far, _ = self._places(points, target)
+        place, far, _ = self._places(points, axis.origin + path * axis.direction)
         ray, aside = place.astype(int), place - place.astype(int)
         shares = np.outer([1.0 - at + int(at), at - int(at)], [1.0, 1.0]) * np.stack([1.0 - aside, aside], -1)
         strong = sums[1, points[:, None], ray[:, None] + np.arange(2), :, 2]
         share = (shares[..., None] * (np.diff(strong) != 0.0)).sum(axis=(0, 1))
-        own = int(np.clip(int(far[1]), 2, fields["fan_depths"] - 6))
+        return share, int(far[1]), sums[1, points[0], int(place[0] + 0.5), :, 2]
+
+    def _depth_outside(self, sums: np.ndarray, axis: Axis, path: float) -> float:
+        """The depth on the axis at which a beam is as at `path`: not in strong tissue or shortly before it."""
+        step = self.fields["fan_step"]
+        share, own, _ = self._shares(sums, axis, path)
+        own = int(np.clip(own, 2, self.fields["fan_depths"] - 6))
         in_front = share[own - 2 : own].sum()
-        if share[own] <= 0.5 and share[own : own + 5].sum() <= 2.0 * in_front:
+        ahead = share[own : own + 5]
+        if ahead.max() <= 0.5 or (share[own] <= 0.5 and ahead.sum() <= 2.0 * in_front):
             return path
+        for ends in (own, own + 1):
+            if share[own] > 0.5 >= share[ends + 1]:
+                return max(path, (ends + 1.5) * step)
         while own > 4 and share[own] > 0.0:
             own -= 1
-        return min(max(own - 3.0, 1.0) * fields["fan_step"], path)
+        return min(max(own - 3.0, 1.0) * step, path)
+
+    def _end_between(self, sums: np.ndarray, axis: Axis, start: float, end: float) -> float:
+        """The path on an axis behind the last step between two in which strong tissue ends; 0 if there is none."""
+        step = self.fields["fan_step"]
+        share, at, nearest = self._shares(sums, axis, end)
+        last = min(at + 1, self.fields["fan_depths"] - 3)
+        first = max(at - int(np.ceil((end - start) / step)) - 1, 0)
+        if nearest[last + 1] == nearest[first]:
+            return 0.0
+        ends = [depth for depth in range(first, last + 1) if share[depth] > 0.5 >= share[depth + 1]]
+        return (ends[-1] + 1.5) * step if ends else 0.0
 
     def _kept_levels(self, nepers: np.ndarray, widths: np.ndarray, paths: np.ndarray) -> np.ndarray:
         """(screen lines, depths) factors that leave every line its mean power, whatever the width of its beam."""
@@ -214,34 +268,11 @@ class Screens:
 
         return np.sqrt(passed(sigma) / passed(sigma * widths)).astype(np.float32)
 
-    def _beam(self, sums: np.ndarray, position: float, path: float) -> tuple[float, ...]:
-        """Nepers lost, extra path, two deflections, nepers lost to strong tissue, width: at one depth of one line."""
-        fields = self.fields
-        angle = np.arcsin(fields["steering_sin"]) if fields["linear"] else position
-        direction, across = np.array([np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
-        centre = position / np.cos(angle) if fields["linear"] else fields["apex_radius_mm"] * position
-        if fields["steered"] and not fields["linear"]:
-            centre = fields["apex_radius_mm"] * np.tan(position)
-        origin = [centre, 0.0] if self.is_flat else fields["apex_radius_mm"] * (direction - [0.0, 1.0])
-        pitch = fields["fan_pitch"]
-
-        def lines_to(depth: float) -> tuple[np.ndarray, ...]:
-            reach = 0.5 * min(fields["aperture_mm"], depth / fields["receive_f_number"])
-            away = np.abs(self.along - centre)
-            used = np.flatnonzero(away <= reach + 0.5 * pitch * (1.0 + 1e-6))
-            open_ = np.clip((reach - away[used]) / pitch + 0.5, 0.0, 1.0)
-            delay, loss, passed, lift = self._sums_at(sums, used, origin + depth * direction, depth)
-            return (
-                (self.points[used] - origin) @ across,
-                open_,
-                delay,
-                loss,
-                passed,
-                lift,
-            )
-
-        x, open_, delay, loss, passed, lift = lines_to(path)
-        power = _WEIGHTS[:, None] * (open_ * (passed**2 + 0.01) + 1e-6)
+    def _beam(self, sums: np.ndarray, axis: Axis, beside: list[Axis], path: float) -> tuple[float, ...]:
+        """The nine values of one depth of one line; `beside` are the axes on which strong tissue may end before it."""
+        fields, pitch = self.fields, self.fields["fan_pitch"]
+        x, open_, delay, loss, kept, passed, lift = self._lines(sums, axis, path)
+        power = _WEIGHTS[:, None] * (open_ * ((kept * passed) ** 2 + 0.01) + 1e-6)
         share = power / power.sum()
         mean_x, mean_delay = (share * x).sum(), (share * delay).sum()
         spread, common = (share * x**2).sum() - mean_x**2, (share * x * delay).sum() - mean_x * mean_delay
@@ -250,17 +281,87 @@ class Screens:
         rise = np.clip(row_lift[2] - row_lift[0], -0.1 * path, 0.1 * path)
         lost = (share * loss).sum()
 
-        depth = self._depth_before_strong(sums, centre, origin + path * direction, path)
-        x, open_, delay, _, passed, _ = lines_to(depth)
-        cycles = 0.5 * fields["cycles_per_mm"]
+        depth = self._depth_outside(sums, axis, path)
+        more, shade, width = self._level(sums, axis, depth, lost if depth == path else None)
+        end_shade, away = shade, _NO_END
+        ends = (self._end_between(sums, each, path - fields["screen_step"], path) for each in beside)
+        end = next((end for end in ends if end), 0.0)
+        if end:
+            end_shade, away = self._level(sums, axis, end, None)[1], max(path - end, 0.0)
+        delays = mean_delay - slope * mean_x, slope * path, rise
+        return lost + more + shade, *delays, shade, end_shade, lost, away, width
+
+    def _lines(self, sums: np.ndarray, axis: Axis, depth: float) -> tuple[np.ndarray, ...]:
+        """Lateral positions and weights (points,) of the lines to a depth of an axis; (rows, points) sums along them.
+
+        These are extra path, nepers, amplitudes that soft and that strong tissue leaves, elevational deflection.
+        """
+        fields, pitch = self.fields, self.fields["fan_pitch"]
+        reach = 0.5 * min(fields["aperture_mm"], depth / fields["receive_f_number"])
+        away = np.abs(self.along - axis.centre)
+        used = np.flatnonzero(away <= reach + 0.5 * pitch * (1.0 + 1e-6))
+        open_ = np.clip((reach - away[used]) / pitch + 0.5, 0.0, 1.0)
+        delay, loss, passed, lift = self._sums_at(sums, used, axis.origin + depth * axis.direction, depth)
+        kept = np.exp(-0.5 * (loss - loss.min())) if np.ptp(loss) >= _LEAST_UNEVEN else np.ones_like(loss)
+        return (self.points[used] - axis.origin) @ axis.across, open_, delay, loss, kept, passed, lift
+
+    def _level(self, sums: np.ndarray, axis: Axis, depth: float, lost: float | None) -> tuple[float, float, float]:
+        """Nepers that soft tissue takes beyond `lost` (None: the mean) and that strong tissue takes; width."""
+        x, open_, delay, loss, kept, passed, _ = self._lines(sums, axis, depth)
+        if lost is None:
+            lost = float(np.average(loss, weights=_WEIGHTS[:, None] * open_ * kept**2))
+        cycles = 0.5 * self.fields["cycles_per_mm"]
         focus = np.exp(1j * np.pi * cycles * (1.0 / depth - 1.0 / Beam(self.acquisition).transmit_focus(depth)) * x**2)
-        wave = open_ * np.exp(2j * np.pi * cycles * (delay - mean_delay))
-        still, bent, stopped = (_two_way(each, focus) for each in (open_[None], wave, wave * passed))
-        by_phase = max(bent.sum() / still.sum(), 1e-4)
-        level = max(stopped.sum() / still.sum(), 1e-7) if (passed != 1.0).any() else by_phase
-        shade = 0.5 * np.log(by_phase / level)
-        spread = np.clip(_width(bent) / _width(still), 1.0, _MOST_SPREAD)
-        return lost - 0.5 * np.log(level), mean_delay - slope * mean_x, slope * path, rise, shade, spread
+        wave = open_ * np.exp(2j * np.pi * cycles * (delay - delay.mean()))
+        waves = open_[None], wave, wave * kept, wave * kept * passed
+        still, bent, soft, stopped = (_two_way(each, focus) for each in waves)
+        by_soft = max(soft.sum() / still.sum(), 1e-7)
+        level = max(stopped.sum() / still.sum(), 1e-7 * by_soft) if (passed != 1.0).any() else by_soft
+        own = loss.min() if np.ptp(loss) >= _LEAST_UNEVEN else lost  # of a line that is `kept`
+        width = _width(soft if np.ptp(loss) < _MOST_UNEVEN else bent)
+        spread = np.clip(width / _width(still), 1.0, _MOST_SPREAD)
+        return own - lost - 0.5 * np.log(by_soft), 0.5 * np.log(by_soft / level), spread
+
+
+class Lit:
+    """What strong tissue lets through between screen lines, averaged over the width of the transmitted beam."""
+
+    def __init__(self, acquisition: np.ndarray, screens: np.ndarray) -> None:
+        self.acquisition, self.screens, self.beam = acquisition, screens, Beam(acquisition)
+
+    def shades(self, place: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """(n, 2) nepers at places among the screen lines and at depths (n,), and behind the last end before them."""
+        acquisition = self.acquisition
+        path = f32(depth + 1) * acquisition["screen_step"]
+        per_line = f32(len(self.screens) - 1) / f32(acquisition["traced_lines"] - 1)
+        per_mm = per_line / self.beam.line_distance(path)
+        extra = self._extra_variance(path)
+        nearest = [self._between(place + row * np.sqrt(2.0) * np.sqrt(extra) * per_mm, depth) for row in _ROWS]
+        away = np.min([pair[..., 7] for left, right, _ in nearest for pair in (left, right)], axis=0)
+        cone = away / acquisition["receive_f_number"]
+        sigma = np.sqrt(np.maximum(extra - cone * cone / 12.0, 0.0)) * per_mm
+        behind = np.sqrt(self._extra_variance(np.maximum(path - away, 0.0))) * per_mm
+        ends = away < _NO_END
+        lit = self._mean(place, depth, 4, np.where(ends, sigma, 0.0))
+        return -np.log(np.stack([lit, np.where(ends, self._mean(place, depth, 5, behind), lit)], -1)).astype(np.float32)
+
+    def _extra_variance(self, path: np.ndarray) -> np.ndarray:
+        transmitted, received = self.beam.one_way(path)
+        return 0.5 * np.maximum(transmitted - received, 0.0)
+
+    def _between(self, place: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values of the screen lines before and behind places, and their parts."""
+        inside = np.clip(place, 0.0, len(self.screens) - 1.001)
+        left = inside.astype(int)
+        return self.screens[left, depth], self.screens[left + 1, depth], inside - left
+
+    def _mean(self, place: np.ndarray, depth: np.ndarray, kind: int, sigma: np.ndarray) -> np.ndarray:
+        total = 0.0
+        for row, weight in zip(_ROWS * np.sqrt(2.0), _WEIGHTS, strict=True):
+            left, right, part = self._between(place + row * sigma, depth)
+            lit = [np.exp(-each[..., kind]) for each in (left, right)]
+            total = total + weight * (lit[0] + part * (lit[1] - lit[0]))
+        return np.asarray(total)
 
 
 def _intensity(wave: np.ndarray) -> np.ndarray:

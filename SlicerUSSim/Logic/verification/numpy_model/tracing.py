@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from SlicerUSSim.Logic.opencl.layout import HIT, SEGMENT
-from SlicerUSSim.Logic.verification.numpy_model.aperture import as_beams_see, bends, is_soft
+from SlicerUSSim.Logic.verification.numpy_model.aperture import Lit, as_beams_see, bends, is_soft
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     LN10_OVER_20,
@@ -33,6 +33,8 @@ _MOST_COURSES = 16
 _MOST_GATHERED, _LEAST_GATHERED = 64, f32(0.4)  # lines with scatterers in common, and the least part of their power
 _MOST_BEFORE_STRONG = f32(0.35)  # nepers by which a piece of a beam in front of bone may differ from its ray
 _MOST_LOSS = 1.0  # nepers by which strong tissue may change the frequency of what has passed it
+_LEAST_GIVEN = f32(0.2)  # nepers lost to a layer which are given back behind it, not along the whole piece
+_NO_DECAY = f32(1e9)  # in front of a piece: what it starts in lies in front of nothing
 
 
 @dataclass
@@ -58,11 +60,15 @@ class Rays:
     piece: np.ndarray  # of the beam, from path piece x screen_step on; -1 where the line is a ray
     since_path: np.ndarray  # path from which the piece is corrected
     course: np.ndarray  # how often the piece was begun again behind strong tissue
-    shade: np.ndarray  # nepers lost to strong tissue there
+    shade: np.ndarray  # nepers lost to strong tissue there, or where the beam entered such tissue
     strong: np.ndarray  # what the beam goes through, since the soft tissue `front`
     front: np.ndarray
     front_weight: np.ndarray
     excess: np.ndarray  # nepers by which strong tissue has attenuated more
+    taken: np.ndarray  # the part of the loss that is of soft tissue
+    given_from: np.ndarray  # path from which losses are given back, ...
+    given: np.ndarray  # ... and the nepers lost to that layer
+    decay_before: np.ndarray  # in front of the tissue that the ray is in
     # The node, set by Tracer._begin: course in voxels, its end, state since its start
     start: np.ndarray = field(init=False)
     step: np.ndarray = field(init=False)
@@ -103,6 +109,7 @@ class Tracer:
         self.elevation_sigma = Beam(acquisition).elevation_sigma
         self.to_voxel = acquisition["ras_to_voxel"]
         self.voxel_mm = acquisition["voxel_mm"]
+        self._lit = Lit(acquisition, screens)
         self.seen = as_beams_see(tissues, acquisition)
         self.decay = tissues["attenuation_db_cm_mhz"] * acquisition["frequency_mhz"] * f32(0.2) * LN10_OVER_20
 
@@ -139,6 +146,7 @@ class Tracer:
             piece=np.full(count, 0 if self.acquisition["aperture_beams"] else -1),
             since_path=zero, course=np.zeros(count, int), shade=zero, strong=np.zeros(count, int),
             front=np.zeros(count, int), front_weight=one, excess=zero,
+            taken=zero, given_from=zero, given=zero, decay_before=zero,
         )  # fmt: skip
 
     def _starts(self, line: np.ndarray) -> np.ndarray:
@@ -149,7 +157,7 @@ class Tracer:
     # ---- pieces of a beam ------------------------------------------------------------------------------------------
 
     def _beams_at(self, line: np.ndarray, number: np.ndarray) -> np.ndarray:
-        """(n, 5) beams of traced lines at the ends `number` of pieces, as in aperture.Screens."""
+        """(n, 8) beams of traced lines at the ends `number` of pieces, as in aperture.Screens."""
         acquisition, count = self.acquisition, len(self.screens)
         per_line = f32(count - 1) / f32(acquisition["traced_lines"] - 1)
         place = line.astype(np.float32) * per_line
@@ -159,6 +167,9 @@ class Tracer:
         path, per_strip = f32(np.maximum(number, 1)) * acquisition["screen_step"], (right - left) * per_line
         apart = Beam(acquisition).line_distance(path)
         turns = acquisition["cycles_per_mm"] * (per_strip[:, 1] - (apart + per_strip[:, 2]) * (beam[:, 2] / path))
+        shades = self._lit.shades(place, np.maximum(number - 1, 0))
+        beam[:, 0] += shades[:, 0] - beam[:, 4]
+        beam[:, 4:6] = shades
         beam[:, 0] += f32(0.5) * log(self._gathered_power(path, f32(1) + per_strip[:, 2] / apart, turns))
         return np.where(number[:, None] == 0, f32(0), beam)
 
@@ -186,7 +197,9 @@ class Tracer:
             root.axis + path[:, None] * root.direction + beam[:, 2:3] * root.lateral + beam[:, 3:4] * root.elevational
         )
         rays.piece[at] = np.where(number < depths, number, -1)
-        rays.since_path[at], rays.course[at], rays.shade[at] = path, 0, beam[:, 4]
+        rays.since_path[at], rays.course[at] = path, 0
+        rays.shade[at] = np.where(rays.strong[at] == _NOT_STRONG, beam[:, 4], rays.shade[at])
+        rays.given[at], rays.given_from[at], rays.decay_before[at] = 0, path, _NO_DECAY
         has_next = number < depths
         at, root, beam = at[has_next], root.of(has_next), beam[has_next]
         turn = self._beams_at(rays.line[at], number[has_next] + 1) - beam
@@ -197,31 +210,53 @@ class Tracer:
         return rays
 
     def _correction(self, rays: Rays, path, depth, log_attenuation, depth_per_mm, more) -> np.ndarray:
-        """(n, 2) changes of depth and of log amplitude per mm by which rays agree with their beams at a piece's end.
+        """(n, 4) by which rays agree with their beams at a piece's end, where they have lost `more` nepers.
 
-        There they have lost `more` nepers; 0 where a line is a ray.
+        Changes per mm of depth since the start of the piece, and of log amplitude and loss since the path that is the
+        fourth; 0 where a line is a ray.
         """
         beam = self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))
         end = f32(rays.piece + 1) * self.acquisition["screen_step"]
-        rest = end - path
+        rest, last = end - path, np.maximum(end, path)
+        decay = self.decay[self._front(rays)]
         depth_left = self._starts(rays.line) + end + beam[:, 1] - (depth + rest * depth_per_mm)
-        log_left = -beam[:, 0] - more - (log_attenuation - rest * self.decay[self._front(rays)])
-        along = np.maximum(np.maximum(end, path) - rays.since_path, f32(1e-3))[:, None]
-        return np.where((rays.piece >= 0)[:, None], np.stack([depth_left, log_left], -1) / along, f32(0))
+        log_left = -beam[:, 0] - more - (log_attenuation - rest * decay)
+        spared = rays.taken + rest * decay - beam[:, 6]
+        since = np.where((log_left > 0) | (spared > 0), np.maximum(rays.since_path, rays.given_from), rays.since_path)
+        along, of_piece = (np.maximum(last - start, f32(1e-3)) for start in (since, rays.since_path))
+        found = np.stack([depth_left / of_piece, log_left / along, -spared / along, since], -1)
+        return np.where((rays.piece >= 0)[:, None], found, f32(0))
 
-    def _keep_correction(self, rays: Rays, per_mm: np.ndarray) -> None:
+    def _keep_correction(self, rays: Rays, correction: np.ndarray) -> None:
         """Keep a correction for what was written in the piece."""
         written = rays.strong != _UNDER
-        self._corrections.append((self._piece_keys(rays)[written], per_mm[written], rays.since_path[written]))
+        kept = np.concatenate([correction, rays.since_path[:, None]], axis=1)
+        self._corrections.append((self._piece_keys(rays)[written], kept[written]))
+
+    @staticmethod
+    def _corrections_at(rays: Rays, path: np.ndarray, correction: np.ndarray) -> tuple[np.ndarray, ...]:
+        """(n,) changes of depth, log amplitude and loss of rays at a path."""
+        along = _corrected_length(path, correction[:, 3])
+        depth = correction[:, 0] * _corrected_length(path, rays.since_path)
+        return depth, correction[:, 1] * along, correction[:, 2] * along
+
+    @staticmethod
+    def _give_back(rays: Rays, which: np.ndarray, lost: np.ndarray, path: np.ndarray) -> np.ndarray:
+        """Which of these rays give back losses from `path` on: of the layer in which most is lost. Noted in rays."""
+        gives = which & (rays.piece >= 0) & (rays.strong == _NOT_STRONG)
+        gives &= lost > np.maximum(rays.given, _LEAST_GIVEN)
+        rays.given = np.where(gives, lost, rays.given)
+        rays.given_from = np.where(gives, path, rays.given_from)
+        return gives
 
     @staticmethod
     def _front(rays: Rays) -> np.ndarray:
         """Labels of the soft tissue that rays are in, or that lies in front of strong tissue."""
         return np.where(rays.strong == _NOT_STRONG, rays.label, rays.front)
 
-    def _next_shade(self, rays: Rays) -> np.ndarray:
-        """Nepers lost to strong tissue at the ends of pieces."""
-        return np.where(rays.piece >= 0, self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))[:, 4], f32(0))
+    def _next_shade(self, rays: Rays, kind: int = 4) -> np.ndarray:
+        """Nepers lost to strong tissue at the ends of pieces, or (kind 5) behind its last end in them."""
+        return np.where(rays.piece >= 0, self._beams_at(rays.line, np.maximum(rays.piece + 1, 0))[:, kind], f32(0))
 
     def _are_dark(self, rays: Rays) -> np.ndarray:
         """Whether strong tissue leaves nothing of beams from their piece on."""
@@ -240,22 +275,25 @@ class Tracer:
         """Apply the corrections to the segments and hits of the pieces."""
         if not self.acquisition["aperture_beams"]:
             return
-        keys, per_mm, since = (np.concatenate(parts) for parts in zip(*self._corrections, strict=True))
+        keys, kept = (np.concatenate(parts) for parts in zip(*self._corrections, strict=True))
         courses = len(self._root) * self.screens.shape[1] * _MOST_COURSES
-        table = np.zeros((courses + 1, 3), np.float32)
-        table[keys[keys >= 0]] = np.concatenate([per_mm, since[:, None]], axis=1)[keys >= 0]
+        table = np.zeros((courses + 1, 5), np.float32)
+        table[keys[keys >= 0]] = kept[keys >= 0]
         for records, pieces in ((self._segments, self._segment_pieces), (self._hits, self._hit_pieces)):
             for record, key in zip(records, pieces, strict=True):
-                depth, log_amplitude, start = table[key].T
-                along = _corrected_length(record["path_mm"], start)
+                depth, log_amplitude, loss, since, start = table[key].T
+                along = _corrected_length(record["path_mm"], since)
                 factor = exp(log_amplitude * along)
-                record["depth_mm"] += depth * along
+                record["depth_mm"] += depth * _corrected_length(record["path_mm"], start)
                 record["attenuation"] *= factor
+                record["loss"] += loss * along
                 if "echo" in (record.dtype.names or ()):
                     record["echo"] *= factor
-                else:
+                else:  # segments end where losses are given back
+                    behind = record["path_mm"] + f32(0.5) * record["length_mm"] >= since
                     record["depth_per_mm"] += depth
-                    record["decay_per_mm"] -= log_amplitude
+                    record["decay_per_mm"] -= np.where(behind, log_amplitude, f32(0))
+                    record["loss_per_mm"] += np.where(behind, loss, f32(0))
 
     # ---- nodes -----------------------------------------------------------------------------------------------------
 
@@ -342,11 +380,14 @@ class Tracer:
         until = np.where(border < 0, longest, border)
         spent_until = rays.spent + decay * (until - rays.since)
         ends = (border < 0) | (group[other] != group[rays.label])
-        written = self._write_segments(rays, decay, until, spent_until, ends)
+        lost = (decay - self.decay[other]) * (until - rays.since)
+        gives = self._give_back(rays, ~ends, lost, rays.path + until)
+        written = self._write_segments(rays, decay, until, spent_until, ends, gives)
 
         on = rays.of(~ends)
         on.since = until[~ends]
         on.spent, on.label, on.inside = spent_until[~ends], other[~ends], border[~ends]
+        on.decay_before = decay[~ends]
         met = ends & (border >= 0)
         rays.spent = spent_until
         branches = self._branch(rays.of(met), border[met], other[met], written[met])
@@ -358,14 +399,15 @@ class Tracer:
     def _next_pieces(self, rays: Rays, until: np.ndarray, goes_dark: np.ndarray) -> list[Rays]:
         """End the pieces of rays that met no more border; returns those that go on, at the next piece or below."""
         path, depth = rays.path + until, rays.depth + until * rays.depth_per_mm
-        rays.excess = self._excess(rays, until)
-        more = rays.excess + np.where(goes_dark, rays.shade - self._next_shade(rays), f32(0))
-        per_mm = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rays.depth_per_mm, more)
-        self._keep_correction(rays, per_mm)
-        along = _corrected_length(path, rays.since_path)[:, None]
-        rays.depth, rays.log_attenuation = depth, rays.log_attenuation - rays.spent
-        rays.depth, rays.log_attenuation = np.stack([rays.depth, rays.log_attenuation]) + (per_mm * along).T
-        rays.path, rays.loss = path, rays.loss + rays.spent
+        lost = (self.decay[self._front(rays)] - rays.decay_before) * (until - rays.since)
+        self._give_back(rays, np.ones(len(rays), bool), lost, rays.path + rays.since)
+        rays.excess, rays.taken = self._excess(rays, until), self._taken(rays, until)
+        more = rays.excess + np.where(rays.strong != _NOT_STRONG, rays.shade - self._next_shade(rays), f32(0))
+        by = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rays.depth_per_mm, more)
+        self._keep_correction(rays, by)
+        deeper, louder, less = self._corrections_at(rays, path, by)
+        rays.depth, rays.log_attenuation = depth + deeper, rays.log_attenuation - rays.spent + louder
+        rays.path, rays.loss, rays.taken = path, rays.loss + rays.spent + less, rays.taken + less
 
         below = rays.of(goes_dark)  # the beam may go on behind this tissue
         below.axis = below.axis + until[goes_dark][:, None] * below.direction
@@ -373,6 +415,7 @@ class Tracer:
         below.strong[:], below.weight = _UNDER, below.front_weight
         below.log_attenuation, below.loss = below.log_attenuation + below.excess, below.loss - below.excess
         below.excess, below.since_path, below.blind_until = 0.0 * below.excess, below.path, below.path
+        below.given_from = below.path
 
         on = rays.of((until == rays.to_piece) & ~goes_dark)
         on = self._start_pieces(on, on.piece + 1)
@@ -384,7 +427,12 @@ class Tracer:
         more = rays.spent - until * self.decay[self._front(rays)]
         return np.where(rays.strong == _THROUGH, rays.excess + more, rays.excess)
 
-    def _write_segments(self, rays: Rays, decay, until, spent_until, ends) -> np.ndarray:
+    def _taken(self, rays: Rays, until: np.ndarray) -> np.ndarray:
+        """The nepers that soft tissue has taken, at lengths of the nodes."""
+        own = np.where(rays.strong == _THROUGH, until * self.decay[self._front(rays)], rays.spent)
+        return rays.taken + own
+
+    def _write_segments(self, rays: Rays, decay, until, spent_until, ends, gives) -> np.ndarray:
         """Write the segments of the axis rays; returns the index of each ray's last segment (-1: none)."""
         earlier = rays.since - rays.open
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -394,10 +442,12 @@ class Tracer:
         self._segment_of(rays, closes, rays.open, rays.since, rays.spent_open, rays.spent)
         rays.open = np.where(closes, rays.since, rays.open)
         rays.spent_open = np.where(closes, rays.spent, rays.spent_open)
-        last = on_axis & ends & (until > rays.open)
+        last = on_axis & (ends | gives) & (until > rays.open)
         self._segment_of(rays, last, rays.open, until, rays.spent_open, spent_until)
         written = np.full(len(rays), -1)
         written[last] = np.arange(last.sum())  # in the last written block
+        rays.open = np.where(last, until, rays.open)
+        rays.spent_open = np.where(last, spent_until, rays.spent_open)
         return written
 
     def _segment_of(self, rays: Rays, which, begin, end, spent_begin, spent_end) -> None:
@@ -441,28 +491,33 @@ class Tracer:
         under, beam = rays.strong == _UNDER, rays.piece >= 0
         bent = ~under & strong & ~(beam & ~bends(front, seen[other]))
         path, depth = rays.path + border, rays.depth + border * rays.depth_per_mm
-        rays.excess = self._excess(rays, border)
-        leaves, next_shade = ~keep, self._next_shade(rays)
+        lost = (self.decay[rays.label] - self.decay[other]) * (border - rays.since)
+        self._give_back(rays, ~strong_border, lost, path)
+        rays.excess, rays.taken = self._excess(rays, border), self._taken(rays, border)
+        leaves, next_shade, end_shade = ~keep, self._next_shade(rays), self._next_shade(rays, 5)
         behind_rate = acquisition["reference_speed_m_s"] / tissues["speed_of_sound_m_s"][other]
         rate = np.where(bent | under | leaves, rays.depth_per_mm, behind_rate)
         more = rays.excess + np.where(leaves, f32(0), rays.shade - next_shade)
-        per_mm = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rate, more)
-        most = np.where(bent, _MOST_BEFORE_STRONG / acquisition["screen_step"], f32(np.inf))
-        per_mm[:, 1] = np.clip(per_mm[:, 1], -most, most)
-        corrected = _corrected_length(path, rays.since_path)[:, None] * per_mm
+        by = self._correction(rays, path, depth, rays.log_attenuation - rays.spent, rate, more)
+        most = np.where(bent, _MOST_BEFORE_STRONG / acquisition["screen_step"], f32(np.inf))[:, None]
+        by[:, 1:3] = np.clip(by[:, 1:3], -most, most)
+        corrected = np.stack(self._corrections_at(rays, path, by), -1)
         # A beam ends where it is bent, and where it leaves the field; below strong tissue it begins again.
-        ends = np.flatnonzero(beam & (leaves | bent | (under & ~strong)))
-        self._keep_correction(rays.of(ends), per_mm[ends])
+        ends = np.flatnonzero(beam & (leaves | bent | ((rays.strong != _NOT_STRONG) & ~strong)))
+        self._keep_correction(rays.of(ends), by[ends])
         rays.depth[ends] += corrected[ends, 0]
         rays.log_attenuation[ends] += corrected[ends, 1]
+        rays.loss[ends] += corrected[ends, 2]
         corrected[ends] = 0.0
+        settled = np.isin(np.arange(len(rays)), ends)  # what is written here is corrected
         below = rays.of(keep)  # where the beam goes on below strong tissue
         ended = rays.of(bent)
         ended.piece[:], ended.strong[:] = -1, _NOT_STRONG
         for name, values in vars(ended).items():
             vars(rays)[name][bent] = values
         under, beam, bent, strong = under[keep], beam[keep], bent[keep], strong[keep]
-        strong_border, corrected, next_shade = strong_border[keep], corrected[keep], next_shade[keep]
+        strong_border, corrected, end_shade = strong_border[keep], corrected[keep], end_shade[keep]
+        settled = settled[keep]
         rays, border, other, normal, overshoot = rays.of(keep), border[keep], other[keep], normal[keep], overshoot[keep]
         before, behind, curvature = before[keep], behind[keep], curvature[keep]
 
@@ -481,7 +536,9 @@ class Tracer:
         z_in, z_out = tissues["impedance_mrayl"][rays.label] * cos_out, tissues["impedance_mrayl"][other] * cos_in
         pressure = np.where(is_total, f32(1), (z_out - z_in) / (z_out + z_in))
         reflectance = pressure * pressure
-        self._write_hits(rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature)
+        self._write_hits(
+            rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature, settled
+        )
 
         reflected_weight, refracted_weight = rays.weight * reflectance, rays.weight * (f32(1) - reflectance)
         reflects = np.flatnonzero(
@@ -506,6 +563,7 @@ class Tracer:
         child.reflections = child.reflections + 1
         child.path, child.depth = path[reflects], depth[reflects] + corrected[reflects, 0]
         child.log_attenuation = log_attenuation[reflects] + corrected[reflects, 1]
+        child.loss = child.loss + corrected[reflects, 2]
         child.piece[:], child.strong[:] = -1, _NOT_STRONG
 
         bent_rays = rays.of(refracts)
@@ -536,6 +594,7 @@ class Tracer:
         below.weight, below.log_attenuation = below.front_weight, log_attenuation[goes_below] + below.excess
         below.strong[:], below.excess = _UNDER, 0.0 * below.excess
         below.loss, below.since_path = rays.loss[goes_below], path_of_all[goes_below]
+        below.given_from = below.since_path
 
         ahead = np.flatnonzero(~bent)
         on = rays.of(ahead)
@@ -543,6 +602,7 @@ class Tracer:
         on.front, on.front_weight = np.where(enters, on.label, on.front), np.where(enters, on.weight, on.front_weight)
         on.strong = np.where(enters, _THROUGH, on.strong)
         on.weight, on.log_attenuation = on.weight - lost[ahead], log_attenuation[ahead]
+        on.decay_before = self.decay[np.where(under[ahead], on.front, on.label)]
         for course, some in ((on, ahead), (below, goes_below)):
             course.axis, course.tube, course.path = point[some] - aside[some], tube[some], path_of_all[some]
             course.depth, course.label, course.blind_until = depth[some], other[some], blind_until[some]
@@ -551,21 +611,21 @@ class Tracer:
             self._begin(child),
             self._begin(bent_rays),
             self._begin(below),
-            self._begin(self._left(on, strong[ahead], next_shade[ahead])),
+            self._begin(self._left(on, strong[ahead], end_shade[ahead])),
         ]
 
-    def _left(self, rays: Rays, strong: np.ndarray, next_shade: np.ndarray) -> Rays:
+    def _left(self, rays: Rays, strong: np.ndarray, end_shade: np.ndarray) -> Rays:
         """Rays behind borders, without the dark ones: those out of strong tissue have again the level of their beam."""
         out = ~strong & (rays.strong != _NOT_STRONG)
-        taken = next_shade - rays.shade
+        taken = end_shade - rays.shade
         kept = np.clip(taken, np.minimum(rays.excess, f32(0)), np.clip(rays.excess, f32(0), f32(_MOST_LOSS)))
         rays.log_attenuation = np.where(out, rays.log_attenuation + rays.excess - taken, rays.log_attenuation)
         rays.loss = np.where(out, rays.loss - rays.excess + kept, rays.loss)
         rays.weight = np.where(out, rays.front_weight, rays.weight)
-        rays.shade, rays.excess = np.where(out, next_shade, rays.shade), np.where(out, f32(0), rays.excess)
-        again = out & (rays.strong == _UNDER)
-        rays.since_path = np.where(again, rays.path, rays.since_path)
-        rays.course, rays.strong = rays.course + again, np.where(out, _NOT_STRONG, rays.strong)
+        rays.shade, rays.excess = np.where(out, end_shade, rays.shade), np.where(out, f32(0), rays.excess)
+        rays.since_path = np.where(out, rays.path, rays.since_path)
+        rays.given_from = np.where(out, rays.path, rays.given_from)
+        rays.course, rays.strong = rays.course + out, np.where(out, _NOT_STRONG, rays.strong)
         return rays.of(~(out & self._are_dark(rays)))
 
     def _normals(self, rays: Rays, border, before, behind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -597,7 +657,7 @@ class Tracer:
         return tube
 
     def _write_hits(
-        self, rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature
+        self, rays, other, point, normal, path, depth, attenuation, cos_in, pressure, tube, curvature, settled
     ) -> None:
         acquisition, beside = self.acquisition, (rays.ray > 0) & (rays.strong != _UNDER)
         count = acquisition["elevational_rays"].astype(np.float32)
@@ -621,7 +681,7 @@ class Tracer:
         gain = acquisition["interface_gain"] / (count * tube[:, 0] * tube[:, 2])
         hit["echo"] = rays.weight * attenuation * strength * specular * gain * coherence
         self._hits.append(hit[beside])
-        self._hit_pieces.append(self._piece_keys(rays)[beside])
+        self._hit_pieces.append(np.where(settled, -1, self._piece_keys(rays))[beside])
         self._hit_lines.append(rays.line[beside])
 
 

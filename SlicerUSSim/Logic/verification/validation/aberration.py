@@ -152,6 +152,20 @@ def beams_past_strong_tissue(rotation: np.ndarray, device) -> Outcome:
             wave = _wave_behind_db(None, "plate", -edge, loss_db)
             seen = float(np.interp(edge, place[:-1], found))
             rows.append(Row(f"{name}, line at {edge} mm", "dB", wave, seen, 3.5))
+    # Soft tissue of 15 dB: a beam has the mean amplitude of its lines, not the mean of their decibels.
+    found = level("plate", replace(plain, name="lossy", attenuation_db_cm_mhz=5.0))
+    waves = np.array([_wave_behind_db(None, "plate", -edge, 15.0) for edge in _EDGE_MM])
+    seen, decibels = np.interp(_EDGE_MM, place[:-1], found), np.array([_mean_db(edge, 15.0) for edge in _EDGE_MM])
+    rows += [
+        Row(f"soft plate of 15 dB, line at {edge} mm", "dB", wave, float(level), 0.8)
+        for edge, wave, level in zip(_EDGE_MM, waves, seen, strict=True)
+    ]
+    plate = "soft plate of 15 dB"
+    away, control = (float(np.sqrt(np.mean((levels - waves) ** 2))) for levels in (seen, decibels))
+    rows += [
+        Row(f"{plate}, difference RMS", "dB", 0.5, away, 0.0, "at most"),
+        Row(f"{plate}, control, mean of decibels: difference RMS", "dB", 1.0, control, 0.0, "at least"),
+    ]
     fat, scalp = (replace(TISSUES[name], attenuation_db_cm_mhz=0.0) for name in ("fat", "scalp"))
     found = level("ball", fat, scalp)
     for edge in (-4.0, -2.4, 0.0):
@@ -159,6 +173,13 @@ def beams_past_strong_tissue(rotation: np.ndarray, device) -> Outcome:
         seen = float(np.interp(edge, place[:-1], found))
         rows.append(Row(f"ball of fat in scalp, line at {edge} mm", "dB", wave, seen, 2.0))
     return Outcome(tuple(rows), None)
+
+
+def _mean_db(line_mm: float, loss_db: float) -> float:
+    """Mean decibels of the straight lines to a scan line behind the plate of phantoms.behind_object."""
+    reach = 0.5 * np.minimum(12.0, _BEHIND_MM / 2.5)
+    at_plate = line_mm + np.linspace(-1.0, 1.0, 81) * (reach * (1.0 - 16.5 / _BEHIND_MM))[:, None]
+    return float(-loss_db * (at_plate > 0.0).mean())
 
 
 @lru_cache
