@@ -78,10 +78,10 @@ class Beam(Declared):
         0.0, "Apodisation", "Weights of the receive aperture: 0 uniform, 1 Hann; lower side lobes, a wider beam",
         bounds=(0, 1),
     )  # fmt: skip
-    clutter_db: float = parameter(
-        -38.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, re its own",
-        unit="dB", bounds=(-100, 0),
-        note="They and the side lobes fill cysts; spread evenly over 24 wavelengths x f-number to either side",
+    clutter_db: float | None = parameter(
+        -36.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, re its own; "
+        "none: only side lobes", unit="dB", bounds=(-100, 0),
+        note="They and the side lobes fill cysts; they fall off smoothly over 48 wavelengths x f-number to either side",
     )  # fmt: skip
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
@@ -105,6 +105,11 @@ class Beam(Declared):
     def received_bandwidth(self) -> float:
         """-6 dB bandwidth as a fraction of received_mhz. The square of a Gaussian pulse is shorter by the root of 2."""
         return self.fractional_bandwidth / (np.sqrt(2.0) if self.harmonic else 1.0)
+
+    @property
+    def clutter_power(self) -> float:
+        """Power of the clutter re that of the beam; 0 without."""
+        return 0.0 if self.clutter_db is None else 10.0 ** (self.clutter_db / 10.0)
 
     @property
     def cycles_per_mm(self) -> float:
