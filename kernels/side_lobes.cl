@@ -5,9 +5,9 @@
 // several beams, so neighbouring lines are averaged to nodes, which are convolved with the square root of the power
 // that the diffraction pattern has at each distance; what comes out is interpolated between nodes. Lines have the main
 // beam already. The phases of lobes and of multiply scattered waves are as good as random: each pair of a place that
-// scatters and a place where its echo is shown has a random sign, fixed in the patient as scatterers are. A lobe and
-// the main beam of the same line are in quadrature, so that they do not interfere. Main beam and lobes together have
-// the power of the main beam before. Walls are added to the lines afterwards.
+// scatters and a distance at which its echo is shown has a random sign, fixed in the patient as scatterers are. A lobe
+// and the main beam of the same line are in quadrature, so that they do not interfere. Main beam and lobes together
+// have the power of the main beam before. Walls are added to the lines afterwards.
 //
 // Buffers: lobes float [LOBE_DEPTHS][LOBE_DISTANCES] of diffraction.py; roots as in raytracing.cl; re, im float [scan
 // line][stride].
@@ -18,7 +18,7 @@
 // correlates.
 #define NODE_DISTANCE 1.0f
 // Signs are random from cell to cell of a lattice fixed in the patient, whose cells are so wide, in the same unit.
-#define SIGN_CELL 0.75f
+#define SIGN_CELL 4.0f
 
 // Random bits of the cell of the patient in which a scan line is at a displayed depth.
 inline uint bits_at(__constant const Acquisition *acquisition, __global const float *roots, int line, float depth_mm,
@@ -31,24 +31,23 @@ inline uint bits_at(__constant const Acquisition *acquisition, __global const fl
   return hash_mix(key ^ acquisition->seed);
 }
 
-// A weight with the sign for a pair of places: the parity of the bits that both have is random, and independent of that
-// of every other pair.
-inline float with_sign(float weight, uint received, uint sent) {
-  return as_float(as_uint(weight) ^ (popcount(received & sent) << 31));
+// A weight with a random sign: the parity of the bits that both have.
+inline float with_sign(float weight, uint place, uint offset) {
+  return as_float(as_uint(weight) ^ (popcount(place & offset) << 31));
 }
 
-// What the lobes of a node receive, with the weights of nodes 0, 1, 2... to either side. Beyond the image nothing is
-// known.
-inline void at_node(const floatn *re, const floatn *im, const uint *sent, uint received, const float *weights, int node,
-                    int nodes, int reach, floatn *lobe_re, floatn *lobe_im) {
+// What the lobes of a node receive, with the weights of nodes 0, 1, 2... to either side and the random bits of these
+// distances. Beyond the image nothing is known.
+inline void at_node(const floatn *re, const floatn *im, const uint *places, const uint *offsets, const float *weights,
+                    int node, int nodes, int reach, floatn *lobe_re, floatn *lobe_im) {
   floatn x = weights[0] * re[node], y = weights[0] * im[node];
   for (int other = max(node - reach, 0); other < node; other++) {
-    const float weight = with_sign(weights[node - other], received, sent[other]);
+    const float weight = with_sign(weights[node - other], places[other], offsets[node - other]);
     x += weight * re[other];
     y += weight * im[other];
   }
   for (int other = node + 1; other <= min(node + reach, nodes - 1); other++) {
-    const float weight = with_sign(weights[other - node], received, sent[other]);
+    const float weight = with_sign(weights[other - node], places[other], rotate(offsets[other - node], 16u));
     x += weight * re[other];
     y += weight * im[other];
   }
@@ -84,6 +83,7 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
   const float deeper = place - depth;
   __global const float *row = lobes + depth * LOBE_DISTANCES;
   float weights[LOBE_NODES], power[LOBE_NODES];  // the power up to each node, on one side
+  uint offsets[LOBE_NODES];                      // random bits of every distance
   int reach = 0;
   for (int n = 0; n < nodes; n++) {
     const float at = n * per_node / LOBE_STEP;
@@ -92,12 +92,13 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
     const float near = blend(row[column], row[column + 1], at - column);
     const float far = blend(row[LOBE_DISTANCES + column], row[LOBE_DISTANCES + column + 1], at - column);
     weights[n] = scale * blend(near, far, deeper);
+    offsets[n] = hash_mix((uint)n * 0x9E3779B1u + 0x3C6EF372u);
     power[n] = mean_power * weights[n] * weights[n] + (n > 1 ? power[n - 1] : 0.0f);
     reach = n;
   }
 
   floatn node_re[LOBE_NODES], node_im[LOBE_NODES];
-  uint sent[LOBE_NODES];  // random bits of every node as a place that scatters
+  uint places[LOBE_NODES];  // random bits of every node
   const float inverse_cell = 1.0f / (SIGN_CELL * unit_least);
   for (int node = 0; node < nodes; node++) {
     floatn sum_re = 0.0f, sum_im = 0.0f;
@@ -107,28 +108,26 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
     }
     node_re[node] = sum_re / (float)step;
     node_im[node] = sum_im / (float)step;
-    sent[node] = bits_at(acquisition, roots, min(node * step + step / 2, lines - 1), depth_mm, inverse_cell);
+    places[node] = bits_at(acquisition, roots, min(node * step + step / 2, lines - 1), depth_mm, inverse_cell);
   }
 
   floatn before_re, before_im;
   float before_kept = 1.0f;
-  uint before_bits = 0u;
   int line = 0;
   for (int node = 0; node <= nodes; node++) {
     const int last = min(node, nodes - 1);
-    const uint received = hash_mix(sent[last] + 0x9E3779B9u);  // its random bits as a place that is shown
     floatn lobe_re, lobe_im;
-    at_node(node_re, node_im, sent, received, weights, last, nodes, reach, &lobe_re, &lobe_im);
+    at_node(node_re, node_im, places, offsets, weights, last, nodes, reach, &lobe_re, &lobe_im);
     // Of those that there are
     const int left = min(last, reach), right = min(nodes - 1 - last, reach);
     const float kept = rsqrt(1.0f + power[0] + (left > 0 ? power[left] : 0.0f) + (right > 0 ? power[right] : 0.0f));
-    if (node == 0) before_re = lobe_re, before_im = lobe_im, before_kept = kept, before_bits = received;
+    if (node == 0) before_re = lobe_re, before_im = lobe_im, before_kept = kept;
     // Up to the middle of the lines of this node
     const int end = node == nodes ? lines : min(lines, node * step + step / 2);
     for (; line < end; line++) {
       const float part = (line + 0.5f) / step + 0.5f - node;
-      // Nodes in different cells are independent: equal power between them
-      const float even = received == before_bits ? 1.0f : rsqrt(1.0f - 2.0f * part * (1.0f - part));
+      // Nodes are independent: equal power between them
+      const float even = node == 0 || node == nodes ? 1.0f : rsqrt(1.0f - 2.0f * part * (1.0f - part));
       floatn x = LOAD_LANES(re + line * stride + here), y = LOAD_LANES(im + line * stride + here);
       const float whole = blend(before_kept, kept, part);
       x = whole * (x - even * (before_im + part * (lobe_im - before_im)));
@@ -136,6 +135,6 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
       STORE_LANES(x, re + line * stride + here);
       STORE_LANES(y, im + line * stride + here);
     }
-    before_re = lobe_re, before_im = lobe_im, before_kept = kept, before_bits = received;
+    before_re = lobe_re, before_im = lobe_im, before_kept = kept;
   }
 }

@@ -91,7 +91,7 @@ class RayTracer(Stage):
                 tree.segments, tree.segment_counts, tree.hits, tree.hit_counts, heavy=True,
             )  # fmt: skip
         lines, samples = frame.line_shape
-        frame.losses = get("losses", lines * (samples // CONSTANTS["LOSS_STEP"] + 1) * 8)
+        frame.losses = get("losses", lines * (samples // CONSTANTS["LOSS_STEP"] + 1) * 12)
         self.device.run(
             self._losses,
             (lines,),

@@ -120,11 +120,12 @@ def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence: float 
 def band_power(probe: Probe, loss_db) -> np.ndarray:
     """Power (...,) of a pulse after losses in dB at its centre frequency, which rise with frequency; 1 before.
 
-    A sum over 201 frequencies of a Gaussian band, each attenuated by itself.
+    A sum over 800 positive frequencies of the Gaussian band that is received, each attenuated by itself.
     """
-    part = np.linspace(-4.0, 4.0, 201)
-    frequency = np.maximum(1.0 + part * probe.fractional_bandwidth / FWHM_PER_SIGMA, 0.0)  # re the centre
-    power = np.exp(-(part**2))
+    sigma = probe.received_bandwidth / FWHM_PER_SIGMA  # re the centre
+    lowest, highest = max(1.0 - 8.0 * sigma, 0.0), 1.0 + 4.0 * sigma
+    frequency = lowest + (np.arange(800) + 0.5) / 800 * (highest - lowest)
+    power = np.exp(-(((frequency - 1.0) / sigma) ** 2))
     return (power * 10.0 ** (-0.1 * np.asarray(loss_db)[..., None] * frequency)).sum(axis=-1) / power.sum()
 
 

@@ -65,19 +65,21 @@ def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray
         weights = table.at(np.full(distance.shape, float(s)), distance * together * apart / unit)
         shown = np.minimum(np.arange(nodes) * together + together // 2, lines - 1)
         depth = f32((first + 0.5 * _TOGETHER) * acquisition["sample_mm"])
-        cell = f32(0.75) * f32(received_wavelength_mm(probe) * probe.receive_f_number)
-        sent = _bits_at(acquisition, beam, roots, shown, depth, cell)
-        received = hash_mix(sent + np.uint32(0x9E3779B9))
+        cell = f32(4) * f32(received_wavelength_mm(probe) * probe.receive_f_number)
+        places = _bits_at(acquisition, beam, roots, shown, depth, cell)
+        bits = hash_mix(distance.astype(np.uint32) * np.uint32(0x9E3779B1) + np.uint32(0x3C6EF372))
+        turned = (bits << np.uint32(16)) | (bits >> np.uint32(16))
+        offsets = np.where(np.arange(nodes)[:, None] > np.arange(nodes), bits, turned)  # to the left, to the right
         weights *= np.sqrt(together * apart / unit / correlation.mean())
-        weights *= np.where(distance == 0, 1.0, _signs(received[:, None] & sent))
+        weights *= np.where(distance == 0, 1.0, _signs(offsets & places))
         of_nodes = weights @ averaging @ scanned[:, first : first + _TOGETHER]
         place = (line + 0.5) / together - 0.5
         before = np.floor(place).astype(int)
         part = (place - before)[:, None]
         left, right = (of_nodes[np.clip(before + n, 0, nodes - 1)] for n in (0, 1))
         between = (1.0 - part) * left + part * right
-        cells = [received[np.clip(before + n, 0, nodes - 1), None] for n in (0, 1)]
-        between /= np.where(cells[0] == cells[1], 1.0, np.sqrt((1.0 - part) ** 2 + part**2))
+        has_two = ((before >= 0) & (before < nodes - 1))[:, None]
+        between /= np.where(has_two, np.sqrt((1.0 - part) ** 2 + part**2), 1.0)
         kept = 1.0 / np.sqrt(1.0 + correlation.mean() * (weights**2).sum(axis=1))
         near, far = (kept[np.clip(before + n, 0, nodes - 1), None] for n in (0, 1))
         both = scanned[:, first : first + _TOGETHER] + 1j * between
