@@ -508,3 +508,23 @@ def test_the_demo_refuses_a_label_map_as_segment_does(labels, tmp_path):
     result = ussim("demo", "--mri", labels, "--out", tmp_path / "demo")
     assert result.exit_code == 2 and "is a label map" in result.stderr and "expected an MRI" in result.stderr
     assert not (tmp_path / "demo").exists()
+
+
+def test_simulate_takes_probes_by_name(labels, tmp_path):
+    """`--probe neonatal` was read as a file."""
+    named, from_file = tmp_path / "named.png", tmp_path / "file.png"
+    (tmp_path / "probe.json").write_text(json.dumps(PROBES["neonatal"].to_dict()))
+    for probe, out in (("neonatal", named), (tmp_path / "probe.json", from_file)):
+        result = ussim(
+            "simulate", labels, "--pose", "auto", "--probe", probe, "--set", "probe.scan_lines=32", "-o", out
+        )
+        assert result.exit_code == 0, result.output
+    np.testing.assert_array_equal(np.asarray(Image.open(named)), np.asarray(Image.open(from_file)))
+    result = ussim("simulate", labels, "--pose", "auto", "--probe", "neonatel", "-o", tmp_path / "none.png")
+    assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
+    assert "neonatel" in result.stderr and ", ".join(PROBES) in result.stderr
+    result = ussim("simulate", labels, "--pose", "auto", "--set", "probe.focal_zones=4", "-o", tmp_path / "none.png")
+    assert (
+        result.exit_code == 2 and "focal_zones is 4 with transmit 'focus', expected transmit 'zones'" in result.stderr
+    )
+    assert not (tmp_path / "none.png").exists()

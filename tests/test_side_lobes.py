@@ -114,7 +114,7 @@ MODES = {
     "harmonic, out of focus": (replace(PULSE, harmonic=True), 12.5, lambda: field(PULSE, 12.0, 24.0, 12.5) ** 2),
     "angles": (
         replace(PLAIN, transmit="angles", transmit_angles=41), 15.0,
-        lambda: plane_waves(replace(PLAIN, transmit_angles=41)),
+        lambda: plane_waves(replace(PLAIN, transmit="angles", transmit_angles=41)),
     ),
 }  # fmt: skip
 
