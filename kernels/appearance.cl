@@ -50,11 +50,12 @@ __kernel void mix_bases(__global const float *bases, __constant const float *wei
   }
   floatn exponent = 0.0f;
   for (int t = 0; t < tissues; t++) exponent += decays[t] * LOAD_LANES(paths + t * values + here);
-  // A further loss costs less of a pulse whose frequency has fallen (downshift.cl).
+  // A further loss costs less of a band whose frequency has fallen (downshift.cl).
   const int sample = get_global_id(0) * LANES;
-  const floatn loss = loss_at(losses + 2 * (int)get_global_id(1) * (samples / LOSS_STEP + 1), sample);
+  const floatn loss = loss_at(losses + LOSS_WORDS * (int)get_global_id(1) * (samples / LOSS_STEP + 1), sample);
   const floatn further = exponent / -LOG2_E;
-  exponent += LOG2_E * acquisition->downshift * further * (loss + 0.5f * further);
+  if (tissues > 0)
+    exponent += LOG2_E * (gain_of_band_lanes(acquisition, loss + further) - gain_of_band_lanes(acquisition, loss));
   const floatn factor = exp2_fast(clamp(exponent, -100.0f, 100.0f));
 #if LANES == 1
   vstore2((float2)(low, high) * factor, here, iq);

@@ -62,8 +62,8 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   const floatn s = fmax((TO_FLOATN(LANE_INDEX) + sample) * acquisition->sample_mm - start, (floatn)(0.0f));
   floatn spread, factor;
   find_spread(acquisition, spreads, centre, s, &spread, &factor);
-  __global const float *of_line = losses + 2 * line * (acquisition->samples / LOSS_STEP + 1);
-  const floatn stretch = 1.0f / frequency_after_lanes(acquisition, loss_at(of_line, sample));
+  __global const float *of_line = losses + LOSS_WORDS * line * (acquisition->samples / LOSS_STEP + 1);
+  const floatn stretch = 1.0f / frequency_at(of_line, sample);
   const floatn apart = line_distance_lanes(acquisition, s);
   const floatn sigma = spread * lateral_sigma_lanes_at(acquisition, s, stretch);
   floatn step = apart / sigma;  // between traced lines, in sigmas
@@ -80,11 +80,11 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   const int last = min((int)longest, max(centre, acquisition->traced_lines - 1 - centre));
   // Up to here both edges of a pair are there, for all lanes.
   const int whole = min((int)shortest, min(centre - 1, acquisition->traced_lines - 2 - centre));
-  // By how much the phase turns at one step from the axis; at the middle between stored losses, which tell the
-  // frequency.
+  // By how much the phase turns at one step from the axis; at the middle between stored frequencies.
   const int node = sample / LOSS_STEP;
   const float middle = fmax((node + 0.5f) * LOSS_STEP * acquisition->sample_mm - start, 0.0f);
-  const float frequency = frequency_after(acquisition, 0.5f * (of_line[2 * node] + of_line[2 * node + 2]));
+  __global const float *stored = of_line + LOSS_WORDS * node + 2;
+  const float frequency = 0.5f * (stored[0] + stored[LOSS_WORDS]);
   SPREAD(float, spread_, spread);
   const float across = line_distance(acquisition, middle) / spread_[0];
   const float curved = lateral_curvature(acquisition, middle, 1.0f / frequency) * across * across;

@@ -22,7 +22,7 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
   }
   if (acquisition->downshift > 0.0f) {  // back to the carrier of the transmitted pulse
     floatn c, s;
-    turn(turns_at(acquisition, losses + 2 * line * (samples / LOSS_STEP + 1), sample), &c, &s);
+    turn(turns_at(acquisition, losses + LOSS_WORDS * line * (samples / LOSS_STEP + 1), sample), &c, &s);
     const floatn x = sum_re;
     sum_re = x * c + sum_im * s;
     sum_im = sum_im * c - x * s;
@@ -30,30 +30,32 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
   STORE_PAIRS(sum_re, sum_im, iq + 2 * (line * samples + sample));
 }
 
-// Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC rises by tgc_per_sample [dB]
-// until sample tgc_samples and stays there. `ringing`, float2 [sample], is added to every line: the reverberation at
-// the face. Both count from where the line leaves it.
+// Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC is `tgc` [sample], in dB.
+// `ringing`, float2 [sample], is added to every line: the reverberation at the face. Both count from where the line
+// leaves it.
 __kernel void compress(__constant const Acquisition *acquisition, __global const float *iq, int samples,
-                       __global const float *ringing, float noise, uint noise_seed, float tgc_per_sample,
-                       float tgc_samples, float level_of_white_db, Display display, __global float *envelope,
-                       __global uchar *grey) {
+                       __global const float *ringing, float noise, uint noise_seed, __global const float *tgc,
+                       float level_of_white_db, Display display, __global float *envelope, __global uchar *grey) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int here = line * samples + sample;
   floatn re, im;
   LOAD_PAIRS(re, im, iq + 2 * here);
   const int start = (int)(line_start(acquisition, (float)line) / acquisition->sample_mm + 0.5f);
-  floatn ring_re, ring_im;
+  floatn ring_re, ring_im, tgc_db;
   if (start == 0) {
     LOAD_PAIRS(ring_re, ring_im, ringing + 2 * sample);
+    tgc_db = LOAD_LANES(tgc + sample);
   } else {
-    float shifted_re[LANES], shifted_im[LANES];
+    float shifted_re[LANES], shifted_im[LANES], shifted_db[LANES];
     for (int lane = 0; lane < LANES; lane++) {
       const int from = sample + lane - start, at = max(from, 0);
       shifted_re[lane] = from < 0 ? 0.0f : ringing[2 * at];
       shifted_im[lane] = from < 0 ? 0.0f : ringing[2 * at + 1];
+      shifted_db[lane] = tgc[at];
     }
     ring_re = LOAD_LANES(shifted_re);
     ring_im = LOAD_LANES(shifted_im);
+    tgc_db = LOAD_LANES(shifted_db);
   }
   re += ring_re;
   im += ring_im;
@@ -64,7 +66,6 @@ __kernel void compress(__constant const Acquisition *acquisition, __global const
     im += noise * gaussian(hash_mixn(key + 0x9E3779B9u));
   }
   floatn power = re * re + im * im + 1e-30f;
-  const floatn tgc_db = clamp(TO_FLOATN(index - start), (floatn)(0.0f), (floatn)(tgc_samples)) * tgc_per_sample;
   const floatn level_db = 3.01029996f * log2_fast(power) + tgc_db;
   STORE_LANES(sqrt(power) * exp2_fast(clamp(tgc_db * 0.166096405f, -100.0f, 100.0f)), envelope + here);
   STORE_GREY(grey_level(level_db, level_of_white_db, display.dynamic_range_db), grey + here);

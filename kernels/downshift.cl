@@ -2,11 +2,12 @@
 // (docs/physics.md#frequency-that-falls-with-depth).
 //
 // A Gaussian spectrum exp(-(f - f0)^2 / 2 sf^2) times exp(-A f), the two-way loss, is the same Gaussian about f0 - A
-// sf^2 times exp(-A f0 + (A sf)^2 / 2). Every echo has its own amplitude (gain_of_band). Its frequency is that of the
-// strongest path to its depth on the scan line: behind bone, that of a mirror image in front of it.
+// sf^2 times exp(-A f0 + (A sf)^2 / 2), of which the part above zero is there. Every echo has its own amplitude
+// (gain_of_band). Its frequency is that of the strongest path to its depth on the scan line: behind bone, that of a
+// mirror image in front of it.
 //
-// Buffers: segments with their counts as in raytracing.cl; losses float2 [scan line][1 + samples / LOSS_STEP]: nepers
-// at f0, and the turns of the carrier that are missing up to there; re, im float [scan line][stride].
+// Buffers: segments with their counts as in raytracing.cl; losses float [scan line][1 + samples / LOSS_STEP]
+// [LOSS_WORDS] of common.clh; re, im float [scan line][stride].
 
 #include "common.clh"
 
@@ -16,9 +17,9 @@ __kernel void losses(__constant const Acquisition *acquisition, __global const S
   const int scan_line = get_global_id(0), nodes = acquisition->samples / LOSS_STEP + 1;
   const int line = acquisition->guard_lines + scan_line * acquisition->lateral_rays;
   const float step = LOSS_STEP * acquisition->sample_mm;
-  __global float *to = losses_ + 2 * scan_line * nodes;
+  __global float *to = losses_ + LOSS_WORDS * scan_line * nodes;
   const int count = min(segment_counts[line], MAX_SEGMENTS);
-  for (int node = 0; node < nodes; node++) vstore2((float2)(0.0f, -1.0f), node, to);
+  for (int node = 0; node < nodes; node++) vstore3((float3)(0.0f, -1.0f, 1.0f), node, to);
   for (int index = 0; index < count; index++) {
     __global const Segment *segment = segments + line * MAX_SEGMENTS + index;
     const float slope = segment->depth_per_mm, end = segment->depth_mm + segment->length_mm * slope;
@@ -26,30 +27,35 @@ __kernel void losses(__constant const Acquisition *acquisition, __global const S
     for (int node = max((int)ceil(segment->depth_mm / step), 0); node <= last; node++) {
       const float along = (node * step - segment->depth_mm) / slope;
       const float strength = segment->weight * segment->attenuation * exp_fast(-segment->decay_per_mm * along);
-      if (strength > to[2 * node + 1])
-        vstore2((float2)(segment->loss + segment->loss_per_mm * along, strength), node, to);
+      if (strength > to[LOSS_WORDS * node + 1])
+        vstore3((float3)(segment->loss + segment->loss_per_mm * along, strength, 1.0f), node, to);
     }
   }
   float loss = 0.0f, lower = 0.0f, turns = 0.0f;
   for (int node = 0; node < nodes; node++) {
-    if (to[2 * node + 1] >= 0.0f) loss = to[2 * node];  // otherwise nothing is there, and it goes on
-    const float missing = 1.0f - frequency_after(acquisition, loss);
+    if (to[LOSS_WORDS * node + 1] >= 0.0f) loss = to[LOSS_WORDS * node];  // otherwise nothing is there: it goes on
+    const float frequency = frequency_after(acquisition, loss), missing = 1.0f - frequency;
     if (node > 0) turns += 0.5f * (lower + missing) * step * acquisition->cycles_per_mm;
     lower = missing;
-    vstore2((float2)(loss, turns), node, to);
+    vstore3((float3)(loss, turns, frequency), node, to);
   }
 }
 
-// The carrier of every echo becomes that of its depth, for a pulse without a carrier to be convolved with. Global size
-// (samples / LANES, scan lines).
+// The carrier of every echo becomes that of its depth, for a pulse without a carrier to be convolved with. Echoes lie
+// between two samples, with one phase in both. Turned by an angle from one sample to the next, they have (2 + cos) / 3
+// of their power on average, which is given back. Global size (samples / LANES, scan lines).
 __kernel void shift_frequency(__constant const Acquisition *acquisition, __global const float *losses_,
                               __global float *re, __global float *im, int stride) {
   const int sample = get_global_id(0) * LANES, line = get_global_id(1);
   const int here = line * stride + LINE_PAD + sample;
-  __global const float *of_line = losses_ + 2 * line * (acquisition->samples / LOSS_STEP + 1);
+  __global const float *of_line = losses_ + LOSS_WORDS * line * (acquisition->samples / LOSS_STEP + 1);
   floatn c, s;
   turn(turns_at(acquisition, of_line, sample), &c, &s);
-  const floatn x = LOAD_LANES(re + here), y = LOAD_LANES(im + here);
+  const float cycles = acquisition->sample_mm * acquisition->cycles_per_mm;
+  floatn step_c, step_s;
+  turn((1.0f - frequency_at(of_line, sample)) * cycles, &step_c, &step_s);
+  const floatn kept = rsqrt((2.0f + step_c) / 3.0f);
+  const floatn x = kept * LOAD_LANES(re + here), y = kept * LOAD_LANES(im + here);
   STORE_LANES(x * c - y * s, re + here);
   STORE_LANES(x * s + y * c, im + here);
 }

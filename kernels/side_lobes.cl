@@ -4,38 +4,61 @@
 // One work-item computes LANES samples of all scan lines; global size (samples / LANES). The lobes are as broad as
 // several beams, so neighbouring lines are averaged to nodes, which are convolved with the square root of the power
 // that the diffraction pattern has at each distance; what comes out is interpolated between nodes. Lines have the main
-// beam already. Lobes of an aperture have alternating signs: on average they do not interfere with the main beam, to
-// which they are added in quadrature; signs change every two nodes. Main beam and lobes together have the power of the
-// main beam before. Walls are added to the lines afterwards.
+// beam already. The phases of lobes and of multiply scattered waves are as good as random: each pair of a place that
+// scatters and a distance at which its echo is shown has a random sign, fixed in the patient as scatterers are. A lobe
+// and the main beam of the same line are in quadrature, so that they do not interfere. Main beam and lobes together
+// have the power of the main beam before. Walls are added to the lines afterwards.
 //
-// Buffers: lobes float [LOBE_DEPTHS][LOBE_DISTANCES] of diffraction.py;
-// re, im float [scan line][stride].
+// Buffers: lobes float [LOBE_DEPTHS][LOBE_DISTANCES] of diffraction.py; roots as in raytracing.cl; re, im float [scan
+// line][stride].
 
 #include "common.clh"
 
-// Nodes are at most this far apart, in wavelengths x f-number: less than a lobe.
-#define NODE_DISTANCE 0.8f
+// Nodes are at most this far apart, in wavelengths x f-number: about the length over which speckle of the main beam
+// correlates.
+#define NODE_DISTANCE 1.0f
+// Signs are random from cell to cell of a lattice fixed in the patient, whose cells are so wide, in the same unit.
+#define SIGN_CELL 4.0f
 
-// The convolution at a node with the weights of nodes 0, 1, 2... to either side.
-inline floatn at_node(const floatn *values, const float *weights, int node, int nodes, int reach) {
-  floatn sum = weights[0] * values[node];
-  for (int n = 1; n <= reach; n++) {
-    const int left = node - n, right = node + n;
-    if (left < 0 && right >= nodes) break;  // beyond the image nothing is known
-    if (left < 0) {
-      sum += weights[n] * values[right];
-    } else if (right >= nodes) {
-      sum += weights[n] * values[left];
-    } else {
-      sum += weights[n] * (values[left] + values[right]);
-    }
+// Random bits of the cell of the patient in which a scan line is at a displayed depth.
+inline uint bits_at(__constant const Acquisition *acquisition, __global const float *roots, int line, float depth_mm,
+                    float inverse_cell) {
+  const float4 root = vload4(acquisition->guard_lines + line * acquisition->lateral_rays, roots);
+  const float along = fmax(depth_mm - line_start(acquisition, (float)line), 0.0f);
+  const float3 place = (float3)(root.x + along * root.z, root.y + along * root.w, 0.0f);
+  const float3 cell = floor(affine_point(acquisition->probe_to_ras, place) * inverse_cell);
+  const uint key = (uint)(int)cell.x * 0x9E3779B1u + (uint)(int)cell.y * 0x85EBCA77u + (uint)(int)cell.z * 0xC2B2AE3Du;
+  return hash_mix(key ^ acquisition->seed);
+}
+
+// A weight with a random sign: the parity of the bits that both have.
+inline float with_sign(float weight, uint place, uint offset) {
+  return as_float(as_uint(weight) ^ (popcount(place & offset) << 31));
+}
+
+// What the lobes of a node receive, with the weights of nodes 0, 1, 2... to either side and the random bits of these
+// distances. Beyond the image nothing is known.
+inline void at_node(const floatn *re, const floatn *im, const uint *places, const uint *offsets, const float *weights,
+                    int node, int nodes, int reach, floatn *lobe_re, floatn *lobe_im) {
+  floatn x = weights[0] * re[node], y = weights[0] * im[node];
+  for (int other = max(node - reach, 0); other < node; other++) {
+    const float weight = with_sign(weights[node - other], places[other], offsets[node - other]);
+    x += weight * re[other];
+    y += weight * im[other];
   }
-  return sum;
+  for (int other = node + 1; other <= min(node + reach, nodes - 1); other++) {
+    const float weight = with_sign(weights[other - node], places[other], rotate(offsets[other - node], 16u));
+    x += weight * re[other];
+    y += weight * im[other];
+  }
+  *lobe_re = x;
+  *lobe_im = y;
 }
 
 // `unit_least` and `unit_slope` give the wavelength times the f-number of the receive aperture, in millimetres.
-__kernel void side_lobes(__constant const Acquisition *acquisition, __global const float *lobes, __global float *re,
-                         __global float *im, int stride, float unit_least, float unit_slope) {
+__kernel void side_lobes(__constant const Acquisition *acquisition, __global const float *lobes,
+                         __global const float *roots, __global float *re, __global float *im, int stride,
+                         float unit_least, float unit_slope) {
   const int sample = get_global_id(0) * LANES, here = LINE_PAD + sample, lines = acquisition->scan_lines;
   // One path length for all lines and LANES: with steered lines that of the middle line, from where it leaves the face.
   const float depth_mm = (sample / LOSS_STEP * LOSS_STEP + 0.5f * LOSS_STEP) * acquisition->sample_mm;
@@ -46,8 +69,8 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
   const int step = clamp((int)(NODE_DISTANCE * unit / apart), dense, lines), nodes = (lines + step - 1) / step;
 
   // The mean of lines whose speckle has the correlation exp(-distance^2 / 4 sigma^2) has this part of their power; with
-  // a curved phase k y^2 / 2 the exponent is 1 + k^2 sigma^4 times as large. (Neighbouring nodes have one sign as often
-  // as the other, and their correlation does not matter.)
+  // a curved phase k y^2 / 2 the exponent is 1 + k^2 sigma^4 times as large. (Signs are random, so that the correlation
+  // of different nodes does not matter.)
   const float bent = lateral_curvature(acquisition, s, 1.0f) * main_beam * main_beam;
   const float fall = 0.25f * LOG2_E * (apart / main_beam) * (apart / main_beam) * (1.0f + bent * bent);
   float mean_power = 1.0f;
@@ -60,6 +83,7 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
   const float deeper = place - depth;
   __global const float *row = lobes + depth * LOBE_DISTANCES;
   float weights[LOBE_NODES], power[LOBE_NODES];  // the power up to each node, on one side
+  uint offsets[LOBE_NODES];                      // random bits of every distance
   int reach = 0;
   for (int n = 0; n < nodes; n++) {
     const float at = n * per_node / LOBE_STEP;
@@ -67,12 +91,15 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
     const int column = (int)at;
     const float near = blend(row[column], row[column + 1], at - column);
     const float far = blend(row[LOBE_DISTANCES + column], row[LOBE_DISTANCES + column + 1], at - column);
-    weights[n] = (n & 2 ? -scale : scale) * blend(near, far, deeper);
+    weights[n] = scale * blend(near, far, deeper);
+    offsets[n] = hash_mix((uint)n * 0x9E3779B1u + 0x3C6EF372u);
     power[n] = mean_power * weights[n] * weights[n] + (n > 1 ? power[n - 1] : 0.0f);
     reach = n;
   }
 
   floatn node_re[LOBE_NODES], node_im[LOBE_NODES];
+  uint places[LOBE_NODES];  // random bits of every node
+  const float inverse_cell = 1.0f / (SIGN_CELL * unit_least);
   for (int node = 0; node < nodes; node++) {
     floatn sum_re = 0.0f, sum_im = 0.0f;
     for (int line = node * step; line < min(lines, (node + 1) * step); line++) {
@@ -81,6 +108,7 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
     }
     node_re[node] = sum_re / (float)step;
     node_im[node] = sum_im / (float)step;
+    places[node] = bits_at(acquisition, roots, min(node * step + step / 2, lines - 1), depth_mm, inverse_cell);
   }
 
   floatn before_re, before_im;
@@ -88,9 +116,9 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
   int line = 0;
   for (int node = 0; node <= nodes; node++) {
     const int last = min(node, nodes - 1);
-    const floatn lobe_re = at_node(node_re, weights, last, nodes, reach);
-    const floatn lobe_im = at_node(node_im, weights, last, nodes, reach);
-    // Of those that there are: beyond the image nothing is known.
+    floatn lobe_re, lobe_im;
+    at_node(node_re, node_im, places, offsets, weights, last, nodes, reach, &lobe_re, &lobe_im);
+    // Of those that there are
     const int left = min(last, reach), right = min(nodes - 1 - last, reach);
     const float kept = rsqrt(1.0f + power[0] + (left > 0 ? power[left] : 0.0f) + (right > 0 ? power[right] : 0.0f));
     if (node == 0) before_re = lobe_re, before_im = lobe_im, before_kept = kept;
@@ -98,7 +126,8 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
     const int end = node == nodes ? lines : min(lines, node * step + step / 2);
     for (; line < end; line++) {
       const float part = (line + 0.5f) / step + 0.5f - node;
-      const float even = rsqrt(1.0f - 2.0f * part * (1.0f - part));  // nodes are independent: equal power between them
+      // Nodes are independent: equal power between them
+      const float even = node == 0 || node == nodes ? 1.0f : rsqrt(1.0f - 2.0f * part * (1.0f - part));
       floatn x = LOAD_LANES(re + line * stride + here), y = LOAD_LANES(im + line * stride + here);
       const float whole = blend(before_kept, kept, part);
       x = whole * (x - even * (before_im + part * (lobe_im - before_im)));

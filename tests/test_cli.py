@@ -517,3 +517,23 @@ def test_the_demo_leaves_nothing_behind_of_an_image_that_it_refuses(tmp_path):
     Volume(values, np.diag([3.0, 3.0, 3.0, 1.0])).write(noise)
     result = ussim("demo", "--mri", noise, "--out", tmp_path / "new" / "demo")
     assert result.exit_code == 2 and "noise" in result.stderr and not (tmp_path / "new").exists()
+
+
+def test_simulate_takes_probes_by_name(labels, tmp_path):
+    """`--probe neonatal` was read as a file."""
+    named, from_file = tmp_path / "named.png", tmp_path / "file.png"
+    (tmp_path / "probe.json").write_text(json.dumps(PROBES["neonatal"].to_dict()))
+    for probe, out in (("neonatal", named), (tmp_path / "probe.json", from_file)):
+        result = ussim(
+            "simulate", labels, "--pose", "auto", "--probe", probe, "--set", "probe.scan_lines=32", "-o", out
+        )
+        assert result.exit_code == 0, result.output
+    np.testing.assert_array_equal(np.asarray(Image.open(named)), np.asarray(Image.open(from_file)))
+    result = ussim("simulate", labels, "--pose", "auto", "--probe", "neonatel", "-o", tmp_path / "none.png")
+    assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
+    assert "neonatel" in result.stderr and ", ".join(PROBES) in result.stderr
+    result = ussim("simulate", labels, "--pose", "auto", "--set", "probe.focal_zones=4", "-o", tmp_path / "none.png")
+    assert (
+        result.exit_code == 2 and "focal_zones is 4 with transmit 'focus', expected transmit 'zones'" in result.stderr
+    )
+    assert not (tmp_path / "none.png").exists()

@@ -16,6 +16,7 @@ from SlicerUSSim.Logic import (
     Preset,
     SimulationError,
     SimulationSettings,
+    TissueTable,
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.imaging.diffraction import lobes_of
@@ -138,6 +139,7 @@ def test_the_sum_over_angles_has_the_width_of_the_array_factor():
 
 
 def test_the_harmonic_grows_as_the_logarithm_of_the_quasi_linear_solution():
+    """Beside a hundredth of its power at the focus, which leaves the face already."""
     probe = LinearProbe(
         30, 60, frequency_mhz=2.5, harmonic=True, focus_mm=30.0, elevation_focus_mm=30.0, aperture_mm=10.0,
         elevation_aperture_mm=10.0,
@@ -146,11 +148,95 @@ def test_the_harmonic_grows_as_the_logarithm_of_the_quasi_linear_solution():
     length = 2 * np.pi * (1.21 * 1.54 / 2.5 * 3.0 / 2.3548) ** 2 / (1.54 / 2.5)
     b = (np.append([0.0, 30.0], depth) - 30.0) / length
     grown = np.abs(np.log((1 + 1j * b[1:]) / (1 + 1j * b[0])))
-    np.testing.assert_allclose(probe.harmonic_level(depth), grown[1:] / grown[0], rtol=1e-3)
+    expected = np.sqrt(((grown[1:] / grown[0]) ** 2 + 0.01) / 1.01)
+    np.testing.assert_allclose(probe.harmonic_level(depth), expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("name", "mhz"), [("abdominal", 1.75), ("linear", 4.5), ("phased", 2.5), ("cardiac", 1.4)])
+def test_the_level_of_the_harmonic_has_no_steps_and_no_black_face(name, mhz):
+    """Between focal zones it had steps of 2 to 4 dB, and 5 mm deep it was 29 dB down."""
+    for transmit in ("focus", "zones", "angles"):
+        probe = replace(PROBES[name], frequency_mhz=mhz, harmonic=True, transmit=transmit)
+        depth = np.arange(0.0, probe.depth_mm, 0.05)
+        level = 20 * np.log10(probe.harmonic_level(depth))
+        assert np.abs(np.diff(level)).max() < 0.1, transmit
+        assert -21.0 < level[0] < -19.0 and level.argmax() * 0.05 > 0.2 * probe.focus_mm
+        assert probe.harmonic_level(np.array([probe.focus_mm]))[0] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_speckle_of_the_harmonic_is_even_where_zones_meet():
+    """The mean level of every millimetre of an image, without attenuation, against that of a smooth curve."""
+    probe = LinearProbe(
+        20.0, 40.0, scan_lines=81, frequency_mhz=3.0, harmonic=True, transmit="zones", focal_zones=3, focus_mm=20.0
+    )
+    tissue = replace(SPECKLE, attenuation_db_cm_mhz=0.0)
+    sim = UltrasoundSimulator(SOLID, TissueTable({0: tissue, 1: tissue}), SimulationSettings(ring_down=False))
+    frame = sim.simulate(probe, rigid(np.eye(3), [0, -20, 0]))
+    borders = np.flatnonzero(np.diff(probe.zone_at(np.arange(1.0, 39.0, 0.05)))) * 0.05 + 1.0
+    assert len(borders) == 2
+    for border in borders:
+        before, behind = (level_db(depth_window(frame, border + side, 0.75)) for side in (-0.75, 0.75))
+        growth = np.diff(20 * np.log10(probe.harmonic_level(np.array([border - 0.75, border + 0.75]))))[0]
+        assert behind - before == pytest.approx(growth, abs=0.8) and abs(growth) < 1.5
+
+
+def test_the_second_harmonic_must_lie_in_the_band_of_the_array():
+    message = (
+        r"ConvexProbe: the second harmonic of frequency_mhz 3\.5 is 7 MHz, expected within band_mhz, 2\.6 to 4\.4; "
+        r"set frequency_mhz to between 1\.3 and 2\.2"
+    )
+    with pytest.raises(SimulationError, match=message):
+        replace(PROBES["abdominal"], harmonic=True)
+    with pytest.raises(SimulationError, match=message):
+        Preset(PROBES["abdominal"]).changed("probe", harmonic=True)
+    with pytest.raises(SimulationError, match="band_mhz is 5 to 3, expected the lower frequency first"):
+        LinearProbe(38, 40, band_mhz=(5.0, 3.0))
+    for name, probe in PROBES.items():
+        low, high = probe.band_mhz or (0.0, 0.0)
+        width = 0.5 * probe.fractional_bandwidth * probe.frequency_mhz
+        assert (low, high) == pytest.approx((probe.frequency_mhz - width, probe.frequency_mhz + width), abs=0.1), name
+        second = replace(probe, harmonic=True, frequency_mhz=0.5 * probe.frequency_mhz)
+        assert second.received_mhz == probe.frequency_mhz
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"focal_zones": 4}, "focal_zones is 4 with transmit 'focus', expected transmit 'zones', or 3, the default"),
+        (
+            {"transmit": "zones", "transmit_angles": 9},
+            "transmit_angles is 9 with transmit 'zones', expected transmit 'ang",
+        ),
+        ({"largest_angle_deg": 12.5}, "largest_angle_deg is 12.5 with transmit 'focus', expected transmit 'angles'"),
+    ],
+)
+def test_parameters_of_another_kind_of_transmission_are_refused(values, message):
+    """They were ignored."""
+    with pytest.raises(SimulationError, match=message):
+        replace(PROBES["linear"], **values)
+    with pytest.raises(SimulationError, match=message):
+        probe_from_dict(PROBES["linear"].to_dict() | values)
+    with pytest.raises(SimulationError, match=message):
+        Preset(PROBES["linear"]).changed("probe", **values)
+
+
+def test_another_kind_of_transmission_takes_its_parameters_with_it():
+    zones = Preset(PROBES["linear"]).changed("probe", transmit="zones").changed("probe", focal_zones=5)
+    assert zones.probe.focal_zones == 5
+    assert zones.changed("probe", transmit="focus").probe == PROBES["linear"]
+
+
+def test_a_parameter_of_another_kind_of_probe_is_named():
+    with pytest.raises(
+        SimulationError, match=r"ConvexProbe has no steering_deg, expected one of frequency_mhz.*radius_mm"
+    ):
+        ConvexProbe(radius_mm=40, field_of_view_deg=60, depth_mm=100, steering_deg=5.0)  # type: ignore[call-arg]
+    with pytest.raises(SimulationError, match="PhasedProbe has no width_mm"):
+        replace(PROBES["phased"], width_mm=5.0)  # type: ignore[call-arg]
 
 
 def test_the_harmonic_has_twice_the_frequency_a_longer_pulse_and_weaker_side_lobes():
-    pulse = replace(PROBES["abdominal"], frequency_mhz=2.0, clutter_db=-100.0)
+    pulse = replace(PROBES["abdominal"], frequency_mhz=2.0, clutter_db=None)
     second = replace(pulse, harmonic=True)
     assert second.cycles_per_mm == 2.0 * pulse.cycles_per_mm
     assert second.axial_sigma_mm == pytest.approx(pulse.axial_sigma_mm / np.sqrt(2.0))

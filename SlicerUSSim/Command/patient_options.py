@@ -76,7 +76,12 @@ class PatientOptions:
         )
     )  # fmt: skip
     probe: str | None = declared(
-        click.option("--probe", type=click.Path(), help="Probe as JSON (default: the preset's, a phased array).")
+        click.option(
+            "--probe",
+            metavar="NAME|PATH",
+            help="Name of a probe (docs/probes.md), as neonatal, or a probe as JSON "
+            "(default: the preset's, a phased array).",
+        )
     )
     tissues: str | None = declared(
         click.option(
@@ -123,16 +128,32 @@ class PatientOptions:
 
         Raises SimulationError for files that cannot be read and values out of range.
         """
-        from SlicerUSSim.Logic.base.files import read_json
         from SlicerUSSim.Logic.imaging.preset import Preset
-        from SlicerUSSim.Logic.probe.arrays import probe_from_dict
 
         changes = Changes.of(self.changes)
         preset = Preset.read(self.preset) if self.preset else Preset()
         preset = preset.changed("display", **self.display).changed("settings", **self.settings)
         if self.probe:
-            preset = replace(preset, probe=probe_from_dict(read_json(self.probe), self.probe))
+            preset = replace(preset, probe=named_probe(self.probe))
         return changes.to_preset(preset)
+
+
+def named_probe(name_or_path: str) -> Probe:
+    """The probe of PROBES by its name, or read from a JSON file.
+
+    Raises SimulationError for what is neither, with the names, and for a file that cannot be read.
+    """
+    from SlicerUSSim.Logic.base.files import read_json
+    from SlicerUSSim.Logic.probe.arrays import PROBES, probe_from_dict
+
+    if name_or_path in PROBES:
+        return PROBES[name_or_path]
+    is_name = not os.path.exists(name_or_path) and not os.path.splitext(name_or_path)[1]
+    require(
+        not is_name or os.path.dirname(name_or_path) != "",
+        f"--probe is {name_or_path!r}, which is no file, expected a JSON file or one of {', '.join(PROBES)}",
+    )
+    return probe_from_dict(read_json(name_or_path), name_or_path)
 
 
 @dataclass(frozen=True, eq=False)

@@ -149,8 +149,10 @@ class DisplaySettings(Declared):
         shown=Shown(20, 120, is_slider=True), option="dynamic-range", fit=Fit(30, 90, tolerance=3.0),
     )  # fmt: skip
     tgc_db_cm_mhz: float = parameter(
-        0.5, "TGC", "Time-gain compensation, as the one-way attenuation it compensates; 0: none", unit="dB/(cm MHz)",
-        bounds=(0, 20), shown=Shown(0, 2, 0.01, is_slider=True), option="tgc", fit=Fit(0.0, 1.2, tolerance=0.1),
+        0.5, "TGC",
+        "Time-gain compensation, as the one-way attenuation that it compensates over the pulse's band; 0: none",
+        unit="dB/(cm MHz)", bounds=(0, 20), shown=Shown(0, 2, 0.01, is_slider=True), option="tgc",
+        fit=Fit(0.0, 1.2, tolerance=0.1),
     )  # fmt: skip
     tgc_reach: float = parameter(
         1.0, "TGC reach",

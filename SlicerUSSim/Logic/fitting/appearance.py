@@ -181,7 +181,7 @@ class AppearanceModel:
     def _buffer(self, kind: str, number: int) -> Buffer:
         lines, samples = self._frames[number].line_shape
         if kind == "losses":
-            return self._workspace.get(f"{kind} {number}", lines * (samples // CONSTANTS["LOSS_STEP"] + 1) * 8)
+            return self._workspace.get(f"{kind} {number}", lines * (samples // CONSTANTS["LOSS_STEP"] + 1) * 12)
         count = 2 * self._base_count if kind == "bases" else max(len(self.attenuating), 1)
         return self._workspace.get(f"{kind} {number}", 4 * count * lines * samples)
 

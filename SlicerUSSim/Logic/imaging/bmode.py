@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB
 from SlicerUSSim.Logic.imaging.noise import noise_key
@@ -18,6 +19,8 @@ from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 if TYPE_CHECKING:
     from pyopencl import Buffer
 
+#: Decibels of amplitude in a neper
+DB_PER_NEPER = 20.0 / np.log(10.0)
 _PER_SAMPLE = 130  # operations: noise, TGC, envelope, log compression
 
 
@@ -100,6 +103,20 @@ def downshift(probe: Probe) -> float:
     return (probe.received_bandwidth / FWHM_PER_SIGMA) ** 2
 
 
+def gain_of_band(shift: float, loss: np.ndarray) -> np.ndarray:
+    """By how many nepers the band of a pulse has more amplitude than its centre alone, after `loss` nepers both ways.
+
+    `shift` is that of `downshift`, 0 for a single frequency. Only frequencies above zero count: the Gaussian spectrum
+    about 1 - shift loss has the part erfc(-z) / 2 of its power there, z in its widths
+    (docs/physics.md#frequency-that-falls-with-depth).
+    """
+    if shift == 0.0:
+        return np.zeros_like(loss)
+    z = (1.0 - shift * loss) / np.sqrt(shift)
+    parts = log_ndtr(np.sqrt(2.0) * z) - log_ndtr(np.sqrt(2.0 / shift))
+    return 0.5 * (shift * loss**2 + parts)
+
+
 class Compressor(Stage):
     """Noise, TGC, envelope and log compression to eight bits."""
 
@@ -111,15 +128,14 @@ class Compressor(Stage):
         self.workspace = Workspace(device)
         #: What the ring-down depends on, and its buffer
         self._ringing: tuple[tuple, Buffer] | None = None
+        #: Likewise of the time-gain compensation
+        self._gains: tuple[tuple, Buffer] | None = None
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the grey levels of every line: the frame's `envelope` and `grey`."""
         display, acquisition, (lines, samples) = frame.display, frame.acquisition, frame.line_shape
         frame.envelope = self.workspace.get("envelope", lines * samples * 4)
         frame.grey = self.workspace.get("grey", lines * samples)
-        # Two-way path per sample, in cm.
-        tgc = 2.0 * display.tgc_db_cm_mhz * float(acquisition["frequency_mhz"]) * float(acquisition["sample_mm"]) * 0.1
-        rising = display.tgc_reach * frame.probe.depth_mm / float(acquisition["sample_mm"])
         # Noise power is shared between the two quadrature components.
         noise = 0.0 if display.noise_db is None else 10.0 ** (display.noise_db / 20.0) / np.sqrt(2.0)
         self.device.run(
@@ -131,8 +147,7 @@ class Compressor(Stage):
             self._ring_down(frame),
             np.float32(noise),
             np.uint32(noise_key(acquisition, frame.noise_seed)),
-            np.float32(tgc),
-            np.float32(rising),
+            self._compensation(frame),
             np.float32(FULL_SCALE_DB - display.gain_db),
             frame.display_record,
             frame.envelope,
@@ -148,6 +163,18 @@ class Compressor(Stage):
             signal = ring_down(probe, np.arange(samples) * sample_mm, sigma, cycles_per_mm)
             self._ringing = key, self.device.upload(signal * frame.settings.ring_down)
         return self._ringing[1]
+
+    def _compensation(self, frame: DeviceFrame) -> Buffer:
+        """float32 [sample] dB of time-gain compensation, from where a line leaves the face."""
+        display, samples, rises_mm = frame.display, frame.line_shape[1], frame.display.tgc_reach * frame.probe.depth_mm
+        sample_mm, mhz, shift = (float(frame.acquisition[n]) for n in ("sample_mm", "frequency_mhz", "downshift"))
+        key = (samples, rises_mm, display.tgc_db_cm_mhz, sample_mm, mhz, shift)
+        if self._gains is None or self._gains[0] != key:
+            path_cm = 0.2 * np.minimum(np.arange(samples) * sample_mm, rises_mm)  # both ways
+            loss = display.tgc_db_cm_mhz * mhz * path_cm / DB_PER_NEPER
+            gains = DB_PER_NEPER * (loss - gain_of_band(shift, loss))
+            self._gains = key, self.device.upload(gains.astype(np.float32))
+        return self._gains[1]
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
         lines, samples = frame.line_shape

@@ -51,7 +51,7 @@ def lobes_of(probe: Probe) -> Lobes:
     The transmit aperture and the elements are uniform and focused once (with zones: once for each), the receive
     aperture has the weights 1 - a + a cos(pi x)^2 and is focused at every depth. The second harmonic is fed by the
     square of the field of the pulse, of twice the received wavelength. Compounded waves are in focus at every depth.
-    The probe's clutter is spread evenly over the lateral table.
+    The probe's clutter falls as 1 + cos(pi u / U) with the distance u up to the end U of the lateral table.
     """
     depth = probe.displayed_mm * np.maximum(np.arange(_DEPTHS), 0.5) / (_DEPTHS - 1)
     sigma = probe.beam_sigma_mm(depth)
@@ -61,9 +61,11 @@ def lobes_of(probe: Probe) -> Lobes:
     x, amplitude = _transmitted(probe, depth, unit)
     pattern = (amplitude * apodized_pattern(x / unit[:, None], probe.receive_apodization)) ** 2
     tails = _tails(x, pattern, sigma[0])
-    clutter = 10.0 ** (probe.clutter_db / 10.0)
+    place = column / (_DISTANCES - 1)
+    clutter = 0.5 * probe.clutter_power / (_STEP * (_DISTANCES - 1)) * (1.0 + np.cos(np.pi * place))
+    fading = 0.5 + 0.5 * np.cos(np.pi * np.clip(4.0 * place - 3.0, 0.0, 1.0))  # the table ends smoothly
     lateral = [
-        _density(tail, _STEP * scale * column, scale) * scale + 0.5 * clutter / (_STEP * (_DISTANCES - 1))
+        _density(tail, _STEP * scale * column, scale) * scale * fading + clutter
         for tail, scale in zip(tails, unit, strict=True)
     ]
 

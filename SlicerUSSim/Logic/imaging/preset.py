@@ -7,12 +7,13 @@ import os
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parameters_of, short
+from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parameter_of, parameters_of, short
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.own_outputs import MARK
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, Probe, probe_from_dict, probe_kind
+from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
 _log = logging.getLogger(__name__)
@@ -55,8 +56,8 @@ class Preset:
         """A preset with values of one section changed: changed("display", gain_db=3).
 
         Sections are "probe", "display" and "settings"; probe values may include its "kind". Parameters that only
-        the new kind has are then taken from its preset in PROBES. A focus at its default depth moves with the image
-        depth.
+        the new kind has are then taken from its preset in PROBES. A new "transmit" resets the parameters that
+        only other ones have. A focus at its default depth moves with the image depth.
         Raises SimulationError for an unknown section or name and for a value out of range.
         """
         _check_section(section)
@@ -128,6 +129,9 @@ def _changed_probe(probe: Probe, values: dict) -> Probe:
     if "depth_mm" in values:
         default = type(probe).default_focus_mm(probe.depth_mm)
         old |= {name: None for name in ("focus_mm", "elevation_focus_mm") if old[name] == default}
+    transmit = values.get("transmit", old["transmit"])
+    if transmit != old["transmit"]:  # what was set for the other kind of transmission goes with it
+        old |= {name: parameter_of(Probe, name).default for name, kind in TRANSMIT_OF.items() if kind != transmit}
     kind = values.get("kind", old["kind"])
     if kind != old["kind"]:
         probe_kind().checked("probe", kind)

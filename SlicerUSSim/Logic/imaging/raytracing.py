@@ -46,7 +46,7 @@ class RayTracer(Stage):
         self._tree: TreeBuffers
 
     def run(self, frame: DeviceFrame) -> None:
-        """Enqueue the tracing of one frame: its `tree`, and the `losses` along its scan lines."""
+        """Enqueue the tracing of one frame: its `roots` and `tree`, and the `losses` along its scan lines."""
         acquisition, medium = frame.acquisition, frame.medium
         traced, rays = int(acquisition["traced_lines"]), int(acquisition["elevational_rays"])
         self.shape, self._acquisition = (traced, rays), acquisition
@@ -65,6 +65,7 @@ class RayTracer(Stage):
         if self._root_key != array:
             self._roots = self.device.upload(line_roots(acquisition))
             self._root_key = array
+        frame.roots = self._roots
         self.device.run(
             self.kernel,
             (traced, rays + 1),
@@ -90,7 +91,7 @@ class RayTracer(Stage):
                 tree.segments, tree.segment_counts, tree.hits, tree.hit_counts, heavy=True,
             )  # fmt: skip
         lines, samples = frame.line_shape
-        frame.losses = get("losses", lines * (samples // CONSTANTS["LOSS_STEP"] + 1) * 8)
+        frame.losses = get("losses", lines * (samples // CONSTANTS["LOSS_STEP"] + 1) * 12)
         self.device.run(
             self._losses,
             (lines,),

@@ -28,7 +28,7 @@ COARSER = 4.0
 DARK = 0.25
 #: Elevational lobes follow one path for as many traced lines as are within so many sigmas of the beam
 _TOGETHER_SIGMAS, _MOST_TOGETHER = 3.0, 9
-_PER_NODE = 4  # operations per sample and pair of nodes
+_PER_NODE = 6  # operations per sample and pair of nodes
 _SEED = 0x51DE10BE
 
 
@@ -52,6 +52,7 @@ class SideLobes(Stage):
             (frame.line_shape[1] // self.device.lanes,),
             frame.acquisition_buffer,
             self.tables.get(probe, lobes_of(probe).lateral),
+            frame.roots,
             frame.scanned.re,
             frame.scanned.im,
             np.int32(frame.scanned.stride),
@@ -67,7 +68,7 @@ class SideLobes(Stage):
         depth = np.arange(samples) * float(frame.acquisition["sample_mm"])
         unit = frame.probe.wavelength_mm * np.maximum(frame.probe.receive_f_number, depth / frame.probe.aperture_mm)
         apart = np.maximum(frame.probe.line_distance_mm(depth), 1e-4)
-        nodes = np.minimum(lines * np.minimum(apart / (0.8 * unit), 1.0) + 1.0, CONSTANTS["LOBE_NODES"])
+        nodes = np.minimum(lines * np.minimum(apart / (0.7 * unit), 1.0) + 1.0, CONSTANTS["LOBE_NODES"])
         return Work(2 * lines * samples * SAMPLE_BYTES, samples * lines * 8.0 + _PER_NODE * float((nodes**2).sum()))
 
 

@@ -82,9 +82,11 @@ class DeviceFrame(FrameInputs):
     beams: Buffer = field(init=False)
     #: How much wider that makes the beam, and a factor of its echoes: float2 [screen line][depth]
     spreads: Buffer = field(init=False)
+    #: Where traced lines begin, and their directions: float4 [traced line] of raytracing.cl
+    roots: Buffer = field(init=False)
     #: Of the ray tree
     tree: TreeBuffers = field(init=False)
-    #: Of the direct path to the samples of scan lines: float2 [scan line][1 + samples / LOSS_STEP] of downshift.cl
+    #: Of the direct path to the samples of scan lines: float [scan line][1 + samples / LOSS_STEP][3] of downshift.cl
     losses: Buffer = field(init=False)
     #: Impulses on the left and right edges of every traced line's strip
     traced: EchoLines = field(init=False)

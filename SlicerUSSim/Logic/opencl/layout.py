@@ -54,7 +54,7 @@ CONSTANTS = {
     "LOSS_STEP": 16,  # samples between those at which losses are stored (downshift.cl); a multiple of all LANES
     "MAX_ZONES": 8,  # of a transmit beam: probe.beam.MOST_ZONES
     "LOBE_DEPTHS": 33,  # of the tables of side lobes (diffraction.py), from the face to the image depth, ...
-    "LOBE_DISTANCES": 33,  # ... and distances from the axis
+    "LOBE_DISTANCES": 65,  # ... and distances from the axis
     "LOBE_STEP": 0.75,  # ... which are so far apart laterally, in wavelengths x receive f-number
     "LOBE_NODES": 128,  # places across the image for which lateral side lobes are computed, at most
     "MAX_BINS": 256,  # of the histograms in similarity.cl

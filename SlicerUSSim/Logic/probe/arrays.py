@@ -6,8 +6,8 @@ Probe frame (millimetres): origin at the centre of the probe face, +x lateral (l
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -17,11 +17,15 @@ from SlicerUSSim.Logic.base.declaration import (
     built,
     kind_of,
     parameter,
+    parameter_of,
     parameters_of,
     short,
 )
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.probe.beam import Beam
+from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF, Beam
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 #: With less the apex is so far behind the face that depths from it are not exact in single precision
 _LEAST_TRAPEZOID_DEG = 1.0
@@ -71,6 +75,41 @@ class Probe(Beam):
         for name in ("focus_mm", "elevation_focus_mm"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, self.default_focus_mm(self.depth_mm))
+        self._check_band()
+        self._check_transmission()
+
+    def __new__(cls, *_: Any, **values: Any) -> Self:
+        """Raises SimulationError that lists the parameters of this kind if `values` has another one."""
+        known = [entry.name for entry in fields(cls)]
+        for name in values:
+            require(
+                name in known,
+                f"{cls.__name__} has no {name}, expected one of {', '.join(known)}",
+            )
+        return super().__new__(cls)
+
+    def _check_band(self) -> None:
+        if self.band_mhz is None:
+            return
+        low, high = self.band_mhz
+        name = type(self).__name__
+        require(low < high, f"{name}: band_mhz is {low:g} to {high:g}, expected the lower frequency first")
+        require(
+            not self.harmonic or low <= self.received_mhz <= high,
+            f"{name}: the second harmonic of frequency_mhz {self.frequency_mhz:g} is {self.received_mhz:g} MHz, "
+            f"expected within band_mhz, {low:g} to {high:g}; set frequency_mhz to between {0.5 * low:g} and "
+            f"{0.5 * high:g}",
+        )
+
+    def _check_transmission(self) -> None:
+        """Raise SimulationError for a parameter of one kind of transmission, set for another."""
+        for name, kind in TRANSMIT_OF.items():
+            value, entry = getattr(self, name), parameter_of(type(self), name)
+            require(
+                self.transmit == kind or value == entry.default,
+                f"{type(self).__name__}: {name} is {value:g} with transmit {self.transmit!r}, expected transmit "
+                f"{kind!r}, or {entry.default:g}, the default",
+            )
 
     def __init_subclass__(cls) -> None:
         kind = cls.__dict__.get("kind")
@@ -380,38 +419,54 @@ def probe_from_dict(values: dict, source: str = "probe") -> Probe:
 
 #: Preset probes by name, such as PROBES["phased"]. docs/probes.md has their sources.
 PROBES: dict[str, Probe] = {
-    "phased": PhasedProbe(field_of_view_deg=80.0, depth_mm=90.0, scan_lines=196, frequency_mhz=5.0),
-    "convex": ConvexProbe(radius_mm=40.0, field_of_view_deg=60.0, depth_mm=100.0, scan_lines=192, frequency_mhz=5.0),
-    "linear": LinearProbe(width_mm=38.0, depth_mm=40.0, scan_lines=192, frequency_mhz=9.0, elevation_aperture_mm=5.0),
+    "phased": PhasedProbe(
+        field_of_view_deg=80.0, depth_mm=90.0, scan_lines=196, frequency_mhz=5.0, band_mhz=(3.75, 6.25),
+    ),
+    "convex": ConvexProbe(
+        radius_mm=40.0, field_of_view_deg=60.0, depth_mm=100.0, scan_lines=192, frequency_mhz=5.0,
+        band_mhz=(3.75, 6.25),
+    ),
+    "linear": LinearProbe(
+        width_mm=38.0, depth_mm=40.0, scan_lines=192, frequency_mhz=9.0, elevation_aperture_mm=5.0,
+        band_mhz=(6.75, 11.25),
+    ),
     "microconvex": ConvexProbe(
         radius_mm=14.0, field_of_view_deg=90.0, depth_mm=80.0, frequency_mhz=6.5, aperture_mm=8.0,
+        band_mhz=(4.9, 8.1),
     ),
     "abdominal": ConvexProbe(
         radius_mm=60.0, field_of_view_deg=70.0, depth_mm=160.0, frequency_mhz=3.5, aperture_mm=20.0,
+        band_mhz=(2.6, 4.4),
         elevation_aperture_mm=12.0,
     ),
     "cardiac": PhasedProbe(  # 64 elements of 0.3 mm
-        field_of_view_deg=90.0, depth_mm=160.0, frequency_mhz=2.7, fractional_bandwidth=0.74, aperture_mm=19.2,
+        field_of_view_deg=90.0, depth_mm=160.0, frequency_mhz=2.7, fractional_bandwidth=0.74,
+        band_mhz=(1.7, 3.7), aperture_mm=19.2,
         elevation_aperture_mm=14.0, elevation_focus_mm=60.0,
     ),
     "neonatal": ConvexProbe(  # for the anterior fontanelle
         radius_mm=11.0, field_of_view_deg=110.0, depth_mm=80.0, frequency_mhz=7.5, fractional_bandwidth=0.6,
+        band_mhz=(5.25, 9.75),
         aperture_mm=8.0, focus_mm=40.0, elevation_aperture_mm=5.0, elevation_focus_mm=40.0,
     ),
     "linear_15": LinearProbe(
-        width_mm=25.6, depth_mm=30.0, scan_lines=256, frequency_mhz=15.0, aperture_mm=6.4, focus_mm=15.0,
+        width_mm=25.6, depth_mm=30.0, scan_lines=256, frequency_mhz=15.0,
+        band_mhz=(11.25, 18.75), aperture_mm=6.4, focus_mm=15.0,
         elevation_aperture_mm=2.5, elevation_focus_mm=12.0,
     ),
     "burr_hole": PhasedProbe(  # its face fits into a hole of 14 mm
-        field_of_view_deg=90.0, depth_mm=80.0, frequency_mhz=5.2, fractional_bandwidth=0.58, aperture_mm=10.9,
+        field_of_view_deg=90.0, depth_mm=80.0, frequency_mhz=5.2, fractional_bandwidth=0.58,
+        band_mhz=(3.7, 6.7), aperture_mm=10.9,
         focus_mm=40.0, elevation_aperture_mm=7.0, elevation_focus_mm=40.0,
     ),
     "hockey_stick": LinearProbe(
-        width_mm=22.8, depth_mm=35.0, frequency_mhz=11.0, fractional_bandwidth=0.7, aperture_mm=8.5, focus_mm=20.0,
+        width_mm=22.8, depth_mm=35.0, frequency_mhz=11.0, fractional_bandwidth=0.7,
+        band_mhz=(7.15, 14.85), aperture_mm=8.5, focus_mm=20.0,
         elevation_aperture_mm=4.0, elevation_focus_mm=15.0,
     ),
     "matrix": PhasedProbe(  # 3000 elements half a wavelength apart; its elevational focus is electronic
-        field_of_view_deg=90.0, depth_mm=140.0, frequency_mhz=3.0, fractional_bandwidth=0.8, aperture_mm=14.0,
+        field_of_view_deg=90.0, depth_mm=140.0, frequency_mhz=3.0, fractional_bandwidth=0.8,
+        band_mhz=(1.8, 4.2), aperture_mm=14.0,
         elevation_aperture_mm=14.0,
     ),
 }  # fmt: skip

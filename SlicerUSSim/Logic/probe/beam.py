@@ -21,8 +21,13 @@ FWHM_PER_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 CURVED = 0.6
 #: Largest number of focal zones
 MOST_ZONES = 8
+#: Amplitude of twice the pulse's frequency that leaves the face itself, and of what is left of the pulse in the band,
+#: re the harmonic at the focus: typical of transmitters (docs/physics.md#harmonic-imaging)
+LEAKED = 0.1
 #: f-number of a beam that is wide compared with all others
 _NO_FOCUS = 1e4
+#: {parameter of the transmit beam: the kind of transmission that it is for}
+TRANSMIT_OF = {"focal_zones": "zones", "transmit_angles": "angles", "largest_angle_deg": "angles"}
 #: None until the probe's depth is set. Typed Any, since constructed probes never have None
 _BY_DEPTH: Any = None
 
@@ -39,7 +44,12 @@ class Beam(Declared):
         False, "Harmonic imaging",
         "Receive the second harmonic, which arises in tissue where the beam is strong: twice the frequency, narrower "
         "beams, weaker side lobes, dark near the face", shown=True,
-        note="Its level is that of the fundamental at the transmit focus, as a scanner's gain makes it",
+        note="frequency_mhz is that of the pulse. The level of the harmonic is that of the fundamental at the transmit "
+        "focus, as a scanner's gain makes it",
+    )  # fmt: skip
+    band_mhz: tuple[float, float] | None = parameter(
+        None, "Band", "Lowest and highest frequency that the array transmits and receives, -6 dB; the second harmonic "
+        "of the pulse must lie within; none: any", unit="MHz", bounds=(0.1, 100),
     )  # fmt: skip
     fractional_bandwidth: float = parameter(
         0.5, "Bandwidth", "-6 dB bandwidth of the two-way pulse, as a fraction of the frequency", bounds=(0.05, 1.5)
@@ -78,10 +88,10 @@ class Beam(Declared):
         0.0, "Apodisation", "Weights of the receive aperture: 0 uniform, 1 Hann; lower side lobes, a wider beam",
         bounds=(0, 1),
     )  # fmt: skip
-    clutter_db: float = parameter(
-        -38.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, re its own",
-        unit="dB", bounds=(-100, 0),
-        note="They and the side lobes fill cysts; spread evenly over 24 wavelengths x f-number to either side",
+    clutter_db: float | None = parameter(
+        -36.0, "Clutter", "Diffuse echoes from beside the beam, by multiple scattering and aberration, re its own; "
+        "none: only side lobes", unit="dB", bounds=(-100, 0),
+        note="They and the side lobes fill cysts; they fall off smoothly over 48 wavelengths x f-number to either side",
     )  # fmt: skip
     elevation_aperture_mm: float = parameter(
         7.0, "Elevational aperture", "Height of the elements, in the elevation direction", unit="mm", bounds=(0.5, 100)
@@ -105,6 +115,11 @@ class Beam(Declared):
     def received_bandwidth(self) -> float:
         """-6 dB bandwidth as a fraction of received_mhz. The square of a Gaussian pulse is shorter by the root of 2."""
         return self.fractional_bandwidth / (np.sqrt(2.0) if self.harmonic else 1.0)
+
+    @property
+    def clutter_power(self) -> float:
+        """Power of the clutter re that of the beam; 0 without."""
+        return 0.0 if self.clutter_db is None else 10.0 ** (self.clutter_db / 10.0)
 
     @property
     def cycles_per_mm(self) -> float:
@@ -168,7 +183,9 @@ class Beam(Declared):
         In the quasi-linear approximation the square of a Gaussian beam feeds a Gaussian beam of twice the frequency and
         the same Rayleigh lengths, whose amplitude grows by 1 / sqrt((1 + i b)(1 + i c)) per millimetre, with b and c
         the distances to the lateral and elevational foci in these lengths (M. F. Hamilton, D. T. Blackstock, Nonlinear
-        Acoustics, 1998, chapter 8).
+        Acoustics, 1998, chapter 8). To it comes, in quadrature, what is sent at this frequency already (LEAKED), so
+        that there is some of it at the face. Zones have gains by which their levels agree where one takes over from
+        the other, as a scanner joins them.
         """
         depth = np.asarray(depth_mm, dtype=float)
         path = np.linspace(0.0, max(float(depth.max(initial=0.0)), self.focus_mm), 4097)
@@ -183,8 +200,12 @@ class Beam(Declared):
                 np.abs(_running_integral(aside / np.sqrt(1.0 + 1j * (path - at) / length), path)) / np.sqrt(sigma)
                 for sigma, at, length in zones
             ]
-            found = np.take_along_axis(np.array(grown), widths.argmin(axis=0)[None], axis=0)[0]
-        return np.interp(depth, path, found / np.interp(self.focus_mm, path, found))
+            used, grown = widths.argmin(axis=0), np.array(grown)
+            found = np.take_along_axis(grown, used[None], axis=0)[0]
+            for border in np.flatnonzero(np.diff(used)) + 1:
+                found[border:] *= grown[used[border - 1], border] / grown[used[border], border]
+        found = np.hypot(found / np.interp(self.focus_mm, path, found), LEAKED) / np.hypot(1.0, LEAKED)
+        return np.interp(depth, path, found)
 
     def transmit_zones(self) -> list[tuple[float, float, float]]:
         """(sigma at the focus, focus, Rayleigh length) in mm of every transmit focus; empty if all depths are in focus.

@@ -120,11 +120,12 @@ def reflection_coefficient(before: Tissue, behind: Tissue, cos_incidence: float 
 def band_power(probe: Probe, loss_db) -> np.ndarray:
     """Power (...,) of a pulse after losses in dB at its centre frequency, which rise with frequency; 1 before.
 
-    A sum over 201 frequencies of a Gaussian band, each attenuated by itself.
+    A sum over 800 positive frequencies of the Gaussian band that is received, each attenuated by itself.
     """
-    part = np.linspace(-4.0, 4.0, 201)
-    frequency = np.maximum(1.0 + part * probe.fractional_bandwidth / FWHM_PER_SIGMA, 0.0)  # re the centre
-    power = np.exp(-(part**2))
+    sigma = probe.received_bandwidth / FWHM_PER_SIGMA  # re the centre
+    lowest, highest = max(1.0 - 8.0 * sigma, 0.0), 1.0 + 4.0 * sigma
+    frequency = lowest + (np.arange(800) + 0.5) / 800 * (highest - lowest)
+    power = np.exp(-(((frequency - 1.0) / sigma) ** 2))
     return (power * 10.0 ** (-0.1 * np.asarray(loss_db)[..., None] * frequency)).sum(axis=-1) / power.sum()
 
 
@@ -416,7 +417,7 @@ def clutter_power(probe: Probe, depth_mm: float, radius_mm: float) -> float:
     By diffraction (Goodman, Introduction to Fourier Optics, section 3.4): the sum of the waves of 512 points of each
     aperture, by their exact distances. The transmit aperture and the elements are focused once, the receive aperture at
     the depth, with its weights. The second harmonic is fed by the square of what is transmitted at half its frequency.
-    To this comes the probe's clutter.
+    To this comes the probe's clutter, which falls as 1 + cos(pi u / 48), u in wavelengths x f-number.
     """
     across = np.linspace(0.0, 60.0, 2401)
     unit = probe.wavelength_mm * max(probe.receive_f_number, depth_mm / probe.aperture_mm)
@@ -429,8 +430,9 @@ def clutter_power(probe: Probe, depth_mm: float, radius_mm: float) -> float:
     reach = np.sqrt(np.maximum(radius_mm**2 - across**2, 0.0))
     seen = np.interp(reach, across, np.cumsum(elevational**2) - 0.5 * elevational**2)
     beyond = 1.0 - float((lateral**2 * seen).sum() / ((lateral**2).sum() * (elevational**2).sum()))
-    clutter = 10.0 ** (probe.clutter_db / 10.0)
-    return (beyond + clutter * max(1.0 - radius_mm / (24.0 * unit), 0.0)) / (1.0 + clutter)
+    clutter = 0.0 if probe.clutter_db is None else 10.0 ** (probe.clutter_db / 10.0)
+    part = min(radius_mm / (48.0 * unit), 1.0)
+    return (beyond + clutter * (1.0 - part - np.sin(np.pi * part) / np.pi)) / (1.0 + clutter)
 
 
 def _pressure(

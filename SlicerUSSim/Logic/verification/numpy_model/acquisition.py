@@ -308,9 +308,16 @@ def harmonic_level(probe: Probe, depth: np.ndarray) -> np.ndarray:
             away = (middle - focus) / _rayleigh_mm(probe, sigma)
             each.append(np.abs(np.cumsum(source * (1.0 + 1j * away) ** -0.5) * step) / np.sqrt(sigma))
             width.append(sigma * np.hypot(1.0, (edges[1:] - focus) / _rayleigh_mm(probe, sigma)))
-        grown = np.choose(np.argmin(width, axis=0), each)
+        zone = np.argmin(width, axis=0)
+        grown = np.choose(zone, each)
+        # Logarithms have the steps between neighbouring depths of one zone, also where another one takes over.
+        steps = np.diff(np.log(grown))
+        for n in np.flatnonzero(np.diff(zone)):
+            steps[n] = np.log(each[zone[n]][n + 1] / each[zone[n]][n])
+        grown = grown[0] * np.exp(np.append(0.0, np.cumsum(steps)))
     grown = np.append(0.0, grown)
-    return np.interp(depth, edges, grown / np.interp(probe.focus_mm, edges, grown))
+    grown /= np.interp(probe.focus_mm, edges, grown)
+    return np.interp(depth, edges, np.sqrt((grown**2 + 0.01) / 1.01))
 
 
 def _is_parallel(probe: Probe) -> bool:

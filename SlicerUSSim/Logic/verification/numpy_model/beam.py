@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import special
 
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32
 
-_NOTHING = f32(0)
+_WHOLE = f32(1)
+_LEAST_FREQUENCY = 0.2
 
 
 class Beam:
@@ -16,17 +18,34 @@ class Beam:
         self.acquisition = acquisition
 
     def frequency_after(self, loss: np.ndarray | np.float32) -> np.ndarray:
-        """The centre frequency after a loss in nepers both ways, re that of the transmitted pulse."""
-        return np.maximum(f32(1) - self.acquisition["downshift"] * np.maximum(loss, f32(0)), f32(0.5))
+        """The mean of the band's power after a loss in nepers both ways, re the frequency of the transmitted pulse.
+
+        Of a Gaussian about 1 - w loss with the amplitude's variance w, from zero frequency on.
+        """
+        shift = float(self.acquisition["downshift"])
+        if shift == 0.0:
+            return np.ones_like(loss)
+        sigma, centre = np.sqrt(shift), 1.0 - shift * np.maximum(np.asarray(loss, float), 0.0)
+        # exp(-z^2) / erfc(-z) = 1 / erfcx(-z)
+        mean = centre + sigma / np.sqrt(np.pi) / special.erfcx(np.minimum(-centre / sigma, 1e4))
+        return f32(np.maximum(mean, _LEAST_FREQUENCY))
 
     def gain_of_band(self, loss: np.ndarray) -> np.ndarray:
         """The logarithm of the amplitude by which an echo exceeds that of its centre frequency."""
-        shift = self.acquisition["downshift"]
-        return f32(0.5) * shift * np.clip(loss, f32(0), f32(0.5) / np.maximum(shift, f32(1e-6))) ** 2
+        shift = float(self.acquisition["downshift"])
+        if shift == 0.0:
+            return np.zeros_like(loss)
+        # Of the power: w loss^2 + log erfc(-z), where log erfc(-z) = log erfcx(-z) - z^2, and w loss^2 - z^2 is
+        # 2 loss - 1 / w
+        lost = np.maximum(np.asarray(loss, float), 0.0)
+        z = (1.0 - shift * lost) / np.sqrt(shift)
+        near = 0.5 * shift * lost**2 + 0.5 * np.log(special.erfc(-np.maximum(z, 0.0)))
+        far = lost - 0.5 / shift + 0.5 * np.log(special.erfcx(-np.minimum(z, 0.0)))
+        return f32(np.where(z >= 0.0, near, far) - 0.5 * np.log(special.erfc(-1.0 / np.sqrt(shift))))
 
-    def elevation_sigma(self, s: np.ndarray, loss: np.ndarray | np.float32 = _NOTHING) -> np.ndarray:
+    def elevation_sigma(self, s: np.ndarray, frequency: np.ndarray | np.float32 = _WHOLE) -> np.ndarray:
         b = (s - self.acquisition["elevation_focus"]) / self.acquisition["elevation_rayleigh"]
-        return self.acquisition["elevation_sigma"] * np.sqrt(self.frequency_after(loss) ** f32(-2) + b * b)
+        return self.acquisition["elevation_sigma"] * np.sqrt(frequency ** f32(-2) + b * b)
 
     def transmit_focus(self, s: float) -> float:
         """The focus of the zone that is narrowest at path length s; s itself if every depth is in focus."""
@@ -48,9 +67,9 @@ class Beam:
             ]
         )
 
-    def one_way(self, s: np.ndarray, loss: np.ndarray | np.float32 = _NOTHING) -> tuple[np.ndarray, np.ndarray]:
+    def one_way(self, s: np.ndarray, frequency: np.ndarray | np.float32 = _WHOLE) -> tuple[np.ndarray, np.ndarray]:
         """Variances of the lateral transmit and receive beams."""
-        acquisition, stretch = self.acquisition, f32(1) / self.frequency_after(loss)
+        acquisition, stretch = self.acquisition, f32(1) / frequency
         if acquisition["transmit_zones"] == 0:
             least = acquisition["transmit_sigma"][0]
             transmit2 = (stretch * np.maximum(s * acquisition["transmit_sigma_slope"], least)) ** 2
@@ -59,15 +78,15 @@ class Beam:
         receive = stretch * np.maximum(s * acquisition["receive_sigma_slope"], acquisition["receive_sigma_min"])
         return transmit2, receive * receive
 
-    def lateral_sigma(self, s: np.ndarray, loss: np.ndarray | np.float32 = _NOTHING) -> np.ndarray:
-        transmit2, receive2 = self.one_way(s, loss)
+    def lateral_sigma(self, s: np.ndarray, frequency: np.ndarray | np.float32 = _WHOLE) -> np.ndarray:
+        transmit2, receive2 = self.one_way(s, frequency)
         return np.sqrt(transmit2 * receive2 / (transmit2 + receive2))
 
-    def lateral_curvature(self, s: np.ndarray, loss: np.ndarray | np.float32 = _NOTHING) -> np.ndarray:
+    def lateral_curvature(self, s: np.ndarray, frequency: np.ndarray | np.float32 = _WHOLE) -> np.ndarray:
         """Radians per squared millimetre by which the phase of the two-way beam is bent."""
         if not self.acquisition["wavefront_curvature"]:
             return np.zeros_like(s)
-        transmit2, receive2 = self.one_way(s, loss)
+        transmit2, receive2 = self.one_way(s, frequency)
         share = self.acquisition["wavefront_curvature"]
         return np.sqrt(np.maximum(share * (receive2 ** f32(-2) - transmit2 ** f32(-2)), f32(0)))
 

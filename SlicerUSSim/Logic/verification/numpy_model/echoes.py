@@ -105,8 +105,9 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     beam = Beam(acquisition)
     path = segment["path_mm"] + np.array([low, high])
     loss = segment["loss"] + segment["loss_per_mm"] * np.array([low, high])
+    frequency = beam.frequency_after(loss)
     lateral, elevation, apart = (
-        beam.lateral_sigma(path, loss), beam.elevation_sigma(path, loss), beam.line_distance(path)
+        beam.lateral_sigma(path, frequency), beam.elevation_sigma(path, frequency), beam.line_distance(path)
     )  # fmt: skip
     narrow = f32(0.5) * LOG2_E / (elevation * elevation)
     along_tube = [segment["tube"][w] + segment["tube"][w + 1] * np.array([low, high]) for w in (0, 2)]
@@ -361,10 +362,10 @@ def _plane_echo(acquisition: np.ndarray, phase2: np.ndarray) -> np.ndarray:
     return exp(f32(-0.5) * phase2 / spread) / np.sqrt(spread)
 
 
-def losses_along(acquisition: np.ndarray, segments, segment_lines) -> np.ndarray:
-    """(scan lines, samples) float32 nepers both ways along the strongest path to a sample, at the carrier's frequency.
+def frequencies_along(acquisition: np.ndarray, segments, segment_lines) -> np.ndarray:
+    """(scan lines, samples) float32 frequency after the strongest path to a sample, re the carrier's.
 
-    They are stored every 16th sample, and linear in between.
+    It follows from the loss at every 16th sample, and is linear in between.
     """
     samples = int(acquisition["samples"])
     nodes = np.arange(0, samples + 1, 16)
@@ -382,15 +383,18 @@ def losses_along(acquisition: np.ndarray, segments, segment_lines) -> np.ndarray
             strongest[is_its] = strength[is_its]
             stored[is_its] = (segment["loss"] + segment["loss_per_mm"] * along)[is_its]
         last = np.maximum.accumulate(np.where(np.isnan(stored), 0, np.arange(len(nodes))))
-        result[n] = np.interp(np.arange(samples), nodes, np.nan_to_num(stored[last]))
+        found = Beam(acquisition).frequency_after(np.nan_to_num(stored[last]))
+        result[n] = np.interp(np.arange(samples), nodes, found)
     return result
 
 
-def lateral_beam(acquisition: np.ndarray, lines: np.ndarray, spreads: np.ndarray, losses: np.ndarray) -> np.ndarray:
+def lateral_beam(
+    acquisition: np.ndarray, lines: np.ndarray, spreads: np.ndarray, frequencies: np.ndarray
+) -> np.ndarray:
     """(scan lines, samples) complex64 from the impulses of the traced lines, distributed by the lateral profile.
 
     `spreads` (screen lines, depths, 2) is by how much tissue has made the beam wider, and a factor of its echoes;
-    `losses` are those of losses_along.
+    `frequencies` are those of frequencies_along.
     """
     beam = Beam(acquisition)
     depth = np.arange(int(acquisition["samples"]), dtype=np.float32) * acquisition["sample_mm"]
@@ -406,7 +410,7 @@ def lateral_beam(acquisition: np.ndarray, lines: np.ndarray, spreads: np.ndarray
         left = min(int(line), screens - 2)
         of_line = spreads[left] + (line - left) * (spreads[left + 1] - spreads[left])
         spread, factor = (f32(np.interp(s, nodes, of_line[:, n])) for n in range(2))
-        sigma = spread * beam.lateral_sigma(s, losses[n])
+        sigma = spread * beam.lateral_sigma(s, frequencies[n])
         step = beam.line_distance(s) / sigma
         narrow2 = np.maximum(f32(1) - step * step / f32(6), f32(0.25))
         scale = factor * step / np.sqrt(narrow2) * np.sqrt(spread) * f32(0.39894228)
@@ -417,7 +421,7 @@ def lateral_beam(acquisition: np.ndarray, lines: np.ndarray, spreads: np.ndarray
         # The phase is that of the middle of sixteen samples; interpolation between the edges loses some of its power.
         blocks = np.arange(len(s)) // 16
         middle = np.maximum((f32(16) * f32(blocks) + f32(8)) * acquisition["sample_mm"] - start, f32(0))
-        of_block = losses[n].reshape(-1, 16).mean(axis=1)[blocks]
+        of_block = frequencies[n].reshape(-1, 16).mean(axis=1)[blocks]
         curved = beam.lateral_curvature(middle, of_block) * (beam.line_distance(middle) / spread) ** 2
         weights = weights * np.exp(np.complex64(-0.5j) * curved * away[near] ** 2)
         apart2 = step * step / narrow2

@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from SlicerUSSim.Logic.probe.arrays import Probe
-from SlicerUSSim.Logic.verification.numpy_model.acquisition import harmonic_level, received_wavelength_mm
+from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
+    harmonic_level,
+    line_roots,
+    received_wavelength_mm,
+)
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, hash_mix
 from SlicerUSSim.Logic.verification.numpy_model.lobes import lateral_table
@@ -42,6 +46,7 @@ def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray
     """(scan lines, samples) complex64: with the lobes in quadrature, and the power of the main beam before."""
     beam, table = Beam(acquisition), lateral_table(acquisition, probe)
     lines, samples = scanned.shape
+    roots = line_roots(acquisition)[int(acquisition["guard_lines"]) :: int(acquisition["lateral_rays"])]
     result = np.empty(scanned.shape, np.complex128)
     line, start = np.arange(lines), beam.line_start(f32(0.5 * (lines - 1)))
     for first in range(0, samples, _TOGETHER):
@@ -49,7 +54,7 @@ def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray
         apart = float(beam.line_distance(s)) * int(acquisition["lateral_rays"])
         main = float(beam.lateral_sigma(s))
         unit = received_wavelength_mm(probe) * max(probe.receive_f_number, float(s) / probe.aperture_mm)
-        together = int(np.clip(int(0.8 * unit / apart), -(-lines // _MOST_NODES), lines))
+        together = int(np.clip(int(unit / apart), -(-lines // _MOST_NODES), lines))
         nodes = -(-lines // together)
         averaging = (np.arange(nodes)[:, None] == line // together) / together
         steps = np.arange(together)
@@ -58,18 +63,49 @@ def add_lateral_lobes(acquisition: np.ndarray, probe: Probe, scanned: np.ndarray
         correlation = np.exp(-0.25 * narrow * ((steps[:, None] - steps) * apart) ** 2)
         distance = np.abs(np.subtract.outer(np.arange(nodes), np.arange(nodes)))
         weights = table.at(np.full(distance.shape, float(s)), distance * together * apart / unit)
-        weights *= np.sqrt(together * apart / unit / correlation.mean()) * np.where(distance % 4 < 2, 1.0, -1.0)
+        shown = np.minimum(np.arange(nodes) * together + together // 2, lines - 1)
+        depth = f32((first + 0.5 * _TOGETHER) * acquisition["sample_mm"])
+        cell = f32(4) * f32(received_wavelength_mm(probe) * probe.receive_f_number)
+        places = _bits_at(acquisition, beam, roots, shown, depth, cell)
+        bits = hash_mix(distance.astype(np.uint32) * np.uint32(0x9E3779B1) + np.uint32(0x3C6EF372))
+        turned = (bits << np.uint32(16)) | (bits >> np.uint32(16))
+        offsets = np.where(np.arange(nodes)[:, None] > np.arange(nodes), bits, turned)  # to the left, to the right
+        weights *= np.sqrt(together * apart / unit / correlation.mean())
+        weights *= np.where(distance == 0, 1.0, _signs(offsets & places))
         of_nodes = weights @ averaging @ scanned[:, first : first + _TOGETHER]
         place = (line + 0.5) / together - 0.5
         before = np.floor(place).astype(int)
         part = (place - before)[:, None]
         left, right = (of_nodes[np.clip(before + n, 0, nodes - 1)] for n in (0, 1))
-        between = ((1.0 - part) * left + part * right) / np.sqrt((1.0 - part) ** 2 + part**2)
+        between = (1.0 - part) * left + part * right
+        has_two = ((before >= 0) & (before < nodes - 1))[:, None]
+        between /= np.where(has_two, np.sqrt((1.0 - part) ** 2 + part**2), 1.0)
         kept = 1.0 / np.sqrt(1.0 + correlation.mean() * (weights**2).sum(axis=1))
         near, far = (kept[np.clip(before + n, 0, nodes - 1), None] for n in (0, 1))
         both = scanned[:, first : first + _TOGETHER] + 1j * between
         result[:, first : first + _TOGETHER] = ((1.0 - part) * near + part * far) * both
     return result.astype(np.complex64)
+
+
+def _bits_at(
+    acquisition: np.ndarray, beam: Beam, roots: np.ndarray, line: np.ndarray, depth: np.ndarray, cell_mm: np.ndarray
+) -> np.ndarray:
+    """(lines,) uint32 random bits of the cells of the patient in which scan lines are at a displayed depth."""
+    along = np.maximum(depth - beam.line_start(line), f32(0))
+    x, y = roots[line, 0] + along * roots[line, 2], roots[line, 1] + along * roots[line, 3]
+    to_ras, per_cell = acquisition["probe_to_ras"].reshape(3, 4), f32(1) / cell_mm
+    key = np.zeros(len(line), np.uint32)
+    for row, step in zip(to_ras, (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D), strict=True):
+        cell = np.floor((row[0] * x + row[1] * y + row[3]) * per_cell).astype(np.int32).astype(np.uint32)
+        key += cell * np.uint32(step)
+    return hash_mix(key ^ acquisition["seed"])
+
+
+def _signs(bits: np.ndarray) -> np.ndarray:
+    """-1 where the number of bits that are set is odd, else 1."""
+    for shift in (16, 8, 4, 2, 1):
+        bits = bits ^ (bits >> np.uint32(shift))
+    return 1.0 - 2.0 * (bits & np.uint32(1))
 
 
 def ring_down(acquisition: np.ndarray, probe: Probe, axial_sigma_mm: float) -> np.ndarray:

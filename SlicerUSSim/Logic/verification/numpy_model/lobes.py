@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.verification.numpy_model.acquisition import received_wave
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32
 
-_ROWS, _COLUMNS = 33, 33  # depths and distances
+_ROWS, _COLUMNS = 33, 65  # depths and distances
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,18 @@ def lateral_table(acquisition: np.ndarray, probe: Probe) -> Table:
     """The lateral lobes, with the clutter, by distance in wavelengths x receive f-number."""
     beam, rows, half = Beam(acquisition), [], 0.5 * probe.receive_apodization
     farthest = 0.75 * (_COLUMNS - 1)
-    clutter = np.exp(probe.clutter_db * np.log(10.0) / 10.0)
+    clutter = 0.0 if probe.clutter_db is None else np.exp(probe.clutter_db * np.log(10.0) / 10.0)
+    distance = np.linspace(0.0, farthest, _COLUMNS)
+    # cos^2 has the mean 1/2 from its peak to its zero.
+    diffuse = clutter / farthest * np.cos(0.5 * np.pi * distance / farthest) ** 2
+    fading = np.cos(0.5 * np.pi * np.maximum(4.0 * distance / farthest - 3.0, 0.0)) ** 2
     for depth in _depths(acquisition):
         unit = received_wavelength_mm(probe) * max(probe.receive_f_number, depth / probe.aperture_mm)
         x, transmitted = _transmitted(beam, probe, depth, unit)
         u = x / unit
         received = (1.0 - half) * np.sinc(u) + 0.5 * half * (np.sinc(u - 1.0) + np.sinc(u + 1.0))
         beyond = _Beyond.of(u, transmitted**2 * received**2, float(beam.lateral_sigma(depth)) / unit)
-        density = beyond.averaged(np.linspace(0.0, farthest, _COLUMNS), 1.0)
-        rows.append(np.sqrt(density + 0.5 * clutter / farthest))
+        rows.append(np.sqrt(fading * beyond.averaged(distance, 1.0) + diffuse))
     return Table(float(acquisition["depth_mm"]), np.array(rows), np.full(_ROWS, farthest))
 
 

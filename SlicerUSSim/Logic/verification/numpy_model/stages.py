@@ -25,9 +25,9 @@ from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.drawn import sheet_hits
 from SlicerUSSim.Logic.verification.numpy_model.echoes import (
     add_interfaces,
+    frequencies_along,
     lateral_beam,
     lobe_lines,
-    losses_along,
     scatterer_lines,
 )
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, gaussian, hash_mix
@@ -59,8 +59,8 @@ class TwinFrame(HostFrame):
     segment_lines: np.ndarray = field(init=False)
     hits: np.ndarray = field(init=False)
     hit_lines: np.ndarray = field(init=False)
-    #: (scan lines, samples) float32 of echoes.losses_along
-    losses: np.ndarray = field(init=False)
+    #: (scan lines, samples) float32 of echoes.frequencies_along
+    frequencies: np.ndarray = field(init=False)
     #: (2 traced lines, samples) and (scan lines, samples) complex64 impulses
     traced: np.ndarray = field(init=False)
     scanned: np.ndarray = field(init=False)
@@ -80,7 +80,7 @@ def ray_tree(frame: TwinFrame) -> None:
     if frame.labels.drawn is not None:
         hits, lines = sheet_hits(record, frame.labels.drawn, quantiles, frame.segments, frame.segment_lines)
         frame.hits, frame.hit_lines = np.concatenate([frame.hits, hits]), np.concatenate([frame.hit_lines, lines])
-    frame.losses = losses_along(record, frame.segments, frame.segment_lines)
+    frame.frequencies = frequencies_along(record, frame.segments, frame.segment_lines)
 
 
 def scatterers(frame: TwinFrame) -> None:
@@ -106,7 +106,7 @@ def interfaces(frame: TwinFrame) -> None:
 
 def beam(frame: TwinFrame) -> None:
     """Impulses of the scan lines."""
-    frame.scanned = lateral_beam(frame.acquisition, frame.traced, frame.spreads, frame.losses)
+    frame.scanned = lateral_beam(frame.acquisition, frame.traced, frame.spreads, frame.frequencies)
 
 
 def side_lobes(frame: TwinFrame) -> None:
@@ -119,12 +119,13 @@ def pulse(frame: TwinFrame) -> None:
     """The baseband signal."""
     taps = pulse_taps(frame.axial_sigma_mm / float(frame.acquisition["sample_mm"]))
     record, reach = frame.acquisition, len(taps) // 2
-    shift = float(record["downshift"])
-    missing = np.minimum(shift * frame.losses.astype(float), 0.5)  # part of the frequency
+    missing = 1.0 - frame.frequencies.astype(float)
     step = float(record["sample_mm"]) * float(record["cycles_per_mm"])
     turns = np.cumsum(missing, axis=1) * step - 0.5 * step * (missing + missing[:, :1])
     turning = np.exp(2j * np.pi * turns)
-    lines = (frame.scanned * turning).astype(np.complex64)
+    # Of an echo between two samples, which have one phase: the mean of |1 - t + t exp(i angle)|^2
+    kept = (2.0 + np.cos(2.0 * np.pi * step * missing)) / 3.0
+    lines = (frame.scanned * turning / np.sqrt(kept)).astype(np.complex64)
     if frame.probe.harmonic:
         starts = Beam(record).line_start(np.arange(len(lines))) / record["sample_mm"]
         below = np.maximum(np.arange(lines.shape[1]) - np.floor(starts + f32(0.5)).astype(int)[:, None], 0)
@@ -155,6 +156,8 @@ def b_mode(frame: TwinFrame) -> None:
     # Two-way path, in cm
     rising = np.clip(below, 0, display.tgc_reach * frame.probe.depth_mm / float(record["sample_mm"]))
     tgc_db = rising * (2.0 * display.tgc_db_cm_mhz * float(record["frequency_mhz"]) * float(record["sample_mm"]) * 0.1)
+    neper_db = 20.0 / np.log(10.0)
+    tgc_db = tgc_db - neper_db * Beam(record).gain_of_band(tgc_db / neper_db).astype(float)
     frame.envelope = (np.sqrt(power) * 10.0 ** (tgc_db / 20.0)).astype(np.float32)
     level_db = 10.0 * np.log10(power) + tgc_db
     value = 255.0 * (1.0 + (level_db - (FULL_SCALE_DB - display.gain_db)) / display.dynamic_range_db)

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.settings import SimulationSettings
+from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.probe.arrays import ConvexProbe, LinearProbe, PhasedProbe, Probe
+from SlicerUSSim.Logic.probe.arrays import PROBES, ConvexProbe, LinearProbe, PhasedProbe, Probe
 from SlicerUSSim.Logic.probe.placement import elevational_motion
 from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, level_db
 from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, band_power, uniform_speckle
@@ -25,11 +25,13 @@ _PROBES: dict[str, Probe] = {
     "phased": PhasedProbe(60.0, 90.0, scan_lines=161, fractional_bandwidth=0.6, **_FOCI),
 }
 _DEPTHS_MM = (20.0, 50.0, 80.0)
+#: Presets with a wide band, in tissue that attenuates much: the centre of the spectrum falls to near zero
+_WIDE, _MUCH_DB_CM_MHZ = ("cardiac", "neonatal", "matrix"), 0.8
 _HALF_MM = 2.0
 
 
 def downshift(rotation: np.ndarray, device) -> Outcome:
-    """Level, frequency and width of the beam in tissue of 0.5 dB/(cm MHz), at three depths."""
+    """Level, frequency and width of the beam in tissue of 0.5 dB/(cm MHz), at three depths; levels of wide bands."""
     phantom = uniform_speckle(BACKGROUND, rotation)
     simulators = [
         # The widths of beams are compared, and curved wavefronts shorten the correlation, too.
@@ -59,8 +61,35 @@ def downshift(rotation: np.ndarray, device) -> Outcome:
         fine = np.linspace(0.0, 90.0, 91)
         theory = 10 * np.log10(band_power(probe, _loss_db(probe, fine)))
         curves.append(Curve(name, deep, np.array(measured) - variance, fine, theory))
+    rows += _wide_bands(rotation, device)
     plot = Plot("level of speckle at 0.5 dB/(cm MHz)", "depth [mm]", "dB", curves)
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
+
+
+def _wide_bands(rotation: np.ndarray, device) -> list[Row]:
+    """Levels down to the end of the image, and after TGC, which is that of the band."""
+    tissue = replace(BACKGROUND, attenuation_db_cm_mhz=_MUCH_DB_CM_MHZ)
+    phantom = uniform_speckle(tissue, rotation)
+    display = DisplaySettings(tgc_db_cm_mhz=_MUCH_DB_CM_MHZ, tgc_reach=1.0, noise_db=None)
+    rows, even = [], 10 * np.log10(tissue.scatterer_variance)
+    for name in _WIDE:
+        probe = PROBES[name]
+        frames = [
+            UltrasoundSimulator(phantom.labels, phantom.tissues, SimulationSettings(seed=seed), device).simulate(
+                probe, phantom.probe_to_ras, display
+            )
+            for seed in range(6)
+        ]
+        for depth in np.array([0.5, 0.95]) * probe.depth_mm:
+            deep = depth + np.linspace(-_HALF_MM, _HALF_MM, 41)
+            loss = 0.2 * _MUCH_DB_CM_MHZ * probe.frequency_mhz * deep
+            level = 10 * np.log10(band_power(probe, loss).mean()) + even
+            found = level_db(np.stack([depth_window(frame, float(depth), _HALF_MM) for frame in frames]))
+            rows.append(Row(f"level at {depth:.0f} mm of 0.8 dB/(cm MHz), {name}", "dB", level, found, 0.3))
+            ends = ((depth + np.array([-_HALF_MM, _HALF_MM])) / frames[0].sample_interval_mm).astype(int)
+            shown = level_db(np.stack([frame.envelope[:, slice(*ends)] for frame in frames]))
+            rows.append(Row(f"after TGC at {depth:.0f} mm, {name}", "dB", even, shown, 0.4))
+    return rows
 
 
 def _loss_db(probe: Probe, depth_mm) -> np.ndarray:

@@ -41,14 +41,14 @@ def cyst_contrast(rotation: np.ndarray, device) -> Outcome:
         return found, predicted
 
     for name, probe in _PROBES.items():
-        plain = replace(probe, clutter_db=-100.0)
+        plain = replace(probe, clutter_db=None)
         levels = [row(name, replace(plain, focus_mm=depth, elevation_focus_mm=depth), depth) for depth in _DEPTHS_MM]
         found, predicted = np.array(levels).T
         depths = np.array(_DEPTHS_MM)
         curves.append(Curve(name, depths, found, depths, predicted))
         row(f"{name}, focus at 54 mm", plain, 20.0)
     phased = _PROBES["phased 5 MHz"]
-    focused = replace(phased, focus_mm=30.0, elevation_focus_mm=30.0, clutter_db=-100.0)
+    focused = replace(phased, focus_mm=30.0, elevation_focus_mm=30.0, clutter_db=None)
     row("phased 5 MHz, Hann window", replace(focused, receive_apodization=1.0), 30.0)
     row("phased 5 MHz, clutter of -30 dB", replace(focused, clutter_db=-30.0), 30.0)
     row("phased 5 MHz as harmonic", replace(focused, frequency_mhz=2.5, harmonic=True), 30.0)

@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import LinearProbe, Probe
-from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, MAIN_LOBE
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, LEAKED, MAIN_LOBE
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, echo_near, full_width, level_db
 from SlicerUSSim.Logic.verification.phantoms import Echo, uniform_speckle, wires_and_cysts
@@ -167,11 +167,15 @@ def harmonic(rotation: np.ndarray, device) -> Outcome:
 
 
 def _level_of_equal_foci(probe: Probe, depth_mm: np.ndarray) -> np.ndarray:
-    """dB of the second harmonic of a Gaussian beam with one focus: the logarithm of (1 + i b) / (1 + i b0)."""
+    """dB of the second harmonic of a Gaussian beam with one focus: the logarithm of (1 + i b) / (1 + i b0).
+
+    To it comes 1 % of its power at the focus, which is sent.
+    """
     sigma = MAIN_LOBE * 2.0 * probe.wavelength_mm * probe.focus_mm / probe.aperture_mm / FWHM_PER_SIGMA
     length = 2.0 * np.pi * sigma**2 / (2.0 * probe.wavelength_mm)
-    b = (np.append(0.0, depth_mm) - probe.focus_mm) / length
-    return 20.0 * np.log10(np.abs(np.log((1.0 + 1j * b[1:]) / (1.0 + 1j * b[0]))))
+    b = (np.append([0.0, probe.focus_mm], depth_mm) - probe.focus_mm) / length
+    grown = np.abs(np.log((1.0 + 1j * b[1:]) / (1.0 + 1j * b[0]))) ** 2
+    return 10.0 * np.log10(grown[1:] / grown[0] + LEAKED**2)
 
 
 def _wires(rotation: np.ndarray, device):
