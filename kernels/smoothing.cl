@@ -13,11 +13,11 @@
 
 #if LANES == 1
 #define LOAD_BYTES(pointer) ((float)*(pointer))
-#define STORE_SMOOTH(value, pointer) (*(pointer) = (ushort)((value)*65535.0f + 0.5f))
+#define STORE_SMOOTH(value, pointer) (*(pointer) = (ushort)((value) * 65535.0f + 0.5f))
 #else
 #define LOAD_BYTES(pointer) TO_FLOATN(JOIN(vload, LANES)(0, pointer))
 #define STORE_SMOOTH(value, pointer) \
-  JOIN(vstore, LANES)(JOIN(JOIN(convert_ushort, LANES), _sat)((value)*65535.0f + 0.5f), 0, pointer)
+  JOIN(vstore, LANES)(JOIN(JOIN(convert_ushort, LANES), _sat)((value) * 65535.0f + 0.5f), 0, pointer)
 #endif
 
 #ifdef MEMBERSHIP
