@@ -33,6 +33,7 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, tilt_sweep  # noqa: E402
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES  # noqa: E402
+from tests.test_label_maps import head  # noqa: E402
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is missing: apt-get install chromium")
@@ -863,6 +864,43 @@ def test_another_mri_takes_the_place_of_the_first(page, files):
         page.set_input_files("#open-file", files / "elsewhere.nii.gz")
     settled(page)
     assert not errors(page) and pixels(page).mean() > 5  # the probe is placed on the patient in another frame
+
+
+def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, files, tmp_path):
+    aseg = head()
+    aseg.write(tmp_path / "aseg.nii.gz")
+    Volume(aseg.array[:, :35].copy(), aseg.ijk_to_ras).write(tmp_path / "crop.nii.gz")
+
+    def opened_as(path: Path) -> str:
+        with new_image(page):
+            page.set_input_files("#open-file", path)
+        settled(page)
+        assert state(page, NAMES.title) == page.locator("#title").inner_text() == path.name
+        return page.locator("#notesLabel").inner_text()
+
+    def as_shown() -> str:
+        return " ".join(page.locator("body").inner_text().split())
+
+    assert "share" in opened_as(files / "head.nii.gz")  # the table of the MRI
+    notes = opened_as(tmp_path / "crop.nii.gz")
+    assert "crop.nii.gz: FreeSurfer aseg: 8 labels to 3 tissues" in notes and "share" not in notes
+    assert "Check: crop.nii.gz: a part of a brain of 1048 ml, cut off at the front" in notes
+    assert "shown over the MRI head.nii.gz" in notes
+    assert errors(page) == [line.removeprefix("Check: ") for line in notes.splitlines() if "cut off" in line]
+    assert "/tmp" not in as_shown() and str(tmp_path) not in as_shown()
+    notes = opened_as(tmp_path / "aseg.nii.gz")
+    assert "aseg.nii.gz: FreeSurfer aseg: 8 labels to 3 tissues" in notes
+    assert not errors(page) and "crop" not in notes
+    page.set_input_files("#open-file", files / "broken.nii.gz")  # changes nothing
+    assert "broken.nii.gz: " in shown_errors(page)
+    settled(page)
+    assert state(page, NAMES.title) == "aseg.nii.gz" and page.locator("#notesLabel").inner_text() == notes
+    with new_image(page):
+        click(page, "#segmentButton")
+    settled(page)
+    assert state(page, NAMES.title) == "head.nii.gz"  # whose MRI it is
+    notes = opened_as(files / "head.nii.gz")
+    assert "share" in notes and "aseg" not in notes and not errors(page)
 
 
 # ---- who may come in, and how it is started --------------------------------------------------------------------------

@@ -246,9 +246,9 @@ class PanelPresenter:
         """What the last segmentation or addition did, and what a user should check, in lines."""
         return "\n".join(self._notes)
 
-    def clearNotes(self) -> None:
-        """Forget them, since another patient is shown."""
-        self._notes = []
+    def setNotes(self, *lines: str) -> None:
+        """Replace them by lines about another patient; by none, to forget them."""
+        self._notes = list(lines)
 
     def placeProbe(self) -> None:
         """Place the probe on the surface in the slice view, or at a craniotomy; create its transform if needed."""

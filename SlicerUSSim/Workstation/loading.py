@@ -15,10 +15,12 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import node_to_world
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.comparison import Comparison
+from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.opener import Files, Opener
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.script import LabelSource
@@ -40,14 +42,15 @@ class Loading:
         tasks: Tasks,
         opener: Opener,
         presenter: PanelPresenter,
+        messages: Messages,
         views: AnatomyViews,
         probe: ProbeControl,
         comparison: Comparison,
     ) -> None:
         self._shared, self._scene, self._logic, self._tasks = shared, app.scene, logic, tasks
-        self._opener, self._presenter = opener, presenter
+        self._opener, self._presenter, self._messages = opener, presenter, messages
         self._views, self._probe, self._comparison = views, probe, comparison
-        self._is_new = False  # an MRI was opened, and has no tissues yet
+        self._is_new = False  # a patient was opened, on whom the probe is not yet
 
     def begin(self, files: Files) -> None:
         """Load the files with which the workstation was started, and show the first image."""
@@ -59,7 +62,7 @@ class Loading:
                 parameters.segmentation, contrast=files.contrast, skull_strip=files.skull_strip
             )
             if files.mri is not None or files.labels is None:
-                self._take_mri(files.mri)
+                self._take_mri(self._opener.mri(files.mri))
             if files.mask is not None:
                 parameters.mask = self._opener.mask(files.mask)
             for contrast, path in list(files.also.items())[:1]:  # the panel has one
@@ -68,7 +71,7 @@ class Loading:
             for tissue, path in files.additions:
                 parameters.lesions = self._opener.lesion_of_file(parameters.lesions, tissue, path)
             if files.labels is not None:
-                self._take_labels(files.labels)
+                self._take_labels(*self._opener.labels(files.labels))
                 if files.additions:
                     self.add_tissues()
             else:
@@ -77,16 +80,25 @@ class Loading:
                 self._take_sequence(files.sequence, files.sequence_name)
 
     def open(self, name: str, content: bytes) -> None:
-        """Open a file sent by a page: an MRI, a label map, a tracked sequence or a preset."""
+        """Open a file sent by a page: an MRI, a label map, a tracked sequence or a preset.
+
+        Nothing changes if it cannot be read. An MRI or a label map takes the place of the patient before, of whom no
+        lesions, notes and messages stay.
+        """
         with self._presenter.shown(), self._opener.uploaded(name, content) as (path, kind):
             if kind == "preset":
                 self._logic.preset = Preset.read(path)
             elif kind == "sequence":
                 self._take_sequence(self._tasks.do(lambda: TrackedSequence.read(path)), name.split(".")[0])
             elif kind == "labels":
-                self._take_labels(path)
+                node, found = self._opener.labels(path)
+                self._messages.clear()
+                self._logic.parameters.lesions, self._is_new = None, True
+                self._take_labels(node, found)
             else:
-                self._take_mri(path)
+                node = self._opener.mri(path)
+                self._messages.clear()
+                self._take_mri(node)
                 self.segment()
 
     def add(self, name: str, content: bytes, tissue: str) -> None:
@@ -109,21 +121,28 @@ class Loading:
 
     def add_tissues(self) -> None:
         """Lay the lesions over the tissues."""
-        source = self._opener.known_source(self._logic.parameters.labels)
+        source, patient = self._opener.known_source(self._logic.parameters.labels), self._opener.patient()
         if self._changed(self._presenter.addTissues):
-            self._laid(source)
+            self._laid(source, patient)
 
     def place_probe(self) -> None:
         """Place the probe at a typical craniotomy."""
         self._presenter.placeProbe()
         self._probe.look()
 
+    def show_title(self) -> None:
+        """Show the name of the patient on the page."""
+        with self._shared.changing() as now:
+            now.title = self._opener.patient()
+
     # ---- implementation ----------------------------------------------------------------------------------------
 
     def _lay(self, mask: Volume, tissue: str, name: str) -> None:
         """Add a mask to the lesions, and lay them over the tissues, if there are any; otherwise Segment does so."""
         parameters: Any = self._logic.parameters
-        before, source = parameters.lesions, self._opener.known_source(parameters.labels)
+        before, source, patient = (
+            parameters.lesions, self._opener.known_source(parameters.labels), self._opener.patient()
+        )  # fmt: skip
         node, undo = self._opener.add_lesion(before, mask, tissue, name)
         parameters.lesions = node
         try:
@@ -134,12 +153,12 @@ class Loading:
             parameters.lesions = before
             raise
         if parameters.labels is not None:
-            self._laid(source)
+            self._laid(source, patient)
 
-    def _laid(self, source: LabelSource | None) -> None:
-        """The lesions now lie over labels of this source."""
+    def _laid(self, source: LabelSource | None, patient: str) -> None:
+        """The lesions now lie over labels of this source and patient."""
         parameters = self._logic.parameters
-        self._opener.added(source, parameters.labels, parameters.lesions)
+        self._opener.added(source, patient, parameters.labels, parameters.lesions)
         self._labels_ready()
 
     def _changed(self, action: Callable[[], None]) -> bool:
@@ -153,29 +172,28 @@ class Loading:
         action()
         return version() not in (before, None)
 
-    def _take_labels(self, path: str) -> None:
-        node, found = self._opener.labels(path)
-        self._presenter.view.showStatus(f"{node.GetName()}: {found.message}")
+    def _take_labels(self, node: Any, found: LabelledTissues) -> None:
+        parameters: Any = self._logic.parameters
         for warning in found.warnings:
             self._presenter.view.showError(warning)
-        if self._logic.parameters.mri is None:
-            self._take_volume(node)
-        self._logic.parameters.labels = node
+        checks = [f"Check: {warning}" for warning in found.warnings]
+        if parameters.mri is None:
+            self._views.show_volume(node)
+        else:
+            checks.append(f"shown over the MRI {parameters.mri.GetName()}")
+        parameters.labels = node
+        self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
+        self.show_title()
         self._labels_ready()
 
-    def _take_mri(self, path: str | None) -> None:
+    def _take_mri(self, node: Any) -> None:
         parameters = self._logic.parameters
-        node = self._opener.mri(path)
         self._logic.stopLiveUpdate()  # until the new MRI is segmented
         parameters.mri, parameters.labels, parameters.mask = node, None, None
         parameters.second_mri = parameters.lesions = None  # of the patient before
-        self._presenter.clearNotes()
+        self._presenter.setNotes()
         self._is_new = True
-        self._take_volume(node)
-
-    def _take_volume(self, node: Any) -> None:
-        with self._shared.changing() as now:
-            now.title = node.GetName()
+        self.show_title()
         self._views.show_volume(node)
 
     def _take_sequence(self, sequence: TrackedSequence, name: str) -> None:
@@ -198,6 +216,7 @@ class Loading:
         if self._logic.parameters.probe_transform is None or (self._is_new and self._probe_is_far()):
             self._presenter.placeProbe()
         self._is_new = False
+        self.show_title()
         if not self._logic.isLive:
             self._presenter.setLive(True)
         self._probe.update_surface()  # after the start of live images, which do not need it

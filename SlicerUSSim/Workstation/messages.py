@@ -25,6 +25,11 @@ class Messages:
         with self._shared.changing() as now:
             now.messages.errors = [*now.messages.errors, message][-_MOST:]
 
+    def clear(self) -> None:
+        """Remove all lines, which are about another patient than the one that is opened now."""
+        with self._shared.changing() as now:
+            now.messages.errors = []
+
     def dismiss(self, number: int) -> None:
         """Remove a line that the user has closed."""
         with self._shared.changing() as now:

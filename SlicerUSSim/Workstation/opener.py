@@ -37,6 +37,8 @@ _log = logging.getLogger(__name__)
 
 #: Attribute of a node: the file from which it was read; "" for the demo brain, the name alone for one sent by a page.
 FILE = "SlicerUSSim.file"
+#: Attribute of a node with labels: the name of the file with the patient, of the labels themselves or of their MRI.
+PATIENT = "SlicerUSSim.patient"
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ class Opener:
         #: {segments of a node: (tissue, file) of each}
         self._lesion_files: dict[tuple, tuple[tuple[str, str], ...]] = {}
         self._volumes = dict(files.volumes)  # read, but not yet used
-        #: {temporary path: name} of the file that a page has sent
+        #: {temporary path: name} of the file that a page has sent last
         self._uploads: dict[str, str] = {}
 
     def mri(self, path: str | None):
@@ -127,7 +129,11 @@ class Opener:
             for tissue in beside.values():
                 mine = mine.with_tissue(tissue)
             self._logic.preset = replace(self._logic.preset, tissues=mine)
+        found = replace(
+            found, message=self._as_known(found.message), warnings=tuple(map(self._as_known, found.warnings))
+        )
         node = self._label_map(found.labels, path, found.names)
+        node.SetAttribute(PATIENT, node.GetName())
         order = read_labels(node, self._logic.preset.tissues).names
         relabelled = {old: order.index(found.names[new - 1]) + 1 if new else 0 for old, new in found.relabelled.items()}
         source = LabelSource(self._place(path), True, relabelled=relabelled, tissue_names=tuple(order))
@@ -173,6 +179,7 @@ class Opener:
         self, labels_node, mri_node, mask_node, options: dict, others: Mapping[str, Any], lesions_node
     ) -> None:
         """Record the source of labels that Segment made, from these nodes and {contrast: node}, with the lesions."""
+        labels_node.SetAttribute(PATIENT, mri_node.GetName())
         file, mask = mri_node.GetAttribute(FILE), None if mask_node is None else _file_of(mask_node)
         self._sources = {}
         additions = self.lesion_files(lesions_node)
@@ -181,11 +188,19 @@ class Opener:
             source = LabelSource(file, mask=mask, options=options, others=files, additions=additions)
             self._sources[_voxels_of(labels_node)] = source
 
-    def added(self, source: LabelSource | None, labels_node, lesions_node) -> None:
-        """Record the source of labels that are those of `source` with the lesions on top."""
+    def added(self, source: LabelSource | None, patient: str, labels_node, lesions_node) -> None:
+        """Record the source of labels that are those of `source`, of this patient, with the lesions on top."""
+        labels_node.SetAttribute(PATIENT, patient)
         additions = self.lesion_files(lesions_node)
         if source is not None and additions is not None:
             self._sources[_voxels_of(labels_node)] = replace(source, additions=additions)
+
+    def patient(self) -> str:
+        """Name of the patient of the chosen labels, or of the MRI if there are none; "" without either."""
+        labels, mri = self._logic.parameters.labels, self._logic.parameters.mri
+        if labels is not None:
+            return labels.GetAttribute(PATIENT) or labels.GetName()
+        return "" if mri is None else mri.GetName()
 
     def known_source(self, labels_node) -> LabelSource | None:
         """The source of labels; None if it is unknown, or there are no labels."""
@@ -217,34 +232,40 @@ class Opener:
     @contextmanager
     def uploaded_mask(self, name: str, content: bytes) -> Iterator[Volume]:
         """The volume of a file with a mask uploaded from a page."""
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / name
-            path.write_bytes(content)
-            try:
-                volume = self._mask(str(path))
-            except SimulationError as error:  # without the temporary folder, as below
-                raise SimulationError(str(error).replace(folder + os.sep, "")) from None
+        with TemporaryDirectory() as folder, self._sent(name, content, folder) as path:
+            volume = self._mask(str(path))
         yield volume
 
     @contextmanager
     def uploaded(self, name: str, content: bytes) -> Iterator[tuple[str, str]]:
         """(path, kind) of a file uploaded from a page; kind is "preset", "sequence", "labels" or "mri"."""
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / name
-            path.write_bytes(content)
-            self._uploads = {str(path): name}
-            try:
-                if name.lower().endswith(".json"):
-                    kind = "preset"
-                elif ".igs." in name.lower() or ".seq." in name.lower():
-                    kind = "sequence"
-                else:
-                    volume = self._volumes[str(path)] = self._volume(str(path))
-                    kind = "labels" if is_label_file(path, volume) else "mri"
-                    _log.info("%s: opened as %s", name, "a label map" if kind == "labels" else "an MRI")
-                yield str(path), kind
-            except SimulationError as error:  # without the temporary folder: the user chose only the file name
-                raise SimulationError(str(error).replace(folder + os.sep, "")) from None
+        with TemporaryDirectory() as folder, self._sent(name, content, folder) as path:
+            if name.lower().endswith(".json"):
+                kind = "preset"
+            elif ".igs." in name.lower() or ".seq." in name.lower():
+                kind = "sequence"
+            else:
+                volume = self._volumes[str(path)] = self._volume(str(path))
+                kind = "labels" if is_label_file(path, volume) else "mri"
+                _log.info("%s: opened as %s", name, "a label map" if kind == "labels" else "an MRI")
+            yield str(path), kind
+
+    @contextmanager
+    def _sent(self, name: str, content: bytes, folder: str) -> Iterator[Path]:
+        """The path of a file that a page has sent; errors within the block are about its name, as the user knows it."""
+        path = Path(folder) / name
+        path.write_bytes(content)
+        self._uploads = {str(path): name}
+        try:
+            yield path
+        except SimulationError as error:
+            raise SimulationError(self._as_known(str(error))) from None
+
+    def _as_known(self, text: str) -> str:
+        """A message with the names of files as the user knows them, without the temporary folder."""
+        for path in self._uploads:
+            text = text.replace(os.path.dirname(path) + os.sep, "")
+        return text
 
     def _place(self, path: str) -> str:
         """The path of a file; its name alone if a page has sent it."""

@@ -179,7 +179,7 @@ class ScriptState:
 class PageState:
     """The complete state, with the values before any file is loaded."""
 
-    #: Name of the MRI
+    #: Name of the patient: the file with the labels, or with the MRI from which they are
     title: str = ""
     #: Titles of the panel's sections that are open
     open_sections: list[str] = field(default_factory=list)

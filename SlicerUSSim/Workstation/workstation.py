@@ -70,7 +70,7 @@ class Workstation:
         presenter.maskFile = opener.mask_file
         self._exports = Exports(app, logic, opener, cine)
         self._loading = Loading(
-            shared, app, logic, tasks, opener, presenter, self._views, self._probe, self._comparison
+            shared, app, logic, tasks, opener, presenter, self._messages, self._views, self._probe, self._comparison
         )  # fmt: skip
 
         self._following = False
@@ -201,6 +201,7 @@ class Workstation:
         """Observe, draw and simulate the nodes that the scene's parameters refer to."""
         self._following = False
         parameters = self._logic.parameters
+        self._loading.show_title()
         self._probe_node.watch(parameters.probe_transform)
         self._image_node.watch(parameters.output)
         self._probe.draw()
