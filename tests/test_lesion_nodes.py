@@ -214,6 +214,69 @@ def test_segment_does_not_replace_labels_that_were_edited(kind, change):
     assert bench.logic.mayReplace(bench.labels)
 
 
+def test_segments_without_voxels_are_a_users_plan_and_not_replaced():
+    bench = Scene()
+    plan = bench.add("Segmentation", "plan")
+    write_labels(plan, HEAD.with_array(np.zeros(HEAD.array.shape, np.uint8)), ("my plan",), bench.mri)
+    with pytest.raises(SimulationError, match="'plan' was not made by Segment, or edited since, and is not replaced"):
+        bench.logic.segment(bench.mri, plan)
+    zeros = bench.add("LabelMapVolume", "zeros")
+    write_volume(zeros, HEAD.with_array(np.zeros(HEAD.array.shape, np.uint8)))
+    assert not bench.logic.mayReplace(zeros)
+    presenter, parameters = bench.presenter(), bench.logic.parameters
+    parameters.labels = plan
+    presenter.segment()
+    assert not presenter.view.errors and parameters.labels.GetName() == "Head tissues"
+    assert presenter.notes().splitlines()[-1] == (
+        "'plan' was not made by Segment, or edited since, and is kept; the result is 'Head tissues'"
+    )
+    segmentation = plan.GetSegmentation()
+    (name,) = [segmentation.GetSegment(segment_id).GetName() for segment_id in segmentation.GetSegmentIDs()]
+    assert name == "my plan"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_tissues_keep_the_colours_that_a_user_gave_them(kind):
+    bench = Scene(kind, tumour=10.0)
+    bench.logic.segment(bench.mri, bench.labels)
+
+    def colours() -> dict[str, tuple[float, ...]]:
+        if kind == "Segmentation":
+            segments = bench.labels.GetSegmentation()
+            found = [segments.GetSegment(segment_id) for segment_id in segments.GetSegmentIDs()]
+            return {segment.GetName(): tuple(np.round(segment.GetColor(), 3)) for segment in found}
+        table, found = bench.labels.GetDisplayNode().GetColorNode(), {}
+        for label in range(1, table.GetNumberOfColors()):
+            colour = [0.0] * 4
+            table.GetColor(label, colour)
+            found[table.GetColorName(label)] = tuple(np.round(colour[:3], 3))
+        return found
+
+    before = colours()
+    if kind == "Segmentation":
+        bench.labels.GetSegmentation().GetNthSegment(1).SetColor(1.0, 0.0, 0.2)
+    else:
+        bench.labels.GetDisplayNode().GetColorNode().SetColor(2, 1.0, 0.0, 0.2, 1.0)
+    expected = {**before, "grey matter": (1.0, 0.0, 0.2)}
+    assert before["grey matter"] != expected["grey matter"] and colours() == expected
+    bench.logic.segment(bench.mri, bench.labels)
+    assert colours() == expected
+    bench.logic.addTissues(bench.labels, bench.lesions)
+    assert {name: colour for name, colour in colours().items() if name != "tumour"} == expected
+
+
+def test_notes_say_whose_they_are_and_do_not_stay_for_another_patient():
+    bench = Scene()
+    presenter, parameters = bench.presenter(), bench.logic.parameters
+    presenter.segment()
+    assert presenter.notes().splitlines()[0] == "Head:" and "white matter" in presenter.notes()
+    other = bench.add("ScalarVolume", "Zeros")
+    write_volume(other, HEAD.with_array(np.zeros(HEAD.array.shape, np.float32)))
+    parameters.mri = other
+    presenter.segment()
+    assert len(presenter.view.errors) == 1 and presenter.notes() == ""
+
+
 def test_a_segmentation_that_was_saved_and_loaded_is_still_segments_own(tmp_path):
     bench = Scene()
     bench.logic.segment(bench.mri, bench.labels)

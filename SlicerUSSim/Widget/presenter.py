@@ -63,6 +63,7 @@ class PanelPresenter:
         self.view = view
         self._handles, self._label_maps = handles, label_maps
         self._notes: list[str] = []
+        self._notes_of: str | None = None  # ID of the MRI node that was segmented
         #: File in which the brain mask of an MRI node is kept beside the MRI's; None: in the scene only
         self.maskFile: Callable[[Any], Path | None] = lambda mri_node: None
         self._busy = False
@@ -192,13 +193,16 @@ class PanelPresenter:
         parameters = self.logic.parameters
         with self.shown(), self.working("Segment") as progress:
             mri = required(parameters.mri, "no MRI chosen, expected a scalar volume")
+            if self._notes_of not in (None, mri.GetID()):  # also if this fails: they are about another patient
+                self.setNotes()
             told = self._forget_other_brain(mri)
             others, untold = self._second_mri()
-            with self._replaceable(f"{mri.GetName()} tissues") as labels:
+            with self._replaceable(f"{mri.GetName()} tissues", mri) as labels:
                 result = self.logic.segment(
                     mri, labels, mask_node=parameters.mask, others=others, lesions_node=parameters.lesions,
                     keep_mask_at=self.maskFile(mri), progress=progress, **asdict(parameters.segmentation),
                 )  # fmt: skip
+            self._notes_of = mri.GetID()
             if (
                 parameters.mask is None
                 and isinstance(result, Segmentation)  # and not of a CT
@@ -239,7 +243,7 @@ class PanelPresenter:
         with self.working("Add to tissues"):
             require(parameters.labels is not None, "no label map chosen; segment the MRI first")
             before = parameters.labels
-            with self._replaceable(f"{before.GetName()} with lesions") as labels:
+            with self._replaceable(f"{before.GetName()} with lesions", before) as labels:
                 self.logic.addTissues(before, parameters.lesions, labels)
 
     def notes(self) -> str:
@@ -248,7 +252,7 @@ class PanelPresenter:
 
     def setNotes(self, *lines: str) -> None:
         """Replace them by lines about another patient; by none, to forget them."""
-        self._notes = list(lines)
+        self._notes, self._notes_of = list(lines), None
 
     def placeProbe(self) -> None:
         """Place the probe on the surface in the slice view, or at a craniotomy; create its transform if needed."""
@@ -392,10 +396,10 @@ class PanelPresenter:
         return self.logic.scene.AddNewNodeByClass(f"vtkMRML{kind}Node", self.logic.scene.GenerateUniqueName(name))
 
     @contextmanager
-    def _replaceable(self, name: str) -> Iterator[Any]:
+    def _replaceable(self, name: str, source: Any) -> Iterator[Any]:
         """The chosen labels if Segment made them and nobody has edited them; otherwise a new node, which is selected.
 
-        Afterwards the notes are those of the logic.
+        Afterwards the notes are those of the logic, about the node `source`.
         """
         chosen: Any = self.logic.parameters.labels
         kept = None if chosen is None or self.logic.mayReplace(chosen) else str(chosen.GetName())
@@ -403,7 +407,8 @@ class PanelPresenter:
         with self._made(chosen if kept is None else None, kind, name) as node:
             yield node
         self.logic.parameters.labels = node
-        self._notes = [*self.logic.notes, *(f"Check: {warning}" for warning in self.logic.warnings)]
+        self._notes = [f"{source.GetName()}:", *self.logic.notes]
+        self._notes += [f"Check: {warning}" for warning in self.logic.warnings]
         if kept is not None:
             self._notes.append(
                 f"{kept!r} was not made by Segment, or edited since, and is kept; the result is {node.GetName()!r}"

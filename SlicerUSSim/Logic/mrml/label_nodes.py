@@ -226,7 +226,7 @@ def _colour_names(labels_node, volume: Volume) -> dict[int, str]:
 
 def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -> None:
     """Write labels with named, coloured tissues into a label map or segmentation node, aligned with another
-    node of volumes or labels."""
+    node of volumes or labels. Tissues that the node already has keep their colours, which may be the user's."""
     parent = like_node.GetParentTransformNode()
     labels_node.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
     if labels_node.IsA("vtkMRMLSegmentationNode"):
@@ -241,15 +241,17 @@ def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -
 def _write_label_map(labels_node, labels: Volume, names: tuple[str, ...]) -> None:
     scene = labels_node.GetScene()
     write_volume(labels_node, labels)
-    colours = labels_node.GetNodeReference("tissueColors")
+    colours, kept = labels_node.GetNodeReference("tissueColors"), {}
     if colours is None:
         colours = scene.AddNewNodeByClass("vtkMRMLColorTableNode", f"{labels_node.GetName()} tissues")
         labels_node.SetNodeReferenceID("tissueColors", colours.GetID())
+    else:
+        kept = _colours_of_table(colours)
     colours.SetTypeToUser()
     colours.SetNumberOfColors(len(names) + 1)
     colours.SetColor(0, "coupling", 0.0, 0.0, 0.0, 0.0)
     for label, name in enumerate(names, 1):
-        colours.SetColor(label, name, *colour_of(name), 1.0)
+        colours.SetColor(label, name, *kept.get(name, (*colour_of(name), 1.0)))
     display = labels_node.GetDisplayNode()
     if display is None:  # the default display node requires colours that exist only in Slicer's own scene
         display = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeDisplayNode")
@@ -258,15 +260,29 @@ def _write_label_map(labels_node, labels: Volume, names: tuple[str, ...]) -> Non
     labels_node.Modified()
 
 
+def _colours_of_table(colours) -> dict[str, tuple[float, ...]]:
+    """{name: red, green, blue and opacity, 0 to 1} of a colour table."""
+    found: dict[str, tuple[float, ...]] = {}
+    for label in range(1, colours.GetNumberOfColors()):
+        colour = [0.0] * 4
+        colours.GetColor(label, colour)
+        found.setdefault(colours.GetColorName(label), tuple(colour))
+    return found
+
+
 def _write_segmentation(segmentation_node, labels: Volume, names: tuple[str, ...]) -> None:
     segmentation = segmentation_node.GetSegmentation()
     was_modifying = segmentation_node.StartModify()
+    segments = [segmentation.GetSegment(segment_id) for segment_id in segmentation.GetSegmentIDs()]
+    kept = {segment.GetName(): segment.GetColor() for segment in segments}
     segmentation.RemoveAllSegments()
     segmentation_node.SetSourceRepresentationToBinaryLabelmap()
     for label, name in enumerate(names, 1):
         mask = slicer.vtkOrientedImageData()
         mask.ShallowCopy(Volume(labels.array == label, np.eye(4)).to_vtk())
         mask.SetImageToWorldMatrix(vtk_matrix(labels.ijk_to_ras))
-        segmentation_node.AddSegmentFromBinaryLabelmapRepresentation(mask, name, colour_of(name), name)
+        segmentation_node.AddSegmentFromBinaryLabelmapRepresentation(
+            mask, name, kept.get(name) or colour_of(name), name
+        )  # fmt: skip
     segmentation_node.EndModify(was_modifying)
     display_of(segmentation_node)

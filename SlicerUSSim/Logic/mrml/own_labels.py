@@ -19,16 +19,25 @@ def mark_as_made(labels_node) -> None:
 
 
 def may_replace(labels_node) -> bool:
-    """Whether a node has no labels, or those that this program made, and nobody has edited since."""
-    content = _content(labels_node)
-    return content == "" or content == labels_node.GetAttribute(_MADE)
+    """Whether a node is new, or has labels that this program made, and nobody has edited since.
+
+    A new one has neither segments nor voxels; segments without voxels are somebody's plan.
+    """
+    return _is_new(labels_node) or _content(labels_node) == labels_node.GetAttribute(_MADE)
+
+
+def _is_new(labels_node) -> bool:
+    if labels_node.IsA("vtkMRMLSegmentationNode"):
+        return labels_node.GetSegmentation().GetNumberOfSegments() == 0
+    image = labels_node.GetImageData()
+    return image is None or image.GetNumberOfPoints() == 0
 
 
 def _content(labels_node) -> str:
-    """A hash of voxels, position and names, the same after saving and loading; "" for a node without labels."""
+    """A hash of voxels, position and names, the same after saving and loading; "" if no voxel has a label."""
     try:
         volume, names = node_labels(labels_node)
-    except SimulationError:  # no segments, no voxels
+    except SimulationError:  # no segments, or none with a voxel
         return ""
     found = np.argwhere(volume.array)
     if not found.size:
