@@ -6,8 +6,10 @@ from functools import cache
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from SlicerUSSim.Command.proposals import split_seeds, write_proposals
+from SlicerUSSim.Command.cli import main
+from SlicerUSSim.Command.proposals import find_proposals, split_seeds, write_proposals
 from SlicerUSSim.Logic import Segmentation, SimulationError, Volume, grow_lesion, propose_lesions, segment_mri
 from SlicerUSSim.Logic.mri.atlas import mni152
 from SlicerUSSim.Logic.mri.lesions.growth import grow
@@ -141,22 +143,86 @@ def test_a_tissue_that_the_user_names_is_taken_at_his_word():
 def test_proposals_are_files_of_their_own_that_are_not_replaced_once_edited(tmp_path, capsys):
     segmentation, true = brain("low")
     labels = tmp_path / "labels.nii.gz"
-    write_proposals(segmentation, ["28,-22,28"], False, labels)
+    proposals = find_proposals(segmentation, ["28,-22,28"], False)
+    assert not list(tmp_path.iterdir())
+    write_proposals(proposals, labels)
     mask = tmp_path / "labels_proposed_tumour.nii.gz"
     told = capsys.readouterr().err
     assert "proposed, not applied" in told and f"--add tumour={mask}" in told
     written = Volume.read(mask)
     assert dice(written.array > 0, true) >= 0.75
     require_own_proposals(labels)
-    write_proposals(segmentation, ["28,-22,28"], False, labels)  # its own file is replaced
+    write_proposals(proposals, labels)  # its own file is replaced
     written.with_array((true * 1).astype(np.uint8)).write(mask)
     for again in (
         lambda: require_own_proposals(labels),
-        lambda: write_proposals(segmentation, ["28,-22,28"], False, labels),
+        lambda: write_proposals(proposals, labels),
     ):
         with pytest.raises(SimulationError, match="not replaced"):
             again()
     assert (Volume.read(mask).array == true).all()
+    capsys.readouterr()
+    write_proposals((), labels)
+    assert f"{mask} of an earlier run stays" in capsys.readouterr().err
+
+
+@needs_atlas
+def test_what_grows_grows_also_under_a_name_unless_the_name_contradicts_its_look():
+    ring, _ = brain("ring")
+    rim = (CENTRE[0] + 13.0, *CENTRE[1:])
+    free = grow_lesion(ring, rim)
+    for name in ("tumour", "enhancing", "haematoma"):
+        named = grow_lesion(ring, rim, name)
+        assert named.tissues == (name,) and dice(core(named), core(free)) > 0.95
+    with pytest.raises(SimulationError, match=r"in what enhances \([0-9.]+ ml\), and cyst does not: expected a point"):
+        grow_lesion(ring, (CENTRE[0] + 15.0, *CENTRE[1:]), "cyst")
+    oedema = grow_lesion(ring, (CENTRE[0] + 15.0, *CENTRE[1:]), "oedema")  # around it
+    assert oedema.tissues == ("oedema",) and oedema.volume_ml() > 20
+    assert not (oedema.labels.array[core(free)] > 0).mean() > 0.1
+    necrosis = grow_lesion(ring, CENTRE, "necrosis")  # within the rim, and not with it
+    assert necrosis.tissues == ("necrosis",)
+    assert dice(necrosis.labels.array > 0, free.mask("necrosis").array > 0) > 0.6
+    low, _ = brain("low")
+    free = grow_lesion(low, CENTRE)
+    for name in ("oedema", "haematoma", "cyst"):
+        named = grow_lesion(low, CENTRE, name)
+        assert named.tissues == (name,) and dice(named.labels.array > 0, core(free)) > 0.95
+    with pytest.raises(SimulationError, match="an MRI without contrast agent, in which nothing is enhancing"):
+        grow_lesion(low, CENTRE, "enhancing")
+    with pytest.raises(SimulationError, match=r"fluid .*, and tumour is none: .*R,A,S=cyst"):
+        grow_lesion(brain("healthy")[0], (4.0, 8.0, 16.0), "tumour")
+
+
+@pytest.mark.parametrize("name", ["liver", "falx", "coupling", "brats", "tumuor of sorts"])
+def test_only_lesions_are_grown(name):
+    with pytest.raises(SimulationError, match="expected a lesion: tumour, oedema, necrosis, cyst") as error:
+        split_seeds([f"1,2,3={name}"])
+    assert f"--seed 1,2,3={name}: " in str(error.value) and "\n" not in str(error.value)
+
+
+@needs_atlas
+def test_a_refused_seed_writes_nothing_and_earlier_proposals_are_told(tmp_path):
+    maps = tissue_maps("mni152")
+    assert maps is not None
+    image = phantom(with_low_grade_tumour(maps, CENTRE, 14.0).coarser(2), "flair", noise=0.03, bias=0.0)
+    mri, mask, labels = (tmp_path / f"{name}.nii.gz" for name in ("mri", "mask", "labels"))
+    image.mri.write(mri)
+    image.mask.write(mask)
+
+    def segment(*options: str):
+        command = ["segment", mri, "--contrast", "flair", "--mask", mask, "-o", labels, *options]
+        return CliRunner().invoke(main, [str(part) for part in command])
+
+    result = segment("--seed", "28,-22,28", "--seed", "-12,-20,8")
+    assert result.exit_code == 2 and "looks healthy" in result.stderr, result.output
+    assert {file.name for file in tmp_path.iterdir()} == {"mri.nii.gz", "mask.nii.gz"}
+    assert segment("--seed", "28,-22,28").exit_code == 0
+    proposal = tmp_path / "labels_proposed_tumour.nii.gz"
+    assert proposal.exists()
+    result = segment("--seed", "28,-22,28=oedema")
+    assert result.exit_code == 0 and f"{proposal} of an earlier run stays" in result.stderr
+    result = segment()
+    assert result.exit_code == 0 and result.stderr.count("of an earlier run stays") == 2
 
 
 @pytest.mark.parametrize("text", ["1,2", "1,2,x", "1,2,3,4", "1,2,3=", ""])

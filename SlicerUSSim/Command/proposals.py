@@ -14,12 +14,14 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.mri import Segmentation
+    from SlicerUSSim.Logic.mri.lesions.proposal import Proposal
 
 seed_option = click.option(
     "--seed", "seeds", multiple=True, metavar="R,A,S[=TISSUE]",
     help="Propose the lesion around a point, RAS mm in the frame of the MRI: masks beside the labels, which stay as "
-    "they are; --add lays them over. With a tissue (tumour, oedema, cyst, cavity, ...) it is proposed as that, also "
-    "where it looks healthy. May be repeated.",
+    "they are; --add lays them over. With a tissue (tumour, oedema, necrosis, cyst, haematoma, cavity, enhancing) it "
+    "is proposed as that, also where it looks like a vessel, a ventricle or the other side; not where it has no border "
+    "or looks as that tissue cannot. May be repeated.",
 )  # fmt: skip
 propose_option = click.option(
     "--propose",
@@ -31,7 +33,7 @@ propose_option = click.option(
 def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | None]]:
     """[((R, A, S) mm, tissue)] of the values of --seed; None for the tissue: by its look.
 
-    Raises SimulationError for a value that is not R,A,S or R,A,S=TISSUE, and for an unknown tissue.
+    Raises SimulationError for a value that is not R,A,S or R,A,S=TISSUE, and for a tissue that is no lesion.
     """
     seeds = []
     for text in texts:
@@ -45,10 +47,12 @@ def split_seeds(texts: Iterable[str]) -> list[tuple[tuple[float, ...], str | Non
             f"--seed is {text!r}, expected R,A,S in mm, such as 31.5,-20,42, or with a tissue 31.5,-20,42=oedema",
         )
         if tissue:
-            from SlicerUSSim.Logic.mri.pathology import tissue_to_add  # imported here to keep --help fast
+            from SlicerUSSim.Logic.base.errors import about_file
+            from SlicerUSSim.Logic.mri.lesions.seeded import lesion_tissue  # imported here to keep --help fast
 
-            tissue = tissue_to_add(tissue)
-        seeds.append((point, tissue.strip() or None))
+            with about_file(f"--seed {text}"):
+                tissue = lesion_tissue(tissue.strip())
+        seeds.append((point, tissue or None))
     return seeds
 
 
@@ -62,10 +66,10 @@ def require_seeds(seeds: Iterable[str], mri: Volume, labels_path: Path) -> None:
     require_own_proposals(labels_path)
 
 
-def write_proposals(segmentation: Segmentation, seeds: Iterable[str], propose: bool, labels_path: Path) -> None:
-    """Write the masks of what is proposed beside the labels, and say what they are and how to apply them.
+def find_proposals(segmentation: Segmentation, seeds: Iterable[str], propose: bool) -> list[Proposal]:
+    """The lesions around seeds, and with `propose` those that are found without one; writes nothing.
 
-    Raises SimulationError for the first seed in what is no lesion, after the others.
+    Raises SimulationError for seeds in what is no lesion, with each of them.
     """
     from SlicerUSSim.Logic.mri.lesions.detection import propose_lesions
     from SlicerUSSim.Logic.mri.lesions.seeded import grow_lesion
@@ -75,18 +79,32 @@ def write_proposals(segmentation: Segmentation, seeds: Iterable[str], propose: b
         try:
             proposals.append(grow_lesion(segmentation, point, tissue))
         except SimulationError as error:
-            refused.append(error)
+            refused.append(str(error))
+    require(not refused, "; ".join(refused))
     if propose:
         found = propose_lesions(segmentation)
         proposals += [new for new in found if not any(new.is_mostly_in(old) for old in proposals)]
         if not found:
             note("no lesion proposed: nothing compact in this brain looks unlike the other hemisphere")
+    return proposals
+
+
+def write_proposals(proposals: Iterable[Proposal], labels_path: Path) -> None:
+    """Write the masks of what is proposed beside the labels, and say what they are and how to apply them.
+
+    Those of an earlier run that stay beside the labels are named.
+    """
+    from SlicerUSSim.Logic.mri.lesions.proposal import proposals_beside
+
+    written: set[Path] = set()
     for number, proposal in enumerate(proposals, 1):
         note(proposal.message)
         for line in proposal.warnings:
             note(f"  {line}")
         files = proposal.write(labels_path, number)
+        written |= set(files.values())
         additions = " ".join(f"--add {tissue}={path}" for tissue, path in files.items())
         note(f"  look at it over the MRI, correct it, and apply it with {additions}")
-    if refused:
-        raise refused[0]
+    for path in proposals_beside(labels_path):
+        if path not in written:
+            note(f"{path} of an earlier run stays: delete it if it is not needed")

@@ -13,7 +13,14 @@ from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri
 from SlicerUSSim.Command.options import check_places, ct_option, device_option, gathered, mask_option
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
-from SlicerUSSim.Command.proposals import propose_option, require_seeds, seed_option, split_seeds, write_proposals
+from SlicerUSSim.Command.proposals import (
+    find_proposals,
+    propose_option,
+    require_seeds,
+    seed_option,
+    split_seeds,
+    write_proposals,
+)
 from SlicerUSSim.Command.sheets import require_sheets, sheet_kind_option, sheets_option, write_sheets
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
@@ -82,6 +89,8 @@ def segment(
         tell_all=True,
     )
     seconds = perf_counter() - start
+    # Before anything is written, since a seed may be refused
+    proposals = find_proposals(result, seeds, propose) if isinstance(result, Segmentation) else []
     labels, names = result.labels, result.tissue_names
     if sheets is not None and isinstance(result, Segmentation):
         labels, names = write_sheets(sheets, mri, volume, result, settings.contrast, sheet_kinds)
@@ -89,8 +98,7 @@ def segment(
     beside = write_label_files(out, added.labels, TissueTable.brain().for_names(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())
     note(f"segmented in {seconds:.1f} s; wrote {out} and {beside}")
-    if (seeds or propose) and isinstance(result, Segmentation):
-        write_proposals(result, seeds, propose, out)
+    write_proposals(proposals, out)
 
 
 def _require_no_kept_mask(out: Path, mri: str) -> None:

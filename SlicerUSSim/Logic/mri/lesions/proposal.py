@@ -52,7 +52,7 @@ class Proposal:
     @property
     def message(self) -> str:
         """One line: "tumour 0.5 ml in oedema 8.1 ml at R 41, A -12, S 20 mm, enhancing; proposed, not applied"."""
-        parts = [f"{tissue} {_millilitres(self.volume_ml(tissue))}" for tissue in reversed(self.tissues)]
+        parts = [f"{tissue} {millilitres(self.volume_ml(tissue))}" for tissue in reversed(self.tissues)]
         return f"{', '.join(parts)} at {place(self.centre_ras_mm)}, {self.look}; proposed, not applied"
 
     def files(self, labels_path: str | os.PathLike, number: int = 1) -> dict[str, Path]:
@@ -76,10 +76,16 @@ class Proposal:
 
 def require_own_proposals(labels_path: str | os.PathLike) -> None:
     """Raise SimulationError for a proposal beside a label map that was edited since write(), or made by others."""
+    require_own(*proposals_beside(labels_path))
+
+
+def proposals_beside(labels_path: str | os.PathLike) -> tuple[Path, ...]:
+    """The proposals beside a label map, of this or an earlier run."""
     path = Path(labels_path)
     stem, suffix = _split(path)
-    if path.parent.is_dir():
-        require_own(*(file for file in sorted(path.parent.iterdir()) if _is_called(file.name, stem, suffix)))
+    if not path.parent.is_dir():
+        return ()
+    return tuple(file for file in sorted(path.parent.iterdir()) if _is_called(file.name, stem, suffix))
 
 
 def _split(path: Path) -> tuple[str, str]:
@@ -98,5 +104,6 @@ def place(ras_mm: np.ndarray) -> str:
     return "{} mm".format(", ".join(f"{axis} {round(float(value))}" for axis, value in zip("RAS", ras_mm, strict=True)))
 
 
-def _millilitres(volume: float) -> str:
+def millilitres(volume: float) -> str:
+    """ "8.1 ml", "0.46 ml" """
     return f"{volume:.1f} ml" if volume >= 1.0 else f"{volume:.2f} ml"

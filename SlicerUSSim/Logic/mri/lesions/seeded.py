@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, either, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.lesions.doubts import why_no_lesion
 from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
-from SlicerUSSim.Logic.mri.lesions.growth import Region, grow, smoothed, with_foot
+from SlicerUSSim.Logic.mri.lesions.growth import Region, distance_from, grow, smoothed, with_foot
 from SlicerUSSim.Logic.mri.lesions.looks import (
+    SNAP_MM,
     Look,
     Window,
     around,
@@ -26,16 +27,20 @@ from SlicerUSSim.Logic.mri.lesions.looks import (
     watery_weights,
     window_around,
 )
-from SlicerUSSim.Logic.mri.lesions.proposal import Proposal, place
-from SlicerUSSim.Logic.mri.pathology import tissue_to_add
+from SlicerUSSim.Logic.mri.lesions.proposal import Proposal, millilitres, place
+from SlicerUSSim.Logic.mri.pathology import LESIONS, tissue_to_add
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
 
+#: Names of looks: fluid, and what does not enhance in what does
+_FLUID, _CORE = "fluid", "in what enhances"
 #: Reach of the windows in which a region is grown, one after the other: most lesions are small
 _REACHES_MM = (20.0, 70.0)
-#: Tissues that are fluid in an MRI
-FLUIDS = ("cyst", "necrosis", "cavity")
+#: Tissues that a lesion may be called
+LESION_TISSUES = tuple(name for name in LESIONS if name != "brats")
+#: Of these, what is fluid in an MRI, and what may be: blood is, once it has liquefied
+FLUIDS, _MAYBE_FLUIDS = ("cyst", "necrosis", "cavity"), ("haematoma", "blood")
 #: Least volume of a part besides the largest
 _LEAST_PART_ML = 0.1
 #: Voxels around a watery region in which its enhancing part may be, and how many places are tried
@@ -46,6 +51,7 @@ _LEAST_ENCLOSED, _RIM_MM = 0.5, 4.0
 _OEDEMA_MM = 4.0
 
 
+_FLUID_NAMES = "R,A,S=cyst, =cavity or =necrosis"
 _WATERY_MEANS = (
     "what holds more water than white matter may be tumour or oedema: look, and say which (R,A,S=oedema); contrast "
     "agent would tell more"
@@ -74,41 +80,115 @@ def grow_lesion(segmentation: Segmentation, seed_ras_mm: Sequence[float], tissue
     ----------
     segmentation : of the MRI by segment_mri; with several volumes, all are used.
     seed_ras_mm : (3,) RAS mm of a point in the lesion. Of what enhances, up to 5 mm beside it.
-    tissue : what it is, where the user knows; default: by its look. What enhances is "tumour" with "necrosis" in it, in
-        "oedema"; what is bright in T2 or FLAIR, or dark in T1, is "tumour". A cyst, a cavity or a necrosis without a
-        rim has to be called so, since it looks like CSF.
+    tissue : what it is, where the user knows, one of LESION_TISSUES; default: by its look. What enhances is "tumour"
+        with "necrosis" in it, in "oedema"; what is bright in T2 or FLAIR, or dark in T1, is "tumour". A cyst, a cavity
+        or a necrosis without a rim has to be called so, since it looks like CSF.
 
     Raises SimulationError, saying what is there, for a point outside the image or the brain, in CSF, in a vessel or in
-    tissue that looks healthy. With `tissue`, only what a lesion cannot be is refused.
+    tissue that looks healthy. With `tissue`, a region is a lesion also if it looks like a vessel, a ventricle or the
+    other side; what has no border is refused, and what contradicts the tissue: fluids and oedema do not enhance,
+    "enhancing" does, and a tumour is no fluid.
 
-    Takes 1 to 2 seconds.
+    Takes 1 to 4 seconds.
     """
     evidence = segmentation.evidence
-    named = None if tissue is None else tissue_to_add(tissue)
+    named = None if tissue is None else lesion_tissue(tissue)
     seed = require_in_image(segmentation.labels, seed_ras_mm)
     index = _require_in_brain(evidence, seed)
-    doubts = []
-    candidates = (fluid,) if named in FLUIDS else (enhancing, watery, fluid) if named is None else (enhancing, watery)
-    for look in candidates:
+    doubts: list[str] = []
+    contradiction, doubtful = None, None
+    for grown in _regions_at(evidence, index, named):
+        why = why_no_lesion(evidence, grown.look, grown.region, grown.window)
+        if named is not None and _contradicts(grown, named):
+            contradiction = contradiction or _contradiction(evidence, grown, named)
+            if named in FLUIDS and why is None:
+                break
+        elif why is None or (named in FLUIDS and grown.look.name in (_FLUID, _CORE)):
+            return proposal_of(segmentation, grown, seed, named)
+        else:
+            doubts.append(why)
+            doubtful = doubtful or grown
+    if named is not None and named not in FLUIDS and doubtful is not None:
+        return proposal_of(segmentation, doubtful, seed, named)
+    what = contradiction or _what_is_at(segmentation, index, doubts, named)
+    raise SimulationError(f"the seed {place(seed)} is in {what}")
+
+
+def _regions_at(evidence: Evidence, index: np.ndarray, named: str | None) -> Iterator[Grown]:
+    """The regions around a place (k, j, i in the box), of each look, the likeliest for a tissue first."""
+    looks = enhancing, watery, fluid
+    if named in FLUIDS:
+        looks = fluid, enhancing, watery
+    elif named == "oedema":  # it begins at the border of what enhances
+        looks = watery, enhancing, fluid
+    for look in looks:
         # A piece of a large rim looks like a vessel; all of it does not
         for reaches in (_REACHES_MM, _REACHES_MM[1:]) if look is enhancing else (_REACHES_MM,):
-            grown = grown_by(look, evidence, index, reaches)
+            grown = grown_by(look, evidence, index, reaches, with_rim=named not in FLUIDS)
             if grown is None:
                 break
-            why = None if named is not None else why_no_lesion(evidence, grown.look, grown.region, grown.window)
-            if why is None:
-                return proposal_of(segmentation, grown, seed, named)
-            doubts.append(why)
-    raise SimulationError(f"the seed {place(seed)} is in {_what_is_at(segmentation, index, doubts, named)}")
+            core = _core_of(evidence, grown, index) if named in FLUIDS and look is enhancing else None
+            yield core or grown
+
+
+def lesion_tissue(name: str) -> str:
+    """One of LESION_TISSUES, by any of its names. Raises SimulationError that lists them for another.
+
+    >>> from SlicerUSSim.Logic.mri.lesions.seeded import lesion_tissue
+    >>> lesion_tissue("Edema")
+    'oedema'
+    """
+    expected = f"expected a lesion: {either(LESION_TISSUES)}"
+    try:
+        tissue = tissue_to_add(name)
+    except SimulationError:
+        raise SimulationError(f"no tissue is called {name!r}, {expected}") from None
+    require(tissue in LESION_TISSUES, f"{name!r} is no lesion, {expected}")
+    return tissue
+
+
+def _contradicts(grown: Grown, named: str) -> bool:
+    """Whether a region does not look as this tissue must."""
+    look = grown.look.name
+    if look == "enhancing":
+        return named in FLUIDS or named == "oedema"
+    if look == _FLUID:
+        return named not in FLUIDS + _MAYBE_FLUIDS
+    return named == "enhancing"
+
+
+def _contradiction(evidence: Evidence, grown: Grown, named: str) -> str:
+    """The rest of the sentence "the seed is in ..."."""
+    look, size = grown.look.name, millilitres(grown.region.volume_ml(evidence.spacing_mm))
+    if look == "enhancing":
+        return f"what enhances ({size}), and {named} does not: expected a point in the {named}, or R,A,S=tumour"
+    if look == _FLUID:
+        return f"fluid ({size}), and {named} is none: expected a point in the {named}, or {_FLUID_NAMES}"
+    if evidence.channel("t1gd") is None:
+        return f"an MRI without contrast agent, in which nothing is enhancing: it is {look} ({size}), as R,A,S=tumour"
+    return f"what does not enhance, but is {look} ({size}), as R,A,S=tumour or =oedema may be"
+
+
+def _core_of(evidence: Evidence, grown: Grown, index: np.ndarray) -> Grown | None:
+    """What does not enhance within a region that does, near a place (k, j, i in the box); None if there is nothing."""
+    core = _necrosis_in(evidence, grown)[grown.window]
+    place_in_window = index - [part.start for part in grown.window]
+    near = core & (distance_from(place_in_window, core.shape, evidence.spacing_mm) <= SNAP_MM)
+    if not near.any() or core.sum() * evidence.voxel_ml < _LEAST_PART_ML:
+        return None
+    return replace(
+        grown, look=replace(grown.look, name=_CORE), region=replace(grown.region, inside=core)
+    )  # fmt: skip
 
 
 def grown_by(
     look: Callable[[Evidence, Window, np.ndarray], Look | None], evidence: Evidence, index: np.ndarray,
-    reaches_mm: Sequence[float] = _REACHES_MM,
+    reaches_mm: Sequence[float] = _REACHES_MM, with_rim: bool = True,
 ) -> Grown | None:  # fmt: skip
     """The region of one look around a place (k, j, i in the box); None if it does not look so, or has no border.
 
-    Regions that end within the first reach are taken, and otherwise within the next.
+    Regions that end within the first reach are taken, and otherwise within the next. Of fluid `with_rim`, the region of
+    the rim that enhances around it.
     """
     for reach in _REACHES_MM[-1:] if look is watery else reaches_mm:
         window = window_around(evidence, index, reach + 2.0)
@@ -121,7 +201,8 @@ def grown_by(
                 region = with_foot(region, seen.likeness, seen.allowed, evidence.spacing_mm)
                 region = _with_enclosed_fluid(evidence, region, window)
             grown = Grown(seen, region, window)
-            return _with_rim(evidence, grown) or grown if seen.name == "fluid" else grown
+            rim = _with_rim(evidence, grown) if with_rim and seen.name == "fluid" else None
+            return rim or grown
     return None
 
 
@@ -304,15 +385,15 @@ def _what_is_at(segmentation: Segmentation, index: np.ndarray, doubts: list[str]
     evidence = segmentation.evidence
     window, ball = around(evidence, index)
     if float(evidence.fluid[window][ball].mean()) >= 0.5:
-        return (
-            "fluid that looks like CSF, expected a point in a lesion; for a fluid lesion say what it is: "
-            "R,A,S=cyst, =cavity or =necrosis"
-        )
+        remedy = f"for a fluid lesion say what it is: {_FLUID_NAMES}"
+        return f"fluid that looks like CSF, expected a point in a lesion; {remedy}"
     nearest = tuple(int(n) for n in np.rint(index).astype(int) + evidence.start)
     label = int(segmentation.labels.array[nearest])
     name = segmentation.tissue_names[label - 1] if label else "the background"
     if doubts and name == "enhancing":
         return f"what enhances {doubts[0]}, expected a point in a lesion"
     why = f" ({doubts[-1]})" if doubts else ""
-    remedy = "" if named is not None else "; if it is a lesion all the same, say what it is, as R,A,S=tumour"
+    remedy = "; if it is a lesion all the same, say what it is, as R,A,S=tumour"
+    if named is not None:
+        remedy = f"; what looks like its surroundings has no border: draw a mask, and give it with --add {named}=MASK"
     return f"{name} that looks healthy{why}, expected a point in a lesion{remedy}"
