@@ -346,6 +346,26 @@ def test_a_binary_mask_is_no_patient_unless_the_user_says_what_it_is(tmp_path):
     assert "a binary mask" in refused("simulate", path, "--tissues", table, "--pose", "auto", "-o", tmp_path / "o.png")
 
 
+@pytest.mark.parametrize("command", [("demo", "--out", "demo", "--mri"), ("segment", "-o", "out.nii.gz")])
+def test_commands_for_an_mri_say_what_a_label_map_is_for_and_no_option_that_they_lack(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tumour((255, 255, 255)).write("glioma.nii.gz")
+    message = refused(*command, "glioma.nii.gz")
+    assert message.endswith(
+        "a binary mask (1 label, 67 ml), not a patient's tissues; add it to an MRI's tissues with --add "
+        "tumour=glioma.nii.gz, or simulate it alone with ussim simulate"
+    )
+    unknown = head()
+    unknown.with_array(np.where(unknown.array == 3, 515, unknown.array)).write("unknown.nii.gz")
+    few((90, 91)).write("few.nii.gz")
+    for name, count in (("unknown.nii.gz", 8), ("few.nii.gz", 2)):
+        message = refused(*command, name)
+        assert "--map" not in message and len(message) < 200
+        assert f"{name}: is a label map ({count} labels), expected an MRI; use it as it is (ussim simulate)" in message
+    assert "--map" not in ussim("demo", "--help").stdout
+    assert {path.name for path in tmp_path.iterdir()} == {"glioma.nii.gz", "unknown.nii.gz", "few.nii.gz"}
+
+
 def test_a_lesion_with_a_name_is_no_patient_but_an_organ_is():
     mask = tumour((1, 1, 1))
     assert "a lesion (Glioma; 1 label, 67 ml)" in str(refusal_of(mask, {1: "Glioma"}))

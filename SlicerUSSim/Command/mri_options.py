@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri import CtSegmentation, Segmentation
     from SlicerUSSim.Logic.tissue import LabelledTissues
 
+#: More labels may be the intensities of an image
+_MOST_LABELS = 100
+
 also_option = click.option(
     "--also", multiple=True, metavar="CONTRAST=FILE",
     help="Another MRI of the same patient, on any grid, registered to the first and classified together with it: "
@@ -138,9 +141,12 @@ def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = M
 
     Raises SimulationError, saying what it is, for a label map, a mask or a tracked sequence, and if it is constant.
     """
+    import numpy as np
+
     from SlicerUSSim.Logic.base.errors import about_file
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.recognition import check_finite
+    from SlicerUSSim.Logic.tissue.label_advice import MRI_COMMAND
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file
 
     require_no_sequence(path)
@@ -150,7 +156,16 @@ def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = M
     with about_file(path):
         check_finite(volume)
     if is_label_file(Path(path), volume):
-        found = read_label_file(Path(path), volume)  # refuses a mask, and says how to add it
+        try:
+            found = read_label_file(Path(path), volume, advice=MRI_COMMAND)  # refuses a mask, and says how to add it
+        except SimulationError as error:
+            if "--map" not in str(error):
+                raise
+            count = np.unique(volume.array[volume.array != 0]).size
+            remedy = "use it as it is (ussim simulate), which says what its labels need"
+            if count > _MOST_LABELS:
+                remedy += "; if these are intensities of an MRI, its file may be incomplete"
+            raise SimulationError(f"{path}: is a label map ({count} labels), expected an MRI; {remedy}") from error
         raise SimulationError(
             f"{path}: is a label map ({found.message}), expected an MRI; use it as it is (ussim simulate {path} ...), "
             "or segment it all the same with --skull-strip none"

@@ -33,6 +33,15 @@ class Advice:
 
 
 COMMAND = Advice()
+#: Commands that expect an MRI, and have no --map
+MRI_COMMAND = replace(
+    COMMAND,
+    lesion="add it to an MRI's tissues with --add {added}, or simulate it alone with ussim simulate",
+    brain_mask=(
+        "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or simulate it alone with "
+        "ussim simulate"
+    ),
+)
 #: The page of the workstation
 PAGE = replace(
     COMMAND,
