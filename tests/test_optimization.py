@@ -216,7 +216,7 @@ def test_simulator_is_left_as_it_was(twin, result):
     ],
 )
 def test_other_algorithms_find_it_too(twin, result, algorithms):
-    other = optimise(twin, ["display", "white matter"], max_evaluations=300, algorithms=algorithms)
+    other = optimise(twin, ["display", "white matter"], max_evaluations=600, algorithms=algorithms)
     assert other.cost_after < 1.25 * result.cost_after
 
 
