@@ -490,9 +490,10 @@ inline float width_of(const Waves *waves, int count) {
 }
 
 // Relative to a beam that nothing disturbs and that has lost `loss` nepers: (nepers of the amplitude of speckle lost by
-// the phases and the uneven losses of soft tissue, nepers lost to strong tissue, width). The power of speckle is the
-// integral over the beam of the transmitted times the received intensity. A shift of both beams changes nothing.
-inline float3 level_and_spread(__constant const Acquisition *acquisition, const Lines *lines, float path,
+// the phases and the uneven losses of soft tissue, nepers lost to strong tissue, width, and the nepers lost to strong
+// tissue right in front, which is the mean power over the lines). The power of speckle is the integral over the beam of
+// the transmitted times the received intensity. A shift of both beams changes nothing.
+inline float4 level_and_spread(__constant const Acquisition *acquisition, const Lines *lines, float path,
                                float mean_delay, float loss) {
   const int count = lines->count;
   Phases phases;
@@ -506,16 +507,22 @@ inline float3 level_and_spread(__constant const Acquisition *acquisition, const 
   const float spread = clamp(width_of(&waves, count) / own_width, 1.0f, MOST_SPREAD);
   if (lines->uneven >= MOST_UNEVEN) find_waves(lines, &phases, BY_LOSS, &waves);
   const float by_soft = fmax(overlap(waves.received, waves.transmitted, count) / still, LEAST_POWER);
-  float differs = 0.0f;
+  float differs = 0.0f, all = 0.0f, lit = 0.0f;
   for (int row = 0; row < ROWS; row++)
-    for (int i = 0; i < count; i++) differs = fmax(differs, fabs(lines->passed[row][i] - 1.0f));
+    for (int i = 0; i < count; i++) {
+      const float square = lines->passed[row][i] * lines->passed[row][i], share = ROW_WEIGHT(row) * lines->weight[i];
+      differs = fmax(differs, fabs(lines->passed[row][i] - 1.0f));
+      all += share;
+      lit += share * square * square;
+    }
   float level = by_soft;
   if (differs > 0.0f) {
     find_waves(lines, &phases, BY_TISSUE, &waves);
     level = fmax(overlap(waves.received, waves.transmitted, count) / still, LEAST_POWER * by_soft);
   }
   const float own = lines->uneven < LEAST_UNEVEN ? loss : lines->least_loss;  // that of a line which is `kept`
-  return (float3)(own - loss - 0.5f * log(by_soft), 0.5f * log(by_soft / level), spread);
+  return (float4)(own - loss - 0.5f * log(by_soft), 0.5f * log(by_soft / level), spread,
+                  differs > 0.0f ? -0.5f * log(fmax(lit / fmax(all, 1e-6f), LEAST_POWER)) : 0.0f);
 }
 
 // Of lines that soft tissue alone disturbs: the mean loss of what arrives.
@@ -565,7 +572,7 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
   const float spread = second / all - mean_x * mean_x, common = moments / all - mean_x * mean_delay;
   const float slope = clamp(common / (spread + 0.02f * pitch * pitch), -STEEPEST, STEEPEST);
   const float rise = clamp(row_lift[2] - row_lift[0], -STEEPEST * path, STEEPEST * path);
-  float3 found = (float3)(0.0f, 0.0f, 1.0f);
+  float4 found = (float4)(0.0f, 0.0f, 1.0f, 0.0f);
   float exit_shade = 0.0f, away = NO_END;
   if (with_level) {
     // In strong tissue, a beam has the level that it has before it: what this tissue takes is a matter of its ray.
@@ -583,8 +590,14 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
     }
     if (behind != 0.0f) {
       find_lines(acquisition, sums, behind, axis, &lines);
-      exit_shade = level_and_spread(acquisition, &lines, behind, mean_delay, loss).y;
+      exit_shade = level_and_spread(acquisition, &lines, behind, mean_delay, loss).w;
+      // The part u of an aperture leaves u^3 of the power of speckle, in a beam 1 / u times as wide; but the edge of a
+      // plate right in front of a point cuts a beam that is in focus: u. A beam is made of the visible aperture from
+      // the distance on at which the cone of its lines is wider than a Fresnel zone, 4 F^2 wavelengths.
       away = fmax(path - behind, 0.0f);
+      const float zone = 8.0f * acquisition->receive_f_number * acquisition->receive_f_number;
+      const float far = fmin(away * acquisition->cycles_per_mm / zone, 1.0f);
+      found.y = blend(found.w, found.y, far);
     }
   }
   const float4 screen = (float4)(losses / all + found.x + found.y, mean_delay - slope * mean_x, slope * path, rise);
@@ -664,19 +677,21 @@ inline Between between_lines(__constant const Acquisition *acquisition, float pl
 }
 
 // The amplitude that strong tissue lets through at the depth `node`, at a place among the screen lines: of one of the
-// two `kinds` of shades. It is averaged over a deviation `sigma` in screen lines, by a Gauss-Hermite rule of three
-// points.
+// two `kinds` of shades. In shadows it is the mean over a deviation `sigma` in screen lines, by a Gauss-Hermite rule of
+// three points; from where the beam passes beside, nothing is taken.
 inline float mean_lit(__constant const Acquisition *acquisition, __global const float *shades, int kind, int node,
                       float place, float sigma) {
   const int nodes = acquisition->screen_depths;
-  float sum = 0.0f;
+  float sum = 0.0f, own = 0.0f;
   for (int side = -1; side <= 1; side++) {
     const Between at = between_lines(acquisition, place + side * 1.7320508f * sigma);
     const float left = exp_fast(-shades[4 * (at.left * nodes + node) + kind]);
     const float right = exp_fast(-shades[4 * ((at.left + 1) * nodes + node) + kind]);
-    sum += (side == 0 ? 0.6666667f : 0.1666667f) * blend(left, right, at.part);
+    const float lit = blend(left, right, at.part);
+    sum += (side == 0 ? 0.6666667f : 0.1666667f) * lit;
+    if (side == 0) own = lit;
   }
-  return sum;
+  return fmax(sum, own);
 }
 
 // The nepers that strong tissue takes at a depth, and behind its last end before.
@@ -697,9 +712,9 @@ inline float2 mean_shades(__constant const Acquisition *acquisition, __global co
   // The lines come together from a distance in a cone, over whose width they average themselves.
   const float cone = away / acquisition->receive_f_number;
   const float sigma = sqrt(fmax(extra - cone * cone / 12.0f, 0.0f)) * lines_per_mm;
+  const float end_sigma = sqrt(extra_variance(acquisition, path - away)) * lines_per_mm;
   return (float2)(-log_fast(mean_lit(acquisition, shades, 0, node, place, sigma)),
-                  -log_fast(mean_lit(acquisition, shades, 1, node, place,
-                                     sqrt(extra_variance(acquisition, path - away)) * lines_per_mm)));
+                  -log_fast(mean_lit(acquisition, shades, 1, node, place, end_sigma)));
 }
 
 // The beams of traced lines, interpolated between screens; 0 at the face. Axes that come together must not create

@@ -149,9 +149,9 @@ def axis_levels_db(tree, line: int, depths: np.ndarray) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize(("top_mm", "rms_db"), [(14.0, 3.6), (16.0, 3.0), (18.0, 2.5), (20.0, 1.8), (22.0, 2.0)])
+@pytest.mark.parametrize(("top_mm", "rms_db"), [(14.0, 2.7), (16.0, 2.3), (18.0, 1.6), (20.0, 1.3)])
 def test_right_behind_opaque_tissue_its_edge_is_as_wide_as_the_beam(top_mm, rms_db):
-    """Up to 8 mm behind a plate of air of 4 mm, against wave propagation. 10, 3.4, 3.8, 4.3 and 1.7 dB before."""
+    """Up to 8 mm behind a plate of air of 4 mm, against wave propagation. 10, 3.4, 3.8 and 4.3 dB before."""
     probe = LinearProbe(30, 48, scan_lines=121, focus_mm=30, elevation_focus_mm=30, frequency_mhz=5.0)
     bottom_mm, aside = top_mm + 3.75, np.array([-2.0, -1.5, -1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.5])
 
@@ -293,7 +293,7 @@ def test_nothing_in_or_before_a_lossy_plate_is_brightened_and_what_has_passed_it
         level = axis_levels_db(tree, line, depths)
         assert np.nanmax(level) < 0.3
         assert np.all(np.diff(level[inside]) < 0.05)
-        path = axis_segments(tree, line)
+        path = axis_segments(tree, int(line))
         assert path["loss"].min() > -1e-3 and path["loss"].max() < nepers / path["direction"][:, 1].min() * 1.2
         # The loss that shifts the frequency is never more than what is lost: phases take nothing here.
         end = path["attenuation"] * np.exp(-path["decay_per_mm"] * path["length_mm"])

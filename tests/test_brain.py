@@ -688,6 +688,32 @@ def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
     assert "was not written by ussim" in kept.text and place.read_bytes() == before
 
 
+@pytest.mark.parametrize("edit", ["everything", "empty", "a lesion", "smoothed"])
+def test_an_edited_kept_mask_is_checked_as_one_that_is_given(edit, head, found, tmp_path):
+    """All of the head was segmented as a brain, and a smoothed mask was wider by a litre."""
+    mask = found.result.mask.array.astype(np.float32)
+    inside = mask > 0
+    lesion = np.zeros_like(mask)
+    lesion[tuple(slice(n // 2, n // 2 + 6) for n in mask.shape)] = 1
+    edited = {
+        "everything": np.ones_like(mask), "empty": np.zeros_like(mask), "a lesion": lesion,
+        "smoothed": ndimage.gaussian_filter(mask, 1.5),
+    }[edit]  # fmt: skip
+    path = tmp_path / "head.brain-mask.nrrd"
+    image = sitk.ReadImage(str(found.place))
+    changed = sitk.GetImageFromArray(edited)
+    changed.CopyInformation(image)
+    for key in image.GetMetaDataKeys():
+        changed.SetMetaData(key, image.GetMetaData(key))
+    sitk.WriteImage(changed, str(path))
+    if edit == "smoothed":
+        used = find_brain(head[0], keep_at=path)
+        assert used.volume_ml == pytest.approx(inside.sum() * head[0].voxel_ml, rel=0.05)
+        return
+    with pytest.raises(SimulationError, match=r"head.brain-mask.nrrd (has|is empty|covers).*or delete it"):
+        find_brain(head[0], keep_at=path)
+
+
 def test_a_mask_edited_in_a_program_that_keeps_no_notes_is_the_users(head, found, tmp_path):
     path = tmp_path / "head.brain-mask.nrrd"
     edited = found.result.mask.array.copy()

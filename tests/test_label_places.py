@@ -82,6 +82,26 @@ def test_other_numbers_get_a_proposal_but_no_tissues():
     assert message.endswith("--map 10=csf --map 150=grey --map 250=white")
 
 
+def test_a_tumour_as_label_4_is_no_leptomeninges():
+    """9 ml deep in white matter became leptomeninges, as did deep nuclei."""
+    brain_ = in_order((1, 2, 3), has_sulci=True)
+    z, y, x = np.indices(brain_.array.shape) * 3.0 - 73.5
+    ball = np.hypot(np.hypot(x - 30, y), z) < 13
+    message = str(refusal_of(brain_.with_array(np.where(ball, 4, brain_.array))))
+    assert "3 white matter" in message and "4 something else (" in message
+    assert message.endswith("--map 1=csf --map 2=grey --map 3=white --map 4=TISSUE")
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    sulci = (np.abs(radius - 62) < 4) & (np.abs(np.sin(x / 9)) < 0.3) & (brain_.array == 2)
+    found = read_label_map(brain_.with_array(np.where(sulci, 4, brain_.array)))
+    assert "leptomeninges" in found.names
+
+
+def test_tissues_from_2_to_4_are_refused_with_their_order_and_not_moved_by_one():
+    """CSF was read as grey matter, grey as white matter, and white matter as leptomeninges."""
+    message = str(refusal_of(in_order((2, 3, 4), has_sulci=True)))
+    assert message.endswith("--map 2=csf --map 3=grey --map 4=white"), message
+
+
 def test_three_organs_beside_each_other_get_no_proposal():
     array = np.zeros((60, 60, 60), np.uint8)
     for label, j in ((1, 2), (2, 22), (3, 42)):
@@ -461,6 +481,22 @@ def test_a_brain_that_was_cut_is_said_to_be_a_part_and_where_it_was_cut(axis, lo
         )
 
 
+def test_a_part_of_a_brain_is_not_judged_by_where_the_whole_has_its_centre():
+    """The lower half was refused as upside down, "below the cerebrum's centre"."""
+    lower = kept(whole_head(), 2, -80, -25)
+    assert any("cut off at the top: what" in line for line in read_label_map(lower).warnings)
+    with pytest.raises(SimulationError, match=r"back to front|upside down"):
+        read_label_map(moved(kept(whole_head(), 2, -80, 10), flip="y"), mapping=LabelMapping.of("freesurfer"))
+
+
+def test_a_whole_brain_whose_sides_have_one_name_is_no_half():
+    whole = whole_head()
+    merged = whole.array.copy()
+    for right, left in ((41, 2), (42, 3), (43, 4), (49, 10), (47, 8)):
+        merged[merged == right] = left
+    assert not read_label_map(whole.with_array(merged), mapping=LabelMapping.of("freesurfer")).warnings
+
+
 def test_one_hemisphere_by_the_names_of_its_labels_is_said_however_its_medial_face_lies():
     turned = moved(whole_head(), turned=(0, 0, 30))
     left = turned.with_array(np.where(np.isin(turned.array, [2, 3, 4, 8, 10]), turned.array, 0))
@@ -483,19 +519,23 @@ def test_a_left_hemisphere_is_not_read_as_organs_whose_numbers_and_places_fit_by
     assert "fit FreeSurfer and TotalSegmentator" in message and message.endswith("with --map freesurfer"), message
 
 
-def test_labels_that_were_interpolated_and_rounded_are_said_and_nearest_neighbours_are_not():
+@pytest.mark.parametrize("way", ["turned", "by half a voxel"])
+def test_labels_that_were_interpolated_and_rounded_are_said_and_nearest_neighbours_are_not(way):
     whole = whole_head()
-    turn = Rotation.from_euler("z", 10, degrees=True).as_matrix()
-    middle = np.array(whole.array.shape) / 2
+    if way == "turned":
+        turn = Rotation.from_euler("z", 10, degrees=True).as_matrix()
+        offset = (np.eye(3) - turn) @ np.array(whole.array.shape) / 2
+    else:
+        turn, offset = np.eye(3), np.array([0, 0, 0.5])
     nearest, linear = (
-        whole.with_array(
-            np.rint(ndimage.affine_transform(whole.array.astype(float), turn, middle - turn @ middle, order=order))
-        )
+        whole.with_array(np.rint(ndimage.affine_transform(whole.array.astype(float), turn, offset, order=order)))
         for order in (0, 1)
     )
     assert not read_label_map(nearest).warnings
     message = str(refusal_of(linear))  # 2 and 41 have any number between them, some of which FreeSurfer has not
     assert "resampled with interpolation and rounded" in message and "nearest neighbours" in message
+    if way != "turned":  # then nearly all numbers in between are none of FreeSurfer's
+        return
     known = np.isin(linear.array, list(freesurfer_names()))
     linear = linear.with_array(np.where(known, linear.array, 0))
     warnings = read_label_map(linear, mapping=LabelMapping.of("freesurfer")).warnings

@@ -44,7 +44,7 @@ def brain():
 
 @pytest.fixture(scope="module")
 def twin(brain):
-    return make_twin(*brain, 3, probe=SMALL)
+    return make_twin(*brain, 4, probe=SMALL)
 
 
 def optimise(twin, free, **options):
@@ -204,7 +204,7 @@ def test_sources_say_what_was_fitted(result):
 
 def test_simulator_is_left_as_it_was(twin, result):
     assert white(twin.simulator.medium.tissues).mu0 == 0.33
-    assert twin.simulator.settings.seed == 3
+    assert twin.simulator.settings.seed == twin.seed
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ def test_simulator_is_left_as_it_was(twin, result):
     ],
 )
 def test_other_algorithms_find_it_too(twin, result, algorithms):
-    other = optimise(twin, ["display", "white matter"], max_evaluations=300, algorithms=algorithms)
+    other = optimise(twin, ["display", "white matter"], max_evaluations=600, algorithms=algorithms)
     assert other.cost_after < 1.25 * result.cost_after
 
 

@@ -9,8 +9,9 @@ import pytest
 
 from SlicerUSSim.Logic import LinearProbe
 from SlicerUSSim.Logic.probe.arrays import PROBES
-from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, level_db
+from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, envelope_snr, level_db
 from SlicerUSSim.Logic.verification.validation import ORIENTATIONS
+from SlicerUSSim.Logic.verification.validation.speckle import smallest_cell
 from tests.conftest import SPECKLE, block, rigid, simulator
 
 LINEAR = LinearProbe(40, 50, scan_lines=161, focus_mm=25, elevation_focus_mm=25)
@@ -140,3 +141,34 @@ def test_speckle_near_the_point_where_all_lines_of_a_phased_array_begin_has_its_
     for depth in (1.5, 2.5, 3.5, 4.5):
         near = np.stack([at_depth(frame.iq, frame, depth, 0.5) for frame in signals])
         assert level_db(near) == pytest.approx(10 * np.log10(SPECKLE.scatterer_variance), abs=1.2), depth
+
+
+def test_the_prediction_for_few_scatterers_is_that_of_sums_of_phasors():
+    """30 000 sums over a lattice of two sites per cubic millimetre, of which one in four has a scatterer."""
+    rng = np.random.default_rng(5)
+    sigmas, sums = np.array([0.4, 0.8, 1.1]), np.zeros(30_000, complex)
+    spacing = 0.8
+    reach = np.ceil(4.0 * sigmas / spacing).astype(int) + 1
+    axes = np.meshgrid(*[np.arange(-n, n) for n in reach], indexing="ij")
+    shift = rng.random((len(sums), 3))
+    for cell in np.stack([axis.ravel() for axis in axes], axis=1):
+        place = spacing * (cell + rng.random((len(sums), 3)) + shift)
+        is_there, phase = rng.random(len(sums)) < 0.25, np.exp(2j * np.pi * rng.random(len(sums)))
+        sums += is_there * phase * np.exp(-0.5 * ((place / sigmas) ** 2).sum(axis=1))
+    found = float(np.abs(sums).mean() / np.abs(sums).std())
+    assert envelope_snr(0.25 * spacing**-3, spacing**-3, [tuple(sigmas)]) == pytest.approx(found, rel=0.015)
+    assert found < 1.85
+    assert envelope_snr(1e5, 1e7, [tuple(sigmas)]) == pytest.approx(1.913, abs=2e-3)
+
+
+def test_rare_scatterers_of_a_15_mhz_array_are_sparse_as_predicted():
+    """They were said to be developed speckle up to mu1 = 3.5; there are two in the smallest resolution cell."""
+    tissue, probe = replace(SPECKLE, mu1=3.0), PROBES["linear_15"]
+    depth, cell, expected = smallest_cell(probe, tissue, 1.0)
+    assert 125_000 * tissue.scatterer_share * cell == pytest.approx(2.1, abs=0.1)
+    frames = [
+        simulator(SOLID, tissue, seed=seed).simulate(probe, rigid(np.eye(3), [0, -depth, 0])) for seed in range(12)
+    ]
+    envelope = np.abs(np.stack([depth_window(frame, depth, 1.0) for frame in frames]))
+    assert envelope.mean() / envelope.std() == pytest.approx(expected, rel=0.025)
+    assert expected < 1.75

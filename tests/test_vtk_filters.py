@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict
 
 import numpy as np
@@ -476,3 +477,34 @@ def test_another_mri_is_registered_and_classified_with_the_first():
     algorithm.AddObserver("ErrorEvent", lambda *_: None)
     algorithm.Update()
     assert "two volumes of contrast t1" in algorithm.GetErrorMessage()
+
+
+def test_labels_without_names_and_table_are_recognised_or_refused_and_not_taken_for_the_brains():
+    """A lesion's mask was simulated as CSF, SPM's grey matter as CSF."""
+    from tests.test_label_places import in_order
+
+    def output(labels: Volume) -> UltrasoundSimulationFilter:
+        algorithm = UltrasoundSimulationFilter()
+        algorithm.SetProbe(PROBE)
+        algorithm.SetDisplay(DISPLAY)
+        algorithm.SetInputData(labels.to_vtk())
+        return algorithm
+
+    mask = np.zeros((40, 40, 40), np.uint8)
+    mask[15:25, 15:25, 15:25] = 1
+    for labels, message in (
+        (Volume(mask, np.eye(4)), "a binary mask .*AddTissueData"),
+        (in_order((3, 1, 2)), "no known program's order.*1=grey --map 2=white --map 3=csf"),
+    ):
+        algorithm = output(labels)
+        for heard in (algorithm, algorithm.GetExecutive()):
+            heard.AddObserver("ErrorEvent", lambda *_: None)
+        algorithm.Update()
+        assert algorithm.GetFrame() is None and re.search(message, algorithm.GetErrorMessage())
+    found = output(in_order((1, 2, 3)))
+    found.Update()
+    assert found.GetFrame() is not None
+    known = output(Volume(mask, np.eye(4)))
+    known.SetTissues(TissueTable({0: FLUID, 1: SPECKLE}))
+    known.Update()
+    assert known.GetFrame() is not None

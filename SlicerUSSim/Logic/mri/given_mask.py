@@ -23,6 +23,8 @@ _LISTED = 6
 #: What a brain mask holds at least, ml or as a share of what the image shows. Lesions are 0.1 to 100 ml in heads of
 #: 3000 ml and brains of 1200 ml, at most 0.08; the newborn's brain has 250 ml and more.
 _LEAST_ML, _LEAST_SHARE = 100.0, 0.3
+#: What a filter leaves beyond 0 and 1
+_ROUNDING = 1e-3
 #: Pieces of a mask smaller than this share of the largest are no part of a brain; and how much of them is said, ml
 _LEAST_PIECE, _WORTH_ML = 0.1, 0.5
 
@@ -111,7 +113,8 @@ def _reordered(mask: Volume, mri: Volume) -> Volume:
 
 def _is_probability(array: np.ndarray) -> bool:
     """Whether these are probabilities of the brain: from 0 to 1, most of them near one of the two."""
-    if not np.issubdtype(array.dtype, np.floating) or not (array.min() >= 0.0 and 0.9 < array.max() <= 1.0):
+    low, high = float(array.min()), float(array.max())
+    if not np.issubdtype(array.dtype, np.floating) or low < -_ROUNDING or not 0.9 < high <= 1.0 + _ROUNDING:
         return False
     some = array[::3, ::3, ::3]
     some = some[some > 0.05]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.files import make_folder, written_whole
 from SlicerUSSim.Logic.base.version import __version__
 from SlicerUSSim.Logic.base.volume import Volume, read_itk_image
+from SlicerUSSim.Logic.mri.given_mask import checked_mask
 
 _log = logging.getLogger(__name__)
 
@@ -66,7 +67,10 @@ def is_kept_mask(path: Path) -> bool:
 
 
 def read_kept(path: Path, mri: Volume, method: str) -> KeptMask | None:
-    """The mask kept for this MRI and method; None if there is none, or it belongs to another image or method."""
+    """The mask kept for this MRI and method; None if there is none, or it belongs to another image or method.
+
+    Raises SimulationError for one that somebody edited and that would be refused if it were given (checked_mask).
+    """
     fingerprint = fingerprint_of(mri)
     for place in (path, _in_cache(path, fingerprint)):
         kept = _read(place, mri, method, fingerprint)
@@ -165,14 +169,11 @@ def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | 
     if entries.get("mri", fingerprint) != fingerprint or not (is_same_grid and is_mask):
         _log.info("%s: is not used, since it was made for another image", path)
         return None
-    inside = mask.array > 0
-    is_edited = entries.get("mask") != _hash(inside.astype(np.uint8))
+    is_edited = entries.get("mask") != _hash((mask.array > 0).astype(np.uint8))
+    inside = _checked(mask, path, mri) if is_edited else mask.array > 0
     made_by = entries.get("method", "")
     if not is_edited and method not in ("auto", made_by):
         _log.info("%s: is not used, since it was made by %s", path, made_by)
-        return None
-    if not inside.any():
-        _log.warning("%s: is empty and is not used", path)
         return None
     try:
         seconds = float(entries.get("seconds", "0"))
@@ -180,3 +181,12 @@ def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | 
         seconds = 0.0
     warnings = tuple(line for line in entries.get("warnings", "").split(" | ") if line)
     return KeptMask(inside, made_by, seconds, is_edited, path, () if is_edited else warnings)
+
+
+def _checked(mask: Volume, path: Path, mri: Volume) -> np.ndarray:
+    try:
+        return checked_mask(replace(mask, name=str(path)), mri)
+    except SimulationError as error:
+        raise SimulationError(
+            f"{error}; that file is beside the MRI and was edited: correct it, or delete it to extract the brain again"
+        ) from None

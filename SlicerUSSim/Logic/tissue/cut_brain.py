@@ -12,13 +12,14 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.volume import Volume
 
-#: Share of the largest slice that the outermost has where a brain was cut; of whole ones it is below 0.1, at slices of
-#: 3 mm. In thicker slices than this, it tells nothing.
-_FLAT, _THICKEST_MM = 0.3, 5.0
+#: Share of the largest slice that the outermost has where a brain was cut (0.36 where a tenth of its extent is gone);
+#: of whole ones it is below 0.1, at slices of 3 mm. In thicker slices than this, it tells nothing.
+_FLAT, _THICKEST_MM = 0.2, 5.0
 #: Smaller pieces are not judged, and none that fill less of their box, which a brain fills by half
 _LEAST_ML, _LEAST_FILLED = 100.0, 0.2
-#: Share of one side's volume that the other has at least, by names
-_LEAST_SIDE = 0.5
+#: Share of one side's volume that the other has at least, by names, and the volume from which both are there: labels of
+#: the right side may have been given the names of the left
+_LEAST_SIDE, _BOTH_SIDES_ML = 0.5, 750.0
 _SIDES = (("left", "right"), ("back", "front"), ("bottom", "top"))
 _LEFT, _RIGHT = (re.compile(rf"(^|[-_ ])({words})([-_ ]|$)", re.IGNORECASE) for words in ("left|lh", "right|rh"))
 
@@ -42,7 +43,8 @@ def cut_sides(labels: Volume, names: Mapping[int, str | None], counts: np.ndarra
         sum(int(counts[label]) for label, name in names.items() if name and side.search(name))
         for side in (_LEFT, _RIGHT)
     )
-    if min(left, right) < _LEAST_SIDE * max(left, right):
+    is_half = inside.sum() * labels.voxel_ml < _BOTH_SIDES_ML
+    if is_half and min(left, right) < _LEAST_SIDE * max(left, right):
         found.add("left" if left < right else "right")
     return [side for sides in _SIDES for side in sides if side in found]
 

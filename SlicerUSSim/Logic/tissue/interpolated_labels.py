@@ -18,10 +18,11 @@ _VALUES, _OF_PLATEAUS = 2, 0.02
 _WHOLE, _MOSTLY_WHOLE = 0.01, 0.9
 #: Steps of the range in which values are counted, and the least distance of the foreground from the background
 _STEP, _FOREGROUND = 1e-3, 1e-2
-#: Share of labelled voxels without a neighbour of their label from which whole numbers were interpolated, in
-#: maps of so many labels. SynthSeg's, AAL and Brodmann's of mricron 0.0000 to 0.0016, by nearest neighbours at 3 mm up
-#: to 0.014; interpolated, at 0.7 to 3 mm, 0.048 to 0.24; more in an image
-_ALONE, _LEAST_LABELS = (0.04, 0.5), 8
+#: Of voxels between two whose labels differ by so much, the share that has a number between these, from which whole
+#: numbers were interpolated, in maps of so many labels with mostly equal neighbours (an image has few). SynthSeg's, AAL
+#: and Brodmann's of mricron 0.007 to 0.019, by nearest neighbours at 3 mm up to 0.083, at 5 mm 0.116; interpolated 0.21
+#: (by half a voxel along one axis) to 0.67
+_APART, _BETWEEN, _LEAST_LABELS, _EQUAL = 4, 0.17, 8, 0.5
 #: Voxels along each side of the part of a volume that is examined
 _EXAMINED = 128
 
@@ -71,25 +72,35 @@ def is_smoothed(array: np.ndarray) -> bool:
     return int((counts >= _OF_PLATEAUS * len(flat)).sum()) >= _VALUES
 
 
-def share_alone(array: np.ndarray) -> float:
-    """Share of the labelled voxels, of whole numbers (k, j, i), in which none of six neighbours has the same label."""
-    part = array[tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)]
-    has_equal = np.zeros(part.shape, bool)
+def share_between(array: np.ndarray) -> tuple[float, float]:
+    """(share of voxels with a number between those of their neighbours, share of equal neighbours).
+
+    The first is of voxels between two neighbours along an axis of an array (k, j, i) whose numbers differ by 4 or more;
+    the second of pairs of neighbours of which neither is 0.
+    """
+    part = array[tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)].astype(np.int64)
+    between = far = equal = pairs = 0
     for axis in range(3):
-        along, found = np.moveaxis(part, axis, 0), np.moveaxis(has_equal, axis, 0)
-        same = along[1:] == along[:-1]
-        found[1:] |= same
-        found[:-1] |= same
-    labelled = part != 0
-    return float((labelled & ~has_equal).sum() / max(1, labelled.sum()))
+        along = np.moveaxis(part, axis, 0)
+        first, second = along[:-1], along[1:]
+        labelled = (first != 0) & (second != 0)
+        equal, pairs = equal + int((labelled & (first == second)).sum()), pairs + int(labelled.sum())
+        before, middle, after = along[:-2], along[1:-1], along[2:]
+        is_far = np.abs(before - after) >= _APART
+        is_between = (np.minimum(before, after) < middle) & (middle < np.maximum(before, after))
+        between, far = between + int((is_far & is_between).sum()), far + int(is_far.sum())
+    return between / max(1, far), equal / max(1, pairs)
 
 
 def are_interpolated_numbers(array: np.ndarray, n_labels: int) -> bool:
     """Whether whole numbers (k, j, i) with so many labels were interpolated and rounded.
 
-    Between two labels are then numbers of others, each in a few voxels.
+    Between two labels are then numbers of others.
     """
-    return n_labels >= _LEAST_LABELS and _ALONE[0] <= share_alone(array) <= _ALONE[1]
+    if n_labels < _LEAST_LABELS:
+        return False
+    between, equal = share_between(array)
+    return between >= _BETWEEN and equal >= _EQUAL
 
 
 def _frequent(levels: np.ndarray) -> float:

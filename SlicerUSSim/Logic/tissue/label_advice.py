@@ -68,3 +68,15 @@ SCENE = Advice(
     between="a segment around them gives it a tissue",
     gives_sizes=False,
 )
+#: A script with the VTK filters
+SCRIPT = replace(
+    COMMAND,
+    unknown="give its labels' tissues with SetTissues or set_tissue_names, of",
+    leave_out="",
+    background="set it to 0, or give its tissue with SetTissues",
+    lesion="lay it over a segmentation with SegmentationFilter.AddTissueData, or give its tissue with SetTissues",
+    brain_mask="if it is the mask of a brain, it is port 1 of the SegmentationFilter of that brain's MRI",
+    ambiguous="read it with read_label_map and a LabelMapping of {key!r}",
+    likely="if that is right, read it with read_label_map and LabelMapping.of([...]) with {maps}",
+    between="read_label_map with a LabelMapping of 0=fat gives it a tissue",
+)

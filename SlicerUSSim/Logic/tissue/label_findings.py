@@ -33,9 +33,8 @@ _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
 #: Tissues of every brain, and the least and largest volume of both that is not remarkable
 _BRAIN, _BRAIN_ML = ("grey matter", "white matter"), (30.0, 2500.0)
 _INTERPOLATED = (
-    "many voxels have a label that none of their neighbours has, as where a label map was resampled with interpolation "
-    "and rounded, so that there are wrong labels between two others: use the original, or resample it with nearest "
-    "neighbours"
+    "many voxels between two labels have a number between theirs, which is that of another structure, as where a label "
+    "map was resampled with interpolation and rounded: use the original, or resample it with nearest neighbours"
 )
 #: A larger binary mask is that of a brain or a head.
 _LARGEST_LESION_ML = 500.0
@@ -107,7 +106,7 @@ class Findings:
             return
         remedy = self.advice.unknown.format(label=unknown[0])
         nothing = "no program's numbers are recognised, and " if len(unknown) == len(self.names) else ""
-        if len(unknown) > 1 and self.advice.leave_out:
+        if len(unknown) > 1 and self.advice.leave_out and not self._are_interpolated:
             each = [f"--map {n}=0" for n in unknown[:_LONGEST_LIST]]
             maps = " ".join([*each, "..."] if len(unknown) > len(each) else each)
             remedy = f"{self.advice.leave_out.format(maps=maps)}; or {remedy}"
@@ -176,14 +175,19 @@ class Findings:
         has_both = {tissue.name for tissue in self.found.values() if tissue} >= set(_BRAIN)
         return [label for label, tissue in self.found.items() if has_both and tissue and tissue.name in _BRAIN]
 
-    def _brain_that_was_cut(self) -> list[str]:
+    @cached_property
+    def cut_sides(self) -> list[str]:
+        """At which sides a brain was cut off: of left, right, back, front, bottom, top."""
         brain = self._brain()
-        sides = cut_sides(self.labels, {label: self.names[label] for label in brain}, self.counts) if brain else []
-        if not sides:
+        return cut_sides(self.labels, {label: self.names[label] for label in brain}, self.counts) if brain else []
+
+    def _brain_that_was_cut(self) -> list[str]:
+        if not self.cut_sides:
             return []
-        where = " and the ".join(sides)
+        *sides, last = (f"the {side}" for side in self.cut_sides)
+        where = f"{', '.join(sides)} and {last}" if sides else last
         return [
-            f"{self.source}: a part of a brain of {self._size(brain)}, cut off at the {where}: what is missing is "
+            f"{self.source}: a part of a brain of {self._size(self._brain())}, cut off at {where}: what is missing is "
             "the coupling medium"
         ]
 

@@ -169,7 +169,7 @@ class _Reading:
         )  # fmt: skip
         findings.require_patient()
         findings.require_known()
-        self._require_upright(names)
+        self._require_upright(names, is_whole=not findings.cut_sides)
         coupling = (self._by_number or self._tissues)[0]
         order: list[Tissue] = []
         relabelled = {0: 0}
@@ -213,11 +213,11 @@ class _Reading:
             f"does, which is expected to be 0; {self._advice.background.format(label=corner)}"
         )
 
-    def _require_upright(self, names: Mapping[int, str | None]) -> None:
+    def _require_upright(self, names: Mapping[int, str | None], *, is_whole: bool) -> None:
         """Raise SimulationError for a head or body that is upside down by what its labels are called."""
         own = {label: name for label, name in names.items() if self._mapping.tissue_of(label, name) is None}
         places = places_of(self._volume, own)
-        wrong = wrong_way_up(self._volume, own) or wrong_body(places)
+        wrong = wrong_way_up(self._volume, own, is_whole=is_whole) or wrong_body(places)
         require(
             wrong is None,
             f"{self._source}: by its header, {wrong}; correct the orientation in its header, or export it again with "
@@ -259,11 +259,14 @@ class _Reading:
     def _likely(self, order: Mapping[int, str]) -> str:
         """What three labels of a brain probably are, and how to say so."""
         total = self._counts[list(order)].sum()
+        others = [label for label in self._present if label not in order]
         parts = [f"{label} {tissue} ({self._counts[label] / total:.0%})" for label, tissue in sorted(order.items())]
-        maps = " ".join(f"--map {label}={tissue.split()[0]}" for label, tissue in sorted(order.items()))
+        parts += [f"{label} something else ({self._counts[label] * self._volume.voxel_ml:.3g} ml)" for label in others]
+        maps = [f"--map {label}={tissue.split()[0]}" for label, tissue in sorted(order.items())]
+        maps += [f"--map {label}=TISSUE" for label in others]
         return (
-            f"labels {listed(sorted(order))} are in no known program's order; by their amounts and places they are "
-            f"{listed(parts)}; {self._advice.likely.format(maps=maps)}"
+            f"labels {listed(self._present)} are in no known program's order; by their amounts and places they are "
+            f"{listed(parts)}; {self._advice.likely.format(maps=' '.join(maps))}"
         )
 
     def _tissue(self, label: int, name: str | None) -> Tissue | None:

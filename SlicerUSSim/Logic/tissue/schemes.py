@@ -31,6 +31,9 @@ _SURE = 8
 #: A label map of a tumour alone is smaller than this, and fills less of its box; a labelled brain is larger, and a part
 #: of one fills its box.
 _LARGEST_LESION_ML, _LARGEST_LESION_SHARE = 400.0, 0.25
+#: Share of the voxels of label 4 that are two voxels and more from others, up to which it may be leptomeninges, which
+#: `ussim segment` makes one or two voxels thin: 0.00 there, 0.2 to 0.6 in tumours, nuclei and white matter
+_THICK = 0.05
 #: A brain with the fluid around it has up to 2 litres.
 _LARGEST_BRAIN_ML = 3000.0
 #: Depth of what is around others, by that of the others
@@ -63,7 +66,8 @@ class Recognition:
     possible: Scheme | None = None
     #: Why not
     doubt: str = ""
-    #: {label: tissue} of the only order of CSF, grey and white matter that fits three labels of a brain, and no scheme
+    #: {label: tissue} of the only order of CSF, grey and white matter that fits three labels of a brain, and no scheme;
+    #: other labels are unknown
     order: Mapping[int, str] = field(default_factory=dict)
 
 
@@ -129,7 +133,7 @@ def recognised(labels: Volume, values: list[int]) -> Recognition:
             fits.append((holds, scheme))
     if not fits:
         brain = _of_brain(labels, values)
-        return possible if possible and brain.scheme is None else brain
+        return possible if possible and brain.scheme is None and not brain.order else brain
     most = max(holds for holds, _ in fits)
     best = [scheme for holds, scheme in fits if holds == most]
     if may_be_freesurfers:  # one hemisphere, whose numbers a few organs have as well
@@ -211,9 +215,23 @@ def _of_brain(labels: Volume, values: list[int]) -> Recognition:
         return Recognition(None)
     tissues = BrainLabels.of(labels, tuple(value for value in values if value < 4 or not has_few))
     if has_few and {2, 3} <= set(values) and tissues.fits(1, 2, 3):
-        return Recognition(known["ussim"])
-    orders = tissues.orders() if len(values) == 3 else []
+        if 4 not in values or _is_thin(labels, 4):
+            return Recognition(known["ussim"])
+        if 1 in values:
+            ussims = known["ussim"].names
+            return Recognition(None, order={value: ussims[value] for value in (1, 2, 3)})
+    if len(values) != 3:
+        return Recognition(None)
+    orders = BrainLabels.of(labels, tuple(values)).orders()
     return Recognition(None, order=orders[0] if len(orders) == 1 else {})
+
+
+def _is_thin(labels: Volume, label: int) -> bool:
+    """Whether a label is at most two voxels thick nearly everywhere."""
+    from scipy import ndimage
+
+    array = labels.array == label
+    return bool(np.asarray(ndimage.binary_erosion(array)).sum() <= _THICK * array.sum())
 
 
 def _is_outermost(labels: Volume, label: int) -> bool:

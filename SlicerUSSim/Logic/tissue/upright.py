@@ -35,8 +35,10 @@ _MOST_TILTED = {"both": 60.0, "brain stem": 75.0, "cerebellum": 75.0}
 _NEAREST_MM = 15.0
 
 
-def wrong_way_up(labels: Volume, names: Mapping[int, str | None]) -> str | None:
+def wrong_way_up(labels: Volume, names: Mapping[int, str | None], *, is_whole: bool = True) -> str | None:
     """What is wrong with the orientation of a head whose labels have these names, in words; None if nothing is.
+
+    Of a part of a brain, whose centre lies elsewhere, only a mirrored one is found.
 
     Parameters
     ----------
@@ -56,8 +58,12 @@ def wrong_way_up(labels: Volume, names: Mapping[int, str | None]) -> str | None:
             if above_mm > 0:
                 return f"{structures} lie {where}: the head is upside down"
             return "the cerebellum lies in front of the brain stem: the head is back to front"
+        if not is_whole:
+            return None
         both = np.sum([np.exp(1j * np.radians(angle)) for angle in angles.values()])
         tilt, most = abs(float(np.degrees(np.angle(both)))), _MOST_TILTED["both"]
+    elif not is_whole:
+        return None
     else:
         ((only, angle),) = angles.items()
         tilt, most = abs(angle), _MOST_TILTED[only]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import integrate, special
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.imaging.frame import Frame
@@ -120,3 +122,37 @@ def fit_rayleigh(envelope: np.ndarray) -> RayleighFit:
     (sigma,), _ = curve_fit(density, grey, histogram, p0=[np.sqrt(0.5 * (scaled**2).mean())])
     fitted = density(grey, sigma)
     return RayleighFit(float(sigma), float(((histogram - fitted) ** 2).sum()), histogram, fitted)
+
+
+def envelope_snr(
+    scatterers_per_mm3: float, sites_per_mm3: float, sigmas_mm: Sequence[tuple[float, float, float]]
+) -> float:
+    """Predicted mean / standard deviation of the envelope of speckle with few scatterers in the resolution cell.
+
+    Scatterers of one amplitude and random phases are in independent cells of a lattice, of which each has one or none,
+    anywhere within it. `sigmas_mm` are those of Gaussian point spread functions (axial, lateral, elevational), by which
+    parts of the envelope of the same mean power were seen.
+
+    The envelope A of such a sum is the length of a random walk in a plane: E A is the integral of (1 - f(u)) / u^2,
+    and log f the sum of log(1 - q (1 - J0(u h))) over the cells, with the point spread function h and the share q of
+    cells that have one (E. Jakeman, P. N. Pusey, IEEE Trans. Antennas Propag. 24, 1976; here to the second order of
+    q, in which the mean over a cell counts).
+    """
+    r, dr = np.linspace(0.01, 7.99, 400, retstep=True)  # sigmas; volumes are in cells of (2 pi)^1.5 sigmas
+    shell = np.sqrt(2.0 / np.pi) * r**2 * dr
+    u = np.geomspace(1e-4, 1e4, 2400)
+    missing = 1.0 - special.j0(u[:, None] * np.exp(-0.5 * r**2))
+    first, second = missing @ shell, missing**2 @ shell
+    means = []
+    for sigmas in sigmas_mm:
+        cell = (2.0 * np.pi) ** 1.5 * float(np.prod(sigmas))
+        count, share = scatterers_per_mm3 * cell, scatterers_per_mm3 / sites_per_mm3
+        # Of the power, two places of one cell have this correlation on average: E exp(-d^2 / 2 sigma^2) along each axis
+        t = sites_per_mm3 ** (-1.0 / 3.0) / (np.sqrt(2.0) * np.array(sigmas))
+        alike = float(np.prod(np.sqrt(np.pi) / t * special.erf(t) - (1.0 - np.exp(-(t**2))) / t**2))
+        walk = np.exp(-count * (first + 0.5 * share * alike * second))
+        power = count / 2.0**1.5
+        below, above = 0.25 * power * u[0], 1.0 / u[-1]  # of the integral
+        means.append((integrate.trapezoid((1.0 - walk) / u, np.log(u)) + below + above) / np.sqrt(power))
+    mean = float(np.mean(means))
+    return mean / float(np.sqrt(1.0 - mean**2))

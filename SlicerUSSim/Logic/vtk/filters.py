@@ -43,7 +43,7 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.shape import outline_polydata
-from SlicerUSSim.Logic.tissue.label_advice import SCENE
+from SlicerUSSim.Logic.tissue.label_advice import SCRIPT
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, read_label_map
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -257,8 +257,8 @@ class UltrasoundSimulationFilter(_ImageFilter):
     The image is one slice in the image plane. The filter executes again only if the labels, the probe's transform
     (including transforms from which it is concatenated) or a parameter has changed. Amplifier noise differs between
     poses (noise.seed_of_pose). Labels are identified by the names from SegmentationFilter (field data "TissueNames");
-    without names, by the labels of the tissue table; with labels above 62, as those of another program
-    (tissue.read_label_map).
+    without names, by the labels of the table that SetTissues or SetPreset gave; without one, or with labels above 62,
+    by what they are (tissue.read_label_map): numbers of a known program. A mask or a tumour alone is an error then.
 
     >>> import numpy as np
     >>> from vtkmodules.vtkCommonTransforms import vtkTransform
@@ -285,6 +285,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         preset = Preset()
         self._probe, self._display, self._settings = preset.probe, preset.display, preset.settings
         self._tissues, self._texture = preset.tissues, None
+        self._are_numbered = False  # whether the table's labels are those of the label image
         self._field_alpha = False
         self._probe_transform: vtkLinearTransform | vtkMatrix4x4 = vtkTransform()  # as it was given
         self._simulator = ReusedSimulator()
@@ -319,8 +320,9 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._placed_outline.SetTransform(transform)
 
     def SetTissues(self, tissues: TissueTable) -> None:
-        """Acoustic parameters of the labels; default: presets of the brain."""
+        """Acoustic parameters of the labels; default: presets of the brain, for labels that have names or are known."""
         self._change("_tissues", tissues)
+        self._change("_are_numbered", True)
 
     def SetSettings(self, settings: SimulationSettings) -> None:
         """Settings of the physical model."""
@@ -385,15 +387,15 @@ class UltrasoundSimulationFilter(_ImageFilter):
         return 1
 
     def _patient(self, labels: vtkImageData) -> tuple[Volume, TissueTable]:
-        """The labels and their tissues; labels that a tissue table cannot have are read as another program's."""
+        """The labels and their tissues: by names, by a table that was given for them, or by what they are."""
         names = tissue_names(labels)
         if names:
             return Volume.from_vtk(labels), self._tissues.for_names(names)
-        if labels.GetScalarRange()[1] <= MAX_LABEL:
+        if self._are_numbered and labels.GetScalarRange()[1] <= MAX_LABEL:
             return Volume.from_vtk(labels), self._tissues
         version = (labels.GetMTime(), self._tissues)
         if self._read is None or self._read[0] != version:
-            found = read_label_map(Volume.from_vtk(labels), source="label image", tissues=self._tissues, advice=SCENE)
+            found = read_label_map(Volume.from_vtk(labels), source="label image", tissues=self._tissues, advice=SCRIPT)
             _log.info("label image: %s", found.message)
             for warning in found.warnings:
                 _log.warning("%s", warning)

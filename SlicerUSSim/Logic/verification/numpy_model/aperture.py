@@ -282,12 +282,14 @@ class Screens:
         lost = (share * loss).sum()
 
         depth = self._depth_outside(sums, axis, path)
-        more, shade, width = self._level(sums, axis, depth, lost if depth == path else None)
+        more, shade, width, near = self._level(sums, axis, depth, lost if depth == path else None)
         end_shade, away = shade, _NO_END
         ends = (self._end_between(sums, each, path - fields["screen_step"], path) for each in beside)
         end = next((end for end in ends if end), 0.0)
         if end:
-            end_shade, away = self._level(sums, axis, end, None)[1], max(path - end, 0.0)
+            end_shade, away = self._level(sums, axis, end, None)[3], max(path - end, 0.0)
+            far = min(away * fields["cycles_per_mm"] / (8.0 * fields["receive_f_number"] ** 2), 1.0)
+            shade = near + far * (shade - near)
         delays = mean_delay - slope * mean_x, slope * path, rise
         return lost + more + shade, *delays, shade, end_shade, lost, away, width
 
@@ -305,8 +307,8 @@ class Screens:
         kept = np.exp(-0.5 * (loss - loss.min())) if np.ptp(loss) >= _LEAST_UNEVEN else np.ones_like(loss)
         return (self.points[used] - axis.origin) @ axis.across, open_, delay, loss, kept, passed, lift
 
-    def _level(self, sums: np.ndarray, axis: Axis, depth: float, lost: float | None) -> tuple[float, float, float]:
-        """Nepers that soft tissue takes beyond `lost` (None: the mean) and that strong tissue takes; width."""
+    def _level(self, sums: np.ndarray, axis: Axis, depth: float, lost: float | None) -> tuple[float, ...]:
+        """Nepers that soft tissue takes beyond `lost` (None: the mean) and strong tissue; width; those right behind."""
         x, open_, delay, loss, kept, passed, _ = self._lines(sums, axis, depth)
         if lost is None:
             lost = float(np.average(loss, weights=_WEIGHTS[:, None] * open_ * kept**2))
@@ -320,7 +322,9 @@ class Screens:
         own = loss.min() if np.ptp(loss) >= _LEAST_UNEVEN else lost  # of a line that is `kept`
         width = _width(soft if np.ptp(loss) < _MOST_UNEVEN else bent)
         spread = np.clip(width / _width(still), 1.0, _MOST_SPREAD)
-        return own - lost - 0.5 * np.log(by_soft), 0.5 * np.log(by_soft / level), spread
+        lit = np.average(passed**4, weights=_WEIGHTS[:, None] * open_)
+        near = -0.5 * np.log(max(float(lit), 1e-7)) if (passed != 1.0).any() else 0.0
+        return own - lost - 0.5 * np.log(by_soft), 0.5 * np.log(by_soft / level), spread, near
 
 
 class Lit:
@@ -356,12 +360,14 @@ class Lit:
         return self.screens[left, depth], self.screens[left + 1, depth], inside - left
 
     def _mean(self, place: np.ndarray, depth: np.ndarray, kind: int, sigma: np.ndarray) -> np.ndarray:
-        total = 0.0
+        total, own = 0.0, 0.0
         for row, weight in zip(_ROWS * np.sqrt(2.0), _WEIGHTS, strict=True):
-            left, right, part = self._between(place + row * sigma, depth)
+            left, right, between = self._between(place + row * sigma, depth)
             lit = [np.exp(-each[..., kind]) for each in (left, right)]
-            total = total + weight * (lit[0] + part * (lit[1] - lit[0]))
-        return np.asarray(total)
+            blended = lit[0] + between * (lit[1] - lit[0])
+            total = total + weight * blended
+            own = blended if row == 0 else own
+        return np.maximum(total, own)
 
 
 def _intensity(wave: np.ndarray) -> np.ndarray:

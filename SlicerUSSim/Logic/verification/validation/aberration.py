@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -35,7 +36,8 @@ _LINES = slice(12, 150, 4)  # around those beyond, the phantoms end
 _SEEDS = 5  # of scatterers, over which speckle averages
 _DARK_DB = -12.0
 _EDGE_MM = (-1.5, -0.7, 0.5, 1.1, 1.7)  # places of lines beside the edge of a plate
-_BEHIND_MM = np.array([27.0, 29.0, 31.0, 33.0, 35.0])
+_BEHIND_MM = (27.0, 29.0, 31.0, 33.0, 35.0)
+_NEAR_MM = np.array([-2.0, -1.5, -1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.5])  # the same, right behind it
 
 
 def beams_in_folds(rotation: np.ndarray, device) -> Outcome:
@@ -124,12 +126,12 @@ def beams_past_strong_tissue(rotation: np.ndarray, device) -> Outcome:
     probe = replace(PROBES["linear"], frequency_mhz=5.0, focus_mm=30.0, depth_mm=48.0, scan_lines=192)
     plain, place, rows = replace(BACKGROUND, attenuation_db_cm_mhz=0.0), probe.line_positions(), []
 
-    def level(shape: str, tissue, background=plain) -> np.ndarray:
+    def level(shape: str, tissue, background=plain, edges=(27.0, 35.0)) -> np.ndarray:
         phantom = behind_object(shape, tissue, rotation, background=background)
         assert phantom.baseline is not None
         return levels_db(
             phantom.labels, phantom.tissues, phantom.baseline, probe, phantom.probe_to_ras, device,
-            beam="aperture", edges_mm=np.array([27.0, 35.0]), lines=slice(0, 191, 1), seeds=_SEEDS,
+            beam="aperture", edges_mm=np.array(edges), lines=slice(0, 191, 1), seeds=_SEEDS,
             reflections=False,  # a mirror image would fill the shadow
         )  # fmt: skip
 
@@ -152,6 +154,15 @@ def beams_past_strong_tissue(rotation: np.ndarray, device) -> Outcome:
             wave = _wave_behind_db(None, "plate", -edge, loss_db)
             seen = float(np.interp(edge, place[:-1], found))
             rows.append(Row(f"{name}, line at {edge} mm", "dB", wave, seen, 3.5))
+    # Right behind its edge: in blocks of depth, since levels change with it.
+    blocks, away = np.array([18.5, 20.5, 22.5, 24.5, 26.5]), []
+    for begin, end in pairwise(blocks):
+        found, depths = level("plate", TISSUES["air"], edges=(begin, end)), (begin + 0.5, end - 0.5)
+        waves = np.array([_wave_behind_db(None, "plate", -edge, 90.0, depths) for edge in _NEAR_MM])
+        lit = waves > -20.0
+        away.append((np.interp(_NEAR_MM, place[:-1], found) - waves)[lit])
+    behind = float(np.sqrt(np.mean(np.concatenate(away) ** 2)))
+    rows.append(Row("air, up to 8 mm behind its edge: difference RMS", "dB", 3.0, behind, 0.0, "at most"))
     # Soft tissue of 15 dB: a beam has the mean amplitude of its lines, not the mean of their decibels.
     found = level("plate", replace(plain, name="lossy", attenuation_db_cm_mhz=5.0))
     waves = np.array([_wave_behind_db(None, "plate", -edge, 15.0) for edge in _EDGE_MM])
@@ -177,19 +188,22 @@ def beams_past_strong_tissue(rotation: np.ndarray, device) -> Outcome:
 
 def _mean_db(line_mm: float, loss_db: float) -> float:
     """Mean decibels of the straight lines to a scan line behind the plate of phantoms.behind_object."""
-    reach = 0.5 * np.minimum(12.0, _BEHIND_MM / 2.5)
-    at_plate = line_mm + np.linspace(-1.0, 1.0, 81) * (reach * (1.0 - 16.5 / _BEHIND_MM))[:, None]
+    depths = np.array(_BEHIND_MM)
+    reach = 0.5 * np.minimum(12.0, depths / 2.5)
+    at_plate = line_mm + np.linspace(-1.0, 1.0, 81) * (reach * (1.0 - 16.5 / depths))[:, None]
     return float(-loss_db * (at_plate > 0.0).mean())
 
 
 @lru_cache
-def _wave_behind_db(speeds: tuple[float, float] | None, shape: str, moved_mm: float, loss_db: float) -> float:
+def _wave_behind_db(
+    speeds: tuple[float, float] | None, shape: str, moved_mm: float, loss_db: float, depths_mm=_BEHIND_MM
+) -> float:
     """Power of speckle on a line behind an object of phantoms.behind_object moved aside, by wave propagation.
 
     `speeds` are of the object and around it; `loss_db` is both ways, through a plate.
     """
     beam = partial(
-        speckle_power, depths_mm=_BEHIND_MM, frequency_mhz=5.0, aperture_mm=12.0, f_number=2.5, focus_mm=30.0,
+        speckle_power, depths_mm=np.array(depths_mm), frequency_mhz=5.0, aperture_mm=12.0, f_number=2.5, focus_mm=30.0,
         reference_m_s=REFERENCE_SPEED_M_S,
     )  # fmt: skip
 

@@ -11,12 +11,19 @@ from scipy import stats
 
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.imaging.scattering import PAPER_SITES_PER_MM3, sites_per_mm3
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import PROBES as SHIPPED, LinearProbe, Probe
 from SlicerUSSim.Logic.probe.placement import elevational_motion
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
-from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, fit_rayleigh, level_db
+from SlicerUSSim.Logic.verification.measurement import (
+    correlation,
+    depth_window,
+    envelope_snr,
+    fit_rayleigh,
+    level_db,
+)
 from SlicerUSSim.Logic.verification.phantoms import BACKGROUND, Phantom, uniform_speckle
 from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import (
@@ -106,6 +113,40 @@ def everywhere(rotation: np.ndarray, device) -> Outcome:
         frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
         rows += _statistics_rows(name, tissue, *_window_statistics(frames, 28.0, 20.0))
     return Outcome(tuple(rows))
+
+
+def sparse(rotation: np.ndarray, device) -> Outcome:
+    """Rare scatterers (mu1 = 3: 169 per mm^3) where the resolution cells of high frequencies are smallest."""
+    tissue = replace(SPECKLE, mu1=3.0)
+    phantom, simulators = _simulators(rotation, device, tissue, range(3 * len(SEEDS)))
+    rows = []
+    for name in ("linear", "hockey_stick", "linear_15", "neonatal"):
+        probe = SHIPPED[name]
+        half = 0.04 * probe.depth_mm
+        depth, cell, expected = smallest_cell(probe, tissue, half)
+        frames = [s.simulate(probe, phantom.probe_to_ras) for s in simulators]
+        found, level = _window_statistics(frames, depth, half)
+        few = f"{name}, {PAPER_SITES_PER_MM3 * tissue.scatterer_share * cell:.2g} in a cell"
+        rows.append(Row(f"mean / standard deviation, {few}", "", expected, found, 0.015 * expected))
+        rows.append(Row(f"level, {few}", "dB", 10 * np.log10(tissue.scatterer_variance), level, 0.3))
+    return Outcome(tuple(rows))
+
+
+def smallest_cell(probe: Probe, tissue: Tissue, half_mm: float) -> tuple[float, float, float]:
+    """(depth in mm, volume in mm^3 of the smallest resolution cell; predicted mean / standard deviation around it).
+
+    The prediction is for depths up to `half_mm` away, where the image has them, in tissue without attenuation.
+    """
+    depth = np.linspace(2.0 * half_mm, probe.depth_mm - 2.0 * half_mm, 257)
+    lateral, elevational = probe.beam_sigma_mm(depth)
+    at = int(np.argmin(lateral * elevational))
+    near = probe.beam_sigma_mm(depth[at] + np.linspace(-half_mm, half_mm, 9))
+    sigmas = [(probe.axial_sigma_mm, float(across), float(high)) for across, high in zip(*near, strict=True)]
+    density = sites_per_mm3(SimulationSettings(), probe)
+    # A site stands for all of the paper's in its cell, and has a scatterer if one of them has.
+    occupied = density * (1.0 - (1.0 - tissue.scatterer_share) ** (PAPER_SITES_PER_MM3 / density))
+    cell = (2.0 * np.pi) ** 1.5 * probe.axial_sigma_mm * float(lateral[at] * elevational[at])
+    return float(depth[at]), cell, envelope_snr(occupied, density, sigmas)
 
 
 def _window_statistics(frames: Sequence[Frame], depth_mm: float, half_mm: float) -> tuple[float, float]:
@@ -270,6 +311,11 @@ CHECKS = (
         "speckle everywhere",
         "Speckle is developed for every tissue, and for the probes of the presets at every depth.",
         everywhere,
+    ),
+    Check(
+        "sparse speckle",
+        "With few scatterers in the resolution cell, mean / standard deviation is that of a random walk.",
+        sparse,
     ),
     Check("speckle coherence", "The scatterers are the same at every pose.", coherence),
     Check("echogenicity", "Var = p (1 - p) mu0^2 + p sigma0^2 alone sets the level.", echogenicity),
