@@ -20,13 +20,18 @@
 // Signs are random from cell to cell of a lattice fixed in the patient, whose cells are so wide, in the same unit.
 #define SIGN_CELL 4.0f
 
+// The lattice is oblique to the patient's axes: an image along them would lie in the border of its cells, and a
+// movement less than rounding turn all signs. Rows of (2 -1 2; 2 2 -1; -1 2 2) / 3 are its axes.
+//
 // Random bits of the cell of the patient in which a scan line is at a displayed depth.
 inline uint bits_at(__constant const Acquisition *acquisition, __global const float *roots, int line, float depth_mm,
                     float inverse_cell) {
   const float4 root = vload4(acquisition->guard_lines + line * acquisition->lateral_rays, roots);
   const float along = fmax(depth_mm - line_start(acquisition, (float)line), 0.0f);
   const float3 place = (float3)(root.x + along * root.z, root.y + along * root.w, 0.0f);
-  const float3 cell = floor(affine_point(acquisition->probe_to_ras, place) * inverse_cell);
+  const float3 p = affine_point(acquisition->probe_to_ras, place) * (inverse_cell / 3.0f);
+  const float3 turned = 2.0f * (p.xxy + p.zyz) - p.yzx;
+  const float3 cell = floor(turned + 0.37f);
   const uint key = (uint)(int)cell.x * 0x9E3779B1u + (uint)(int)cell.y * 0x85EBCA77u + (uint)(int)cell.z * 0xC2B2AE3Du;
   return hash_mix(key ^ acquisition->seed);
 }

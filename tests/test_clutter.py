@@ -79,6 +79,14 @@ def test_clutter_is_fixed_in_the_patient():
     assert correlation(here, other) < 0.15
 
 
+@pytest.mark.parametrize("towards", [-1, 1])
+def test_an_image_along_the_axes_of_the_patient_does_not_depend_on_rounding(towards):
+    """It lay in the border of the cells of signs, all of which turned with the sixth digit of the pose."""
+    sim = UltrasoundSimulator(GAP, TissueTable({0: TISSUE, 1: TISSUE, 2: BLACK}), SimulationSettings(interfaces=False))
+    here, beside = (sim.simulate(LINEAR, rigid(np.eye(3), [0, -DEPTH_MM, aside])).iq for aside in (0.0, towards * 1e-6))
+    assert np.linalg.norm(here - beside) < 1e-3 * np.linalg.norm(here)
+
+
 def test_lobes_leave_the_speckle_of_bright_tissue_as_it_is():
     """At the focus 0.3 % of the power is in them."""
     solid = block(lambda x, y, z: np.ones_like(x), half_mm=(24, 30, 12))

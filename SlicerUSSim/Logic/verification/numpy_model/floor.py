@@ -93,11 +93,12 @@ def _bits_at(
     """(lines,) uint32 random bits of the cells of the patient in which scan lines are at a displayed depth."""
     along = np.maximum(depth - beam.line_start(line), f32(0))
     x, y = roots[line, 0] + along * roots[line, 2], roots[line, 1] + along * roots[line, 3]
-    to_ras, per_cell = acquisition["probe_to_ras"].reshape(3, 4), f32(1) / cell_mm
+    to_ras, per_cell = acquisition["probe_to_ras"].reshape(3, 4), f32(1) / cell_mm / f32(3)
+    p = [(row[0] * x + row[1] * y + row[3]) * per_cell for row in to_ras]
+    turned = [f32(2) * (p[0] + p[2]) - p[1], f32(2) * (p[0] + p[1]) - p[2], f32(2) * (p[1] + p[2]) - p[0]]
     key = np.zeros(len(line), np.uint32)
-    for row, step in zip(to_ras, (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D), strict=True):
-        cell = np.floor((row[0] * x + row[1] * y + row[3]) * per_cell).astype(np.int32).astype(np.uint32)
-        key += cell * np.uint32(step)
+    for along, step in zip(turned, (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D), strict=True):
+        key += np.floor(along + f32(0.37)).astype(np.int32).astype(np.uint32) * np.uint32(step)
     return hash_mix(key ^ acquisition["seed"])
 
 
