@@ -215,3 +215,12 @@ def test_a_bug_of_ours_is_not_swallowed(presenter, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         presenter.segment()
     assert presenter.logic.scene.GetFirstNodeByName("Head tissues") is None and presenter.canSegment()[0]
+
+
+def test_values_of_another_transmission_are_not_offered_and_those_of_the_chosen_one_can_be_set(presenter):
+    presenter.setValue("probe.transmit", "focus")
+    assert presenter.value("probe.focal_zones") is None and presenter.value("probe.transmit_angles") is None
+    presenter.setValue("probe.transmit", "zones")
+    presenter.setValue("probe.focal_zones", 5)
+    assert presenter.value("probe.focal_zones") == 5 and presenter.value("probe.transmit_angles") is None
+    assert not presenter.view.errors

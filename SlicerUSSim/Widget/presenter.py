@@ -21,6 +21,7 @@ from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
 from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
 from SlicerUSSim.Logic.tissue.names import same_name
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -75,7 +76,10 @@ class PanelPresenter:
     # ---- values of preset and scene ----------------------------------------------------------------------------
 
     def value(self, name: str):
-        """The displayed form of a value, named as in controls.py; None if the probe has no such value."""
+        """The displayed form of a value, named as in controls.py; None if the probe has no such value.
+
+        The same for a value of another transmission than the probe's, which it would refuse.
+        """
         declared = value_parameter(name)
         section, attribute = name.split(".")
         if section == SCENE:
@@ -84,6 +88,8 @@ class PanelPresenter:
             except SimulationError:  # an invalid value in the scene: the error is shown when it is used
                 return to_shown(declared, declared.default)
         owner = getattr(self._preset(), section)
+        if section == "probe" and attribute in TRANSMIT_OF and owner.transmit != TRANSMIT_OF[attribute]:
+            return None
         return to_shown(declared, getattr(owner, attribute)) if hasattr(owner, attribute) else None
 
     def setValue(self, name: str, shown) -> None:
