@@ -96,6 +96,32 @@ def test_a_tumour_as_label_4_is_no_leptomeninges():
     assert "leptomeninges" in found.names
 
 
+def test_a_lesion_as_thin_as_the_slices_is_no_leptomeninges_in_white_matter():
+    brain_ = in_order((1, 2, 3), has_sulci=True)
+    lesion = np.zeros(brain_.array.shape, bool)
+    lesion[24:26, 24:27, 36:39] = True  # 6 mm thick, two voxels
+    assert (brain_.array[lesion] == 3).all()
+    assert "4 something else" in str(refusal_of(brain_.with_array(np.where(lesion, 4, brain_.array))))
+
+
+@pytest.mark.parametrize(("numbers", "thin"), [((3, 2, 1), 4), ((1, 3, 2), 4), ((1, 2, 3), 5)])
+def test_what_segment_wrote_of_other_contrasts_without_its_table_is_refused_with_its_order(numbers, thin):
+    """The advice was to leave all of it out."""
+    brain_ = in_order(numbers, has_sulci=True)
+    z, y, x = np.indices(brain_.array.shape) * 3.0 - 73.5
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    sulci = (np.abs(radius - 62) < 4) & (np.abs(np.sin(x / 9)) < 0.3) & (brain_.array == numbers[1])
+    array = np.where(sulci, thin, brain_.array)
+    if thin == 5:
+        array[24:27, 24:27, 24:27] = 4  # what enhances
+    message = str(refusal_of(brain_.with_array(array)))
+    truth = dict(zip(numbers, ("csf", "grey", "white"), strict=True)) | {thin: "leptomeninges"}
+    for number, name in truth.items():
+        assert f"--map {number}={name}" in message, message
+    if thin == 5:
+        assert "--map 4=TISSUE" in message
+
+
 def test_tissues_from_2_to_4_are_refused_with_their_order_and_not_moved_by_one():
     """CSF was read as grey matter, grey as white matter, and white matter as leptomeninges."""
     message = str(refusal_of(in_order((2, 3, 4), has_sulci=True)))
@@ -487,6 +513,15 @@ def test_a_part_of_a_brain_is_not_judged_by_where_the_whole_has_its_centre():
     assert any("cut off at the top: what" in line for line in read_label_map(lower).warnings)
     with pytest.raises(SimulationError, match=r"back to front|upside down"):
         read_label_map(moved(kept(whole_head(), 2, -80, 10), flip="y"), mapping=LabelMapping.of("freesurfer"))
+
+
+def test_a_part_with_an_oblique_cut_is_said_by_its_volume_and_not_refused_as_upside_down():
+    whole = whole_head()
+    ijk = np.indices(whole.array.shape)[::-1].reshape(3, -1)
+    _, y, z = (whole.ijk_to_ras[:3, :3] @ ijk + whole.ijk_to_ras[:3, 3:]).reshape(3, *whole.array.shape)
+    lower = whole.with_array(np.where(z + 0.4 * y < -20, whole.array, 0))
+    warnings = read_label_map(lower, mapping=LabelMapping.of("freesurfer")).warnings
+    assert any("a part of a brain, of which the rest is the coupling medium" in line for line in warnings), warnings
 
 
 def test_a_whole_brain_whose_sides_have_one_name_is_no_half():

@@ -224,3 +224,22 @@ def test_values_of_another_transmission_are_not_offered_and_those_of_the_chosen_
     presenter.setValue("probe.focal_zones", 5)
     assert presenter.value("probe.focal_zones") == 5 and presenter.value("probe.transmit_angles") is None
     assert not presenter.view.errors
+
+
+def test_the_notes_say_what_labels_were_recognised_as_and_are_those_of_the_shown_ones(presenter):
+    """They stayed those of the segmentation before; what labels are was in the log alone."""
+    from tests.test_label_places import kept, whole_head
+
+    presenter.segment()
+    presenter.simulate()
+    assert presenter.notes().startswith("Head:") and not presenter.view.errors
+    scene = presenter.logic.scene
+    for name, volume in (("aseg", whole_head()), ("half", kept(whole_head(), 1, -80, 0))):
+        node = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", name)
+        write_volume(node, volume)
+        presenter.logic.parameters.labels = node
+        presenter.simulate()
+        assert presenter.notes().startswith(f"{name}: FreeSurfer"), presenter.notes()
+    assert "cut off at the front" in presenter.notes() and not presenter.view.errors
+    presenter.simulate()
+    assert presenter.notes().startswith("half:")

@@ -65,6 +65,7 @@ class PanelPresenter:
         self._handles, self._label_maps = handles, label_maps
         self._notes: list[str] = []
         self._notes_of: str | None = None  # ID of the MRI node that was segmented
+        self._labels_said: str | None = ""  # ID of the labels that the notes are about; None: those of the next image
         #: File in which the brain mask of an MRI node is kept beside the MRI's; None: in the scene only
         self.maskFile: Callable[[Any], Path | None] = lambda mri_node: None
         self._busy = False
@@ -258,7 +259,7 @@ class PanelPresenter:
 
     def setNotes(self, *lines: str) -> None:
         """Replace them by lines about another patient; by none, to forget them."""
-        self._notes, self._notes_of = list(lines), None
+        self._notes, self._notes_of, self._labels_said = list(lines), None, None
 
     def placeProbe(self) -> None:
         """Place the probe on the surface in the slice view, or at a craniotomy; create its transform if needed."""
@@ -274,11 +275,19 @@ class PanelPresenter:
             start = perf_counter()
             caught: list[Warning] = []
             self.logic.simulate(nodes.labels, nodes.probe_transform, nodes.output, warned=caught.append)
+            self._say_labels(nodes.labels)
             self.view.showStatus("; ".join(map(str, caught)) or f"{(perf_counter() - start) * 1e3:.0f} ms")
             self.logic.showOutline(nodes.outline, nodes.probe_transform)
             if self.view.sliceNode() is not None:
                 self.logic.showInSlice(self.view.sliceNode(), nodes.output, nodes.probe_transform)
         self.view.refresh()
+
+    def _say_labels(self, labels: Any) -> None:
+        """Replace the notes by what labels were recognised as, if they are about others."""
+        if self._labels_said not in (None, labels.GetID()):
+            message, warnings = self.logic.recognised()
+            self.setNotes(f"{labels.GetName()}: {message}", *(f"Check: {warning}" for warning in warnings))
+        self._labels_said = labels.GetID()
 
     def isLive(self) -> bool:
         return self.logic.isLive
@@ -300,6 +309,7 @@ class PanelPresenter:
                 report=self._reported,
                 stopped=self._stopped,
             )
+            self._say_labels(self.logic.parameters.labels)
         self.view.refresh()
 
     def simulateSequence(self) -> None:
@@ -413,7 +423,7 @@ class PanelPresenter:
         with self._made(chosen if kept is None else None, kind, name) as node:
             yield node
         self.logic.parameters.labels = node
-        self._notes = [f"{source.GetName()}:", *self.logic.notes]
+        self._notes, self._labels_said = [f"{source.GetName()}:", *self.logic.notes], node.GetID()
         self._notes += [f"Check: {warning}" for warning in self.logic.warnings]
         if kept is not None:
             self._notes.append(

@@ -148,7 +148,13 @@ def _is_ours(path: Path) -> bool:
     except SimulationError:
         return False
     key = f"{_PREFIX}mask"
-    return image.HasMetaDataKey(key) and image.GetMetaData(key) == _hash(mask.array.astype(np.uint8))
+    return image.HasMetaDataKey(key) and _is_as_written(mask, image.GetMetaData(key))
+
+
+def _is_as_written(mask: Volume, digest: str) -> bool:
+    """Whether nobody has edited a mask since its voxels, 0 and 1, had this hash."""
+    inside = mask.array > 0
+    return np.array_equal(mask.array, inside) and digest == _hash(inside.astype(np.uint8))
 
 
 def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | None:
@@ -169,7 +175,7 @@ def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | 
     if entries.get("mri", fingerprint) != fingerprint or not (is_same_grid and is_mask):
         _log.info("%s: is not used, since it was made for another image", path)
         return None
-    is_edited = entries.get("mask") != _hash((mask.array > 0).astype(np.uint8))
+    is_edited = not _is_as_written(mask, entries.get("mask", ""))
     inside = _checked(mask, path, mri) if is_edited else mask.array > 0
     made_by = entries.get("method", "")
     if not is_edited and method not in ("auto", made_by):

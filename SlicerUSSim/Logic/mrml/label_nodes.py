@@ -68,6 +68,11 @@ class PatientReader:
     def __init__(self) -> None:
         self._read: tuple[Hashable, LabelledTissues] | None = None
 
+    @property
+    def recognised(self) -> tuple[str, tuple[str, ...]]:
+        """(what the labels that were read last are, warnings about them)"""
+        return ("", ()) if self._read is None else (self._read[1].message, self._read[1].warnings)
+
     def read(self, labels_node, tissues: TissueTable) -> Patient:
         """The content and position of a label map or segmentation; see read_labels for `tissues` and errors."""
         require_node(labels_node, *LABEL_CLASSES, use="label map")

@@ -582,6 +582,10 @@ class UltrasoundSceneLogic:
         )
         require_result(output_node, "output")
 
+    def recognised(self) -> tuple[str, tuple[str, ...]]:
+        """(what the labels of the last image were recognised as, warnings about them): "FreeSurfer aseg: ..."."""
+        return self._patients.recognised
+
     def _patient(self, labels_node) -> Patient:
         return self._patients.read(labels_node, self.preset.tissues)
 

@@ -16,7 +16,9 @@ from SlicerUSSim.Logic.base.volume import Volume
 #: of whole ones it is below 0.1, at slices of 3 mm. In thicker slices than this, it tells nothing.
 _FLAT, _THICKEST_MM = 0.2, 5.0
 #: Smaller pieces are not judged, and none that fill less of their box, which a brain fills by half
-_LEAST_ML, _LEAST_FILLED = 100.0, 0.2
+LEAST_ML, _LEAST_FILLED = 100.0, 0.2
+#: Grey and white matter of a whole brain have more; a newborn's has 300
+WHOLE_ML = 600.0
 #: Share of one side's volume that the other has at least, by names, and the volume from which both are there: labels of
 #: the right side may have been given the names of the left
 _LEAST_SIDE, _BOTH_SIDES_ML = 0.5, 750.0
@@ -33,7 +35,7 @@ def cut_sides(labels: Volume, names: Mapping[int, str | None], counts: np.ndarra
     names : {label: name} of the labels that are brain; None for one without a name.
     counts : voxels of label 0, 1, 2, ...
     """
-    if counts[list(names)].sum() * labels.voxel_ml < _LEAST_ML:
+    if counts[list(names)].sum() * labels.voxel_ml < LEAST_ML:
         return []
     lookup = np.zeros(len(counts), bool)
     lookup[list(names)] = True
@@ -49,9 +51,20 @@ def cut_sides(labels: Volume, names: Mapping[int, str | None], counts: np.ndarra
     return [side for sides in _SIDES for side in sides if side in found]
 
 
-def _flat_sides(inside: np.ndarray, labels: Volume) -> list[str]:
+def is_solid(labels: Volume, names: Mapping[int, str | None], counts: np.ndarray) -> bool:
+    """Whether labels, as for cut_sides, fill their box as a piece of a brain does, and not as scattered pieces."""
+    lookup = np.zeros(len(counts), bool)
+    lookup[list(names)] = True
+    return _filled(lookup[labels.array]) >= _LEAST_FILLED
+
+
+def _filled(inside: np.ndarray) -> float:
     boxes = [np.flatnonzero(inside.any(axis=tuple(other for other in range(3) if other != axis))) for axis in range(3)]
-    if inside.sum() < _LEAST_FILLED * np.prod([float(np.ptp(box) + 1) for box in boxes]):
+    return float(inside.sum() / np.prod([float(np.ptp(box) + 1) for box in boxes]))
+
+
+def _flat_sides(inside: np.ndarray, labels: Volume) -> list[str]:
+    if _filled(inside) < _LEAST_FILLED:
         return []
     sides = []
     for axis, column in enumerate((2, 1, 0)):  # of (k, j, i), and of the matrix

@@ -22,7 +22,7 @@ _STEP, _FOREGROUND = 1e-3, 1e-2
 #: numbers were interpolated, in maps of so many labels with mostly equal neighbours (an image has few). SynthSeg's, AAL
 #: and Brodmann's of mricron 0.007 to 0.019, by nearest neighbours at 3 mm up to 0.083, at 5 mm 0.116; interpolated 0.21
 #: (by half a voxel along one axis) to 0.67
-_APART, _BETWEEN, _LEAST_LABELS, _EQUAL = 4, 0.17, 8, 0.5
+_APART, _BETWEEN, _LEAST_LABELS, _EQUAL = 4, 0.17, 8, 0.3
 #: Voxels along each side of the part of a volume that is examined
 _EXAMINED = 128
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, either
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.tissue.cut_brain import cut_sides
+from SlicerUSSim.Logic.tissue import cut_brain
 from SlicerUSSim.Logic.tissue.freesurfer import missing_structures
 from SlicerUSSim.Logic.tissue.interpolated_labels import are_interpolated_numbers
 from SlicerUSSim.Logic.tissue.label_advice import Advice
@@ -179,11 +179,30 @@ class Findings:
     def cut_sides(self) -> list[str]:
         """At which sides a brain was cut off: of left, right, back, front, bottom, top."""
         brain = self._brain()
-        return cut_sides(self.labels, {label: self.names[label] for label in brain}, self.counts) if brain else []
+        return (
+            cut_brain.cut_sides(self.labels, {label: self.names[label] for label in brain}, self.counts)
+            if brain
+            else []
+        )
+
+    @cached_property
+    def is_part_of_brain(self) -> bool:
+        """Whether grey and white matter are in one piece and cut, or less than a whole brain's."""
+        brain = self._brain()
+        if not brain or self.cut_sides:
+            return bool(self.cut_sides)
+        is_small = cut_brain.LEAST_ML <= self._millilitres(brain) < cut_brain.WHOLE_ML
+        return is_small and cut_brain.is_solid(self.labels, {label: self.names[label] for label in brain}, self.counts)
 
     def _brain_that_was_cut(self) -> list[str]:
-        if not self.cut_sides:
+        if not self.is_part_of_brain:
             return []
+        if not self.cut_sides:
+            return [
+                f"{self.source}: grey and white matter have {self._size(self._brain())}, an adult's 900 to 1500 ml: a "
+                "part of a brain, of which the rest is the coupling medium, an infant's, or a wrong size of the voxels "
+                "in its header"
+            ]
         *sides, last = (f"the {side}" for side in self.cut_sides)
         where = f"{', '.join(sides)} and {last}" if sides else last
         return [

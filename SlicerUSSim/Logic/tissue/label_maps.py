@@ -169,7 +169,7 @@ class _Reading:
         )  # fmt: skip
         findings.require_patient()
         findings.require_known()
-        self._require_upright(names, is_whole=not findings.cut_sides)
+        self._require_upright(names, is_whole=not findings.is_part_of_brain)
         coupling = (self._by_number or self._tissues)[0]
         order: list[Tissue] = []
         relabelled = {0: 0}

@@ -16,7 +16,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import either
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue import freesurfer, totalsegmentator
-from SlicerUSSim.Logic.tissue.brain_orders import BrainLabels
+from SlicerUSSim.Logic.tissue.brain_orders import BRAIN_TISSUES, BrainLabels
 from SlicerUSSim.Logic.tissue.names import same_name
 from SlicerUSSim.Logic.tissue.thinning import label_centres, thinning
 
@@ -34,6 +34,8 @@ _LARGEST_LESION_ML, _LARGEST_LESION_SHARE = 400.0, 0.25
 #: Share of the voxels of label 4 that are two voxels and more from others, up to which it may be leptomeninges, which
 #: `ussim segment` makes one or two voxels thin: 0.00 there, 0.2 to 0.6 in tumours, nuclei and white matter
 _THICK = 0.05
+#: Share of the voxels beside leptomeninges that is white matter
+_IN_WHITE = 0.4
 #: A brain with the fluid around it has up to 2 litres.
 _LARGEST_BRAIN_ML = 3000.0
 #: Depth of what is around others, by that of the others
@@ -200,7 +202,8 @@ def _of_brain(labels: Volume, values: list[int]) -> Recognition:
     """A brain as `ussim segment` numbers it or in another order, or a tumour as BraTS does, with labels from 1 to 4."""
     known = schemes()
     has_few = set(values) <= set(known["brats"].names)
-    if len(values) < 2 or (not has_few and len(values) != 3):
+    is_with_others = {1, 2, 3} <= set(values) <= {1, 2, 3, 4, 5}  # what enhances and leptomeninges of `ussim segment`
+    if len(values) < 2 or not (has_few or len(values) == 3 or is_with_others):
         return Recognition(None)
     if has_few and 4 in values and 3 not in values:  # a brain without white matter, but with thin sulci, is none
         return Recognition(known["brats-2022"])
@@ -213,25 +216,32 @@ def _of_brain(labels: Volume, values: list[int]) -> Recognition:
             doubt = f"only amounts and places tell: {volume_ml / 1000:.1f} litres, label 1 around the others"
             return Recognition(None, possible=known["totalsegmentator-tissues"], doubt=doubt)
         return Recognition(None)
-    tissues = BrainLabels.of(labels, tuple(value for value in values if value < 4 or not has_few))
-    if has_few and {2, 3} <= set(values) and tissues.fits(1, 2, 3):
-        if 4 not in values or _is_thin(labels, 4):
-            return Recognition(known["ussim"])
-        if 1 in values:
-            ussims = known["ussim"].names
-            return Recognition(None, order={value: ussims[value] for value in (1, 2, 3)})
-    if len(values) != 3:
+    has_other_numbers = len(values) == 3 and not has_few
+    tissues = BrainLabels.of(labels, tuple(value for value in values if value < 4 or has_other_numbers))
+    is_ours = has_few and {2, 3} <= set(values) and tissues.fits(1, 2, 3)
+    if is_ours and (4 not in values or _is_leptomeninges(labels, 4, white=3)):
+        return Recognition(known["ussim"])
+    three = (1, 2, 3) if {1, 2, 3} <= set(values) else tuple(values)
+    if len(three) != 3:
         return Recognition(None)
-    orders = BrainLabels.of(labels, tuple(values)).orders()
-    return Recognition(None, order=orders[0] if len(orders) == 1 else {})
+    orders = [dict(zip(three, BRAIN_TISSUES, strict=True))] if is_ours else BrainLabels.of(labels, three).orders()
+    if len(orders) != 1:
+        return Recognition(None)
+    (order,) = orders
+    white = next(label for label, tissue in order.items() if tissue == "white matter")
+    thin = [value for value in values if value not in three and _is_leptomeninges(labels, value, white=white)]
+    return Recognition(None, order=order | dict.fromkeys(thin[-1:], "leptomeninges"))
 
 
-def _is_thin(labels: Volume, label: int) -> bool:
-    """Whether a label is at most two voxels thick nearly everywhere."""
+def _is_leptomeninges(labels: Volume, label: int, *, white: int) -> bool:
+    """Whether a label is at most two voxels thick nearly everywhere, and does not lie in white matter."""
     from scipy import ndimage
 
     array = labels.array == label
-    return bool(np.asarray(ndimage.binary_erosion(array)).sum() <= _THICK * array.sum())
+    if np.asarray(ndimage.binary_erosion(array)).sum() > _THICK * array.sum():
+        return False
+    beside = np.asarray(ndimage.binary_dilation(array)) & ~array
+    return bool((labels.array[beside] == white).mean() <= _IN_WHITE)
 
 
 def _is_outermost(labels: Volume, label: int) -> bool:

@@ -25,7 +25,7 @@ from vtkmodules.vtkCommonMath import vtkMatrix4x4
 from vtkmodules.vtkCommonTransforms import vtkLinearTransform, vtkMatrixToLinearTransform, vtkTransform
 from vtkmodules.vtkFiltersGeneral import vtkTransformPolyDataFilter
 
-from SlicerUSSim.Logic.base.errors import Cancelled, require, user_message
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, user_message
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
@@ -257,8 +257,9 @@ class UltrasoundSimulationFilter(_ImageFilter):
     The image is one slice in the image plane. The filter executes again only if the labels, the probe's transform
     (including transforms from which it is concatenated) or a parameter has changed. Amplifier noise differs between
     poses (noise.seed_of_pose). Labels are identified by the names from SegmentationFilter (field data "TissueNames");
-    without names, by the labels of the table that SetTissues or SetPreset gave; without one, or with labels above 62,
-    by what they are (tissue.read_label_map): numbers of a known program. A mask or a tumour alone is an error then.
+    without names, by the labels of the table that SetTissues or SetPreset gave; without one, or with labels that it
+    lacks, by what they are (tissue.read_label_map): numbers of a known program. A mask or a tumour alone is an error
+    then.
 
     >>> import numpy as np
     >>> from vtkmodules.vtkCommonTransforms import vtkTransform
@@ -391,16 +392,28 @@ class UltrasoundSimulationFilter(_ImageFilter):
         names = tissue_names(labels)
         if names:
             return Volume.from_vtk(labels), self._tissues.for_names(names)
-        if self._are_numbered and labels.GetScalarRange()[1] <= MAX_LABEL:
-            return Volume.from_vtk(labels), self._tissues
-        version = (labels.GetMTime(), self._tissues)
-        if self._read is None or self._read[0] != version:
-            found = read_label_map(Volume.from_vtk(labels), source="label image", tissues=self._tissues, advice=SCRIPT)
+        volume = Volume.from_vtk(labels)
+        is_numbered = self._are_numbered and labels.GetScalarRange()[1] <= MAX_LABEL
+        if is_numbered and all(int(label) in self._tissues for label in np.unique(volume.array)):
+            return volume, self._tissues
+        try:
+            found = self._recognised(volume, labels.GetMTime())
+        except SimulationError:
+            if is_numbered:  # the simulator names the labels that the table lacks
+                return volume, self._tissues
+            raise
+        return found.labels, found.tissues
+
+    def _recognised(self, volume: Volume, version: int) -> LabelledTissues:
+        """The labels of another program, read once for each version of the image and its table."""
+        key = (version, self._tissues)
+        if self._read is None or self._read[0] != key:
+            found = read_label_map(volume, source="label image", tissues=self._tissues, advice=SCRIPT)
             _log.info("label image: %s", found.message)
             for warning in found.warnings:
                 _log.warning("%s", warning)
-            self._read = (version, found)
-        return self._read[1].labels, self._read[1].tissues
+            self._read = (key, found)
+        return self._read[1]
 
     def _pose(self) -> np.ndarray:
         return check_rigid("probe transform", matrix_array(self._placed_outline.GetTransform().GetMatrix()))
