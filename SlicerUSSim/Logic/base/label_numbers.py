@@ -73,11 +73,12 @@ def has_uniform_fractions(array: np.ndarray) -> bool:
     if not np.issubdtype(array.dtype, np.floating):
         return False
     array = _without_repeats(array)
-    values = np.unique(array[_middle(array)])
+    values = np.unique(array[middle(array)])
     return 1 < len(values) <= _BYTES and _has_regions(array, values, 0 if values[0] == 0 else None)
 
 
-def _middle(array: np.ndarray) -> tuple[slice, ...]:
+def middle(array: np.ndarray) -> tuple[slice, ...]:
+    """The part of a volume (k, j, i) that is examined: its middle 128 voxels along each axis."""
     return tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)
 
 
@@ -94,7 +95,7 @@ def _has_regions(array: np.ndarray, values: np.ndarray, background: int | None) 
 
     Those of the background, given by its index among the values, are not counted.
     """
-    ranks = np.searchsorted(values, array[_middle(array)])
+    ranks = np.searchsorted(values, array[middle(array)])
     inside = np.ones(ranks.shape, bool) if background is None else ranks != background
     pairs = np.concatenate([_pairs(ranks, inside, axis) for axis in range(3)], axis=1)
     is_equal = pairs[0] == pairs[1]

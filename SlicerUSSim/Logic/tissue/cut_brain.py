@@ -37,9 +37,7 @@ def cut_sides(labels: Volume, names: Mapping[int, str | None], counts: np.ndarra
     """
     if counts[list(names)].sum() * labels.voxel_ml < LEAST_ML:
         return []
-    lookup = np.zeros(len(counts), bool)
-    lookup[list(names)] = True
-    inside = lookup[labels.array]
+    inside = _inside(labels, names, counts)
     found = set(_flat_sides(inside, labels))
     left, right = (
         sum(int(counts[label]) for label, name in names.items() if name and side.search(name))
@@ -53,9 +51,14 @@ def cut_sides(labels: Volume, names: Mapping[int, str | None], counts: np.ndarra
 
 def is_solid(labels: Volume, names: Mapping[int, str | None], counts: np.ndarray) -> bool:
     """Whether labels, as for cut_sides, fill their box as a piece of a brain does, and not as scattered pieces."""
+    return _filled(_inside(labels, names, counts)) >= _LEAST_FILLED
+
+
+def _inside(labels: Volume, names: Mapping[int, str | None], counts: np.ndarray) -> np.ndarray:
+    """(k, j, i) True in the labels that have these names."""
     lookup = np.zeros(len(counts), bool)
     lookup[list(names)] = True
-    return _filled(lookup[labels.array]) >= _LEAST_FILLED
+    return lookup[labels.array]
 
 
 def _filled(inside: np.ndarray) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from SlicerUSSim.Logic.base.label_numbers import middle
+
 #: Share of whole numbers in an interpolated label map, and of equal neighbours among them: 0.76 and more, in MRIs 0.14
 _MOSTLY, _UNIFORM = 0.3, 0.65
 #: Variation among 27 neighbours, relative to the range of the image, up to which they are a plateau, and the share of
@@ -23,8 +25,6 @@ _STEP, _FOREGROUND = 1e-3, 1e-2
 #: and Brodmann's of mricron 0.007 to 0.019, by nearest neighbours at 3 mm up to 0.083, at 5 mm 0.116; interpolated 0.21
 #: (by half a voxel along one axis) to 0.67
 _APART, _BETWEEN, _LEAST_LABELS, _EQUAL = 4, 0.17, 8, 0.3
-#: Voxels along each side of the part of a volume that is examined
-_EXAMINED = 128
 
 
 def is_interpolated(array: np.ndarray) -> bool:
@@ -51,7 +51,7 @@ def is_smoothed(array: np.ndarray) -> bool:
     """
     if not np.issubdtype(array.dtype, np.floating) or min(array.shape) < 3:
         return False
-    part = array[tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)]
+    part = array[middle(array)]
     if not np.isfinite(part).all():
         return False
     low, high = float(part.min()), float(np.percentile(part, 99.9))
@@ -78,16 +78,16 @@ def share_between(array: np.ndarray) -> tuple[float, float]:
     The first is of voxels between two neighbours along an axis of an array (k, j, i) whose numbers differ by 4 or more;
     the second of pairs of neighbours of which neither is 0.
     """
-    part = array[tuple(slice(max((n - _EXAMINED) // 2, 0), (n + _EXAMINED) // 2) for n in array.shape)].astype(np.int64)
+    part = array[middle(array)].astype(np.int64)
     between = far = equal = pairs = 0
     for axis in range(3):
         along = np.moveaxis(part, axis, 0)
         first, second = along[:-1], along[1:]
         labelled = (first != 0) & (second != 0)
         equal, pairs = equal + int((labelled & (first == second)).sum()), pairs + int(labelled.sum())
-        before, middle, after = along[:-2], along[1:-1], along[2:]
+        before, here, after = along[:-2], along[1:-1], along[2:]
         is_far = np.abs(before - after) >= _APART
-        is_between = (np.minimum(before, after) < middle) & (middle < np.maximum(before, after))
+        is_between = (np.minimum(before, after) < here) & (here < np.maximum(before, after))
         between, far = between + int((is_far & is_between).sum()), far + int(is_far.sum())
     return between / max(1, far), equal / max(1, pairs)
 

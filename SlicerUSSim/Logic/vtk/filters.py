@@ -44,7 +44,7 @@ from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.shape import outline_polydata
 from SlicerUSSim.Logic.tissue.label_advice import SCRIPT
-from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, read_label_map
+from SlicerUSSim.Logic.tissue.label_maps import read_label_map
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
@@ -291,7 +291,7 @@ class UltrasoundSimulationFilter(_ImageFilter):
         self._probe_transform: vtkLinearTransform | vtkMatrix4x4 = vtkTransform()  # as it was given
         self._simulator = ReusedSimulator()
         self._frame: Frame | None = None
-        self._read: tuple[tuple, LabelledTissues] | None = None  # labels of another program, and their version
+        self._read: tuple[tuple, tuple[Volume, TissueTable]] | None = None  # labels without names, and their version
         self._placed_outline = vtkTransformPolyDataFilter()
         self._placed_outline.SetInputData(outline_polydata(self._probe))
         self._placed_outline.SetTransform(self._probe_transform)
@@ -392,28 +392,27 @@ class UltrasoundSimulationFilter(_ImageFilter):
         names = tissue_names(labels)
         if names:
             return Volume.from_vtk(labels), self._tissues.for_names(names)
+        key = (labels.GetMTime(), self._tissues, self._are_numbered)
+        if self._read is None or self._read[0] != key:  # once for an image, and not for each pose
+            self._read = (key, self._identified(labels))
+        return self._read[1]
+
+    def _identified(self, labels: vtkImageData) -> tuple[Volume, TissueTable]:
+        """The labels without names, and their tissues."""
         volume = Volume.from_vtk(labels)
         is_numbered = self._are_numbered and labels.GetScalarRange()[1] <= MAX_LABEL
         if is_numbered and all(int(label) in self._tissues for label in np.unique(volume.array)):
             return volume, self._tissues
         try:
-            found = self._recognised(volume, labels.GetMTime())
+            found = read_label_map(volume, source="label image", tissues=self._tissues, advice=SCRIPT)
         except SimulationError:
             if is_numbered:  # the simulator names the labels that the table lacks
                 return volume, self._tissues
             raise
+        _log.info("label image: %s", found.message)
+        for warning in found.warnings:
+            _log.warning("%s", warning)
         return found.labels, found.tissues
-
-    def _recognised(self, volume: Volume, version: int) -> LabelledTissues:
-        """The labels of another program, read once for each version of the image and its table."""
-        key = (version, self._tissues)
-        if self._read is None or self._read[0] != key:
-            found = read_label_map(volume, source="label image", tissues=self._tissues, advice=SCRIPT)
-            _log.info("label image: %s", found.message)
-            for warning in found.warnings:
-                _log.warning("%s", warning)
-            self._read = (key, found)
-        return self._read[1]
 
     def _pose(self) -> np.ndarray:
         return check_rigid("probe transform", matrix_array(self._placed_outline.GetTransform().GetMatrix()))
