@@ -882,10 +882,14 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, fil
         return " ".join(page.locator("body").inner_text().split())
 
     assert "share" in opened_as(files / "head.nii.gz")  # the table of the MRI
+    notes = opened_as(files / "labels.nii.gz")
+    assert "of the MRI head.nii.gz, which is shown: its intensities follow the labels" in notes
+    assert page.locator("#mriSelector option:checked").inner_text().strip() == "head.nii.gz"
     notes = opened_as(tmp_path / "crop.nii.gz")
     assert "crop.nii.gz: FreeSurfer aseg: 8 labels to 3 tissues" in notes and "share" not in notes
     assert "Check: crop.nii.gz: a part of a brain of 1048 ml, cut off at the front" in notes
-    assert "shown over the MRI head.nii.gz" in notes
+    assert "Check: the MRI head.nii.gz was deselected: its intensities do not follow the labels" in notes
+    assert shown(page, "mriSelector") is None
     assert errors(page) == [line.removeprefix("Check: ") for line in notes.splitlines() if "cut off" in line]
     assert "/tmp" not in as_shown() and str(tmp_path) not in as_shown()
     notes = opened_as(tmp_path / "aseg.nii.gz")
@@ -895,10 +899,6 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, fil
     assert "broken.nii.gz: " in shown_errors(page)
     settled(page)
     assert state(page, NAMES.title) == "aseg.nii.gz" and page.locator("#notesLabel").inner_text() == notes
-    with new_image(page):
-        click(page, "#segmentButton")
-    settled(page)
-    assert state(page, NAMES.title) == "head.nii.gz"  # whose MRI it is
     notes = opened_as(files / "head.nii.gz")
     assert "share" in notes and "aseg" not in notes and not errors(page)
 

@@ -12,9 +12,10 @@ from trame_slicer.core import SlicerApp
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mri.label_agreement import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import node_to_world
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, read_volume
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
@@ -177,14 +178,24 @@ class Loading:
         for warning in found.warnings:
             self._presenter.view.showError(warning)
         checks = [f"Check: {warning}" for warning in found.warnings]
+        checks += self._keep_mri_of(found.labels)
         if parameters.mri is None:
             self._views.show_volume(node)
-        else:
-            checks.append(f"shown over the MRI {parameters.mri.GetName()}")
         parameters.labels = node
         self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
         self.show_title()
         self._labels_ready()
+
+    def _keep_mri_of(self, labels: Volume) -> list[str]:
+        """Deselect an MRI that does not follow the labels, which may be of another patient; lines about it."""
+        parameters: Any = self._logic.parameters
+        if parameters.mri is None:
+            return []
+        mri, name = read_volume(parameters.mri), parameters.mri.GetName()
+        if self._tasks.do(lambda: follows(mri, labels)):
+            return [f"of the MRI {name}, which is shown: its intensities follow the labels"]
+        parameters.mri = parameters.mask = parameters.second_mri = None
+        return [f"Check: the MRI {name} was deselected: its intensities do not follow the labels (of another patient?)"]
 
     def _take_mri(self, node: Any) -> None:
         parameters = self._logic.parameters
