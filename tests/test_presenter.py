@@ -243,3 +243,32 @@ def test_the_notes_say_what_labels_were_recognised_as_and_are_those_of_the_shown
     assert "cut off at the front" in presenter.notes() and not presenter.view.errors
     presenter.simulate()
     assert presenter.notes().startswith("half:")
+
+
+def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(presenter):
+    """The line that half of the brain is missing was gone when a tumour had been laid over the tissues."""
+    from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
+    from tests.test_label_places import kept, whole_head
+
+    scene, parameters = presenter.logic.scene, presenter.logic.parameters
+    half = kept(whole_head(), 1, -80, 0)
+    parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "half")
+    write_volume(parameters.labels, half)
+    presenter.simulate()
+    checks = [line for line in presenter.notes().splitlines() if "cut off at the front" in line]
+    assert len(checks) == 1
+    mask = np.zeros(half.array.shape, np.uint8)
+    centre = np.argwhere(half.array > 0).mean(axis=0).astype(int)
+    mask[tuple(slice(at - 3, at + 4) for at in centre)] = 1
+    parameters.lesions = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Lesions")
+    add_lesion(parameters.lesions, half.with_array(mask), "tumour", "tumour.nii.gz")
+    for _ in range(2):
+        presenter.addTissues()
+        lines = presenter.notes().splitlines()
+        assert not presenter.view.errors and lines.count(checks[0]) == 1 and any("tumour: " in line for line in lines)
+        presenter.simulate()
+        assert presenter.notes().splitlines() == lines
+    parameters.labels = scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "whole")
+    write_volume(parameters.labels, whole_head())
+    presenter.addTissues()  # over the tissues of another patient, which were not simulated yet
+    assert "tumour: " in presenter.notes() and checks[0] not in presenter.notes()

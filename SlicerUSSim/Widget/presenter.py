@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -31,6 +31,8 @@ from SlicerUSSim.Widget.fit_presenter import FitPresenter
 from SlicerUSSim.Widget.interface import PanelView
 from SlicerUSSim.Widget.sections import CUSTOM_PROBE, SHOWN_PROBES
 
+#: Begin of the lines of the notes that a user should check
+_CHECK = "Check: "
 _BUSY = "Wait until the work under way is done"
 #: Columns of the tissue table: parameter, heading, tool tip.
 TISSUE_COLUMNS = tuple(
@@ -64,8 +66,9 @@ class PanelPresenter:
         self.view = view
         self._handles, self._label_maps = handles, label_maps
         self._notes: list[str] = []
+        self._checks: list[str] = []  # those of the notes that are about the tissues under the lesions
         self._notes_of: str | None = None  # ID of the MRI node that was segmented
-        self._labels_said: str | None = ""  # ID of the labels that the notes are about; None: those of the next image
+        self._labels_said: str | None = None  # ID of the labels that the notes are about
         #: File in which the brain mask of an MRI node is kept beside the MRI's; None: in the scene only
         self.maskFile: Callable[[Any], Path | None] = lambda mri_node: None
         self._busy = False
@@ -209,7 +212,7 @@ class PanelPresenter:
                     mri, labels, mask_node=parameters.mask, others=others, lesions_node=parameters.lesions,
                     keep_mask_at=self.maskFile(mri), progress=progress, **asdict(parameters.segmentation),
                 )  # fmt: skip
-            self._notes_of = mri.GetID()
+            self._notes_of, self._checks = mri.GetID(), _checks(result.warnings)
             if (
                 parameters.mask is None
                 and isinstance(result, Segmentation)  # and not of a CT
@@ -249,17 +252,23 @@ class PanelPresenter:
         parameters = self.logic.parameters
         with self.working("Add to tissues"):
             require(parameters.labels is not None, "no label map chosen; segment the MRI first")
-            before = parameters.labels
+            before: Any = parameters.labels
+            if self._labels_said != before.GetID():
+                self._checks = []
             with self._replaceable(f"{before.GetName()} with lesions", before) as labels:
                 self.logic.addTissues(before, parameters.lesions, labels)
+            self._notes += self._checks
 
     def notes(self) -> str:
         """What the last segmentation or addition did, and what a user should check, in lines."""
         return "\n".join(self._notes)
 
     def setNotes(self, *lines: str) -> None:
-        """Replace them by lines about another patient; by none, to forget them."""
-        self._notes, self._notes_of, self._labels_said = list(lines), None, None
+        """Replace them by lines about another patient, whose labels are chosen; by none, to forget them."""
+        labels: Any = self.logic.parameters.labels
+        self._notes, self._notes_of = list(lines), None
+        self._checks = [line for line in lines if line.startswith(_CHECK)]
+        self._labels_said = None if labels is None else labels.GetID()
 
     def placeProbe(self) -> None:
         """Place the probe on the surface in the slice view, or at a craniotomy; create its transform if needed."""
@@ -284,10 +293,9 @@ class PanelPresenter:
 
     def _say_labels(self, labels: Any) -> None:
         """Replace the notes by what labels were recognised as, if they are about others."""
-        if self._labels_said not in (None, labels.GetID()):
+        if self._labels_said != labels.GetID():
             message, warnings = self.logic.recognised()
-            self.setNotes(f"{labels.GetName()}: {message}", *(f"Check: {warning}" for warning in warnings))
-        self._labels_said = labels.GetID()
+            self.setNotes(f"{labels.GetName()}: {message}", *_checks(warnings))
 
     def isLive(self) -> bool:
         return self.logic.isLive
@@ -424,7 +432,7 @@ class PanelPresenter:
             yield node
         self.logic.parameters.labels = node
         self._notes, self._labels_said = [f"{source.GetName()}:", *self.logic.notes], node.GetID()
-        self._notes += [f"Check: {warning}" for warning in self.logic.warnings]
+        self._notes += _checks(self.logic.warnings)
         if kept is not None:
             self._notes.append(
                 f"{kept!r} was not made by Segment, or edited since, and is kept; the result is {node.GetName()!r}"
@@ -480,6 +488,10 @@ class PanelPresenter:
                 yield progress
         finally:
             self._busy = False
+
+
+def _checks(warnings: Iterable[str]) -> list[str]:
+    return [f"{_CHECK}{warning}" for warning in warnings]
 
 
 def _without(tissue: Tissue, parameter: str) -> dict[str, str]:
