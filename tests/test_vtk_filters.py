@@ -494,7 +494,7 @@ def test_labels_without_names_and_table_are_recognised_or_refused_and_not_taken_
     mask[15:25, 15:25, 15:25] = 1
     for labels, message in (
         (Volume(mask, np.eye(4)), "a binary mask .*AddTissueData"),
-        (in_order((3, 1, 2)), "no known program's order.*1=grey --map 2=white --map 3=csf"),
+        (in_order((3, 1, 2)), "no known program's order.*LabelMapping.of\\(\\[.1=grey., .2=white., .3=csf.\\]"),
     ):
         algorithm = output(labels)
         for heard in (algorithm, algorithm.GetExecutive()):

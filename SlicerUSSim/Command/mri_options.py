@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.mri import CtSegmentation, Segmentation
     from SlicerUSSim.Logic.tissue import LabelledTissues
 
-#: More labels may be the intensities of an image
-_MOST_LABELS = 100
 
 also_option = click.option(
     "--also", multiple=True, metavar="CONTRAST=FILE",
@@ -147,6 +145,7 @@ def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = M
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.recognition import check_finite
     from SlicerUSSim.Logic.tissue.label_advice import MRI_COMMAND
+    from SlicerUSSim.Logic.tissue.label_findings import MOST_LABELS
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file
 
     require_no_sequence(path)
@@ -163,7 +162,7 @@ def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = M
                 raise
             count = np.unique(volume.array[volume.array != 0]).size
             remedy = "use it as it is (ussim simulate), which says what its labels need"
-            if count > _MOST_LABELS:
+            if count > MOST_LABELS:
                 remedy += "; if these are intensities of an MRI, its file may be incomplete"
             raise SimulationError(f"{path}: is a label map ({count} labels), expected an MRI; {remedy}") from error
         raise SimulationError(

@@ -27,6 +27,10 @@ WRITABLE_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".mnc"
 MADE_BY = "ussim_made_by"
 
 
+#: Names of the sides towards which R, A and S decrease and increase
+SIDES = (("left", "right"), ("back", "front"), ("bottom", "top"))
+
+
 @dataclass(frozen=True, eq=False)
 class Volume:
     """A scalar image in patient space.
@@ -75,6 +79,14 @@ class Volume:
     def spacing_mm(self) -> np.ndarray:
         """(3,) voxel size along i, j, k in millimetres."""
         return np.linalg.norm(self.ijk_to_ras[:3, :3], axis=0)
+
+    @property
+    def ends(self) -> tuple[tuple[str, str], ...]:
+        """The sides (SIDES) at which the axes i, j, k begin and end: (("left", "right"), ...)."""
+        return tuple(
+            SIDES[row] if self.ijk_to_ras[row, column] > 0 else SIDES[row][::-1]
+            for column, row in enumerate(np.abs(self.ijk_to_ras[:3, :3]).argmax(axis=0))
+        )
 
     @property
     def size_text(self) -> str:

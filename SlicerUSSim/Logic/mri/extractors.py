@@ -27,8 +27,8 @@ _SPACING_MM = 1.0
 _POLL_S = 0.1
 #: Of the registration to ROBEX's atlas: size of voxels, and the largest rotation that a head has in a scanner
 _COARSE_MM, _LARGEST_TURN_DEG = 4.0, 45.0
-#: ROBEX's nine steps: share of its time after each (measured on three heads)
-_ROBEX_SHARES = (0.01, 0.27, 0.41, 0.75, 0.90, 0.96, 0.96, 0.99, 1.0)
+#: ROBEX's nine steps: share of its time after each, and that time (measured on three heads)
+_ROBEX_SECONDS, _ROBEX_SHARES = 80.0, (0.01, 0.27, 0.41, 0.75, 0.90, 0.96, 0.96, 0.99, 1.0)
 _DEEPBET_SECONDS = 30.0
 _DEEPBET = """
 import json, sys
@@ -90,7 +90,7 @@ def robex(mri: Volume, report: Report) -> np.ndarray:
             program.chmod(0o700)
         # It reads its model from the working folder. The seed makes two runs equal.
         command = [str(program), str(folder / "image.nii"), str(folder / "brain.nii"), str(folder / "mask.nii"), "0"]
-        log = _run("ROBEX", command, program.parent, folder, lambda text, seconds: report(_robex_share(text)))
+        log = _run("ROBEX", command, program.parent, folder, lambda text, seconds: report(_robex_share(text, seconds)))
         return _mask_from(folder / "mask.nii", "ROBEX", log, image, mri, to_mri.GetInverse())
 
 
@@ -250,12 +250,13 @@ def _run(name: str, command: Sequence[str], where: Path, folder: Path, report: C
     return text
 
 
-def _robex_share(log: str) -> float:
-    """The share done, from the number of finished steps in ROBEX's messages."""
-    done = log.count("It took roughly")
-    return ((0.0, *_ROBEX_SHARES) if "Step 1" in log else (0.0,))[
-        min(done, len(_ROBEX_SHARES)) if "Step 1" in log else 0
-    ]
+def _robex_share(log: str, seconds: float) -> float:
+    """The share done: between those before and after the step under way in ROBEX's messages, by the time."""
+    if "Step 1" not in log:
+        return 0.0
+    shares = (0.0, *_ROBEX_SHARES, 1.0)
+    done = min(log.count("It took roughly"), len(_ROBEX_SHARES))
+    return float(np.clip(seconds / _ROBEX_SECONDS, shares[done], shares[done + 1]))
 
 
 def _last_line(log: str) -> str:

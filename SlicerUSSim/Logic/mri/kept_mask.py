@@ -171,7 +171,7 @@ def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | 
     }
     # Without our entries: another program wrote it under this name, and most programs drop them from what they edit.
     is_same_grid = mask.array.shape == mri.array.shape and np.allclose(mask.ijk_to_ras, mri.ijk_to_ras, atol=1e-3)
-    is_mask = bool(entries) or len(np.unique(mask.array)) <= 2
+    is_mask = bool(entries) or len(np.unique(np.nan_to_num(mask.array))) <= 2
     if entries.get("mri", fingerprint) != fingerprint or not (is_same_grid and is_mask):
         _log.info("%s: is not used, since it was made for another image", path)
         return None

@@ -7,14 +7,13 @@ from typing import cast
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.volume import SIDES, Volume
 from SlicerUSSim.Logic.mri.coarse import largest_component
 
 #: Voxels of the blank are a ball of this radius at least: dark CSF or bone with the same value is not
 _THICK_MM = 5.0
 #: Volume of the brain without data from which it is said, millilitres
 _WORTH_ML = 2.0
-_ENDS = (("left", "right"), ("back", "front"), ("bottom", "top"))
 
 
 def no_data(mri: Volume) -> np.ndarray:
@@ -55,7 +54,7 @@ def without_blank(mri: Volume, inside: np.ndarray) -> tuple[np.ndarray, tuple[st
     away = np.argwhere(lost).mean(axis=0)[::-1] - np.argwhere(inside).mean(axis=0)[::-1]
     towards = mri.ijk_to_ras[:3, :3] @ away
     axis = int(np.abs(towards).argmax())
-    name = _ENDS[axis][int(towards[axis] > 0)]
+    name = SIDES[axis][int(towards[axis] > 0)]
     line = (
         f"{millilitres:.0f} ml where the brain should be have no data (one value, as around it): they "
         f"get no tissue, and the brain is cut off at its {name}"

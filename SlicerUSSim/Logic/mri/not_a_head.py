@@ -27,7 +27,6 @@ _SYMMETRIC = 0.85
 #: Cross-section at an end of the object, relative to the largest, from which it is cut there. The neck is cut in
 #: most images of a head, so that the bottom has to be cut through the head itself.
 _CUT, _CUT_AT_BOTTOM = 0.5, 0.85
-_ENDS = (("left", "right"), ("back", "front"), ("bottom", "top"))
 
 
 def is_ultrasound(mri: Volume) -> bool:
@@ -112,10 +111,7 @@ def cut_ends(mri: Volume) -> tuple[str, ...]:
     ends = []
     for axis in range(3):
         areas = np.trim_zeros(inside.sum(axis=tuple(other for other in range(3) if other != axis)))
-        towards = mri.ijk_to_ras[:3, 2 - axis]
-        row = int(np.abs(towards).argmax())
-        names = _ENDS[row] if towards[row] > 0 else _ENDS[row][::-1]
-        for area, name in ((areas[:2].max(), names[0]), (areas[-2:].max(), names[1])):
+        for area, name in zip((areas[:2].max(), areas[-2:].max()), mri.ends[2 - axis], strict=True):
             if area > (_CUT_AT_BOTTOM if name == "bottom" else _CUT) * areas.max():
                 ends.append(name)
     return tuple(ends)

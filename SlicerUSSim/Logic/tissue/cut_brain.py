@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.volume import SIDES, Volume
 
 #: Share of the largest slice that the outermost has where a brain was cut (0.36 where a tenth of its extent is gone);
 #: of whole ones it is below 0.1, at slices of 3 mm. In thicker slices than this, it tells nothing.
@@ -22,7 +22,6 @@ WHOLE_ML = 600.0
 #: Share of one side's volume that the other has at least, by names, and the volume from which both are there: labels of
 #: the right side may have been given the names of the left
 _LEAST_SIDE, _BOTH_SIDES_ML = 0.5, 750.0
-_SIDES = (("left", "right"), ("back", "front"), ("bottom", "top"))
 _LEFT, _RIGHT = (re.compile(rf"(^|[-_ ])({words})([-_ ]|$)", re.IGNORECASE) for words in ("left|lh", "right|rh"))
 
 
@@ -46,7 +45,7 @@ def cut_sides(labels: Volume, names: Mapping[int, str | None], counts: np.ndarra
     is_half = inside.sum() * labels.voxel_ml < _BOTH_SIDES_ML
     if is_half and min(left, right) < _LEAST_SIDE * max(left, right):
         found.add("left" if left < right else "right")
-    return [side for sides in _SIDES for side in sides if side in found]
+    return [side for sides in SIDES for side in sides if side in found]
 
 
 def is_solid(labels: Volume, names: Mapping[int, str | None], counts: np.ndarray) -> bool:
@@ -75,9 +74,7 @@ def _flat_sides(inside: np.ndarray, labels: Volume) -> list[str]:
             continue
         areas = inside.sum(axis=tuple(other for other in range(3) if other != axis))
         occupied = np.flatnonzero(areas)
-        direction = labels.ijk_to_ras[:3, column]
-        ras = int(np.abs(direction).argmax())
-        for end, way in ((occupied[0], -1), (occupied[-1], 1)):
+        for end, side in zip(occupied[[0, -1]], labels.ends[column], strict=True):
             if areas[end] > _FLAT * areas.max():
-                sides.append(_SIDES[ras][int(way * direction[ras] > 0)])
+                sides.append(side)
     return sides

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 
@@ -30,6 +32,14 @@ class Advice:
     between: str = "--map 0=fat gives it a tissue"
     #: Whether the volumes of unknown labels are listed
     gives_sizes: bool = True
+    #: Whether {maps} are in Python, and not options of the command
+    is_python: bool = False
+
+    def maps(self, texts: Iterable[str]) -> str:
+        """{maps} of texts for LabelMapping.of: --map 1=csf --map 2=tumour."""
+        if self.is_python:
+            return f"mapping=LabelMapping.of({list(texts)})"
+        return " ".join(f"--map {shlex.quote(text)}" for text in texts)
 
 
 COMMAND = Advice()
@@ -77,6 +87,7 @@ SCRIPT = replace(
     lesion="lay it over a segmentation with SegmentationFilter.AddTissueData, or give its tissue with SetTissues",
     brain_mask="if it is the mask of a brain, it is port 1 of the SegmentationFilter of that brain's MRI",
     ambiguous="read it with read_label_map and a LabelMapping of {key!r}",
-    likely="if that is right, read it with read_label_map and LabelMapping.of([...]) with {maps}",
+    likely="if that is right, read it with read_label_map(volume, {maps})",
     between="read_label_map with a LabelMapping of 0=fat gives it a tissue",
+    is_python=True,
 )

@@ -27,7 +27,7 @@ _LONGEST_LIST = 12
 #: So few labels are not recognised by their places.
 _TOO_FEW = 3
 #: More unknown labels may be the intensities of an image
-_MOST_LABELS = 100
+MOST_LABELS = 100
 #: Tissues of a lesion, which alone are no patient
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
 #: Tissues of every brain, and the least and largest volume of both that is not remarkable
@@ -88,7 +88,7 @@ class Findings:
             return
         of_file = _tissue_of_file(self.source) or "tumour"
         pairs = zip(self.names, known, strict=True)
-        maps = " ".join("--map " + shlex.quote(f"{label}={tissue or of_file}") for label, tissue in pairs)
+        maps = self.advice.maps(f"{label}={tissue or of_file}" for label, tissue in pairs)
         is_brats = self.scheme is not None and self.scheme.is_lesion
         tissue = "brats" if is_brats or len(set(known)) > 1 else known[0] or of_file
         is_large = len(known) == 1 and self._millilitres(self.names) > _LARGEST_LESION_ML
@@ -107,14 +107,14 @@ class Findings:
         remedy = self.advice.unknown.format(label=unknown[0])
         nothing = "no program's numbers are recognised, and " if len(unknown) == len(self.names) else ""
         if len(unknown) > 1 and self.advice.leave_out and not self._are_interpolated:
-            each = [f"--map {n}=0" for n in unknown[:_LONGEST_LIST]]
-            maps = " ".join([*each, "..."] if len(unknown) > len(each) else each)
+            maps = self.advice.maps(f"{n}=0" for n in unknown[:_LONGEST_LIST])
+            maps += " ..." * (len(unknown) > _LONGEST_LIST)
             remedy = f"{self.advice.leave_out.format(maps=maps)}; or {remedy}"
         if nothing:
             remedy = f"{self._if_of_a_program(unknown)}{remedy}"
         if self._are_interpolated:
             remedy = f"{_INTERPOLATED}; or {remedy}"
-        elif nothing and len(unknown) > _MOST_LABELS:
+        elif nothing and len(unknown) > MOST_LABELS:
             remedy = f"if these are intensities of an MRI, its file may be incomplete; {remedy}"
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))

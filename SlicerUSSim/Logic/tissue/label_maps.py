@@ -262,11 +262,11 @@ class _Reading:
         others = [label for label in self._present if label not in order]
         parts = [f"{label} {tissue} ({self._counts[label] / total:.0%})" for label, tissue in sorted(order.items())]
         parts += [f"{label} something else ({self._counts[label] * self._volume.voxel_ml:.3g} ml)" for label in others]
-        maps = [f"--map {label}={tissue.split()[0]}" for label, tissue in sorted(order.items())]
-        maps += [f"--map {label}=TISSUE" for label in others]
+        maps = [f"{label}={tissue.split()[0]}" for label, tissue in sorted(order.items())]
+        maps += [f"{label}=TISSUE" for label in others]
         return (
             f"labels {listed(self._present)} are in no known program's order; by their amounts and places they are "
-            f"{listed(parts)}; {self._advice.likely.format(maps=' '.join(maps))}"
+            f"{listed(parts)}; {self._advice.likely.format(maps=self._advice.maps(maps))}"
         )
 
     def _tissue(self, label: int, name: str | None) -> Tissue | None:

@@ -86,7 +86,7 @@ class CombinedMaps:
             return
         is_known = len(orders) == 1
         order = dict(sorted(orders[0].items())) if is_known else self.names
-        maps = " ".join(f"--map {label}={tissue.split()[0]}" for label, tissue in order.items())
+        maps = advice.maps(f"{label}={tissue.split()[0]}" for label, tissue in order.items())
         numbered = ", ".join(f"{label} {file}" for label, file in enumerate(self.files, 1))
         found = ", ".join(f"{label} {tissue} ({brain.shares[label]:.0%})" for label, tissue in order.items())
         is_of_t2 = self.is_by_brightness and list(order.values()) == [*reversed(BRAIN_TISSUES)]
