@@ -19,9 +19,9 @@ from SlicerUSSim.Logic.mri import demo_mri
 from SlicerUSSim.Logic.probe import PROBES, ImageGrid, craniotomy_pose, slice_under_probe
 
 VARIANTS = {
-    "labels alone (paper)": {},
+    "labels alone (paper)": {"partial_volume": False},
     "partial volume": {"partial_volume": True},
-    "MRI, 3 dB per deviation": {"mri_modulation_db": 3.0},
+    "MRI, 3 dB per deviation": {"partial_volume": False, "mri_modulation_db": 3.0},
     "both": {"partial_volume": True, "mri_modulation_db": 3.0},
 }
 REGION_MM = (-40.0, 40.0, 15.0, 95.0)  # left, right, top, bottom: sulci, ventricles, nuclei

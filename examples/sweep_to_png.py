@@ -13,7 +13,8 @@ from SlicerUSSim.Logic.probe import craniotomy_pose
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "sweep")
 out.mkdir(exist_ok=True)
 segmentation = segment_mri(demo_mri()[0], thin_sulci=True)
-simulator = UltrasoundSimulator(segmentation.labels, TissueTable.brain(segmentation.tissue_names))
+tissues = TissueTable.brain(segmentation.tissue_names)
+simulator = UltrasoundSimulator(segmentation.labels, tissues, texture=segmentation.texture())
 probe = PhasedProbe(field_of_view_deg=80, depth_mm=90)
 middle = craniotomy_pose(segmentation.labels, probe)
 poses = []

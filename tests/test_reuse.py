@@ -32,7 +32,7 @@ def test_other_voxels_need_another_simulator():
     for version, texture, settings in (
         (2, None, SETTINGS),
         (2, known, SETTINGS),
-        (2, known, replace(SETTINGS, partial_volume=True)),
+        (2, known, replace(SETTINGS, partial_volume=False)),
         (2, known, replace(SETTINGS, mri_modulation_db=2.0)),
     ):
         seen.append(reused.get(version, LABELS, TABLE, settings, texture=texture))

@@ -56,11 +56,13 @@ def inner(found) -> np.ndarray:
 
 
 def test_off_is_the_paper_bit_for_bit():
-    (plain,), (with_texture,) = frames(seeds=[0]), frames(texture(0.5), seeds=[0])
+    (plain,), (with_texture,) = frames(seeds=[0]), frames(texture(0.5), seeds=[0], partial_volume=False)
     np.testing.assert_array_equal(plain.iq, with_texture.iq)
     # A texture without information beyond the labels does not change the image either.
     (ignorant,) = frames(texture(0.0), seeds=[0], partial_volume=True, mri_modulation_db=3.0)
     np.testing.assert_array_equal(plain.iq, ignorant.iq)
+    (mixed,) = frames(texture(0.5), seeds=[0])  # the default
+    assert not np.array_equal(plain.iq, mixed.iq)
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.9])
@@ -250,7 +252,7 @@ def test_a_segmentation_knows_the_shares_of_its_voxels():
 
 
 def test_textures_that_do_not_fit_are_refused():
-    with pytest.raises(SimulationError, match=r"mri_modulation_db 2 need a texture; pass segmentation\.texture"):
+    with pytest.raises(SimulationError, match=r"mri_modulation_db 2 needs a texture; pass segmentation\.texture"):
         UltrasoundSimulator(SOLID, TABLE, SimulationSettings(mri_modulation_db=2.0))
     small = Texture(*(np.zeros((2, 2, 2), dtype) for dtype in (np.uint8, np.float32, np.float32)))
     with pytest.raises(SimulationError, match=r"the texture has shape \(2, 2, 2\), expected that of the labels"):
@@ -271,13 +273,13 @@ def test_the_commands_take_the_settings_from_an_mri_and_refuse_them_for_labels(t
     head_mri(spacing_mm=3.0).write(tmp_path / "mri.nii.gz")
     arguments = ["simulate", str(tmp_path / "mri.nii.gz"), "--pose", "auto", "-o", str(tmp_path / "a.png")]
     images = []
-    for extra in ([], ["--partial-volume"], ["--mri-modulation", "3"]):
+    for extra in ([], ["--hard-labels"], ["--mri-modulation", "3"]):
         result = CliRunner().invoke(main, [*arguments, *extra])
         assert result.exit_code == 0, result.output
         images.append(np.asarray(Image.open(tmp_path / "a.png")).astype(int))
     assert np.abs(images[1] - images[0]).max() > 0 and np.abs(images[2] - images[0]).max() > 0
     SOLID.write(tmp_path / "labels.nii.gz")
     arguments[1] = str(tmp_path / "labels.nii.gz")
-    result = CliRunner().invoke(main, [*arguments, "--partial-volume"])
+    result = CliRunner().invoke(main, [*arguments, "--mri-modulation", "3"])
     assert result.exit_code == 2
-    assert "is a label map; --partial-volume and --mri-modulation need an MRI" in result.stderr
+    assert "is a label map; --mri-modulation needs an MRI" in result.stderr

@@ -82,9 +82,11 @@ class SimulationSettings(Declared):
         source="The paper's Rayleigh test uses cells of 20 µm (125000/mm³), of which mu1 keeps 1 %",
     )  # fmt: skip
     partial_volume: bool = parameter(
-        False, "Partial volume",
-        "Mix the scatterers of tissues by the probabilities of the segmentation; requires segmenting the MRI first",
-        shown=True, option="partial-volume/hard-labels", source="Off in the paper",
+        True, "Partial volume",
+        "Mix the scatterers of tissues by the probabilities of the segmentation, where the MRI was segmented",
+        shown=True, option="partial-volume/hard-labels",
+        note="Label maps have no probabilities",
+        source="Off in the paper; images are more like real ones with it, see optimization.md",
     )  # fmt: skip
     mri_modulation_db: float = parameter(
         0.0, "MRI modulation",
@@ -126,8 +128,13 @@ class SimulationSettings(Declared):
 
     @property
     def needs_texture(self) -> bool:
-        """Whether scatterers depend on the MRI's intensities or class probabilities, and not only on labels."""
-        return self.partial_volume or self.mri_modulation_db != 0.0
+        """Whether scatterers depend on the MRI's intensities, so that labels alone are not enough."""
+        return self.mri_modulation_db != 0.0
+
+    @property
+    def uses_texture(self) -> bool:
+        """Whether scatterers depend on the MRI's intensities or class probabilities, if there are any."""
+        return self.partial_volume or self.needs_texture
 
 
 @dataclass(frozen=True)

@@ -457,13 +457,13 @@ def _packed_texture(texture: Texture | None, labels: Volume, settings: Simulatio
             texture.deviation.shape == labels.array.shape,
             f"the texture has shape {texture.deviation.shape}, expected that of the labels, {labels.array.shape}",
         )
-    if not settings.needs_texture:
-        return None
-    texture = required(
-        texture,
-        f"partial_volume {settings.partial_volume}, mri_modulation_db {settings.mri_modulation_db:g} need a texture; "
-        "pass segmentation.texture(), or Texture.from_mri(mri, labels) for your own label map",
+    require(
+        texture is not None or not settings.needs_texture,
+        f"mri_modulation_db {settings.mri_modulation_db:g} needs a texture; pass segmentation.texture(), or "
+        "Texture.from_mri(mri, labels) for your own label map",
     )
+    if texture is None or not (settings.needs_texture or (settings.partial_volume and texture.second_share.any())):
+        return None
     return texture.packed(as_labels(labels.array), settings.partial_volume, settings.mri_modulation_db)
 
 

@@ -22,14 +22,14 @@ class NumpyModel:
     """Simulates the images of `simulator` on the host.
 
     Of the simulator only the user's inputs are read (label map, tissues and settings), and the names and order of its
-    stages; nothing is read from its device. Raises SimulationError for settings that need a texture, which this model
-    does not have, and for a stage without a twin.
+    stages; nothing is read from its device. Raises SimulationError for a simulator that uses a texture, which this
+    model does not have, and for a stage without a twin.
     """
 
     def __init__(self, simulator: UltrasoundSimulator) -> None:
-        settings = simulator.settings
         require(
-            not settings.needs_texture, "NumpyModel has no texture, expected partial_volume and mri_modulation_db 0"
+            not (simulator.medium.has_texture or simulator.settings.needs_texture),
+            "NumpyModel has no texture, expected a simulator without one or partial_volume and mri_modulation_db 0",
         )
         self.simulator = simulator
         self._twins = {stage.name: twin_of(stage) for stage in simulator.stages}
