@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -299,3 +302,30 @@ def test_the_voxels_of_another_header_are_not_replaced(new, tmp_path):
     volume.write(tmp_path / new)
     volume.write(tmp_path / new)  # its own may be
     np.testing.assert_array_equal(Volume.read(tmp_path / new).array, volume.array)
+
+
+_FULL = """
+import resource, signal, sys
+import numpy as np
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.volume import Volume
+
+Volume(np.ones((10, 10, 10), np.uint8), np.eye(4)).write(sys.argv[1])
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    Volume(np.random.default_rng(0).integers(0, 255, (80, 80, 80)).astype(np.uint8), np.eye(4)).write(sys.argv[1])
+except SimulationError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
+@pytest.mark.parametrize("name", ["v.nii.gz", "v.nii", "v.nrrd", "v.mha", "v.vti"])
+def test_a_file_that_does_not_fit_on_the_disk_leaves_the_one_before(name, tmp_path):
+    """Of a NIfTI file ITK did not say so: the file before was replaced by an empty one."""
+    done = subprocess.run([sys.executable, "-c", _FULL, name], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and f"{name}: cannot be written" in done.stdout
+    kept = Volume.read(tmp_path / name)
+    assert kept.array.shape == (10, 10, 10) and (kept.array == 1).all()
+    assert [file.name for file in tmp_path.iterdir()] == [name]

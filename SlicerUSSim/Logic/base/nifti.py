@@ -118,6 +118,13 @@ def require_complete(path: Path) -> None:
     )
 
 
+def require_written(path: Path, voxel_bytes: int) -> None:
+    """Raise OSError unless a NIfTI file holds what was to be written: ITK does not say that the disk is full."""
+    found, is_damaged = _bytes_of(path)
+    if found < voxel_bytes or is_damaged:
+        raise OSError(f"{found} of {voxel_bytes} bytes are in the file; is the disk full?")
+
+
 def _bytes_of(file: Path) -> tuple[int, bool]:
     """The bytes of a file, decompressed if it is compressed, and whether they are not those that were compressed."""
     if file.suffix != ".gz":

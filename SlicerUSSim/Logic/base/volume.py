@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import require_own_voxels, why_unreadable, written_whole
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
-from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry, require_complete
+from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry, require_complete, require_written
 from SlicerUSSim.Logic.base.segments import flattened, segments_of
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
 
@@ -202,10 +202,12 @@ class Volume:
                 import SimpleITK as sitk
 
                 image = self.to_sitk()
+                is_nifti = path.name.lower().endswith((".nii", ".nii.gz"))
                 if made_by is not None:
-                    is_nifti = path.name.lower().endswith((".nii", ".nii.gz"))
                     image.SetMetaData("ITK_FileNotes" if is_nifti else MADE_BY, made_by)
                 sitk.WriteImage(image, str(partial), useCompression=not path.name.lower().endswith(".mhd"))
+                if is_nifti:
+                    require_written(partial, self.array.nbytes)
 
     # ---- VTK ---------------------------------------------------------------------------------------------------
 
@@ -278,7 +280,8 @@ class Volume:
         writer = vtkXMLImageDataWriter()
         writer.SetFileName(str(path))
         writer.SetInputData(image)
-        require(writer.Write() == 1, f"{path}: cannot be written")
+        if writer.Write() != 1 or writer.GetErrorCode() != 0:
+            raise OSError("not all voxels are in the file; is the disk full?")
 
 
 def _log_size(volume: Volume, path: Path) -> None:
