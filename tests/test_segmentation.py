@@ -461,3 +461,38 @@ def test_a_fifth_of_the_field_of_one_persons_phantom_is_left_at_most(seed):
     true = np.log(case.bias[tissue])
     left = np.log((found.factor / anatomy(fit, case.mri, inside.shape))[tissue]) - true
     assert left.std() < 0.19 * true.std()
+
+
+def test_thin_sulci_are_not_looked_for_in_slices_thicker_than_they_are(mni):
+    """In slices of 5 mm, leptomeninges had 1.5 times the volume that they have in those of 1 mm."""
+    t1 = mni[0]
+    count = t1.array.shape[0] // 5
+    thick = Volume(
+        t1.array[: 5 * count].reshape(count, 5, *t1.array.shape[1:]).mean(axis=1).astype(np.float32),
+        t1.ijk_to_ras @ np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 5, 2], [0, 0, 0, 1.0]]),
+    )
+    found = segment_mri(thick, thin_sulci=True)
+    assert found.tissue_names == ("csf", "grey matter", "white matter")
+    assert "thin sulci are not looked for: voxels of 5 mm are thicker than they are" in found.notes
+    both = segment_mri(t1, others={"t1gd": thick}, thin_sulci=True)
+    assert "leptomeninges" in both.tissue_names
+    assert any("t1gd has voxels of 5 mm, across which its tissues mix" in line for line in both.warnings)
+    assert not any("across which" in line for line in segment_mri(thick, others={"t1gd": t1}).warnings)
+
+
+def test_a_lesion_that_is_bright_in_a_flair_needs_four_classes_which_is_said(mni):
+    """It was grey matter without a word."""
+    t1 = mni[0]
+    flair = np.where(t1.array > 60, np.clip(200.0 - t1.array, 60.0, 140.0), 0.3 * t1.array)
+    flair += np.where(t1.array > 0, np.random.default_rng(0).normal(0.0, 2.0, t1.array.shape), 0.0)
+    flair = np.maximum(flair, 0.0).astype(np.float32)
+    lesion = np.zeros(flair.shape, bool)
+    k, j, i = (n // 2 for n in flair.shape)
+    lesion[k + 10 : k + 30, j : j + 20, i + 15 : i + 35] = True
+    healthy = flair.copy()
+    flair[lesion] += 150.0
+    line = "are far brighter than grey matter, as lesions are in a FLAIR"
+    assert any(line in said for said in segment_mri(t1.with_array(flair), contrast="flair").warnings)
+    assert not any(line in said for said in segment_mri(t1.with_array(healthy), contrast="flair").warnings)
+    found = segment_mri(t1.with_array(flair), contrast="flair", classes=4)
+    assert not any(line in said for said in found.warnings)

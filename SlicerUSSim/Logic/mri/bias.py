@@ -72,7 +72,7 @@ def _strength(factor: np.ndarray, inside: np.ndarray) -> float:
 
 
 def _about(contrast: str, strength: float, wanted: bool | None, how: str) -> str:
-    amount = f"{strength:.0%}" if strength < 10.0 else "more than a factor of ten"
+    amount = f"{strength:.1%}" if strength < 10.0 else "more than a factor of ten"
     found = f"{contrast}: intensity varies by {amount} across the brain"
     if not how:
         return f"{found}, below {LEAST_FIELD:.0%}: left as it is"

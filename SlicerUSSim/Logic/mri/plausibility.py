@@ -138,15 +138,25 @@ def faint(found: Classes, noise: float) -> list[str]:
     ]
 
 
-def enhancement(image: np.ndarray, inside: np.ndarray, grey: float, white: float, voxel_ml: float) -> list[str]:
-    """A warning where a T1 has something that only contrast agent makes so bright: sinuses, plexus, a tumour's rim.
+def brighter_than_tissue(
+    image: np.ndarray, inside: np.ndarray, grey: float, white: float, voxel_ml: float, contrast: str
+) -> list[str]:
+    """A warning where an image of three classes has something that is far brighter than all of them.
 
+    In a T1 that is what only contrast agent makes so bright: sinuses, plexus, a tumour's rim; in a FLAIR a lesion.
     `image` and `inside` are (k, j, i); `grey` and `white` are the means of the tissues.
     """
-    labels, count = cast(tuple[np.ndarray, int], ndimage.label((image > white + _ENHANCED * (white - grey)) & inside))
+    brightest, darker = (white, grey) if contrast == "t1" else (grey, white)
+    is_bright = (image > brightest + _ENHANCED * (brightest - darker)) & inside
+    labels, count = cast(tuple[np.ndarray, int], ndimage.label(is_bright))
     largest = float(np.bincount(labels.ravel())[1:].max()) * voxel_ml if count else 0.0
-    if not _ENHANCED_ML <= largest <= _LARGEST_ENHANCED_ML or white <= grey:
+    if not _ENHANCED_ML <= largest <= _LARGEST_ENHANCED_ML or brightest <= darker:
         return []
+    if contrast == "flair":
+        return [
+            f"{largest:.1f} ml in one piece are far brighter than grey matter, as lesions are in a FLAIR, and get one "
+            "of three tissues: choose four classes (--classes 4)"
+        ]
     return [
         f"contrast is t1, but {largest:.1f} ml in one piece are far brighter than white matter, as vessels and tumour "
         "rims after contrast agent: if it was given, choose t1gd (--contrast t1gd)"

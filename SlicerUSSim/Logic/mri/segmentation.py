@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate
 from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
 from SlicerUSSim.Logic.mri.neighbours import less_sure, smoothed_posteriors
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
-from SlicerUSSim.Logic.mri.plausibility import enhancement, require_contrast
+from SlicerUSSim.Logic.mri.plausibility import brighter_than_tissue, require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_hounsfield
 from SlicerUSSim.Logic.mri.segmentation_steps import (
     BrainPart,
@@ -42,6 +42,8 @@ _log = logging.getLogger(__name__)
 _LEAST_TO_REGISTER_ML = 100.0
 #: Share of the time in which the brain is looked for in a whole head
 _SHARE_OF_BRAIN = 0.6
+#: Size of voxels in which thin sulci, which are narrower, cannot be told, and beyond which tissues mix across them
+_THICK_SLICE_MM = 3.5
 #: Means from which on the table has two decimals, and three digits below
 _LARGE = 10.0
 
@@ -156,6 +158,7 @@ def segment_mri(
         where it is strong or there is no atlas; see bias.corrected.
     thin_sulci : also label the middle of sulci that are too narrow to reach CSF intensity, one voxel thick, as an extra
         tissue "leptomeninges" within the grey matter. Ultrasound shows these sulci, but intensity classes miss them.
+        In voxels of more than 3.5 mm they are not looked for, which the notes say.
     skull_strip : how the brain is found without a `mask`; see brain.find_brain.
     keep_mask_at : file in which the mask of a whole head is kept, so that it is extracted once; see brain.find_brain.
     progress : called with the completed fraction, 0 to 1.
@@ -216,6 +219,12 @@ def segment_mri(
         images.append(image)
         notes.append(message)
         warnings += doubts_of_it
+        thickest_mm = float(other.spacing_mm.max())
+        if thickest_mm > max(_THICK_SLICE_MM, float(mri.spacing_mm.max())):
+            warnings.append(
+                f"{named} has voxels of {thickest_mm:.3g} mm, across which its tissues mix: compare with the labels of "
+                f"the {contrast} alone"
+            )
     if others:
         if brain.method != "given":
             notes.append(
@@ -260,14 +269,17 @@ def segment_mri(
     timed("neighbours")
     report(0.9)
     warnings += doubts(found, part, filtered[0][1], atlas, contrasts)
-    if contrasts == ("t1",) and not brain.takes_in_more:  # fat is as bright
+    if contrasts in (("t1",), ("flair",)) and len(names) == 3 and not brain.takes_in_more:  # fat is as bright
         voxel_ml = part.images[0].voxel_ml
-        warnings += enhancement(filtered[0][0], part.inside, *found.grey_and_white, voxel_ml)
+        warnings += brighter_than_tissue(filtered[0][0], part.inside, *found.grey_and_white, voxel_ml, contrast)
 
     labels = np.zeros(part.inside.shape, np.uint8)
     labels[part.inside] = found.posteriors.argmax(axis=0) + 1
     tissue_names = names
-    if thin_sulci:
+    thickest_mm = float(mri.spacing_mm.max())
+    if thin_sulci and thickest_mm > _THICK_SLICE_MM:
+        notes.append(f"thin sulci are not looked for: voxels of {thickest_mm:.3g} mm are thicker than they are")
+    elif thin_sulci:
         middles = narrow_sulci(labels, found, filtered[0][0], filtered[0][1])
         labels[middles] = len(names) + 1
         tissue_names = (*names, "leptomeninges")
