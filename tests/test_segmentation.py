@@ -483,14 +483,16 @@ def test_thin_sulci_are_not_looked_for_in_slices_thicker_than_they_are(mni):
 def test_a_lesion_that_is_bright_in_a_flair_needs_four_classes_which_is_said(mni):
     """It was grey matter without a word."""
     t1 = mni[0]
-    flair = np.where(t1.array > 60, np.clip(200.0 - t1.array, 60.0, 140.0), 0.3 * t1.array)
-    flair += np.where(t1.array > 0, np.random.default_rng(0).normal(0.0, 2.0, t1.array.shape), 0.0)
+    grey, white = np.percentile(t1.array[mni[1].array > 0.9], 50), np.percentile(t1.array[mni[2].array > 0.9], 50)
+    bright = np.clip(grey - 0.5 * (t1.array - grey), 0.6 * grey, 1.1 * grey)  # white matter is darker
+    flair = np.where(t1.array > 0.7 * grey, bright, 0.3 * t1.array)
+    flair += np.where(t1.array > 0, np.random.default_rng(0).normal(0.0, 0.02 * white, t1.array.shape), 0.0)
     flair = np.maximum(flair, 0.0).astype(np.float32)
     lesion = np.zeros(flair.shape, bool)
     k, j, i = (n // 2 for n in flair.shape)
     lesion[k + 10 : k + 30, j : j + 20, i + 15 : i + 35] = True
     healthy = flair.copy()
-    flair[lesion] += 150.0
+    flair[lesion] += grey
     line = "are far brighter than grey matter, as lesions are in a FLAIR"
     assert any(line in said for said in segment_mri(t1.with_array(flair), contrast="flair").warnings)
     assert not any(line in said for said in segment_mri(t1.with_array(healthy), contrast="flair").warnings)
