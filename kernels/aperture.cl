@@ -11,13 +11,14 @@
 //
 // Buffers: voxels ushort [k][j][i] (medium.py); acoustics float4 [label]: extra path per mm, attenuation in nepers per
 // mm (both ways), speed of sound, impedance; sums float4 [row][point][angle][depth]: extra path in mm, nepers, nepers
-// that strong tissue takes, and the sheet's part in the elevational deflection in mm; screens float4 [screen
-// line][depth], depths from screen_step on: nepers lost both ways, extra path in mm, deflection in the lateral and in
-// the elevational direction in mm; shades float4 [screen line][depth]: the nepers of them that strong tissue takes;
-// those that it takes right behind its last end between the depth before and this one; those that soft tissue has taken
-// from what arrives, on the mean; and the distance from that end in mm, NO_END if there is none. spreads float2 [screen
-// line][depth]: width of the beam and a factor of its echoes, both re an undisturbed one; beams float4 [traced line][1
-// + depth] as screens, followed by float4 [traced line][1 + depth] as shades.
+// that strong tissue takes (the lowest bit says whether the step before is in it), and the sheet's part in the
+// elevational deflection in mm; screens float4 [screen line][depth], depths from screen_step on: nepers lost both ways,
+// extra path in mm, deflection in the lateral and in the elevational direction in mm; shades float4 [screen
+// line][depth]: the nepers of them that strong tissue takes; those that it takes right behind its last end between the
+// depth before and this one; those that soft tissue has taken from what arrives, on the mean; and the distance from
+// that end in mm, NO_END if there is none, negative in strong tissue. spreads float2 [screen line][depth]: width of the
+// beam and a factor of its echoes, both re an undisturbed one; beams float4 [traced line][1 + depth] as screens,
+// followed by float4 [traced line][1 + depth] as shades.
 
 #include "common.clh"
 
@@ -53,24 +54,24 @@ inline float2 point_on_face(__constant const Acquisition *acquisition, float alo
 }
 
 // Extra path and nepers per mm of tissue beside `soft`, of which strong tissue has the attenuation, and also the extra
-// path if it bends what goes through; and whether it does.
-inline float3 rates_beside(float4 soft, float4 tissue) {
-  if (is_soft(soft.z, soft.w, tissue.z, tissue.w)) return (float3)(tissue.xy, 0.0f);
-  const int is_bent = bends(soft.z, tissue.z);
-  return (float3)(is_bent ? soft.x : tissue.x, soft.y, is_bent);
+// path if it bends what goes through; whether it does; and the nepers per mm that it takes more, if it does not.
+inline float4 rates_beside(float4 soft, float4 tissue) {
+  if (is_soft(soft.z, soft.w, tissue.z, tissue.w)) return (float4)(tissue.xy, 0.0f, 0.0f);
+  if (bends(soft.z, tissue.z)) return (float4)(soft.xy, 1.0f, 0.0f);
+  return (float4)(tissue.x, soft.y, 0.0f, tissue.y - soft.y);
 }
 
-// Extra path and nepers per mm at the fraction f of a cell of voxels, and its part that is tissue which bends: linear
-// between the eight labels.
-inline float3 rates_in_cell(__global const float4 *acoustics, __global const ushort *cell, int nx, int nxy, float3 f,
+// Extra path and nepers per mm at the fraction f of a cell of voxels, its part that is tissue which bends, and the
+// nepers per mm that strong tissue takes more: linear between the eight labels.
+inline float4 rates_in_cell(__global const float4 *acoustics, __global const ushort *cell, int nx, int nxy, float3 f,
                             float4 soft, int all_soft) {
-  float3 along_y[2], along_z[2];
+  float4 along_y[2], along_z[2];
   for (int z = 0; z < 2; z++) {
     for (int y = 0; y < 2; y++) {
       __global const ushort *row = cell + y * nx + z * nxy;
       const float4 left = acoustics[row[0] & LABEL_MASK], right = acoustics[row[1] & LABEL_MASK];
-      const float3 a = all_soft ? (float3)(left.xy, 0.0f) : rates_beside(soft, left);
-      const float3 b = all_soft ? (float3)(right.xy, 0.0f) : rates_beside(soft, right);
+      const float4 a = all_soft ? (float4)(left.xy, 0.0f, 0.0f) : rates_beside(soft, left);
+      const float4 b = all_soft ? (float4)(right.xy, 0.0f, 0.0f) : rates_beside(soft, right);
       along_y[y] = a + f.x * (b - a);
     }
     along_z[z] = along_y[0] + f.y * (along_y[1] - along_y[0]);
@@ -89,8 +90,9 @@ inline float border_nepers(float impedance, float other_impedance) {
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
-__kernel void fans(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                   __global const float4 *acoustics, int all_soft, __global float *sums) {
+__kernel void
+fans(__constant const Acquisition *acquisition, __global const ushort *voxels, __global const float4 *acoustics,
+     int all_soft, __global float *sums) {
   const int ray = get_global_id(0), point = get_global_id(1), row = get_global_id(2);
   const int depths = acquisition->fan_depths;
   const int nx = acquisition->dims[0], ny = acquisition->dims[1], nxy = nx * ny;
@@ -112,6 +114,7 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
 
   float covered = 0.0f;           // the largest part of a cell that was bone
   int label = 0, was_strong = 0;  // of the last soft tissue; whether there was strong tissue behind it
+  int leaving = 0;                // whether it was in this cell or the last ones
   float4 soft = acoustics[0];
   float impedance = 0.0f;
   float4 sum = (float4)(0.0f);
@@ -139,8 +142,8 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
     }
     for (int n = 0; n < min(8, depths - depth); n++) {
       float2 rate = soft.xy;
-      float strong = 0.0f, bone = 0.0f;
-      int is_strong = 0;
+      float strong = 0.0f, bone = 0.0f, excess = 0.0f;
+      int is_strong = 0, is_seen = 0;  // as strong
       if (differs) {
         __global const ushort *cell = voxels + here[n];
         const float3 f = (float3)(fx[n], fy[n], fz[n]);
@@ -155,9 +158,10 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
           label = nearest;
         }
         if (is_mixed) {
-          const float3 in_cell = rates_in_cell(acoustics, cell, nx, nxy, f, soft, all_soft);
+          const float4 in_cell = rates_in_cell(acoustics, cell, nx, nxy, f, soft, all_soft);
           rate = in_cell.xy;
           bone = in_cell.z;
+          excess = in_cell.w;
         } else {
           rate = soft.xy;
         }
@@ -165,29 +169,40 @@ __kernel void fans(__constant const Acquisition *acquisition, __global const ush
         if (is_strong || was_strong) strong = border_nepers(was_strong ? impedance : soft.w, found.w);
         impedance = found.w;
         if (is_strong) {
-          const float excess = found.y - soft.y;
-          const int is_bent = bends(soft.z, found.z);
-          if (is_bent) {
+          if (bends(soft.z, found.z)) {
             if (!is_mixed) bone = 1.0f;
             strong += length * fmax(BENT_PER_MM * ramp(EDGE_OF_BONE, 1.0f, bone), LEAST_PER_MM);
           } else {
-            strong += length * (fabs(excess) < LEAST_PER_MM ? LEAST_PER_MM : excess);
-            if (!is_mixed) rate.x = found.x;
+            if (!is_mixed) {
+              excess = found.y - soft.y;
+              rate.x = found.x;
+            }
+            if (fabs(excess) < LEAST_PER_MM) excess = LEAST_PER_MM;
           }
         }
+        // Of a cell at the border, strong tissue beyond it has a part too. It begins there, as bone does, and ends
+        // where soft tissue is nearest.
+        is_seen = is_strong || strong != 0.0f || (excess != 0.0f && !leaving);
+        leaving = is_strong || (leaving && excess != 0.0f);
+        strong += length * excess;
         // Beside bone a line is covered in part, as its neighbours are in whole: no step as the edge comes to it.
         if (bone > covered) {
           strong += 2.0f * log((1.0f - covered) / fmax(1.0f - bone, LEAST_OPEN));
           covered = fmin(bone, 1.0f - LEAST_OPEN);
+          is_seen = 1;
         }
       } else if (was_strong) {
         strong = border_nepers(impedance, soft.w);
+        is_seen = strong != 0.0f;
+        leaving = 0;
       }
       was_strong = is_strong;
       const float turned = rate.x * turn_per_rate[n];
       sum += (float4)(length * rate.x, length * rate.y, strong, length * (lean + 0.5f * turned));
       lean += turned;
-      vstore4(sum, depth + n, to);
+      float4 stored = sum;
+      stored.z = as_float((as_uint(sum.z) & ~1u) | is_seen);
+      vstore4(stored, depth + n, to);
     }
   }
 }
@@ -297,7 +312,7 @@ inline float share_strong(__constant const Acquisition *acquisition, __global co
       __global const float *at = sums + 4 * (((acquisition->fan_points + point) * acquisition->fan_angles + ray + m) *
                                                  acquisition->fan_depths +
                                              depth);
-      if (at[6] != at[2]) strong += share;
+      if (as_uint(at[6]) & 1u) strong += share;
     }
   }
   return strong;
@@ -574,9 +589,11 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
   const float rise = clamp(row_lift[2] - row_lift[0], -STEEPEST * path, STEEPEST * path);
   float4 found = (float4)(0.0f, 0.0f, 1.0f, 0.0f);
   float exit_shade = 0.0f, away = NO_END;
+  int is_inside = 0;  // strong tissue
   if (with_level) {
     // In strong tissue, a beam has the level that it has before it: what this tissue takes is a matter of its ray.
     const float depth = all_soft ? path : depth_outside(acquisition, sums, path, axis);
+    is_inside = depth < path;
     if (depth != path) find_lines(acquisition, sums, depth, axis, &lines);
     const float loss = depth != path ? mean_loss(&lines) : losses / all;
     found = level_and_spread(acquisition, &lines, depth, mean_delay, loss);
@@ -602,7 +619,8 @@ __kernel void screens(__constant const Acquisition *acquisition, __global const 
   }
   const float4 screen = (float4)(losses / all + found.x + found.y, mean_delay - slope * mean_x, slope * path, rise);
   vstore4(screen, line * nodes + node, screens_);
-  vstore4((float4)(found.y, exit_shade, losses / all, away), line * nodes + node, shades);
+  const float signed_away = is_inside ? -fmax(away, 1e-3f) : away;
+  vstore4((float4)(found.y, exit_shade, losses / all, signed_away), line * nodes + node, shades);
   vstore2((float2)(found.z, 1.0f), line * nodes + node, spreads);
 }
 
@@ -678,18 +696,27 @@ inline Between between_lines(__constant const Acquisition *acquisition, float pl
 
 // The amplitude that strong tissue lets through at the depth `node`, at a place among the screen lines: of one of the
 // two `kinds` of shades. In shadows it is the mean over a deviation `sigma` in screen lines, by a Gauss-Hermite rule of
-// three points; from where the beam passes beside, nothing is taken.
+// three points; from where the beam passes beside, nothing is taken. In strong tissue shades are those before it, and
+// light from there does not reach what is behind: its lines count as the line itself.
 inline float mean_lit(__constant const Acquisition *acquisition, __global const float *shades, int kind, int node,
                       float place, float sigma) {
   const int nodes = acquisition->screen_depths;
-  float sum = 0.0f, own = 0.0f;
-  for (int side = -1; side <= 1; side++) {
+  const Between middle = between_lines(acquisition, place);
+  __global const float *left = shades + 4 * (middle.left * nodes + node), *right = left + 4 * nodes;
+  // Between a line that is in strong tissue and one that is not, a ray which has left it is as the latter.
+  const int one_is_inside = (left[3] < 0.0f) != (right[3] < 0.0f);
+  const float own = blend(exp_fast(-left[kind]), exp_fast(-right[kind]),
+                          one_is_inside ? (left[3] < 0.0f ? 1.0f : 0.0f) : middle.part);
+  float sum = 0.6666667f * own;
+  for (int side = -1; side <= 1; side += 2) {
     const Between at = between_lines(acquisition, place + side * 1.7320508f * sigma);
-    const float left = exp_fast(-shades[4 * (at.left * nodes + node) + kind]);
-    const float right = exp_fast(-shades[4 * ((at.left + 1) * nodes + node) + kind]);
-    const float lit = blend(left, right, at.part);
-    sum += (side == 0 ? 0.6666667f : 0.1666667f) * lit;
-    if (side == 0) own = lit;
+    float lit[2];
+    for (int n = 0; n < 2; n++) {
+      __global const float *shade = shades + 4 * ((at.left + n) * nodes + node);
+      lit[n] = exp_fast(-shade[kind]);
+      if (shade[3] < 0.0f) lit[n] = fmin(lit[n], own);
+    }
+    sum += 0.1666667f * blend(lit[0], lit[1], at.part);
   }
   return fmax(sum, own);
 }
@@ -703,7 +730,8 @@ inline float2 mean_shades(__constant const Acquisition *acquisition, __global co
   float away = NO_END;
   for (int side = -1; side <= 1; side++) {
     const Between at = between_lines(acquisition, place + side * 1.7320508f * reach);
-    away = fmin(away, fmin(shades[4 * (at.left * nodes + node) + 3], shades[4 * ((at.left + 1) * nodes + node) + 3]));
+    away = fmin(away, fmin(fabs(shades[4 * (at.left * nodes + node) + 3]),
+                           fabs(shades[4 * ((at.left + 1) * nodes + node) + 3])));
   }
   if (away == NO_END) {
     const float lit = mean_lit(acquisition, shades, 0, node, place, 0.0f);

@@ -216,9 +216,10 @@ inline float4 tube_reflected(__global const uchar *groups, __global const ushort
     // Projected along the ray onto the surface, which lengthens the offset by 1 / cos i.
     const float3 along = offset - dot3(normal, offset) / fmin(dot3(normal, ray.direction), -0.2f) * ray.direction;
     const float longer = fmax(length3(along), 1e-3f);
-    const float curvature = border_curvature(groups, smooth, acquisition, point, along / longer, before, behind);
     // Concave mirrors focus. With curvatures from voxels this would cause random bright spots, so they count as flat.
-    const float growth = 2.0f * fmax(curvature, 0.0f) * longer;
+    const float curvature =
+        convex_curvature(groups, smooth, acquisition, point, normal, along / longer, before, behind);
+    const float growth = 2.0f * curvature * longer;
     if (axis == 0)
       tube.y += growth * tube.x;
     else
@@ -395,11 +396,12 @@ inline float membrane_coherence(__constant const Acquisition *acquisition, Tissu
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
-__kernel void trace(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                    __global const uchar *groups, __global const ushort *smooth, __constant const Tissue *tissues,
-                    __global const float *roots, __global const float *quantiles, __global const float *beams,
-                    __global Segment *segments, __global int *segment_counts, __global Hit *hits,
-                    __global int *hit_counts, __global float *cut, __global int *overflown) {
+__kernel void
+trace(__constant const Acquisition *acquisition, __global const ushort *voxels, __global const uchar *groups,
+      __global const ushort *smooth, __constant const Tissue *tissues, __global const float *roots,
+      __global const float *quantiles, __global const float *beams, __global Segment *segments,
+      __global int *segment_counts, __global Hit *hits, __global int *hit_counts, __global float *cut,
+      __global int *overflown) {
   const int line = get_global_id(0), ray_of_line = get_global_id(1), rays = acquisition->elevational_rays;
   const int on_axis = ray_of_line == 0;
   const int slot = line * rays + ray_of_line - 1;

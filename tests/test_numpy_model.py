@@ -129,14 +129,15 @@ def test_numpy_follows_beams_through_and_past_strong_tissue(kind):
 
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k != "linear")) for k in PROBES])
-def test_numpy_follows_beams_past_lossy_tissue(kind):
+@pytest.mark.parametrize("attenuations", [(4.0, 1.9), (12.0, 7.0)])
+def test_numpy_follows_beams_past_lossy_tissue(kind, attenuations):
     """Plates before parts of the aperture, in which pieces end or not; with borders of their own and without."""
 
     def label(x, y, z):
         plates = np.where((y > 6) & (y < 9.5) & (x > -8) & (x < 0), 2, 1)
         return np.where((y > 13) & (y < 17) & (x > 2) | (y > 19) & (y < 21) & (x > -7) & (x < -1), 3, plates)
 
-    lossy = [replace(BRAIN, name=f"{db} dB", attenuation_db_cm_mhz=db) for db in (4.0, 1.9)]
+    lossy = [replace(BRAIN, name=f"{db} dB", attenuation_db_cm_mhz=db) for db in attenuations]
     simulator = UltrasoundSimulator(
         block(label, half_mm=(22, 34, 12)), TissueTable(dict(enumerate([BRAIN, BRAIN, *lossy])))
     )

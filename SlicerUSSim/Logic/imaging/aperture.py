@@ -86,19 +86,19 @@ def acoustic_rows(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore"):
         extra = np.where(speed > 0.0, acquisition["reference_speed_m_s"] / speed - 1.0, 0.0)
     nepers = tissues["attenuation_db_cm_mhz"] * acquisition["frequency_mhz"] * 0.2 * _NEPERS_PER_DB
-    speed = np.where(nepers > CONSTANTS["LOSSY_PER_MM"], CONSTANTS["LOSSY_SPEED"], speed)
+    speed = np.where(nepers > CONSTANTS["LOSSY_PER_MM"], -speed, speed)
     return np.stack([extra, nepers, speed, tissues["impedance_mrayl"]], axis=1).astype(np.float32)
 
 
 def are_soft(acoustics: np.ndarray) -> bool:
     """Whether borders between all of acoustic_rows (labels, 4) are soft (is_soft in kernels/common.clh)."""
 
-    def contrast(column: int) -> float:
+    def differ_less(column: int, contrast: float) -> bool:
         low, high = float(acoustics[:, column].min()), float(acoustics[:, column].max())
-        return (high - low) / (high + low)
+        return high - low < contrast * abs(high + low)
 
     # A little less, since the kernels round.
-    return contrast(2) < 0.4999 * CONSTANTS["SOFT_SPEED"] and contrast(3) < 0.9999 * CONSTANTS["SOFT_REFLECTION"]
+    return differ_less(2, 0.4999 * CONSTANTS["SOFT_SPEED"]) and differ_less(3, 0.9999 * CONSTANTS["SOFT_REFLECTION"])
 
 
 def aperture_fields(

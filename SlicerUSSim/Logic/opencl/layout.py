@@ -44,10 +44,9 @@ CONSTANTS = {
     "SOFT_SPEED": 0.105,  # largest relative difference of speed of sound at a soft border (common.clh), ...
     "SOFT_REFLECTION": 0.12,  # ... and largest reflection coefficient at normal incidence
     "STRAIGHT_SPEED": 0.2,  # ... and largest relative difference of speed at which a path goes straight on
-    # Nepers per mm (both ways) from which tissue, as bone marrow, leaves nothing of a beam within a few mm, and the
-    # speed by which its borders are to beams as those of bone, with tissue of any speed
+    # Nepers per mm (both ways) from which tissue, as bone marrow, leaves nothing of a beam within a few mm: its borders
+    # with other tissue are strong
     "LOSSY_PER_MM": 0.8,
-    "LOSSY_SPEED": 5000.0,
     "MAX_STACK": 24,  # reflected rays waiting to be followed
     "BLOCK": 64,  # samples over which beam widths and gains are assumed linear; lines are whole blocks long
     "PARTS": 4,  # of the echoes, which are computed at once for fits (scattering.cl)

@@ -20,15 +20,15 @@ _MOST_SPREAD = 3.0  # of a beam
 _NO_END = 1e3  # mm: no strong tissue ends in front
 _LEAST_UNEVEN, _MOST_UNEVEN = 0.02, 0.7  # nepers by which soft tissue takes more from one line than from another
 _SOFT_SPEED, _SOFT_REFLECTION = 0.105, 0.12  # largest contrasts of a soft border
-_LOSSY_PER_MM, _LOSSY_SPEED = 0.8, 5000.0  # nepers both ways, and m/s
+_LOSSY_PER_MM = 0.8  # nepers both ways
 _STRAIGHT_SPEED = 0.2  # and of strong tissue in which paths go straight on
 
 
 def as_beams_see(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
-    """The layout.TISSUE records with the speeds for is_soft and bends: those of bone where tissue is very lossy."""
+    """The layout.TISSUE records with the speeds for is_soft and bends: negative where tissue is very lossy."""
     seen = tissues.copy()
     decay = tissues["attenuation_db_cm_mhz"] * f32(acquisition["frequency_mhz"]) * f32(0.2) * LN10_OVER_20
-    seen["speed_of_sound_m_s"][decay > f32(_LOSSY_PER_MM)] = _LOSSY_SPEED
+    seen["speed_of_sound_m_s"][decay > f32(_LOSSY_PER_MM)] *= f32(-1)
     return seen
 
 
@@ -36,14 +36,14 @@ def is_soft(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Whether the borders between layout.TISSUE records are soft: speeds of sound and impedances are similar."""
     speeds = first["speed_of_sound_m_s"], second["speed_of_sound_m_s"]
     impedances = first["impedance_mrayl"], second["impedance_mrayl"]
-    return (np.abs(speeds[0] - speeds[1]) <= f32(0.5 * _SOFT_SPEED) * (speeds[0] + speeds[1])) & (
+    return (np.abs(speeds[0] - speeds[1]) <= f32(0.5 * _SOFT_SPEED) * np.abs(speeds[0] + speeds[1])) & (
         np.abs(impedances[0] - impedances[1]) <= f32(_SOFT_REFLECTION) * (impedances[0] + impedances[1])
     )
 
 
 def bends(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Whether paths between layout.TISSUE records do not go straight on, however soft or strong the border."""
-    speeds = first["speed_of_sound_m_s"], second["speed_of_sound_m_s"]
+    speeds = np.abs(first["speed_of_sound_m_s"]), np.abs(second["speed_of_sound_m_s"])
     return np.abs(speeds[0] - speeds[1]) > f32(0.5 * _STRAIGHT_SPEED) * (speeds[0] + speeds[1])
 
 
@@ -78,7 +78,7 @@ class Screens:
 
         The last of the eight are the nepers of the first that strong tissue takes, those that it takes right behind its
         last end after the depth before, those that soft tissue has taken from what arrives, on the mean, and the
-        distance from that end in mm.
+        distance from that end in mm, negative in strong tissue.
         Widths (screen lines, depths, 2) are those of the beam re an undisturbed one, and factors of its echoes.
         """
         fields = self.fields
@@ -99,7 +99,10 @@ class Screens:
         return found[..., :8], np.stack([found[..., 8], factors], -1)
 
     def _fans(self) -> np.ndarray:
-        """(rows, points, angles, depths, 4) sums: extra path, nepers, by strong tissue, elevational deflection."""
+        """(rows, points, angles, depths, 5) sums: extra path, nepers, by strong tissue, elevational deflection.
+
+        The last says whether the step before a depth is in strong tissue.
+        """
         fields, acquisition = self.fields, self.acquisition
         own = fields["fan_first_angle"] + fields["fan_angle_step"] * np.arange(fields["fan_angles"])
         angle = f32(self.normal[:, None] + own)
@@ -114,7 +117,7 @@ class Screens:
         aside = f32(_ROWS)[:, None, None, None] * aside
         length = f32(fields["fan_step"])
         self._start_rays(int(np.prod(shape)))
-        stored = np.zeros((fields["fan_depths"], 4, self.total.shape[1]), np.float32)
+        stored = np.zeros((fields["fan_depths"], 5, self.total.shape[1]), np.float32)
         elevation_sigma = Beam(acquisition).elevation_sigma
         for n in range(fields["fan_depths"] - 1):
             path = (f32(n) + f32(0.5)) * length
@@ -127,7 +130,8 @@ class Screens:
             turned = (self.total[0] - before) / (f32(_ROWS[2] - _ROWS[0]) * sigma)
             stored[n + 1, 3] = stored[n, 3] + length * (self.lean + f32(0.5) * turned)
             self.lean += turned
-        return np.moveaxis(stored.reshape(-1, 4, *shape), (0, 1), (-2, -1))
+            stored[n + 1, 4] = self.is_seen
+        return np.moveaxis(stored.reshape(-1, 5, *shape), (0, 1), (-2, -1))
 
     def _start_rays(self, count: int) -> None:
         """Rates per millimetre by label, and for every ray the tissue in which it is and its sums."""
@@ -147,6 +151,8 @@ class Screens:
         self.current = np.full(count, -1)  # the last soft tissue
         self.last = np.zeros(count, int)  # the tissue of the last step, and whether it was strong
         self.was_strong = np.zeros(count, bool)
+        self.leaving = np.zeros(count, bool)  # whether strong tissue was in this cell or the last ones
+        self.is_seen = np.zeros(count, bool)  # whether it is, in the last step
         self.covered = np.zeros(count)  # the largest part of a cell that was bone
         self.total = np.zeros((3, count), np.float32)
         self.lean = np.zeros(count, np.float32)
@@ -170,12 +176,17 @@ class Screens:
         self.total[:2] += length * rate
         bone = bent.astype(float)
         bone[mixed] = (self.bent[current, corners] * weights).sum(axis=-1)
-        excess = self.rates[1, nearest] - self.rates[1, self.current]
+        taken = self.rates[1, corners] - self.rates[1, current]
+        excess = np.where(soft | bent, 0.0, self.rates[1, nearest] - self.rates[1, self.current])
+        straight = ~self.soft[current, corners] & ~self.bent[current, corners]
+        excess[mixed] = (np.where(straight, taken, 0.0) * weights).sum(axis=-1)
+        excess = np.where(~soft & ~bent & (np.abs(excess) < _LEAST), _LEAST, excess)
         in_bone = np.maximum(_BENT * ramp(_EDGE_OF_BONE, 1.0, bone), _LEAST)
-        excess = np.where(bent, in_bone, np.where(np.abs(excess) < _LEAST, _LEAST, excess))
         before = np.where(self.was_strong, self.last, self.current)
-        self.total[2] += np.where(soft, 0.0, length * excess)
-        self.total[2] += np.where(~soft | self.was_strong, self.border[before, nearest], 0.0)
+        at_border = np.where(~soft | self.was_strong, self.border[before, nearest], 0.0)
+        self.total[2] += at_border + length * (excess + np.where(bent, in_bone, 0.0))
+        self.is_seen = ~soft | (at_border != 0.0) | ((excess != 0.0) & ~self.leaving) | (bone > self.covered)
+        self.leaving = ~soft | (self.leaving & (excess != 0.0))
         more = np.log((1.0 - self.covered) / np.maximum(1.0 - bone, _LEAST_OPEN))
         self.total[2] += np.where(bone > self.covered, 2.0 * more, 0.0)
         self.covered = np.maximum(self.covered, np.minimum(bone, 1.0 - _LEAST_OPEN))
@@ -198,7 +209,7 @@ class Screens:
         for next_ray, of_ray in ((0, 1.0 - place + ray), (1, place - ray)):
             on_ray = 0.0
             for next_depth, of_depth in ((0, 1.0 - far + depth), (1, far - depth)):
-                on_ray += sums[:, used, ray + next_ray, depth + next_depth] * of_depth[:, None]
+                on_ray += sums[:, used, ray + next_ray, depth + next_depth, :4] * of_depth[:, None]
             on_ray[..., 2] = np.exp(-0.5 * np.maximum(on_ray[..., 2], -4))
             result += on_ray * of_ray[:, None]
         result[..., [0, 1, 3]] *= (path / away)[:, None]
@@ -224,8 +235,8 @@ class Screens:
         place, far, _ = self._places(points, axis.origin + path * axis.direction)
         ray, aside = place.astype(int), place - place.astype(int)
         shares = np.outer([1.0 - at + int(at), at - int(at)], [1.0, 1.0]) * np.stack([1.0 - aside, aside], -1)
-        strong = sums[1, points[:, None], ray[:, None] + np.arange(2), :, 2]
-        share = (shares[..., None] * (np.diff(strong) != 0.0)).sum(axis=(0, 1))
+        strong = sums[1, points[:, None], ray[:, None] + np.arange(2), 1:, 4]
+        share = (shares[..., None] * strong).sum(axis=(0, 1))
         return share, int(far[1]), sums[1, points[0], int(place[0] + 0.5), :, 2]
 
     def _depth_outside(self, sums: np.ndarray, axis: Axis, path: float) -> float:
@@ -290,6 +301,8 @@ class Screens:
             end_shade, away = self._level(sums, axis, end, None)[3], max(path - end, 0.0)
             far = min(away * fields["cycles_per_mm"] / (8.0 * fields["receive_f_number"] ** 2), 1.0)
             shade = near + far * (shade - near)
+        if depth < path:
+            away = -max(away, 1e-3)
         delays = mean_delay - slope * mean_x, slope * path, rise
         return lost + more + shade, *delays, shade, end_shade, lost, away, width
 
@@ -341,7 +354,7 @@ class Lit:
         per_mm = per_line / self.beam.line_distance(path)
         extra = self._extra_variance(path)
         nearest = [self._between(place + row * np.sqrt(2.0) * np.sqrt(extra) * per_mm, depth) for row in _ROWS]
-        away = np.min([pair[..., 7] for left, right, _ in nearest for pair in (left, right)], axis=0)
+        away = np.min([np.abs(pair[..., 7]) for left, right, _ in nearest for pair in (left, right)], axis=0)
         cone = away / acquisition["receive_f_number"]
         sigma = np.sqrt(np.maximum(extra - cone * cone / 12.0, 0.0)) * per_mm
         behind = np.sqrt(self._extra_variance(np.maximum(path - away, 0.0))) * per_mm
@@ -360,13 +373,17 @@ class Lit:
         return self.screens[left, depth], self.screens[left + 1, depth], inside - left
 
     def _mean(self, place: np.ndarray, depth: np.ndarray, kind: int, sigma: np.ndarray) -> np.ndarray:
-        total, own = 0.0, 0.0
-        for row, weight in zip(_ROWS * np.sqrt(2.0), _WEIGHTS, strict=True):
+        left, right, between = self._between(place, depth)
+        inside = [each[..., 7] < 0.0 for each in (left, right)]
+        between = np.where(inside[0] ^ inside[1], inside[0], between)
+        lit = [np.exp(-each[..., kind]) for each in (left, right)]
+        own = lit[0] + between * (lit[1] - lit[0])
+        total = _WEIGHTS[1] * own
+        for row, weight in zip(_ROWS[::2] * np.sqrt(2.0), _WEIGHTS[::2], strict=True):
             left, right, between = self._between(place + row * sigma, depth)
-            lit = [np.exp(-each[..., kind]) for each in (left, right)]
-            blended = lit[0] + between * (lit[1] - lit[0])
-            total = total + weight * blended
-            own = blended if row == 0 else own
+            most = [np.where(each[..., 7] < 0.0, own, np.inf) for each in (left, right)]
+            lit = [np.minimum(np.exp(-each[..., kind]), limit) for each, limit in zip((left, right), most, strict=True)]
+            total = total + weight * (lit[0] + between * (lit[1] - lit[0]))
         return np.maximum(total, own)
 
 

@@ -40,7 +40,7 @@ class Labels:
         self.groups = np.pad(medium.group.ravel(), (0, 8))
         self.smooth_groups = medium.smooth_groups
         # Smoothed indicators with the variance of the Gaussians that they resemble near their centre, in their voxels
-        self.wide = SmoothGrid(medium.smooth, 8.91, 0.955, 1.0)
+        self.wide = SmoothGrid(medium.smooth, 8.91, 0.9, 1.0)
         self.widest = SmoothGrid(medium.smoother, 18.29, 0.99, 0.5)
         self.flat = FlatBorders(self.widest, self.dims)
         self.distance = None if medium.distance is None else medium.distance.ravel()

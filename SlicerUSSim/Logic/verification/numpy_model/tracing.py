@@ -30,6 +30,7 @@ from SlicerUSSim.Logic.verification.numpy_model.labels import Labels, border_nor
 _NOT_STRONG, _THROUGH, _UNDER = range(3)
 _DARKEST = 7.0  # nepers lost to strong tissue: behind it nothing is left of a beam
 _MOST_COURSES = 16
+_CURVATURE_REACH = 3.0  # voxels to either side from which the curvature of a mirror is found
 _MOST_GATHERED, _LEAST_GATHERED = 64, f32(0.4)  # lines with scatterers in common, and the least part of their power
 _MOST_BEFORE_STRONG = f32(0.35)  # nepers by which a piece of a beam in front of bone may differ from its ray
 _MOST_LOSS = 1.0  # nepers by which strong tissue may change the frequency of what has passed it
@@ -641,19 +642,18 @@ class Tracer:
 
     def _tube_reflected(self, tube, rays: Rays, point, normal, before, behind) -> np.ndarray:
         tube = tube.copy()
-        reach = f32(2) * self.voxel_mm
         towards_ray = np.minimum(dot(normal, rays.direction), f32(-0.2))
         for width, offset in ((0, rays.lateral), (2, rays.elevational)):
             along = offset - (dot(normal, offset) / towards_ray)[:, None] * rays.direction
             longer = np.maximum(length(along), f32(1e-3))
             tangent = along / longer[:, None]
-            sides = []
-            for side in (-reach, reach):
-                place = affine_point(self.to_voxel, point + side * tangent)
-                sides.append(border_normals(self.to_voxel, self.labels.borders(place, before, behind)[0]))
-            curvature = dot(sides[1] - sides[0], tangent) / (f32(2) * reach)
-            curvature = curvature * ramp(0.004, 0.008, np.abs(curvature) * self.voxel_mm)
-            tube[:, width + 1] += f32(2) * np.maximum(curvature, f32(0)) * longer * tube[:, width]
+            curvature = np.full(len(point), np.inf, np.float32)
+            for reach in f32([-_CURVATURE_REACH, _CURVATURE_REACH]) * self.voxel_mm:
+                place = affine_point(self.to_voxel, point + reach * tangent)
+                turned = border_normals(self.to_voxel, self.labels.borders(place, before, behind)[0])
+                curvature = np.minimum(curvature, dot(turned - normal, tangent) / reach)
+            curvature = np.maximum(curvature, f32(0)) * ramp(0.004, 0.008, curvature * self.voxel_mm)
+            tube[:, width + 1] += f32(2) * curvature * longer * tube[:, width]
         return tube
 
     def _write_hits(
