@@ -52,9 +52,10 @@ def search_axes(statistics_of: Callable[[np.ndarray], np.ndarray], units: np.nda
     units : (parameters,) position at which the change is measured, by differences of 0.02 to either side.
 
     >>> import numpy as np
+    >>> from SlicerUSSim.Logic.fitting.sensitivity import search_axes
     >>> axes = search_axes(lambda units: np.array([10.0 * (units[0] - units[1])]), np.array([0.5, 0.5]))
-    >>> np.round(np.sort(np.linalg.norm(axes, axis=0)), 2)  # against each other, and together
-    array([0.07, 3.  ])
+    >>> [round(float(size), 2) for size in sorted(np.linalg.norm(axes, axis=0))]  # against each other, and together
+    [0.07, 3.0]
     """
     changes = []
     for place in range(len(units)):

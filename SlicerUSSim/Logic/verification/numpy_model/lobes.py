@@ -84,7 +84,8 @@ def _sharpened(power: np.ndarray, width: float) -> np.ndarray:
     # Both ends are mirrors, in which the first and the last place are once.
     images = [place - place[:, None], place + place[:, None], 2.0 * place[-1] - place - place[:, None]]
     once = [np.ones(len(place), bool), place > 0.0, place < place[-1]]
-    blur = sum(np.exp(-0.5 * (image / width) ** 2) * counts for image, counts in zip(images, once, strict=True))
+    terms = [np.exp(-0.5 * (image / width) ** 2) * counts for image, counts in zip(images, once, strict=True)]
+    blur = np.sum(terms, axis=0)
     made = wanted
     for _ in range(3):
         made = made * wanted / (blur @ made / blur.sum(axis=1))
