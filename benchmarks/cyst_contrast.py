@@ -53,7 +53,7 @@ def contrast_db(probe: Probe, depth_mm: float, device: str | None) -> float:
 
 
 def predicted_db(probe: Probe, depth_mm: float) -> float:
-    return float(10.0 * np.log10(clutter_power(probe, depth_mm, RADIUS_MM)))
+    return float(10.0 * np.log10(clutter_power(probe, depth_mm, RADIUS_MM, within_mm=1.0)))
 
 
 def draw(path: str, device: str | None) -> None:

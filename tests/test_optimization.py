@@ -27,6 +27,7 @@ from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.optimization import _identifiability
 from SlicerUSSim.Logic.fitting.parameters import FreeParameters
 from SlicerUSSim.Logic.fitting.search import Evaluation, Search
+from SlicerUSSim.Logic.fitting.sensitivity import FIRST_STEP, patch_statistics, search_axes
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -44,7 +45,7 @@ def brain():
 
 @pytest.fixture(scope="module")
 def twin(brain):
-    return make_twin(*brain, 4, probe=SMALL)
+    return make_twin(*brain, 3, probe=SMALL)
 
 
 def optimise(twin, free, **options):
@@ -126,6 +127,18 @@ def test_it_says_what_cannot_be_known(result):
     assert json.loads(json.dumps(result.to_dict()))["identifiability"]["cost_tolerance"] > 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+def test_restarts_reach_the_fit_and_its_interval_holds_the_truth(brain, seed):
+    """Along the parameters restarts stopped in the valley of TGC and attenuation: 8 of 25 reached the fit's cost."""
+    twin = make_twin(*brain, seed, probe=SMALL)
+    result = optimise(twin, ["display", "white matter"], max_evaluations=600, restarts=2)
+    assert result.identifiability.restarts_as_good > 0
+    fall = result.identifiability["net attenuation in white matter"]
+    true = white(twin.true_tissues).attenuation_db_cm_mhz - twin.true_display.tgc_db_cm_mhz
+    assert fall.is_determined and fall.low - 0.1 <= 2 * SMALL.frequency_mhz * true <= fall.high + 0.1
+
+
 def test_equally_good_is_what_another_draw_of_the_speckle_could_make_of_the_best(result):
     """The tolerance, how many solutions lie within it, and that no other widens a spread."""
     found = result.identifiability
@@ -172,7 +185,9 @@ def test_a_restart_is_compared_with_the_best_fit_of_its_own_scatterers(offset):
     search = Search(cost, lambda units: {}, 100)
     search.evaluate("polish", best)
     model = SimpleNamespace(anchor=lambda tissues: None, probe=SMALL)
-    problem = SimpleNamespace(parameters=parameters, tissues=tissues, display=display, model=model)
+    problem = SimpleNamespace(
+        parameters=parameters, tissues=tissues, display=display, model=model, axes=lambda units: np.eye(1)
+    )
     found = _identifiability(problem, search, simulator, best, restarts=1, budget=40, algorithm="LN_SBPLX")
     assert found.cost_tolerance == pytest.approx(0.2)
     assert (found.restarts, found.restarts_as_good) == (1, 1)
@@ -378,6 +393,60 @@ def test_search_finds_the_lowest_point_and_keeps_its_history(algorithm):
     assert np.abs(best - goal).max() < 0.05
     assert search.computed == len(search.history) <= 400
     assert search.best_cost("here") == min(entry.cost for entry in search.history)
+
+
+def narrow_valley(units):
+    """Two parameters that only differ in their effect together, and a third; rough as an image's grey levels are."""
+    together, apart, third = units[0] + units[1] - 1.2, 30.0 * (units[0] - units[1]), units[2] - 0.9
+    return float(np.sqrt(0.01 + apart**2 + together**2 + third**2)) + 1e-3 * float(np.sin(400.0 * units).sum())
+
+
+def changes(units):
+    return np.array([units[0] + units[1], 30.0 * (units[0] - units[1]), units[2]])
+
+
+@pytest.mark.parametrize("start", [(0.1, 0.2, 0.3), (0.9, 0.1, 0.2), (0.95, 0.9, 0.1)])
+def test_along_the_axes_of_its_changes_a_search_reaches_the_bottom_of_a_narrow_valley(start):
+    start, lowest = np.array(start), narrow_valley(np.array([0.6, 0.6, 0.9]))
+    axes = search_axes(changes, start)
+    plain, along = Search(narrow_valley, lambda units: {}, 80), Search(narrow_valley, lambda units: {}, 80)
+    plain.minimise("LN_BOBYQA", "here", start, 80)
+    best = along.minimise("LN_BOBYQA", "here", start, 80, FIRST_STEP, axes)
+    assert along.best_cost("here") < lowest + 0.01 < plain.best_cost("here")
+    assert best == pytest.approx([0.6, 0.6, 0.9], abs=0.05)
+
+
+def test_along_axes_a_search_keeps_within_bounds_and_finds_a_best_point_there():
+    def cost(units):
+        return float((units[0] + 0.1) ** 2 + (units[1] - 0.4) ** 2)
+
+    search = Search(cost, lambda units: {}, 100)
+    turned = np.array([[0.8, -0.6], [0.6, 0.8]])
+    best = search.minimise("LN_BOBYQA", "here", np.array([0.7, 0.9]), 100, 0.1, turned)
+    assert best == pytest.approx([0.0, 0.4], abs=0.02)
+    assert all(0.0 <= value <= 1.0 for entry in search.history for value in entry.units)
+
+
+def test_axes_are_the_directions_that_change_images_in_steps_that_change_them_equally():
+    def of(units):
+        return np.array([[4.0 * (units[0] - units[1]), 2.0 * (units[0] + units[1])], [0.0, 0.0]])
+
+    axes = search_axes(of, np.array([0.5, 0.99, 0.3]))  # the third has no effect, the second is near its bound
+    for axis in axes.T[1:]:
+        assert np.sqrt((of(axis) ** 2).mean()) == pytest.approx(1.0, rel=0.06)
+    assert np.abs(axes[:, 0]) == pytest.approx([0.0, 0.0, 3.0], abs=1e-9)
+
+
+def test_patches_have_means_and_standard_deviations_of_the_pixels_inside():
+    image = np.random.default_rng(0).integers(0, 256, (20, 25)).astype(np.uint8)
+    inside = np.ones(image.shape, bool)
+    inside[:, 20:] = False
+    inside[0, 0] = False
+    mean, deviation = patch_statistics(image, inside, (10, 10))
+    first = image[:10, :10].ravel()[1:] / 255
+    assert (mean[0], deviation[0]) == pytest.approx((first.mean(), first.std()))
+    last = image[10:, 10:20] / 255
+    assert mean.shape == (4,) and (mean[3], deviation[3]) == pytest.approx((last.mean(), last.std()))
 
 
 def test_each_algorithm_is_the_one_named_but_for_a_single_parameter():

@@ -128,7 +128,7 @@ def test_poses_that_fit_exactly_are_returned_although_the_coarse_search_leaves_t
     pose = rotation @ rigid_from([0, -12, 0, 0, 0, 0])
     reference = seen.simulate(SMALL, pose, display, grid).image
     found = register_poses(
-        seen, SMALL, [pose], [reference], display=display, grid=grid, range_mm=1, range_deg=1, max_evaluations=12
+        seen, SMALL, [pose], [reference], display=display, grid=grid, range_mm=1.5, range_deg=1.5, max_evaluations=12
     )
     fine = [entry for entry in found.history if entry.stage == "fine"]
     assert fine and min(entry.cost for entry in fine) > 0.0

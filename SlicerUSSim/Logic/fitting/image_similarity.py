@@ -132,7 +132,9 @@ class PatchComparison:
         self.patches = tuple(-(-size // step) for size, step in zip(self.shape, self.patch, strict=True))
         self.kernel = device.kernels("similarity.cl")["compare_patches"]
         self._reference = device.upload(reference)
-        self._inside = device.upload(_as_mask(mask, reference.shape).astype(np.uint8))
+        #: (rows, columns) bool, the pixels that are compared
+        self.inside = _as_mask(mask, reference.shape)
+        self._inside = device.upload(self.inside.astype(np.uint8))
         self._workspace = Workspace(device)
 
     def run(self, image) -> None:

@@ -37,6 +37,7 @@ from SlicerUSSim.Logic.fitting.search import (
     Search,
     history_from,
 )
+from SlicerUSSim.Logic.fitting.sensitivity import FIRST_STEP, patch_statistics, search_axes
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.targets import mean_cost, target_comparisons
 from SlicerUSSim.Logic.imaging.medium import as_labels
@@ -147,6 +148,22 @@ class AppearanceCost:
         """The mean cost at (parameters,) positions, 0 to 1 between the bounds."""
         tissues, display = self.parameters.apply(units, self.tissues, self.display)
         return mean_cost(self.of_each(tissues, display))
+
+    def axes(self, units: np.ndarray) -> np.ndarray:
+        """(parameters, parameters) axes of a local search from a position (sensitivity.py)."""
+
+        def statistics(at: np.ndarray) -> np.ndarray:
+            tissues, display = self.parameters.apply(at, self.tissues, self.display)
+            images = (self.model.image(number, tissues, display) for number in range(len(self.comparisons)))
+            return np.concatenate(
+                [
+                    patch_statistics(image, comparison.inside, comparison.patch)
+                    for image, comparison in zip(images, self.comparisons, strict=True)
+                ],
+                axis=1,
+            )
+
+        return search_axes(statistics, units)
 
 
 def optimize_appearance(
@@ -271,10 +288,17 @@ def _searched(
     best = start
     if global_name is not None:
         best = search.minimise(global_name, STAGES[0], best, int(_SHARES[0] * evaluations))
-    best = search.minimise(local_name, STAGES[1], best, int(_SHARES[1] * evaluations))
+    best = _descended(search, cost, local_name, STAGES[1], best, int(_SHARES[1] * evaluations))
     # With the anchor here, the model is exact again.
     cost.model.anchor(cost.parameters.apply(best, cost.tissues, cost.display)[0])
-    return search.minimise(local_name, STAGES[2], best, evaluations - len(search.history))
+    return _descended(search, cost, local_name, STAGES[2], best, evaluations - len(search.history))
+
+
+def _descended(
+    search: Search, cost: AppearanceCost, algorithm: str, stage: str, start: np.ndarray, budget: int
+) -> np.ndarray:
+    """The best positions of a local search, along the axes at its start."""
+    return search.minimise(algorithm, stage, start, budget, FIRST_STEP, cost.axes(start))
 
 
 def _identifiability(
@@ -293,6 +317,7 @@ def _identifiability(
     met = [entry for entry in search.history if entry.stage in STAGES[1:]]
     settings = simulator.settings
     costs_of_best, found = [best_cost], []
+    axes = cost.axes(best) if restarts else None
     try:
         for number in range(1, restarts + 1):
             simulator.settings = replace(settings, seed=(settings.seed + 7919 * number) % 2**32)
@@ -300,7 +325,7 @@ def _identifiability(
             stage = f"restart {number}"
             start = np.clip(best + random.normal(0.0, _RESTART_SPREAD, len(best)), 0.0, 1.0)
             costs_of_best.append(search.evaluate(f"redraw {number}", best))
-            units = search.minimise(algorithm, stage, start, budget)
+            units = search.minimise(algorithm, stage, start, budget, FIRST_STEP, axes)
             found.append((units, search.best_cost(stage) - costs_of_best[-1]))
     finally:
         simulator.settings = settings

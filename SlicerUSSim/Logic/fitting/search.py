@@ -16,6 +16,8 @@ GLOBAL_ALGORITHM, LOCAL_ALGORITHM = "G_MLSL_LDS", "LN_BOBYQA"
 _ALGORITHM_FOR_ONE = "LN_SBPLX"
 #: Tolerance of the best position and first step of local searches, with bounds scaled to 0 and 1.
 _TOLERANCE, _FIRST_STEP = 1e-3, 0.1
+#: The same along the axes of the images' changes, in fractions of the grey scale: 0.1 of 255 levels.
+_TOLERANCE_ALONG_AXES = 5e-4
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,23 @@ class Search:
         self._best: Evaluation | None = None
 
     def minimise(
-        self, algorithm: str, stage: str, start: np.ndarray, budget: int, step: float = _FIRST_STEP
+        self,
+        algorithm: str,
+        stage: str,
+        start: np.ndarray,
+        budget: int,
+        step: float = _FIRST_STEP,
+        axes: np.ndarray | None = None,
     ) -> np.ndarray:
         """The best position, (parameters,) from 0 to 1, of at most `budget` evaluations that begin at `start`.
+
+        Parameters
+        ----------
+        algorithm, stage : nlopt's name, and that of the entries in the history.
+        step : first step of local searches, of positions or along the axes.
+        axes : (parameters, parameters), columns by which positions change per unit of the search's coordinates (see
+            sensitivity.py); default: the parameters themselves. Coordinates have no bounds: beyond those of the
+            parameters the cost is that at the bound, and rises with the distance.
 
         Raises SimulationError for an algorithm that nlopt does not have or that cannot be used here.
         """
@@ -89,18 +105,25 @@ class Search:
         first = len(self.history)
         failure: list[BaseException] = []
 
-        def evaluate(units: np.ndarray, _gradient) -> float:
+        start = np.clip(start, 0.0, 1.0)
+        coordinates = None if axes is None else np.linalg.inv(axes)
+
+        def evaluate(place: np.ndarray, _gradient) -> float:
             if len(self.history) - first >= budget:  # some algorithms exceed the limit by a few
                 itself.force_stop()
                 return float("inf")
+            units = place if axes is None else start + axes @ place
             try:
-                return self.evaluate(stage, units)
+                cost = self.evaluate(stage, units)
+                if coordinates is not None:
+                    cost += float(np.linalg.norm(coordinates @ (units - np.clip(units, 0.0, 1.0))))
+                return cost
             except BaseException as error:  # nlopt's C++ would lose the type of the exception
                 failure.append(error)
                 itself.force_stop()
                 return float("inf")
 
-        search = self._optimiser(algorithm, len(start), step)
+        search = self._optimiser(algorithm, len(start), step, axes is None)
         itself = weakref.proxy(search)  # nlopt refers to `evaluate` invisibly to Python's garbage collector
         self.evaluate(stage, start)
         if budget > 1:
@@ -108,7 +131,7 @@ class Search:
             search.set_min_objective(evaluate)
             search.set_maxeval(budget - 1)
             try:
-                search.optimize(np.clip(start, 0.0, 1.0))
+                search.optimize(start if axes is None else np.zeros(len(start)))
             except (nlopt.ForcedStop, nlopt.RoundoffLimited):
                 pass
             except (RuntimeError, ValueError) as error:
@@ -156,7 +179,7 @@ class Search:
         known = self.history + self.replayed[len(self.history) :]
         return [[entry.stage, list(entry.units), entry.cost] for entry in known]
 
-    def _optimiser(self, algorithm: str, parameters: int, step: float):
+    def _optimiser(self, algorithm: str, parameters: int, step: float, bounded: bool):
         import nlopt
 
         def made(name: str, tolerance: float):
@@ -167,13 +190,14 @@ class Search:
             except (AttributeError, TypeError, ValueError):
                 known = f"{GLOBAL_ALGORITHM} or {LOCAL_ALGORITHM}"
                 raise SimulationError(f"nlopt has no algorithm {name!r}, expected a name such as {known}") from None
-            optimiser.set_lower_bounds(np.zeros(parameters))
-            optimiser.set_upper_bounds(np.ones(parameters))
+            if bounded:
+                optimiser.set_lower_bounds(np.zeros(parameters))
+                optimiser.set_upper_bounds(np.ones(parameters))
             optimiser.set_xtol_abs(tolerance)
             optimiser.set_initial_step(step)
             return optimiser
 
-        search = made(algorithm, _TOLERANCE)
+        search = made(algorithm, _TOLERANCE if bounded else _TOLERANCE_ALONG_AXES)
         if "MLSL" in algorithm or "AUGLAG" in algorithm:
             search.set_local_optimizer(made(LOCAL_ALGORITHM, 10.0 * _TOLERANCE))
         return search

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import fft
+from scipy.ndimage import gaussian_filter1d
 from scipy.special import erfc
 
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
@@ -23,6 +24,12 @@ if TYPE_CHECKING:
 _DEPTHS, _DISTANCES, _STEP = (CONSTANTS[f"LOBE_{name}"] for name in ("DEPTHS", "DISTANCES", "STEP"))
 _POINTS, _PADDED = 512, 4096  # of an aperture, and of its Fourier transform
 _BEYOND_SIGMAS = 2.0  # what is closer to the axis belongs to the main beam
+#: Variance by which side_lobes.cl widens lobes: of a node's lines and of the interpolation between nodes, in squared
+#: distances of nodes (1/12 + 0.105), and of the table's mean over one lobe and its interpolation (1/12 + 0.75^2 / 12),
+#: in squared wavelengths x f-number
+_NODE_VARIANCE, _TABLE_VARIANCE = 0.188, 0.130
+#: Steps of the deconvolution, its samples per distance of the table, and what it takes for no power
+_SHARPENED, _FINER, _LEAST_POWER = 3, 8, 1e-9
 #: Elevational lobes are computed up to the larger of these: in wavelengths x f-number, and in wavelengths
 _REACH_LOBES, _REACH_WAVELENGTHS = 5.0, 26.0
 
@@ -79,6 +86,36 @@ def lobes_of(probe: Probe) -> Lobes:
         for tail, step in zip(_tails(x, (sent * received) ** 2, sigma[1]), reach / (_DISTANCES - 1), strict=True)
     ]
     return Lobes(*(np.array(values, np.float32) for values in (np.sqrt(lateral), np.sqrt(elevational), reach)))
+
+
+@lru_cache(maxsize=16)
+def lateral_weights(probe: Probe) -> np.ndarray:
+    """(depths, distances) float32, the lateral lobes as kernels/side_lobes.cl takes them.
+
+    The kernel makes lobes wider: it applies them to lines, which have the main beam, averages these to nodes, and
+    interpolates between nodes and between the table's distances. Where the beam is out of focus and lobes fall by 8 dB
+    per millimetre, that adds 1 to 2 dB. So weights are such that lobes have the power of the pattern after it.
+    """
+    depth = probe.displayed_mm * np.maximum(np.arange(_DEPTHS), 0.5) / (_DEPTHS - 1)
+    unit = probe.wavelength_mm * np.maximum(probe.receive_f_number, depth / probe.aperture_mm)
+    apart = np.maximum(probe.line_distance_mm(depth) / unit, 1e-6)
+    dense = -(-probe.scan_lines // CONSTANTS["LOBE_NODES"])
+    node = apart * np.clip((1.0 / apart).astype(int), dense, probe.scan_lines)
+    variance = 0.5 * (probe.beam_sigma_mm(depth)[0] / unit) ** 2 + _NODE_VARIANCE * node**2 + _TABLE_VARIANCE
+    column = np.arange(_DISTANCES)
+    place = column / (_DISTANCES - 1)
+    clutter = 0.5 * probe.clutter_power / (_STEP * (_DISTANCES - 1)) * (1.0 + np.cos(np.pi * place))
+    power = np.maximum(lobes_of(probe).lateral.astype(float) ** 2 - clutter, 0.0)
+    fine = np.arange(_FINER * (_DISTANCES - 1) + 1) / _FINER
+    rows = []
+    for row, width in zip(power, np.sqrt(variance), strict=True):
+        peak = int(row.argmax())  # nearer the axis is the main beam, which hides lobes
+        wanted = np.exp(np.interp(np.maximum(fine, peak), column, np.log(row + _LEAST_POWER)))
+        made = wanted
+        for _ in range(_SHARPENED):
+            made = made * wanted / gaussian_filter1d(made, width * _FINER / _STEP, mode="mirror")
+        rows.append(np.where(column > peak, np.maximum(made[::_FINER] - _LEAST_POWER, 0.0), row))
+    return np.sqrt(np.array(rows) + clutter).astype(np.float32)
 
 
 def _transmitted(probe: Probe, depth: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.imaging.diffraction import lobes_of
+from SlicerUSSim.Logic.imaging.diffraction import lateral_weights
 from SlicerUSSim.Logic.imaging.noise import stirred
 from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
@@ -51,7 +51,7 @@ class SideLobes(Stage):
             self.kernel,
             (frame.line_shape[1] // self.device.lanes,),
             frame.acquisition_buffer,
-            self.tables.get(probe, lobes_of(probe).lateral),
+            self.tables.get(probe, lateral_weights(probe)),
             frame.roots,
             frame.scanned.re,
             frame.scanned.im,

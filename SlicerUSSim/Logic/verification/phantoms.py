@@ -411,8 +411,10 @@ def round_cyst(rotation: np.ndarray | None = None, *, depth_mm: float = 40.0, ra
     return _phantom("round cyst", label, TissueTable({0: plain, 1: plain, 2: cyst}), rotation, 0.5, lambda probe: ())
 
 
-def clutter_power(probe: Probe, depth_mm: float, radius_mm: float) -> float:
+def clutter_power(probe: Probe, depth_mm: float, radius_mm: float, within_mm: float = 0.0) -> float:
     """Power received from outside a disc across the beam at a depth, re that of everything; without attenuation.
+
+    It is that of lines through the centre of the disc, or the mean of those within `within_mm` of it laterally.
 
     By diffraction (Goodman, Introduction to Fourier Optics, section 3.4): the sum of the waves of 512 points of each
     aperture, by their exact distances. The transmit aperture and the elements are focused once, the receive aperture at
@@ -427,8 +429,9 @@ def clutter_power(probe: Probe, depth_mm: float, radius_mm: float) -> float:
     lateral *= _pressure(probe, receive, depth_mm, across, depth_mm, probe.receive_apodization)
     lens = probe.elevation_aperture_mm, probe.elevation_focus_mm, across, depth_mm
     elevational = _pressure(pulse, *lens) ** order * _pressure(probe, *lens)
-    reach = np.sqrt(np.maximum(radius_mm**2 - across**2, 0.0))
-    seen = np.interp(reach, across, np.cumsum(elevational**2) - 0.5 * elevational**2)
+    aside = np.linspace(-within_mm, within_mm, 41)[:, None] + across
+    reach = np.sqrt(np.maximum(radius_mm**2 - aside**2, 0.0))
+    seen = np.interp(reach, across, np.cumsum(elevational**2) - 0.5 * elevational**2).mean(axis=0)
     beyond = 1.0 - float((lateral**2 * seen).sum() / ((lateral**2).sum() * (elevational**2).sum()))
     clutter = 0.0 if probe.clutter_db is None else 10.0 ** (probe.clutter_db / 10.0)
     part = min(radius_mm / (48.0 * unit), 1.0)
