@@ -193,6 +193,39 @@ def test_a_restart_is_compared_with_the_best_fit_of_its_own_scatterers(offset):
     assert (found.restarts, found.restarts_as_good) == (1, 1)
 
 
+def curved_valley(units):
+    """(2,) what changes along a valley and across it; its direction at the ends is not that at the bottom."""
+    return np.array([units[0] - 0.5, 25.0 * (units[1] - 0.5 - 2.0 * (units[0] - 0.5) ** 2)])
+
+
+def restarted_in_a_curved_valley(budget):
+    """Restarts as good of four, and the numbers of evaluations of each."""
+    display, tissues = DisplaySettings(), TissueTable.named(["liver"])
+    parameters = FreeParameters.of({"gain_db": (-12, 12), "dynamic_range_db": (40, 80)}, tissues, display)
+    best = np.array([0.5, 0.5])
+    search = Search(lambda units: 1.0 + float(np.linalg.norm(curved_valley(units))), lambda units: {}, 1000)
+    search.evaluate("polish", best)
+    problem = SimpleNamespace(
+        parameters=parameters, tissues=tissues, display=display,
+        model=SimpleNamespace(anchor=lambda tissues: None, probe=SMALL),
+        axes=lambda units: search_axes(curved_valley, units),
+    )  # fmt: skip
+    simulator = SimpleNamespace(settings=SimulationSettings())
+    found = _identifiability(problem, search, simulator, best, restarts=4, budget=budget, algorithm="LN_BOBYQA")
+    stages = [[entry for entry in search.history if entry.stage == f"restart {n}"] for n in range(1, 5)]
+    return found.restarts_as_good, stages
+
+
+def test_a_restart_that_stopped_above_the_fit_goes_on_along_the_axes_where_it_stopped():
+    as_good, stages = restarted_in_a_curved_valley(300)
+    assert as_good == 4
+    assert all(len(stage) <= 300 for stage in stages)
+    # What is as good already is not searched again.
+    assert min(len(stage) for stage in stages) < 0.5 * max(len(stage) for stage in stages)
+    as_good, stages = restarted_in_a_curved_valley(12)
+    assert as_good < 4 and all(len(stage) <= 12 for stage in stages)
+
+
 def test_the_last_search_sees_what_whole_simulations_show(twin):
     """Far from the presets the cost is approximate until it is recomputed at the best result of the previous search."""
     from SlicerUSSim.Logic import similarity

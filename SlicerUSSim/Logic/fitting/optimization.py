@@ -52,8 +52,12 @@ _log = logging.getLogger(__name__)
 STAGES = ("global", "local", "polish")
 #: Fractions of the evaluations for the first two; the rest is for the search after the anchor has changed.
 _SHARES = (0.6, 0.25)
+#: The largest number of evaluations of a restart, as a fraction of the fit's. Most need half of it or less.
+_RESTART_SHARE = 0.4
 #: Standard deviation of the starting points of restarts around the best, with bounds scaled to 0 and 1.
 _RESTART_SPREAD = 0.15
+#: Costs that differ by less than this fraction are considered equal, even if other speckle changes them by less.
+_LEAST_TOLERANCE = 0.01
 #: Number of sampled solutions with equal variance of the scatterers, expected to fit equally well.
 _DRAWS = 12
 
@@ -235,7 +239,7 @@ def optimize_appearance(
     model = AppearanceModel(simulator, probe, poses, parameters.varied(), grid)
     cost = AppearanceCost(model, parameters, references, masks, tissues, display, settings)
     problem = _problem(cost, references, masks, settings, algorithms, seed)
-    limit = max_evaluations + restarts * (int(_SHARES[1] * max_evaluations) + 1) + _DRAWS
+    limit = max_evaluations + restarts * (int(_RESTART_SHARE * max_evaluations) + 1) + _DRAWS
 
     def describe(units: np.ndarray) -> dict[str, float]:
         return dict(zip(parameters.names, parameters.values(units).tolist(), strict=True))
@@ -256,7 +260,7 @@ def optimize_appearance(
         model.anchor(fitted_tissues)
         after = cost.of_each(fitted_tissues, fitted_display)
         identifiability = _identifiability(
-            cost, search, simulator, best, restarts, int(_SHARES[1] * max_evaluations), algorithms[1]
+            cost, search, simulator, best, restarts, int(_RESTART_SHARE * max_evaluations), algorithms[1]
         )
     finally:
         state = {"problem": problem, "history": search.state()}
@@ -301,6 +305,31 @@ def _descended(
     return search.minimise(algorithm, stage, start, budget, FIRST_STEP, cost.axes(start))
 
 
+def _descended_again(
+    search: Search,
+    cost: AppearanceCost,
+    algorithm: str,
+    stage: str,
+    start: np.ndarray,
+    axes: np.ndarray | None,
+    budget: int,
+    enough: float,
+) -> np.ndarray:
+    """The best positions of local searches, the first along `axes`, each of the others along those where one ended.
+
+    Far from the best fit a valley's direction is not the one at the bottom, so that steps along the axes of the start
+    soon gain nothing. Another search follows while the cost is above `enough`, the last one gained, and evaluations are
+    left for more than the quadratic model with which BOBYQA begins.
+    """
+    end = len(search.history) + budget
+    best = search.minimise(algorithm, stage, start, budget, FIRST_STEP, axes)
+    reached, gain = search.best_cost(stage), np.inf
+    while reached > enough and gain > _LEAST_TOLERANCE * reached and end - len(search.history) > 2 * len(start) + 1:
+        best = _descended(search, cost, algorithm, stage, best, end - len(search.history))
+        gain, reached = reached - search.best_cost(stage), search.best_cost(stage)
+    return best
+
+
 def _identifiability(
     cost: AppearanceCost,
     search: Search,
@@ -325,12 +354,13 @@ def _identifiability(
             stage = f"restart {number}"
             start = np.clip(best + random.normal(0.0, _RESTART_SPREAD, len(best)), 0.0, 1.0)
             costs_of_best.append(search.evaluate(f"redraw {number}", best))
-            units = search.minimise(algorithm, stage, start, budget, FIRST_STEP, axes)
+            enough = costs_of_best[-1] + _LEAST_TOLERANCE * best_cost
+            units = _descended_again(search, cost, algorithm, stage, start, axes, budget, enough)
             found.append((units, search.best_cost(stage) - costs_of_best[-1]))
     finally:
         simulator.settings = settings
     # The change of the cost between realisations of the speckle: a smaller difference of two fits is not significant.
-    tolerance = max(float(np.std(costs_of_best)), 0.01 * best_cost)
+    tolerance = max(float(np.std(costs_of_best)), _LEAST_TOLERANCE * best_cost)
     cost.model.anchor(parameters.apply(best, cost.tissues, cost.display)[0])
     for units in equal_variance_draws(parameters, best, cost.tissues, cost.display, random, _DRAWS):
         search.evaluate("draw", units)
