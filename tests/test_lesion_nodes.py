@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import node_labels, read_labels, write_l
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
+from SlicerUSSim.Logic.tissue.label_advice import PAGE  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 from tests.conftest import rigid  # noqa: E402
 from tests.test_pathology import ball, empty, moved  # noqa: E402
@@ -170,6 +171,26 @@ def test_a_brats_map_is_three_segments_each_within_the_one_before():
     assert [segmentation.GetSegment(name).GetName() for name in ids] == ["oedema", "necrosis", "enhancing"]
     bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
     assert {"oedema", "necrosis", "enhancing"} <= {note.split(":")[0] for note in bench.logic.notes}
+
+
+def test_what_is_to_be_checked_about_a_file_of_lesions_is_told_with_them_every_time():
+    """Of a BraTS map that was added as one tissue, in the words of the page, and not only when it was opened."""
+    bench = Scene()
+    r = np.sqrt(((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0))
+    values = np.select([r < 4, r < 6, r < 9], [1, 3, 2], 0).astype(np.uint8)
+    whole = Volume(values, rigid(np.eye(3), PLACE - 9.5), doubts=("brats3.nii.gz: 7 voxels are NaN",))
+    add_lesion(bench.lesions, whole, "tumour", "brats3.nii.gz", PAGE)
+    bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
+    told = (
+        "brats3.nii.gz holds the labels 1, 2, 3; all of them are added as tumour ('labels by their names, or a BraTS "
+        "map' adds the tissues of a BraTS map)",
+        "brats3.nii.gz: 7 voxels are NaN",
+    )
+    assert set(told) <= set(bench.logic.warnings)
+    bench.logic.addTissues(bench.labels, bench.lesions)
+    assert set(told) <= set(bench.logic.warnings)
+    with pytest.raises(SimulationError, match=r"what it is: 'tumour', or 'necrosis' if it is BraTS's label 1$"):
+        add_lesion(bench.lesions, whole.with_array((values == 1).astype(np.uint8)), "brats", "core", PAGE)
 
 
 # ---- labels that stay as they are ------------------------------------------------------------------------------------

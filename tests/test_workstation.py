@@ -837,6 +837,29 @@ def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_say
     assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
 
+def test_masks_whose_files_are_doubtful_are_added_with_what_to_check_in_the_notes(page, tmp_path):
+    distance = np.sqrt(((np.indices((40, 40, 40)) - 19.5) ** 2).sum(axis=0))
+    place = np.eye(4)
+    place[:3, 3] = [-30 - 19.5, 10 - 19.5, 40 - 19.5]
+    brats = Volume(np.select([distance < 5, distance < 8, distance < 12], [1, 3, 2], 0).astype(np.uint8), place)
+    brats.write(tmp_path / "brats3.nii.gz")
+    partial = (distance < 6).astype(np.float32)
+    partial[:, :, :3] = np.nan
+    Volume(partial, place).write(tmp_path / "partial.nii.gz")
+    page.select_option("#added-as", "tumour")
+    for name, line in (
+        ("brats3", "Check: brats3.nii.gz holds the labels 1, 2, 3; all of them are added as tumour ('labels by their "
+         "names, or a BraTS map' adds the tissues of a BraTS map)"),
+        ("partial", "Check: partial.nii.gz: 4800 of 64000 voxels, at the border of the volume, are NaN: they are read "
+         "as 0"),
+    ):  # fmt: skip
+        with new_image(page):
+            page.set_input_files("#add-file", tmp_path / f"{name}.nii.gz")
+        settled(page)
+        assert line in page.locator("#notesLabel").inner_text() and not errors(page)
+    assert "Check: brats3.nii.gz holds" in page.locator("#notesLabel").inner_text()  # its lesion is still there
+
+
 def test_latency_is_measured_on_request(page):
     begun = monotonic()
     click(page, "#show-latency")

@@ -130,7 +130,9 @@ class Opener:
                 mine = mine.with_tissue(tissue)
             self._logic.preset = replace(self._logic.preset, tissues=mine)
         found = replace(
-            found, message=self._as_known(found.message), warnings=tuple(map(self._as_known, found.warnings))
+            found,
+            message=self._as_known(found.message),
+            warnings=tuple(map(self._as_known, (*found.warnings, *volume.doubts))),
         )
         node = self._label_map(found.labels, path, found.names)
         node.SetAttribute(PATIENT, node.GetName())
@@ -161,7 +163,8 @@ class Opener:
                 self._scene.RemoveNode(node)
 
         try:
-            ids = add_lesion(node, mask, tissue, name)
+            told = replace(mask, doubts=tuple(map(self._as_known, mask.doubts)))
+            ids = add_lesion(node, told, tissue, name, PAGE)
         except SimulationError:
             undo()
             raise

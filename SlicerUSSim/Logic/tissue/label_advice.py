@@ -6,6 +6,9 @@ import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+#: What the page calls the masks of several tissues
+PAGE_SEVERAL = "labels by their names, or a BraTS map"
+
 
 @dataclass(frozen=True)
 class Advice:
@@ -30,6 +33,9 @@ class Advice:
     likely: str = "if that is right, say so with {maps}"
     #: About voxels without a label between organs
     between: str = "--map 0=fat gives it a tissue"
+    #: A mask that is added as {tissue}, and one of several tissues
+    one_tissue: str = "{tissue}=FILE"
+    several_tissues: str = "brats=FILE"
     #: Whether the volumes of unknown labels are listed
     gives_sizes: bool = True
     #: Whether {maps} are in Python, and not options of the command
@@ -65,6 +71,8 @@ PAGE = replace(
     background="start ussim serve --labels with --map {label}=0, or with --map {label}=TISSUE",
     ambiguous="start ussim serve --labels with --map {key}",
     likely="if that is right, start ussim serve --labels with {maps}",
+    one_tissue="{tissue!r}",
+    several_tissues=repr(PAGE_SEVERAL),
 )
 #: 3D Slicer
 SCENE = Advice(
@@ -89,5 +97,7 @@ SCRIPT = replace(
     ambiguous="read it with read_label_map and a LabelMapping of {key!r}",
     likely="if that is right, read it with read_label_map(volume, {maps})",
     between="read_label_map with a LabelMapping of 0=fat gives it a tissue",
+    one_tissue="AddTissueData({tissue!r}, mask)",
+    several_tissues="AddTissueData('brats', mask)",
     is_python=True,
 )
