@@ -139,8 +139,8 @@ def _drawer(sections: tuple[Section, ...]) -> None:
 
 def _open_file() -> None:
     v3.VFileInput(
-        label="Open an MRI, label map or tracked sequence", v_model=(NAMES.opened_file, None), density="compact",
-        hide_details=True, variant="outlined", id="open-file", classes="mb-1",
+        label="Open an MRI, label map (with its table) or tracked sequence", v_model=(NAMES.opened_file, None),
+        multiple=True, density="compact", hide_details=True, variant="outlined", id="open-file", classes="mb-1",
     )  # fmt: skip
     options = "".join(f'<option value="{name}">{_LESION_TEXTS.get(name, name)}</option>' for name in LESIONS)
     html.Div(

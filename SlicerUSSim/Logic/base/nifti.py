@@ -138,7 +138,8 @@ def check_numbers(path: Path, image) -> tuple[str, ...]:
     """Look for voxels of a NIfTI file that are not numbers: ITK reads them as 0 without a word.
 
     NaN that reaches the border of the volume is how SPM and others write "outside the head": it is read as 0, with a
-    warning, which is returned, too. Raises SimulationError for NaN within, for slices of NaN between others, and for infinite voxels.
+    warning, which is returned, too. Raises SimulationError for NaN within, for slices of NaN between others, and for
+    infinite voxels.
     """
     if not (image.HasMetaDataKey("sform_code") and "float" in image.GetPixelIDTypeAsString()):
         return ()

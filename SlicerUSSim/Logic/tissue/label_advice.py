@@ -36,6 +36,8 @@ class Advice:
     #: A mask that is added as {tissue}, and one of several tissues
     one_tissue: str = "{tissue}=FILE"
     several_tissues: str = "brats=FILE"
+    #: By what a user gives labels tissues
+    mapping: str = "--map"
     #: Whether the volumes of unknown labels are listed
     gives_sizes: bool = True
     #: Whether {maps} are in Python, and not options of the command
@@ -62,15 +64,24 @@ MRI_COMMAND = replace(
 PAGE = replace(
     COMMAND,
     leave_out="",
-    unknown="name them in a table beside it (.txt), or start ussim serve --labels with --map {label}=TISSUE, one of",
+    unknown=(
+        "open it together with a table of its names (.txt, .ctbl), the tissue table of ussim segment (.json), or a "
+        '.json file with {{"{label}": "TISSUE"}} (0 removes a label), one of'
+    ),
     lesion="add it to a segmentation, or start ussim serve --labels {source} {maps}",
     brain_mask=(
         "if it is the mask of a brain, start ussim serve MRI --mask {source} with that brain's MRI, or ussim serve "
         "--labels {source} {maps}"
     ),
-    background="start ussim serve --labels with --map {label}=0, or with --map {label}=TISSUE",
+    background=(
+        'open it together with a .json file with {{"{label}": 0}} that leaves it out, or {{"{label}": "TISSUE"}}'
+    ),
     ambiguous="start ussim serve --labels with --map {key}",
-    likely="if that is right, start ussim serve --labels with {maps}",
+    likely=(
+        "if it is of ussim segment, open it together with the .json file that was written beside it; if that is right, "
+        "start ussim serve --labels with {maps}"
+    ),
+    mapping="the .json file",
     one_tissue="{tissue!r}",
     several_tissues=repr(PAGE_SEVERAL),
 )

@@ -119,7 +119,7 @@ class Findings:
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
         unused = self.mapping.unused(self.names)
-        mistaken = f"; it has no label {listed(unused)}, which --map mentions" if unused else ""
+        mistaken = f"; it has no label {listed(unused)}, which {self.advice.mapping} mentions" if unused else ""
         raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}{mistaken}; {remedy}: {known}")
 
     def _if_of_a_program(self, labels: list[int]) -> str:
@@ -146,7 +146,7 @@ class Findings:
             doubts.append(f"{self.source}: the nearest tissue is used for {pairs}")
         unused = self.mapping.unused(self.names)
         if unused:
-            doubts.append(f"{self.source}: has no label {listed(unused)}, which --map mentions")
+            doubts.append(f"{self.source}: has no label {listed(unused)}, which {self.advice.mapping} mentions")
         is_part = False
         if self.scheme is not None and self.scheme.key == "freesurfer":
             missing = missing_structures([name for name in self.names.values() if name is not None])
