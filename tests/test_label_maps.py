@@ -355,6 +355,12 @@ def test_commands_for_an_mri_say_what_a_label_map_is_for_and_no_option_that_they
         "a binary mask (1 label, 67 ml), not a patient's tissues; add it to an MRI's tissues with --add "
         "tumour=glioma.nii.gz, or simulate it alone with ussim simulate"
     )
+    brats = tumour((1, 3, 2))
+    brats.write("map.nii.gz")
+    message = refused(*command, "map.nii.gz")
+    assert "a tumour's labels (as BraTS" in message and "--add brats=map.nii.gz, or simulate it alone" in message
+    assert message.endswith("if it is a brain, use ussim simulate with --map ussim")
+    Path("map.nii.gz").unlink()
     unknown = head()
     unknown.with_array(np.where(unknown.array == 3, 515, unknown.array)).write("unknown.nii.gz")
     few((90, 91)).write("few.nii.gz")

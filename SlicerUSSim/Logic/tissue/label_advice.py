@@ -20,7 +20,7 @@ class Advice:
     leave_out: str = "leave them out with {maps}"
     #: About a label that is the background; {label} is its number
     background: str = "leave it out with --map {label}=0, or say what it is with --map {label}=TISSUE"
-    #: About a mask or lesion without a patient; {added}, {source} and {maps} are for this label map
+    #: About a mask or lesion without a patient; {added}, {tissue}, {source} and {maps} are for this label map
     lesion: str = "add it to a segmentation with --add {added}, or simulate it alone with {maps} (ussim simulate)"
     #: The same about one as large as a brain
     brain_mask: str = (
@@ -59,6 +59,7 @@ MRI_COMMAND = replace(
         "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or simulate it alone with "
         "ussim simulate"
     ),
+    ambiguous="use ussim simulate with --map {key}",
 )
 #: The page of the workstation
 PAGE = replace(
@@ -111,4 +112,14 @@ SCRIPT = replace(
     one_tissue="AddTissueData({tissue!r}, mask)",
     several_tissues="AddTissueData('brats', mask)",
     is_python=True,
+)
+#: A script with the VTK filter for an MRI
+MRI_SCRIPT = replace(
+    SCRIPT,
+    lesion=(
+        "lay it over an MRI's tissues with AddTissueData({tissue!r}, image), or simulate it alone with "
+        "UltrasoundSimulationFilter.SetTissues"
+    ),
+    brain_mask="if it is the mask of a brain, give it with that brain's MRI (SetMaskData)",
+    ambiguous="give it to the UltrasoundSimulationFilter with read_label_map and a LabelMapping of {key!r}",
 )

@@ -40,6 +40,10 @@ _INTERPOLATED = (
 _LARGEST_LESION_ML = 500.0
 
 
+class NoPatientError(SimulationError):
+    """A label map is a mask or a lesion, and no patient."""
+
+
 @dataclass(frozen=True, eq=False)
 class Findings:
     """The labels of a label map, other than 0, with their names and tissues."""
@@ -72,7 +76,7 @@ class Findings:
         return are_interpolated_numbers(self.labels.array, len(self.names))
 
     def require_patient(self) -> None:
-        """Raise SimulationError for a mask or lesion, which is no patient, unless the user gave it a tissue."""
+        """Raise NoPatientError for a mask or lesion, which is no patient, unless the user gave it a tissue."""
         if self.is_mapped:
             return
         size = f"{self.number()}, {self._size(self.names)}"
@@ -94,10 +98,10 @@ class Findings:
         is_large = len(known) == 1 and self._millilitres(self.names) > _LARGEST_LESION_ML
         advice = self.advice.brain_mask if is_large else self.advice.lesion
         added = shlex.quote(f"{tissue}={self.source}")
-        remedy = advice.format(added=added, source=self.source, maps=maps)
+        remedy = advice.format(added=added, tissue=tissue, source=self.source, maps=maps)
         if self.scheme is not None and is_brats and set(self.names) <= set(schemes()["ussim"].names):
             remedy += f"; if it is a brain, {self.advice.ambiguous.format(key='ussim')}"
-        raise SimulationError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
+        raise NoPatientError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
 
     def require_known(self) -> None:
         """Raise SimulationError that lists the labels without a tissue, and what to do."""
