@@ -312,6 +312,12 @@ def tumour(labels: tuple[int, int, int]) -> Volume:
                   np.diag([3.0, 3.0, 3.0, 1.0]))  # fmt: skip
 
 
+def test_the_remedy_for_a_lesion_without_a_file_has_the_place_of_a_file():
+    """It was --add 'brats=label map'."""
+    with pytest.raises(SimulationError, match=r"^label map: a tumour's labels .* with --add brats=FILE, or simulate"):
+        read_label_map(tumour((1, 3, 2)))
+
+
 @pytest.mark.parametrize(("labels", "title"), [((1, 2, 4), "BraTS 2017 to 2022"), ((1, 2, 3), "BraTS since 2023")])
 @pytest.mark.parametrize("stored", [np.uint8, np.float32])
 def test_a_tumour_of_brats_is_no_patient(labels, title, stored, tmp_path):

@@ -173,6 +173,28 @@ def test_a_brats_map_is_three_segments_each_within_the_one_before():
     assert {"oedema", "necrosis", "enhancing"} <= {note.split(":")[0] for note in bench.logic.notes}
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_lesion_is_told_once_however_often_masks_are_added(kind):
+    """The second time it was told as "added over tumour 100 %", and what to check about it was forgotten."""
+    bench = Scene(kind)
+    bench.paint(moved(lesion(10.0), 30, 0, 0), "tumour")  # reaches out of the brain
+    bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
+    (first,) = (note for note in bench.logic.notes if note.startswith("tumour: "))
+    check = [line for line in bench.logic.warnings if "the brain mask leaves out" in line]
+    assert len(check) == 1
+    bench.paint(moved(lesion(6.0), 0, -30, 0), "cyst")
+    for _ in range(2):
+        bench.logic.addTissues(bench.labels, bench.lesions)
+        tumour, cyst = bench.logic.notes
+        assert tumour == first and cyst.startswith("cyst: ") and "cyst 100 %" not in cyst
+        assert [line for line in bench.logic.warnings if "the brain mask leaves out" in line] == check
+    segmentation = bench.lesions.GetSegmentation()
+    segmentation.RemoveSegment(segmentation.GetSegmentIDs()[0])
+    bench.paint(moved(lesion(6.0), 30, 0, 0), "tumour")  # corrected: told anew
+    bench.logic.addTissues(bench.labels, bench.lesions)
+    assert bench.logic.notes[0] == cyst and "added over tumour 100 %" in bench.logic.notes[1]
+
+
 def test_what_is_to_be_checked_about_a_file_of_lesions_is_told_with_them_every_time():
     """Of a BraTS map that was added as one tissue, in the words of the page, and not only when it was opened."""
     bench = Scene()

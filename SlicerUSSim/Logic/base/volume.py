@@ -344,6 +344,11 @@ def read_itk_image(path: Path):
         reason = why_unreadable(path) or str(error).strip().splitlines()[-1]
         if "No such file" in reason and path.exists():  # ITK's words for voxels that it could not read
             reason = "its voxels are missing or incomplete; copy or export it again"
+        if "orthonormal" in reason:  # ITK's words for the sform of NIfTI
+            reason = (
+                "its axes are not perpendicular, as after an affine registration that was written into the header; "
+                "resample it to a regular grid"
+            )
         raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
     require_complete(path)
     is_complex = "complex" in image.GetPixelIDTypeAsString()

@@ -28,6 +28,8 @@ _LONGEST_LIST = 12
 _TOO_FEW = 3
 #: More unknown labels may be the intensities of an image
 MOST_LABELS = 100
+#: A label map without a name, in messages
+UNNAMED = "label map"
 #: Tissues of a lesion, which alone are no patient
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
 #: Tissues of every brain, and the least and largest volume of both that is not remarkable
@@ -67,6 +69,11 @@ class Findings:
         """Whether the user gave every label a tissue."""
         return all(self.mapping.tissue_of(label, name) for label, name in self.names.items())
 
+    @property
+    def _file(self) -> str:
+        """The label map in options; FILE for one that has no name."""
+        return "FILE" if self.source == UNNAMED else self.source
+
     def number(self) -> str:
         """Their number in words: "41 labels"."""
         return f"{len(self.names)} label{'s' * (len(self.names) > 1)}"
@@ -97,8 +104,8 @@ class Findings:
         tissue = "brats" if is_brats or len(set(known)) > 1 else known[0] or of_file
         is_large = len(known) == 1 and self._millilitres(self.names) > _LARGEST_LESION_ML
         advice = self.advice.brain_mask if is_large else self.advice.lesion
-        added = shlex.quote(f"{tissue}={self.source}")
-        remedy = advice.format(added=added, tissue=tissue, source=self.source, maps=maps)
+        added = shlex.quote(f"{tissue}={self._file}")
+        remedy = advice.format(added=added, tissue=tissue, source=self._file, maps=maps)
         if self.scheme is not None and is_brats and set(self.names) <= set(schemes()["ussim"].names):
             remedy += f"; if it is a brain, {self.advice.ambiguous.format(key='ussim')}"
         raise NoPatientError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
