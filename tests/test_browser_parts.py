@@ -83,6 +83,7 @@ from SlicerUSSim.Workstation.state import (  # noqa: E402
     TissueLine,
 )
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
+from tests.test_label_places import in_order  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -646,6 +647,22 @@ def test_files_that_cannot_be_opened_together_or_alone_are_one_line(head, tmp_pa
     ):
         pass
     assert str(tmp_path) not in str(caught.value) and "/tmp" not in str(caught.value)
+
+
+def test_the_pages_proposal_for_labels_in_another_order_is_a_file_that_opens_them(tmp_path):
+    in_order((3, 1, 2)).write(tmp_path / "spm.nii.gz")
+    opener = _opener()
+    with (
+        pytest.raises(SimulationError) as caught,
+        opener.uploaded(_as_sent(tmp_path)) as upload,
+    ):
+        opener.labels(upload.path, upload.table)
+    proposal = re.search(r"with a \.json file with (\{.*\})$", str(caught.value))
+    assert proposal is not None, str(caught.value)
+    (tmp_path / "spm.json").write_text(proposal[1])
+    with opener.uploaded(_as_sent(tmp_path)) as upload:
+        _, found = opener.labels(upload.path, upload.table)
+    assert found.names == ("grey matter", "white matter", "csf")
 
 
 def test_a_preset_is_opened_alone(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -42,11 +43,15 @@ class Advice:
     gives_sizes: bool = True
     #: Whether {maps} are in Python, and not options of the command
     is_python: bool = False
+    #: Whether they are the content of a .json file
+    is_json: bool = False
 
     def maps(self, texts: Iterable[str]) -> str:
         """{maps} of texts for LabelMapping.of: --map 1=csf --map 2=tumour."""
         if self.is_python:
             return f"mapping=LabelMapping.of({list(texts)})"
+        if self.is_json:
+            return json.dumps(dict(text.split("=", 1) for text in texts))
         return " ".join(f"--map {shlex.quote(text)}" for text in texts)
 
 
@@ -69,10 +74,10 @@ PAGE = replace(
         "open it together with a table of its names (.txt, .ctbl), the tissue table of ussim segment (.json), or a "
         '.json file with {{"{label}": "TISSUE"}} (0 removes a label), one of'
     ),
-    lesion="add it to a segmentation, or start ussim serve --labels {source} {maps}",
+    lesion="add it to a patient's tissues (Add a mask as), or open it together with a .json file with {maps}",
     brain_mask=(
-        "if it is the mask of a brain, start ussim serve MRI --mask {source} with that brain's MRI, or ussim serve "
-        "--labels {source} {maps}"
+        "if it is the mask of a brain, start ussim serve MRI --mask {source} with that brain's MRI, or open it "
+        "together with a .json file with {maps}"
     ),
     background=(
         'open it together with a .json file with {{"{label}": 0}} that leaves it out, or {{"{label}": "TISSUE"}}'
@@ -80,9 +85,10 @@ PAGE = replace(
     ambiguous="start ussim serve --labels with --map {key}",
     likely=(
         "if it is of ussim segment, open it together with the .json file that was written beside it; if that is right, "
-        "start ussim serve --labels with {maps}"
+        "with a .json file with {maps}"
     ),
     mapping="the .json file",
+    is_json=True,
     one_tissue="{tissue!r}",
     several_tissues=repr(PAGE_SEVERAL),
 )
