@@ -201,7 +201,9 @@ def open_examination(patient: PatientOptions) -> Examination:
         kinds = ("a label map", "--mri") if is_labels else ("an MRI, to be segmented", "--labels")
         log.info("%s is read as %s; use %s if it is not", patient.mri_or_labels, *kinds)
     if is_labels and preset.settings.needs_texture:
-        raise SimulationError(f"{patient.mri_or_labels}: is a label map; --mri-modulation needs an MRI")
+        raise SimulationError(
+            f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need an MRI"
+        )
     if not is_labels:
         require_no_map(patient.mri_or_labels, patient.maps, patient.organs)
     if is_labels:

@@ -649,17 +649,15 @@ class UltrasoundSceneLogic:
         return self._simulators.get(patient.version, patient.labels, tissues, preset.settings, self.device, texture)
 
     def _texture_of(self, patient: Patient) -> Texture | None:
-        """The texture from the MRI, if the settings use it and the labels are as segment() made them."""
-        settings, segmented = self.preset.settings, self._segmented
+        """The texture from the MRI, if the settings require it."""
+        if not self.preset.settings.needs_texture:
+            return None
+        segmented = self._segmented
         if segmented is None or segmented.version != patient.node_version:
-            require(
-                not settings.needs_texture,
+            raise SimulationError(
                 f"the settings need a texture from the MRI, which {patient.name} lacks; segment the MRI again, or set "
-                "mri_modulation_db to 0",
+                "partial_volume to false and mri_modulation_db to 0"
             )
-            return None
-        if not settings.uses_texture:
-            return None
         if self._texture is None or self._texture[0] != patient.version:
             # A segmentation node may return its labels on a larger or smaller part of the grid.
             texture = segmented.texture().on_grid_of(patient.labels, segmented.labels)
