@@ -283,4 +283,3 @@ def test_the_commands_take_the_settings_from_an_mri_and_refuse_them_for_labels(t
     result = CliRunner().invoke(main, [*arguments, "--partial-volume"])
     assert result.exit_code == 2
     assert "is a label map; --partial-volume and --mri-modulation need an MRI" in result.stderr
-    assert CliRunner().invoke(main, arguments).exit_code == 0
