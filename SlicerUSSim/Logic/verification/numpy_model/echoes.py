@@ -359,7 +359,7 @@ def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndar
         np.add.at(sums, bins[near] + 1, echo * part)
 
 
-def _carried(least: np.ndarray | np.float32, phase: np.ndarray, most: np.float32, turning: np.ndarray) -> np.ndarray:
+def _carried(least: np.ndarray, phase: np.ndarray, most: np.ndarray, turning: np.ndarray) -> np.ndarray:
     """Part by which a patch's centre of phase moves: on steep flat walls more, so that sums have few radians."""
     flat = f32(1) / (f32(1) + f32(16) * turning * turning)
     more = f32(1) - most / np.maximum(np.abs(phase), most) - least
