@@ -421,7 +421,7 @@ inline void find_lines(__constant const Acquisition *acquisition, __global const
 // The integral of the square of that product. Its spectrum is the convolution of the two autocorrelations.
 inline float squared_overlap(const float2 *first, const float2 *second, int count) {
   float sum = 0.0f;
-  for (int k = 0; k < 2 * count - 1; k += 2) {  // it is smooth, so that every second sample is enough
+  for (int k = 0; k < 2 * count - 1; k++) {
     float2 value = (float2)(0.0f);
     for (int n = k + 1 - count; n < count; n++) {
       const int rest = k - n;

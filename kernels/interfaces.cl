@@ -40,6 +40,21 @@ inline float bent_patch(float per_mm, float slope, float bend, float variance, f
   return phase * phase * variance / zones;
 }
 
+// Radians from one hit to the next, laterally, and over a standard deviation of the beam, elevationally, up to which a
+// sum over hits is the integral, also at the upper frequencies of a pulse. Laterally no fewer: in a fan of lines a
+// plane is not one against the depth, and a patch that is moved far has the slope of another line.
+#define MOST_PER_STEP 2.6f
+#define MOST_ASIDE 1.3f
+
+// The part by which a patch's centre of phase is moved: `least`, and on steeper walls so much that at most `most` of
+// `phase` is left to the sum over the patches. Walls that bend within the beam, by `turning` radians, are seen where
+// they are square to it, and a plane there is not what is found beside that.
+inline float part_carried(float least, float phase, float most, float turning) {
+  const float flat = 1.0f / (1.0f + 16.0f * turning * turning);
+  const float more = 1.0f - most / fmax(fabs(phase), most) - least;
+  return fmin(least + flat * fmax(more, 0.0f), 1.0f);
+}
+
 // One work-item computes the walls of one traced line.
 __kernel void find_walls(__constant const Acquisition *acquisition, __global const Hit *hits,
                          __global const int *hit_counts, __global Wall *walls, __global int *wall_counts,
@@ -60,18 +75,20 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
       int every = 1;
       for (; 8.0f * step < sigma.x && every < 64; every *= 2) step *= 2.0f;
       if (line % every) continue;
-      // A patch has a deviation of 0.45 steps: aliases of planes are then below -35 dB. The beam times the patch would
-      // be wider than the beam; this width gives a row of hits, each a strip one step wide, the beam's own.
-      const float sigma2 = sigma.x * sigma.x, width2 = sigma2 + step * step / 12.0f;
-      const float carried = fmin(0.2025f * step * step / width2, 1.0f);
-      const float inside = fmax(1.0f - (1.0f - carried) * (1.0f - carried) * width2 / sigma2, 0.0f);
-      // The strata of the elevational rays are 2.5 / rays deviations wide in the middle and 7 / rays outside.
-      const float carried_aside = fmin(10.0f / (rays * rays), 1.0f);
-      const float inside_aside = 1.0f - (1.0f - carried_aside) * (1.0f - carried_aside);
+      const float stretch = fmin(1.0f + hit->lateral_slope * hit->lateral_slope, 10.0f);
+      const float bend = hit->curvature * stretch * sqrt(stretch), sigma2 = sigma.x * sigma.x;
       const float across = per_mm * hit->lateral_slope, aside = per_mm * hit->elevational_slope;
       const float phase2 = across * across * sigma2 + aside * aside * sigma.y * sigma.y;
-      const float stretch = fmin(1.0f + hit->lateral_slope * hit->lateral_slope, 10.0f);
-      const float bend = hit->curvature * stretch * sqrt(stretch);
+      // A patch has a deviation of 0.45 steps: aliases of planes are then below -35 dB at one frequency. The beam times
+      // the patch would be wider than the beam; this width gives a row of hits, each a strip one step wide, the beam's.
+      const float width2 = sigma2 + step * step / 12.0f;
+      const float carried =
+          part_carried(0.2025f * step * step / width2, across * step, MOST_PER_STEP, per_mm * bend * sigma2);
+      const float inside = fmax(1.0f - (1.0f - carried) * (1.0f - carried) * width2 / sigma2, 0.0f);
+      // The strata of the elevational rays are 2.5 / rays deviations wide in the middle and 7 / rays outside.
+      const float carried_aside =
+          part_carried(10.0f / (rays * rays), aside * sigma.y, MOST_ASIDE, per_mm * bend * sigma.y * sigma.y);
+      const float inside_aside = 1.0f - (1.0f - carried_aside) * (1.0f - carried_aside);
       Wall wall;
       wall.echo = hit->echo * exp_fast(gain_of_band(acquisition, hit->loss));
       wall.depth_mm = hit->depth_mm - carried_aside * hit->elevational_slope * hit->elevational_mm;

@@ -686,6 +686,10 @@ def test_a_file_of_somebody_else_is_not_overwritten(tmp_path):
     before = place.read_bytes()
     kept = brain_module.keep(place, mri, mri.array > 0, "atlas", 1.0, ())
     assert "was not written by ussim" in kept.text and place.read_bytes() == before
+    place.write_bytes(before[: len(before) // 2])  # cut short while it was copied
+    kept = brain_module.keep(place, mri, mri.array > 0, "atlas", 1.0, ())
+    assert kept.text.startswith(f"{place} cannot be read and stays as it is") and "edited" not in kept.text
+    assert not kept.is_beside and place.read_bytes() == before[: len(before) // 2]
 
 
 @pytest.mark.parametrize("edit", ["everything", "empty", "a lesion", "smoothed"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import asyncio
 import io
+import json
 import re
 import selectors
 import subprocess
@@ -41,6 +42,7 @@ from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, tilt_sweep, turned
 from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
+from SlicerUSSim.Logic.tissue.own_files import write_label_files
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.script import LabelSource, python_script
 
@@ -57,7 +59,7 @@ from SlicerUSSim.Logic.base.declaration import Parameter, Shown  # noqa: E402
 from SlicerUSSim.Logic.mrml import parameter_node  # noqa: E402
 from SlicerUSSim.Logic.mrml.fit_nodes import tracked_images  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
-from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.mrml.logic import AtOnce, UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, SequenceIndex, add_sequence  # noqa: E402
 from SlicerUSSim.Logic.tracked.images import TrackedImages  # noqa: E402
@@ -69,6 +71,7 @@ from SlicerUSSim.Workstation.buttons import Buttons  # noqa: E402
 from SlicerUSSim.Workstation.comparison import Comparison, RealImages  # noqa: E402
 from SlicerUSSim.Workstation.export import Cine  # noqa: E402
 from SlicerUSSim.Workstation.messages import Messages  # noqa: E402
+from SlicerUSSim.Workstation.opener import Files, Opener  # noqa: E402
 from SlicerUSSim.Workstation.panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.state import (  # noqa: E402
     NAMES,
@@ -80,6 +83,7 @@ from SlicerUSSim.Workstation.state import (  # noqa: E402
     TissueLine,
 )
 from SlicerUSSim.Workstation.tasks import AtMost, Tasks  # noqa: E402
+from tests.test_label_places import in_order  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -456,10 +460,10 @@ def test_a_script_means_the_very_names_it_was_given(name, path):
 
 def test_the_script_of_an_mri_has_its_mask_and_options_and_the_texture_if_it_is_used():
     source = LabelSource("it's here.nii", mask="mask.nii", options={"contrast": "t2", "classes": 3})
-    plain = python_script(source, Preset().changed("settings", partial_volume=False), np.eye(4))
+    plain = python_script(source, Preset(), np.eye(4))
     assert """Volume.read("it's here.nii")""" in plain and "mask=Volume.read('mask.nii')" in plain
     assert "contrast='t2'" in plain and "texture" not in plain
-    hybrid = Preset()
+    hybrid = Preset().changed("settings", partial_volume=True)
     assert "texture=segmentation.texture()" in python_script(source, hybrid, np.eye(4))
     for text in (plain, python_script(LabelSource(""), hybrid, np.eye(4))):
         compile(text, "script", "exec")
@@ -571,6 +575,100 @@ def test_times_that_tell_images_apart_are_their_index_and_equal_ones_follow_each
     _, images = add_sequence(scene, sequence, "sweep")
     assert [images.GetNthDataNode(number).GetAttribute(TIME) for number in range(3)] == ["0.200000", "0.200000", None]
     assert (images.GetIndexName(), images.GetIndexUnit(), images.GetIndexTypeAsString()) == ("time", "s", "numeric")
+
+
+def _as_sent(folder: Path) -> dict[str, bytes]:
+    """The files of a folder as a page sends them."""
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def _opener() -> Opener:
+    scene = slicer.vtkMRMLScene()
+    return Opener(scene, UltrasoundSceneLogic(scene), AtOnce(), Files())
+
+
+@pytest.mark.parametrize("table", ["t2", "names", "mapping"])
+def test_a_label_map_is_opened_with_the_table_of_its_labels_whatever_that_is_called(head, tmp_path, table):
+    """Of ussim segment, of another program, or as --map takes it; the label map alone is refused with this remedy."""
+    numbers = {"t2": (0, 3, 2, 1, 4)}.get(table, (0, 507, 502, 504, 509))
+    names = ("csf", "grey matter", "white matter", "leptomeninges")
+    assert head.tissue_names == names
+    labels = head.labels.with_array(np.array(numbers, np.uint16)[head.labels.array])
+    if table == "t2":
+        order = ("white matter", "grey matter", "csf", "leptomeninges")
+        write_label_files(tmp_path / "rem.nii.gz", labels, TissueTable.brain().for_names(order))
+    else:
+        labels.write(tmp_path / "rem.nii.gz")
+        of_numbers = dict(zip(map(str, numbers[1:]), names, strict=True))
+        if table == "names":
+            lines = [f'{n} 255 0 0 1 1 1 "{name}"' for n, name in of_numbers.items()]
+            (tmp_path / "colours.txt").write_text("\n".join(lines))
+        else:
+            (tmp_path / "map.json").write_text(json.dumps(of_numbers))
+    sent, opener = _as_sent(tmp_path), _opener()
+    alone = {name: content for name, content in sent.items() if name == "rem.nii.gz"}
+    with (
+        pytest.raises(SimulationError, match=r"^rem.nii.gz: .*open it together with .*\.json file"),
+        opener.uploaded(alone) as upload,
+    ):
+        opener.labels(upload.path, upload.table)
+    with opener.uploaded(sent) as upload:
+        assert upload.kind == "labels"
+        node, found = opener.labels(upload.path, upload.table)
+    assert node.GetName() == "rem.nii.gz" and set(found.names) == set(names)
+    for name, n in zip(names, range(1, 5), strict=True):
+        np.testing.assert_array_equal(found.labels.array == found.names.index(name) + 1, head.labels.array == n)
+    if table == "names":
+        assert found.message.endswith("named in colours.txt")
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["rem.json"], "rem.json is the tissue table of a label map: open both files together"),
+        (["names.txt"], "names.txt is a table of the labels of a label map: open both files together"),
+        (["names.txt", "rem.json"], "names.txt, rem.json: are tables, expected a label map with one of them"),
+        (["a.nii.gz", "b.nii.gz"], "a.nii.gz, b.nii.gz: are 2 files, expected one, or a label map with the table of"),
+        (["a.nii.gz", "names.txt", "rem.json"], "are 3 files, expected one, or a label map with the table of"),
+        (["mri.nii.gz", "rem.json"], "mri.nii.gz is no label map, and rem.json a table of labels"),
+        (["a.nii.gz", "preset.json"], "preset.json is a preset: open it alone"),
+    ],
+)  # fmt: skip
+def test_files_that_cannot_be_opened_together_or_alone_are_one_line(head, tmp_path, names, message):
+    write_label_files(tmp_path / "rem.nii.gz", head.labels, TissueTable.brain().for_names(head.tissue_names))
+    for name in ("a.nii.gz", "b.nii.gz"):
+        (tmp_path / name).write_bytes((tmp_path / "rem.nii.gz").read_bytes())
+    head_mri(3.0).write(tmp_path / "mri.nii.gz")
+    (tmp_path / "names.txt").write_text('1 255 0 0 1 1 1 "csf"')
+    Preset().write(tmp_path / "preset.json")
+    with (
+        pytest.raises(SimulationError, match=re.escape(message)) as caught,
+        _opener().uploaded({name: (tmp_path / name).read_bytes() for name in names}),
+    ):
+        pass
+    assert str(tmp_path) not in str(caught.value) and "/tmp" not in str(caught.value)
+
+
+def test_the_pages_proposal_for_labels_in_another_order_is_a_file_that_opens_them(tmp_path):
+    in_order((3, 1, 2)).write(tmp_path / "spm.nii.gz")
+    opener = _opener()
+    with (
+        pytest.raises(SimulationError) as caught,
+        opener.uploaded(_as_sent(tmp_path)) as upload,
+    ):
+        opener.labels(upload.path, upload.table)
+    proposal = re.search(r"with a \.json file with (\{.*\})$", str(caught.value))
+    assert proposal is not None, str(caught.value)
+    (tmp_path / "spm.json").write_text(proposal[1])
+    with opener.uploaded(_as_sent(tmp_path)) as upload:
+        _, found = opener.labels(upload.path, upload.table)
+    assert found.names == ("grey matter", "white matter", "csf")
+
+
+def test_a_preset_is_opened_alone(tmp_path):
+    Preset().write(tmp_path / "preset.json")
+    with _opener().uploaded(_as_sent(tmp_path)) as upload:
+        assert upload.kind == "preset" and upload.table is None
 
 
 def test_nothing_tracked_is_said():

@@ -329,8 +329,8 @@ def test_ribs_are_bright_lines_with_shadows_and_lung_a_bright_line_between_them(
     part = lambda lines, low, high: level[lines][:, int(low / mm) : int(high / mm)]  # noqa: E731
     tissue = np.median(part(between, 22.0, 26.0))
     assert np.median(part(on_rib, 13.0, 20.0).max(axis=1)) > tissue + 10.0
-    # The shadow holds the mirror image of the wall, down to twice the rib's depth of 14 mm or so. Beams 16 mm behind a rib
-    # with radii of 10 mm across and 100 mm along it (r = 0.6) are 4.2 and 1.3 times as wide: -4.4 - 6.2 - 1.2 dB.
+    # The shadow holds the mirror image of the wall, down to twice the rib's depth of 14 mm or so. Beams 16 mm behind a
+    # rib with radii of 10 mm across and 100 mm along it (r = 0.6) are 4.2 and 1.3 times as wide: -4.4 - 6.2 - 1.2 dB.
     assert np.median(part(on_rib, 28.0, 32.0)) == pytest.approx(tissue - 11.8, abs=2.5)
     assert np.median(part(on_rib, 36.0, 40.0)) < tissue - 20.0
     assert np.median(part(between, 26.0, 31.0).max(axis=1)) > tissue + 15.0

@@ -431,7 +431,7 @@ def test_help_says_label_unit_what_it_does_and_the_default():
     said = " ".join(ussim("simulate", "--help").output.split())
     for text in (
         "Gain [dB]: brightness of all echoes (default: the preset's, 0).",
-        "(default: the preset's, --partial-volume).",
+        "as in a command that segments an MRI (default: the preset's, none).",
         "--contrast [t1|t1gd|t2|flair|ct] Contrast of the MRI, which gives the order of the tissues by intensity; ct: "
         "a CT in Hounsfield units (default: t1).",
     ):
@@ -461,8 +461,8 @@ def options_of(*texts):
 def test_options_go_before_the_preset_and_set_before_them(tmp_path):
     assert options_of() == Preset()
     Preset(PROBES["linear"]).changed("display", gain_db=6.0, noise_db=-70.0).write(tmp_path / "p.json")
-    found = options_of("--preset", tmp_path / "p.json", "--gain", 3, "--noise", "none", "--hard-labels")
-    assert (found.display.gain_db, found.display.noise_db, found.settings.partial_volume) == (3.0, None, False)
+    found = options_of("--preset", tmp_path / "p.json", "--gain", 3, "--noise", "none", "--partial-volume")
+    assert (found.display.gain_db, found.display.noise_db, found.settings.partial_volume) == (3.0, None, True)
     assert found.probe == PROBES["linear"]
     found = options_of(
         "--preset", tmp_path / "p.json", "--gain", 3, "--set", "display.gain_db=4", "--set", "display.gain_db = 5",

@@ -9,9 +9,18 @@ import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from SlicerUSSim.Logic import ConvexProbe, DisplaySettings, LinearProbe, SimulationSettings, Tissue, UltrasoundSimulator
+from SlicerUSSim.Logic import (
+    ConvexProbe,
+    DisplaySettings,
+    LinearProbe,
+    SimulationSettings,
+    Tissue,
+    TissueTable,
+    UltrasoundSimulator,
+)
 from SlicerUSSim.Logic.imaging.borders import HALVED_CUT, WIDE_CUT, gaussian_taps
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.verification.phantoms import folds, parallel_plates
 from tests.conftest import FLUID, SPECKLE, block, rigid, simulator
 
@@ -108,6 +117,44 @@ def test_a_steep_wall_returns_nothing():
     square = peak(sim, 61, 0.0)
     for angle_deg in (25.0, 35.0):
         assert peak(sim, 61, angle_deg) < 10 ** (-30 / 20) * square
+
+
+@pytest.mark.parametrize(
+    ("probe", "depth_mm", "angle_deg", "turn_deg"),
+    [
+        # Lines 0.9 mm apart, for which the wall differs by 4.7 and 6.3 radians from line to line, aliased to -26 dB
+        (PROBES["matrix"], 55.0, 12.0, 0.0),
+        (PROBES["matrix"], 55.0, 16.0, 0.0),
+        (replace(PROBES["cardiac"], frequency_mhz=5.0, band_mhz=(3.75, 6.25)), 55.0, 16.0, 0.0),
+        # 2.3 radians per elevational deviation, which a few rays cannot add up
+        (PROBES["linear"], 25.0, 9.0, 40.0),
+        (PROBES["linear_15"], 15.0, 8.0, 40.0),
+    ],
+    ids=["matrix, 12 degrees", "matrix, 16 degrees", "cardiac", "linear", "linear_15"],
+)
+def test_a_steep_wall_does_not_depend_on_the_lines_of_shipped_probes(probe, depth_mm, angle_deg, turn_deg):
+    """Levels re a square wall on the middle line, those below -28 dB as equal; in a grid oblique to the probe."""
+    grid = Rotation.from_euler("xyz", [25.0, -35.0, 15.0], degrees=True)
+    normal = grid.apply([0.0, 1.0, 0.0])
+    wall = block(
+        lambda x, y, z: x * normal[0] + y * normal[1] + z * normal[2] > 0, half_mm=(20, 20, 20), spacing_mm=0.3
+    )
+    sim = UltrasoundSimulator(
+        wall, TissueTable({0: FLUID, 1: WALL}), SimulationSettings(scattering=False, specular_exponent=0.0)
+    )
+    turn = Rotation.from_euler("y", turn_deg, degrees=True)
+
+    def level_db(scan_lines: int, tilt_deg: float) -> float:
+        tilt = grid * turn * Rotation.from_euler("z", tilt_deg, degrees=True) * turn.inv()
+        pose = rigid(tilt.as_matrix(), [0.0, -depth_mm, 0.0])
+        frame = sim.simulate(replace(probe, scan_lines=scan_lines), pose)
+        near = slice(*(round((depth_mm + off) / frame.sample_interval_mm) for off in (-3.0, 3.0)))
+        return float(20 * np.log10(np.abs(frame.iq[scan_lines // 2, near]).max() + 1e-12))
+
+    square = level_db(193, 0.0)
+    assert square > 10.0
+    levels = [level_db(lines, angle_deg) - square for lines in (97, 193, 257, 385)]
+    assert np.ptp(np.maximum(levels, -28.0)) < 1.0, levels
 
 
 def test_a_ball_is_seen_on_and_between_the_lines():

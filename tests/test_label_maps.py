@@ -312,6 +312,12 @@ def tumour(labels: tuple[int, int, int]) -> Volume:
                   np.diag([3.0, 3.0, 3.0, 1.0]))  # fmt: skip
 
 
+def test_the_remedy_for_a_lesion_without_a_file_has_the_place_of_a_file():
+    """It was --add 'brats=label map'."""
+    with pytest.raises(SimulationError, match=r"^label map: a tumour's labels .* with --add brats=FILE, or simulate"):
+        read_label_map(tumour((1, 3, 2)))
+
+
 @pytest.mark.parametrize(("labels", "title"), [((1, 2, 4), "BraTS 2017 to 2022"), ((1, 2, 3), "BraTS since 2023")])
 @pytest.mark.parametrize("stored", [np.uint8, np.float32])
 def test_a_tumour_of_brats_is_no_patient(labels, title, stored, tmp_path):
@@ -355,6 +361,12 @@ def test_commands_for_an_mri_say_what_a_label_map_is_for_and_no_option_that_they
         "a binary mask (1 label, 67 ml), not a patient's tissues; add it to an MRI's tissues with --add "
         "tumour=glioma.nii.gz, or simulate it alone with ussim simulate"
     )
+    brats = tumour((1, 3, 2))
+    brats.write("map.nii.gz")
+    message = refused(*command, "map.nii.gz")
+    assert "a tumour's labels (as BraTS" in message and "--add brats=map.nii.gz, or simulate it alone" in message
+    assert message.endswith("if it is a brain, use ussim simulate with --map ussim")
+    Path("map.nii.gz").unlink()
     unknown = head()
     unknown.with_array(np.where(unknown.array == 3, 515, unknown.array)).write("unknown.nii.gz")
     few((90, 91)).write("few.nii.gz")

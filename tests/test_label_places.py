@@ -119,7 +119,11 @@ def test_what_segment_wrote_of_other_contrasts_without_its_table_is_refused_with
     for number, name in truth.items():
         assert f"--map {number}={name}" in message, message
     if thin == 5:
-        assert "--map 4=TISSUE" in message
+        assert message.endswith("--map 4=enhancing --map 5=leptomeninges")
+        found = read_label_map(brain_.with_array(array), mapping=LabelMapping.of(re.findall(r"--map (\S+)", message)))
+        assert found.names == ("csf", "grey matter", "white matter", "enhancing", "leptomeninges")
+        array[14:35, 14:35, 14:35] = 4  # a fifth of the brain
+        assert "--map 4=TISSUE" in str(refusal_of(brain_.with_array(array)))
 
 
 def test_tissues_from_2_to_4_are_refused_with_their_order_and_not_moved_by_one():

@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import node_labels, read_labels, write_l
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
+from SlicerUSSim.Logic.tissue.label_advice import PAGE  # noqa: E402
 from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
 from tests.conftest import rigid  # noqa: E402
 from tests.test_pathology import ball, empty, moved  # noqa: E402
@@ -170,6 +171,48 @@ def test_a_brats_map_is_three_segments_each_within_the_one_before():
     assert [segmentation.GetSegment(name).GetName() for name in ids] == ["oedema", "necrosis", "enhancing"]
     bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
     assert {"oedema", "necrosis", "enhancing"} <= {note.split(":")[0] for note in bench.logic.notes}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_lesion_is_told_once_however_often_masks_are_added(kind):
+    """The second time it was told as "added over tumour 100 %", and what to check about it was forgotten."""
+    bench = Scene(kind)
+    bench.paint(moved(lesion(10.0), 30, 0, 0), "tumour")  # reaches out of the brain
+    bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
+    (first,) = (note for note in bench.logic.notes if note.startswith("tumour: "))
+    check = [line for line in bench.logic.warnings if "the brain mask leaves out" in line]
+    assert len(check) == 1
+    bench.paint(moved(lesion(6.0), 0, -30, 0), "cyst")
+    for _ in range(2):
+        bench.logic.addTissues(bench.labels, bench.lesions)
+        tumour, cyst = bench.logic.notes
+        assert tumour == first and cyst.startswith("cyst: ") and "cyst 100 %" not in cyst
+        assert [line for line in bench.logic.warnings if "the brain mask leaves out" in line] == check
+    segmentation = bench.lesions.GetSegmentation()
+    segmentation.RemoveSegment(segmentation.GetSegmentIDs()[0])
+    bench.paint(moved(lesion(6.0), 30, 0, 0), "tumour")  # corrected: told anew
+    bench.logic.addTissues(bench.labels, bench.lesions)
+    assert bench.logic.notes[0] == cyst and "added over tumour 100 %" in bench.logic.notes[1]
+
+
+def test_what_is_to_be_checked_about_a_file_of_lesions_is_told_with_them_every_time():
+    """Of a BraTS map that was added as one tissue, in the words of the page, and not only when it was opened."""
+    bench = Scene()
+    r = np.sqrt(((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0))
+    values = np.select([r < 4, r < 6, r < 9], [1, 3, 2], 0).astype(np.uint8)
+    whole = Volume(values, rigid(np.eye(3), PLACE - 9.5), doubts=("brats3.nii.gz: 7 voxels are NaN",))
+    add_lesion(bench.lesions, whole, "tumour", "brats3.nii.gz", PAGE)
+    bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
+    told = (
+        "brats3.nii.gz holds the labels 1, 2, 3; all of them are added as tumour ('labels by their names, or a BraTS "
+        "map' adds the tissues of a BraTS map)",
+        "brats3.nii.gz: 7 voxels are NaN",
+    )
+    assert set(told) <= set(bench.logic.warnings)
+    bench.logic.addTissues(bench.labels, bench.lesions)
+    assert set(told) <= set(bench.logic.warnings)
+    with pytest.raises(SimulationError, match=r"what it is: 'tumour', or 'necrosis' if it is BraTS's label 1$"):
+        add_lesion(bench.lesions, whole.with_array((values == 1).astype(np.uint8)), "brats", "core", PAGE)
 
 
 # ---- labels that stay as they are ------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from SlicerUSSim.Logic import (
     ConvexProbe,
@@ -108,6 +109,27 @@ def test_numpy_meets_the_sheets_that_were_found(turn_deg):
     assert (np.abs(image.astype(int) - plain) > 10).mean() > 0.03  # the sheets are in it
     tree = simulator.tracer.download()
     assert (tree.hits["label_before"] == tree.hits["label_behind"]).any() or turn_deg > 0.0
+
+
+def test_beams_that_a_thin_layer_splits_are_as_wide_as_in_numpy():
+    """A layer along the beams, of another speed of sound: their intensity has lobes."""
+    turned = Rotation.from_euler("xyz", [25.0, -35.0, 15.0], degrees=True)
+
+    def label(x, y, z):
+        across, along, _ = np.tensordot(turned.as_matrix().T, np.stack(np.broadcast_arrays(x, y, z)), 1)
+        return (np.abs(across - 2.0 - 0.1 * along) < 0.8).astype(int)
+
+    layer = replace(BRAIN, name="layer", speed_of_sound_m_s=1504.5)
+    settings = SimulationSettings(interfaces=False)
+    simulator = UltrasoundSimulator(
+        block(label, half_mm=(20, 20, 20), spacing_mm=0.8), TissueTable({0: BRAIN, 1: layer}), settings
+    )
+    probe, pose = replace(PROBES["convex"], frequency_mhz=5), rigid(turned.as_matrix(), [0.0, -18.0, 0.0])
+    display = DisplaySettings(image_size=(240, 200))
+    image = simulator.simulate(probe, pose, display).image
+    difference = np.abs(image.astype(int) - NumpyModel(simulator).simulate(probe, pose, display))
+    assert image.max() > 100
+    assert (difference <= 1).mean() > 0.99
 
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k != "phased")) for k in PROBES])

@@ -319,8 +319,7 @@ def test_segment_names_and_colours_tissues_where_the_mri_is(kind):
     logic.placeProbe(labels, probe)
     frame = logic.simulate(labels, probe, image)
     pose = np.linalg.inv(node_to_world(moved)) @ node_to_world(probe)
-    table = TissueTable.brain(result.tissue_names)
-    direct = UltrasoundSimulator(result.labels, table, texture=result.texture()).simulate(
+    direct = UltrasoundSimulator(result.labels, TissueTable.brain(result.tissue_names)).simulate(
         Preset().probe, pose, noise_seed=seed_of_pose(pose)
     )
     assert frame.image.mean() > 15 and np.mean(frame.image != direct.image) < 0.02

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -235,6 +236,14 @@ def test_the_table_has_means_and_deviations_in_every_unit(unit):
     for line, mean, deviation in zip(lines, result.means, result.standard_deviations, strict=True):
         numbers = [float(text) for text in line.split()[-2:]]
         assert numbers == pytest.approx([mean, deviation], rel=0.006, abs=0.006 * unit)
+
+
+def test_the_table_leaves_out_tissues_that_were_covered_wholly():
+    """A tissue under a lesion was a row of 0.0 ml."""
+    result = segment_mri(head_mri(4.0))
+    covered = result.labels.with_array(np.where(result.labels.array == 1, 2, result.labels.array))
+    rows = replace(result, labels=covered).table().splitlines()[1:]
+    assert [row.split()[0] for row in rows] == ["2", "3"] and result.tissue_names[0] not in "\n".join(rows)
 
 
 def test_posteriors_sum_to_one_inside_and_agree_with_the_labels():

@@ -252,7 +252,7 @@ def test_a_segmentation_knows_the_shares_of_its_voxels():
 
 
 def test_textures_that_do_not_fit_are_refused():
-    with pytest.raises(SimulationError, match=r"mri_modulation_db 2 needs a texture; pass segmentation\.texture"):
+    with pytest.raises(SimulationError, match=r"mri_modulation_db 2 need a texture; pass segmentation\.texture"):
         UltrasoundSimulator(SOLID, TABLE, SimulationSettings(mri_modulation_db=2.0))
     small = Texture(*(np.zeros((2, 2, 2), dtype) for dtype in (np.uint8, np.float32, np.float32)))
     with pytest.raises(SimulationError, match=r"the texture has shape \(2, 2, 2\), expected that of the labels"):
@@ -280,6 +280,6 @@ def test_the_commands_take_the_settings_from_an_mri_and_refuse_them_for_labels(t
     assert np.abs(images[1] - images[0]).max() > 0 and np.abs(images[2] - images[0]).max() > 0
     SOLID.write(tmp_path / "labels.nii.gz")
     arguments[1] = str(tmp_path / "labels.nii.gz")
-    result = CliRunner().invoke(main, [*arguments, "--mri-modulation", "3"])
+    result = CliRunner().invoke(main, [*arguments, "--partial-volume"])
     assert result.exit_code == 2
-    assert "is a label map; --mri-modulation needs an MRI" in result.stderr
+    assert "is a label map; --partial-volume and --mri-modulation need an MRI" in result.stderr

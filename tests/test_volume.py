@@ -226,6 +226,20 @@ def test_impossible_volumes_are_refused(array, matrix, message):
         Volume(array, matrix)
 
 
+def test_a_sheared_matrix_in_a_file_is_refused_with_a_remedy(tmp_path):
+    """In ITK's words it was "No orthonormal definition found"."""
+    import nibabel
+
+    skewed = np.eye(4)
+    skewed[0, 1] = 0.2
+    path = tmp_path / "sheared.nii.gz"
+    nibabel.Nifti1Image(np.ones((5, 6, 7), np.int16), skewed).to_filename(path)
+    with pytest.raises(
+        SimulationError, match=r"sheared.nii.gz: .*axes are not perpendicular.*resample it to a regular"
+    ):
+        Volume.read(path)
+
+
 def test_a_failed_write_leaves_nothing_behind(tmp_path):
     skewed = np.eye(4)
     skewed[0, 1] = 0.5

@@ -508,3 +508,37 @@ def test_labels_without_names_and_table_are_recognised_or_refused_and_not_taken_
     known.SetTissues(TissueTable({0: FLUID, 1: SPECKLE}))
     known.Update()
     assert known.GetFrame() is not None
+
+
+def test_masks_in_place_of_the_mri_or_of_a_lesion_are_told_by_the_filters_methods():
+    """Errors gave options of the command, which the filter lacks: is it the mask of the brain (--mask)?"""
+    from tests.test_label_maps import tumour
+
+    mri = head_mri(4.0)
+    mask = mri.with_array((np.linalg.norm((np.indices(mri.array.shape).T - 12.0).T, axis=0) < 5).astype(np.uint8))
+    segmentation = SegmentationFilter()
+    for heard in (segmentation, segmentation.GetExecutive()):
+        heard.AddObserver("ErrorEvent", lambda *_: None)
+    for image, method in (
+        (tumour((1, 3, 2)), r"as BraTS since 2023: .* with AddTissueData\('brats', image\)"),
+        (mask, r"a binary mask .* with AddTissueData\('tumour', image\)"),
+    ):
+        segmentation.SetInputData(image.to_vtk())
+        segmentation.Update()
+        message = segmentation.GetErrorMessage()
+        assert re.search(method, message) and "--" not in message, message
+    segmentation.SetInputData(mri.to_vtk())
+    segmentation.SetMaskData(mri.with_array((mri.array > 0).astype(np.uint8)).to_vtk())
+    segmentation.AddTissueData("tumour", mri.with_array((mri.array > 0).astype(np.uint8)).to_vtk())
+    segmentation.Update()
+    message = segmentation.GetErrorMessage()
+    assert message.endswith("is it the mask of the brain (SetMaskData)?") and "--" not in message
+    segmentation.RemoveAddedTissues()
+    labels = np.where(mask.array > 0, 2, 0).astype(np.uint8)
+    labels[:, :, :13] = np.where(labels[:, :, :13] > 0, 1, 0)
+    segmentation.AddTissueData("tumour", mri.with_array(labels).to_vtk())
+    segmentation.Update()
+    assert segmentation.GetErrorMessage() == ""
+    several = "all of them are added as tumour (AddTissueData('brats', mask) adds the tissues of a BraTS map)"
+    assert any(several in line for line in segmentation.GetWarnings()), segmentation.GetWarnings()
+    assert any(line.startswith("tumour: ") for line in segmentation.GetNotes())

@@ -31,6 +31,7 @@ from SlicerUSSim.Logic.base.volume import read_array  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, tilt_sweep  # noqa: E402
+from SlicerUSSim.Logic.tissue.own_files import write_label_files  # noqa: E402
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES  # noqa: E402
 from tests.test_label_maps import head  # noqa: E402
@@ -837,6 +838,29 @@ def test_a_mask_opened_on_the_page_is_laid_over_the_tissues_as_what_the_user_say
     assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
 
+def test_masks_whose_files_are_doubtful_are_added_with_what_to_check_in_the_notes(page, tmp_path):
+    distance = np.sqrt(((np.indices((40, 40, 40)) - 19.5) ** 2).sum(axis=0))
+    place = np.eye(4)
+    place[:3, 3] = [-30 - 19.5, 10 - 19.5, 40 - 19.5]
+    brats = Volume(np.select([distance < 5, distance < 8, distance < 12], [1, 3, 2], 0).astype(np.uint8), place)
+    brats.write(tmp_path / "brats3.nii.gz")
+    partial = (distance < 6).astype(np.float32)
+    partial[:, :, :3] = np.nan
+    Volume(partial, place).write(tmp_path / "partial.nii.gz")
+    page.select_option("#added-as", "tumour")
+    for name, line in (
+        ("brats3", "Check: brats3.nii.gz holds the labels 1, 2, 3; all of them are added as tumour ('labels by their "
+         "names, or a BraTS map' adds the tissues of a BraTS map)"),
+        ("partial", "Check: partial.nii.gz: 4800 of 64000 voxels, at the border of the volume, are NaN: they are read "
+         "as 0"),
+    ):  # fmt: skip
+        with new_image(page):
+            page.set_input_files("#add-file", tmp_path / f"{name}.nii.gz")
+        settled(page)
+        assert line in page.locator("#notesLabel").inner_text() and not errors(page)
+    assert "Check: brats3.nii.gz holds" in page.locator("#notesLabel").inner_text()  # its lesion is still there
+
+
 def test_latency_is_measured_on_request(page):
     begun = monotonic()
     click(page, "#show-latency")
@@ -901,6 +925,26 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, fil
     assert state(page, NAMES.title) == "aseg.nii.gz" and page.locator("#notesLabel").inner_text() == notes
     notes = opened_as(files / "head.nii.gz")
     assert "share" in notes and "aseg" not in notes and not errors(page)
+
+
+def test_a_label_map_is_opened_together_with_its_table(page, files, tmp_path):
+    labels = Volume.read(files / "labels.nii.gz")
+    names = TissueTable.read(files / "labels.json").names()[1:]
+    order = [names[2], names[1], names[0], *names[3:]]  # as of a T2
+    of_t2 = labels.with_array(np.array([0, 3, 2, 1, 4], np.uint8)[labels.array])
+    write_label_files(tmp_path / "rem.nii.gz", of_t2, TissueTable.brain().for_names(order))
+    page.set_input_files("#open-file", tmp_path / "rem.json")
+    assert "rem.json is the tissue table of a label map: open both files together" in shown_errors(page)
+    page.locator(".ussim-error button").first.click()
+    page.set_input_files("#open-file", tmp_path / "rem.nii.gz")
+    assert "open it together with the .json file that was written beside it" in shown_errors(page)
+    page.locator(".ussim-error button").first.click()
+    with new_image(page):
+        page.set_input_files("#open-file", [tmp_path / "rem.nii.gz", tmp_path / "rem.json"])
+    settled(page)
+    assert state(page, NAMES.title) == "rem.nii.gz" and not errors(page)
+    assert "4 labels by their numbers in the tissue table" in page.locator("#notesLabel").inner_text()
+    assert set(names) <= {row["name"] for row in state(page, NAMES.panel.tissues)}
 
 
 # ---- who may come in, and how it is started --------------------------------------------------------------------------

@@ -145,7 +145,7 @@ def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = M
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.recognition import check_finite
     from SlicerUSSim.Logic.tissue.label_advice import MRI_COMMAND
-    from SlicerUSSim.Logic.tissue.label_findings import MOST_LABELS
+    from SlicerUSSim.Logic.tissue.label_findings import MOST_LABELS, NoPatientError
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file
 
     require_no_sequence(path)
@@ -156,7 +156,9 @@ def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = M
         check_finite(volume)
     if is_label_file(Path(path), volume):
         try:
-            found = read_label_file(Path(path), volume, advice=MRI_COMMAND)  # refuses a mask, and says how to add it
+            found = read_label_file(Path(path), volume, advice=MRI_COMMAND)
+        except NoPatientError:  # says how to add it
+            raise
         except SimulationError as error:
             if "--map" not in str(error):
                 raise

@@ -27,6 +27,7 @@ from SlicerUSSim.Command.options import (
     mask_option,
     require_no_mri_options,
 )
+from SlicerUSSim.Command.outside import outside_option, require_outside, with_outside
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Command.sheets import DrawnSheets, drawn_sheets_option, no_sheet_option
@@ -102,6 +103,8 @@ class PatientOptions:
     also: tuple[str, ...] = declared(also_option)
     #: TISSUE=FILE
     additions: tuple[str, ...] = declared(add_option)
+    #: Whether skin, scalp, skull and air are labelled, too
+    outside: bool = declared(outside_option)
     #: A file, auto or none
     sheets: str = declared(drawn_sheets_option)
     #: Kinds that are not drawn
@@ -198,12 +201,17 @@ def open_examination(patient: PatientOptions) -> Examination:
         kinds = ("a label map", "--mri") if is_labels else ("an MRI, to be segmented", "--labels")
         log.info("%s is read as %s; use %s if it is not", patient.mri_or_labels, *kinds)
     if is_labels and preset.settings.needs_texture:
-        raise SimulationError(f"{patient.mri_or_labels}: is a label map; --mri-modulation needs an MRI")
+        raise SimulationError(
+            f"{patient.mri_or_labels}: is a label map; --partial-volume and --mri-modulation need an MRI"
+        )
     if not is_labels:
         require_no_map(patient.mri_or_labels, patient.maps, patient.organs)
     if is_labels:
         require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")
     split_also(patient.also)
+    if patient.outside and is_labels:
+        raise SimulationError(f"{patient.mri_or_labels}: is a label map, and --outside is for an MRI")
+    require_outside(patient.outside, patient.segmentation["contrast"])
     sheets = DrawnSheets.of(
         patient.sheets, patient.no_sheets, is_labels=is_labels, contrast=patient.segmentation["contrast"]
     )
@@ -232,6 +240,8 @@ def open_examination(patient: PatientOptions) -> Examination:
     if isinstance(segmentation, Segmentation):
         drawn = sheets.found(patient.mri_or_labels, volume, segmentation, patient.segmentation["contrast"])
         labels, names, surfels = drawn.labels, drawn.names, drawn.surfels
+        if patient.outside:
+            labels, names = with_outside(patient.mri_or_labels, volume, segmentation, labels, names)
     names = names if table is None else tissues.names_by_label()
     added = additions.on(labels, names, has_brain_mask=not is_ct)
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)

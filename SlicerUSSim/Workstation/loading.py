@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,19 +81,22 @@ class Loading:
             if files.sequence is not None:
                 self._take_sequence(files.sequence, files.sequence_name)
 
-    def open(self, name: str, content: bytes) -> None:
-        """Open a file sent by a page: an MRI, a label map, a tracked sequence or a preset.
+    def open(self, files: Mapping[str, bytes]) -> None:
+        """Open what a page has sent, {name: content}: an MRI, a label map, a tracked sequence or a preset.
+
+        A label map may come with the table of its labels.
 
         Nothing changes if it cannot be read. An MRI or a label map takes the place of the patient before, of whom no
         lesions, notes and messages stay.
         """
-        with self._presenter.shown(), self._opener.uploaded(name, content) as (path, kind):
+        with self._presenter.shown(), self._opener.uploaded(files) as upload:
+            path, kind = upload.path, upload.kind
             if kind == "preset":
                 self._logic.preset = Preset.read(path)
             elif kind == "sequence":
-                self._take_sequence(self._tasks.do(lambda: TrackedSequence.read(path)), name.split(".")[0])
+                self._take_sequence(self._tasks.do(lambda: TrackedSequence.read(path)), Path(path).name.split(".")[0])
             elif kind == "labels":
-                node, found = self._opener.labels(path)
+                node, found = self._opener.labels(path, upload.table)
                 self._messages.clear()
                 self._logic.parameters.lesions, self._is_new = None, True
                 self._take_labels(node, found)

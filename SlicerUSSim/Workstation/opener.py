@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.imaging.preset import SECTIONS, Preset
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.masks import with_label_names
 from SlicerUSSim.Logic.mri.samples import demo_mri
@@ -25,9 +26,11 @@ from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
 from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
 from SlicerUSSim.Logic.tissue.label_advice import PAGE
+from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file, table_beside
+from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.script import LabelSource
@@ -69,6 +72,27 @@ class Files:
     volumes: Mapping[str, Volume] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class LabelTable:
+    """What the file of a table says about the labels of a label map."""
+
+    name: str
+    #: As `ussim segment` writes them; None of another table
+    tissues: TissueTable | None = None
+    mapping: LabelMapping = field(default_factory=LabelMapping)
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A file that a page has sent."""
+
+    path: str
+    #: "preset", "sequence", "labels" or "mri"
+    kind: str
+    #: Of the labels; None without
+    table: LabelTable | None = None
+
+
 class Opener:
     """Reads files in the worker thread and adds them to the scene. Raises SimulationError for invalid files."""
 
@@ -78,7 +102,7 @@ class Opener:
         #: {segments of a node: (tissue, file) of each}
         self._lesion_files: dict[tuple, tuple[tuple[str, str], ...]] = {}
         self._volumes = dict(files.volumes)  # read, but not yet used
-        #: {temporary path: name} of the file that a page has sent last
+        #: {temporary path: name} of the files that a page has sent last
         self._uploads: dict[str, str] = {}
 
     def mri(self, path: str | None):
@@ -110,15 +134,18 @@ class Opener:
         """A label map node with the mask of a file."""
         return self._label_map(self._volume(path), path, ["inside"])
 
-    def labels(self, path: str) -> tuple[Any, LabelledTissues]:
+    def labels(self, path: str, table: LabelTable | None = None) -> tuple[Any, LabelledTissues]:
         """(label map node, what was recognised) of a file; see label_sources.read_label_file.
 
-        Tissues are those of the table or names beside it, of the preset, or of a known program's numbers.
+        Tissues are those of `table`, of the table or names beside it, of the preset, or of a known program's numbers.
         """
         volume = self._volume(path)
         mine = self._logic.preset.tissues
         mapping = LabelMapping.of(self._files.maps if path == self._files.labels else (), mine)
-        beside = None if mapping else table_beside(Path(path))
+        if table is not None:
+            mapping, beside = table.mapping, table.tissues
+        else:
+            beside = None if mapping else table_beside(Path(path))
         is_chosen = mine.names() != Preset().tissues.names()
         found = self._tasks.do(
             lambda: read_label_file(
@@ -129,8 +156,12 @@ class Opener:
             for tissue in beside.values():
                 mine = mine.with_tissue(tissue)
             self._logic.preset = replace(self._logic.preset, tissues=mine)
+        if mapping.names and table is not None:
+            found = replace(found, message=f"{found.message}, named in {table.name}")
         found = replace(
-            found, message=self._as_known(found.message), warnings=tuple(map(self._as_known, found.warnings))
+            found,
+            message=self._as_known(found.message),
+            warnings=tuple(map(self._as_known, (*found.warnings, *volume.doubts))),
         )
         node = self._label_map(found.labels, path, found.names)
         node.SetAttribute(PATIENT, node.GetName())
@@ -161,7 +192,8 @@ class Opener:
                 self._scene.RemoveNode(node)
 
         try:
-            ids = add_lesion(node, mask, tissue, name)
+            told = replace(mask, doubts=tuple(map(self._as_known, mask.doubts)))
+            ids = add_lesion(node, told, tissue, name, PAGE)
         except SimulationError:
             undo()
             raise
@@ -232,32 +264,66 @@ class Opener:
     @contextmanager
     def uploaded_mask(self, name: str, content: bytes) -> Iterator[Volume]:
         """The volume of a file with a mask uploaded from a page."""
-        with TemporaryDirectory() as folder, self._sent(name, content, folder) as path:
+        with TemporaryDirectory() as folder, self._sent({name: content}, folder) as (path,):
             volume = self._mask(str(path))
         yield volume
 
     @contextmanager
-    def uploaded(self, name: str, content: bytes) -> Iterator[tuple[str, str]]:
-        """(path, kind) of a file uploaded from a page; kind is "preset", "sequence", "labels" or "mri"."""
-        with TemporaryDirectory() as folder, self._sent(name, content, folder) as path:
-            if name.lower().endswith(".json"):
-                kind = "preset"
-            elif ".igs." in name.lower() or ".seq." in name.lower():
-                kind = "sequence"
-            else:
-                volume = self._volumes[str(path)] = self._volume(str(path))
-                kind = "labels" if is_label_file(path, volume) else "mri"
-                _log.info("%s: opened as %s", name, "a label map" if kind == "labels" else "an MRI")
-            yield str(path), kind
+    def uploaded(self, files: Mapping[str, bytes]) -> Iterator[Upload]:
+        """What a page has sent together, {name: content}: one file, or a label map with the table of its labels."""
+        with TemporaryDirectory() as folder, self._sent(files, folder) as paths:
+            presets = [path for path in paths if _is_json(path) and len(paths) == 1 and not _has_tissues_only(path)]
+            for path in paths if len(paths) > 1 else ():
+                require(not (_is_json(path) and _has_probe(path)), f"{path.name} is a preset: open it alone")
+            tables = [path for path in paths if path not in presets and (_is_json(path) or _is_table(path))]
+            others = [path for path in paths if path not in tables]
+            called = ", ".join(path.name for path in paths)
+            if not others:
+                what = "the tissue table" if _is_json(paths[0]) else "a table of the labels"
+                require(len(paths) == 1, f"{called}: are tables, expected a label map with one of them")
+                raise SimulationError(f"{called} is {what} of a label map: open both files together")
+            require(
+                len(others) == 1 and len(tables) <= 1,
+                f"{called}: are {len(paths)} files, expected one, or a label map with the table of its labels",
+            )
+            path, kind, table = others[0], self._kind(others[0]), None
+            if tables:
+                require(
+                    kind == "labels",
+                    f"{path.name} is no label map, and {tables[0].name} a table of labels, expected both of a label "
+                    "map; open it alone",
+                )
+                table = self._table(tables[0])
+            yield Upload(str(path), kind, table)
+
+    def _kind(self, path: Path) -> str:
+        """The kind of a file, as Upload has it."""
+        name = path.name.lower()
+        if name.endswith(".json"):
+            return "preset"
+        if ".igs." in name or ".seq." in name:
+            return "sequence"
+        volume = self._volumes[str(path)] = self._volume(str(path))
+        kind = "labels" if is_label_file(path, volume) else "mri"
+        _log.info("%s: opened as %s", path.name, "a label map" if kind == "labels" else "an MRI")
+        return kind
+
+    def _table(self, path: Path) -> LabelTable:
+        if _is_json(path) and _has_tissues_only(path):
+            return LabelTable(path.name, TissueTable.read(path))
+        return LabelTable(path.name, mapping=LabelMapping.of([str(path)], self._logic.preset.tissues))
 
     @contextmanager
-    def _sent(self, name: str, content: bytes, folder: str) -> Iterator[Path]:
-        """The path of a file that a page has sent; errors within the block are about its name, as the user knows it."""
-        path = Path(folder) / name
-        path.write_bytes(content)
-        self._uploads = {str(path): name}
+    def _sent(self, files: Mapping[str, bytes], folder: str) -> Iterator[list[Path]]:
+        """The paths of files that a page has sent, {name: content}.
+
+        Errors within the block are about their names, as the user knows them.
+        """
+        self._uploads = {str(Path(folder) / name): name for name in files}
+        for path, content in zip(self._uploads, files.values(), strict=True):
+            Path(path).write_bytes(content)
         try:
-            yield path
+            yield list(map(Path, self._uploads))
         except SimulationError as error:
             raise SimulationError(self._as_known(str(error))) from None
 
@@ -285,6 +351,26 @@ class Opener:
         node.SetAttribute(FILE, self._place(path))
         write_labels(node, volume.with_array(volume.array.astype(np.uint8)), names, node)
         return node
+
+
+def _is_json(path: Path) -> bool:
+    return path.suffix.lower() == ".json"
+
+
+def _is_table(path: Path) -> bool:
+    return path.suffix.lower() in TABLE_SUFFIXES
+
+
+def _has_tissues_only(path: Path) -> bool:
+    """Whether a .json file has the tissues of a label map, as `ussim segment` writes them, and is no preset."""
+    values = read_json(path)
+    return isinstance(values, dict) and "tissues" in values and not _has_probe(path)
+
+
+def _has_probe(path: Path) -> bool:
+    """Whether a .json file has sections that a preset has, and no table."""
+    values = read_json(path)
+    return isinstance(values, dict) and bool(values.keys() & {"probe", *SECTIONS})
 
 
 def _file_of(node) -> str:

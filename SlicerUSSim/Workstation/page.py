@@ -17,6 +17,7 @@ from trame_slicer.core import LayoutManager
 from trame_slicer.views import AbstractView
 
 from SlicerUSSim.Logic.mri.pathology import LESIONS
+from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
 from SlicerUSSim.Widget.controls import Control, Section
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS
 from SlicerUSSim.Workstation.state import NAMES, PLANES, SLICE_VIEWS, ComparisonMode
@@ -39,7 +40,7 @@ _IN_PAGE = {
     "savePresetButton": "window.ussim.save('json')",
     "loadPresetButton": "window.document.getElementById('open-file').click()",
 }
-_LESION_TEXTS = {"brats": "labels by their names, or a BraTS map"}
+_LESION_TEXTS = {"brats": PAGE_SEVERAL}
 #: Colours of the marks beside the slice views' planes.
 _STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
 
@@ -138,8 +139,8 @@ def _drawer(sections: tuple[Section, ...]) -> None:
 
 def _open_file() -> None:
     v3.VFileInput(
-        label="Open an MRI, label map or tracked sequence", v_model=(NAMES.opened_file, None), density="compact",
-        hide_details=True, variant="outlined", id="open-file", classes="mb-1",
+        label="Open an MRI, label map (with its table) or tracked sequence", v_model=(NAMES.opened_file, None),
+        multiple=True, density="compact", hide_details=True, variant="outlined", id="open-file", classes="mb-1",
     )  # fmt: skip
     options = "".join(f'<option value="{name}">{_LESION_TEXTS.get(name, name)}</option>' for name in LESIONS)
     html.Div(

@@ -109,8 +109,8 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         )
         lines.append(f"labels = add_tissues(labels, {names}, [{masks}]{more_options}).labels")
         texture = f"texture_below({texture}, mri, segmentation.labels, labels)"
-    uses_texture = preset.settings.uses_texture and not source.is_labels
-    if uses_texture and source.additions:
+    needs_texture = preset.settings.needs_texture and not source.is_labels
+    if needs_texture and source.additions:
         more += "from SlicerUSSim.Logic.mri.pathology import texture_below\n"
     return _TEMPLATE.format(
         missing="".join(
@@ -121,7 +121,7 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         labels="\n".join(lines),
         preset=indent(pformat(_plain(preset), width=112, sort_dicts=False), "    ").strip(),
         pose=np.array2string(probe_to_ras, separator=", ", floatmode="unique", max_line_width=118),
-        texture=f", texture={texture}" if uses_texture else "",
+        texture=f", texture={texture}" if needs_texture else "",
     )
 
 

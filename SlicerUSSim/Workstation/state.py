@@ -183,9 +183,9 @@ class PageState:
     title: str = ""
     #: Titles of the panel's sections that are open
     open_sections: list[str] = field(default_factory=list)
-    #: File uploaded by the user, as the file input provides it (name, content); None after it was read
+    #: Files uploaded by the user, as the file input provides them (name, content); None after they were read
     opened_file: object = None
-    #: As opened_file: a mask to add, and the tissue that it is
+    #: The same of one file: a mask to add, and the tissue that it is
     added_file: object = None
     added_as: str = LESIONS[0]
     #: None before the first image

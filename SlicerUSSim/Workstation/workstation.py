@@ -131,14 +131,14 @@ class Workstation:
         return lambda *arguments: self._tasks.start(lambda: method(*arguments))
 
     def _file_opened(self, given: Any) -> None:
-        file = _uploaded(given)
-        if file is not None:
+        files = _uploaded(given)
+        if files:
             with self._shared.changing() as now:
                 now.opened_file = None
-            self._tasks.start(lambda: self._then_refresh(self._loading.open, *file))
+            self._tasks.start(lambda: self._then_refresh(self._loading.open, files))
 
     def _file_added(self, given: Any) -> None:
-        file = _uploaded(given)
+        file = next(iter(_uploaded(given).items()), None)
         if file is not None:
             tissue = self._shared.now.added_as
             with self._shared.changing() as now:
@@ -212,9 +212,7 @@ class Workstation:
         self._presenter.parametersChanged()
 
 
-def _uploaded(given: Any) -> tuple[str, bytes] | None:
-    """(name, content) of a page's file input; None if it is empty."""
-    given = given[0] if isinstance(given, list) and given else given
-    if not given or not given.get("content"):
-        return None
-    return Path(given["name"]).name, bytes(given["content"])
+def _uploaded(given: Any) -> dict[str, bytes]:
+    """{name: content} of the files of a page's file input."""
+    files = given if isinstance(given, list) else [given]
+    return {Path(file["name"]).name: bytes(file["content"]) for file in files if file and file.get("content")}

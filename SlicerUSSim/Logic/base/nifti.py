@@ -141,14 +141,15 @@ def _bytes_of(file: Path) -> tuple[int, bool]:
     return count, False
 
 
-def check_numbers(path: Path, image) -> None:
+def check_numbers(path: Path, image) -> tuple[str, ...]:
     """Look for voxels of a NIfTI file that are not numbers: ITK reads them as 0 without a word.
 
     NaN that reaches the border of the volume is how SPM and others write "outside the head": it is read as 0, with a
-    warning. Raises SimulationError for NaN within, for slices of NaN between others, and for infinite voxels.
+    warning, which is returned, too. Raises SimulationError for NaN within, for slices of NaN between others, and for
+    infinite voxels.
     """
     if not (image.HasMetaDataKey("sform_code") and "float" in image.GetPixelIDTypeAsString()):
-        return
+        return ()
     import nibabel
     from scipy import ndimage
 
@@ -157,7 +158,7 @@ def check_numbers(path: Path, image) -> None:
     bad = ~np.isfinite(stored)
     count = int(bad.sum())
     if not count:
-        return
+        return ()
     require(count < bad.size, f"{path}: no voxel is a finite number, expected an image")
     background = np.zeros_like(bad)
     if bad.ndim == 3:
@@ -180,4 +181,6 @@ def check_numbers(path: Path, image) -> None:
                 f"{path}: {gaps.size} slice{'s are' if gaps.size > 1 else ' is'} NaN between slices with values, the "
                 f"first at {name} = {gaps[0]}; expected numbers, or NaN around the head alone"
             )
-    _log.warning("%s: %d of %d voxels, at the border of the volume, are NaN: they are read as 0", path, count, bad.size)
+    line = f"{path}: {count} of {bad.size} voxels, at the border of the volume, are NaN: they are read as 0"
+    _log.warning("%s", line)
+    return (line,)

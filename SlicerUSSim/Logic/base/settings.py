@@ -81,11 +81,12 @@ class SimulationSettings(Declared):
         "patient for a given probe",
         source="The paper's Rayleigh test uses cells of 20 µm (125000/mm³), of which mu1 keeps 1 %",
     )  # fmt: skip
-    partial_volume: bool = parameter(
-        True, "Partial volume",
-        "Mix the scatterers of tissues by the probabilities of the segmentation, where the MRI was segmented",
+    partial_volume: bool | None = parameter(
+        None, "Partial volume",
+        "Mix the scatterers of tissues by the probabilities of the segmentation, which requires segmenting the MRI "
+        "first; none: where they are at hand, as in a command that segments an MRI",
         shown=True, option="partial-volume/hard-labels",
-        note="Label maps have no probabilities",
+        note="Scenes of 3D Slicer and the page keep no probabilities: none is false there",
         source="Off in the paper; images are more like real ones with it, see optimization.md",
     )  # fmt: skip
     mri_modulation_db: float = parameter(
@@ -128,13 +129,8 @@ class SimulationSettings(Declared):
 
     @property
     def needs_texture(self) -> bool:
-        """Whether scatterers depend on the MRI's intensities, so that labels alone are not enough."""
-        return self.mri_modulation_db != 0.0
-
-    @property
-    def uses_texture(self) -> bool:
-        """Whether scatterers depend on the MRI's intensities or class probabilities, if there are any."""
-        return self.partial_volume or self.needs_texture
+        """Whether scatterers depend on the MRI's intensities or class probabilities, so that labels are not enough."""
+        return self.partial_volume is True or self.mri_modulation_db != 0.0
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,7 @@ class Volume:
     ijk_to_ras : (4, 4) from homogeneous voxel indices (i, j, k, 1) of voxel *centres* to RAS millimetres.
     name : of its file or node, for messages.
     label_names : {label: name} of masks and label maps, where their file gives them; see mri.read_mask.
+    doubts : what a user should check about its file, one line each, which read() has also logged.
 
     Raises SimulationError for an array that is not 3D or not numeric, and for a singular or non-affine matrix.
 
@@ -60,6 +61,7 @@ class Volume:
     ijk_to_ras: np.ndarray
     name: str = field(default="", compare=False)  # of no meaning for the image
     label_names: Mapping[int, str] = field(default_factory=dict, compare=False)
+    doubts: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         array = np.asarray(self.array)
@@ -128,7 +130,7 @@ class Volume:
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
         require_path(path)
-        path = Path(path)
+        path, doubts = Path(path), ()
         require(path.exists(), f"{path}: no such file or folder")
         if path.suffix.lower() == ".vti":
             volume = cls._read_vti(path)
@@ -143,13 +145,13 @@ class Volume:
             image = read_itk_image(path)
             volume = cls.from_sitk(image, name=str(path))
             log_nifti_geometry(image, volume.ijk_to_ras, str(path))
-            check_numbers(path, image)
+            doubts = check_numbers(path, image)
         else:
             array, ijk_to_ras = _read_minc1(path)
             _require_volume(array.shape[::-1], str(path))
             volume = cls(array, ijk_to_ras)
         _log_size(volume, path)
-        return replace(volume, name=str(path))
+        return replace(volume, name=str(path), doubts=doubts)
 
     @classmethod
     def from_sitk(cls, image, name: str = "image") -> Volume:
@@ -345,6 +347,11 @@ def read_itk_image(path: Path):
         reason = why_unreadable(path) or str(error).strip().splitlines()[-1]
         if "No such file" in reason and path.exists():  # ITK's words for voxels that it could not read
             reason = "its voxels are missing or incomplete; copy or export it again"
+        if "orthonormal" in reason:  # ITK's words for the sform of NIfTI
+            reason = (
+                "its axes are not perpendicular, as after an affine registration that was written into the header; "
+                "resample it to a regular grid"
+            )
         raise SimulationError(f"{path}: cannot be read as an image ({reason})") from None
     require_complete(path)
     is_complex = "complex" in image.GetPixelIDTypeAsString()

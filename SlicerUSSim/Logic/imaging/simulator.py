@@ -459,12 +459,13 @@ def _packed_texture(texture: Texture | None, labels: Volume, settings: Simulatio
         )
     require(
         texture is not None or not settings.needs_texture,
-        f"mri_modulation_db {settings.mri_modulation_db:g} needs a texture; pass segmentation.texture(), or "
-        "Texture.from_mri(mri, labels) for your own label map",
+        f"partial_volume {settings.partial_volume}, mri_modulation_db {settings.mri_modulation_db:g} need a texture; "
+        "pass segmentation.texture(), or Texture.from_mri(mri, labels) for your own label map",
     )
-    if texture is None or not (settings.needs_texture or (settings.partial_volume and texture.second_share.any())):
+    is_mixed = settings.partial_volume is not False and texture is not None and bool(texture.second_share.any())
+    if texture is None or not (is_mixed or settings.needs_texture):
         return None
-    return texture.packed(as_labels(labels.array), settings.partial_volume, settings.mri_modulation_db)
+    return texture.packed(as_labels(labels.array), is_mixed, settings.mri_modulation_db)
 
 
 def steering_fields(probe: Probe) -> dict[str, Any]:

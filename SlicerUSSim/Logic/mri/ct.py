@@ -67,10 +67,12 @@ class CtSegmentation:
         return Texture(second, share, tissue_deviation(self._filtered, self.labels.array), share)
 
     def table(self) -> str:
-        """Share, volume, mean and standard deviation of every label in HU, one per line."""
+        """Share, volume, mean and standard deviation of every label that occurs in HU, one per line."""
         counts = np.bincount(self.labels.array.ravel(), minlength=len(self.tissue_names) + 1)[1:]
         lines = [f"{'label':>5}  {'tissue':15} {'share':>6} {'ml':>8} {'HU':>6} {'sd':>5}"]
         for n, name in enumerate(self.tissue_names):
+            if not counts[n]:
+                continue
             lines.append(
                 f"{n + 1:5d}  {name:15} {counts[n] / counts.sum():6.1%} {counts[n] * self.labels.voxel_ml:8.1f} "
                 f"{self.means[n]:6.0f} {self.standard_deviations[n]:5.0f}"

@@ -84,11 +84,9 @@ def keep(path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: floa
 
     A file that was not written by this function is never replaced.
     """
-    if path.exists() and not _is_ours(path):
-        return Kept(
-            f"{path} was not written by ussim, or was edited, and stays as it is; the brain mask is not kept (to use "
-            "that file, give it as --mask)", False,
-        )  # fmt: skip
+    why = _why_not_ours(path) if path.exists() else None
+    if why is not None:
+        return Kept(f"{path} {why}", False)
     mask = mri.with_array(inside.astype(np.uint8))
     entries = {
         "mri": fingerprint_of(mri), "mask": _hash(mask.array), "method": method, "seconds": f"{seconds:.1f}",
@@ -140,15 +138,20 @@ def _write(path: Path, mask: Volume, entries: dict[str, str]) -> None:
         sitk.WriteImage(image, str(partial), useCompression=True)
 
 
-def _is_ours(path: Path) -> bool:
-    """Whether the file was written by `keep` and nobody has edited it since."""
+def _why_not_ours(path: Path) -> str | None:
+    """Why a file stays as it is; None if `keep` has written it and nobody has edited it since."""
     try:
         image = read_itk_image(path)
         mask = Volume.from_sitk(image, str(path))
     except SimulationError:
-        return False
+        return "cannot be read and stays as it is; the brain mask is not kept (delete that file to keep it there)"
     key = f"{_PREFIX}mask"
-    return image.HasMetaDataKey(key) and _is_as_written(mask, image.GetMetaData(key))
+    if image.HasMetaDataKey(key) and _is_as_written(mask, image.GetMetaData(key)):
+        return None
+    return (
+        "was not written by ussim, or was edited, and stays as it is; the brain mask is not kept (to use that file, "
+        "give it as --mask)"
+    )
 
 
 def _is_as_written(mask: Volume, digest: str) -> bool:

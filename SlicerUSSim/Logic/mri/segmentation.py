@@ -111,12 +111,14 @@ class Segmentation:
         return Texture(second_label, second_share, tissue_deviation(self._filtered, labels), shares)
 
     def table(self) -> str:
-        """Share, volume, mean intensity and standard deviation of every label, one per line."""
+        """Share, volume, mean intensity and standard deviation of every label that occurs, one per line."""
         counts = np.bincount(self.labels.array.ravel(), minlength=len(self.tissue_names) + 1)[1:]
         millilitres = counts * self.labels.voxel_ml
         digits = ".2f" if np.abs(self.means).max() >= _LARGE else ".3g"  # of images from 0 to 1, or 1e-6
         lines = [f"{'label':>5}  {'tissue':14} {'share':>6} {'ml':>7} {'mean':>9} {'sd':>8}"]
         for n, name in enumerate(self.tissue_names):
+            if not counts[n]:  # of a part of a brain, or under what was added
+                continue
             numbers = ""
             if n < len(self.means):
                 numbers = f" {self.means[n]:9{digits}} {self.standard_deviations[n]:8{digits}}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import slicer
+from vtkmodules.vtkCommonCore import mutable
 from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
@@ -12,15 +13,20 @@ from SlicerUSSim.Logic.base.vtk_data import matrix_array, vtk_matrix
 from SlicerUSSim.Logic.mri.masks import read_masks
 from SlicerUSSim.Logic.mri.pathology import box_ras, tissue_to_add
 from SlicerUSSim.Logic.mrml.nodes import named, node_to_world, require_node
+from SlicerUSSim.Logic.tissue.label_advice import SCENE, Advice
 from SlicerUSSim.Logic.tissue.presets import TISSUES, colour_of
 from SlicerUSSim.Logic.tissue.table import TissueTable
 
 #: Voxels on a side; masks farther away are an error, which is found later.
 _MOST_PADDING = 40
+#: Tag of a segment: what a user should check about the file from which it is, in lines
+_CHECKS = "SlicerUSSim.checks"
 
 
 def read_lesions(lesions_node, to_frame_of, tissues: TissueTable) -> tuple[list[tuple[str, Volume, str]], list[str]]:
     """([(tissue, mask, name in messages)], warnings) of the segments that are called as tissues.
+
+    Warnings are about segments that are not added, and those of add_lesion.
 
     Masks are in the own frame of the node `to_frame_of`, before its parent transform. Names are looked up in `tissues`,
     then in the presets. Raises SimulationError for another node, and if no segment is called as a tissue or has voxels.
@@ -48,6 +54,7 @@ def read_lesions(lesions_node, to_frame_of, tissues: TissueTable) -> tuple[list[
             warnings.append(f"segment {name!r} of {lesions_node.GetName()!r} is not added: it is empty")
         else:
             found.append((tissue, Volume(mask.array, moved @ mask.ijk_to_ras), f"segment {name!r}"))
+            warnings += _checks_of(segmentation.GetSegment(segment_id))
     require(
         bool(found),
         f"lesions {named(lesions_node)}: {'; '.join(warnings)}; expected segments with voxels, called as one of: "
@@ -56,12 +63,13 @@ def read_lesions(lesions_node, to_frame_of, tissues: TissueTable) -> tuple[list[
     return found, warnings
 
 
-def add_lesion(lesions_node, mask: Volume, tissue: str, name: str) -> list[str]:
+def add_lesion(lesions_node, mask: Volume, tissue: str, name: str, advice: Advice = SCENE) -> list[str]:
     """Append the segments of a mask, as add_tissue reads it, to a segmentation node; returns their IDs.
 
+    What should be checked about the mask is kept with the segments, in the words of `advice`: see read_lesions.
     Raises SimulationError for what is not a mask; the node is then as it was.
     """
-    masks = read_masks(mask, tissue, name)
+    masks = read_masks(mask, tissue, name, advice)
     if lesions_node.GetSegmentation().GetNumberOfSegments() == 0:
         lesions_node.SetSourceRepresentationToBinaryLabelmap()
     ids = []
@@ -74,7 +82,23 @@ def add_lesion(lesions_node, mask: Volume, tissue: str, name: str) -> list[str]:
         segment_id = lesions_node.GetSegmentation().GenerateUniqueSegmentID(part)
         lesions_node.AddSegmentFromBinaryLabelmapRepresentation(image, part, colour_of(part), segment_id)
         ids.append(segment_id)
+    checks = (*masks.warnings, *mask.doubts)
+    if checks:
+        lesions_node.GetSegmentation().GetSegment(ids[0]).SetTag(_CHECKS, "\n".join(checks))
     return ids
+
+
+def _checks_of(segment) -> list[str]:
+    checks = mutable("")
+    return str(checks).splitlines() if segment.GetTag(_CHECKS, checks) else []
+
+
+def place_of(mask: Volume) -> tuple[float, ...]:
+    """Volume in ml, centre and box in RAS mm of a mask that is not empty: equal for a lesion that nobody has edited."""
+    inside = mask.array > 0
+    centre = mask.ijk_to_ras[:3] @ np.append(np.argwhere(inside).mean(axis=0)[::-1], 1.0)
+    numbers = (inside.sum() * mask.voxel_ml, *centre, *np.ravel(box_ras(inside, mask)))
+    return tuple(round(float(number), 3) for number in numbers)
 
 
 def padded_for(lesions: list[tuple[str, Volume, str]], labels: Volume) -> Volume:

@@ -39,7 +39,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import (
     read_mask,
     write_labels,
 )
-from SlicerUSSim.Logic.mrml.lesion_nodes import padded_for, read_lesions
+from SlicerUSSim.Logic.mrml.lesion_nodes import padded_for, place_of, read_lesions
 from SlicerUSSim.Logic.mrml.live import LiveNodes, LiveUpdate
 from SlicerUSSim.Logic.mrml.nodes import (
     named,
@@ -97,6 +97,10 @@ class _Segmented:
     is_of_brain: bool
 
 
+#: {lesion, see lesion_nodes.place_of: (messages, warnings) when it was laid over labels that did not have it}
+_Told = dict[Hashable, tuple[tuple[str, ...], tuple[str, ...]]]
+
+
 class UltrasoundSceneLogic:
     """Simulates on the nodes of one scene.
 
@@ -118,6 +122,8 @@ class UltrasoundSceneLogic:
         self._simulators = ReusedSimulator()
         self._patients = PatientReader()
         self._segmented: _Segmented | None = None
+        #: Version of the labels over which lesions were laid last, and what was told about each of them
+        self._laid: tuple[Hashable, _Told] = (None, {})
         #: Lesions proposed from the MRI that was segmented last
         self.proposals = LesionProposals(scene, lambda work: self._work.do(work))
         #: What the last segment() or addTissues() did, and what a user should check, one line each
@@ -208,9 +214,10 @@ class UltrasoundSceneLogic:
             )
         )  # fmt: skip
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
-        added = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=is_of_brain)
+        added, told = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=is_of_brain)
         write_labels(labels_node, added.labels, added.tissue_names, mri_node)
         mark_as_made(labels_node)
+        self._laid = labels_version(labels_node), told
         if isinstance(result, Segmentation):  # lesions are proposed on MRIs only
             self.proposals.segmented(mri_node, result)
         self._segmented = _Segmented(
@@ -260,7 +267,8 @@ class UltrasoundSceneLogic:
 
         Segments are called as tissues: tumour, oedema, necrosis, cyst, haematoma, cavity, or others of the preset and
         the presets; the last is on top. The result is written into `output_node`, by default into `labels_node` itself,
-        which must then be made by segment() and not be edited since. `notes` and `warnings` tell what was done.
+        which must then be made by segment() and not be edited since. `notes` and `warnings` tell what was done; of a
+        lesion that the labels already have, what it was laid over at first.
         Raises SimulationError if no segment is called as a tissue, and for one that is not a lesion of this patient
         (see pathology.add_tissue); nothing is changed then.
         """
@@ -280,9 +288,13 @@ class UltrasoundSceneLogic:
         lesions, skipped = self._lesions(lesions_node, labels_node)
         if labels_node.IsA("vtkMRMLSegmentationNode"):
             labels = padded_for(lesions, labels)  # it is cropped to what it holds
-        added = self._with_lesions(labels, names, lesions, has_brain_mask=was is not None and was.is_of_brain)
+        before = self._laid[1] if self._laid[0] == labels_version(labels_node) else {}
+        added, told = self._with_lesions(
+            labels, names, lesions, before, has_brain_mask=was is not None and was.is_of_brain
+        )
         write_labels(output, added.labels, added.tissue_names, labels_node)
         mark_as_made(output)
+        self._laid = labels_version(output), told
         if was is not None and labels is was.labels:
             self._segmented = _Segmented(
                 labels_version(output), added.labels, added.tissue_names,
@@ -563,10 +575,29 @@ class UltrasoundSceneLogic:
         return read_lesions(lesions_node, to_frame_of, self.preset.tissues)
 
     def _with_lesions(
-        self, labels: Volume, names: Sequence[str], lesions: list[tuple[str, Volume, str]], *, has_brain_mask: bool
-    ) -> Added:
+        self,
+        labels: Volume,
+        names: Sequence[str],
+        lesions: list[tuple[str, Volume, str]],
+        before: _Told | None = None,
+        *,
+        has_brain_mask: bool,
+    ) -> tuple[Added, _Told]:
+        """(labels with lesions, what is told about each); `before` is that about those which the labels have."""
         own = [tissue.name for tissue in self.preset.tissues.all_tissues()]
-        return self._work.do(lambda: add_tissues(labels, names, lesions, also=own, has_brain_mask=has_brain_mask))
+
+        def lay() -> tuple[Added, _Told]:
+            added, told = Added(labels, tuple(names)), {}
+            for tissue, mask, source in lesions:
+                added = add_tissues(
+                    added.labels, added.tissue_names, [(tissue, mask, source)], also=own, has_brain_mask=has_brain_mask
+                )
+                place = (tissue, source, *place_of(mask))
+                told[place] = (before or {}).get(place, (added.messages, added.warnings))
+            lines = [tuple(line for one in told.values() for line in one[kind]) for kind in (0, 1)]
+            return Added(added.labels, added.tissue_names, *lines), told
+
+        return self._work.do(lay)
 
     def _check_output(self, labels_node, output_node) -> None:
         require_node(output_node, "vtkMRMLScalarVolumeNode", use="output")
@@ -618,17 +649,15 @@ class UltrasoundSceneLogic:
         return self._simulators.get(patient.version, patient.labels, tissues, preset.settings, self.device, texture)
 
     def _texture_of(self, patient: Patient) -> Texture | None:
-        """The texture from the MRI, if the settings use it and the labels are as segment() made them."""
-        settings, segmented = self.preset.settings, self._segmented
+        """The texture from the MRI, if the settings require it."""
+        if not self.preset.settings.needs_texture:
+            return None
+        segmented = self._segmented
         if segmented is None or segmented.version != patient.node_version:
-            require(
-                not settings.needs_texture,
+            raise SimulationError(
                 f"the settings need a texture from the MRI, which {patient.name} lacks; segment the MRI again, or set "
-                "mri_modulation_db to 0",
+                "partial_volume to false and mri_modulation_db to 0"
             )
-            return None
-        if not settings.uses_texture:
-            return None
         if self._texture is None or self._texture[0] != patient.version:
             # A segmentation node may return its labels on a larger or smaller part of the grid.
             texture = segmented.texture().on_grid_of(patient.labels, segmented.labels)

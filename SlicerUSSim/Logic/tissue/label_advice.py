@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+
+#: What the page calls the masks of several tissues
+PAGE_SEVERAL = "labels by their names, or a BraTS map"
 
 
 @dataclass(frozen=True)
@@ -17,7 +21,7 @@ class Advice:
     leave_out: str = "leave them out with {maps}"
     #: About a label that is the background; {label} is its number
     background: str = "leave it out with --map {label}=0, or say what it is with --map {label}=TISSUE"
-    #: About a mask or lesion without a patient; {added}, {source} and {maps} are for this label map
+    #: About a mask or lesion without a patient; {added}, {tissue}, {source} and {maps} are for this label map
     lesion: str = "add it to a segmentation with --add {added}, or simulate it alone with {maps} (ussim simulate)"
     #: The same about one as large as a brain
     brain_mask: str = (
@@ -30,15 +34,24 @@ class Advice:
     likely: str = "if that is right, say so with {maps}"
     #: About voxels without a label between organs
     between: str = "--map 0=fat gives it a tissue"
+    #: A mask that is added as {tissue}, and one of several tissues
+    one_tissue: str = "{tissue}=FILE"
+    several_tissues: str = "brats=FILE"
+    #: By what a user gives labels tissues
+    mapping: str = "--map"
     #: Whether the volumes of unknown labels are listed
     gives_sizes: bool = True
     #: Whether {maps} are in Python, and not options of the command
     is_python: bool = False
+    #: Whether they are the content of a .json file
+    is_json: bool = False
 
     def maps(self, texts: Iterable[str]) -> str:
         """{maps} of texts for LabelMapping.of: --map 1=csf --map 2=tumour."""
         if self.is_python:
             return f"mapping=LabelMapping.of({list(texts)})"
+        if self.is_json:
+            return json.dumps(dict(text.split("=", 1) for text in texts))
         return " ".join(f"--map {shlex.quote(text)}" for text in texts)
 
 
@@ -51,20 +64,33 @@ MRI_COMMAND = replace(
         "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or simulate it alone with "
         "ussim simulate"
     ),
+    ambiguous="use ussim simulate with --map {key}",
 )
 #: The page of the workstation
 PAGE = replace(
     COMMAND,
     leave_out="",
-    unknown="name them in a table beside it (.txt), or start ussim serve --labels with --map {label}=TISSUE, one of",
-    lesion="add it to a segmentation, or start ussim serve --labels {source} {maps}",
-    brain_mask=(
-        "if it is the mask of a brain, start ussim serve MRI --mask {source} with that brain's MRI, or ussim serve "
-        "--labels {source} {maps}"
+    unknown=(
+        "open it together with a table of its names (.txt, .ctbl), the tissue table of ussim segment (.json), or a "
+        '.json file with {{"{label}": "TISSUE"}} (0 removes a label), one of'
     ),
-    background="start ussim serve --labels with --map {label}=0, or with --map {label}=TISSUE",
+    lesion="add it to a patient's tissues (Add a mask as), or open it together with a .json file with {maps}",
+    brain_mask=(
+        "if it is the mask of a brain, start ussim serve MRI --mask {source} with that brain's MRI, or open it "
+        "together with a .json file with {maps}"
+    ),
+    background=(
+        'open it together with a .json file with {{"{label}": 0}} that leaves it out, or {{"{label}": "TISSUE"}}'
+    ),
     ambiguous="start ussim serve --labels with --map {key}",
-    likely="if that is right, start ussim serve --labels with {maps}",
+    likely=(
+        "if it is of ussim segment, open it together with the .json file that was written beside it; if that is right, "
+        "with a .json file with {maps}"
+    ),
+    mapping="the .json file",
+    is_json=True,
+    one_tissue="{tissue!r}",
+    several_tissues=repr(PAGE_SEVERAL),
 )
 #: 3D Slicer
 SCENE = Advice(
@@ -89,5 +115,17 @@ SCRIPT = replace(
     ambiguous="read it with read_label_map and a LabelMapping of {key!r}",
     likely="if that is right, read it with read_label_map(volume, {maps})",
     between="read_label_map with a LabelMapping of 0=fat gives it a tissue",
+    one_tissue="AddTissueData({tissue!r}, mask)",
+    several_tissues="AddTissueData('brats', mask)",
     is_python=True,
+)
+#: A script with the VTK filter for an MRI
+MRI_SCRIPT = replace(
+    SCRIPT,
+    lesion=(
+        "lay it over an MRI's tissues with AddTissueData({tissue!r}, image), or simulate it alone with "
+        "UltrasoundSimulationFilter.SetTissues"
+    ),
+    brain_mask="if it is the mask of a brain, give it with that brain's MRI (SetMaskData)",
+    ambiguous="give it to the UltrasoundSimulationFilter with read_label_map and a LabelMapping of {key!r}",
 )

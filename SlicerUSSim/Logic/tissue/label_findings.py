@@ -28,6 +28,8 @@ _LONGEST_LIST = 12
 _TOO_FEW = 3
 #: More unknown labels may be the intensities of an image
 MOST_LABELS = 100
+#: A label map without a name, in messages
+UNNAMED = "label map"
 #: Tissues of a lesion, which alone are no patient
 _LESIONS = ("tumour", "oedema", "necrosis", "cyst", "cavity", "enhancing")
 #: Tissues of every brain, and the least and largest volume of both that is not remarkable
@@ -38,6 +40,10 @@ _INTERPOLATED = (
 )
 #: A larger binary mask is that of a brain or a head.
 _LARGEST_LESION_ML = 500.0
+
+
+class NoPatientError(SimulationError):
+    """A label map is a mask or a lesion, and no patient."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +69,11 @@ class Findings:
         """Whether the user gave every label a tissue."""
         return all(self.mapping.tissue_of(label, name) for label, name in self.names.items())
 
+    @property
+    def _file(self) -> str:
+        """The label map in options; FILE for one that has no name."""
+        return "FILE" if self.source == UNNAMED else self.source
+
     def number(self) -> str:
         """Their number in words: "41 labels"."""
         return f"{len(self.names)} label{'s' * (len(self.names) > 1)}"
@@ -72,7 +83,7 @@ class Findings:
         return are_interpolated_numbers(self.labels.array, len(self.names))
 
     def require_patient(self) -> None:
-        """Raise SimulationError for a mask or lesion, which is no patient, unless the user gave it a tissue."""
+        """Raise NoPatientError for a mask or lesion, which is no patient, unless the user gave it a tissue."""
         if self.is_mapped:
             return
         size = f"{self.number()}, {self._size(self.names)}"
@@ -93,11 +104,11 @@ class Findings:
         tissue = "brats" if is_brats or len(set(known)) > 1 else known[0] or of_file
         is_large = len(known) == 1 and self._millilitres(self.names) > _LARGEST_LESION_ML
         advice = self.advice.brain_mask if is_large else self.advice.lesion
-        added = shlex.quote(f"{tissue}={self.source}")
-        remedy = advice.format(added=added, source=self.source, maps=maps)
+        added = shlex.quote(f"{tissue}={self._file}")
+        remedy = advice.format(added=added, tissue=tissue, source=self._file, maps=maps)
         if self.scheme is not None and is_brats and set(self.names) <= set(schemes()["ussim"].names):
             remedy += f"; if it is a brain, {self.advice.ambiguous.format(key='ussim')}"
-        raise SimulationError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
+        raise NoPatientError(f"{self.source}: {what}, not a patient's tissues; {remedy}")
 
     def require_known(self) -> None:
         """Raise SimulationError that lists the labels without a tissue, and what to do."""
@@ -119,7 +130,7 @@ class Findings:
         known = ", ".join(dict.fromkeys([*self.tissues.names()[1:], *TISSUES]))
         called = listed(map(self._described, unknown))
         unused = self.mapping.unused(self.names)
-        mistaken = f"; it has no label {listed(unused)}, which --map mentions" if unused else ""
+        mistaken = f"; it has no label {listed(unused)}, which {self.advice.mapping} mentions" if unused else ""
         raise SimulationError(f"{self.source}: {nothing}no tissue is called {called}{mistaken}; {remedy}: {known}")
 
     def _if_of_a_program(self, labels: list[int]) -> str:
@@ -146,7 +157,7 @@ class Findings:
             doubts.append(f"{self.source}: the nearest tissue is used for {pairs}")
         unused = self.mapping.unused(self.names)
         if unused:
-            doubts.append(f"{self.source}: has no label {listed(unused)}, which --map mentions")
+            doubts.append(f"{self.source}: has no label {listed(unused)}, which {self.advice.mapping} mentions")
         is_part = False
         if self.scheme is not None and self.scheme.key == "freesurfer":
             missing = missing_structures([name for name in self.names.values() if name is not None])

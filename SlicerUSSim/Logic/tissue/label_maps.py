@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.base.label_numbers import whole_numbers
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.tissue.body_orientation import has_exchanged_sides, places_of, wrong_body
 from SlicerUSSim.Logic.tissue.label_advice import COMMAND, Advice
-from SlicerUSSim.Logic.tissue.label_findings import Findings, listed
+from SlicerUSSim.Logic.tissue.label_findings import UNNAMED, Findings, listed
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 from SlicerUSSim.Logic.tissue.names import nearest_tissue, plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -62,7 +62,7 @@ def read_label_map(
     names: Mapping[int, str] | None = None,
     mapping: LabelMapping | None = None,
     *,
-    source: str = "label map",
+    source: str = UNNAMED,
     tissues: TissueTable | None = None,
     by_number: TissueTable | None = None,
     renumber: bool = False,

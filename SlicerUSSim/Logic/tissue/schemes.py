@@ -34,6 +34,9 @@ _LARGEST_LESION_ML, _LARGEST_LESION_SHARE = 400.0, 0.25
 #: Share of the voxels of label 4 that are two voxels and more from others, up to which it may be leptomeninges, which
 #: `ussim segment` makes one or two voxels thin: 0.00 there, 0.2 to 0.6 in tumours, nuclei and white matter
 _THICK = 0.05
+#: What `ussim segment` writes of a T1 with contrast agent, but for 4, what enhances: no other program numbers
+#: leptomeninges behind it. And the largest share that enhances
+_OF_CONTRAST, _LARGEST_ENHANCING = {**dict(enumerate(BRAIN_TISSUES, 1)), 5: "leptomeninges"}, 0.15
 #: Share of the voxels beside leptomeninges that is white matter
 _IN_WHITE = 0.4
 #: A brain with the fluid around it has up to 2 litres.
@@ -230,7 +233,10 @@ def _of_brain(labels: Volume, values: list[int]) -> Recognition:
     (order,) = orders
     white = next(label for label, tissue in order.items() if tissue == "white matter")
     thin = [value for value in values if value not in three and _is_leptomeninges(labels, value, white=white)]
-    return Recognition(None, order=order | dict.fromkeys(thin[-1:], "leptomeninges"))
+    order |= dict.fromkeys(thin[-1:], "leptomeninges")
+    if order == _OF_CONTRAST and np.count_nonzero(labels.array == 4) <= _LARGEST_ENHANCING * filled:
+        order = order | {4: "enhancing"}
+    return Recognition(None, order=order)
 
 
 def _is_leptomeninges(labels: Volume, label: int, *, white: int) -> bool:

@@ -43,7 +43,8 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.shape import outline_polydata
-from SlicerUSSim.Logic.tissue.label_advice import SCRIPT
+from SlicerUSSim.Logic.tissue.label_advice import MRI_SCRIPT, SCRIPT
+from SlicerUSSim.Logic.tissue.label_findings import NoPatientError
 from SlicerUSSim.Logic.tissue.label_maps import read_label_map
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL, TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -54,6 +55,13 @@ _WHOLE_EXTENT = vtkStreamingDemandDrivenPipeline.WHOLE_EXTENT
 
 #: Field data of a label image: the name of label 1, 2, ...
 TISSUE_NAMES = "TissueNames"
+#: Options of the command in messages of the segmentation, and what the filter has for them
+_METHODS = (
+    ("--skull-strip none", "SetSkullStrip('none')"), ("--skull-strip auto", "SetSkullStrip('auto')"),
+    ("--skull-strip", "SetSkullStrip"), ("--mask", "SetMaskData"), ("--add tumour=FILE", "AddTissueData"),
+    ("--add", "AddTissueData"), ("--ct (contrast ct)", "SetContrast('ct')"), ("--contrast", "SetContrast"),
+    ("--ct", "SetContrast('ct')"),
+)  # fmt: skip
 
 
 class _ImageFilter(VTKPythonAlgorithmBase):
@@ -223,23 +231,45 @@ class SegmentationFilter(_ImageFilter):
     def RequestData(self, request, inInfo, outInfo):  # noqa: N803
         self._segmentation, self._notes, self._warnings = None, (), ()
         mri = vtkImageData.GetData(inInfo[0])
+        self._require_no_lesion(Volume.from_vtk(mri))
         masked = inInfo[1].GetNumberOfInformationObjects() > 0
         masks = [(tissue, Volume.from_vtk(image), f"the mask of {tissue}") for tissue, image in self._added]
         image, mask = Volume.from_vtk(mri), Volume.from_vtk(vtkImageData.GetData(inInfo[1])) if masked else None
         is_of_brain = has_brain_mask(self._values["contrast"])
-        require_addable(image, masks, mask=mask, skull_strip=self._values["skull_strip"] if is_of_brain else "none")
+        require_addable(
+            image,
+            masks,
+            mask=mask,
+            skull_strip=self._values["skull_strip"] if is_of_brain else "none",
+            advice=MRI_SCRIPT,
+        )
         found = segment_image(
             image, others={name: Volume.from_vtk(other) for name, other in self._others.items()}, mask=mask,
             **self._values, device=self._device, progress=self._report,
         )  # fmt: skip
         output = vtkImageData.GetData(outInfo)
         output.CopyStructure(mri)
-        added = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=is_of_brain)
+        added = add_tissues(found.labels, found.tissue_names, masks, has_brain_mask=is_of_brain, advice=MRI_SCRIPT)
         set_scalars(output, added.labels.array)
         set_tissue_names(output, added.tissue_names)
         self._segmentation = found
-        self._notes, self._warnings = (*found.notes, *added.messages), (*found.warnings, *added.warnings)
+        self._notes = (*found.notes, *added.messages)
+        self._warnings = tuple(map(_by_methods, (*found.warnings, *added.warnings)))
         return 1
+
+    def _fail(self, message: str) -> None:
+        super()._fail(_by_methods(message))
+
+    def _require_no_lesion(self, image: Volume) -> None:
+        """Raise SimulationError for a mask or a lesion's labels in place of the MRI, with what takes them."""
+        if self._values["skull_strip"] == "none" or not image.looks_like_labels():
+            return
+        try:
+            read_label_map(image, source="the MRI", advice=MRI_SCRIPT)
+        except NoPatientError:
+            raise
+        except SimulationError:  # the segmentation says what it is
+            return
 
     def _set(self, name: str, value) -> None:
         """Keep a value, which the next update checks."""
@@ -249,6 +279,13 @@ class SegmentationFilter(_ImageFilter):
         self.UpdateProgress(share)
         if self.CheckAbort():
             raise Cancelled
+
+
+def _by_methods(message: str) -> str:
+    """A message with the filter's methods in place of the command's options."""
+    for option, method in _METHODS:
+        message = message.replace(option, method)
+    return message
 
 
 class UltrasoundSimulationFilter(_ImageFilter):

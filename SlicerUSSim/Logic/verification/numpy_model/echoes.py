@@ -21,6 +21,8 @@ from SlicerUSSim.Logic.verification.numpy_model.elementary import (
 from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
 from SlicerUSSim.Logic.verification.numpy_model.lobes import Table
 
+# Radians that the sum over hits has at most: from line to line, and over an elevational sigma (interfaces.cl)
+_MOST_PER_STEP, _MOST_ASIDE = f32(2.6), f32(1.3)
 _AXIS_STEPS = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint32)
 
 
@@ -299,15 +301,28 @@ def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndar
     step = beam.line_distance(hits["path_mm"]) * f32(crowd)
     lateral, elevational = beam.lateral_sigma(hits["path_mm"]), beam.elevation_sigma(hits["path_mm"])
     width = np.sqrt(lateral * lateral + step * step / f32(12))
+    per_slope = f32(2 * np.pi) * acquisition["cycles_per_mm"]
+    stretch = np.minimum(f32(1) + hits["lateral_slope"] ** 2, f32(10))
+    bend = hits["curvature"] * stretch * np.sqrt(stretch)
     # How far the centre of phase moves towards the scan line, and the fraction of the squared phase inside a patch
-    carried = [np.minimum((f32(0.45) * step / width) ** 2, f32(1)), np.minimum(f32(10) / (rays * rays), f32(1))]
+    carried = [
+        _carried(
+            (f32(0.45) * step / width) ** 2,
+            per_slope * hits["lateral_slope"] * step,
+            _MOST_PER_STEP,
+            per_slope * bend * lateral**2,
+        ),
+        _carried(
+            f32(10) / (rays * rays),
+            per_slope * hits["elevational_slope"] * elevational,
+            _MOST_ASIDE,
+            per_slope * bend * elevational**2,
+        ),
+    ]
     within = [
         np.maximum(f32(1) - ((f32(1) - carried[0]) * width / lateral) ** 2, f32(0)),
         f32(1) - (f32(1) - carried[1]) ** 2,
     ]
-    per_slope = f32(2 * np.pi) * acquisition["cycles_per_mm"]
-    stretch = np.minimum(f32(1) + hits["lateral_slope"] ** 2, f32(10))
-    bend = hits["curvature"] * stretch * np.sqrt(stretch)
     depth = hits["depth_mm"] - carried[1] * hits["elevational_slope"] * hits["elevational_mm"]
     whole, inside, zones = f32(0), f32(0), []
     for part, sigma, axis in zip(within, (lateral, elevational), ("lateral", "elevational"), strict=True):
@@ -342,6 +357,13 @@ def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndar
         echo = strength[near] * profile * (cosine - 1j * sine)
         np.add.at(sums, bins[near], echo * (f32(1) - part))
         np.add.at(sums, bins[near] + 1, echo * part)
+
+
+def _carried(least: np.ndarray, phase: np.ndarray, most: np.ndarray, turning: np.ndarray) -> np.ndarray:
+    """Part by which a patch's centre of phase moves: on steep flat walls more, so that sums have few radians."""
+    flat = f32(1) / (f32(1) + f32(16) * turning * turning)
+    more = f32(1) - most / np.maximum(np.abs(phase), most) - least
+    return np.minimum(least + flat * np.maximum(more, f32(0)), f32(1))
 
 
 def _patch_echo(acquisition: np.ndarray, phase2: np.ndarray, inside2: np.ndarray) -> np.ndarray:

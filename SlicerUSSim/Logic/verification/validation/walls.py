@@ -102,14 +102,18 @@ def walls_and_lines(rotation: np.ndarray, device) -> Outcome:
     simulator, phantom = _wall(rotation, device)
     rows = []
     for name, shipped in _PROBES.items():
-        for tilt in (0.0, 4.0, 8.0, 20.0, 30.0):
-            levels = np.array([
-                _level_db(simulator, phantom, replace(shipped, scan_lines=lines), tilt) for lines in (97, 193, 257, 385)
-            ])  # fmt: skip
+        for tilt, turn in ((0.0, 0.0), (4.0, 0.0), (8.0, 0.0), (12.0, 0.0), (20.0, 0.0), (30.0, 0.0), (9.0, 40.0)):
+            levels = np.array(
+                [
+                    _level_db(simulator, phantom, replace(shipped, scan_lines=lines), tilt, turn)
+                    for lines in (97, 193, 257, 385)
+                ]
+            )
             if tilt == 0.0:
                 square = levels[1]
             change = float(np.ptp(np.maximum(levels - square, _CEILING_DB)))
-            rows.append(Row(f"change at {tilt:.0f} degrees, {name}", "dB", 1.5, change, 0.0, "at most"))
+            where = f"{tilt:.0f} degrees{f' in a plane turned by {turn:.0f}' if turn else ''}, {name}"
+            rows.append(Row(f"change at {where}", "dB", 1.5, change, 0.0, "at most"))
     return Outcome(tuple(rows))
 
 

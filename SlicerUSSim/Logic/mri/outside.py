@@ -1,0 +1,144 @@
+"""What lies outside the brain in the MRI of a whole head: skin, scalp, skull with its marrow, and air.
+
+Bone, its tables at least, and air give no signal; fat, muscle and marrow do. As in Dogdas, Shattuck and Leahy,
+"Segmentation of skull and scalp in 3-D human MRI using mathematical morphology" (Human Brain Mapping 26, 2005), the
+skull is what is dark between the brain and the scalp, closed over its marrow. Bone and air look alike: what is dark
+farther from the brain is air.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.coarse import largest_component
+from SlicerUSSim.Logic.mri.distances import distance_to
+
+#: Tissues outside the brain, in the order of their labels
+OUTSIDE = ("skin", "scalp", "skull", "cancellous bone", "air")
+#: Air around the head: below this part of Otsu's threshold. Bone: below this part of the one beside the brain
+_AIR, _DARK = 0.35, 0.8
+#: Gaps of the head's outline that are closed: mouth, ears, sinuses
+_OUTLINE_MM = 10.0
+#: Sulci over which the inner surface of the skull goes, and the dura with what is between it and the brain
+_SULCUS_MM, _DURA_MM = 5.0, 1.0
+#: Bright tissue beside the brain, from which the threshold is found
+_BESIDE_MM = (2.0, 30.0)
+#: Skin over the skull, marrow within it that is closed over, its least thickness, and the largest
+_SKIN_MM, _MARROW_MM, _LEAST_SKULL_MM, _LARGEST_SKULL_MM = 2.0, 3.5, 2.5, 14.0
+#: A skull is smooth at this scale
+_SMOOTH_MM = 6.0
+#: Tables of the skull over its marrow
+_TABLE_MM = 1.2
+#: Air in the head, other than cracks between tissues
+_CAVITY_MM = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Outside:
+    """Tissues outside the brain, on the grid of the MRI."""
+
+    #: (k, j, i) uint8, 0 in the brain and around the head, else the number in OUTSIDE from 1 on
+    labels: np.ndarray
+    #: Intensity below which it is bone or air
+    dark: float
+
+    def text(self, voxel_ml: float) -> str:
+        """One line for the user: "outside the brain: skin 240 ml, scalp 1100 ml, ..."."""
+        counts = np.bincount(self.labels.ravel(), minlength=len(OUTSIDE) + 1)[1:]
+        parts = [f"{name} {count * voxel_ml:.0f} ml" for name, count in zip(OUTSIDE, counts, strict=True)]
+        return f"outside the brain: {', '.join(parts)}; bone is what is darker than {self.dark:.4g}"
+
+    def over(self, labels: Volume, names: Sequence[str]) -> tuple[Volume, tuple[str, ...]]:
+        """(labels with those outside the brain after them, names of all labels from 1 on).
+
+        `labels` (k, j, i) are those of the brain, which go first.
+        """
+        present = [n for n in range(1, len(OUTSIDE) + 1) if (self.labels == n).any()]
+        lookup = np.zeros(len(OUTSIDE) + 1, labels.array.dtype)
+        lookup[present] = len(names) + 1 + np.arange(len(present))
+        array = np.where(labels.array > 0, labels.array, lookup[self.labels])
+        return labels.with_array(array), (*names, *(OUTSIDE[n - 1] for n in present))
+
+
+def find_outside(mri: Volume, brain: np.ndarray) -> Outside:
+    """Label what lies outside the brain in the MRI of a whole head (T1, with or without contrast agent).
+
+    Parameters
+    ----------
+    mri : whole head.
+    brain : (k, j, i) bool, the brain.
+
+    Raises SimulationError if there is no brain, or nothing around it.
+    """
+    require(brain.any(), "the brain mask is empty, expected a brain")
+    image = mri.array.astype(np.float32)
+    head = _head(image, mri.spacing_mm) | brain
+    margin = [slice(max(box.start - 2, 0), box.stop + 2) for box in ndimage.find_objects(head.astype(np.uint8))[0]]
+    box = tuple(margin)
+    image, head, brain, mm = image[box], head[box], brain[box], mri.spacing_mm
+    inner = _within(_closed(brain, _SULCUS_MM, mm), _DURA_MM, mm)
+    from_brain = distance_to(inner, mm)
+    beside = image[head & (from_brain > _BESIDE_MM[0]) & (from_brain < _BESIDE_MM[1])]
+    require(
+        beside.size > 10 * inner.sum() ** (2.0 / 3.0),
+        "there is next to nothing around the brain, expected a whole head",
+    )
+    dark = _DARK * _otsu(beside)
+    below_skin = _depth(head, mm)
+    is_dark = head & (image < dark) & ~inner
+    skull = inner | (is_dark & (from_brain < _LARGEST_SKULL_MM) & (below_skin > _SKIN_MM))
+    skull = _closed(skull, _MARROW_MM, mm) & (below_skin > _SKIN_MM) & (from_brain < _LARGEST_SKULL_MM)
+    skull = largest_component(_opened(skull | inner, _SMOOTH_MM, mm) | inner)
+    skull |= head & (from_brain < _LEAST_SKULL_MM)
+    below_table = _depth(skull, mm)
+    labels = np.where(below_skin > _SKIN_MM, 2, 1).astype(np.uint8)
+    labels[_opened(is_dark & ~skull & (below_skin > _SKIN_MM), _CAVITY_MM, mm)] = 5
+    labels[skull] = 3
+    labels[skull & (image > dark) & (below_table > _TABLE_MM) & (from_brain > _TABLE_MM)] = 4
+    # Between brain and skull there are fluid and the dura: the coupling medium, as in a label map without this
+    labels[~head | inner] = 0
+    whole = np.zeros(mri.array.shape, np.uint8)
+    whole[box] = labels
+    return Outside(whole, float(dark))
+
+
+def _head(image: np.ndarray, mm: np.ndarray) -> np.ndarray:
+    """(k, j, i) bool: what is within the skin, with its cavities."""
+    smooth = ndimage.gaussian_filter(image, 1.0 / mm[::-1])
+    inside = largest_component(_opened(smooth > _AIR * _otsu(smooth[smooth > np.percentile(smooth, 1.0)]), 1.5, mm))
+    inside = _closed(inside, _OUTLINE_MM, mm)
+    for axis in range(3):
+        inside = np.stack([ndimage.binary_fill_holes(part) for part in np.moveaxis(inside, axis, 0)])  # type: ignore
+        inside = np.moveaxis(inside, 0, axis)
+    return largest_component(_opened(inside, 4.0, mm))
+
+
+def _otsu(values: np.ndarray) -> float:
+    from skimage.filters import threshold_otsu
+
+    return float(threshold_otsu(values[values <= np.percentile(values, 99.0)]))
+
+
+def _within(mask: np.ndarray, distance_mm: float, mm: np.ndarray) -> np.ndarray:
+    return distance_to(mask, mm) <= distance_mm
+
+
+def _depth(mask: np.ndarray, mm: np.ndarray) -> np.ndarray:
+    """(k, j, i) distance in mm to what is outside; beyond the image it goes on."""
+    return distance_to(~mask, mm)
+
+
+def _opened(mask: np.ndarray, radius_mm: float, mm: np.ndarray) -> np.ndarray:
+    return _within(_depth(mask, mm) > radius_mm, radius_mm, mm)
+
+
+def _closed(mask: np.ndarray, radius_mm: float, mm: np.ndarray) -> np.ndarray:
+    pad = int(np.ceil(radius_mm / mm.min())) + 1
+    wide = _within(np.pad(mask, pad), radius_mm, mm)
+    return (distance_to(~wide, mm) > radius_mm)[pad:-pad, pad:-pad, pad:-pad]

@@ -1,0 +1,92 @@
+"""Skin, scalp, skull, marrow and air around the brain of a whole head."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy import ndimage
+
+from SlicerUSSim.Command.cli import main
+from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic.mri.outside import OUTSIDE, find_outside
+
+SPACING_MM = (1.0, 1.2, 1.5)
+#: Outer radii in mm of the layers of a round head, and their intensities
+LAYERS = {"brain": (60.0, 100.0), "fluid": (62.0, 20.0), "inner table": (64.5, 6.0), "marrow": (67.5, 110.0),
+          "outer table": (70.0, 6.0), "scalp": (80.0, 90.0)}  # fmt: skip
+
+
+def round_head(seed: int = 0) -> tuple[Volume, np.ndarray, np.ndarray]:
+    """(MRI with noise, (k, j, i) bool brain, (k, j, i) distance from the centre in mm), with a cavity in the scalp."""
+    matrix = np.diag([*SPACING_MM, 1.0])
+    shape = [int(172.0 / mm) for mm in SPACING_MM[::-1]]
+    places = [(index - (n - 1) / 2.0) * mm for index, n, mm in zip(np.indices(shape), shape, SPACING_MM[::-1])]  # noqa: B905
+    radius = np.sqrt(sum(place**2 for place in places))
+    radius *= 1.0 + 0.03 * np.sin(3.0 * np.arctan2(places[1], places[2]))  # not quite round
+    image = np.full(shape, 1.0)
+    for outer, value in reversed(LAYERS.values()):
+        image[radius <= outer] = value
+    cavity = (places[0] + 75.0) ** 2 + places[1] ** 2 + places[2] ** 2 < 3.5**2
+    image[cavity] = 1.0
+    image = ndimage.gaussian_filter(image, 0.5)
+    noise = np.random.default_rng(seed).normal(0.0, 2.0, (2, *shape))
+    return Volume(np.hypot(image + noise[0], noise[1]).astype(np.float32), matrix), radius <= 60.0, radius
+
+
+def test_layers_of_a_round_head_are_found_where_they_are():
+    mri, brain, radius = round_head()
+    found = find_outside(mri, brain)
+    named = {name: found.labels == number for number, name in enumerate(OUTSIDE, 1)}
+    skull = named["skull"] | named["cancellous bone"]
+    truth = (radius > 62.0) & (radius <= 70.0)
+    assert 2.0 * (skull & truth).sum() / (skull.sum() + truth.sum()) > 0.88
+    assert radius[skull].max() < 72.0 and radius[skull].min() > 60.0
+    marrow = (radius > 64.5) & (radius <= 67.5)
+    assert 2.0 * (named["cancellous bone"] & marrow).sum() / (named["cancellous bone"].sum() + marrow.sum()) > 0.75
+    assert radius[named["skin"]].min() > 76.5
+    assert (named["scalp"] | named["skin"])[(radius > 72.0) & (radius < 79.0)].mean() > 0.98
+    assert 50 < named["air"].sum() * mri.voxel_ml * 1000.0 < 250  # 180 mm3
+    assert not found.labels[(radius > 85.0) | brain].any()
+
+
+def test_the_tissues_of_the_brain_go_first():
+    mri, brain, _ = round_head()
+    labels = mri.with_array(np.where(brain, 2, 0).astype(np.uint8))
+    over, names = find_outside(mri, brain).over(labels, ("csf", "grey matter"))
+    assert names == ("csf", "grey matter", *OUTSIDE)
+    assert (over.array[brain] == 2).all() and set(np.unique(over.array)) == {0, 2, 3, 4, 5, 6, 7}
+
+
+def test_a_brain_without_a_head_is_refused():
+    mri, brain, _ = round_head()
+    with pytest.raises(SimulationError, match="next to nothing around the brain, expected a whole head"):
+        find_outside(mri.with_array(np.where(brain, mri.array, 0.0)), brain)
+    with pytest.raises(SimulationError, match="the brain mask is empty"):
+        find_outside(mri, np.zeros_like(brain))
+
+
+def test_the_commands_label_what_is_outside_and_put_the_probe_on_the_skin(tmp_path):
+    mri, brain, _ = round_head()
+    mri.write(tmp_path / "head.nii.gz")
+    mri.with_array(brain.astype(np.uint8)).write(tmp_path / "brain.nii.gz")
+    image, mask, out = (str(tmp_path / name) for name in ("head.nii.gz", "brain.nii.gz", "labels.nii.gz"))
+    done = CliRunner().invoke(main, ["segment", image, "--mask", mask, "--outside", "-o", out])
+    assert done.exit_code == 0, done.output
+    assert "outside the brain: skin" in done.stderr and "skull" in done.stdout
+    table = json.loads((tmp_path / "labels.json").read_text())
+    assert {"skin", "scalp", "skull", "cancellous bone"} <= {
+        entry["name"] for entry in table.get("tissues", table).values() if isinstance(entry, dict) and "name" in entry
+    }
+    picture = str(tmp_path / "a.png")
+    for arguments in ([image, "--mask", mask, "--outside"], [out]):
+        done = CliRunner().invoke(main, ["simulate", *arguments, "--pose", "auto", "-o", picture])
+        assert done.exit_code == 0, done.output
+    for arguments, message in (
+        ([out, "--outside"], "is a label map, and --outside is for an MRI"),
+        ([image, "--mask", mask, "--contrast", "t2", "--outside"], "--outside is for a whole head of contrast t1"),
+    ):
+        done = CliRunner().invoke(main, ["simulate", *arguments, "--pose", "auto", "-o", picture])
+        assert done.exit_code == 2 and message in done.stderr
