@@ -945,6 +945,17 @@ def test_a_label_map_is_opened_together_with_its_table(page, files, tmp_path):
     assert state(page, NAMES.title) == "rem.nii.gz" and not errors(page)
     assert "4 labels by their numbers in the tissue table" in page.locator("#notesLabel").inner_text()
     assert set(names) <= {row["name"] for row in state(page, NAMES.panel.tissues)}
+    # Its table says nothing about the next map, whose numbers mean something else: labels 4 and 5 were exchanged.
+    enhancing = of_t2.with_array(np.array([0, 1, 2, 3, 5, 4], np.uint8)[labels.array])
+    tissues = TissueTable.brain().for_names(["csf", "grey matter", "white matter", "enhancing", "leptomeninges"])
+    write_label_files(tmp_path / "gd.nii.gz", enhancing, tissues)
+    with new_image(page):
+        page.set_input_files("#open-file", [tmp_path / "gd.nii.gz", tmp_path / "gd.json"])
+    settled(page)
+    assert state(page, NAMES.title) == "gd.nii.gz" and not errors(page)
+    page.set_input_files("#open-file", tmp_path / "rem.nii.gz")
+    assert "open it together with the .json file that was written beside it" in shown_errors(page)
+    assert state(page, NAMES.title) == "gd.nii.gz"
 
 
 # ---- who may come in, and how it is started --------------------------------------------------------------------------

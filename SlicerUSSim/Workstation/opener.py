@@ -102,6 +102,8 @@ class Opener:
         #: {segments of a node: (tissue, file) of each}
         self._lesion_files: dict[tuple, tuple[tuple[str, str], ...]] = {}
         self._volumes = dict(files.volumes)  # read, but not yet used
+        #: Names of the preset's tissues since the table of a label map was added to them
+        self._names_of_table: list[str] | tuple[str, ...] = ()
         #: {temporary path: name} of the files that a page has sent last
         self._uploads: dict[str, str] = {}
 
@@ -146,7 +148,8 @@ class Opener:
             mapping, beside = table.mapping, table.tissues
         else:
             beside = None if mapping else table_beside(Path(path))
-        is_chosen = mine.names() != Preset().tissues.names()
+        # A table that came with other labels was not chosen for these, whose numbers mean something else.
+        is_chosen = mine.names() not in (Preset().tissues.names(), self._names_of_table)
         found = self._tasks.do(
             lambda: read_label_file(
                 Path(path), volume, mapping, table=beside, preset=mine if is_chosen else None, default=mine, advice=PAGE
@@ -156,6 +159,7 @@ class Opener:
             for tissue in beside.values():
                 mine = mine.with_tissue(tissue)
             self._logic.preset = replace(self._logic.preset, tissues=mine)
+            self._names_of_table = mine.names()
         if mapping.names and table is not None:
             found = replace(found, message=f"{found.message}, named in {table.name}")
         found = replace(

@@ -17,6 +17,8 @@ _log = logging.getLogger(__name__)
 
 #: Millimetres per unit and name of the lower three bits of xyzt_units (nifti1.h)
 _UNITS = {1: (1000.0, "metres"), 2: (1.0, "millimetres"), 3: (0.001, "micrometres")}
+#: Before the voxels of a file that this program writes: the header and four bytes for extensions
+_HEADER_BYTES = 352
 _CHUNK = 2**18  # bytes
 #: Two orientations are different if they move a corner of the volume by more than this, millimetres.
 _SAME_MM = 0.1
@@ -120,13 +122,16 @@ def require_complete(path: Path) -> None:
 
 def require_written(path: Path, voxel_bytes: int) -> None:
     """Raise OSError unless a NIfTI file holds what was to be written: ITK does not say that the disk is full."""
-    found, is_damaged = _bytes_of(path)
-    if found < voxel_bytes or is_damaged:
-        raise OSError(f"{found} of {voxel_bytes} bytes are in the file; is the disk full?")
+    found, is_damaged = _bytes_of(path, has_end=True)
+    if found < _HEADER_BYTES + voxel_bytes or is_damaged:
+        raise OSError("not all voxels are in the file; is the disk full?")
 
 
-def _bytes_of(file: Path) -> tuple[int, bool]:
-    """The bytes of a file, decompressed if it is compressed, and whether they are not those that were compressed."""
+def _bytes_of(file: Path, has_end: bool = False) -> tuple[int, bool]:
+    """The bytes of a file, decompressed if it is compressed, and whether they are not those that were compressed.
+
+    With `has_end`, compressed content without its end and checksum counts as damaged, too.
+    """
     if file.suffix != ".gz":
         return file.stat().st_size, False
     count = 0
@@ -135,7 +140,7 @@ def _bytes_of(file: Path) -> tuple[int, bool]:
             while chunk := content.read1(_CHUNK):
                 count += len(chunk)
     except EOFError:
-        return count, False
+        return count, has_end
     except (OSError, zlib.error):  # a checksum that differs, or codes that do not exist
         return count, True
     return count, False

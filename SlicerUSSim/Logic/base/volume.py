@@ -210,6 +210,10 @@ class Volume:
                 sitk.WriteImage(image, str(partial), useCompression=not path.name.lower().endswith(".mhd"))
                 if is_nifti:
                     require_written(partial, self.array.nbytes)
+                elif path.suffix.lower() == ".nrrd":  # of which the last block may be missing without a word
+                    written = sitk.GetArrayFromImage(sitk.ReadImage(str(partial)))
+                    if not np.array_equal(written, sitk.GetArrayViewFromImage(image), equal_nan=True):
+                        raise OSError("not all voxels are in the file; is the disk full?")
 
     # ---- VTK ---------------------------------------------------------------------------------------------------
 
