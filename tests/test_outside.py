@@ -86,6 +86,7 @@ def test_the_commands_label_what_is_outside_and_put_the_probe_on_the_skin(tmp_pa
         assert done.exit_code == 0, done.output
     for arguments, message in (
         ([out, "--outside"], "is a label map, and --outside is for an MRI"),
+        ([image, "--skull-strip", "none", "--outside"], "--outside needs to know the brain"),
         ([image, "--mask", mask, "--contrast", "t2", "--outside"], "--outside is for a whole head of contrast t1"),
     ):
         done = CliRunner().invoke(main, ["simulate", *arguments, "--pose", "auto", "-o", picture])

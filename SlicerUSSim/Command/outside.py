@@ -23,11 +23,15 @@ outside_option = click.option(
 _CONTRASTS = ("t1", "t1gd")
 
 
-def require_outside(wanted: bool, contrast: str) -> None:
-    """Raise SimulationError where --outside is asked for and the image is no T1."""
+def require_outside(wanted: bool, contrast: str, skull_strip: str, mask: str | None) -> None:
+    """Raise SimulationError where --outside is asked for and the image is no T1, or its brain is not to be found."""
     require(
         not wanted or contrast in _CONTRASTS,
         f"--outside is for a whole head of contrast t1 or t1gd, and this is {contrast}",
+    )
+    require(
+        not wanted or mask is not None or skull_strip != "none",
+        "--outside needs to know the brain, and --skull-strip is none; give another, or a --mask",
     )
 
 

@@ -211,7 +211,9 @@ def open_examination(patient: PatientOptions) -> Examination:
     split_also(patient.also)
     if patient.outside and is_labels:
         raise SimulationError(f"{patient.mri_or_labels}: is a label map, and --outside is for an MRI")
-    require_outside(patient.outside, patient.segmentation["contrast"])
+    require_outside(
+        patient.outside, patient.segmentation["contrast"], patient.segmentation["skull_strip"], patient.mask
+    )
     sheets = DrawnSheets.of(
         patient.sheets, patient.no_sheets, is_labels=is_labels, contrast=patient.segmentation["contrast"]
     )

@@ -69,7 +69,7 @@ def segment(
     _require_no_kept_mask(out, mri)
     if not overwrite:
         require_replaceable(out)
-    require_outside(outside, settings.contrast)
+    require_outside(outside, settings.contrast, settings.skull_strip, mask)
     require_sheets(sheets, sheet_kinds, settings.contrast)
     split_also(also)
     split_seeds(seeds)
