@@ -90,9 +90,8 @@ inline float border_nepers(float impedance, float other_impedance) {
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
-__kernel void
-fans(__constant const Acquisition *acquisition, __global const ushort *voxels, __global const float4 *acoustics,
-     int all_soft, __global float *sums) {
+__kernel void fans(__constant const Acquisition *acquisition, __global const ushort *voxels,
+                   __global const float4 *acoustics, int all_soft, __global float *sums) {
   const int ray = get_global_id(0), point = get_global_id(1), row = get_global_id(2);
   const int depths = acquisition->fan_depths;
   const int nx = acquisition->dims[0], ny = acquisition->dims[1], nxy = nx * ny;

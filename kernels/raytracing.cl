@@ -396,12 +396,11 @@ inline float membrane_coherence(__constant const Acquisition *acquisition, Tissu
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
-__kernel void
-trace(__constant const Acquisition *acquisition, __global const ushort *voxels, __global const uchar *groups,
-      __global const ushort *smooth, __constant const Tissue *tissues, __global const float *roots,
-      __global const float *quantiles, __global const float *beams, __global Segment *segments,
-      __global int *segment_counts, __global Hit *hits, __global int *hit_counts, __global float *cut,
-      __global int *overflown) {
+__kernel void trace(__constant const Acquisition *acquisition, __global const ushort *voxels,
+                    __global const uchar *groups, __global const ushort *smooth, __constant const Tissue *tissues,
+                    __global const float *roots, __global const float *quantiles, __global const float *beams,
+                    __global Segment *segments, __global int *segment_counts, __global Hit *hits,
+                    __global int *hit_counts, __global float *cut, __global int *overflown) {
   const int line = get_global_id(0), ray_of_line = get_global_id(1), rays = acquisition->elevational_rays;
   const int on_axis = ray_of_line == 0;
   const int slot = line * rays + ray_of_line - 1;

@@ -14,8 +14,8 @@ from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.brain import given_brain
 from SlicerUSSim.Logic.mri.classification import Classes
 from SlicerUSSim.Logic.mri.plausibility import (
+    brighter_than_tissue,
     csf_is_doubtful,
-    enhancement,
     faint,
     require_order,
     require_several_tissues,
@@ -56,8 +56,8 @@ def test_a_healthy_t1_is_not_taken_for_one_with_contrast_agent():
 def test_bright_pieces_smaller_than_2_ml_are_no_contrast_agent():
     image, inside = np.full((20, 30, 30), 100.0), np.ones((20, 30, 30), bool)
     image[2:12, 2:12, 2:12] = image[14:, 14:, 14:24] = 300.0  # 1.0 and 0.96 ml
-    assert not enhancement(image, inside, 80.0, 100.0, voxel_ml=0.001)
-    assert "2.0 ml" in enhancement(image, inside, 80.0, 100.0, voxel_ml=0.002)[0]
+    assert not brighter_than_tissue(image, inside, 80.0, 100.0, voxel_ml=0.001, contrast="t1")
+    assert "2.0 ml" in brighter_than_tissue(image, inside, 80.0, 100.0, voxel_ml=0.002, contrast="t1")[0]
 
 
 @pytest.mark.parametrize(("shown", "said"), [("t2", "t1"), ("t1", "t2"), ("t1", "flair"), ("t2", "flair")])
