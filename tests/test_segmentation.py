@@ -395,7 +395,9 @@ def test_the_brain_of_another_patient_is_refused_as_second_mri(mni):
 def test_a_label_map_is_refused_as_second_mri(mni):
     t1 = mni[0]
     labels = t1.with_array(np.digitize(t1.array, [20, 60, 90]).astype(np.uint8))
-    with pytest.raises(SimulationError, match="t2 has only 4 different values, as a mask or label map has"):
+    with pytest.raises(
+        SimulationError, match=r"t2 has only 4 different values, as a mask or label map has.*--add tumour=FILE"
+    ):
         segment_mri(t1, contrast="t1", others={"t2": labels})
     parts = t1.with_array((labels.array * (1 + np.indices(t1.array.shape)[2] // 25)).astype(np.uint8))  # many labels
     with pytest.raises(SimulationError, match="t2 is a label map"):

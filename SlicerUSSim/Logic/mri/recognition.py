@@ -182,7 +182,7 @@ def check_intensities(mri: Volume, name: str = "MRI") -> None:
     require(
         len(sample) > _MOST_LABELS,
         f"{name} has only {len(sample)} different values, as a mask or label map has, expected the intensities of an "
-        "MRI",
+        "MRI; a lesion is added to one with --add tumour=FILE",
     )
 
 
