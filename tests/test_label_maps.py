@@ -112,6 +112,28 @@ def refused(*arguments) -> str:
     return errors[0]
 
 
+def test_the_workstation_refuses_a_label_map_as_an_mri_and_names_the_file(tmp_path, monkeypatch):
+    """It was shown, with a warning that named no file."""
+    monkeypatch.chdir(tmp_path)
+    tumour((1, 3, 2)).write("map.nii.gz")
+    message = refused("serve", "map.nii.gz")
+    assert message.startswith("ussim: map.nii.gz: a tumour's labels (as BraTS")
+    assert "with MRI --add brats=map.nii.gz, or show it alone with --labels map.nii.gz --map 1=necrosis" in message
+    head().write("aseg.nii.gz")
+    assert "expected an MRI; use it as it is (--labels aseg.nii.gz)" in refused("serve", "aseg.nii.gz")
+
+
+def test_probabilities_of_a_lesion_in_place_of_an_mri_get_the_hint(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    mask = tumour((1, 1, 1))
+    soft = 0.8 * ndimage.gaussian_filter(mask.array.astype(np.float32), 2.0)
+    mask.with_array(soft).write("soft.nii.gz")
+    for command in (("segment", "-o", "out.nii.gz"), ("simulate", "--pose", "auto", "-o", "a.png")):
+        assert "the probabilities of a lesion are added to an MRI with --add tumour=FILE" in refused(
+            *command, "soft.nii.gz"
+        )
+
+
 # ---- names -----------------------------------------------------------------------------------------------------------
 
 
@@ -359,7 +381,7 @@ def test_commands_for_an_mri_say_what_a_label_map_is_for_and_no_option_that_they
     message = refused(*command, "glioma.nii.gz")
     assert message.endswith(
         "a binary mask (1 label, 67 ml), not a patient's tissues; add it to an MRI's tissues with --add "
-        "tumour=glioma.nii.gz, or simulate it alone with ussim simulate"
+        "tumour=glioma.nii.gz, or simulate it alone (ussim simulate) with --map 255=tumour"
     )
     brats = tumour((1, 3, 2))
     brats.write("map.nii.gz")
@@ -373,7 +395,10 @@ def test_commands_for_an_mri_say_what_a_label_map_is_for_and_no_option_that_they
     for name, count in (("unknown.nii.gz", 8), ("few.nii.gz", 2)):
         message = refused(*command, name)
         assert "--map" not in message and len(message) < 200
-        assert f"{name}: is a label map ({count} labels), expected an MRI; use it as it is (ussim simulate)" in message
+        assert (
+            f"{name}: is a label map ({count} labels), expected an MRI; use it as it is (ussim simulate {name}"
+            in message
+        )
     assert "--map" not in ussim("demo", "--help").stdout
     assert {path.name for path in tmp_path.iterdir()} == {"glioma.nii.gz", "unknown.nii.gz", "few.nii.gz"}
 
@@ -643,8 +668,6 @@ NAMES = {
 
 def probability_maps(folder, names: dict[str, str]) -> Volume:
     """Smoothed maps of a brain in a folder; returns the labels."""
-    from scipy import ndimage
-
     numbers = {"csf": 1, "grey matter": 2, "white matter": 3}
     labels = brain(numbers)
     for tissue, name in names.items():

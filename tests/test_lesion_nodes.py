@@ -49,7 +49,7 @@ class Scene:
 
     def paint(self, mask: Volume, name: str) -> None:
         """As a user does in the segment editor: a segment with a name of his own."""
-        (segment,) = add_lesion(self.lesions, mask, "tumour", "painted")
+        (segment,) = add_lesion(self.lesions, mask, "tumour", "tumour")
         self.lesions.GetSegmentation().GetSegment(segment).SetName(name.replace("_", " "))
 
     def voxels(self, name: str, node=None) -> int:
@@ -209,10 +209,19 @@ def test_what_is_to_be_checked_about_a_file_of_lesions_is_told_with_them_every_t
         "brats3.nii.gz: 7 voxels are NaN",
     )
     assert set(told) <= set(bench.logic.warnings)
+    add_lesion(bench.lesions, whole, "tumour", "brats3.nii.gz", PAGE)  # again
     bench.logic.addTissues(bench.labels, bench.lesions)
-    assert set(told) <= set(bench.logic.warnings)
+    assert [bench.logic.warnings.count(line) for line in told] == [1, 1]
     with pytest.raises(SimulationError, match=r"what it is: 'tumour', or 'necrosis' if it is BraTS's label 1$"):
         add_lesion(bench.lesions, whole.with_array((values == 1).astype(np.uint8)), "brats", "core", PAGE)
+
+
+def test_the_file_of_a_lesion_elsewhere_is_named():
+    """Of several files that were added, a page said only that segment 'tumour' was elsewhere."""
+    bench = Scene()
+    add_lesion(bench.lesions, moved(lesion(8.0), 300, 0, 0), "tumour", "of another.nii.gz", PAGE)
+    with pytest.raises(SimulationError, match=r"^of another\.nii\.gz \(segment 'tumour'\): lies 2.. mm outside"):
+        bench.logic.segment(bench.mri, bench.labels, lesions_node=bench.lesions)
 
 
 # ---- labels that stay as they are ------------------------------------------------------------------------------------

@@ -7,11 +7,14 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.mri.outside import OUTSIDE, find_outside
+from SlicerUSSim.Logic.mri.samples import demo_mri
+from SlicerUSSim.Logic.tissue.table import TissueTable
 
 SPACING_MM = (1.0, 1.2, 1.5)
 #: Outer radii in mm of the layers of a round head, and their intensities
@@ -91,3 +94,34 @@ def test_the_commands_label_what_is_outside_and_put_the_probe_on_the_skin(tmp_pa
     ):
         done = CliRunner().invoke(main, ["simulate", *arguments, "--pose", "auto", "-o", picture])
         assert done.exit_code == 2 and message in done.stderr
+
+
+def test_what_is_outside_keeps_its_tissue_beside_a_table_of_more_tissues(tmp_path):
+    """Label 4 of the table was that of the skin, too, which became a tumour."""
+    mri, brain, _ = round_head()
+    mri.write(tmp_path / "head.nii.gz")
+    mri.with_array(brain.astype(np.uint8)).write(tmp_path / "brain.nii.gz")
+    names = ("csf", "grey matter", "white matter", "tumour")
+    TissueTable.brain().for_names(names).write(tmp_path / "brain.json")
+    TissueTable.brain().for_names((*names, *OUTSIDE)).write(tmp_path / "head.json")
+    images = []
+    for table in ("brain.json", "head.json"):
+        done = CliRunner().invoke(
+            main,
+            [
+                "simulate", str(tmp_path / "head.nii.gz"), "--mask", str(tmp_path / "brain.nii.gz"), "--outside",
+                "--tissues", str(tmp_path / table), "--pose", "auto", "-o", str(tmp_path / f"{table}.png"),
+            ],
+        )  # fmt: skip
+        assert done.exit_code == 0, done.output
+        images.append(np.asarray(Image.open(tmp_path / f"{table}.png"), float))
+    assert images[0].std() > 10.0
+    np.testing.assert_allclose(images[0], images[1], atol=2.0)
+
+
+def test_a_brain_without_a_head_is_refused_before_it_is_segmented(tmp_path):
+    path = str(tmp_path / "brain.nii.gz")
+    demo_mri()[0].write(path)
+    done = CliRunner().invoke(main, ["segment", path, "--outside", "-o", str(tmp_path / "labels.nii.gz")])
+    assert done.exit_code == 2 and "is a brain without its head (skull-stripped), and --outside is for" in done.stderr
+    assert len(done.stderr.splitlines()) == 1

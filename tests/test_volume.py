@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -343,6 +345,17 @@ def test_a_file_that_does_not_fit_on_the_disk_leaves_the_one_before(name, tmp_pa
     """Of a NIfTI file ITK did not say so: the file before was replaced by an empty one."""
     done = subprocess.run([sys.executable, "-c", _FULL, name], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.count(f"{name}: cannot be written") == 2, done.stdout
+    assert done.stderr == ""  # ITK and VTK told of it in words of their own
     kept = Volume.read(tmp_path / name)
     assert kept.array.shape == (10, 10, 10) and (kept.array == 1).all()
     assert [file.name for file in tmp_path.iterdir()] == [name]
+
+
+def test_a_minc_file_is_not_begun_where_it_may_not_fit(tmp_path, monkeypatch):
+    """HDF5 left a torso without an error, and ended the program when it was closed."""
+    volume = Volume(np.ones((10, 10, 10), np.uint8), np.eye(4))
+    volume.write(tmp_path / "v.mnc")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=7999))
+    with pytest.raises(SimulationError, match=r"v\.mnc: cannot be written \(may need 8000 bytes, .* 7999 left\)"):
+        Volume(np.zeros((20, 20, 20), np.uint8), np.eye(4)).write(tmp_path / "v.mnc")
+    assert (Volume.read(tmp_path / "v.mnc").array == 1).all() and len(list(tmp_path.iterdir())) == 1

@@ -134,9 +134,12 @@ def _read_organs(path: str, maps: Iterable[str]) -> LabelledTissues:
     return found
 
 
-def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = MRI_CONTRASTS[0]) -> Volume:
-    """Read an MRI or a CT, which is not a label map unless it is segmented all the same
+def read_mri(
+    path: str, *, mask: str | None, skull_strip: str, contrast: str = MRI_CONTRASTS[0], is_served: bool = False
+) -> Volume:
+    """Read an MRI or a CT, which is not a label map unless it is segmented all the same.
 
+    `is_served` is for the words of the errors: the command is that of the workstation.
     Raises SimulationError, saying what it is, for a label map, a mask or a tracked sequence, and if it is constant.
     """
     import numpy as np
@@ -144,7 +147,7 @@ def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = M
     from SlicerUSSim.Logic.base.errors import about_file
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.mri.recognition import check_finite
-    from SlicerUSSim.Logic.tissue.label_advice import MRI_COMMAND
+    from SlicerUSSim.Logic.tissue.label_advice import MRI_COMMAND, SERVE_COMMAND
     from SlicerUSSim.Logic.tissue.label_findings import MOST_LABELS, NoPatientError
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_file
 
@@ -155,21 +158,22 @@ def read_mri(path: str, *, mask: str | None, skull_strip: str, contrast: str = M
     with about_file(path):
         check_finite(volume)
     if is_label_file(Path(path), volume):
+        used_by = f"--labels {path}" if is_served else f"ussim simulate {path} ..."
         try:
-            found = read_label_file(Path(path), volume, advice=MRI_COMMAND)
+            found = read_label_file(Path(path), volume, advice=SERVE_COMMAND if is_served else MRI_COMMAND)
         except NoPatientError:  # says how to add it
             raise
         except SimulationError as error:
             if "--map" not in str(error):
                 raise
             count = np.unique(volume.array[volume.array != 0]).size
-            remedy = "use it as it is (ussim simulate), which says what its labels need"
+            remedy = f"use it as it is ({used_by}), which says what its labels need"
             if count > MOST_LABELS:
                 remedy += "; if these are intensities of an MRI, its file may be incomplete"
             raise SimulationError(f"{path}: is a label map ({count} labels), expected an MRI; {remedy}") from error
         raise SimulationError(
-            f"{path}: is a label map ({found.message}), expected an MRI; use it as it is (ussim simulate {path} ...), "
-            "or segment it all the same with --skull-strip none"
+            f"{path}: is a label map ({found.message}), expected an MRI; use it as it is ({used_by}), or segment it "
+            "all the same with --skull-strip none"
         )
     return volume
 

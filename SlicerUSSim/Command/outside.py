@@ -35,6 +35,16 @@ def require_outside(wanted: bool, contrast: str, skull_strip: str, mask: str | N
     )
 
 
+def require_head(wanted: bool, mri_path: str, mri: Volume) -> None:
+    """Raise SimulationError where --outside is asked for and the image is a brain without its head."""
+    from SlicerUSSim.Logic.mri.recognition import stripped_brain
+
+    require(
+        not wanted or stripped_brain(mri) is None,
+        f"{mri_path}: is a brain without its head (skull-stripped), and --outside is for a whole head",
+    )
+
+
 def with_outside(
     mri_path: str, mri: Volume, segmentation: Segmentation, labels: Volume, names: Sequence[str]
 ) -> tuple[Volume, tuple[str, ...]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +27,7 @@ from SlicerUSSim.Command.options import (
     mask_option,
     require_no_mri_options,
 )
-from SlicerUSSim.Command.outside import outside_option, require_outside, with_outside
+from SlicerUSSim.Command.outside import outside_option, require_head, require_outside, with_outside
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Command.sheets import DrawnSheets, drawn_sheets_option, no_sheet_option
@@ -214,6 +214,7 @@ def open_examination(patient: PatientOptions) -> Examination:
     require_outside(
         patient.outside, patient.segmentation["contrast"], patient.segmentation["skull_strip"], patient.mask
     )
+    require_head(patient.outside, patient.mri_or_labels, volume)
     sheets = DrawnSheets.of(
         patient.sheets, patient.no_sheets, is_labels=is_labels, contrast=patient.segmentation["contrast"]
     )
@@ -244,7 +245,8 @@ def open_examination(patient: PatientOptions) -> Examination:
         labels, names, surfels = drawn.labels, drawn.names, drawn.surfels
         if patient.outside:
             labels, names = with_outside(patient.mri_or_labels, volume, segmentation, labels, names)
-    names = names if table is None else tissues.names_by_label()
+    if table is not None:
+        labels, names = _numbered_as(tissues, labels, names, len(segmentation.tissue_names))
     added = additions.on(labels, names, has_brain_mask=not is_ct)
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
@@ -295,3 +297,19 @@ def _labelled(
     for warning in found.warnings:
         log.warning("%s", warning)
     return found.labels, found.tissues
+
+
+def _numbered_as(
+    table: TissueTable, labels: Volume, names: Sequence[str], classes: int
+) -> tuple[Volume, tuple[str, ...]]:
+    """(labels, names of all) of a segmentation whose classes, the first labels, are those of a table (--tissues).
+
+    What was found besides them has its number from the table, if a tissue is called so there, or one after all of it.
+    """
+    import numpy as np
+
+    numbered = list(table.names_by_label())
+    others = list(dict.fromkeys(name for name in names[classes:] if name not in numbered))
+    numbered += [""] * (classes - len(numbered)) + others
+    numbers = [*range(classes + 1), *(numbered.index(name) + 1 for name in names[classes:])]
+    return labels.with_array(np.asarray(numbers, np.uint8)[labels.array]), tuple(numbered)

@@ -11,7 +11,7 @@ import click
 from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri, segmented_file, split_also
 from SlicerUSSim.Command.options import check_places, ct_option, device_option, gathered, mask_option
-from SlicerUSSim.Command.outside import outside_option, require_outside, with_outside
+from SlicerUSSim.Command.outside import outside_option, require_head, require_outside, with_outside
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.proposals import (
@@ -75,6 +75,7 @@ def segment(
     split_seeds(seeds)
     masks = Additions.read(additions)
     volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip, contrast=settings.contrast)
+    require_head(outside, mri, volume)
     if seeds or propose:
         require(has_brain_mask(settings.contrast), "--seed and --propose look for lesions in an MRI, and this is a CT")
         require_seeds(seeds, volume, out)

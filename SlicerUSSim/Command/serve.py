@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option, split_additions
-from SlicerUSSim.Command.mri_options import also_option, require_other_files, split_also
+from SlicerUSSim.Command.mri_options import also_option, read_mri, require_other_files, split_also
 from SlicerUSSim.Command.options import ct_option, device_option, mask_option, parameter_option, require_no_mri_options
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.sequence_options import (
@@ -118,7 +118,9 @@ def serve(
     from SlicerUSSim.Logic.opencl.devices import choose_device
 
     choose_device(device)
-    volumes = {file: Volume.read(file) for file in files}
+    volumes = {file: Volume.read(file) for file in files if file != mri or labels is not None}
+    if mri is not None and labels is None:
+        volumes[mri] = read_mri(mri, mask=mask, skull_strip=skull_strip, contrast=contrast, is_served=True)
     checked = Additions.of((tissue, with_label_names(volumes[file], file), file) for tissue, file in added)
     if mri is not None and labels is None:
         checked.require_addable(

@@ -6,6 +6,8 @@ import gzip
 import json
 import os
 import re
+import shutil
+import sys
 import tempfile
 import zlib
 from collections.abc import Iterator
@@ -62,6 +64,38 @@ def make_folder(path: str | os.PathLike) -> Path:
     except OSError as error:
         raise SimulationError(f"{folder}: cannot be created ({error.strerror})") from None
     return folder
+
+
+def require_space(path: Path, most_bytes: int) -> None:
+    """Raise SimulationError unless the disk has room for a file of `most_bytes`."""
+    free = shutil.disk_usage(path.parent).free
+    require(free > most_bytes, f"{path}: cannot be written (may need {most_bytes} bytes, and the disk has {free} left)")
+
+
+@contextmanager
+def messages_withheld() -> Iterator[None]:
+    """Keep what C++ libraries print to stderr in the block, and drop it if the block raises: the error says it all."""
+    try:
+        stderr, printed = os.dup(2), tempfile.TemporaryFile()  # noqa: SIM115 (closed below)
+    except OSError:  # there is no stderr, or no room
+        yield
+        return
+    with printed:
+        _flush_stderr()
+        os.dup2(printed.fileno(), 2)
+        try:
+            yield
+        finally:
+            _flush_stderr()
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        printed.seek(0)
+        os.write(2, printed.read())
+
+
+def _flush_stderr() -> None:
+    if sys.stderr is not None:  # as in programs without a console
+        sys.stderr.flush()
 
 
 @contextmanager

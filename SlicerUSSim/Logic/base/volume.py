@@ -12,7 +12,13 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
-from SlicerUSSim.Logic.base.files import require_own_voxels, why_unreadable, written_whole
+from SlicerUSSim.Logic.base.files import (
+    messages_withheld,
+    require_own_voxels,
+    require_space,
+    why_unreadable,
+    written_whole,
+)
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
 from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry, require_complete, require_written
 from SlicerUSSim.Logic.base.segments import flattened, segments_of
@@ -197,8 +203,11 @@ class Volume:
         path = Path(path)
         require_image_name(path)
         require_own_voxels(path)
-        with written_whole(path) as partial:
-            if path.suffix.lower() == ".vti":
+        suffix = path.suffix.lower()
+        if suffix == ".mnc":  # HDF5 leaves a torso on a full disk without an error, and may end the program later
+            require_space(path, self.array.nbytes)
+        with written_whole(path) as partial, messages_withheld():
+            if suffix == ".vti":
                 self._write_vti(partial, made_by)
             else:
                 import SimpleITK as sitk
@@ -210,7 +219,7 @@ class Volume:
                 sitk.WriteImage(image, str(partial), useCompression=not path.name.lower().endswith(".mhd"))
                 if is_nifti:
                     require_written(partial, self.array.nbytes)
-                elif path.suffix.lower() == ".nrrd":  # of which the last block may be missing without a word
+                elif suffix in (".nrrd", ".mnc"):  # of which the last blocks may be missing without a word
                     written = sitk.GetArrayFromImage(sitk.ReadImage(str(partial)))
                     if not np.array_equal(written, sitk.GetArrayViewFromImage(image), equal_nan=True):
                         raise OSError("not all voxels are in the file; is the disk full?")

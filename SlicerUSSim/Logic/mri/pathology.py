@@ -67,7 +67,7 @@ class Added:
         mine = {tissue.name: tissue for tissue in tissues.all_tissues()[::-1]}
         new = {label: name for label, name in enumerate(self.tissue_names, 1) if name and label not in tissues}
         table = {**tissues, **{label: mine.get(name) or tissue_named(name) for label, name in new.items()}}
-        return TissueTable(table, tissues.membrane)
+        return tissues.with_labels(table)
 
 
 def tissue_to_add(name: str, tissue_names: Iterable[str] = ()) -> str:

@@ -315,10 +315,12 @@ def _check_size(image: CoarseImage, mri: Volume) -> None:
     is_half = all(low <= mm <= high for mm, (low, high) in zip(np.sort(extent), _HALF_A_BRAIN_MM, strict=True))
     is_half &= _HALF_A_BRAIN_ML[0] <= millilitres <= _HALF_A_BRAIN_ML[1]
     known = "a whole brain: it may be half a brain" if is_half else "a head"
+    is_share = mri.array.min() == 0.0 and mri.array.max() <= 1.0
     require(
         millilitres >= _LEAST_HEAD_ML and extent.max() >= 110.0,
         f"image shows {millilitres:.0f} ml of tissue in {size} mm, too little for {known}; "
-        "correct the voxel size in its header, or use an image of the whole head",
+        "correct the voxel size in its header, or use an image of the whole head"
+        + ("; the probabilities of a lesion are added to an MRI with --add tumour=FILE" if is_share else ""),
     )
     # A head with neck has 4 to 6 litres. Nothing of a body is searched for a brain, which would take minutes.
     require(

@@ -19,8 +19,8 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 
 #: Voxels on a side; masks farther away are an error, which is found later.
 _MOST_PADDING = 40
-#: Tag of a segment: what a user should check about the file from which it is, in lines
-_CHECKS = "SlicerUSSim.checks"
+#: Tags of a segment: what it was made from (a file), and what a user should check about that, in lines
+_SOURCE, _CHECKS = "SlicerUSSim.source", "SlicerUSSim.checks"
 
 
 def read_lesions(lesions_node, to_frame_of, tissues: TissueTable) -> tuple[list[tuple[str, Volume, str]], list[str]]:
@@ -53,14 +53,16 @@ def read_lesions(lesions_node, to_frame_of, tissues: TissueTable) -> tuple[list[
         if mask is None:
             warnings.append(f"segment {name!r} of {lesions_node.GetName()!r} is not added: it is empty")
         else:
-            found.append((tissue, Volume(mask.array, moved @ mask.ijk_to_ras), f"segment {name!r}"))
-            warnings += _checks_of(segmentation.GetSegment(segment_id))
+            source = _tag_of(segmentation.GetSegment(segment_id), _SOURCE)
+            called = f"{source} (segment {name!r})" if source else f"segment {name!r}"
+            found.append((tissue, Volume(mask.array, moved @ mask.ijk_to_ras), called))
+            warnings += _tag_of(segmentation.GetSegment(segment_id), _CHECKS).splitlines()
     require(
         bool(found),
         f"lesions {named(lesions_node)}: {'; '.join(warnings)}; expected segments with voxels, called as one of: "
         f"{', '.join(TISSUES)}",
     )
-    return found, warnings
+    return found, list(dict.fromkeys(warnings))  # a file may have been added twice
 
 
 def add_lesion(lesions_node, mask: Volume, tissue: str, name: str, advice: Advice = SCENE) -> list[str]:
@@ -81,6 +83,8 @@ def add_lesion(lesions_node, mask: Volume, tissue: str, name: str, advice: Advic
         image.SetImageToWorldMatrix(vtk_matrix(masks.union.ijk_to_ras))
         segment_id = lesions_node.GetSegmentation().GenerateUniqueSegmentID(part)
         lesions_node.AddSegmentFromBinaryLabelmapRepresentation(image, part, colour_of(part), segment_id)
+        if name != part:
+            lesions_node.GetSegmentation().GetSegment(segment_id).SetTag(_SOURCE, name)
         ids.append(segment_id)
     checks = (*masks.warnings, *mask.doubts)
     if checks:
@@ -88,9 +92,10 @@ def add_lesion(lesions_node, mask: Volume, tissue: str, name: str, advice: Advic
     return ids
 
 
-def _checks_of(segment) -> list[str]:
-    checks = mutable("")
-    return str(checks).splitlines() if segment.GetTag(_CHECKS, checks) else []
+def _tag_of(segment, tag: str) -> str:
+    """The text of a segment's tag; "" without one."""
+    text = mutable("")
+    return str(text) if segment.GetTag(tag, text) else ""
 
 
 def place_of(mask: Volume) -> tuple[float, ...]:

@@ -59,12 +59,22 @@ COMMAND = Advice()
 #: Commands that expect an MRI, and have no --map
 MRI_COMMAND = replace(
     COMMAND,
-    lesion="add it to an MRI's tissues with --add {added}, or simulate it alone with ussim simulate",
+    lesion="add it to an MRI's tissues with --add {added}, or simulate it alone (ussim simulate) with {maps}",
     brain_mask=(
-        "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or simulate it alone with "
-        "ussim simulate"
+        "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or simulate it alone (ussim "
+        "simulate) with {maps}"
     ),
     ambiguous="use ussim simulate with --map {key}",
+)
+#: The command of the workstation, where its MRI is a label map
+SERVE_COMMAND = replace(
+    COMMAND,
+    lesion="add it to an MRI's tissues with MRI --add {added}, or show it alone with --labels {source} {maps}",
+    brain_mask=(
+        "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or show it alone with "
+        "--labels {source} {maps}"
+    ),
+    ambiguous="use --labels with --map {key}",
 )
 #: The page of the workstation
 PAGE = replace(

@@ -164,10 +164,17 @@ class TissueTable(Mapping[int, Tissue]):
             not unknown,
             f"no tissue for {', '.join(map(repr, unknown))}, expected names among: {', '.join(TISSUES)}",
         )
+        return self.with_labels(table)
+
+    def with_labels(self, tissues: Mapping[int, Tissue]) -> TissueTable:
+        """A table of these {label: tissue} with this table's membrane, on which coupling is no fluid if skin is there.
+
+        Raises SimulationError as TissueTable().
+        """
         membrane = self.membrane
-        if membrane is not None and any(tissue.name == "skin" for tissue in table.values()):
+        if membrane is not None and any(tissue.name == "skin" for tissue in tissues.values()):
             membrane = replace(membrane, fluids=tuple(name for name in membrane.fluids if name != "coupling"))
-        return TissueTable(table, membrane)
+        return TissueTable(tissues, membrane)
 
     def with_membrane(self, membrane: Membrane | None) -> TissueTable:
         """A new table with another membrane, or none."""
