@@ -460,11 +460,13 @@ def test_a_script_means_the_very_names_it_was_given(name, path):
 
 def test_the_script_of_an_mri_has_its_mask_and_options_and_the_texture_if_it_is_used():
     source = LabelSource("it's here.nii", mask="mask.nii", options={"contrast": "t2", "classes": 3})
-    plain = python_script(source, Preset(), np.eye(4))
+    hard = Preset().changed("settings", partial_volume=False)
+    plain = python_script(source, hard, np.eye(4))
     assert """Volume.read("it's here.nii")""" in plain and "mask=Volume.read('mask.nii')" in plain
     assert "contrast='t2'" in plain and "texture" not in plain
-    hybrid = Preset().changed("settings", partial_volume=True)
-    assert "texture=segmentation.texture()" in python_script(source, hybrid, np.eye(4))
+    hybrid = hard.changed("settings", mri_modulation_db=1.0)
+    for preset in (Preset(), hybrid):  # the page keeps the shares of the tissues
+        assert "texture=segmentation.texture()" in python_script(source, preset, np.eye(4))
     for text in (plain, python_script(LabelSource(""), hybrid, np.eye(4))):
         compile(text, "script", "exec")
 

@@ -319,7 +319,8 @@ def test_segment_names_and_colours_tissues_where_the_mri_is(kind):
     logic.placeProbe(labels, probe)
     frame = logic.simulate(labels, probe, image)
     pose = np.linalg.inv(node_to_world(moved)) @ node_to_world(probe)
-    direct = UltrasoundSimulator(result.labels, TissueTable.brain(result.tissue_names)).simulate(
+    tissues = TissueTable.brain(result.tissue_names)
+    direct = UltrasoundSimulator(result.labels, tissues, texture=result.texture()).simulate(
         Preset().probe, pose, noise_seed=seed_of_pose(pose)
     )
     assert frame.image.mean() > 15 and np.mean(frame.image != direct.image) < 0.02

@@ -109,7 +109,8 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         )
         lines.append(f"labels = add_tissues(labels, {names}, [{masks}]{more_options}).labels")
         texture = f"texture_below({texture}, mri, segmentation.labels, labels)"
-    needs_texture = preset.settings.needs_texture and not source.is_labels
+    settings = preset.settings
+    needs_texture = (settings.needs_texture or settings.partial_volume is not False) and not source.is_labels
     if needs_texture and source.additions:
         more += "from SlicerUSSim.Logic.mri.pathology import texture_below\n"
     return _TEMPLATE.format(

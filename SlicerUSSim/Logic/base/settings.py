@@ -84,9 +84,9 @@ class SimulationSettings(Declared):
     partial_volume: bool | None = parameter(
         None, "Partial volume",
         "Mix the scatterers of tissues by the probabilities of the segmentation, which requires segmenting the MRI "
-        "first; none: where they are at hand, as in a command that segments an MRI",
+        "first; none: where they are at hand",
         shown=True, option="partial-volume/hard-labels",
-        note="Scenes of 3D Slicer and the page keep no probabilities: none is false there",
+        note="A scene of 3D Slicer or the page keeps them beside labels that Segment wrote, until somebody edits these",
         source="Off in the paper; images are more like real ones with it, see optimization.md",
     )  # fmt: skip
     mri_modulation_db: float = parameter(

@@ -59,6 +59,7 @@ from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_resul
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
+from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_in_slice
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -90,7 +91,8 @@ class _Segmented:
     labels: Volume
     #: Of labels 1, 2, ...
     names: tuple[str, ...]
-    texture: Callable[[], Texture]
+    #: With that of their MRI
+    texture: Texture
     #: On the grid of the labels
     mri: Volume
     #: Whether the labels are within a brain mask
@@ -129,7 +131,7 @@ class UltrasoundSceneLogic:
         #: What the last segment() or addTissues() did, and what a user should check, one line each
         self.notes: tuple[str, ...] = ()
         self.warnings: tuple[str, ...] = ()
-        self._texture: tuple[Hashable, Texture] | None = None  # with the version of its labels
+        self._texture: tuple[Hashable, Texture | None] | None = None  # with the version of its labels
         self._preset: tuple[str, Preset] = ("", Preset())
         self._live: LiveUpdate | None = None
         self._last: tuple[Frame, np.ndarray] | None = None  # with the pose of the probe
@@ -218,12 +220,13 @@ class UltrasoundSceneLogic:
         write_labels(labels_node, added.labels, added.tissue_names, mri_node)
         mark_as_made(labels_node)
         self._laid = labels_version(labels_node), told
+        shares = self._work.do(lambda: texture_below(result.texture(), mri, result.labels, added.labels))
+        write_shares(labels_node, added.labels, added.tissue_names, shares)
         if isinstance(result, Segmentation):  # lesions are proposed on MRIs only
             self.proposals.segmented(mri_node, result)
         self._segmented = _Segmented(
-            labels_version(labels_node), added.labels, added.tissue_names,
-            lambda: texture_below(result.texture(), mri, result.labels, added.labels), mri, is_of_brain,
-        )  # fmt: skip
+            labels_version(labels_node), added.labels, added.tissue_names, shares, mri, is_of_brain
+        )
         self.notes = (*result.notes, *result.table().splitlines(), *added.messages)
         self.warnings = (*result.warnings, *skipped, *added.warnings)
         return result
@@ -285,6 +288,7 @@ class UltrasoundSceneLogic:
         else:
             was, labelled = None, read_labels(labels_node, self.preset.tissues)
             labels, names = labelled.labels, labelled.names
+        whole, known = labels, read_shares(labels_node, labels, names) if was is None else was.texture
         lesions, skipped = self._lesions(lesions_node, labels_node)
         if labels_node.IsA("vtkMRMLSegmentationNode"):
             labels = padded_for(lesions, labels)  # it is cropped to what it holds
@@ -295,11 +299,15 @@ class UltrasoundSceneLogic:
         write_labels(output, added.labels, added.tissue_names, labels_node)
         mark_as_made(output)
         self._laid = labels_version(output), told
-        if was is not None and labels is was.labels:
-            self._segmented = _Segmented(
-                labels_version(output), added.labels, added.tissue_names,
-                lambda: texture_below(was.texture(), was.mri, was.labels, added.labels), was.mri, was.is_of_brain,
-            )  # fmt: skip
+        if known is not None and labels is whole:
+            # Without the MRI, deviations are 0 as in what was read from the node
+            mri = whole.with_array(np.zeros(whole.array.shape, np.float32)) if was is None else was.mri
+            texture = self._work.do(lambda: texture_below(known, mri, whole, added.labels))
+            write_shares(output, added.labels, added.tissue_names, texture)
+            if was is not None:
+                self._segmented = _Segmented(
+                    labels_version(output), added.labels, added.tissue_names, texture, was.mri, was.is_of_brain
+                )
         self.notes, self.warnings = added.messages, (*skipped, *added.warnings)
         return added
 
@@ -315,7 +323,7 @@ class UltrasoundSceneLogic:
         """
         self._check_output(labels_node, output_node)
         probe_to_world = probe_pose(probe_transform_node)
-        frame = self._frame(self._patient(labels_node), probe_to_world, warned)
+        frame = self._frame(labels_node, probe_to_world, warned)
         self._check_output(labels_node, output_node)  # nodes may have changed in the meantime
         require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         self._last = (frame, probe_to_world)
@@ -371,7 +379,7 @@ class UltrasoundSceneLogic:
             item = transforms_node.GetNthDataNode(number)
             require_node(item, "vtkMRMLTransformNode", use=f"item {number} of {named(transforms_node)}")
             pose = check_rigid(f"item {number} of {named(transforms_node)}", to_world @ node_to_world(item))
-            frame = self._frame(self._patient(labels_node), pose, warn_again, noise_seed=number)
+            frame = self._frame(labels_node, pose, warn_again, noise_seed=number)
             image = self.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
             image.UnRegister(None)
             write_image(image, frame)
@@ -455,7 +463,7 @@ class UltrasoundSceneLogic:
             images_node, frames, preset.probe, probe_to_world=pose, estimate_geometry=estimate_geometry
         )
         tracked = replace(tracked, poses=[patient.pose(pose) for pose in tracked.poses])
-        texture = self._texture_of(patient)
+        texture = self._texture_of(labels_node, patient)
 
         def report(step: Progress) -> None:
             if plot is not None:
@@ -622,13 +630,14 @@ class UltrasoundSceneLogic:
 
     def _frame(
         self,
-        patient: Patient,
+        labels_node,
         probe_to_world: np.ndarray,
         warned: Callable[[Warning], None],
         noise_seed: int | None = None,
     ) -> Frame:
         """The image at a pose; the default seed of its noise depends on the pose."""
-        preset, texture = self.preset, self._texture_of(patient)
+        patient, preset = self._patient(labels_node), self.preset
+        texture = self._texture_of(labels_node, patient)
         pose = patient.pose(probe_to_world)
         seed = seed_of_pose(pose) if noise_seed is None else noise_seed
 
@@ -648,20 +657,31 @@ class UltrasoundSceneLogic:
         tissues = preset.tissues.for_names(patient.names)
         return self._simulators.get(patient.version, patient.labels, tissues, preset.settings, self.device, texture)
 
-    def _texture_of(self, patient: Patient) -> Texture | None:
-        """The texture from the MRI, if the settings require it."""
-        if not self.preset.settings.needs_texture:
+    def _texture_of(self, labels_node, patient: Patient) -> Texture | None:
+        """What the settings take from the MRI besides the labels; None if they take nothing, or if nothing is known.
+
+        Raises SimulationError if they demand what is not known.
+        """
+        settings = self.preset.settings
+        is_modulated = settings.mri_modulation_db != 0.0
+        if settings.partial_volume is False and not is_modulated:
             return None
-        segmented = self._segmented
-        if segmented is None or segmented.version != patient.node_version:
+        version = patient.version, is_modulated
+        if self._texture is None or self._texture[0] != version:
+            _, scaling = pose_in_labels(labels_node, np.eye(4))
+            own = Volume(patient.labels.array, np.linalg.inv(scaling) @ patient.labels.ijk_to_ras)
+            segmented, texture = self._segmented, None
+            if not is_modulated:
+                texture = read_shares(labels_node, own, patient.names)
+            elif segmented is not None and segmented.version == patient.node_version:
+                # A segmentation node may return its labels on a larger or smaller part of the grid.
+                texture = segmented.texture.on_grid_of(own, segmented.labels)
+            self._texture = version, texture
+        if self._texture[1] is None and settings.needs_texture:
             raise SimulationError(
                 f"the settings need a texture from the MRI, which {patient.name} lacks; segment the MRI again, or set "
-                "partial_volume to false and mri_modulation_db to 0"
+                "partial_volume to none and mri_modulation_db to 0"
             )
-        if self._texture is None or self._texture[0] != patient.version:
-            # A segmentation node may return its labels on a larger or smaller part of the grid.
-            texture = segmented.texture().on_grid_of(patient.labels, segmented.labels)
-            self._texture = (patient.version, texture)
         return self._texture[1]
 
 

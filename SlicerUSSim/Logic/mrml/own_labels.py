@@ -15,7 +15,7 @@ _MADE = "SlicerUSSim.made"
 
 def mark_as_made(labels_node) -> None:
     """Record that the present content of a label map or segmentation node was made by this program."""
-    labels_node.SetAttribute(_MADE, _content(labels_node))
+    labels_node.SetAttribute(_MADE, content_of(labels_node))
 
 
 def may_replace(labels_node) -> bool:
@@ -23,7 +23,7 @@ def may_replace(labels_node) -> bool:
 
     A new one has neither segments nor voxels; segments without voxels are somebody's plan.
     """
-    return _is_new(labels_node) or _content(labels_node) == labels_node.GetAttribute(_MADE)
+    return _is_new(labels_node) or content_of(labels_node) == labels_node.GetAttribute(_MADE)
 
 
 def _is_new(labels_node) -> bool:
@@ -33,7 +33,7 @@ def _is_new(labels_node) -> bool:
     return image is None or image.GetNumberOfPoints() == 0
 
 
-def _content(labels_node) -> str:
+def content_of(labels_node) -> str:
     """A hash of voxels, position and names, the same after saving and loading; "" if no voxel has a label."""
     try:
         volume, names = node_labels(labels_node)
