@@ -16,7 +16,7 @@ from SlicerUSSim.Logic.mri.pathology import add_tissues, texture_below  # noqa: 
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.mrml.nodes import node_to_world, nodes_of_class, write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, nodes_of_class, read_volume, write_volume  # noqa: E402
 from tests.test_pathology import ball, empty, moved  # noqa: E402
 
 KINDS = ["LabelMapVolume", "Segmentation"]
@@ -134,6 +134,19 @@ def test_shares_are_hidden_saved_and_removed_with_their_labels(tmp_path):
     bench.logic.segment(bench.mri, bench.labels)
     (left,) = bench.shares()
     assert left.GetName().startswith("others")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_live_image_has_the_shares_of_labels_that_are_made_anew(kind):
+    """One was computed between labels and shares, and kept."""
+    bench = Bench(kind).segmented()
+    bench.logic.startLiveUpdate(bench.labels, bench.probe, bench.image)
+    bench.result = bench.logic.segment(bench.mri, bench.labels, thin_sulci=False)
+    live = read_volume(bench.image).array[0].copy()
+    bench.logic.stopLiveUpdate()
+    np.testing.assert_array_equal(live, bench.pixels(UltrasoundSceneLogic(bench.scene)))
+    texture = bench.result.texture()
+    assert differ(live, expected(bench, bench.result.labels, bench.result.tissue_names, texture)) < 0.001
 
 
 def test_labels_under_a_transform_that_scales_have_them_too():

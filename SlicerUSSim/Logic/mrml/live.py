@@ -57,8 +57,8 @@ class LiveUpdate:
         self._observe(scene, scene.StartCloseEvent, self.stop)
         self._observe(scene, scene.NodeAboutToBeRemovedEvent, self._node_goes, call_data=VTK_OBJECT)
         self._observe(scene, scene.EndBatchProcessEvent, self._batch_ended)
-        self._observe(transform_node, transform_node.TransformModifiedEvent, self._request)
-        self._observe(labels_node, labels_node.TransformModifiedEvent, self._request)
+        self._observe(transform_node, transform_node.TransformModifiedEvent, self.request)
+        self._observe(labels_node, labels_node.TransformModifiedEvent, self.request)
         if labels_node.IsA("vtkMRMLSegmentationNode"):
             segmentation, events = labels_node.GetSegmentation(), slicer.vtkSegmentation
             for event in (
@@ -67,11 +67,11 @@ class LiveUpdate:
                 events.SegmentRemoved,
                 events.SegmentModified,
             ):
-                self._observe(segmentation, event, self._request)
+                self._observe(segmentation, event, self.request)
         else:
-            self._observe(labels_node, labels_node.ImageDataModifiedEvent, self._request)
-            self._observe(labels_node, vtkCommand.ModifiedEvent, self._request)
-        self._observe(logic.parameters.node, vtkCommand.ModifiedEvent, self._request)
+            self._observe(labels_node, labels_node.ImageDataModifiedEvent, self.request)
+            self._observe(labels_node, vtkCommand.ModifiedEvent, self.request)
+        self._observe(logic.parameters.node, vtkCommand.ModifiedEvent, self.request)
 
     def stop(self) -> None:
         """Remove all observers and node references, and report the end once."""
@@ -109,9 +109,9 @@ class LiveUpdate:
     def _batch_ended(self) -> None:
         if self._pending:
             self._pending = False
-            self._request()
+            self.request()
 
-    def _request(self) -> None:
+    def request(self) -> None:
         """After a change: schedule exactly one image."""
         if self._pending or self._nodes is None:
             return

@@ -59,7 +59,7 @@ from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_resul
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
-from SlicerUSSim.Logic.mrml.share_nodes import read_shares, write_shares
+from SlicerUSSim.Logic.mrml.share_nodes import read_shares, shares_version, write_shares
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_in_slice
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -215,13 +215,11 @@ class UltrasoundSceneLogic:
                 skull_strip=skull_strip, keep_mask_at=keep_mask_at, device=self.device, progress=progress,
             )
         )  # fmt: skip
-        require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         added, told = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=is_of_brain)
-        write_labels(labels_node, added.labels, added.tissue_names, mri_node)
-        mark_as_made(labels_node)
-        self._laid = labels_version(labels_node), told
         shares = self._work.do(lambda: texture_below(result.texture(), mri, result.labels, added.labels))
-        write_shares(labels_node, added.labels, added.tissue_names, shares)
+        require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
+        self._write_tissues(labels_node, added, mri_node, shares)
+        self._laid = labels_version(labels_node), told
         if isinstance(result, Segmentation):  # lesions are proposed on MRIs only
             self.proposals.segmented(mri_node, result)
         self._segmented = _Segmented(
@@ -296,18 +294,17 @@ class UltrasoundSceneLogic:
         added, told = self._with_lesions(
             labels, names, lesions, before, has_brain_mask=was is not None and was.is_of_brain
         )
-        write_labels(output, added.labels, added.tissue_names, labels_node)
-        mark_as_made(output)
-        self._laid = labels_version(output), told
+        texture = None
         if known is not None and labels is whole:
             # Without the MRI, deviations are 0 as in what was read from the node
             mri = whole.with_array(np.zeros(whole.array.shape, np.float32)) if was is None else was.mri
             texture = self._work.do(lambda: texture_below(known, mri, whole, added.labels))
-            write_shares(output, added.labels, added.tissue_names, texture)
-            if was is not None:
-                self._segmented = _Segmented(
-                    labels_version(output), added.labels, added.tissue_names, texture, was.mri, was.is_of_brain
-                )
+        self._write_tissues(output, added, labels_node, texture)
+        self._laid = labels_version(output), told
+        if texture is not None and was is not None:
+            self._segmented = _Segmented(
+                labels_version(output), added.labels, added.tissue_names, texture, was.mri, was.is_of_brain
+            )
         self.notes, self.warnings = added.messages, (*skipped, *added.warnings)
         return added
 
@@ -657,6 +654,15 @@ class UltrasoundSceneLogic:
         tissues = preset.tissues.for_names(patient.names)
         return self._simulators.get(patient.version, patient.labels, tissues, preset.settings, self.device, texture)
 
+    def _write_tissues(self, labels_node, added: Added, like_node, texture: Texture | None) -> None:
+        """Write labels and what is known of their shares."""
+        write_labels(labels_node, added.labels, added.tissue_names, like_node)
+        mark_as_made(labels_node)
+        if texture is not None:
+            write_shares(labels_node, added.labels, added.tissue_names, texture)
+            if self._live is not None:  # which may have seen the labels without them
+                self._live.request()
+
     def _texture_of(self, labels_node, patient: Patient) -> Texture | None:
         """What the settings take from the MRI besides the labels; None if they take nothing, or if nothing is known.
 
@@ -666,7 +672,7 @@ class UltrasoundSceneLogic:
         is_modulated = settings.mri_modulation_db != 0.0
         if settings.partial_volume is False and not is_modulated:
             return None
-        version = patient.version, is_modulated
+        version = patient.version, shares_version(labels_node), is_modulated
         if self._texture is None or self._texture[0] != version:
             _, scaling = pose_in_labels(labels_node, np.eye(4))
             own = Volume(patient.labels.array, np.linalg.inv(scaling) @ patient.labels.ijk_to_ras)

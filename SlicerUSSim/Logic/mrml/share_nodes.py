@@ -8,7 +8,7 @@ edits the labels, and is saved with the scene, so that a scene has the same imag
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 
@@ -38,9 +38,15 @@ def write_shares(labels_node, labels: Volume, names: Sequence[str], texture: Tex
     voxels = texture.second_label.astype(np.uint32) | _byte(texture.second_share) << _PROBABILITY
     if texture.volume_share is not None:
         voxels |= _byte(texture.volume_share) << _FILLED | np.uint32(1 << _IS_FILLED)
-    write_volume(node, labels.with_array(voxels))
     node.SetAttribute(_NAMES, json.dumps(list(names)))
     node.SetAttribute(_OF, content_of(labels_node))
+    write_volume(node, labels.with_array(voxels))
+
+
+def shares_version(labels_node) -> Hashable:
+    """A value that changes with what write_shares kept for a node."""
+    node = labels_node.GetNodeReference(_ROLE)
+    return None if node is None or node.GetImageData() is None else (node.GetID(), node.GetImageData().GetMTime())
 
 
 def read_shares(labels_node, labels: Volume, names: Sequence[str]) -> Texture | None:
