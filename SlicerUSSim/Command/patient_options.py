@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option
+from SlicerUSSim.Command.craniotomy import GEL_MM, Craniotomy, craniotomy_option
 from SlicerUSSim.Command.mri_options import (
     also_option,
     organs_option,
@@ -31,7 +32,7 @@ from SlicerUSSim.Command.outside import outside_option, require_head, require_ou
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Command.sheets import DrawnSheets, drawn_sheets_option, no_sheet_option
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
     from SlicerUSSim.Logic.base import Volume
     from SlicerUSSim.Logic.imaging import Preset, UltrasoundSimulator
+    from SlicerUSSim.Logic.mri import Added
     from SlicerUSSim.Logic.probe import Probe
     from SlicerUSSim.Logic.tissue import TissueTable
 
@@ -50,6 +52,8 @@ map_option = click.option(
     "totalsegmentator-v1, totalsegmentator-mr, totalsegmentator-tissues, ussim, brats-2022, brats. May be repeated.",
 )  # fmt: skip
 
+#: A pose that is chosen
+AUTO = "auto"
 pose_option = click.option(
     "--pose", required=True,
     help='File with probe_to_ras (4 x 4 in JSON, 16 numbers in text, or a Slicer transform), or "auto": a coronal '
@@ -105,6 +109,8 @@ class PatientOptions:
     additions: tuple[str, ...] = declared(add_option)
     #: Whether skin, scalp, skull and air are labelled, too
     outside: bool = declared(outside_option)
+    #: none, auto, disc:MM or a file
+    craniotomy: str = declared(craniotomy_option)
     #: A file, auto or none
     sheets: str = declared(drawn_sheets_option)
     #: Kinds that are not drawn
@@ -168,13 +174,15 @@ class Examination:
     display: DisplaySettings
     #: Whether the input was a label map, and not an MRI
     is_labels: bool
-    #: (3,) RAS mm of what --add laid over the labels; None without
-    added_ras: np.ndarray | None = None
+    #: (4, 4) probe_to_ras, if open_examination was given one
+    probe_to_ras: np.ndarray | None = None
 
 
-def open_examination(patient: PatientOptions) -> Examination:
+def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = None) -> Examination:
     """The Examination of a command's options. An MRI is segmented, with a progress bar.
 
+    `pose` is a (4, 4) probe_to_ras, or AUTO: a view through a craniotomy, of what --add laid over the labels if there
+    is something.
     Fast checks come before slow computations. Raises SimulationError for inconsistent options.
     """
     import logging  # imported here to keep --help fast
@@ -193,6 +201,7 @@ def open_examination(patient: PatientOptions) -> Examination:
     volume = Volume.read(patient.mri_or_labels)
     is_ct = patient.segmentation["contrast"] == CT
     is_labels = patient.is_labels
+    craniotomy = Craniotomy.of(patient.craniotomy)
     require(not (is_ct and is_labels), f"{patient.mri_or_labels}: --labels and --ct are given, expected one of them")
     if is_labels is None and is_ct:
         is_labels = False
@@ -226,8 +235,13 @@ def open_examination(patient: PatientOptions) -> Examination:
             labels, tissues.names_by_label(), has_brain_mask=False
         )
         tissues = changes.to_tissues(added.table(tissues))
-        simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device, sheets=sheets.read)
-        return Examination(simulator, preset.probe, preset.display, is_labels, added.centre_ras(labels))
+        placed = _placed(patient, craniotomy, preset, added, labels, pose)
+        simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, sheets=sheets.read)
+        return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
+    require(
+        not craniotomy.is_wanted or patient.outside,
+        f"--craniotomy is {patient.craniotomy}, and only a brain is labelled, expected --outside too",
+    )
     log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
     tissues = preset.tissues if table is None else table
     additions = Additions.read(patient.additions, (tissue.name for tissue in tissues.all_tissues()))
@@ -251,8 +265,37 @@ def open_examination(patient: PatientOptions) -> Examination:
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
     tissues = changes.to_tissues(tissues)
-    simulator = UltrasoundSimulator(added.labels, tissues, preset.settings, patient.device, texture, surfels)
-    return Examination(simulator, preset.probe, preset.display, is_labels, added.centre_ras(segmentation.labels))
+    placed = _placed(patient, craniotomy, preset, added, segmentation.labels, pose)
+    simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, texture, surfels)
+    return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """Labels with the craniotomy, the probe's pose, and the settings with the gel between them."""
+
+    labels: Volume
+    probe_to_ras: np.ndarray | None
+    settings: SimulationSettings
+
+
+def _placed(
+    patient: PatientOptions, craniotomy: Craniotomy, preset: Preset, added: Added, before: Volume,
+    pose: np.ndarray | str | None,
+) -> _Placed:  # fmt: skip
+    """The probe at its pose on a patient; `before` are the labels without what --add laid over them."""
+    from SlicerUSSim.Logic.mri.craniotomy import without_outside
+    from SlicerUSSim.Logic.probe.placement import craniotomy_pose
+
+    labels, names, settings = added.labels, added.tissue_names, preset.settings
+    if isinstance(pose, str):
+        ground = without_outside(labels, names) if craniotomy.is_wanted else labels
+        pose = craniotomy_pose(ground, preset.probe, target_ras=added.centre_ras(before))
+    labels = craniotomy.on(labels, names, preset.probe, pose)
+    if "skin" in names and not craniotomy.is_wanted and "contact_gap_mm" not in patient.settings and not patient.preset:
+        note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--contact-gap)")
+        settings = replace(settings, contact_gap_mm=GEL_MM)
+    return _Placed(labels, pose, settings)
 
 
 def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination, np.ndarray]:
@@ -260,19 +303,15 @@ def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination
 
     The pose "auto" is a view through a craniotomy, of what --add laid over the labels if there is something.
     """
-    from SlicerUSSim.Logic.probe.placement import craniotomy_pose
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
-    given = None if pose == "auto" else read_pose(pose)
+    given = None if pose == AUTO else read_pose(pose)
     require(
         given is not None or patient.segmentation["contrast"] != CT,
         "--pose is auto, which is a craniotomy, and the image is a CT (--ct), expected a file with the pose",
     )
-    examination = open_examination(patient)
-    if given is not None:
-        return examination, given
-    labels = examination.simulator.medium.labels
-    return examination, craniotomy_pose(labels, examination.probe, target_ras=examination.added_ras)
+    examination = open_examination(patient, AUTO if given is None else given)
+    return examination, required(examination.probe_to_ras, "the examination has no pose")
 
 
 def _labelled(

@@ -73,6 +73,13 @@ class SimulationSettings(Declared):
     ring_down: bool = parameter(
         True, "Ring-down", "Reverberation between the probe's face and the skin, as the probe has it", shown=True
     )
+    contact_gap_mm: float | None = parameter(
+        None, "Contact gap",
+        "Widest gap between probe and patient that gel fills; elements over a wider one see nothing, and their lines "
+        "are dark; none: the patient lies in the coupling medium, as in a water bath or under saline",
+        unit="mm", bounds=(0.0, 50.0), shown=Shown(0.0, 20.0, 0.5, none_at=20.0), can_be_none=True,
+        source="Not in the paper",
+    )  # fmt: skip
     scatterers_per_mm3: float | None = parameter(
         None, "Scatterers",
         "Sites of the scatterer lattice per cubic millimetre; none: eight in the probe's smallest resolution cell",

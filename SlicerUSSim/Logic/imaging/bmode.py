@@ -35,7 +35,7 @@ class PulseFilter(Stage):
         self._shift = device.kernels("downshift.cl", device.lanes)["shift_frequency"]
         self.workspace = Workspace(device)
         self._level = device.kernels("harmonic.cl", device.lanes)["apply_level"]
-        #: What the level of the harmonic depends on, and its buffer
+        #: What levels along the lines depend on, and their buffer
         self._levels: tuple[tuple, Buffer] | None = None
         self._sigma: float | None = None
         # Taps of the pulse with this sigma
@@ -60,7 +60,7 @@ class PulseFilter(Stage):
                 frame.scanned.im,
                 np.int32(frame.scanned.stride),
             )
-        if frame.probe.harmonic:
+        if frame.probe.harmonic or frame.contact is not None:
             self._apply_level(frame)
         self.device.run(
             self.kernel,
@@ -80,13 +80,19 @@ class PulseFilter(Stage):
         lines, samples = frame.line_shape
         key = frame.probe, samples, float(frame.acquisition["sample_mm"])
         if self._levels is None or self._levels[0] != key:
-            levels = frame.probe.harmonic_level(np.arange(samples) * key[2]).astype(np.float32)
+            levels = np.ones(samples, np.float32)
+            if frame.probe.harmonic:
+                levels = frame.probe.harmonic_level(np.arange(samples) * key[2]).astype(np.float32)
             self._levels = key, self.device.upload(levels)
+        contact = np.ones(lines, np.float32) if frame.contact is None else frame.contact
+        buffer = self.workspace.get("contact", contact.nbytes)
+        self.device.write(buffer, contact)
         self.device.run(
             self._level,
             (samples // self.device.lanes, lines),
             frame.acquisition_buffer,
             self._levels[1],
+            buffer,
             frame.scanned.re,
             frame.scanned.im,
             np.int32(frame.scanned.stride),

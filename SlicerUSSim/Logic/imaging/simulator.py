@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
 from SlicerUSSim.Logic.imaging.bmode import downshift
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
+from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
@@ -329,9 +330,11 @@ class UltrasoundSimulator:
         """The inputs of the stages of one frame; its record is written to `buffer`, by default a new one."""
         display = DisplaySettings() if display is None else display
         require(isinstance(display, DisplaySettings), f"display is {display!r:.80}, expected DisplaySettings")
+        gap_mm = self.settings.contact_gap_mm
         frame = DeviceFrame(
             probe=probe,
             settings=self.settings,
+            contact=None if gap_mm is None else line_contact(self.medium.labels, probe, pose, gap_mm),
             acquisition=self.acquisition(probe, pose),
             axial_sigma_mm=self.axial_sigma_mm(probe),
             display=display,

@@ -50,6 +50,8 @@ class FrameInputs:
     grid: ImageGrid
     #: Seed of the amplifier noise (noise.py)
     noise_seed: int
+    #: (scan lines,) float32 factor of contact.line_contact; None where the patient lies in the coupling medium
+    contact: np.ndarray | None = field(default=None, kw_only=True)
 
     @property
     def line_shape(self) -> tuple[int, int]:

@@ -9,6 +9,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
+from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
@@ -55,6 +56,7 @@ class NumpyModel:
         if self.simulator.medium.tissues is not self.medium.tissues:
             self._read_medium()
         display, settings = display or DisplaySettings(), self.simulator.settings
+        gap_mm = settings.contact_gap_mm
         frame = TwinFrame(
             probe=probe,
             settings=settings,
@@ -63,6 +65,7 @@ class NumpyModel:
             display=display,
             grid=grid or ImageGrid.for_probe(probe, display.image_size),
             noise_seed=noise_seed,
+            contact=None if gap_mm is None else line_contact(self.simulator.medium.labels, probe, probe_to_ras, gap_mm),
             labels=self._labels,
             tissues=self.medium.rows,
         )

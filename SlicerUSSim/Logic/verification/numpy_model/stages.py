@@ -130,6 +130,8 @@ def pulse(frame: TwinFrame) -> None:
         starts = Beam(record).line_start(np.arange(len(lines))) / record["sample_mm"]
         below = np.maximum(np.arange(lines.shape[1]) - np.floor(starts + f32(0.5)).astype(int)[:, None], 0)
         lines *= f32(harmonic_level(frame.probe, np.arange(lines.shape[1]) * float(record["sample_mm"])))[below]
+    if frame.contact is not None:
+        lines *= frame.contact[:, None]
     padded = np.pad(lines, ((0, 0), (reach, reach)))
     pulses = sum((tap * padded[:, k : k + lines.shape[1]] for k, tap in enumerate(taps)), np.zeros_like(lines))
     frame.iq = (pulses / turning).astype(np.complex64)

@@ -1,0 +1,91 @@
+"""--craniotomy: an opening in the skull of a whole head; and the gel between its skin and the probe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import click
+
+from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from SlicerUSSim.Logic.base import Volume
+    from SlicerUSSim.Logic.probe import Probe
+
+NONE, AUTO, DISC = "none", "auto", "disc:"
+#: What gel bridges between skin and probe unless --contact-gap says otherwise, mm
+GEL_MM = 3.0
+
+craniotomy_option = click.option(
+    "--craniotomy", default=NONE, show_default=True, metavar="none|auto|disc:MM|FILE",
+    help="Opening in skin and skull of a whole head (--outside, or a label map with them), filled with the coupling "
+    "medium: a disc of this diameter under the probe, auto (as wide as the probe's face needs), the mask in FILE, or "
+    "the polygon of a .mrk.json file of 3D Slicer. With --pose auto the probe then stands on the brain.",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Craniotomy:
+    """What --craniotomy asks for."""
+
+    source: str = NONE
+    #: Of a disc, None for another opening or as wide as the probe needs
+    diameter_mm: float | None = None
+
+    @classmethod
+    def of(cls, text: str) -> Craniotomy:
+        """Raises SimulationError for a value that is none of those, or a file that is not there."""
+        if text in (NONE, AUTO):
+            return cls(text)
+        if text.startswith(DISC):
+            try:
+                diameter = float(text.removeprefix(DISC))
+            except ValueError:
+                diameter = math.nan
+            require(
+                5.0 <= diameter <= 150.0,
+                f"--craniotomy is {text!r}, expected disc: and a diameter from 5 to 150 mm, such as disc:30",
+            )
+            return cls(DISC, diameter)
+        from pathlib import Path
+
+        require(Path(text).is_file(), f"--craniotomy is {text!r}, expected none, auto, disc:MM, or a file")
+        return cls(text)
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether there is an opening."""
+        return self.source != NONE
+
+    @property
+    def needs_pose(self) -> bool:
+        """Whether the opening lies under the probe."""
+        return self.source in (AUTO, DISC)
+
+    def on(self, labels: Volume, names: Sequence[str], probe: Probe, probe_to_ras: np.ndarray | None) -> Volume:
+        """Labels 1, 2, ... called `names` with the opening; says what was removed.
+
+        Raises SimulationError where that cannot be done.
+        """
+        if not self.is_wanted:
+            return labels
+        from SlicerUSSim.Logic.mri.craniotomy import ROOM_MM, disc_opening, file_opening, opened
+
+        if self.needs_pose:
+            if probe_to_ras is None:
+                raise SimulationError(
+                    f"--craniotomy {self.source.rstrip(':')} needs one pose of the probe, expected a file"
+                )
+            diameter = self.diameter_mm or max(probe.face_mm, probe.elevation_aperture_mm) + ROOM_MM
+            opening, what = disc_opening(labels, names, probe_to_ras, diameter), f"a disc of {diameter:.0f} mm"
+        else:
+            opening, what = file_opening(labels, names, self.source), self.source
+        found, millilitres = opened(labels, names, opening)
+        note(f"craniotomy: {what}; {millilitres:.1f} ml of skin, scalp and skull are replaced by the coupling medium")
+        return found
