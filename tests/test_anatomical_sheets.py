@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 from dataclasses import fields, replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -471,3 +474,45 @@ def test_sheets_of_colin27_are_where_its_image_and_aal_show_them():
         normal = tentorium.normal[nearest] * np.sign(tentorium.normal[nearest][:, 2:])
         side = ((places - tentorium.place[nearest]) * normal).sum(axis=1)
         assert (sign * side[away < 8] > 0).mean() > 0.85
+
+
+_FULL = """
+import resource, signal, sys
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.mri.sheets.polydata import write_surfels
+from tests.test_anatomical_sheets import some_surfels
+
+surfels = some_surfels()
+write_surfels(sys.argv[1], surfels)
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+for size in (0, 700, 2000):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+    try:
+        write_surfels(sys.argv[1], surfels)
+        print("written")
+    except SimulationError as error:
+        print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
+@pytest.mark.parametrize("name", ["sheets.vtp", "sheets.ply"])
+def test_sheets_that_do_not_fit_on_the_disk_leave_those_before(name, tmp_path):
+    """They were replaced by an empty file, which was said to be written."""
+    place = tmp_path / name
+    done = subprocess.run(
+        [sys.executable, "-c", _FULL, str(place)], capture_output=True, text=True, cwd=Path(__file__).parents[1]
+    )
+    size = place.stat().st_size
+    assert done.returncode == 0 and size > 2000
+    assert done.stdout.count("cannot be written (not all of it is in the file; is the disk full?)") == 3, done.stdout
+    assert done.stderr == "" and [file.name for file in tmp_path.iterdir()] == [name]
+
+
+def test_an_incomplete_file_of_sheets_is_one_line(tmp_path, capfd):
+    path = tmp_path / "sheets.vtp"
+    write_surfels(path, some_surfels())
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(SimulationError, match=r"sheets\.vtp: is incomplete; copy or write it again"):
+        read_surfels(path)
+    assert capfd.readouterr().err == ""

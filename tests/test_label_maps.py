@@ -118,7 +118,7 @@ def test_the_workstation_refuses_a_label_map_as_an_mri_and_names_the_file(tmp_pa
     tumour((1, 3, 2)).write("map.nii.gz")
     message = refused("serve", "map.nii.gz")
     assert message.startswith("ussim: map.nii.gz: a tumour's labels (as BraTS")
-    assert "with MRI --add brats=map.nii.gz, or show it alone with --labels map.nii.gz --map 1=necrosis" in message
+    assert "with MRI --add brats=map.nii.gz, or simulate it alone (ussim simulate) with --map 1=necrosis" in message
     head().write("aseg.nii.gz")
     assert "expected an MRI; use it as it is (--labels aseg.nii.gz)" in refused("serve", "aseg.nii.gz")
 

@@ -125,3 +125,26 @@ def test_a_brain_without_a_head_is_refused_before_it_is_segmented(tmp_path):
     done = CliRunner().invoke(main, ["segment", path, "--outside", "-o", str(tmp_path / "labels.nii.gz")])
     assert done.exit_code == 2 and "is a brain without its head (skull-stripped), and --outside is for" in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (("grey matter", "csf", "white matter"), "label 1 is grey matter, and it is csf here, expected 1 csf, 2 grey"),
+        (("csf", "grey matter"), "has no label 3, which is white matter here, expected 1 csf, 2 grey matter, 3 white"),
+    ],
+)
+def test_a_table_of_other_numbers_is_refused(names, message, tmp_path):
+    """Tissues were exchanged without a word, and an error did not name what was missing."""
+    mri, brain, _ = round_head()
+    mri.write(tmp_path / "head.nii.gz")
+    mri.with_array(brain.astype(np.uint8)).write(tmp_path / "brain.nii.gz")
+    TissueTable.brain().for_names(names).write(tmp_path / "table.json")
+    done = CliRunner().invoke(
+        main,
+        [
+            "simulate", str(tmp_path / "head.nii.gz"), "--mask", str(tmp_path / "brain.nii.gz"), "--tissues",
+            str(tmp_path / "table.json"), "--pose", "auto", "-o", str(tmp_path / "a.png"),
+        ],
+    )  # fmt: skip
+    assert done.exit_code == 2 and f"table.json: {message}" in done.stderr

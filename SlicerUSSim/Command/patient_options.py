@@ -260,7 +260,9 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         if patient.outside:
             labels, names = with_outside(patient.mri_or_labels, volume, segmentation, labels, names)
     if table is not None:
-        labels, names = _numbered_as(tissues, labels, names, len(segmentation.tissue_names))
+        labels, names = _numbered_as(
+            tissues, labels, names, len(segmentation.tissue_names), patient.tissues or "tissues"
+        )
     added = additions.on(labels, names, has_brain_mask=not is_ct)
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)
@@ -286,11 +288,15 @@ def _placed(
     """The probe at its pose on a patient; `before` are the labels without what --add laid over them."""
     from SlicerUSSim.Logic.mri.craniotomy import without_outside
     from SlicerUSSim.Logic.probe.placement import craniotomy_pose
+    from SlicerUSSim.Logic.probe.surface import PatientSurface
 
     labels, names, settings = added.labels, added.tissue_names, preset.settings
     if isinstance(pose, str):
         ground = without_outside(labels, names) if craniotomy.is_wanted else labels
         pose = craniotomy_pose(ground, preset.probe, target_ras=added.centre_ras(before))
+        if ground is labels and "skin" in names:  # a face that is oblique to the skin would stand in the bone
+            surface = PatientSurface(labels)
+            pose = surface.slid(pose, surface.nearest(pose[:3, 3]))
     labels = craniotomy.on(labels, names, preset.probe, pose)
     if "skin" in names and not craniotomy.is_wanted and "contact_gap_mm" not in patient.settings and not patient.preset:
         note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--contact-gap)")
@@ -339,16 +345,35 @@ def _labelled(
 
 
 def _numbered_as(
-    table: TissueTable, labels: Volume, names: Sequence[str], classes: int
+    table: TissueTable, labels: Volume, names: Sequence[str], classes: int, source: str
 ) -> tuple[Volume, tuple[str, ...]]:
     """(labels, names of all) of a segmentation whose classes, the first labels, are those of a table (--tissues).
 
     What was found besides them has its number from the table, if a tissue is called so there, or one after all of it.
+    Raises SimulationError for a table that lacks a class, or has another class under its number, and one without room.
     """
     import numpy as np
 
+    from SlicerUSSim.Logic.tissue.names import same_name
+    from SlicerUSSim.Logic.tissue.table import MAX_LABEL
+
     numbered = list(table.names_by_label())
+    expected = ", ".join(f"{number} {name}" for number, name in enumerate(names[:classes], 1))
+    for number, name in enumerate(names[:classes], 1):
+        there = numbered[number - 1] if number <= len(numbered) else ""
+        is_used = bool((labels.array == number).any())
+        require(there or not is_used, f"{source}: has no label {number}, which is {name} here, expected {expected}")
+        others = [other for other in names[:classes] if other != name]
+        require(
+            not any(same_name(there, other) for other in others),
+            f"{source}: label {number} is {there}, and it is {name} here, expected {expected}",
+        )
     others = list(dict.fromkeys(name for name in names[classes:] if name not in numbered))
     numbered += [""] * (classes - len(numbered)) + others
+    require(
+        len(numbered) <= MAX_LABEL,
+        f"{source}: has labels up to {len(numbered) - len(others)}, which leaves no room for {', '.join(others)}, "
+        f"expected at most {MAX_LABEL} in all",
+    )
     numbers = [*range(classes + 1), *(numbered.index(name) + 1 for name in names[classes:])]
     return labels.with_array(np.asarray(numbers, np.uint8)[labels.array]), tuple(numbered)

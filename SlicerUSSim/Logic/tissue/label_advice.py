@@ -69,10 +69,10 @@ MRI_COMMAND = replace(
 #: The command of the workstation, where its MRI is a label map
 SERVE_COMMAND = replace(
     COMMAND,
-    lesion="add it to an MRI's tissues with MRI --add {added}, or show it alone with --labels {source} {maps}",
+    lesion="add it to an MRI's tissues with MRI --add {added}, or simulate it alone (ussim simulate) with {maps}",
     brain_mask=(
-        "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or show it alone with "
-        "--labels {source} {maps}"
+        "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or simulate it alone (ussim "
+        "simulate) with {maps}"
     ),
     ambiguous="use --labels with --map {key}",
 )

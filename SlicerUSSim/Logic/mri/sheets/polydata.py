@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.base.files import written_whole
+from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
 from SlicerUSSim.Logic.base.own_outputs import mark_of
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 
@@ -43,7 +43,7 @@ def write_surfels(path: str | os.PathLike, surfels: Surfels) -> None:
 
     is_ply = Path(path).suffix.lower() == ".ply"
     data = as_polydata(surfels, (-1.0, -1.0, 1.0) if is_ply else (1.0, 1.0, 1.0))
-    with written_whole(path) as partial:
+    with written_whole(path) as partial, messages_withheld():
         if is_ply:
             writer = vtkPLYWriter()
             writer.SetArrayName("colour")
@@ -52,7 +52,36 @@ def write_surfels(path: str | os.PathLike, surfels: Surfels) -> None:
             writer = vtkXMLPolyDataWriter()
         writer.SetInputData(data)
         writer.SetFileName(str(partial))
-        require(writer.Write() == 1, f"{path}: cannot be written")
+        # On a full disk VTK writes a part of the file, and says that it has written it.
+        if writer.Write() != 1 or not _is_whole(partial, data):
+            raise OSError("not all of it is in the file; is the disk full?")
+
+
+def _is_whole(path: Path, data: vtkPolyData) -> bool:
+    """Whether a file has the points and squares of `data`."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOPLY import vtkPLYReader
+
+    if path.suffix.lower() != ".ply":
+        return _has_end(path)
+    # Of each point 3 float32 and 3 bytes of colour, of each square its size and 4 int32
+    if path.stat().st_size < 15 * data.GetNumberOfPoints() + 17 * data.GetNumberOfCells():
+        return False
+    reader = vtkPLYReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    found = reader.GetOutput()
+    if found.GetNumberOfCells() != data.GetNumberOfCells():
+        return False
+    one, other = (vtk_to_numpy(surface.GetPoints().GetData()).astype(np.float32) for surface in (found, data))
+    return bool(np.array_equal(one, other))
+
+
+def _has_end(path: Path) -> bool:
+    """Whether a .vtp goes on to its end."""
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - 64, 0))
+        return b"</VTKFile>" in file.read()
 
 
 def as_polydata(surfels: Surfels, signs: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> vtkPolyData:
@@ -138,16 +167,19 @@ def read_surfels(path: str | os.PathLike) -> Surfels:
     require(Path(path).is_file(), f"{path}: no such file")
     require(Path(path).suffix.lower() == ".vtp", f"{path}: expected a .vtp that `ussim segment --sheets` has written")
     reader = vtkXMLPolyDataReader()
-    require(reader.CanReadFile(str(path)) == 1, f"{path}: is no VTK surface")
-    reader.SetFileName(str(path))
-    reader.Update()
-    cells = reader.GetOutput().GetCellData()
-    arrays = []
-    for entry in fields(Surfels):
-        array = cells.GetArray(entry.name)
-        require(
-            array is not None,
-            f"{path}: has no array {entry.name!r} of its cells, expected a file of `ussim segment --sheets`",
-        )
-        arrays.append(np.array(vtk_to_numpy(array)))
+    with messages_withheld():
+        require(reader.CanReadFile(str(path)) == 1, f"{path}: is no VTK surface")
+        require(_has_end(Path(path)), f"{path}: is incomplete; copy or write it again")
+        reader.SetFileName(str(path))
+        reader.Update()
+        require(reader.GetErrorCode() == 0, f"{path}: is damaged; copy or write it again")
+        cells = reader.GetOutput().GetCellData()
+        arrays = []
+        for entry in fields(Surfels):
+            array = cells.GetArray(entry.name)
+            require(
+                array is not None,
+                f"{path}: has no array {entry.name!r} of its cells, expected a file of `ussim segment --sheets`",
+            )
+            arrays.append(np.array(vtk_to_numpy(array)))
     return Surfels(*arrays)
