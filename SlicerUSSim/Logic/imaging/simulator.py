@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
 from SlicerUSSim.Logic.imaging.bmode import downshift
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
+from SlicerUSSim.Logic.imaging.diffraction import speckle_height_mm
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
@@ -384,6 +385,7 @@ class UltrasoundSimulator:
         acquisition["receive_sigma_min"], acquisition["receive_sigma_slope"] = probe.receive_beam()
         for name, value in zip(("sigma", "focus", "rayleigh"), probe.elevation_beam(), strict=True):
             acquisition[f"elevation_{name}"] = value
+        acquisition["speckle_height_mm"] = speckle_height_mm(probe) if settings.wavefront_curvature else 0.0
         acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
         lateral, guard = _traced_lines_for(probe, settings)
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard

@@ -6,6 +6,7 @@ it takes names and number formats, but no values.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import cast
 
 import numpy as np
@@ -71,6 +72,7 @@ def acquisition_record(
         "elevation_sigma": elevational,
         "elevation_focus": probe.elevation_focus_mm,
         "elevation_rayleigh": elevational_length,
+        "speckle_height_mm": _speckle_heights(probe) if settings.wavefront_curvature else np.zeros(33),
         "aperture_beams": settings.beam == "aperture",
         "aperture_mm": probe.aperture_mm,
         "receive_f_number": probe.receive_f_number,
@@ -287,6 +289,34 @@ def _elevation(probe: Probe) -> tuple[float, float]:
     if probe.harmonic:  # of the pulse sigma and length are twice as large; transmitted, squared, received
         return np.sqrt(2.0 / 3.0) * sigma, np.sqrt(2.0) * _rayleigh_mm(probe, sigma)
     return np.sqrt(0.5) * sigma, _rayleigh_mm(probe, sigma)
+
+
+@lru_cache(maxsize=16)
+def _speckle_heights(probe: Probe) -> np.ndarray:
+    """(33,) elevational sigma of speckle at depths from the face on, from Fresnel's integral over the aperture."""
+    focus, wavelength = probe.elevation_focus_mm, received_wavelength_mm(probe)
+    aperture = min(probe.elevation_aperture_mm, 2.0 * focus)
+    point = (np.arange(512) - 255.5) / 512.0 * aperture
+    heights = []
+    for depth in np.linspace(0.0, _steering(probe)["depth_mm"], 33):
+        half = 2.0 * aperture + 8.0 * wavelength * depth / aperture
+        place = np.arange(-half, half, aperture / 256.0)
+
+        def field(length: float, depth: float = depth, place: np.ndarray = place) -> np.ndarray:
+            if depth == 0.0:
+                return np.exp(-1j * np.pi * place**2 / (length * focus)) * (np.abs(place) < 0.5 * aperture)
+            path = (place[:, None] - point) ** 2 / depth - point**2 / focus
+            return np.exp(1j * np.pi / length * path).sum(axis=1)
+
+        received = field(wavelength)
+        both = received * (field(2.0 * wavelength) ** 2 if probe.harmonic else received)
+        energy = (np.abs(both) ** 2).sum()
+        lag, before, here = 0, 1.0, 1.0
+        while here >= 0.5:
+            lag, before = lag + 1, here
+            here = np.abs((both[lag:] * both[:-lag].conj()).sum()) / energy
+        heights.append((lag - (0.5 - here) / (before - here)) * aperture / 256.0 / np.sqrt(np.log(16.0)))
+    return np.array(heights)
 
 
 def _sent_sigma(probe: Probe, f_number: float) -> float:
