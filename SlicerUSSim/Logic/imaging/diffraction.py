@@ -132,9 +132,9 @@ def speckle_height_mm(probe: Probe) -> np.ndarray:
     wavelength, focus = probe.wavelength_mm, probe.elevation_focus_mm
     aperture = min(probe.elevation_aperture_mm, focus / LEAST_F_NUMBER)
     point = aperture / _OPEN
-    # What leaves the plane at one side returns at the other one: beams, with two lobes, must not be as wide. Far away
+    # What leaves the plane at one side returns at the other one: beams, with six lobes, must not be as wide. Far away
     # speckle has the same length at all depths, so that depths end there.
-    aside = 0.5 * aperture / focus + 2.0 * (2.0 if probe.harmonic else 1.0) * wavelength / aperture
+    aside = 0.5 * aperture / focus + 6.0 * (2.0 if probe.harmonic else 1.0) * wavelength / aperture
     needed = 2.0 * (aperture + aside * probe.displayed_mm) / point
     plane = int(np.clip(2 ** np.ceil(np.log2(needed)), _LEAST_PLANE, _MOST_PLANE))
     farthest = max(0.5 * plane * point - aperture, 0.0) / aside
@@ -147,7 +147,8 @@ def speckle_height_mm(probe: Probe) -> np.ndarray:
 
     received = field(wavelength)
     sent = field(2.0 * wavelength) ** 2 if probe.harmonic else received
-    correlation = np.abs(fft.ifft(np.abs(np.asarray(fft.fft(sent * received, axis=1))) ** 2, axis=1))[:, : plane // 2]
+    power = np.abs(np.asarray(fft.fft(sent * received, axis=1))) ** 2
+    correlation = np.abs(np.asarray(fft.ifft(power, axis=1)))[:, : plane // 2]
     correlation /= correlation[:, :1]
     beyond, row = np.argmax(correlation < 0.5, axis=1), np.arange(_DEPTHS)
     at, before = correlation[row, beyond], correlation[row, beyond - 1]
