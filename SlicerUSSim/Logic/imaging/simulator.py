@@ -110,6 +110,9 @@ class UltrasoundSimulator:
         self.display_stages = [stage(self.device) for stage in stages.DISPLAY_STAGES]
         self.tracer = self.stage(RayTracer)
         self._acquisition_buffer = self.device.empty(ACQUISITION.itemsize)
+        # The record of the last frame, and its inputs but for the pose
+        self._record: np.ndarray | None = None
+        self._record_made_for: tuple | None = None
         # The baseband signal of the last frame, and its inputs
         self._iq: Buffer
         self._iq_made_for: tuple | None = None
@@ -346,6 +349,15 @@ class UltrasoundSimulator:
 
     def acquisition(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
         """The record (layout.ACQUISITION) of the constants of one frame."""
+        made_for = probe, self.settings, self.medium.version
+        if self._record is None or self._record_made_for != made_for:
+            self._record, self._record_made_for = self._record_of(probe), made_for
+        acquisition = self._record.copy()
+        acquisition["probe_to_ras"] = pose[:3].ravel()
+        return acquisition
+
+    def _record_of(self, probe: Probe) -> np.ndarray:
+        """The part of the record that does not depend on the pose."""
         settings, medium = self.settings, self.medium
         block = CONSTANTS["BLOCK"]
         axial_sigma = self.axial_sigma_mm(probe)
@@ -367,7 +379,6 @@ class UltrasoundSimulator:
             acquisition["membrane_exponent"] = membrane.diffuse_exponent
             # 2 k s of the range's deviation s: the carrier has 2 k / 2 pi cycles per millimetre of depth.
             acquisition["membrane_phase"] = 2.0 * np.pi * self._cycles_per_mm(probe) * membrane.roughness_mm
-        acquisition["probe_to_ras"] = pose[:3].ravel()
         acquisition["linear"] = probe.is_linear
         acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
         for name, value in steering_fields(probe).items():

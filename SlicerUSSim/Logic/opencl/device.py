@@ -108,8 +108,9 @@ class Device:
     def run(self, kernel: Kernel, global_size: tuple[int, ...], *arguments, heavy: bool = False) -> None:
         """Enqueue a kernel; its event is kept if `profiling` is on.
 
-        `heavy` is for work-items with large private arrays: on a processor each is then a separate group, since PoCL
-        keeps the arrays of a group on the stack of one thread, and a stack overflow would end the process.
+        `heavy` is for long work-items with large private arrays, or few of them: on a processor each is then a separate
+        group. PoCL keeps the arrays of a group on the stack of one thread, and a stack overflow would end the process;
+        and it puts a few hundred work-items into one group, which one core computes while the others wait.
         """
         local_size = (1,) * len(global_size) if heavy and self.info.kind != "GPU" else None
         event = kernel(self.queue, global_size, local_size, *arguments)
