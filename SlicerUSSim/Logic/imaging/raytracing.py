@@ -99,7 +99,7 @@ class RayTracer(Stage):
             tree.segments,
             tree.segment_counts,
             frame.losses,
-            heavy=True,
+            few=True,
         )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:

@@ -137,7 +137,7 @@ class InterfaceEchoes(Stage):
         reach = get("reach", 4 * traced)
         tree, scanned = frame.tree, frame.scanned
         self.device.run(
-            self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, *walls, reach, heavy=True
+            self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, *walls, reach, few=True
         )
         self.device.run(
             self._add,
@@ -148,7 +148,7 @@ class InterfaceEchoes(Stage):
             scanned.re,
             scanned.im,
             np.int32(scanned.stride),
-            heavy=True,
+            few=True,
         )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
