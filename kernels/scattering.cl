@@ -72,6 +72,7 @@ typedef struct {
   float3 at_start, row_i, row_j, row_k;  // voxel index = at_start + rows * (offset from the segment's start)
   float start_u, low, span;              // first path length of this piece, 1 / its length
   float narrow0, narrow1;                // elevational exponent of two per mm^2 at the near end, and its change
+  float curved0, curved1;                // elevational phase in cycles per mm^2, likewise
   float gain0, gain1;                    // amplitude as an exponent of two, likewise
   float line0, line1;                    // 1 / distance of traced lines, likewise
   float edge;                            // of the strip that begins there: distance re its width
@@ -99,18 +100,32 @@ typedef float4 Echoes;  // [PARTS][PART] left re, im, right re, im
 // The hash uses cell indices by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
-#ifdef LOBES
-// The depth of the table for a path length: its row, and the part by which it is deeper.
-inline float row_of_lobes(__constant const Acquisition *acquisition, float path, int *row) {
+// The depth of tables for a path length: its row, and the part by which it is deeper.
+inline float row_of_depth(__constant const Acquisition *acquisition, float path, int *row) {
   const float place = clamp(path / acquisition->depth_mm * (LOBE_DEPTHS - 1), 0.0f, LOBE_DEPTHS - 1.001f);
   *row = (int)place;
   return place - *row;
 }
 
+#ifndef LOBES
+// By how many cycles the phase of the elevational beam, of this sigma, is behind that on its axis, per squared
+// millimetre from there. With it, speckle has the height that it has at the aperture's beam (diffraction.py).
+inline float elevational_cycles(__constant const Acquisition *acquisition, float path, float loss, float sigma) {
+  int row;
+  const float deeper = row_of_depth(acquisition, path, &row);
+  __constant const float *heights = acquisition->speckle_height_mm + row;
+  const float height = blend(heights[0], heights[1], deeper) / frequency_after(acquisition, loss);
+  if (height <= 0.0f || height >= sigma) return 0.0f;
+  return sqrt(1.0f / (height * height) - 1.0f / (sigma * sigma)) / (sigma * 2.0f * TWO_PI);
+}
+#endif
+
+#ifdef LOBES
+
 // The distance from the axis at which lobes are cut off.
 inline float reach_of_lobes(__constant const Acquisition *acquisition, __global const float *lobes, float path) {
   int row;
-  const float deeper = row_of_lobes(acquisition, path, &row);
+  const float deeper = row_of_depth(acquisition, path, &row);
   __global const float *ends = lobes + LOBE_DEPTHS * LOBE_DISTANCES + row;
   return blend(ends[0], ends[1], deeper);
 }
@@ -121,7 +136,7 @@ inline float lobe_at(__constant const Acquisition *acquisition, __global const f
   const float at = distance / reach_of_lobes(acquisition, lobes, path) * (LOBE_DISTANCES - 1);
   if (at >= LOBE_DISTANCES - 1) return 0.0f;
   int row;
-  const float deeper = row_of_lobes(acquisition, path, &row);
+  const float deeper = row_of_depth(acquisition, path, &row);
   const int column = (int)at;
   __global const float *near = lobes + row * LOBE_DISTANCES + column, *far = near + LOBE_DISTANCES;
   return blend(blend(near[0], near[1], at - column), blend(far[0], far[1], at - column), deeper);
@@ -304,12 +319,14 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn t = (along - piece->low) * piece->span;
     const floatn right = piece->edge + aside_l * (piece->line0 + t * piece->line1);
 #ifdef LOBES
-    const floatn r2 = 0.0f;
+    const floatn r2 = 0.0f, curved = 0.0f;  // lobes have random phases
     const intn near = fabs(aside_e) <= piece->reach;
     STORE_LANES(fabs(aside_e), away_ + begin);
     STORE_LANES(piece->path0 + (along - piece->low), path_ + begin);
 #else
-    const floatn r2 = aside_e * aside_e * (piece->narrow0 + t * piece->narrow1);
+    const floatn aside2 = aside_e * aside_e;
+    const floatn r2 = aside2 * (piece->narrow0 + t * piece->narrow1);
+    const floatn curved = aside2 * (piece->curved0 + t * piece->curved1);
     const intn near = r2 <= cutoff2;
 #endif
     const floatn range = along + aside_l * aside_l * piece->bend;
@@ -328,7 +345,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
         exp2_fast(clamp(piece->gain0 + t * piece->gain1 - r2, (floatn)(-100.0f), (floatn)(100.0f)));
     const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
-    turn(depth * acquisition->cycles_per_mm, &cosine, &sine);
+    turn(depth * acquisition->cycles_per_mm + curved, &cosine, &sine);
     const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
     const floatn vx = clamp(at.x + pu * ri.x + pv * ri.y + pw * ri.z, (floatn)(0.0f), (floatn)(voxel_top.x));
     const floatn vy = clamp(at.y + pu * rj.x + pv * rj.y + pw * rj.z, (floatn)(0.0f), (floatn)(voxel_top.y));
@@ -605,6 +622,8 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float radius_e = acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y);
       piece.narrow0 = 0.5f * LOG2_E / (sigma_low.y * sigma_low.y);
       piece.narrow1 = 0.5f * LOG2_E / (sigma_high.y * sigma_high.y) - piece.narrow0;
+      piece.curved0 = elevational_cycles(acquisition, path_low, loss_low, sigma_low.y);
+      piece.curved1 = elevational_cycles(acquisition, path_high, loss_high, sigma_high.y) - piece.curved0;
 #endif
       // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
       // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak.

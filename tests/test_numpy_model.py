@@ -292,7 +292,8 @@ def test_the_record_of_a_frame_follows_from_the_equations(name, settings):
         acquisition_record(probe, pose, settings, NumpyModel(simulator).medium),
     )
     for field in ACQUISITION.names or ():
-        np.testing.assert_allclose(record[field], expected[field], rtol=1e-6, atol=1e-5, err_msg=field)
+        close = 0.003 if field == "speckle_height_mm" else 1e-6  # two integrals, each over points of its own
+        np.testing.assert_allclose(record[field], expected[field], rtol=close, atol=1e-5, err_msg=field)
     assert simulator.axial_sigma_mm(probe) == pytest.approx(axial_sigma_mm(probe, settings))
     np.testing.assert_allclose(raytracing.line_roots(record), line_roots(expected), atol=1e-5)
     traced, rays = int(record["traced_lines"]), int(record["elevational_rays"])
@@ -357,7 +358,7 @@ WRONG_RECORDS = {
     "first_line": 1.02, "apex_radius_mm": 1.05, "interface_gain": 1.3, "membrane_reach": 1.2, "beam_cutoff": 0.9,
     "reference_speed_m_s": 1.01, "frequency_mhz": 1.1, "specular_exponent": 10.0, "fractional_bandwidth": 2.0,
     "sheet_reach_mm": 1.3, "membrane_gain": 1.1, "membrane_exponent": 1.5, "membrane_phase": 3.0, "screen_step": 1.2,
-    "fan_step": 1.3,
+    "fan_step": 1.3, "speckle_height_mm": 1.1,
 }  # fmt: skip
 
 

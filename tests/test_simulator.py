@@ -533,3 +533,26 @@ def test_plain_dictionaries_are_refused_for_settings_and_display():
         sim.simulate(probe, pose, {"gain_db": 3})
     with pytest.raises(SimulationError, match=r"settings are \{'seed': 3\}, expected SimulationSettings"):
         UltrasoundSimulator(labels, sim.medium.tissues, {"seed": 3})
+
+
+def test_a_simulator_follows_changed_probes_settings_and_tissues_and_keeps_no_changed_record():
+    """The record of constants is kept from frame to frame."""
+    labels, probe, pose = (
+        block(lambda x, y, z: np.ones_like(x)),
+        LinearProbe(20, 30, scan_lines=32),
+        rigid(np.eye(3), [0, -15, 0]),
+    )
+    kept = simulator(labels, SPECKLE)
+    changes = [
+        (probe, SimulationSettings(), SPECKLE),
+        (replace(probe, frequency_mhz=4.0), SimulationSettings(), SPECKLE),
+        (replace(probe, frequency_mhz=4.0), SimulationSettings(seed=3), SPECKLE),
+        (replace(probe, frequency_mhz=4.0), SimulationSettings(seed=3), replace(SPECKLE, attenuation_db_cm_mhz=1.0)),
+    ]  # fmt: skip
+    for seen, settings_, tissue in changes:
+        kept.settings = settings_
+        kept.set_tissues(simulator(labels, tissue).medium.tissues)
+        kept.acquisition(seen, pose)["cycles_per_mm"] *= 2.0  # a caller's own
+        found = kept.simulate(seen, pose).iq
+        expected = UltrasoundSimulator(labels, kept.medium.tissues, settings_).simulate(seen, pose).iq
+        np.testing.assert_array_equal(found, expected)

@@ -19,13 +19,14 @@ from SlicerUSSim.Logic import (
     TissueTable,
     UltrasoundSimulator,
 )
-from SlicerUSSim.Logic.imaging.diffraction import lobes_of
+from SlicerUSSim.Logic.imaging.diffraction import lobes_of, speckle_height_mm
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
 from SlicerUSSim.Logic.probe.arrays import PROBES, probe_from_dict
 from SlicerUSSim.Logic.probe.beam import MOST_ZONES
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, level_db
 from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
+from SlicerUSSim.Logic.verification.wave import speckle_half_length
 from tests.conftest import SPECKLE, block, rigid, simulator
 from tests.test_numpy_model import scene
 
@@ -264,3 +265,32 @@ def test_a_curved_phase_shortens_the_correlation_of_speckle_and_keeps_its_level(
             assert found[curved][0] == pytest.approx(float(np.exp(-(apart**2) / (4 * sigma**2))), abs=0.05)
     assert found[True][0] < found[False][0] - 0.05
     assert found[True][1] == pytest.approx(found[False][1], abs=0.5)
+
+
+@pytest.mark.parametrize("depth", [12.0, 38.0])
+def test_speckle_changes_across_the_image_plane_as_that_of_waves_away_from_the_focus_of_the_lens(depth):
+    """The half length of waves; the beam without its curved phase has a correlation of 0.9 and 0.8 there."""
+    probe = LinearProbe(20.0, 44.0, scan_lines=81, focus_mm=25.0, elevation_focus_mm=25.0)
+    lens = probe.elevation_aperture_mm, probe.elevation_focus_mm
+    half = speckle_half_length(
+        depth, frequency_mhz=5.0, fractional_bandwidth=0.5, transmit_mm=lens, receive_mm=lens
+    )  # fmt: skip
+    poses = [rigid(np.eye(3), [0, -22, z]) for z in (-0.5 * half, 0.5 * half)]
+    tissues = simulator(SOLID, SPECKLE, coupling=SPECKLE).medium.tissues
+    found = []
+    for seed in range(4):
+        sim = UltrasoundSimulator(SOLID, tissues, SimulationSettings(seed=seed))
+        found.append(correlation(*(depth_window(sim.simulate(probe, pose), depth, 3.0) for pose in poses)))
+    assert np.mean(found) == pytest.approx(0.5, abs=0.08)
+
+
+@pytest.mark.parametrize("changes", [{}, {"elevation_aperture_mm": 12.0}, {"frequency_mhz": 2.0}])
+def test_the_height_of_speckle_is_that_of_waves(changes):
+    probe = LinearProbe(20.0, 80.0, focus_mm=25.0, elevation_focus_mm=35.0, **changes)
+    lens = probe.elevation_aperture_mm, probe.elevation_focus_mm
+    for row in (6, 14, 24):
+        half = speckle_half_length(
+            row / 32.0 * 80.0, frequency_mhz=probe.frequency_mhz, fractional_bandwidth=0.05,
+            transmit_mm=lens, receive_mm=lens,
+        )  # fmt: skip
+        assert float(speckle_height_mm(probe)[row]) * np.sqrt(4.0 * np.log(2.0)) == pytest.approx(half, rel=0.03)

@@ -56,10 +56,12 @@ class Aperture(Stage):
         self.device.write(acoustics, rows)
         sums = get("sums", int(np.prod(fan)) * int(fields["fan_depths"]) * 16)
         all_soft = np.int32(are_soft(rows[frame.medium.present]))
-        self.device.run(self._fans, fan, frame.acquisition_buffer, frame.medium.voxel_buffer, acoustics, all_soft, sums)
+        self.device.run(
+            self._fans, fan, frame.acquisition_buffer, frame.medium.voxel_buffer, acoustics, all_soft, sums, few=True
+        )
         self.device.run(
             self._screens, (depths, lines), frame.acquisition_buffer, sums, np.int32(with_level), all_soft,
-            frame.screens, shades, frame.spreads,
+            frame.screens, shades, frame.spreads, few=True,
         )  # fmt: skip
         self.device.run(self._keep_levels, (depths, lines), frame.acquisition_buffer, frame.screens, frame.spreads)
         self.device.run(

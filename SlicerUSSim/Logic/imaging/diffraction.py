@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.special import erfc
 
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
-from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, MAIN_LOBE, apodized_pattern
+from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, LEAST_F_NUMBER, MAIN_LOBE, apodized_pattern
 
 if TYPE_CHECKING:
     from SlicerUSSim.Logic.probe.arrays import Probe
@@ -32,6 +32,8 @@ _NODE_VARIANCE, _TABLE_VARIANCE = 0.188, 0.130
 _SHARPENED, _FINER, _LEAST_POWER = 3, 8, 1e-9
 #: Elevational lobes are computed up to the larger of these: in wavelengths x f-number, and in wavelengths
 _REACH_LOBES, _REACH_WAVELENGTHS = 5.0, 26.0
+#: Points of the elevational aperture for speckle_height_mm, and the fewest and most of the plane that waves run over
+_OPEN, _LEAST_PLANE, _MOST_PLANE = 256, 2048, 16384
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,42 @@ def lateral_weights(probe: Probe) -> np.ndarray:
             made = made * wanted / gaussian_filter1d(made, width * _FINER / _STEP, mode="mirror")
         rows.append(np.where(column > peak, np.maximum(made[::_FINER] - _LEAST_POWER, 0.0), row))
     return np.sqrt(np.array(rows) + clutter).astype(np.float32)
+
+
+@lru_cache(maxsize=16)
+def speckle_height_mm(probe: Probe) -> np.ndarray:
+    """(LOBE_DEPTHS,) float32 elevational sigma, in millimetres, of the beam without curved phase of the same speckle.
+
+    At LOBE_DEPTHS depths evenly from the face to the image depth. Speckle d apart has the correlation
+    exp(-d^2 / 4 sigma^2), here one half where that of the two-way field of the lens has one half. That field is found
+    by its angular spectrum at the centre frequency (Goodman, section 3.10), so that its phase is right too
+    (docs/physics.md#wavefront-curvature).
+    """
+    wavelength, focus = probe.wavelength_mm, probe.elevation_focus_mm
+    aperture = min(probe.elevation_aperture_mm, focus / LEAST_F_NUMBER)
+    point = aperture / _OPEN
+    # What leaves the plane at one side returns at the other one: beams, with six lobes, must not be as wide. Far away
+    # speckle has the same length at all depths, so that depths end there.
+    aside = 0.5 * aperture / focus + 6.0 * (2.0 if probe.harmonic else 1.0) * wavelength / aperture
+    needed = 2.0 * (aperture + aside * probe.displayed_mm) / point
+    plane = int(np.clip(2 ** np.ceil(np.log2(needed)), _LEAST_PLANE, _MOST_PLANE))
+    farthest = max(0.5 * plane * point - aperture, 0.0) / aside
+    depth = np.minimum(np.linspace(0.0, probe.displayed_mm, _DEPTHS), farthest)
+    place, frequency = ((np.arange(_OPEN) + 0.5) / _OPEN - 0.5) * aperture, np.fft.fftfreq(plane, point)
+
+    def field(length: float) -> np.ndarray:
+        face = fft.fft(np.exp(-1j * np.pi / (length * focus) * place**2), plane)
+        return np.asarray(fft.ifft(face * np.exp(-1j * np.pi * length * depth[:, None] * frequency**2), axis=1))
+
+    received = field(wavelength)
+    sent = field(2.0 * wavelength) ** 2 if probe.harmonic else received
+    power = np.abs(np.asarray(fft.fft(sent * received, axis=1))) ** 2
+    correlation = np.abs(np.asarray(fft.ifft(power, axis=1)))[:, : plane // 2]
+    correlation /= correlation[:, :1]
+    beyond, row = np.argmax(correlation < 0.5, axis=1), np.arange(_DEPTHS)
+    at, before = correlation[row, beyond], correlation[row, beyond - 1]
+    half = point * (beyond - (0.5 - at) / (before - at))
+    return (half / np.sqrt(4.0 * np.log(2.0))).astype(np.float32)
 
 
 def _transmitted(probe: Probe, depth: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -99,6 +99,7 @@ class RayTracer(Stage):
             tree.segments,
             tree.segment_counts,
             frame.losses,
+            few=True,
         )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:

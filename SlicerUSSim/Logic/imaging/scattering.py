@@ -136,7 +136,9 @@ class InterfaceEchoes(Stage):
         walls = get("walls", traced * rays * CONSTANTS["MAX_HITS"] * WALL.itemsize), get("counts", 4 * traced)
         reach = get("reach", 4 * traced)
         tree, scanned = frame.tree, frame.scanned
-        self.device.run(self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, *walls, reach)
+        self.device.run(
+            self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, *walls, reach, few=True
+        )
         self.device.run(
             self._add,
             (_SLICES if self.device.info.kind == "GPU" else 1, frame.line_shape[0]),
@@ -146,6 +148,7 @@ class InterfaceEchoes(Stage):
             scanned.re,
             scanned.im,
             np.int32(scanned.stride),
+            few=True,
         )
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:

@@ -21,6 +21,7 @@ from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
 from SlicerUSSim.Logic.imaging.bmode import downshift
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
+from SlicerUSSim.Logic.imaging.diffraction import speckle_height_mm
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
@@ -110,6 +111,9 @@ class UltrasoundSimulator:
         self.display_stages = [stage(self.device) for stage in stages.DISPLAY_STAGES]
         self.tracer = self.stage(RayTracer)
         self._acquisition_buffer = self.device.empty(ACQUISITION.itemsize)
+        # The record of the last frame, and its inputs but for the pose
+        self._record: np.ndarray | None = None
+        self._record_made_for: tuple | None = None
         # The baseband signal of the last frame, and its inputs
         self._iq: Buffer
         self._iq_made_for: tuple | None = None
@@ -348,6 +352,15 @@ class UltrasoundSimulator:
 
     def acquisition(self, probe: Probe, pose: np.ndarray) -> np.ndarray:
         """The record (layout.ACQUISITION) of the constants of one frame."""
+        made_for = probe, self.settings, self.medium.version
+        if self._record is None or self._record_made_for != made_for:
+            self._record, self._record_made_for = self._record_of(probe), made_for
+        acquisition = self._record.copy()
+        acquisition["probe_to_ras"] = pose[:3].ravel()
+        return acquisition
+
+    def _record_of(self, probe: Probe) -> np.ndarray:
+        """The part of the record that does not depend on the pose."""
         settings, medium = self.settings, self.medium
         block = CONSTANTS["BLOCK"]
         axial_sigma = self.axial_sigma_mm(probe)
@@ -369,7 +382,6 @@ class UltrasoundSimulator:
             acquisition["membrane_exponent"] = membrane.diffuse_exponent
             # 2 k s of the range's deviation s: the carrier has 2 k / 2 pi cycles per millimetre of depth.
             acquisition["membrane_phase"] = 2.0 * np.pi * self._cycles_per_mm(probe) * membrane.roughness_mm
-        acquisition["probe_to_ras"] = pose[:3].ravel()
         acquisition["linear"] = probe.is_linear
         acquisition["apex_radius_mm"] = 0.0 if probe.is_linear else probe.apex_radius_mm
         for name, value in steering_fields(probe).items():
@@ -387,6 +399,7 @@ class UltrasoundSimulator:
         acquisition["receive_sigma_min"], acquisition["receive_sigma_slope"] = probe.receive_beam()
         for name, value in zip(("sigma", "focus", "rayleigh"), probe.elevation_beam(), strict=True):
             acquisition[f"elevation_{name}"] = value
+        acquisition["speckle_height_mm"] = speckle_height_mm(probe) if settings.wavefront_curvature else 0.0
         acquisition["max_ray_depth"] = settings.max_ray_depth if settings.reflections else 0
         lateral, guard = _traced_lines_for(probe, settings)
         acquisition["lateral_rays"], acquisition["guard_lines"] = lateral, guard

@@ -40,7 +40,8 @@ class Device:
         cl = load_pyopencl()
         self.cl = cl
         self.info = info
-        if "Portable Computing Language" in info.platform:
+        self._is_pocl = "Portable Computing Language" in info.platform
+        if self._is_pocl:
             from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, require_linker
 
             require_linker(info.handle.platform.version)
@@ -105,13 +106,18 @@ class Device:
             self._kernels[key] = {kernel.function_name: kernel for kernel in program.all_kernels()}
         return self._kernels[key]
 
-    def run(self, kernel: Kernel, global_size: tuple[int, ...], *arguments, heavy: bool = False) -> None:
+    def run(
+        self, kernel: Kernel, global_size: tuple[int, ...], *arguments, heavy: bool = False, few: bool = False
+    ) -> None:
         """Enqueue a kernel; its event is kept if `profiling` is on.
 
         `heavy` is for work-items with large private arrays: on a processor each is then a separate group, since PoCL
-        keeps the arrays of a group on the stack of one thread, and a stack overflow would end the process.
+        keeps the arrays of a group on the stack of one thread, and a stack overflow would end the process. `few` is
+        for long work-items of which there are at most some thousand: PoCL puts hundreds of them into one group, which
+        one core computes while the others wait, so that each is a separate group there.
         """
-        local_size = (1,) * len(global_size) if heavy and self.info.kind != "GPU" else None
+        apart = self.info.kind != "GPU" and (heavy or (few and self._is_pocl))
+        local_size = (1,) * len(global_size) if apart else None
         event = kernel(self.queue, global_size, local_size, *arguments)
         if self.profiling:
             self._events.append((kernel.function_name, event))

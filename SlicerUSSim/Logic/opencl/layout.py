@@ -109,12 +109,13 @@ ACQUISITION = np.dtype(
         ("transmit_rayleigh", _FLOAT, CONSTANTS["MAX_ZONES"]),
         ("transmit_waist", _FLOAT),  # the shortest of these
         ("transmit_sigma_slope", _FLOAT),  # where focused at every depth
-        ("wavefront_curvature", _FLOAT),  # probe.beam.CURVED; 0: none
+        ("wavefront_curvature", _FLOAT),  # laterally, probe.beam.CURVED; 0: none
         ("receive_sigma_min", _FLOAT),
         ("receive_sigma_slope", _FLOAT),
         ("elevation_sigma", _FLOAT),
         ("elevation_focus", _FLOAT),
         ("elevation_rayleigh", _FLOAT),
+        ("speckle_height_mm", _FLOAT, CONSTANTS["LOBE_DEPTHS"]),  # diffraction.speckle_height_mm; 0: no curved phase
         # beams from an aperture (aperture.cl)
         ("aperture_beams", _INT),
         ("aperture_mm", _FLOAT),

@@ -7,6 +7,7 @@ Probe frame (millimetres): origin at the centre of the probe face, +x lateral (l
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -222,13 +223,7 @@ class Probe(Beam):
 
     def image_bounds_mm(self) -> tuple[float, float, float, float]:
         """(left, right, top, bottom) of the imaged field in the probe frame; top is negative for a curved face."""
-        starts, directions = self.origins_mm(), self.directions()
-        starts = starts + self.line_starts_mm(self.line_positions())[:, None] * directions
-        points = np.concatenate([starts, self.line_ends_mm(self.line_positions())])
-        if not self.is_linear:
-            points = np.concatenate([points, [[0.0, self.depth_mm, 0.0]]])  # the middle of the arc, if there is no line
-        x, y = points[:, 0], points[:, 1]
-        return float(x.min()), float(x.max()), float(min(y.min(), 0.0)), float(y.max())
+        return _bounds_of(self)
 
     def outline_mm(self, points_per_arc: int = 65) -> np.ndarray:
         """(points, 3) closed outline of the imaged field in the probe frame."""
@@ -258,6 +253,18 @@ class Probe(Beam):
     def to_dict(self) -> dict:
         """Plain values, with the kind of probe under "kind"; probe_from_dict reads it back."""
         return {"kind": self.kind, **asdict(self)}
+
+
+@lru_cache(maxsize=16)
+def _bounds_of(probe: Probe) -> tuple[float, float, float, float]:
+    """Probe.image_bounds_mm, which every frame asks for twice."""
+    positions = probe.line_positions()
+    starts = probe.origins_mm() + probe.line_starts_mm(positions)[:, None] * probe.directions()
+    points = np.concatenate([starts, probe.line_ends_mm(positions)])
+    if not probe.is_linear:
+        points = np.concatenate([points, [[0.0, probe.depth_mm, 0.0]]])  # the middle of the arc, if there is no line
+    x, y = points[:, 0], points[:, 1]
+    return float(x.min()), float(x.max()), float(min(y.min(), 0.0)), float(y.max())
 
 
 def _own(label: str, tip: str, unit: str, bounds: tuple[float, float], shown: Shown) -> Any:

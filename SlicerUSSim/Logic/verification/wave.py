@@ -1,7 +1,8 @@
-"""Two-dimensional wave propagation through a map of the speed of sound, as a reference for beams in tissue.
+"""Two-dimensional waves as references for beams: propagation through a map of the speed of sound, and of a lens.
 
 Split steps: the angular spectrum over a short distance at the reference speed, then the phase that the medium adds
-(Hardin and Tappert, SIAM Review 15, 1973). Independent of the simulator; there are no reflections.
+(Hardin and Tappert, SIAM Review 15, 1973). The field of a lens is Huygens' sum over its aperture, with the distances as
+they are and for several frequencies of the band. Independent of the simulator; there are no reflections.
 """
 
 from __future__ import annotations
@@ -77,3 +78,35 @@ def beam_intensities(
         for at in np.flatnonzero(ends == n + 1):
             transmitted[at], received[at] = np.abs(waves[[0, at + 1]]) ** 2
     return x, transmitted, received
+
+
+def speckle_half_length(
+    depth_mm: float,
+    *,
+    frequency_mhz: float,
+    fractional_bandwidth: float,
+    transmit_mm: tuple[float, float],
+    receive_mm: tuple[float, float],
+    speed_m_s: float = 1540.0,
+) -> float:
+    """Distance in mm across the beam over which the correlation of speckle falls to one half, at `depth_mm`.
+
+    `transmit_mm` and `receive_mm` are (size, focus) of uniform apertures in that direction; pulses have this -6 dB
+    two-way bandwidth. Speckle is the sum of the echoes of point scatterers that are everywhere.
+    """
+    half = 1.5 * max(transmit_mm[0], receive_mm[0])
+    place = np.arange(-half, half, 0.05 * speed_m_s * 1e-3 / frequency_mhz)
+    element = (np.arange(400) - 199.5) / 400.0
+    power, sigma = np.zeros(2 * len(place)), fractional_bandwidth / np.sqrt(8.0 * np.log(2.0))
+    for offset in np.linspace(-1.4, 1.4, 7):
+        wave_number = 2e3 * np.pi * frequency_mhz * (1.0 + offset * sigma) / speed_m_s
+        both = np.ones(len(place), complex)
+        for size, focus in (transmit_mm, receive_mm):
+            path = np.hypot(depth_mm, place[:, None] - size * element)
+            late = path - np.hypot(focus, size * element)
+            both *= (np.exp(1j * wave_number * late) / np.sqrt(path)).sum(axis=1)
+        power += np.exp(-(offset**2)) * np.abs(np.fft.fft(both, 2 * len(place))) ** 2
+    correlation = np.abs(np.fft.ifft(power))[: len(place)]
+    beyond = int(np.argmax(correlation < 0.5 * correlation[0]))
+    near = slice(beyond - 1, beyond + 1)
+    return float(np.interp(-0.5 * correlation[0], -correlation[near], place[near] - place[0]))

@@ -11,7 +11,6 @@ shared with the simulator, and therefore only checked against theory by `ussim v
 - the names and number formats of layout.py, the block of samples with linear interpolation of widths, and
   settings.FULL_SCALE_DB;
 - the names and the order of the stages (imaging/stages.py), and the pixels of an image (ImageGrid);
-- which lines have contact (imaging/contact.py), checked in tests/test_contact.py;
 - no texture: hybrid scatterers are checked in tests/test_texture.py.
 """
 

@@ -6,6 +6,7 @@ it takes names and number formats, but no values.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import cast
 
 import numpy as np
@@ -71,6 +72,7 @@ def acquisition_record(
         "elevation_sigma": elevational,
         "elevation_focus": probe.elevation_focus_mm,
         "elevation_rayleigh": elevational_length,
+        "speckle_height_mm": _speckle_heights(probe) if settings.wavefront_curvature else np.zeros(33),
         "aperture_beams": settings.beam == "aperture",
         "aperture_mm": probe.aperture_mm,
         "receive_f_number": probe.receive_f_number,
@@ -287,6 +289,37 @@ def _elevation(probe: Probe) -> tuple[float, float]:
     if probe.harmonic:  # of the pulse sigma and length are twice as large; transmitted, squared, received
         return np.sqrt(2.0 / 3.0) * sigma, np.sqrt(2.0) * _rayleigh_mm(probe, sigma)
     return np.sqrt(0.5) * sigma, _rayleigh_mm(probe, sigma)
+
+
+@lru_cache(maxsize=16)
+def _speckle_heights(probe: Probe) -> np.ndarray:
+    """(33,) elevational sigma of speckle at depths from the face on, from Fresnel's integral over the aperture."""
+    focus, wavelength = probe.elevation_focus_mm, received_wavelength_mm(probe)
+    aperture = min(probe.elevation_aperture_mm, 2.0 * focus)
+    step, heights = aperture / 512.0, []
+    for depth in np.linspace(0.0, _steering(probe)["depth_mm"], 33):
+        half = 2.0 * aperture + 24.0 * wavelength * depth / aperture
+        place = (np.arange(2 * round(half / step)) + 0.5) * step - step * round(half / step)
+        both = _field_of_lens(place, wavelength, aperture, focus, depth)
+        both = both * (_field_of_lens(place, 2.0 * wavelength, aperture, focus, depth) ** 2 if probe.harmonic else both)
+        energy, lag, before, here = (np.abs(both) ** 2).sum(), 0, 1.0, 1.0
+        while here >= 0.5:
+            lag, before = lag + 1, here
+            here = float(np.abs((both[lag:] * both[:-lag].conj()).sum()) / energy)
+        heights.append((lag - (0.5 - here) / (before - here)) * step / np.sqrt(np.log(16.0)))
+    return np.array(heights)
+
+
+def _field_of_lens(x: np.ndarray, wavelength: float, aperture: float, focus: float, depth: float) -> np.ndarray:
+    """The field of a uniform aperture with one focus, at distances x from the axis, by Fresnel's integrals."""
+    if depth == 0.0:
+        return np.exp(-1j * np.pi * x**2 / (wavelength * focus)) * (np.abs(x) < 0.5 * aperture)
+    bend, phase = (1.0 / depth - 1.0 / focus) / wavelength, np.pi * x**2 / (wavelength * depth)
+    if abs(bend) * aperture**2 < 1e-4:
+        return np.exp(1j * phase) * np.sinc(x * aperture / (wavelength * depth))
+    centre, scale = x / (wavelength * depth * bend), np.sqrt(2.0 * abs(bend))
+    (sine, cosine), (sine0, cosine0) = (special.fresnel(scale * (0.5 * s * aperture - centre)) for s in (1.0, -1.0))
+    return np.exp(1j * (phase - np.pi * bend * centre**2)) * (cosine - cosine0 + 1j * np.sign(bend) * (sine - sine0))
 
 
 def _sent_sigma(probe: Probe, f_number: float) -> float:

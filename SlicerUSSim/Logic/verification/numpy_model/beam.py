@@ -47,6 +47,16 @@ class Beam:
         b = (s - self.acquisition["elevation_focus"]) / self.acquisition["elevation_rayleigh"]
         return self.acquisition["elevation_sigma"] * np.sqrt(frequency ** f32(-2) + b * b)
 
+    def elevational_cycles(self, s: np.ndarray, frequency: np.ndarray | np.float32) -> np.ndarray:
+        """Cycles per squared millimetre by which the phase of the two-way elevational beam is behind off its axis."""
+        heights = self.acquisition["speckle_height_mm"]
+        at = np.clip(s / self.acquisition["depth_mm"], 0.0, 1.0)
+        height = np.interp(at, np.linspace(0.0, 1.0, len(heights)), heights) / frequency
+        if not heights.any():
+            return np.zeros_like(s)
+        sigma = self.elevation_sigma(s, frequency)
+        return f32(np.sqrt(np.maximum(height**-2.0 - sigma**-2.0, 0.0)) / sigma / (4.0 * np.pi))
+
     def transmit_focus(self, s: float) -> float:
         """The focus of the zone that is narrowest at path length s; s itself if every depth is in focus."""
         zones = int(self.acquisition["transmit_zones"])

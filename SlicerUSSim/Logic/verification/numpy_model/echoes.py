@@ -112,6 +112,7 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
         beam.lateral_sigma(path, frequency), beam.elevation_sigma(path, frequency), beam.line_distance(path)
     )  # fmt: skip
     narrow = f32(0.5) * LOG2_E / (elevation * elevation)
+    curved = beam.elevational_cycles(path, frequency)
     along_tube = [segment["tube"][w] + segment["tube"][w + 1] * np.array([low, high]) for w in (0, 2)]
     strength = np.log2(segment["weight"] * segment["attenuation"] * acquisition["speckle_scale"] * f32(2.50662827))
     gain = strength - LOG2_E * segment["decay_per_mm"] * np.array([low, high]) + LOG2_E * beam.gain_of_band(loss)
@@ -169,7 +170,10 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     if strips.table is not None:
         strength, profile = strength * strips.table.at(path[0] + t * (high - low), away), f32(0)
     amplitude = exp2(np.clip(gain[0] + t * (gain[1] - gain[0]) - profile, f32(-100), f32(100)))
-    cosine, sine = turn(depth * acquisition["cycles_per_mm"])
+    cycles = depth * acquisition["cycles_per_mm"]
+    if strips.table is None:
+        cycles = cycles + away * away * (curved[0] + t * (curved[1] - curved[0]))
+    cosine, sine = turn(cycles)
     echo = of_sheet * strength * amplitude * (cosine - 1j * sine)
     strip = np.minimum((right * strips.lines).astype(int), strips.lines - 1)
     right = right * strips.lines - strip

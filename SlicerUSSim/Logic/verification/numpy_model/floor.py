@@ -1,10 +1,11 @@
-"""A scanner's floor: side lobes and ring-down (kernels/side_lobes.cl, bmode.cl)."""
+"""A scanner's floor: side lobes, ring-down and contact (kernels/side_lobes.cl, bmode.cl, harmonic.cl)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.probe.arrays import ConvexProbe, Probe
 from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
     harmonic_level,
     line_roots,
@@ -123,3 +124,30 @@ def ring_down(acquisition: np.ndarray, probe: Probe, axial_sigma_mm: float) -> n
     if probe.harmonic:
         signal *= harmonic_level(probe, depth)
     return signal.astype(np.complex64)
+
+
+def contact(
+    acquisition: np.ndarray, labels: Volume, probe: Probe, probe_to_ras: np.ndarray, gap_mm: float
+) -> np.ndarray:
+    """(scan lines,) float32: the square of the part of every line's aperture that has tissue within a gap."""
+    line = float(acquisition["first_line"]) + float(acquisition["line_spacing"]) * np.arange(probe.scan_lines)
+    along = probe.aperture_mm * ((np.arange(100) + 0.5) / 100 - 0.5)
+    if isinstance(probe, ConvexProbe):
+        angle = line[:, None] + along / probe.radius_mm
+        face = probe.radius_mm * np.stack([np.sin(angle), np.cos(angle) - 1.0], axis=-1)
+        normal = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+    else:
+        radius = float(acquisition["apex_radius_mm"])
+        middle = line / float(acquisition["steering_cos"]) if acquisition["linear"] else radius * np.tan(line)
+        face = np.stack([middle[:, None] + along, np.zeros((len(line), 100))], axis=-1)
+        normal = np.broadcast_to([0.0, 1.0], face.shape)
+    to_ijk, touching = labels.ras_to_ijk @ probe_to_ras, np.zeros((5, *face.shape[:-1]), bool)
+    for row, share in enumerate((np.arange(5) - 2.0) / 5.0):
+        for away in np.linspace(0.0, gap_mm, int(np.ceil(4.0 * gap_mm / labels.spacing_mm.min())) + 1):
+            lateral, depth = np.moveaxis(face + away * normal, -1, 0)
+            place = np.stack([lateral, depth, np.full_like(depth, share * probe.elevation_aperture_mm)], axis=-1)
+            i, j, k = np.moveaxis(np.rint(place @ to_ijk[:3, :3].T + to_ijk[:3, 3]).astype(int), -1, 0)
+            nk, nj, ni = labels.array.shape
+            inside = (i >= 0) & (i < ni) & (j >= 0) & (j < nj) & (k >= 0) & (k < nk)
+            touching[row][inside] |= labels.array[k[inside], j[inside], i[inside]] > 0
+    return (touching.mean(axis=(0, 2)) ** 2).astype(np.float32)

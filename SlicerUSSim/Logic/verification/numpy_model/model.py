@@ -9,11 +9,11 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
-from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.verification.numpy_model.acquisition import acquisition_record, axial_sigma_mm
+from SlicerUSSim.Logic.verification.numpy_model.floor import contact
 from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
 from SlicerUSSim.Logic.verification.numpy_model.medium import HostMedium
 from SlicerUSSim.Logic.verification.numpy_model.stages import TwinFrame, twin_of
@@ -41,7 +41,7 @@ class NumpyModel:
     def _read_medium(self) -> None:
         given = self.simulator.medium
         self.medium = HostMedium(given.labels, given.tissues, given.membership, given.sheets)
-        self._labels = Labels(self.medium)
+        self._labels, self._whole = Labels(self.medium), given.labels
 
     def simulate(
         self,
@@ -56,16 +56,17 @@ class NumpyModel:
         if self.simulator.medium.tissues is not self.medium.tissues:
             self._read_medium()
         display, settings = display or DisplaySettings(), self.simulator.settings
-        gap_mm = settings.contact_gap_mm
+        probe_to_ras, gap_mm = check_rigid("probe_to_ras", probe_to_ras), settings.contact_gap_mm
+        record = acquisition_record(probe, probe_to_ras, settings, self.medium)
         frame = TwinFrame(
             probe=probe,
             settings=settings,
-            acquisition=acquisition_record(probe, check_rigid("probe_to_ras", probe_to_ras), settings, self.medium),
+            acquisition=record,
             axial_sigma_mm=axial_sigma_mm(probe, settings),
             display=display,
             grid=grid or ImageGrid.for_probe(probe, display.image_size),
             noise_seed=noise_seed,
-            contact=None if gap_mm is None else line_contact(self.simulator.medium.labels, probe, probe_to_ras, gap_mm),
+            contact=None if gap_mm is None else contact(record, self._whole, probe, probe_to_ras, gap_mm),
             labels=self._labels,
             tissues=self.medium.rows,
         )
