@@ -14,6 +14,7 @@ from SlicerUSSim.Command.additions import Additions, add_option, split_additions
 from SlicerUSSim.Command.mri_options import also_option, read_mri, require_other_files, split_also
 from SlicerUSSim.Command.options import ct_option, device_option, mask_option, parameter_option, require_no_mri_options
 from SlicerUSSim.Command.patient_options import map_option
+from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.sequence_options import (
     calibration_option,
     read_sequence,
@@ -126,6 +127,11 @@ def serve(
         checked.require_addable(
             volumes[mri], None if mask is None else volumes[mask], "none" if contrast == CT else skull_strip
         )
+    if labels is not None and mri is not None and (mask is not None or others):
+        what = " and ".join(
+            name for name, is_given in (("--mask", mask is not None), ("--also", bool(others))) if is_given
+        )
+        note(f"{what}: for Segment in the page; the labels shown are those of {labels}")
     masks = tuple((tissue, file) for (tissue, _, _), (_, file) in zip(checked.masks, added, strict=True))
     chosen_preset = Preset.read(preset) if preset else None
     tracked = read_sequence(sequence, calibration) if sequence else None
