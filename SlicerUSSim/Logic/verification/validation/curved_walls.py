@@ -27,7 +27,7 @@ _RADII = {
     "rod across the image": {4: 4.5, 5: 3.5, 8: 2.0},
     "rod in the image": {4: 3.0, 5: 3.0, 8: 2.0},
 }
-_GRIDS, _MEAN_DB = 6, 2.0
+_GRIDS, _MEAN_DB = 6, 2.5
 
 
 def _expected_db(shape: str, radius_mm: float) -> float:
