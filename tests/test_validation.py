@@ -21,7 +21,8 @@ from SlicerUSSim.Logic.verification.phantoms import Echo
 from SlicerUSSim.Logic.verification.validation import ORIENTATIONS, PROBES, Outcome, Row, all_checks, run, validate
 
 #: Checks that take long: of these the suite has one orientation
-_LONG = ("beams in heads", "compounding", "curved mirrors", "oblique walls", "slice thickness", "speckle statistics")
+_LONG = ("beams in heads", "compounding", "curved mirrors", "oblique walls", "rough sheets", "slice thickness",
+         "speckle statistics", "thickness of sheets")  # fmt: skip
 #: All of them; of the two oblique orientations the suite takes one, and the slow tests the other.
 CASES = [
     pytest.param(

@@ -593,6 +593,61 @@ def thin_slab(thickness_mm: float, rotation: np.ndarray | None = None, *, depth_
     return _phantom("thin slab", label, tissues, rotation, 0.05, _facing(depth_mm), box=box)
 
 
+def rough_plane(
+    heights_mm: np.ndarray,
+    step_mm: float,
+    tissues: Sequence[Tissue],
+    rotation: np.ndarray | None = None,
+    *,
+    depth_mm: float = 25.0,
+    spacing_mm: float = 0.05,
+) -> Phantom[Echo]:
+    """Two tissues, labels 1 and 2, whose border is a plane across the beam with heights that vary laterally.
+
+    Parameters
+    ----------
+    heights_mm : (n,) deviation from the plane, away from the probe, at lateral positions `step_mm` apart about the axis
+    tissues : before and behind it
+    rotation : (3, 3), of the probe to the voxels
+    """
+    at = step_mm * (np.arange(len(heights_mm)) - 0.5 * (len(heights_mm) - 1))
+
+    def label(x, y, z):
+        return np.where(y > depth_mm + np.interp(x, at, heights_mm), 2, 1).astype(np.uint8)
+
+    # Beyond the volume is the tissue before the plane: its bottom, another border, is well behind the echo.
+    table = TissueTable({0: tissues[0], **dict(enumerate(tissues, 1))})
+    box = _Box(7.0, depth_mm - 1.5, depth_mm + 4.0, 3.0)
+    return _phantom("rough plane", label, table, rotation, spacing_mm, _facing(depth_mm), box=box)
+
+
+def curved_wall(
+    shape: str,
+    radius_mm: float,
+    rotation: np.ndarray | None = None,
+    *,
+    depth_mm: float = 25.0,
+    spacing_mm: float = 0.5,
+) -> Phantom[Echo]:
+    """A "ball", "rod across the image" (along z) or "rod in the image" (along x) whose front is on the probe's axis.
+
+    Its impedance differs from that of the fluid around it, not its speed of sound.
+    """
+    shapes = {"ball": (1.0, 1.0), "rod across the image": (1.0, 0.0), "rod in the image": (0.0, 1.0)}
+    require(shape in shapes, f"shape is {shape!r}, expected one of {', '.join(shapes)}")
+    along_x, along_z = shapes[shape]
+
+    def label(x, y, z):
+        return np.where(along_x * x**2 + (y - depth_mm - radius_mm) ** 2 + along_z * z**2 < radius_mm**2, 1, 0)
+
+    inside = replace(FLUID, name="inside", impedance_mrayl=1.9)
+    beyond = 8.0 * spacing_mm
+    # A rod is longer than the smoothing of its border is wide.
+    half_x, half_z = (radius_mm + beyond if bent else 18.0 * spacing_mm for bent in (along_x, along_z))
+    box = _Box(half_x, depth_mm - beyond, depth_mm + 2.0 * radius_mm + beyond, half_z)
+    return _phantom(shape, label, TissueTable({0: FLUID, 1: inside}), rotation, spacing_mm, _facing(depth_mm), box=box)
+
+
 def _facing(depth_mm: float) -> Callable[[Probe], tuple[Echo, ...]]:
     """The prediction for a face perpendicular to the axis."""
     return lambda probe: (Echo("face", (0.0, depth_mm), (0.0, depth_mm)),)

@@ -40,7 +40,7 @@ class Labels:
         self.groups = np.pad(medium.group.ravel(), (0, 8))
         self.smooth_groups = medium.smooth_groups
         # Smoothed indicators with the variance of the Gaussians that they resemble near their centre, in their voxels
-        self.wide = SmoothGrid(medium.smooth, 8.91, 0.9, 1.0)
+        self.wide = SmoothGrid(medium.smooth, 8.91, 0.9, 1.0, 0.88)
         self.widest = SmoothGrid(medium.smoother, 18.29, 0.99, 0.5)
         self.flat = FlatBorders(self.widest, self.dims)
         self.distance = None if medium.distance is None else medium.distance.ravel()
@@ -86,7 +86,11 @@ class Labels:
         near = self.wide.border(places, *sides)
         some = np.flatnonzero(near.confidence < 1)
         fine = self._fine(places[some], before[less][some], behind[less][some])
-        fine.refine(near.at(some))
+        wider = near.at(some)
+        agrees = f32(1) - ramp(0.4, 0.55, np.abs(wider.overshoot - fine.overshoot))
+        agrees *= ramp(0.9877, 0.9945, dot(wider.towards, fine.towards))
+        wider.confidence = np.maximum(wider.confidence, wider.bent * agrees)
+        fine.refine(wider)
         near.put(some, fine)
         towards = near.towards / np.maximum(length(near.towards), f32(1e-6))[:, None]
         layer = borders_of_layers(self.widest, halved[less], towards, widest, *sides).doubled()

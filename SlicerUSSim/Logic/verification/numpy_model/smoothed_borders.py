@@ -39,14 +39,16 @@ class Borders:
     beside: np.ndarray
     #: Whether it is that of a thin layer
     is_thin: np.ndarray
+    #: Confidence as a bent border, if the nearest voxels agree on its place
+    bent: np.ndarray
 
     @classmethod
     def none(cls, count: int) -> Borders:
         """Without any border."""
-        zero, share = np.zeros((7, count), np.float32), np.full(count, np.nan, np.float32)
+        zero, share = np.zeros((8, count), np.float32), np.full(count, np.nan, np.float32)
         return cls(
             np.zeros((count, 3), np.float32), zero[0], zero[1], zero[2], share, zero[3], zero[4], zero[5], zero[6],
-            np.zeros(count, bool),
+            np.zeros(count, bool), zero[7],
         )  # fmt: skip
 
     def at(self, index) -> Borders:
@@ -91,13 +93,15 @@ class SmoothGrid:
     """Indicators of acoustic groups, smoothed in advance: uint16 (groups, k, j, i), 65535 for 1.
 
     `variance` of the smoothing in squared voxels; `least` steepness, re that of a plane, that determines a border;
-    `farthest` voxels at which it may be.
+    `farthest` voxels at which it may be; `most_bent` mean curvature per sigma up to which bent borders count.
     """
 
-    def __init__(self, smooth: np.ndarray, variance: float, least: float, farthest: float) -> None:
+    def __init__(
+        self, smooth: np.ndarray, variance: float, least: float, farthest: float, most_bent: float = 0.0
+    ) -> None:
         self.groups, shape = smooth.shape[0], smooth.shape[1:]
         self.dims, self.variance, self.least = np.array(shape[::-1], np.int64), f32(variance), least
-        self.farthest = f32(farthest)
+        self.farthest, self.most_bent = f32(farthest), most_bent
         self.steps = np.array([1, self.dims[0], self.dims[0] * self.dims[1]])
         self.smooth = smooth.reshape(self.groups, -1)
 
@@ -126,7 +130,7 @@ class SmoothGrid:
         layer.confidence *= ramp(0.9, 0.97, np.abs(along) / steep)
         better = layer.confidence >= found.confidence[known]
         found.put(known[better], layer.at(better))
-        found.sigma[known], found.share[known] = 0, np.nan
+        found.sigma[known], found.share[known], found.bent[known] = 0, np.nan, 0
         return found
 
     def _border(self, voxel, before, behind, way, farthest) -> tuple[Borders, np.ndarray]:
@@ -137,14 +141,32 @@ class SmoothGrid:
         sigma, bend = np.sqrt(seen.variance), seen.variance * seen.bends / seen.steepness
         place, curvature = border_place(sigma, found.share, bend)
         of_plane = f32(0.79788456) / sigma * exp(f32(-0.5) * place * place / seen.variance) * seen.seen
+        near = np.abs(place) <= farthest
         with np.errstate(divide="ignore"):
-            sure = ramp(self.least, 0.5 + 0.5 * self.least, seen.steepness / of_plane) * (np.abs(place) <= farthest)
+            steep = seen.steepness / of_plane
+        sure = ramp(self.least, 0.5 + 0.5 * self.least, steep) * near
+        bent, place, curvature = self._bent(steep, place, curvature, sigma)
         for name, values in (
             ("towards", seen.towards), ("overshoot", place), ("curvature", curvature), ("confidence", sure),
-            ("sigma", sigma), ("steepness", seen.steepness / seen.seen), ("bend", bend),
+            ("sigma", sigma), ("steepness", seen.steepness / seen.seen), ("bend", bend), ("bent", bent * near),
         ):  # fmt: skip
             getattr(found, name)[known] = values[known]
         return found, seen.both
+
+    def _bent(self, steep, place, curvature, sigma):
+        """(confidence, place, curvature) of a bent border, as between spheres and cylinders."""
+        if self.most_bent == 0:
+            return np.zeros_like(place), place, curvature
+        bent = curvature * sigma
+        square, known = bent * bent, np.abs(bent) < f32(self.most_bent)
+        sure = ramp(self.least, 0.5 + 0.5 * self.least, steep * (f32(1) + f32(1.1) * square))
+        sure *= f32(1) - ramp(0.9, 1.0, np.abs(bent) / f32(self.most_bent))
+        nearer = f32(0.5) * square * bent * sigma / (f32(1) + f32(0.5) * square)
+        return (
+            np.where(known, sure, f32(0)),
+            np.where(known, place - nearer, place),
+            np.where(known, curvature / (f32(1) + square), curvature),
+        )
 
     def differences(self, voxel, before, behind, way) -> Differences:
         """D at voxel positions, trilinear, and its differences; the outermost cells are extrapolated from the next."""

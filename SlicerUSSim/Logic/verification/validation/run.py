@@ -88,17 +88,34 @@ def all_checks() -> tuple[Check, ...]:
         artefacts,
         band,
         beams,
+        curved_walls,
         flat_walls,
         floor,
         heads,
         rays,
+        rough,
         speckle,
         sulci,
         transmit,
         walls,
     )
 
-    groups = (rays, speckle, band, floor, artefacts, beams, transmit, walls, flat_walls, sulci, aberration, heads)
+    groups = (
+        rays,
+        speckle,
+        band,
+        floor,
+        artefacts,
+        beams,
+        curved_walls,
+        transmit,
+        walls,
+        flat_walls,
+        sulci,
+        rough,
+        aberration,
+        heads,
+    )
     return tuple(check for group in groups for check in group.CHECKS)
 
 
