@@ -195,8 +195,11 @@ def slice_thickness(rotation: np.ndarray, device) -> Outcome:
         wide = replace(probe, elevation_focus_mm=55.0)
         sigma = float(wide.beam_sigma_mm(depth)[1])
         offsets = sigma * np.array([0.0, 0.5, 1.0, 1.5, 2.0])
-        poses = [phantom.probe_to_ras @ elevational_motion(offset) for offset in offsets]
-        powers = [_band_power(frame, wide, depth) for frame in simulator.sweep(wide, poses)]
+        # To both sides: one has too few independent scatterers for the limits below.
+        poses = [phantom.probe_to_ras @ elevational_motion(offset) for offset in (*offsets, *-offsets)]
+        powers = np.reshape([_band_power(frame, wide, depth) for frame in simulator.sweep(wide, poses)], (2, -1)).mean(
+            0
+        )
         measured = 10 * np.log10(np.maximum(powers, 1e-30) / powers[0])
         expected = _bar_fall_db(offsets, sigma, width)
         rows += [
