@@ -105,7 +105,8 @@ def values(entry: Parameter) -> str:
     if entry.choices:
         text = ", ".join(f"`{choice}`" for choice in entry.choices)
     elif kind is tuple and between:
-        text = f"{len(get_args(entry.type))} whole numbers, {between}"
+        elements = get_args(entry.type)
+        text = f"{len(elements)} {'numbers' if float in elements else 'whole numbers'}, {between}"
     elif kind is tuple:
         text = "texts"
     else:

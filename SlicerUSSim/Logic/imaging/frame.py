@@ -15,7 +15,7 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 class Frame:
     """One simulated image with its geometry and the signals from which it was computed."""
 
-    #: (scan_lines, samples) complex64 baseband (I/Q) signal before noise and TGC
+    #: (scan_lines, samples) complex64 baseband (I/Q) signal before ring-down, noise and TGC
     iq: np.ndarray = field(repr=False)
     #: (scan_lines, samples) float32 after noise and TGC
     envelope: np.ndarray = field(repr=False)
