@@ -431,7 +431,7 @@ def test_help_says_label_unit_what_it_does_and_the_default():
     said = " ".join(ussim("simulate", "--help").output.split())
     for text in (
         "Gain [dB]: brightness of all echoes (default: the preset's, 0).",
-        "as in a command that segments an MRI (default: the preset's, none).",
+        "none: where they are at hand (default: the preset's, none).",
         "--contrast [t1|t1gd|t2|flair|ct] Contrast of the MRI, which gives the order of the tissues by intensity; ct: "
         "a CT in Hounsfield units (default: t1).",
     ):

@@ -77,7 +77,7 @@ class SimulationSettings(Declared):
         None, "Contact gap",
         "Widest gap between probe and patient that gel fills; elements over a wider one see nothing, and their lines "
         "are dark; none: the patient lies in the coupling medium, as in a water bath or under saline",
-        unit="mm", bounds=(0.0, 50.0), shown=Shown(0.0, 20.0, 0.5, none_at=20.0), can_be_none=True,
+        unit="mm", bounds=(0.0, 50.0), shown=Shown(-0.5, 20.0, 0.5, none_at=-0.5), can_be_none=True,
         option="contact-gap",
         source="Not in the paper",
     )  # fmt: skip
