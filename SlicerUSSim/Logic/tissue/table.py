@@ -167,9 +167,9 @@ class TissueTable(Mapping[int, Tissue]):
         return self.with_labels(table)
 
     def with_labels(self, tissues: Mapping[int, Tissue]) -> TissueTable:
-        """A table of these {label: tissue} with this table's membrane, on which coupling is no fluid if skin is there.
+        """A table of these tissues by label, with this table's membrane, on which coupling is no fluid if skin is there.
 
-        Raises SimulationError as TissueTable().
+        Raises SimulationError for a label out of range.
         """
         membrane = self.membrane
         if membrane is not None and any(tissue.name == "skin" for tissue in tissues.values()):
