@@ -167,7 +167,7 @@ class TissueTable(Mapping[int, Tissue]):
         return self.with_labels(table)
 
     def with_labels(self, tissues: Mapping[int, Tissue]) -> TissueTable:
-        """A table of these tissues by label, with this table's membrane, on which coupling is no fluid if skin is there.
+        """A table of these tissues by label, with this table's membrane; coupling is none of its fluids on skin.
 
         Raises SimulationError for a label out of range.
         """
