@@ -104,6 +104,13 @@ def test_the_beam_reaches_the_brain_through_the_opening_and_not_through_the_skul
     (tmp_path / "pose.json").write_text(json.dumps(TOP.tolist()))
     on_skin, told = image(tmp_path, "--pose", "auto")
     assert "gel fills gaps of up to 3 mm between skin and probe" in told
+    for given in (
+        ("--contact-gap", "5"),
+        ("--set", "settings.contact_gap_mm=5"),
+        ("--set", "settings.contact_gap_mm=none"),
+    ):
+        _, told = image(tmp_path, "--pose", "auto", *given)  # was replaced by 3 mm
+        assert "gel" not in told
     through, told = image(tmp_path, "--pose", "auto", "--craniotomy", "auto")
     assert "craniotomy: a disc of" in told and "gel" not in told
     deep = np.s_[on_skin.shape[0] // 2 : -40, on_skin.shape[1] // 3 : -on_skin.shape[1] // 3]

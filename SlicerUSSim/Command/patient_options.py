@@ -128,6 +128,12 @@ class PatientOptions:
         return bool(self.probe or self.preset) or Changes.of(self.changes).gives_geometry
 
     @property
+    def gives_contact(self) -> bool:
+        """Whether the user said, by an option, --set or a preset, what gel fills; "none" counts, too."""
+        changed = (text.partition("=")[0].strip().rpartition(".")[2] for text in self.changes)
+        return bool(self.preset) or "contact_gap_mm" in (*self.settings, *changed)
+
+    @property
     def source(self) -> str:
         """The MRI or label map, for a report."""
         return os.path.abspath(self.mri_or_labels)
@@ -298,7 +304,7 @@ def _placed(
             surface = PatientSurface(labels)
             pose = surface.slid(pose, surface.nearest(pose[:3, 3]))
     labels = craniotomy.on(labels, names, preset.probe, pose)
-    if "skin" in names and not craniotomy.is_wanted and "contact_gap_mm" not in patient.settings and not patient.preset:
+    if "skin" in names and not craniotomy.is_wanted and not patient.gives_contact:
         note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--contact-gap)")
         settings = replace(settings, contact_gap_mm=GEL_MM)
     return _Placed(labels, pose, settings)

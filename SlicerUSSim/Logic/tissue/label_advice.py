@@ -68,12 +68,8 @@ MRI_COMMAND = replace(
 )
 #: The command of the workstation, where its MRI is a label map
 SERVE_COMMAND = replace(
-    COMMAND,
+    MRI_COMMAND,
     lesion="add it to an MRI's tissues with MRI --add {added}, or simulate it alone (ussim simulate) with {maps}",
-    brain_mask=(
-        "if it is the mask of a brain, give it with that brain's MRI as --mask {source}; or simulate it alone (ussim "
-        "simulate) with {maps}"
-    ),
     ambiguous="use --labels with --map {key}",
 )
 #: The page of the workstation
