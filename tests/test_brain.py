@@ -658,6 +658,18 @@ def test_a_kept_mask_is_read_instead_of_extracted_again(head, found):
 
 
 @needs_nilearn
+def test_a_mask_that_was_asked_for_by_name_is_said_to_be(head, found, monkeypatch):
+    """Auto took a doubtful mask of the atlas, for which it would itself have asked the other programs."""
+    monkeypatch.setattr(extractors, "robex_folder", lambda: Path("robex"))
+    monkeypatch.setattr(extractors, "has_deepbet", lambda: False)
+    said = "asked for by name (--skull-strip robex may be better)"
+    assert said in find_brain(head[0], keep_at=found.place).message
+    assert said not in find_brain(head[0], "atlas", keep_at=found.place).message
+    monkeypatch.setattr(extractors, "robex_folder", lambda: None)
+    assert "by name" not in find_brain(head[0], keep_at=found.place).message
+
+
+@needs_nilearn
 def test_an_edited_kept_mask_is_used_and_said_and_never_overwritten(head, found, tmp_path):
     import SimpleITK as sitk
 

@@ -504,6 +504,27 @@ def test_the_demo_replaces_only_files_that_it_wrote_itself(head, tmp_path):
     assert preset.read_text() == edited
 
 
+_FULL = """
+import resource, signal, sys
+from SlicerUSSim.Command.cli import main
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (4000, resource.RLIM_INFINITY))
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
+def test_the_demo_on_a_full_disk_names_its_own_folder_and_leaves_nothing(head, tmp_path):
+    """It named a file in a hidden folder that was gone, and left an empty one."""
+    pytest.importorskip("matplotlib", reason="pictures need matplotlib: pip install '.[demo]'")
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", _FULL, "demo", "--mri", head, "--skull-strip", "none", "--out", out]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
+    assert done.returncode == 2 and f"{out / 'figure.png'}: cannot be written" in done.stderr, done.stderr
+    assert not out.exists()
+
+
 def test_the_demo_refuses_a_label_map_as_segment_does(labels, tmp_path):
     result = ussim("demo", "--mri", labels, "--out", tmp_path / "demo")
     assert result.exit_code == 2 and "is a label map" in result.stderr and "expected an MRI" in result.stderr

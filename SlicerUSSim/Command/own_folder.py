@@ -6,7 +6,7 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
@@ -43,18 +43,38 @@ def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
     """(a temporary folder for files, the summary to be filled): both are moved to `folder` if the block succeeds.
 
     So a run that fails or is interrupted changes nothing. The summary also has the hashes of what earlier runs wrote,
-    which may be more files. Raises SimulationError if the folder cannot be created.
+    which may be more files. Raises SimulationError if the folder cannot be created or a file cannot be written, naming
+    it by its later place.
     """
+    is_new = not folder.exists()
     make_folder(folder)
     content: dict = {}
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".results-") as name:
-        partial = Path(name)
-        yield partial, content
-        files = sorted(file for file in partial.iterdir() if file.name != summary)
-        hashes = _written(folder, summary) | {file.name: _hash_of(file) for file in files}
-        write_json(partial / summary, {**content, _FILES: hashes})
-        for file in (*files, partial / summary):
-            os.replace(file, folder / file.name)
+    try:
+        with _temporary_folder(folder) as partial:
+            try:
+                yield partial, content
+                files = sorted(file for file in partial.iterdir() if file.name != summary)
+                hashes = _written(folder, summary) | {file.name: _hash_of(file) for file in files}
+                write_json(partial / summary, {**content, _FILES: hashes})
+            except SimulationError as error:  # the user knows no temporary folder
+                raise SimulationError(str(error).replace(str(partial), str(folder))) from None
+            for file in (*files, partial / summary):
+                os.replace(file, folder / file.name)
+    except BaseException:
+        if is_new:
+            with suppress(OSError):  # not empty
+                folder.rmdir()
+        raise
+
+
+@contextmanager
+def _temporary_folder(folder: Path) -> Iterator[Path]:
+    try:
+        temporary = tempfile.TemporaryDirectory(dir=folder, prefix=".results-")
+    except OSError as error:
+        raise SimulationError(f"{folder}: cannot be written to ({error.strerror})") from None
+    with temporary as name:
+        yield Path(name)
 
 
 def _hash_of(path: Path) -> str:

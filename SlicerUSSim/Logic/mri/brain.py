@@ -130,7 +130,7 @@ def find_brain(
     if found.sureness is not None:
         message += f", overlap with the registered atlas {found.sureness:.2f}"
     if keep_at is not None:
-        note = keep(keep_at, mri, inside, found.method, seconds, warnings)
+        note = keep(keep_at, mri, inside, found.method, seconds, warnings, method)
         _log.info("%s", note.text)
         warnings = warnings if note.is_beside else (*warnings, note.text)
     report(1.0)
@@ -231,18 +231,22 @@ def _candidates(method: str) -> list[str]:
     """Methods to try, in the order of their measured quality (docs/brain.md)."""
     if method != "auto":
         return [method]
-    available = {
-        "atlas": mni152() is not None,
-        "deepbet": extractors.has_deepbet(),
-        "robex": extractors.robex_folder() is not None,
-    }
-    found = [name for name, is_available in available.items() if is_available]
+    found = _installed()
     require(
         bool(found),
         "image shows a whole head, and no program for brain extraction is installed; install one with: "
         'pip install "SlicerUSSim[head]", or give a brain mask (--mask)',
     )
     return found
+
+
+def _installed() -> list[str]:
+    available = {
+        "atlas": mni152() is not None,
+        "deepbet": extractors.has_deepbet(),
+        "robex": extractors.robex_folder() is not None,
+    }
+    return [name for name, is_available in available.items() if is_available]
 
 
 def _by(name: str, mri: Volume, expected: np.ndarray | None, robex: Program, report: Report) -> np.ndarray:
@@ -290,6 +294,10 @@ def _kept(path: Path, mri: Volume, method: str) -> BrainMask | None:
     else:
         by = _NAMES.get(kept.method, kept.method)
         message = f"whole head: brain mask kept in {kept.path}, by {by} in {kept.seconds:.0f} s, {millilitres:.0f} ml"
+        if method == "auto" and kept.asked == "atlas":  # auto would have asked them, had it doubted that mask
+            others = [name for name in _installed() if name != "atlas"]
+            options = " or ".join(f"--skull-strip {name}" for name in others)
+            message += f"; it was asked for by name ({options} may be better)" if others else ""
     mask = mri.with_array(kept.inside.astype(np.uint8))
     if not kept.is_edited:
         return BrainMask(mask, kept.method, message, kept.warnings, 0.0)

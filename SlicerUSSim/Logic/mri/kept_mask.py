@@ -32,6 +32,8 @@ class KeptMask:
     is_edited: bool
     path: Path
     warnings: tuple[str, ...] = ()
+    #: What the user asked for when it was made: "auto", or a method by name
+    asked: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -79,10 +81,14 @@ def read_kept(path: Path, mri: Volume, method: str) -> KeptMask | None:
     return None
 
 
-def keep(path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: float, warnings: tuple[str, ...]) -> Kept:
+def keep(
+    path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: float, warnings: tuple[str, ...],
+    asked: str = "auto",
+) -> Kept:  # fmt: skip
     """Write the mask to `path`, or to the user's cache folder if that cannot be written; returns one line about it.
 
-    A file that was not written by this function is never replaced.
+    `asked` is what the user asked for, of which `method` came. A file that was not written by this function is never
+    replaced.
     """
     why = _why_not_ours(path) if path.exists() else None
     if why is not None:
@@ -90,7 +96,7 @@ def keep(path: Path, mri: Volume, inside: np.ndarray, method: str, seconds: floa
     mask = mri.with_array(inside.astype(np.uint8))
     entries = {
         "mri": fingerprint_of(mri), "mask": _hash(mask.array), "method": method, "seconds": f"{seconds:.1f}",
-        "version": __version__, "warnings": " | ".join(warnings),
+        "version": __version__, "warnings": " | ".join(warnings), "asked": asked,
     }  # fmt: skip
     try:
         _write(path, mask, entries)
@@ -189,7 +195,9 @@ def _read(path: Path, mri: Volume, method: str, fingerprint: str) -> KeptMask | 
     except ValueError:
         seconds = 0.0
     warnings = tuple(line for line in entries.get("warnings", "").split(" | ") if line)
-    return KeptMask(inside, made_by, seconds, is_edited, path, () if is_edited else warnings)
+    return KeptMask(
+        inside, made_by, seconds, is_edited, path, () if is_edited else warnings, entries.get("asked", "auto")
+    )
 
 
 def _checked(mask: Volume, path: Path, mri: Volume) -> np.ndarray:

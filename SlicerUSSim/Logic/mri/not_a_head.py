@@ -1,4 +1,4 @@
-"""What an image shows that is no head: an ultrasound fan, a phantom, a part of a head or of a body."""
+"""What an image shows that is no head: an ultrasound fan, a phantom, a part of a head or of a body, probabilities."""
 
 from __future__ import annotations
 
@@ -27,6 +27,9 @@ _SYMMETRIC = 0.85
 #: Cross-section at an end of the object, relative to the largest, from which it is cut there. The neck is cut in
 #: most images of a head, so that the bottom has to be cut through the head itself.
 _CUT, _CUT_AT_BOTTOM = 0.5, 0.85
+#: Largest value of probabilities, with what is rounded where they are stored as integers with a slope, and as percent
+#: or in 8 bits
+_FULL_SHARE, _FULL_SHARES = 1.0001, (100.0, 255.0)
 
 
 def is_ultrasound(mri: Volume) -> bool:
@@ -168,3 +171,15 @@ def _straight_sides(outline: np.ndarray) -> list[tuple[float, float, bool]]:
         at_edge = bool(((ends <= 2.5).all(axis=0) | (ends >= edges - 2.5).all(axis=0)).any())
         sides.append((length / perimeter, float(np.degrees(np.arctan2(way[0], way[1]))), at_edge))
     return sides
+
+
+def if_probabilities(mri: Volume) -> str:
+    """What to do with a refused image that may be probabilities, as percent or in 8 bits, too; empty for any other."""
+    low, high = float(mri.array.min()), float(mri.array.max())
+    if low != 0.0 or not (high <= _FULL_SHARE or high in _FULL_SHARES):
+        return ""
+    values = f"values from 0 to {high:.3g}"
+    hint = f"; if it shows the probabilities of a tissue ({values}), use the MRI from which they were made"
+    if high > _FULL_SHARE:
+        return hint
+    return f"{hint}; the probabilities of a lesion are added to an MRI with --add tumour=FILE"

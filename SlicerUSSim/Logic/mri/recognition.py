@@ -23,7 +23,7 @@ from SlicerUSSim.Logic.mri.atlas_registration import WHOLE_BRAIN_ML
 from SlicerUSSim.Logic.mri.coarse import CoarseImage, largest_component
 from SlicerUSSim.Logic.mri.ct_unit import looks_like_ct
 from SlicerUSSim.Logic.mri.no_data import edge_value
-from SlicerUSSim.Logic.mri.not_a_head import cut_ends, is_phantom, is_symmetric, is_ultrasound
+from SlicerUSSim.Logic.mri.not_a_head import cut_ends, if_probabilities, is_phantom, is_symmetric, is_ultrasound
 from SlicerUSSim.Logic.mri.orientation import MOST_TURN_DEG, lies_otherwise, stripped_lies_otherwise, why_refused
 from SlicerUSSim.Logic.mri.scalp import skull_share
 
@@ -106,7 +106,7 @@ def recognise(mri: Volume, progress: Callable[[float], None] | None = None) -> S
     later = lambda share: report(0.7 + 0.3 * share)  # noqa: E731
     if alignment.agreement < LEAST_AGREEMENT or not is_plausible:
         _require_no_ct(mri)
-        raise SimulationError(why_refused(mri, image, alignment, LEAST_AGREEMENT, later))
+        raise SimulationError(why_refused(mri, image, alignment, LEAST_AGREEMENT, later) + if_probabilities(mri))
     if alignment.agreement < DOUBTFUL_AGREEMENT:
         message = lies_otherwise(mri, image, alignment, LEAST_AGREEMENT, later)
         require(message is None, message or "")
@@ -315,12 +315,10 @@ def _check_size(image: CoarseImage, mri: Volume) -> None:
     is_half = all(low <= mm <= high for mm, (low, high) in zip(np.sort(extent), _HALF_A_BRAIN_MM, strict=True))
     is_half &= _HALF_A_BRAIN_ML[0] <= millilitres <= _HALF_A_BRAIN_ML[1]
     known = "a whole brain: it may be half a brain" if is_half else "a head"
-    is_share = mri.array.min() == 0.0 and mri.array.max() <= 1.0
     require(
         millilitres >= _LEAST_HEAD_ML and extent.max() >= 110.0,
         f"image shows {millilitres:.0f} ml of tissue in {size} mm, too little for {known}; "
-        "correct the voxel size in its header, or use an image of the whole head"
-        + ("; the probabilities of a lesion are added to an MRI with --add tumour=FILE" if is_share else ""),
+        "correct the voxel size in its header, or use an image of the whole head" + if_probabilities(mri),
     )
     # A head with neck has 4 to 6 litres. Nothing of a body is searched for a brain, which would take minutes.
     require(
@@ -366,7 +364,8 @@ def _head(mri: Volume, image: CoarseImage, alignment: Alignment) -> Shown:
             alignment.agreement >= DOUBTFUL_AGREEMENT or overlap >= _STRIPPED_OVERLAP,
             "image shows neither a head, with a scalp around the brain, nor the outline of a brain alone (agreement "
             f"with the atlas {alignment.agreement:.2f}, Dice of the outlines {overlap:.2f}): a small head, a wrong "
-            "voxel size in its header, or no head; correct the header, or give a brain mask (--mask)",
+            "voxel size in its header, or no head; correct the header, or give a brain mask (--mask)"
+            + if_probabilities(mri),
         )
         return Shown(inside, alignment, warnings)
     return Shown(None, alignment, warnings)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import about_other_file, require, require_kind
+from SlicerUSSim.Logic.base.errors import SimulationError, about_other_file, require, require_kind
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.brain import BrainMask, find_brain, given_brain
@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.mri.coregistration import aligned
 from SlicerUSSim.Logic.mri.filtering import denoised, estimate_noise as estimate_noise
 from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
 from SlicerUSSim.Logic.mri.neighbours import less_sure, smoothed_posteriors
+from SlicerUSSim.Logic.mri.not_a_head import if_probabilities
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
 from SlicerUSSim.Logic.mri.plausibility import brighter_than_tissue, require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_hounsfield
@@ -243,7 +244,10 @@ def segment_mri(
     report(0.4)
     prior = atlas.prior(part.images[0], part.inside) if atlas else None
     if prior is not None:
-        warnings += require_contrast(part.images[0], part.inside, prior, contrast)
+        try:
+            warnings += require_contrast(part.images[0], part.inside, prior, contrast)
+        except SimulationError as error:
+            raise SimulationError(f"{error}{if_probabilities(mri)}") from None
         for (name, other), image in zip(others.items(), part.images[1:], strict=True):
             with about_other_file(_called(name, other)):
                 warnings += require_contrast(image, part.inside, prior, name)
