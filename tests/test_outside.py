@@ -11,7 +11,7 @@ from PIL import Image
 from scipy import ndimage
 
 from SlicerUSSim.Command.cli import main
-from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic import SimulationError, Volume, segment_mri
 from SlicerUSSim.Logic.mri.outside import OUTSIDE, find_outside
 from SlicerUSSim.Logic.mri.samples import demo_mri
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -89,8 +89,14 @@ def test_the_commands_label_what_is_outside_and_put_the_probe_on_the_skin(tmp_pa
         assert done.exit_code == 0, done.output
     for arguments, message in (
         ([out, "--outside"], "is a label map, and --outside is for an MRI"),
-        ([image, "--skull-strip", "none", "--outside"], "--outside needs to know the brain"),
-        ([image, "--mask", mask, "--contrast", "t2", "--outside"], "--outside is for a whole head of contrast t1"),
+        (
+            [image, "--skull-strip", "none", "--outside"],
+            "(--outside) is not known without it, and --skull-strip is none",
+        ),
+        (
+            [image, "--mask", mask, "--contrast", "t2", "--outside"],
+            "(--outside) are found in a whole head of contrast t1 or t1gd, and this is t2",
+        ),
     ):
         done = CliRunner().invoke(main, ["simulate", *arguments, "--pose", "auto", "-o", picture])
         assert done.exit_code == 2 and message in done.stderr
@@ -123,8 +129,37 @@ def test_a_brain_without_a_head_is_refused_before_it_is_segmented(tmp_path):
     path = str(tmp_path / "brain.nii.gz")
     demo_mri()[0].write(path)
     done = CliRunner().invoke(main, ["segment", path, "--outside", "-o", str(tmp_path / "labels.nii.gz")])
-    assert done.exit_code == 2 and "is a brain without its head (skull-stripped), and --outside is for" in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+    assert done.exit_code == 2 and "is a brain without its head (skull-stripped), and what is outside" in done.stderr
+    assert "segmented" not in done.stderr and not (tmp_path / "labels.nii.gz").exists()
+
+
+def test_the_segmentation_has_what_is_outside_after_its_own_labels():
+    mri, brain, _ = round_head()
+    mask = mri.with_array(brain.astype(np.uint8))
+    plain, whole = (segment_mri(mri, mask=mask, bias_correction=False, outside=on) for on in (False, True))
+    assert whole.tissue_names == (*plain.tissue_names, *OUTSIDE) and whole.brain_names == plain.tissue_names
+    np.testing.assert_array_equal(np.where(brain, whole.labels.array, 0), plain.labels.array)
+    found = find_outside(mri, brain).over(plain.labels, plain.tissue_names)
+    np.testing.assert_array_equal(whole.labels.array, found[0].array)
+    np.testing.assert_array_equal(whole.posteriors, plain.posteriors)
+    for name in ("second_label", "second_share", "deviation", "volume_share"):
+        np.testing.assert_array_equal(getattr(whole.texture(), name), getattr(plain.texture(), name))
+    assert whole.notes[-1].startswith("outside the brain: skin")
+
+
+def test_the_filter_labels_what_is_outside():
+    pytest.importorskip("vtkmodules")
+    from SlicerUSSim.Logic.vtk import SegmentationFilter
+
+    mri, brain, _ = round_head()
+    segmentation = SegmentationFilter()
+    segmentation.SetInputDataObject(0, mri.to_vtk())
+    segmentation.SetMaskData(mri.with_array(brain.astype(np.uint8)).to_vtk())
+    segmentation.SetOutside(True)
+    segmentation.Update()
+    found = segmentation.GetSegmentation()
+    assert found is not None and found.tissue_names[-5:] == OUTSIDE
+    np.testing.assert_array_equal(Volume.from_vtk(segmentation.GetOutputDataObject(0)).array, found.labels.array)
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,10 @@ def segmented_file(
             mri, **settings, others=others, mask=brain, organs=found, keep_mask_at=mask_beside(path),
             device=device, progress=progress,
         )  # fmt: skip
-    for line in (result.brain.message,) if isinstance(result, Segmentation) and not tell_all else result.notes:
+    lines = result.notes
+    if isinstance(result, Segmentation) and not tell_all:
+        lines = tuple(line for line in lines if line == result.brain.message or line.startswith("outside the brain:"))
+    for line in lines:
         note(line)
     return result
 

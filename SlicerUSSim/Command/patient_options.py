@@ -28,7 +28,6 @@ from SlicerUSSim.Command.options import (
     mask_option,
     require_no_mri_options,
 )
-from SlicerUSSim.Command.outside import outside_option, require_head, require_outside, with_outside
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.set_option import Changes, set_option
 from SlicerUSSim.Command.sheets import DrawnSheets, drawn_sheets_option, no_sheet_option
@@ -98,7 +97,7 @@ class PatientOptions:
     maps: tuple[str, ...] = declared(map_option)
     #: {parameter: value}
     segmentation: Mapping[str, Any] = declared_parameters(
-        SegmentationSettings, ("contrast", "skull_strip", "thin_sulci"), also=(ct_option,)
+        SegmentationSettings, ("contrast", "skull_strip", "thin_sulci", "outside"), also=(ct_option,)
     )
     #: Label map of organs of a CT
     organs: str | None = declared(organs_option)
@@ -107,8 +106,6 @@ class PatientOptions:
     also: tuple[str, ...] = declared(also_option)
     #: TISSUE=FILE
     additions: tuple[str, ...] = declared(add_option)
-    #: Whether skin, scalp, skull and air are labelled, too
-    outside: bool = declared(outside_option)
     #: none, auto, disc:MM or a file
     craniotomy: str = declared(craniotomy_option)
     #: A file, auto or none
@@ -195,6 +192,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
 
     from SlicerUSSim.Logic.base.volume import Volume
     from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+    from SlicerUSSim.Logic.mri.outside import require_findable
     from SlicerUSSim.Logic.mri.pathology import texture_below
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
     from SlicerUSSim.Logic.tissue.label_sources import is_label_file
@@ -224,12 +222,10 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     if is_labels:
         require_no_mri_options(patient.mri_or_labels, "leave it out, or use --mri if it is one")
     split_also(patient.also)
-    if patient.outside and is_labels:
-        raise SimulationError(f"{patient.mri_or_labels}: is a label map, and --outside is for an MRI")
-    require_outside(
-        patient.outside, patient.segmentation["contrast"], patient.segmentation["skull_strip"], patient.mask
-    )
-    require_head(patient.outside, patient.mri_or_labels, volume)
+    if patient.segmentation["outside"] and not is_ct:
+        require_findable(
+            patient.segmentation["contrast"], patient.segmentation["skull_strip"], patient.mask is not None
+        )
     sheets = DrawnSheets.of(
         patient.sheets, patient.no_sheets, is_labels=is_labels, contrast=patient.segmentation["contrast"]
     )
@@ -245,7 +241,7 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
         simulator = UltrasoundSimulator(placed.labels, tissues, placed.settings, patient.device, sheets=sheets.read)
         return Examination(simulator, preset.probe, preset.display, is_labels, placed.probe_to_ras)
     require(
-        not craniotomy.is_wanted or patient.outside,
+        not craniotomy.is_wanted or patient.segmentation["outside"],
         f"--craniotomy is {patient.craniotomy}, and only a brain is labelled, expected --outside too",
     )
     log.info("tissues: %s", patient.tissues or ("the preset's" if patient.preset else "presets of the brain"))
@@ -263,12 +259,9 @@ def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = No
     if isinstance(segmentation, Segmentation):
         drawn = sheets.found(patient.mri_or_labels, volume, segmentation, patient.segmentation["contrast"])
         labels, names, surfels = drawn.labels, drawn.names, drawn.surfels
-        if patient.outside:
-            labels, names = with_outside(patient.mri_or_labels, volume, segmentation, labels, names)
     if table is not None:
-        labels, names = _numbered_as(
-            tissues, labels, names, len(segmentation.tissue_names), patient.tissues or "tissues"
-        )
+        of_brain = segmentation.brain_names if isinstance(segmentation, Segmentation) else segmentation.tissue_names
+        labels, names = _numbered_as(tissues, labels, names, len(of_brain), patient.tissues or "tissues")
     added = additions.on(labels, names, has_brain_mask=not is_ct)
     tissues = tissues.for_names(added.tissue_names) if table is None else added.table(tissues)
     texture = texture_below(segmentation.texture(), volume, segmentation.labels, added.labels)

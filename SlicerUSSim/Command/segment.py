@@ -11,7 +11,6 @@ import click
 from SlicerUSSim.Command.additions import Additions, add_option
 from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri, segmented_file, split_also
 from SlicerUSSim.Command.options import check_places, ct_option, device_option, gathered, mask_option
-from SlicerUSSim.Command.outside import outside_option, require_head, require_outside, with_outside
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.proposals import (
@@ -24,7 +23,7 @@ from SlicerUSSim.Command.proposals import (
 )
 from SlicerUSSim.Command.sheets import require_sheets, sheet_kind_option, sheets_option, write_sheets
 from SlicerUSSim.Logic.base.errors import require
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
 
 @click.command()
@@ -45,7 +44,6 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 @add_option
 @seed_option
 @propose_option
-@outside_option
 @sheets_option
 @sheet_kind_option
 @click.option(
@@ -55,11 +53,12 @@ from SlicerUSSim.Logic.mri.settings import SegmentationSettings
 def segment(
     mri: str, out: Path, settings: SegmentationSettings, mask: str | None, also: tuple[str, ...],
     organs: str | None, maps: tuple[str, ...], additions: tuple[str, ...], seeds: tuple[str, ...], propose: bool,
-    outside: bool, sheets: Path | None, sheet_kinds: tuple[str, ...], overwrite: bool, device: str | None,
+    sheets: Path | None, sheet_kinds: tuple[str, ...], overwrite: bool, device: str | None,
 ) -> None:  # fmt: skip
     """Segment an MRI of a head or a brain, or a CT (--ct), into tissues."""
     from SlicerUSSim.Logic.base.volume import require_image_name
     from SlicerUSSim.Logic.mri.modality import has_brain_mask
+    from SlicerUSSim.Logic.mri.outside import require_findable
     from SlicerUSSim.Logic.mri.segmentation import Segmentation
     from SlicerUSSim.Logic.tissue.own_files import require_replaceable, write_label_files
     from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -69,13 +68,13 @@ def segment(
     _require_no_kept_mask(out, mri)
     if not overwrite:
         require_replaceable(out)
-    require_outside(outside, settings.contrast, settings.skull_strip, mask)
+    if settings.outside and settings.contrast != CT:
+        require_findable(settings.contrast, settings.skull_strip, mask is not None)
     require_sheets(sheets, sheet_kinds, settings.contrast)
     split_also(also)
     split_seeds(seeds)
     masks = Additions.read(additions)
     volume = read_mri(mri, mask=mask, skull_strip=settings.skull_strip, contrast=settings.contrast)
-    require_head(outside, mri, volume)
     if seeds or propose:
         require(has_brain_mask(settings.contrast), "--seed and --propose look for lesions in an MRI, and this is a CT")
         require_seeds(seeds, volume, out)
@@ -98,8 +97,6 @@ def segment(
     labels, names = result.labels, result.tissue_names
     if sheets is not None and isinstance(result, Segmentation):
         labels, names = write_sheets(sheets, mri, volume, result, settings.contrast, sheet_kinds)
-    if outside and isinstance(result, Segmentation):
-        labels, names = with_outside(mri, volume, result, labels, names)
     added = masks.on(labels, names, has_brain_mask=has_brain_mask(settings.contrast))
     beside = write_label_files(out, added.labels, TissueTable.brain().for_names(added.tissue_names))
     click.echo(replace(result, labels=added.labels, tissue_names=added.tissue_names).table())

@@ -43,6 +43,7 @@ _PORT = 8080
 @parameter_option(SegmentationSettings, "contrast")
 @ct_option
 @parameter_option(SegmentationSettings, "skull_strip")
+@parameter_option(SegmentationSettings, "outside")
 @mask_option
 @also_option
 @add_option
@@ -72,6 +73,7 @@ def serve(
     preset: str | None,
     contrast: str,
     skull_strip: str,
+    outside: bool,
     mask: str | None,
     also: tuple[str, ...],
     additions: tuple[str, ...],
@@ -105,6 +107,12 @@ def serve(
         raise SimulationError(
             "the contrast is ct (--ct), expected a CT; without a file the demo brain is shown, an MRI"
         )
+    if outside and contrast != CT:
+        from SlicerUSSim.Logic.mri.outside import require_findable
+
+        require_findable(contrast, skull_strip, mask is not None)
+        if mri is None:
+            raise SimulationError("--outside is for a whole head, expected an MRI of one; the demo brain has no head")
     if contrast == CT and others:
         raise SimulationError("--also is for an MRI, and the contrast is ct (--ct); leave it out")
     if igtl is not None:
@@ -143,7 +151,8 @@ def serve(
 
     workstation = Workstation(
         Files(
-            mri=mri, labels=labels, maps=maps, contrast=contrast, mask=mask, skull_strip=skull_strip, also=others,
+            mri=mri, labels=labels, maps=maps, contrast=contrast, mask=mask, skull_strip=skull_strip, outside=outside,
+            also=others,
             additions=masks, preset=chosen_preset,
             sequence=tracked, sequence_name=Path(sequence).name.split(".")[0] if sequence else "", transform=transform,
             to_ras=to_ras, tracker=igtl, tracker_device=igtl_device, volumes=volumes,

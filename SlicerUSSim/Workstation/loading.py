@@ -61,7 +61,7 @@ class Loading:
             if files.preset is not None:
                 self._logic.preset = files.preset
             parameters.segmentation = replace(
-                parameters.segmentation, contrast=files.contrast, skull_strip=files.skull_strip
+                parameters.segmentation, contrast=files.contrast, skull_strip=files.skull_strip, outside=files.outside
             )
             if files.mri is not None or files.labels is None:
                 self._take_mri(self._opener.mri(files.mri))

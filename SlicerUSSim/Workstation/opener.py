@@ -55,6 +55,8 @@ class Files:
     contrast: str = "t1"
     mask: str | None = None
     skull_strip: str = "auto"
+    #: Whether skin, scalp, skull and air are labelled, too
+    outside: bool = False
     #: {contrast: file} of further MRIs of the patient; the first is selected
     also: Mapping[str, str] = field(default_factory=dict)
     #: (tissue, file) of masks that are laid over the labels

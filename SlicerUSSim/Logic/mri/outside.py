@@ -19,6 +19,8 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import largest_component
 from SlicerUSSim.Logic.mri.distances import distance_to
 
+#: Contrasts in which bone is known to be found
+CONTRASTS = ("t1", "t1gd")
 #: Tissues outside the brain, in the order of their labels
 OUTSIDE = ("skin", "scalp", "skull", "cancellous bone", "air")
 #: Air around the head: below this part of Otsu's threshold. Bone: below this part of the one beside the brain
@@ -64,6 +66,20 @@ class Outside:
         lookup[present] = len(names) + 1 + np.arange(len(present))
         array = np.where(labels.array > 0, labels.array, lookup[self.labels])
         return labels.with_array(array), (*names, *(OUTSIDE[n - 1] for n in present))
+
+
+def require_findable(contrast: str, skull_strip: str, has_mask: bool) -> None:
+    """Raise SimulationError where the image is no T1, or its brain is not to be found."""
+    require(
+        contrast in CONTRASTS,
+        f"skin, skull and what else is outside the brain (--outside) are found in a whole head of contrast "
+        f"{' or '.join(CONTRASTS)}, and this is {contrast}",
+    )
+    require(
+        has_mask or skull_strip != "none",
+        "what is outside the brain (--outside) is not known without it, and --skull-strip is none; choose another, or "
+        "give a brain mask (--mask)",
+    )
 
 
 def find_outside(mri: Volume, brain: np.ndarray) -> Outside:

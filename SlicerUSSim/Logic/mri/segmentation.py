@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.mri.lesions.evidence import Evidence
 from SlicerUSSim.Logic.mri.neighbours import less_sure, smoothed_posteriors
 from SlicerUSSim.Logic.mri.not_a_head import if_probabilities
 from SlicerUSSim.Logic.mri.nuclei import with_nuclei
+from SlicerUSSim.Logic.mri.outside import find_outside, require_findable
 from SlicerUSSim.Logic.mri.plausibility import brighter_than_tissue, require_contrast
 from SlicerUSSim.Logic.mri.recognition import check_intensities, require_no_hounsfield
 from SlicerUSSim.Logic.mri.segmentation_steps import (
@@ -79,6 +80,8 @@ class Segmentation:
     _filtered: np.ndarray = field(repr=False)
     #: (classes, voxels of the brain)
     _shares: np.ndarray = field(repr=False)
+    #: Number of the labels that are outside the brain
+    _labels_outside: int = 0
 
     @property
     def atlas(self) -> AtlasFit | None:
@@ -86,9 +89,18 @@ class Segmentation:
         return self.evidence.atlas
 
     @property
+    def brain_names(self) -> tuple[str, ...]:
+        """Names of the labels in the brain, which are the first of tissue_names."""
+        return self.tissue_names[: len(self.tissue_names) - self._labels_outside]
+
+    @property
+    def _in_brain(self) -> np.ndarray:
+        return self.brain.mask.array > 0
+
+    @property
     def posteriors(self) -> np.ndarray:
         """(classes, k, j, i) float32 probability that each tissue fills most of the voxel; 0 in the background."""
-        foreground = self.labels.array > 0
+        foreground = self._in_brain
         result = np.zeros((len(self.means), *foreground.shape), np.float32)
         result[:, foreground] = self._shares
         return result
@@ -97,8 +109,8 @@ class Segmentation:
         """Information of the MRI beyond labels: the second most probable tissue of every voxel with its probability
         relative to the two and the part of the voxel it fills, and the filtered intensity in standard deviations of its
         tissue."""
-        labels = self.labels.array
-        foreground = labels > 0
+        foreground = self._in_brain
+        labels = np.where(foreground, self.labels.array, 0).astype(np.uint8)
         label, posteriors = labels[foreground], self._shares.copy()
         sure = label > len(self.means)  # thin sulci do not come from the mixture
         own = np.where(sure, 1, label)[None].astype(np.intp) - 1
@@ -140,6 +152,7 @@ def segment_mri(
     filter_epsilon: float | None = SegmentationSettings.filter_epsilon,
     bias_correction: bool | None = SegmentationSettings.bias_correction,
     thin_sulci: bool = False,
+    outside: bool = SegmentationSettings.outside,
     skull_strip: str = SegmentationSettings.skull_strip,
     keep_mask_at: Path | None = None,
     device: DeviceChoice = None,
@@ -162,6 +175,8 @@ def segment_mri(
     thin_sulci : also label the middle of sulci that are too narrow to reach CSF intensity, one voxel thick, as an extra
         tissue "leptomeninges" within the grey matter. Ultrasound shows these sulci, but intensity classes miss them.
         In voxels of more than 3.5 mm they are not looked for, which the notes say.
+    outside : also label what is outside the brain of a whole head (t1, t1gd), after all others: see
+        outside.find_outside. Probabilities are those of the brain.
     skull_strip : how the brain is found without a `mask`; see brain.find_brain.
     keep_mask_at : file in which the mask of a whole head is kept, so that it is extracted once; see brain.find_brain.
     progress : called with the completed fraction, 0 to 1.
@@ -190,8 +205,10 @@ def segment_mri(
     contrasts = (contrast, *others)
     names = class_names(contrasts, classes)
     settings = SegmentationSettings(
-        contrast, classes, skull_strip, thin_sulci, bias_correction, filter_radius, filter_epsilon
+        contrast, classes, skull_strip, thin_sulci, outside, bias_correction, filter_radius, filter_epsilon
     )
+    if outside:
+        require_findable(contrast, settings.skull_strip, mask is not None)
     timed = StepTimes()
     intensity = finite(mri)
     if mask is None and settings.skull_strip != "none":
@@ -209,6 +226,11 @@ def segment_mri(
             f"the mask has {brain.volume_ml:.3g} ml, expected a brain or a large part of one, from which volumes are "
             "registered to each other; a lesion is added with --add tumour=FILE",
         )
+    require(
+        not outside or brain.method != "stripped",
+        "image is a brain without its head (skull-stripped), and what is outside the brain (--outside) is found in a "
+        "whole head",
+    )
     foreground = brain.mask.array > 0
     timed("brain")
     report(0.05)
@@ -291,6 +313,12 @@ def segment_mri(
         tissue_names = (*names, "leptomeninges")
         timed("thin sulci")
         _log.info("thin sulci: %d voxels become leptomeninges", int(middles.sum()))
+    whole, brain_labels = mri.with_array(part.whole(labels)), len(tissue_names)
+    if outside:
+        around = find_outside(images[0], foreground)
+        whole, tissue_names = around.over(whole, tissue_names)
+        notes.append(around.text(mri.voxel_ml))
+        timed("outside the brain")
     for line in notes:
         _log.info("%s", line)
     for line in warnings:
@@ -298,7 +326,7 @@ def segment_mri(
     _log.debug("segmentation: %s", timed)
     report(1.0)
     return Segmentation(
-        labels=mri.with_array(part.whole(labels)),
+        labels=whole,
         tissue_names=tissue_names,
         means=found.means[:, 0] + above,
         standard_deviations=found.standard_deviations[:, 0],
@@ -323,6 +351,7 @@ def segment_mri(
         corrected=part.whole(np.where(part.inside, part.images[0].array + np.float32(above), np.float32(0.0))),
         _filtered=part.whole(filtered[0][0]),
         _shares=found.posteriors,
+        _labels_outside=len(tissue_names) - brain_labels,
     )
 
 

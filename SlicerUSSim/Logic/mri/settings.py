@@ -32,6 +32,11 @@ class SegmentationSettings(Declared):
         "Label sulci too narrow to reach CSF intensity as leptomeninges, one voxel thick", shown=True,
         option="thin-sulci/no-thin-sulci", note="segment_mri itself has it off by default",
     )  # fmt: skip
+    outside: bool = parameter(
+        False, "Label what is outside the brain",
+        "Also label skin, scalp, skull, its marrow and air in the T1 of a whole head, so that a probe stands on the "
+        "skin", shown=True, option="outside/no-outside",
+    )  # fmt: skip
     bias_correction: bool | None = parameter(
         None, "Correct the bias field", "Remove the bias field, for scans with an intensity gradient; none: decided "
         "from the image", shown=True, option="bias-correction/no-bias-correction",

@@ -179,6 +179,7 @@ class UltrasoundSceneLogic:
         filter_epsilon: float | None = SegmentationSettings.filter_epsilon,
         bias_correction: bool | None = SegmentationSettings.bias_correction,
         thin_sulci: bool = SegmentationSettings.thin_sulci,
+        outside: bool = SegmentationSettings.outside,
         skull_strip: str = SegmentationSettings.skull_strip,
         progress: Callable[[float], None] | None = None,
     ) -> Segmentation | CtSegmentation:
@@ -212,7 +213,8 @@ class UltrasoundSceneLogic:
             lambda: segment_image(
                 mri, classes=classes, contrast=contrast, others=volumes, mask=mask, filter_radius=filter_radius,
                 filter_epsilon=filter_epsilon, bias_correction=bias_correction, thin_sulci=thin_sulci,
-                skull_strip=skull_strip, keep_mask_at=keep_mask_at, device=self.device, progress=progress,
+                outside=outside, skull_strip=skull_strip, keep_mask_at=keep_mask_at, device=self.device,
+                progress=progress,
             )
         )  # fmt: skip
         added, told = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=is_of_brain)

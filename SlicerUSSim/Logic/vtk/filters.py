@@ -171,6 +171,10 @@ class SegmentationFilter(_ImageFilter):
         """Label sulci too narrow to reach CSF intensity as leptomeninges."""
         self._set("thin_sulci", bool(on))
 
+    def SetOutside(self, on: bool) -> None:
+        """Also label skin, scalp, skull, its marrow and air in the T1 of a whole head."""
+        self._set("outside", bool(on))
+
     def SetSkullStrip(self, method: str) -> None:
         """How the brain is found in a whole head without a mask: "auto", "robex", "deepbet", "atlas" or "none"."""
         self._set("skull_strip", method)
