@@ -32,15 +32,15 @@ from SlicerUSSim.Logic import (
     TissueTable,
     UltrasoundSimulator,
 )
-from SlicerUSSim.Logic.base.volume import read_array
+from SlicerUSSim.Logic.base.volume import Volume, read_array
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mri import add_tissues
+from SlicerUSSim.Logic.mri import add_tissues, craniotomy
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.mri.segmentation import segment_mri
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, tilt_sweep, turned
+from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, tilt_sweep, turned
 from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
 from SlicerUSSim.Logic.tissue.own_files import write_label_files
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
@@ -300,7 +300,7 @@ def test_a_section_with_a_value_and_a_button_works_on_the_page_without_further_c
     messages = Messages(shared)
     logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
     panel = BrowserPanel(shared, messages, logic, tasks, sections, lambda: None)
-    loading = SimpleNamespace(segment=None, add_tissues=None, place_probe=None)
+    loading = SimpleNamespace(**dict.fromkeys(LOADING))
     buttons = Buttons(shared, tasks, panel.presenter, sections, loading)
     panel.refresh()
     assert shared.now.panel.values["marginSpinBox"] == 2.0 and shared.now.panel.can["extractButton"]
@@ -326,7 +326,7 @@ def test_a_section_with_a_value_and_a_button_works_on_the_page_without_further_c
 def test_what_the_page_does_otherwise_is_there_to_be_done_otherwise():
     names = set(controls.by_widget(panel_sections()))
     assert names.issuperset(page_of.NOT_SHOWN | set(page_of._IN_PAGE))
-    loading = SimpleNamespace(segment=None, add_tissues=None, place_probe=None)
+    loading = SimpleNamespace(**dict.fromkeys(LOADING))
     assert names.issuperset(Buttons(None, None, None, panel_sections(), loading)._own_actions)
 
 
@@ -396,6 +396,8 @@ def test_a_cine_keeps_time_and_begins_anew_with_another_size():
         assert gif.info["duration"] == 250 and np.asarray(gif.convert("L"))[0, 0] == 50 * number
 
 
+#: Methods of Loading that buttons call
+LOADING = ("segment", "add_tissues", "place_probe", "open_craniotomy", "close_craniotomy")
 #: What breaks text that is pasted between quotes.
 NASTY = ["it's", 'a "b"', "back\\slash\\", "two\nlines", "'''", '"""', "\\N{x} {y} %s", "grüße ∎"]
 
@@ -494,6 +496,26 @@ def test_the_script_of_labels_with_lesions_of_a_page_simulates_the_same_image_be
         probe, pose, preset.display, noise_seed=seed_of_pose(pose)
     )
     assert not np.array_equal(without.image, frame.image)
+
+
+def test_the_script_of_an_opened_head_simulates_the_same_image(tmp_path):
+    axis = np.arange(-60.0, 61.0, 2.0)
+    radius = np.sqrt(sum(place**2 for place in np.meshgrid(axis, axis, axis)))
+    matrix = np.diag([2.0, 2.0, 2.0, 1.0])
+    matrix[:3, 3] = axis[0]
+    names = ("grey matter", "skull", "skin")
+    labels = Volume(np.select([radius < 40, radius < 50, radius < 56], [1, 2, 3], 0).astype(np.uint8), matrix)
+    labels.write(tmp_path / "labels.nii.gz")
+    probe = PhasedProbe(60.0, 60.0, scan_lines=48)
+    preset, pose = Preset(probe=probe, tissues=TissueTable.brain(names)), pose_looking_at((0, 0, 42), (0, 0, 0))
+    source = LabelSource(str(tmp_path / "labels.nii.gz"), True, tissue_names=names, disc=(36.0, pose))
+    found, _ = craniotomy.opened(labels, names, craniotomy.disc_opening(labels, names, pose, 36.0))
+    images = [
+        UltrasoundSimulator(one, preset.tissues).simulate(probe, pose, preset.display, noise_seed=seed_of_pose(pose))
+        for one in (labels, found)
+    ]
+    assert np.array_equal(run_again(python_script(source, preset, pose), tmp_path), images[1].image)
+    assert not np.array_equal(images[0].image, images[1].image)
 
 
 def test_the_script_of_an_mri_has_its_second_mri_and_says_which_files_have_no_path():

@@ -707,6 +707,35 @@ def test_the_script_gives_the_same_image_pixel_by_pixel(page, tmp_path):
     assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
 
+def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
+    axis = np.arange(-84.0, 85.0, 3.0)
+    radius = np.sqrt(sum(place**2 for place in np.meshgrid(axis, axis, axis)))
+    matrix = np.diag([3.0, 3.0, 3.0, 1.0])
+    matrix[:3, 3] = axis[0]
+    labels = np.select([radius < 60, radius < 70, radius < 78], [1, 2, 3], 0).astype(np.uint8)
+    Volume(labels, matrix).write(tmp_path / "labels.nii.gz")
+    TissueTable.brain(("grey matter", "skull", "skin")).write(tmp_path / "labels.json")
+    with serving("--labels", str(tmp_path / "labels.nii.gz")) as address:
+        page = opened(browser, address)
+        settled(page)
+        shut = np.asarray(Image.open(download(page, "png")), float)
+        open_section(page, "Craniotomy")
+        assert page.locator("#closeCraniotomyButton").is_disabled()
+        click(page, "#openCraniotomyButton")
+        settled(page)
+        page.evaluate("window.trame.trigger('press', ['placeButton'])")  # on the brain, in the middle of the opening
+        settled(page)
+        assert not errors(page) and "craniotomy: a disc of" in shown(page, "notesLabel")
+        through = np.asarray(Image.open(download(page, "png")), float)
+        assert through.mean() > shut.mean() + 5.0
+        assert np.array_equal(run_again(script_of(page), tmp_path), through)
+        click(page, "#closeCraniotomyButton")
+        settled(page)
+        assert not errors(page) and "craniotomy: " not in shown(page, "notesLabel")
+        assert page.locator("#closeCraniotomyButton").is_disabled()
+        page.close()
+
+
 def test_the_cine_is_a_gif_that_moves(page):
     for _ in range(4):
         with new_image(page):

@@ -75,14 +75,14 @@ class Craniotomy:
         """
         if not self.is_wanted:
             return labels
-        from SlicerUSSim.Logic.mri.craniotomy import ROOM_MM, disc_opening, file_opening, opened
+        from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm, disc_opening, file_opening, opened
 
         if self.needs_pose:
             if probe_to_ras is None:
                 raise SimulationError(
                     f"--craniotomy {self.source.rstrip(':')} needs one pose of the probe, expected a file"
                 )
-            diameter = self.diameter_mm or max(probe.face_mm, probe.elevation_aperture_mm) + ROOM_MM
+            diameter = self.diameter_mm or disc_diameter_mm(probe)
             opening, what = disc_opening(labels, names, probe_to_ras, diameter), f"a disc of {diameter:.0f} mm"
         else:
             opening, what = file_opening(labels, names, self.source), self.source

@@ -285,17 +285,12 @@ def _placed(
     pose: np.ndarray | str | None,
 ) -> _Placed:  # fmt: skip
     """The probe at its pose on a patient; `before` are the labels without what --add laid over them."""
-    from SlicerUSSim.Logic.mri.craniotomy import without_outside
-    from SlicerUSSim.Logic.probe.placement import craniotomy_pose
-    from SlicerUSSim.Logic.probe.surface import PatientSurface
+    from SlicerUSSim.Logic.mri.craniotomy import default_pose
 
     labels, names, settings = added.labels, added.tissue_names, preset.settings
     if isinstance(pose, str):
-        ground = without_outside(labels, names) if craniotomy.is_wanted else labels
-        pose = craniotomy_pose(ground, preset.probe, target_ras=added.centre_ras(before))
-        if ground is labels and "skin" in names:  # a face that is oblique to the skin would stand in the bone
-            surface = PatientSurface(labels)
-            pose = surface.slid(pose, surface.nearest(pose[:3, 3]))
+        target = added.centre_ras(before)
+        pose = default_pose(labels, names, preset.probe, is_open=craniotomy.is_wanted, target_ras=target)
     labels = craniotomy.on(labels, names, preset.probe, pose)
     if "skin" in names and not craniotomy.is_wanted and not patient.gives_contact:
         note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--contact-gap)")

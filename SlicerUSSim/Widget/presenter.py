@@ -33,6 +33,8 @@ from SlicerUSSim.Widget.sections import CUSTOM_PROBE, SHOWN_PROBES
 
 #: Begin of the lines of the notes that a user should check
 _CHECK = "Check: "
+#: Begin of the line about an opening
+_OPENED = "craniotomy: "
 _BUSY = "Wait until the work under way is done"
 #: Columns of the tissue table: parameter, heading, tool tip.
 TISSUE_COLUMNS = tuple(
@@ -198,6 +200,24 @@ class PanelPresenter:
             return False, "Choose a segmentation with segments called tumour, oedema, ..."
         return True, ""
 
+    def canOpenCraniotomy(self) -> tuple[bool, str]:
+        """(whether skin and skull can be opened, the reason if not)"""
+        can, why_not = self.canSimulate()
+        if not can:
+            return can, why_not
+        if self.logic.parameters.opening is None and self.logic.parameters.probe_transform is None:
+            return False, "Place the probe over the brain, or choose an opening"
+        return True, ""
+
+    def canCloseCraniotomy(self) -> tuple[bool, str]:
+        """(whether there are labels before the opening, the reason if not)"""
+        labels: Any = self.logic.parameters.labels
+        if self._busy:
+            return False, _BUSY
+        if labels is None or self.logic.closedLabels(labels) is labels:
+            return False, "These labels have no opening, or those before it are gone"
+        return True, ""
+
     def segment(self) -> None:
         """Segment the MRI into the chosen label map or segmentation, or into a new node (see _replaceable)."""
         parameters = self.logic.parameters
@@ -258,6 +278,40 @@ class PanelPresenter:
             with self._replaceable(f"{before.GetName()} with lesions", before) as labels:
                 self.logic.addTissues(before, parameters.lesions, labels)
             self._notes += self._checks
+
+    def openCraniotomy(self) -> None:
+        """Open skin and skull under the probe, or where the chosen node says, in labels of their own.
+
+        Labels that were opened are opened anew, from those before: an opening follows the probe when it is moved.
+        """
+        parameters = self.logic.parameters
+        with self.shown(), self.working("Open skull"):
+            chosen: Any = required(parameters.labels, "no label map chosen; segment the MRI first")
+            closed = self.logic.closedLabels(chosen)
+            again = chosen if closed is not chosen and self.logic.mayReplace(chosen) else None
+            kind = "Segmentation" if closed.IsA("vtkMRMLSegmentationNode") else "LabelMapVolume"
+            with self._made(again, kind, f"{closed.GetName()} with craniotomy") as node:
+                self.logic.openCraniotomy(
+                    closed, node, probe_transform_node=parameters.probe_transform, opening_node=parameters.opening,
+                    diameter_mm=parameters.panel.craniotomy_mm,
+                )  # fmt: skip
+            parameters.labels = node
+            kept = [line for line in self._notes if not line.startswith(_OPENED)]
+            self._notes, self._labels_said = [*kept, *self.logic.notes], node.GetID()
+        self.view.refresh()
+
+    def closeCraniotomy(self) -> None:
+        """Choose the labels without the opening again."""
+        parameters = self.logic.parameters
+        with self.shown():
+            chosen: Any = required(parameters.labels, "no label map chosen; segment the MRI first")
+            closed = self.logic.closedLabels(chosen)
+            require(closed is not chosen, f"{chosen.GetName()!r} has no opening, or the labels before it are gone")
+            self.logic.hideOpening(chosen)
+            parameters.labels = closed
+            self._notes = [line for line in self._notes if not line.startswith(_OPENED)]
+            self._labels_said = closed.GetID()
+        self.view.refresh()
 
     def notes(self) -> str:
         """What the last segmentation or addition did, and what a user should check, in lines."""

@@ -29,6 +29,7 @@ def panel_sections() -> tuple[Section, ...]:
     return (
         Section("Inputs", True, _inputs()),
         Section("Probe", True, _probe()),
+        Section("Craniotomy", False, _craniotomy()),
         Section("Ultrasound", True, (*_of_preset("display"), *values(*_CONSOLE))),
         Section("Tissues", False, _tissues()),
         Section("Rays", False, _of_preset("settings")),
@@ -106,6 +107,29 @@ def _probe() -> tuple[Row, ...]:
             Control("sliceView", "choice", tip="Slice view in which the probe is placed and the image is shown"),
         ),
         value("scene.show_in_slice"),
+    )  # fmt: skip
+
+
+def _craniotomy() -> tuple[Row, ...]:
+    return (
+        value("scene.craniotomy_mm"),
+        node(
+            "opening", "Opening",
+            "What is opened instead of a disc under the probe: a closed curve or other markups, whose points are a "
+            "polygon over the skin, or a label map or segmentation",
+        ),
+        (
+            button(
+                "openCraniotomy", "Open skull",
+                "Replace skin, scalp and skull in the opening by the coupling medium, in new labels; the tissues need "
+                "them, as Segment makes them with Label what is outside the brain",
+                enabled="canOpenCraniotomy",
+            ),
+            button(
+                "closeCraniotomy", "Close skull", "Go back to the labels without the opening",
+                enabled="canCloseCraniotomy",
+            ),
+        ),
     )  # fmt: skip
 
 

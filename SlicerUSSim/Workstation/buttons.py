@@ -28,6 +28,8 @@ class Buttons:
         self._own_actions: dict[str, Callable[[], None]] = {
             "segmentButton": loading.segment,
             "addTissuesButton": loading.add_tissues,
+            "openCraniotomyButton": loading.open_craniotomy,
+            "closeCraniotomyButton": loading.close_craniotomy,
             "placeButton": loading.place_probe,
             "assignTissueButton": self._assign_tissue,
         }

@@ -13,10 +13,11 @@ from trame_slicer.core import SlicerApp
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
+from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm
 from SlicerUSSim.Logic.mri.label_agreement import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import node_to_world, read_volume
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, pose_in_labels, probe_pose, read_volume
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
@@ -129,6 +130,25 @@ class Loading:
         source, patient = self._opener.known_source(self._logic.parameters.labels), self._opener.patient()
         if self._changed(self._presenter.addTissues):
             self._laid(source, patient)
+
+    def open_craniotomy(self) -> None:
+        """Open skin and skull under the probe, or where the chosen node says."""
+        parameters: Any = self._logic.parameters
+        labels, patient = parameters.labels, self._opener.patient()
+        source = None if labels is None else self._opener.known_source(self._logic.closedLabels(labels))
+        if self._changed(self._presenter.openCraniotomy):
+            disc = None
+            if parameters.opening is None:
+                pose, _ = pose_in_labels(parameters.labels, probe_pose(parameters.probe_transform))
+                diameter = parameters.panel.craniotomy_mm or disc_diameter_mm(self._logic.preset.probe)
+                disc = diameter, pose
+            self._opener.opened(source, patient, parameters.labels, disc)
+            self._labels_ready()
+
+    def close_craniotomy(self) -> None:
+        """Go back to the labels without the opening."""
+        if self._changed(self._presenter.closeCraniotomy):
+            self._labels_ready()
 
     def place_probe(self) -> None:
         """Place the probe at a typical craniotomy."""

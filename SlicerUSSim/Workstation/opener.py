@@ -233,6 +233,14 @@ class Opener:
         if source is not None and additions is not None:
             self._sources[_voxels_of(labels_node)] = replace(source, additions=additions)
 
+    def opened(
+        self, source: LabelSource | None, patient: str, labels_node, disc: tuple[float, np.ndarray] | None
+    ) -> None:
+        """Record the source of labels that are those of `source` with a disc opened; None: with another opening."""
+        labels_node.SetAttribute(PATIENT, patient)
+        if source is not None and disc is not None:
+            self._sources[_voxels_of(labels_node)] = replace(source, disc=disc)
+
     def patient(self) -> str:
         """Name of the patient of the chosen labels, or of the MRI if there are none; "" without either."""
         labels, mri = self._logic.parameters.labels, self._logic.parameters.mri

@@ -56,6 +56,8 @@ class LabelSource:
     others: Mapping[str, str] = field(default_factory=dict)
     #: (tissue, file) of the masks added on top
     additions: tuple[tuple[str, str], ...] = ()
+    #: Of a craniotomy: diameter of the disc, mm, and the (4, 4) pose of the probe in the frame of the labels
+    disc: tuple[float, np.ndarray] | None = None
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -95,11 +97,12 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
             others = ", ".join(f"{name!r}: Volume.read({path!r})" for name, path in source.others.items())
             options.append(f"others={{{others}}}")
         lines += [f"segmentation = {function}({', '.join(['mri', *options])})", "labels = segmentation.labels"]
-    texture = "segmentation.texture()"
+    texture, names = "segmentation.texture()", "segmentation.tissue_names"
+    if source.is_labels:
+        names = repr(list(source.tissue_names))
     if source.additions:
         more += "from SlicerUSSim.Logic.mri import add_tissues, read_mask\n"
         masks = ", ".join(f"({name!r}, read_mask({path!r}), {path!r})" for name, path in source.additions)
-        names = repr(list(source.tissue_names)) if source.is_labels else "segmentation.tissue_names"
         own = [tissue.name for tissue in preset.tissues.all_tissues()]
         also = [name for name, _ in source.additions if name in own and name not in TISSUES]
         if any(name in SEVERAL for name, _ in source.additions):
@@ -107,11 +110,21 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         more_options = (f", also={also!r}" if also else "") + (
             "" if source.is_labels or is_ct else ", has_brain_mask=True"
         )
-        lines.append(f"labels = add_tissues(labels, {names}, [{masks}]{more_options}).labels")
+        lines += [f"added = add_tissues(labels, {names}, [{masks}]{more_options})", "labels = added.labels"]
+        names = "added.tissue_names"
+    if source.disc is not None:
+        more += "from SlicerUSSim.Logic.mri.craniotomy import disc_opening, opened\n"
+        diameter, pose = source.disc
+        lines += [
+            f"opening = disc_opening(labels, {names}, np.array({_array(pose)}), {diameter!r})",
+            f"labels, _ = opened(labels, {names}, opening)",
+        ]
+    is_changed = bool(source.additions) or source.disc is not None
+    if is_changed:
         texture = f"texture_below({texture}, mri, segmentation.labels, labels)"
     settings = preset.settings
     needs_texture = (settings.needs_texture or settings.partial_volume is not False) and not source.is_labels
-    if needs_texture and source.additions:
+    if needs_texture and is_changed:
         more += "from SlicerUSSim.Logic.mri.pathology import texture_below\n"
     return _TEMPLATE.format(
         missing="".join(
@@ -121,9 +134,13 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         more_imports=more,
         labels="\n".join(lines),
         preset=indent(pformat(_plain(preset), width=112, sort_dicts=False), "    ").strip(),
-        pose=np.array2string(probe_to_ras, separator=", ", floatmode="unique", max_line_width=118),
+        pose=_array(probe_to_ras),
         texture=f", texture={texture}" if needs_texture else "",
     )
+
+
+def _array(matrix: np.ndarray) -> str:
+    return np.array2string(matrix, separator=", ", floatmode="unique", max_line_width=118)
 
 
 def _plain(preset: Preset) -> dict:

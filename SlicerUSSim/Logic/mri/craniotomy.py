@@ -16,7 +16,9 @@ from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
-from SlicerUSSim.Logic.probe.placement import sample
+from SlicerUSSim.Logic.probe.arrays import Probe
+from SlicerUSSim.Logic.probe.placement import craniotomy_pose, sample
+from SlicerUSSim.Logic.probe.surface import PatientSurface
 
 #: What an opening removes
 REMOVED = tuple(name for name in OUTSIDE if name != "air")
@@ -74,12 +76,45 @@ def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
     """
     if Path(path).suffix.lower() == ".json":
         return polygon_opening(labels, names, _control_points(path))
-    mask = Volume.read(path)
+    return mask_opening(labels, Volume.read(path), path)
+
+
+def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
+    """(k, j, i) bool of a mask on any grid (not 0 is open), called `name` in errors.
+
+    Raises SimulationError for one that is empty or lies elsewhere.
+    """
     k, j, i = np.indices(labels.array.shape)
     ras = np.stack([i, j, k], axis=-1) @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
     opening = sample(mask.with_array((mask.array != 0).astype(np.uint8)), ras, order=0) > 0
-    require(bool(opening.any()), f"{path}: is empty, or lies outside of the patient, expected a mask of the opening")
+    require(bool(opening.any()), f"{name}: is empty, or lies outside of the patient, expected a mask of the opening")
     return opening
+
+
+def disc_diameter_mm(probe: Probe) -> float:
+    """Diameter of a disc through which a probe reaches the brain."""
+    return max(probe.face_mm, probe.elevation_aperture_mm) + ROOM_MM
+
+
+def default_pose(
+    labels: Volume, names: Sequence[str], probe: Probe, *, is_open: bool = False,
+    opening_ras: np.ndarray | None = None, target_ras: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """(4, 4) probe_to_ras where a probe stands by default on labels 1, 2, ... called `names`.
+
+    On a brain alone it is a view through a craniotomy (placement.craniotomy_pose), of `target_ras` if that is given; on
+    a whole head the same, upright on the skin. With `is_open` it is on the brain, at `opening_ras` (3,), the middle of
+    an opening, if that is given.
+    """
+    ground = without_outside(labels, names) if is_open else labels
+    pose = craniotomy_pose(ground, probe, target_ras=target_ras)
+    if opening_ras is not None:
+        surface = PatientSurface(ground)
+        return surface.slid(pose, surface.nearest(opening_ras))
+    if not is_open and "skin" in names:  # a face that is oblique to the skin would stand in the bone
+        surface = PatientSurface(labels)
+        return surface.slid(pose, surface.nearest(pose[:3, 3]))
+    return pose
 
 
 def opened(labels: Volume, names: Sequence[str], opening: np.ndarray) -> tuple[Volume, float]:

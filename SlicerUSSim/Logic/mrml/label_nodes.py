@@ -238,6 +238,10 @@ def write_labels(labels_node, labels: Volume, names: Iterable[str], like_node) -
         if like_node.IsA("vtkMRMLVolumeNode"):
             # After the transform, since the node converts the reference geometry to its own frame.
             labels_node.SetReferenceImageGeometryParameterFromVolumeNode(like_node)
+        elif like_node.IsA("vtkMRMLSegmentationNode"):
+            geometry = slicer.vtkSegmentationConverter.GetReferenceImageGeometryParameterName()
+            text = like_node.GetSegmentation().GetConversionParameter(geometry)
+            labels_node.GetSegmentation().SetConversionParameter(geometry, text)
         _write_segmentation(labels_node, labels, tuple(names))
     else:
         _write_label_map(labels_node, labels, tuple(names))

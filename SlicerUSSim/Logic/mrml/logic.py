@@ -24,11 +24,21 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.addable import require_addable
+from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_diameter_mm, disc_opening, opened
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mrml.craniotomy_nodes import (
+    closed_labels,
+    flap_centre,
+    hide_flap,
+    is_opened,
+    opening_of,
+    set_closed_labels,
+    show_flap,
+)
 from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot, tracked_images, write_compared
 from SlicerUSSim.Logic.mrml.label_nodes import (
     LABEL_CLASSES,
@@ -60,7 +70,7 @@ from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, shares_version, write_shares
-from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_in_slice
+from SlicerUSSim.Logic.probe.placement import pose_in_slice
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
@@ -296,6 +306,7 @@ class UltrasoundSceneLogic:
         added, told = self._with_lesions(
             labels, names, lesions, before, has_brain_mask=was is not None and was.is_of_brain
         )
+        stays = is_opened(output)
         texture = None
         if known is not None and labels is whole:
             # Without the MRI, deviations are 0 as in what was read from the node
@@ -308,7 +319,79 @@ class UltrasoundSceneLogic:
                 labels_version(output), added.labels, added.tissue_names, texture, was.mri, was.is_of_brain
             )
         self.notes, self.warnings = added.messages, (*skipped, *added.warnings)
+        if stays:
+            self.warnings += (f"the opening of {named(output)} can no longer be closed or moved; for that, add the "
+                              "lesions to the labels before it, and open those",)  # fmt: skip
         return added
+
+    def openCraniotomy(
+        self,
+        labels_node,
+        output_node,
+        *,
+        probe_transform_node=None,
+        opening_node=None,
+        diameter_mm: float | None = None,
+    ) -> float:
+        """Open skin, scalp and skull over the brain for the beam; returns how many ml were removed.
+
+        The opening is a disc under the probe of `diameter_mm` (default: as wide as its face needs), or what
+        `opening_node` says: the polygon of a markups node, such as a closed curve, or a label map or segmentation. The
+        labels (a label map or segmentation with skin and skull, as Segment makes with `outside`) with the opening,
+        filled with the coupling medium, are written into `output_node`; the labels stay as they are. Opened labels are
+        opened anew from those before (closedLabels). A model shows the piece that was removed.
+        Raises SimulationError, and changes nothing, if that removes nothing or there is no brain under it, and for an
+        output with labels that this module did not make, or edited since.
+        """
+        closed = self.closedLabels(labels_node)
+        require_node(output_node, *LABEL_CLASSES, use="output of Open skull")
+        require(closed is not output_node, f"labels and output are both {named(closed)}, expected different nodes")
+        require(
+            self.mayReplace(output_node),
+            f"{named(output_node)} was not made by this module, or edited since, and is not replaced; choose another "
+            "node",
+        )
+        was = self._segmented
+        if was is not None and was.version == labels_version(closed):
+            labels, names = was.labels, was.names
+        else:
+            labelled = read_labels(closed, self.preset.tissues)
+            was, labels, names = None, labelled.labels, labelled.names
+        known = read_shares(closed, labels, names) if was is None else was.texture
+        world_to_labels, scaling = pose_in_labels(closed, np.eye(4))
+        placed = Volume(labels.array, scaling @ labels.ijk_to_ras)
+        if opening_node is not None:
+            opening = self._work.do(lambda: opening_of(opening_node, placed, names, world_to_labels))
+            what = named(opening_node)
+        else:
+            pose, probe = world_to_labels @ probe_pose(probe_transform_node), self.preset.probe
+            diameter = disc_diameter_mm(probe) if diameter_mm is None else diameter_mm
+            opening = self._work.do(lambda: disc_opening(placed, names, pose, diameter))
+            what = f"a disc of {diameter:.0f} mm under the probe"
+        result, millilitres = self._work.do(lambda: opened(placed, names, opening))
+        found = labels.with_array(result.array)
+        texture = None
+        if known is not None:
+            mri = labels.with_array(np.zeros(labels.array.shape, np.float32)) if was is None else was.mri
+            texture = self._work.do(lambda: texture_below(known, mri, labels, found))
+        self._write_tissues(output_node, Added(found, tuple(names)), closed, texture)
+        set_closed_labels(output_node, closed)
+        show_flap(output_node, labels.with_array(found.array != labels.array))
+        self.notes = (
+            f"craniotomy: {what}; {millilitres:.1f} ml of skin, scalp and skull are replaced by the coupling medium in "
+            f"{named(output_node)}, and {named(closed)} stays as it is",
+        )
+        self.warnings = ()
+        return millilitres
+
+    def closedLabels(self, labels_node):
+        """The labels from which openCraniotomy made these; other labels are returned themselves."""
+        require_node(labels_node, *LABEL_CLASSES, use="label map")
+        return closed_labels(labels_node)
+
+    def hideOpening(self, labels_node) -> None:
+        """Hide the model of the piece that openCraniotomy removed."""
+        hide_flap(labels_node)
 
     def simulate(
         self, labels_node, probe_transform_node, output_node, *, warned: Callable[[Warning], None] = warn_again
@@ -403,13 +486,16 @@ class UltrasoundSceneLogic:
 
         With a slice node the image is in that slice, with its depth towards the bottom of the view, aimed at
         `target_ras` (default: the middle of the view). Without one it is a coronal view through a parasagittal
-        craniotomy.
+        craniotomy: on a brain, upright on the skin of a whole head, or on the brain in the middle of an opening.
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
         patient = self._patient(labels_node)
         surface = Volume(patient.labels.array, np.linalg.inv(patient.world_to_patient) @ patient.labels.ijk_to_ras)
         if slice_node is None:
-            pose = craniotomy_pose(surface, self.preset.probe)
+            pose = default_pose(
+                surface, patient.names, self.preset.probe, is_open=is_opened(labels_node),
+                opening_ras=flap_centre(labels_node),
+            )  # fmt: skip
         else:
             require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
             pose = pose_in_slice(surface, matrix_array(slice_node.GetSliceToRAS()), target_ras)
@@ -660,6 +746,8 @@ class UltrasoundSceneLogic:
         """Write labels and what is known of their shares."""
         write_labels(labels_node, added.labels, added.tissue_names, like_node)
         mark_as_made(labels_node)
+        set_closed_labels(labels_node, None)
+        hide_flap(labels_node)
         if texture is not None:
             write_shares(labels_node, added.labels, added.tissue_names, texture)
             if self._live is not None:  # which may have seen the labels without them

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
-from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter, parameters_of
+from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, parameter, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.mri.settings import MRI_CONTRASTS, SegmentationSettings
@@ -31,6 +31,10 @@ class PanelSettings(Declared):
     second_contrast: str = parameter(
         "none", "Its contrast", "Contrast of the second MRI, which is classified together with the first",
         choices=("none", *MRI_CONTRASTS), shown=True,
+    )  # fmt: skip
+    craniotomy_mm: float | None = parameter(
+        None, "Diameter", "Diameter of the disc under the probe that is opened; none: as wide as its face needs",
+        unit="mm", bounds=(5.0, 150.0), shown=Shown(4.0, 150.0, 1.0, none_at=4.0), can_be_none=True,
     )  # fmt: skip
     preset: str = parameter("", "Preset", "The JSON text of a Preset; empty: the default")
 
@@ -125,6 +129,8 @@ class SceneParameters:
     labels = NodeParameter("vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     #: Its segments are laid over the labels
     lesions = NodeParameter("vtkMRMLSegmentationNode")
+    #: Of a craniotomy; none: a disc under the probe
+    opening = NodeParameter("vtkMRMLMarkupsNode", "vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     probe_transform = NodeParameter("vtkMRMLLinearTransformNode")
     output = NodeParameter("vtkMRMLScalarVolumeNode")
     outline = NodeParameter("vtkMRMLModelNode")

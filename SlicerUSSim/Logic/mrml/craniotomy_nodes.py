@@ -1,0 +1,121 @@
+"""Craniotomies in a scene: openings given by nodes, and the piece that was removed as a model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D, vtkWindowedSincPolyDataFilter
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.craniotomy import mask_opening, polygon_opening
+from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, node_labels
+from SlicerUSSim.Logic.mrml.nodes import display_of, named, node_to_world, require_node
+from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_result
+
+#: Nodes that describe an opening
+OPENING_CLASSES = ("vtkMRMLMarkupsNode", *LABEL_CLASSES)
+#: References of opened labels: to the labels before, and to the model of the removed piece
+_CLOSED, _FLAP = "SlicerUSSim.closed", "SlicerUSSim.flap"
+_FLAP_COLOR = (0.95, 0.75, 0.35)
+
+
+def closed_labels(labels_node: Any) -> Any:
+    """The node from which opened labels were made; the node itself for others, and if that node is gone."""
+    return labels_node.GetNodeReference(_CLOSED) or labels_node
+
+
+def is_opened(labels_node: Any) -> bool:
+    """Whether labels were made by opening others, which are still there."""
+    return labels_node.GetNodeReference(_CLOSED) is not None
+
+
+def set_closed_labels(labels_node: Any, closed_node: Any | None) -> None:
+    """Record that labels are those of another node with an opening, or that they no longer are."""
+    labels_node.SetNodeReferenceID(_CLOSED, None if closed_node is None else closed_node.GetID())
+
+
+def opening_of(opening_node: Any, labels: Volume, names: tuple[str, ...], world_to_labels: np.ndarray) -> np.ndarray:
+    """(k, j, i) bool of a markups node (the polygon of its points), a label map or a segmentation.
+
+    `world_to_labels` (4, 4) leads to the frame of `labels`. Raises SimulationError for another or an empty node.
+    """
+    require_node(opening_node, *OPENING_CLASSES, use="opening")
+    if opening_node.IsA("vtkMRMLMarkupsNode"):
+        return polygon_opening(
+            labels, names, _points(opening_node) @ world_to_labels[:3, :3].T + world_to_labels[:3, 3]
+        )
+    mask, _ = node_labels(opening_node)
+    placed = Volume(mask.array, world_to_labels @ node_to_world(opening_node) @ mask.ijk_to_ras)
+    return mask_opening(labels, placed, named(opening_node))
+
+
+def _points(markups_node: Any) -> np.ndarray:
+    """(points, 3) world RAS mm of the control points that are placed."""
+    points = []
+    for number in range(markups_node.GetNumberOfControlPoints()):
+        if markups_node.GetNthControlPointPositionStatus(number) == markups_node.PositionDefined:
+            position = [0.0, 0.0, 0.0]
+            markups_node.GetNthControlPointPositionWorld(number, position)
+            points.append(position)
+    require(len(points) >= 3, f"opening {named(markups_node)} has {len(points)} points, expected three or more")
+    return np.array(points)
+
+
+def show_flap(labels_node: Any, removed: Volume) -> Any:
+    """The model node with the surface of what an opening removed, (k, j, i) bool, which opened labels refer to."""
+    scene = labels_node.GetScene()
+    model = labels_node.GetNodeReference(_FLAP)
+    if model is None or not may_replace_result(model):
+        model = scene.AddNewNodeByClass(
+            "vtkMRMLModelNode", scene.GenerateUniqueName(f"{labels_node.GetName()} removed")
+        )
+        labels_node.SetNodeReferenceID(_FLAP, model.GetID())
+    model.SetAndObservePolyData(_surface(removed))
+    parent = labels_node.GetParentTransformNode()
+    model.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
+    mark_as_result(model)
+    display = display_of(model)
+    if display is not None:
+        display.SetColor(*_FLAP_COLOR)
+        display.SetOpacity(0.5)
+        display.SetVisibility(True)
+        display.SetVisibility2D(True)
+    return model
+
+
+def hide_flap(labels_node: Any) -> None:
+    """Hide the model of the removed piece, if there is one."""
+    model = labels_node.GetNodeReference(_FLAP)
+    display = None if model is None else model.GetDisplayNode()
+    if display is not None:
+        display.SetVisibility(False)
+
+
+def flap_centre(labels_node: Any) -> np.ndarray | None:
+    """(3,) world RAS mm, the middle of the piece that was removed; None without one."""
+    model = labels_node.GetNodeReference(_FLAP)
+    surface = None if model is None or not is_opened(labels_node) else model.GetPolyData()
+    if surface is None or surface.GetNumberOfPoints() == 0:
+        return None
+    return (node_to_world(model) @ [*surface.GetCenter(), 1.0])[:3]
+
+
+def _surface(removed: Volume) -> Any:
+    """The surface of a mask as vtkPolyData, in the frame of the mask's matrix."""
+    places = np.argwhere(removed.array)
+    low, high = places.min(axis=0), places.max(axis=0) + 1
+    box = tuple(slice(start, stop) for start, stop in zip(low, high, strict=True))
+    padded = np.pad(removed.array[box].astype(np.uint8), 1)
+    matrix = removed.ijk_to_ras.copy()
+    matrix[:3, 3] = (removed.ijk_to_ras @ [*(low[::-1] - 1), 1.0])[:3]
+    edges = vtkFlyingEdges3D()
+    edges.SetInputData(Volume(padded, matrix).to_vtk())
+    edges.SetValue(0, 0.5)
+    smooth = vtkWindowedSincPolyDataFilter()
+    smooth.SetInputConnection(edges.GetOutputPort())
+    smooth.SetNumberOfIterations(12)
+    smooth.SetPassBand(0.05)
+    smooth.Update()
+    return smooth.GetOutput()

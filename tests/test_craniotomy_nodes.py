@@ -1,0 +1,172 @@
+"""Craniotomies in a scene, as the module and the page open and close them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
+
+from vtkmodules.vtkCommonCore import vtkPoints  # noqa: E402
+
+from SlicerUSSim.Logic import SimulationError, Volume  # noqa: E402
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.mri.craniotomy import disc_opening, opened  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, nodes_of_class, set_node_to_world, write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.own_labels import mark_as_made  # noqa: E402
+from SlicerUSSim.Logic.probe.placement import pose_looking_at  # noqa: E402
+from SlicerUSSim.Widget.presenter import PanelPresenter  # noqa: E402
+from tests.test_craniotomy import NAMES, TOP, head  # noqa: E402, F401
+from tests.test_presenter import PlainView  # noqa: E402
+
+KINDS = ["LabelMapVolume", "Segmentation"]
+TURN = np.array([[0.8, -0.6, 0.0, 12.0], [0.6, 0.8, 0.0, -7.0], [0.0, 0.0, 1.0, 25.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+class Bench:
+    """The round head in a scene, with a probe on its vertex, under a transform that turns and moves both."""
+
+    def __init__(self, labels: Volume, kind: str = KINDS[0], to_world: np.ndarray = TURN) -> None:
+        self.scene = slicer.vtkMRMLScene()
+        self.presenter = PanelPresenter(UltrasoundSceneLogic(self.scene), PlainView(), label_maps=kind == KINDS[0])
+        self.logic, self.view = self.presenter.logic, self.presenter.view
+        self.logic.preset = self.logic.preset.changed("probe", scan_lines=48)
+        parent = self.add("LinearTransform", "to world")
+        parent.SetMatrixTransformToParent(vtk_matrix(to_world))
+        grid = self.add("ScalarVolume", "grid")
+        write_volume(grid, labels)
+        grid.SetAndObserveTransformNodeID(parent.GetID())
+        self.whole, self.probe, self.to_world = (
+            self.add(kind, "tissues"),
+            self.add("LinearTransform", "Probe"),
+            to_world,
+        )
+        write_labels(self.whole, labels, NAMES, grid)
+        mark_as_made(self.whole)
+        self.logic.parameters.labels, self.logic.parameters.probe_transform = self.whole, self.probe
+        self.move(TOP)
+
+    def add(self, kind: str, name: str):
+        return self.scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
+
+    def move(self, pose: np.ndarray) -> None:
+        set_node_to_world(self.probe, self.to_world @ pose)
+
+    @property
+    def labels(self):
+        return self.logic.parameters.labels
+
+    def tissues(self, node) -> np.ndarray:
+        """(k, j, i) of the brain (1) and of what is around it (2) in a box that both kinds of nodes have."""
+        found = read_labels(node, self.logic.preset.tissues)
+        around = [number for number, name in enumerate(found.names, 1) if name not in ("csf", "grey matter")]
+        return np.where(np.isin(found.labels.array, around), 2, np.minimum(found.labels.array, 1))
+
+
+def expected(labels: Volume, pose: np.ndarray, diameter_mm: float) -> float:
+    return opened(labels, NAMES, disc_opening(labels, NAMES, pose, diameter_mm))[1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_disc_under_the_probe_is_opened_in_labels_of_their_own_and_closed_again(kind, head):  # noqa: F811
+    bench = Bench(head, kind)
+    before = bench.tissues(bench.whole)
+    assert bench.presenter.canOpenCraniotomy()[0] and not bench.presenter.canCloseCraniotomy()[0]
+    bench.presenter.setValue("scene.craniotomy_mm", 30.0)
+    bench.presenter.openCraniotomy()
+    assert not bench.view.errors and bench.labels is not bench.whole
+    np.testing.assert_array_equal(bench.tissues(bench.whole), before)
+    after = bench.tissues(bench.labels)
+    gone = (after != before) & (before == 2)
+    assert not after[after != before].any() and (after == 1).sum() == (before == 1).sum()
+    assert gone.sum() * head.voxel_ml == pytest.approx(expected(head, TOP, 30.0), rel=1e-6)
+    assert "craniotomy: a disc of 30 mm under the probe; " in bench.presenter.notes()
+    bench.presenter.closeCraniotomy()
+    assert bench.labels is bench.whole and "craniotomy: " not in bench.presenter.notes()
+    assert not bench.presenter.canCloseCraniotomy()[0] and not bench.view.errors
+
+
+def test_the_model_shows_what_was_removed_where_it_was(head):  # noqa: F811
+    bench = Bench(head)
+    bench.logic.openCraniotomy(bench.whole, output := bench.add("LabelMapVolume", "open"),
+                               probe_transform_node=bench.probe, diameter_mm=30.0)  # fmt: skip
+    (model,) = nodes_of_class(bench.scene, "vtkMRMLModelNode")
+    assert model.GetDisplayNode().GetVisibility()
+    bounds = np.array(model.GetPolyData().GetBounds()).reshape(3, 2)
+    np.testing.assert_allclose(bounds[:2], [[-15, 15], [-15, 15]], atol=1.6)
+    assert 55.0 < bounds[2, 0] < 62.5 and bounds[2, 1] == pytest.approx(78.0, abs=1.6)
+    np.testing.assert_allclose(node_to_world(model), TURN)
+    bench.logic.hideOpening(output)
+    assert not model.GetDisplayNode().GetVisibility()
+
+
+def test_an_opening_follows_the_probe(head):  # noqa: F811
+    bench = Bench(head)
+    bench.presenter.openCraniotomy()
+    first, node = bench.tissues(bench.labels), bench.labels
+    bench.move(pose_looking_at((0.0, 80.0, 0.0), (0.0, 0.0, 0.0)))
+    bench.presenter.openCraniotomy()
+    assert bench.labels is node and len(nodes_of_class(bench.scene, "vtkMRMLModelNode")) == 1
+    second = bench.tissues(bench.labels)
+    before = bench.tissues(bench.whole)
+    assert (second[first != before] == 2).mean() > 0.9  # closed again there
+    assert bench.presenter.notes().count("craniotomy: ") == 1
+
+
+def test_the_beam_reaches_the_brain_through_it_alone(head):  # noqa: F811
+    bench = Bench(head)
+    image = bench.add("ScalarVolume", "image")
+    bench.logic.placeProbe(bench.whole, bench.probe)
+    shut = bench.logic.simulate(bench.whole, bench.probe, image).image
+    bench.presenter.openCraniotomy()
+    bench.logic.placeProbe(bench.labels, bench.probe)
+    place = (np.linalg.inv(TURN) @ node_to_world(bench.probe))[:3, 3]
+    assert np.linalg.norm(place) == pytest.approx(60.0, abs=3.0)  # on the brain
+    through = bench.logic.simulate(bench.labels, bench.probe, image).image
+    deep = slice(shut.shape[0] // 2, None)
+    assert through[deep].mean() > 2.0 * shut[deep].mean() + 5.0
+
+
+def test_markups_and_masks_are_opened(head):  # noqa: F811
+    bench = Bench(head)
+    curve = bench.add("MarkupsClosedCurve", "curve")
+    points = vtkPoints()
+    for x, y in ((-20, -10), (20, -10), (20, 10), (-20, 10)):
+        points.InsertNextPoint((TURN @ [x, y, 78.0, 1.0])[:3])
+    bench.logic.parameters.opening = curve
+    bench.presenter.openCraniotomy()
+    assert "'curve' has 0 points, expected three or more" in bench.view.errors[-1] and bench.labels is bench.whole
+    curve.SetControlPointPositionsWorld(points)
+    bench.presenter.openCraniotomy()
+    before = bench.tissues(bench.whole)
+    gone = np.argwhere(bench.tissues(bench.labels) != before)
+    along = gone @ np.diag([1.5] * 3) - 84.0
+    assert np.abs(along[:, 2]).max() == pytest.approx(19.5, abs=1.5) and np.abs(along[:, 1]).max() <= 10.0
+    mask = bench.add("LabelMapVolume", "mask")
+    above = head.with_array(((head.array > 2) & (np.arange(head.array.shape[0])[:, None, None] > 100)).astype(np.uint8))
+    write_labels(mask, above, ("opening",), bench.whole)
+    bench.logic.parameters.opening = mask
+    bench.presenter.openCraniotomy()
+    gone = (bench.tissues(bench.labels) != before) & (before == 2)
+    assert len(bench.view.errors) == 1
+    np.testing.assert_array_equal(gone, above.array > 0)
+
+
+def test_what_cannot_be_opened_changes_nothing(head):  # noqa: F811
+    bench = Bench(head)
+    bench.move(pose_looking_at((300.0, 0.0, 0.0), (300.0, 100.0, 0.0)))
+    names = [node.GetName() for node in nodes_of_class(bench.scene, "vtkMRMLVolumeNode")]
+    bench.presenter.openCraniotomy()
+    assert "there is no brain under the craniotomy" in bench.view.errors[-1] and bench.labels is bench.whole
+    assert [node.GetName() for node in nodes_of_class(bench.scene, "vtkMRMLVolumeNode")] == names
+    brain = Bench(head.with_array(np.where(head.array == 2, 2, 0).astype(np.uint8)))
+    brain.presenter.openCraniotomy()
+    assert "the craniotomy removes nothing, expected skin, scalp" in brain.view.errors[-1]
+    mine = bench.add("LabelMapVolume", "mine")
+    write_labels(mine, head, NAMES, bench.whole)
+    with pytest.raises(SimulationError, match="was not made by this module, or edited since, and is not replaced"):
+        bench.logic.openCraniotomy(bench.whole, mine, probe_transform_node=bench.probe)
+    bench.presenter.closeCraniotomy()
+    assert "has no opening, or the labels before it are gone" in bench.view.errors[-1]
