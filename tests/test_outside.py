@@ -55,6 +55,21 @@ def test_layers_of_a_round_head_are_found_where_they_are():
     assert not found.labels[(radius > 85.0) | brain].any()
 
 
+def test_a_skull_is_smooth_where_its_outer_table_is_not_to_be_seen():
+    """Its surface had steps of 6 mm there, from which a beam went aside: there was no echo of the bone."""
+    mri, brain, radius = round_head()
+    k, j, i = np.indices(mri.array.shape)
+    places = [(index - (n - 1) / 2.0) * mm for index, n, mm in zip((k, j, i), mri.array.shape, SPACING_MM[::-1])]  # noqa: B905
+    patch = (places[0] > 0) & (np.hypot(places[1], places[2]) < 12.0)
+    array = np.where(patch & (radius > 67.5) & (radius <= 70.0), 100.0, mri.array).astype(np.float32)
+    found = find_outside(mri.with_array(array), brain)
+    skull = np.isin(found.labels, (3, 4))
+    around = (places[0] > 0) & (np.hypot(places[1], places[2]) < 20.0) & ~patch
+    outer = [float(np.percentile(radius[skull & where], 97.0)) for where in (patch, around)]
+    assert outer[1] == pytest.approx(70.0, abs=1.2) and outer[0] == pytest.approx(outer[1], abs=1.5)
+    assert not (found.labels == 5)[patch].any()
+
+
 def test_the_tissues_of_the_brain_go_first():
     mri, brain, _ = round_head()
     labels = mri.with_array(np.where(brain, 2, 0).astype(np.uint8))

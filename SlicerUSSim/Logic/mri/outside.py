@@ -18,6 +18,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.coarse import largest_component
 from SlicerUSSim.Logic.mri.distances import distance_to
+from SlicerUSSim.Logic.mri.skull_surface import thickness_of_skull
 
 #: Contrasts in which bone is known to be found
 CONTRASTS = ("t1", "t1gd")
@@ -35,10 +36,13 @@ _BESIDE_MM = (2.0, 30.0)
 _SKIN_MM, _MARROW_MM, _LEAST_SKULL_MM, _LARGEST_SKULL_MM = 2.0, 3.5, 2.5, 14.0
 #: A skull is smooth at this scale
 _SMOOTH_MM = 6.0
+#: Near the faces of an image no air is labelled
+_FACES_MM = 8.0
 #: Tables of the skull over its marrow
 _TABLE_MM = 1.2
-#: Air in the head, other than cracks between tissues
-_CAVITY_MM = 1.5
+#: Air in the head, other than cracks between tissues; it is darker than this part of what is dark, as bone between fat
+#: and marrow is not
+_CAVITY_MM, _VOID = 1.5, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,13 +112,15 @@ def find_outside(mri: Volume, brain: np.ndarray) -> Outside:
     dark = _DARK * _otsu(beside)
     below_skin = _depth(head, mm)
     is_dark = head & (image < dark) & ~inner
-    skull = inner | (is_dark & (from_brain < _LARGEST_SKULL_MM) & (below_skin > _SKIN_MM))
-    skull = _closed(skull, _MARROW_MM, mm) & (below_skin > _SKIN_MM) & (from_brain < _LARGEST_SKULL_MM)
+    may_be = (below_skin > _SKIN_MM) & (from_brain < _LARGEST_SKULL_MM)
+    skull = may_be & (from_brain <= thickness_of_skull(image, inner, below_skin, dark, mm))
+    skull = _closed(inner | skull | _opened(is_dark & may_be, _CAVITY_MM, mm), _MARROW_MM, mm) & may_be
     skull = largest_component(_opened(skull | inner, _SMOOTH_MM, mm) | inner)
     skull |= head & (from_brain < _LEAST_SKULL_MM)
     below_table = _depth(skull, mm)
     labels = np.where(below_skin > _SKIN_MM, 2, 1).astype(np.uint8)
-    labels[_opened(is_dark & ~skull & (below_skin > _SKIN_MM), _CAVITY_MM, mm)] = 5
+    is_void = is_dark & (image < _VOID * dark) & ~skull & (below_skin > _SKIN_MM)
+    labels[_opened(is_void & ~_at_faces(margin, mri), _CAVITY_MM, mm)] = 5
     labels[skull] = 3
     labels[skull & (image > dark) & (below_table > _TABLE_MM) & (from_brain > _TABLE_MM)] = 4
     # Between brain and skull there are fluid and the dura: the coupling medium, as in a label map without this
@@ -122,6 +128,15 @@ def find_outside(mri: Volume, brain: np.ndarray) -> Outside:
     whole = np.zeros(mri.array.shape, np.uint8)
     whole[box] = labels
     return Outside(whole, float(dark))
+
+
+def _at_faces(box: list[slice], mri: Volume) -> np.ndarray:
+    """(k, j, i) bool of the box: near the faces of the image, where coils hear little and fat is as dark as air."""
+    inside = np.ones(mri.array.shape, bool)
+    for axis, step in enumerate(mri.spacing_mm[::-1]):
+        n = min(int(np.ceil(_FACES_MM / step)), mri.array.shape[axis] // 2)
+        np.moveaxis(inside, axis, 0)[[*range(n), *range(-n, 0)]] = False
+    return ~inside[tuple(box)]
 
 
 def _head(image: np.ndarray, mm: np.ndarray) -> np.ndarray:
