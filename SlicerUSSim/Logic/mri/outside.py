@@ -113,8 +113,11 @@ def find_outside(mri: Volume, brain: np.ndarray) -> Outside:
     below_skin = _depth(head, mm)
     is_dark = head & (image < dark) & ~inner
     may_be = (below_skin > _SKIN_MM) & (from_brain < _LARGEST_SKULL_MM)
-    skull = may_be & (from_brain <= thickness_of_skull(image, inner, below_skin, dark, mm))
-    skull = _closed(inner | skull | _opened(is_dark & may_be, _CAVITY_MM, mm), _MARROW_MM, mm) & may_be
+    thickness = thickness_of_skull(image, inner, below_skin, dark, mm, mri.ijk_to_ras)
+    vault = may_be & (from_brain <= thickness)
+    base = may_be & np.isnan(thickness) & (is_dark | inner)
+    thick = _opened(is_dark & may_be, _CAVITY_MM, mm)  # also where it is thicker than usual
+    skull = _closed(inner | vault | base | thick, _MARROW_MM, mm) & may_be
     skull = largest_component(_opened(skull | inner, _SMOOTH_MM, mm) | inner)
     skull |= head & (from_brain < _LEAST_SKULL_MM)
     below_table = _depth(skull, mm)

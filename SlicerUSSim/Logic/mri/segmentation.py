@@ -42,8 +42,8 @@ _log = logging.getLogger(__name__)
 
 #: Least volume of a mask in which several images are compared
 _LEAST_TO_REGISTER_ML = 100.0
-#: Share of the time in which the brain is looked for in a whole head
-_SHARE_OF_BRAIN = 0.6
+#: Share of the time in which the brain is looked for in a whole head, and until what is outside of it is looked for
+_SHARE_OF_BRAIN, _SHARE_OF_TISSUES = 0.6, 0.75
 #: Size of voxels in which thin sulci, which are narrower, cannot be told, and beyond which tissues mix across them
 _THICK_SLICE_MM = 3.5
 #: Means from which on the table has two decimals, and three digits below
@@ -196,7 +196,8 @@ def segment_mri(
     require_kind("mri", mri, Volume, "Volume.read reads a file")
     told = progress or (lambda share: None)
     begin = _SHARE_OF_BRAIN if mask is None else 0.0
-    report = lambda share: told(begin + (1.0 - begin) * share)  # noqa: E731
+    end = _SHARE_OF_TISSUES if outside else 1.0
+    report = lambda share: told(begin + (end - begin) * share)  # noqa: E731
     others = dict(others or {})
     require(
         contrast not in others,
@@ -324,7 +325,7 @@ def segment_mri(
     for line in warnings:
         _log.warning("%s", line)
     _log.debug("segmentation: %s", timed)
-    report(1.0)
+    told(1.0)
     return Segmentation(
         labels=whole,
         tissue_names=tissue_names,

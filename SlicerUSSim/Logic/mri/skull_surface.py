@@ -20,17 +20,23 @@ _PLACES_MM, _STEP_MM = 4.0, 0.5
 LEAST_MM, LARGEST_MM = 2.5, 14.0
 #: Usual distance from the brain's surface to that of the skull with what is between, and its deviation over heads and
 #: places (skulls of adults: 3 mm at the temples to 9 mm at the back; Lillie et al., Journal of Anatomy 228, 2016)
-_USUAL_MM, _DEVIATION_MM = 7.0, 3.0
+_USUAL_MM, _DEVIATION_MM = 5.5, 3.0
 #: A border is looked for across this
 _ACROSS_MM = 1.5
+#: What it costs that there is bone farther out, but below the skin
+_NOT_OUTERMOST, _SKIN_MM = 1.0, 2.0
+#: The brain's surface looks down below this (the upward part of its normal)
+_BASE = -0.3
 #: Weight of the usual thickness; reach in mm and weight per mm^2 of the neighbours, from the first rounds to the last
-_PRIOR, _NEIGHBOURS, _ROUNDS = 0.15, ((12.0, 0.05), (8.0, 0.05), (5.0, 0.06)), 20
+_PRIOR, _NEIGHBOURS, _ROUNDS = 0.15, ((15.0, 0.1), (10.0, 0.08), (5.0, 0.06)), 20
 
 
 def thickness_of_skull(
-    image: np.ndarray, inner: np.ndarray, below_skin: np.ndarray, dark: float, mm: np.ndarray
+    image: np.ndarray, inner: np.ndarray, below_skin: np.ndarray, dark: float, mm: np.ndarray, ijk_to_ras: np.ndarray
 ) -> np.ndarray:
     """(k, j, i) float32 mm from the brain to the outer surface of the skull over the nearest place of the brain.
+
+    NaN below the brain, where the base of the skull is neither smooth nor of even thickness.
 
     Parameters
     ----------
@@ -39,6 +45,7 @@ def thickness_of_skull(
     below_skin : (k, j, i) mm below the surface of the head, 0 outside.
     dark : intensity below which it is bone or air.
     mm : (3,) voxel size along i, j, k.
+    ijk_to_ras : (4, 4), from which is known where is up.
     """
     step = mm[::-1]
     points, outward = _places(inner, mm)
@@ -53,10 +60,14 @@ def thickness_of_skull(
     n = round(_ACROSS_MM / _STEP_MM)
     tried = depth[n:-n]
     # From dark to bright, both relative to the threshold; where it is not dark inside there is no bone
-    before, after = value[:, : -2 * n], value[:, 2 * n :]
+    before, at, after = value[:, : -2 * n], value[:, n:-n], value[:, 2 * n :]
     rise = np.clip(after, 0.0, 1.5) - np.clip(before, 0.0, 1.5)
-    border = np.clip(rise, 0.0, 1.0) * np.clip(1.6 - before, 0.0, 1.0)
+    border = np.clip(rise, 0.0, 1.0) * np.clip(1.6 - before, 0.0, 1.0) * np.clip(1.2 - np.abs(at - 1.0), 0.0, 1.0)
     cost = -border + _PRIOR * ((tried - _USUAL_MM) / _DEVIATION_MM) ** 2
+    # Bone farther out, the outer table, makes it a border of the marrow
+    table = np.where(skin > _SKIN_MM, value, np.inf)[:, 2 * n :]
+    beyond = np.minimum.accumulate(table[:, ::-1], axis=1)[:, ::-1]
+    cost += _NOT_OUTERMOST * np.clip((1.0 - beyond) / 0.4, 0.0, 1.0)
     cost[(tried < LEAST_MM) | (skin[:, n:-n] < 1.0)] = 10.0
     found = tried[cost.argmin(axis=1)]
     for reach_mm, weight in _NEIGHBOURS:
@@ -65,11 +76,13 @@ def thickness_of_skull(
             around = neighbours @ found
             found = tried[(cost + weight * (tried - around[:, None]) ** 2).argmin(axis=1)]
     found = _neighbours(points, _PLACES_MM) @ found
-    return _over(points, found, inner.shape, step)
+    up = outward @ (ijk_to_ras[2, :3] / mm)[::-1]
+    is_vault = _over(points, (up > _BASE).astype(float), inner.shape, step) > 0.5
+    return np.where(is_vault, _over(points, found, inner.shape, step), np.float32(np.nan))
 
 
 def _places(inner: np.ndarray, mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(places, 3) k, j, i mm on the surface of the brain, evenly spread, and the directions outward from there."""
+    """(places, 3) k, j, i mm of voxels on the surface of the brain, evenly spread, and the directions outward."""
     step = mm[::-1]
     signed = distance_to(inner, mm) - distance_to(~inner, mm)
     smooth = ndimage.gaussian_filter(signed.astype(np.float32), 3.0 / step)
@@ -81,8 +94,7 @@ def _places(inner: np.ndarray, mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     length = np.linalg.norm(gradient, axis=1)
     keep = np.asarray(length > 0.1)
     outward = gradient[keep] / length[keep, None]
-    places = voxels[keep] * step
-    return places - outward * signed[tuple(voxels[keep].T)][:, None], outward
+    return voxels[keep] * step, outward
 
 
 def _neighbours(points: np.ndarray, reach_mm: float) -> csr_array:
