@@ -86,7 +86,7 @@ def _places(inner: np.ndarray, mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     step = mm[::-1]
     signed = distance_to(inner, mm) - distance_to(~inner, mm)
     smooth = ndimage.gaussian_filter(signed.astype(np.float32), 3.0 / step)
-    surface = np.argwhere(inner & ~ndimage.binary_erosion(inner))
+    surface = np.argwhere(inner & np.logical_not(ndimage.binary_erosion(inner)))
     # One of the voxels in each cell of a coarse grid
     _, first = np.unique((surface * step // _PLACES_MM).astype(int), axis=0, return_index=True)
     voxels = surface[first]
