@@ -438,7 +438,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       const float front_decay = decay_in(acquisition, front);
       const float depth_per_mm =
           acquisition->reference_speed_m_s / (is_under ? front.speed_of_sound_m_s : here.speed_of_sound_m_s);
-      const float to_depth = (acquisition->depth_mm - ray.depth) / depth_per_mm;
+      const float to_depth = (acquisition->traced_mm - ray.depth) / depth_per_mm;
       const float to_piece = ray.piece < 0 ? 2.0f * to_depth : (ray.piece + 1) * acquisition->screen_step - ray.path;
       const float2 span =
           volume_span(acquisition, &course, 3.0f + fabs(quantile) * 4.0f / acquisition->voxel_mm, to_depth);
@@ -560,7 +560,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       const int is_bent = !is_under && is_strong && !(is_beam && !bends(front_speed, behind_speed));
       const float path = ray.path + border;
       float depth = ray.depth + border * depth_per_mm, log_attenuation = ray.log_attenuation - spent;
-      const int leaves = depth >= acquisition->depth_mm;
+      const int leaves = depth >= acquisition->traced_mm;
       if (!is_strong_border)
         gives_back(&ray, decay_in(acquisition, here), decay_in(acquisition, behind), border - since, path);
       ray.soft += ray.strong == THROUGH ? border * front_decay : spent;

@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
-from SlicerUSSim.Logic.imaging.bmode import downshift
+from SlicerUSSim.Logic.imaging.bmode import downshift, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.diffraction import speckle_height_mm
@@ -392,7 +392,11 @@ class UltrasoundSimulator:
         acquisition["fractional_bandwidth"] = probe.received_bandwidth
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
         acquisition["sample_mm"] = self._sample_mm(probe)
-        acquisition["samples"] = -(-self._sample_count(probe) // block) * block
+        # The last samples of the image have echoes from half a pulse behind it. Borders are found by labels, up to a
+        # voxel behind where they are.
+        behind = pulse_taps(axial_sigma / self._sample_mm(probe)).size // 2
+        acquisition["samples"] = -(-(self._sample_count(probe) + behind) // block) * block
+        acquisition["traced_mm"] = probe.displayed_mm + behind * self._sample_mm(probe) + medium.labels.spacing_mm.min()
         acquisition["wavefront_curvature"] = CURVED if settings.wavefront_curvature else 0.0
         for name, value in transmit_fields(probe).items():
             acquisition[name] = value

@@ -86,7 +86,8 @@ ACQUISITION = np.dtype(
         ("first_line", _FLOAT),
         ("line_spacing", _FLOAT),
         ("scan_lines", _INT),
-        ("depth_mm", _FLOAT),  # displayed, up to which lines are computed
+        ("depth_mm", _FLOAT),  # displayed, of the image
+        ("traced_mm", _FLOAT),  # displayed, up to which rays are traced: half a pulse and a voxel beyond the image
         # steering of a linear array (line_start in common.clh)
         ("steered", _INT),
         ("flat_face", _INT),
@@ -102,7 +103,7 @@ ACQUISITION = np.dtype(
         ("reference_speed_m_s", _FLOAT),
         ("cycles_per_mm", _FLOAT),
         ("sample_mm", _FLOAT),
-        ("samples", _INT),  # rounded up to whole chunks
+        ("samples", _INT),  # up to traced_mm, rounded up to whole blocks
         ("transmit_zones", _INT),  # 0: focused at every depth, with transmit_sigma[0] at least
         ("transmit_sigma", _FLOAT, CONSTANTS["MAX_ZONES"]),
         ("transmit_focus", _FLOAT, CONSTANTS["MAX_ZONES"]),

@@ -33,7 +33,9 @@ def acquisition_record(
     first, spacing, radius = _geometry(probe)
     lateral, guard = _traced_lines(probe, settings)
     traced = 2 * guard + 1 + lateral * (probe.scan_lines - 1)
-    samples = int(np.ceil(_steering(probe)["depth_mm"] / sample_mm(probe, settings)))
+    step = sample_mm(probe, settings)
+    behind = len(pulse_taps(axial_sigma_mm(probe, settings) / step)) // 2  # half a pulse, in samples
+    samples = int(np.ceil(_steering(probe)["depth_mm"] / step)) + behind
     membrane = medium.tissues.membrane
     elevational, elevational_length = _elevation(probe)
     density = settings.scatterers_per_mm3 or _automatic_density(probe)
@@ -59,11 +61,12 @@ def acquisition_record(
         "line_spacing": spacing,
         "scan_lines": probe.scan_lines,
         **_steering(probe),
+        "traced_mm": _steering(probe)["depth_mm"] + behind * step + medium.voxel_mm,
         "frequency_mhz": _received_mhz(probe),
         "fractional_bandwidth": _received_bandwidth(probe),
         "reference_speed_m_s": settings.reference_speed_m_s,
         "cycles_per_mm": _cycles_per_mm(probe, settings),
-        "sample_mm": sample_mm(probe, settings),
+        "sample_mm": step,
         "samples": int(np.ceil(samples / CONSTANTS["BLOCK"])) * CONSTANTS["BLOCK"],
         **_transmit(probe),
         "wavefront_curvature": 0.6 if settings.wavefront_curvature else 0.0,

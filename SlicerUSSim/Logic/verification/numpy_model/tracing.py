@@ -311,7 +311,7 @@ class Tracer:
             rays.label[unknown] = self.labels.at(self._place(some, zero[unknown]))
         medium = np.where(rays.strong == _UNDER, rays.front, rays.label)
         rays.depth_per_mm = acquisition["reference_speed_m_s"] / self.tissues["speed_of_sound_m_s"][medium]
-        rays.to_depth = (acquisition["depth_mm"] - rays.depth) / rays.depth_per_mm
+        rays.to_depth = (acquisition["traced_mm"] - rays.depth) / rays.depth_per_mm
         to_piece = f32(rays.piece) * acquisition["screen_step"] + acquisition["screen_step"] - rays.path
         rays.to_piece = np.where(rays.piece < 0, f32(np.inf), to_piece)
         margin = f32(3) + np.abs(rays.quantile) * f32(4) / self.voxel_mm
@@ -484,7 +484,7 @@ class Tracer:
         shortened = written >= 0
         lengths = self._segments[-1]["length_mm"]
         lengths[written[shortened]] = np.maximum(lengths[written[shortened]] - back[shortened], f32(0))
-        keep = rays.depth + border * rays.depth_per_mm < acquisition["depth_mm"]
+        keep = rays.depth + border * rays.depth_per_mm < acquisition["traced_mm"]
         seen = self.seen
         strong_border = ~(is_soft(seen[rays.label], seen[other]) & bool(acquisition["aperture_beams"]))
         front = seen[self._front(rays)]
