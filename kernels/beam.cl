@@ -64,7 +64,7 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   find_spread(acquisition, spreads, centre, s, &spread, &factor);
   __global const float *of_line = losses + LOSS_WORDS * line * (acquisition->samples / LOSS_STEP + 1);
   const floatn stretch = 1.0f / frequency_at(of_line, sample);
-  const floatn apart = line_distance_lanes(acquisition, s);
+  const floatn apart = line_distance_lanes(acquisition, s + start);
   const floatn sigma = spread * lateral_sigma_lanes_at(acquisition, s, stretch);
   floatn step = apart / sigma;  // between traced lines, in sigmas
   floatn step2 = step * step;
@@ -86,7 +86,7 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   __global const float *stored = of_line + LOSS_WORDS * node + 2;
   const float frequency = 0.5f * (stored[0] + stored[LOSS_WORDS]);
   SPREAD(float, spread_, spread);
-  const float across = line_distance(acquisition, middle) / spread_[0];
+  const float across = line_distance(acquisition, middle + start) / spread_[0];
   const float curved = lateral_curvature(acquisition, middle, 1.0f / frequency) * across * across;
   const float turns = curved / (2.0f * TWO_PI);
   // Edge `edge` is half a step before traced line `edge`. Edges come in pairs, n + 1/2 lines to either side. Their

@@ -72,8 +72,8 @@ __kernel void compress(__constant const Acquisition *acquisition, __global const
 }
 
 // Mean grey level over `width` samples about each sample, the depth range of one pixel of the image. Single samples
-// would alias the speckle into black dashes. Beyond its ends a line repeats its first and last sample of the image, which
-// has `shown` of them: the pulse is not whole in those behind.
+// would alias the speckle into black dashes. Beyond its ends a line repeats its first and last sample of the image,
+// which has `shown` of them: the pulse is not whole in those behind.
 __kernel void average_depth(__global const uchar *grey, __global uchar *smooth, int samples, int shown, int width) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   __global const uchar *row = grey + line * samples;

@@ -547,6 +547,7 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
   const int block = first / PIECE_BLOCK * PIECE_BLOCK;
   const float block_low = (block - 1) * acquisition->sample_mm;
   const float block_high = (block + PIECE_BLOCK) * acquisition->sample_mm;
+  const float line_begins = traced_start(acquisition, (float)line);
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int index = 0; index < count; index++) {
@@ -590,7 +591,7 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
     const float longest = 0.4f * fmin(acquisition->transmit_waist, acquisition->elevation_rayleigh);
 #endif
     const int pieces = max(1, (int)ceil((segment_high - segment_low) / longest));
-    const float to_apex = segment->path_mm + (acquisition->linear ? 1e6f : acquisition->apex_radius_mm);
+    const float to_apex = segment->path_mm + (acquisition->linear ? 1e6f : acquisition->apex_radius_mm + line_begins);
     float high = segment_low;
     for (int n = 0; n < pieces;) {
       const float low = high, next_high = blend(segment_low, segment_high, (float)(n + 1) / pieces);
@@ -603,10 +604,11 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float loss_high = segment->loss + segment->loss_per_mm * high;
       const float2 sigma_low = sigma_after(acquisition, path_low, loss_low);
       const float2 sigma_high = sigma_after(acquisition, path_high, loss_high);
-      const float apart_low = line_distance(acquisition, path_low), apart_high = line_distance(acquisition, path_high);
+      const float apart_low = line_distance(acquisition, path_low + line_begins);
+      const float apart_high = line_distance(acquisition, path_high + line_begins);
       piece.low = low;
       piece.span = 1.0f / fmax(high - low, 1e-6f);
-      piece.bend = acquisition->linear ? 0.0f : 0.5f / fmax(acquisition->apex_radius_mm + path_low, 1.0f);
+      piece.bend = acquisition->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
       piece.edge = (line - left_line + 0.5f) / lines;
       piece.line0 = 1.0f / (lines * apart_low);
       piece.line1 = 1.0f / (lines * apart_high) - piece.line0;

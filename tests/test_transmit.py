@@ -36,6 +36,7 @@ MODES = {
     "angles": PhasedProbe(35, 30, scan_lines=24, transmit="angles", transmit_angles=7),
     "one wave": replace(LINEAR, transmit="angles", transmit_angles=1),
     "trapezoid": replace(LINEAR, trapezoid_deg=15.0),
+    "wide trapezoid": replace(LINEAR, trapezoid_deg=45.0),
     "steered": replace(LINEAR, steering_deg=-20.0),
     "harmonic": replace(LINEAR, harmonic=True, frequency_mhz=2.5),
     "harmonic, steered, zones": replace(
@@ -106,6 +107,22 @@ def test_steered_lines_leave_the_face_between_its_ends(steering, opening, is_fan
     outline = probe.outline_mm()
     assert bounds[2] == pytest.approx(0.0, abs=1e-6) and bounds[0] <= outline[:, 0].min() + 1e-6
     assert bounds[1] >= outline[:, 0].max() - 1e-6 and bounds[3] >= outline[:, 1].max() - 1e-6
+
+
+def test_all_lines_of_a_wide_trapezoid_have_the_level_of_speckle():
+    """Near the face those in the middle were 0.6 to 0.9 dB too bright: all had the mean distance of lines."""
+    probe = LinearProbe(38, 40, scan_lines=192, trapezoid_deg=45.0, frequency_mhz=9.0, elevation_aperture_mm=5.0)
+    medium = block(lambda x, y, z: np.ones_like(x), half_mm=(80, 60, 20), spacing_mm=2.0)
+    frames = [
+        simulator(medium, SPECKLE, coupling=SPECKLE, seed=seed).simulate(probe, rigid(np.eye(3), [0, -50, 0]))
+        for seed in range(12)
+    ]
+    starts = probe.line_starts_mm(probe.line_positions())
+    dz = frames[0].sample_interval_mm
+    spans = [slice(int((start + 2.0) / dz), int((start + 8.0) / dz)) for start in starts]
+    power = [np.mean([np.mean(np.abs(frame.iq[n, span]) ** 2) for frame in frames]) for n, span in enumerate(spans)]
+    levels = 10.0 * np.log10(np.reshape(power, (6, 32)).mean(axis=1) / SPECKLE.scatterer_variance)
+    np.testing.assert_allclose(levels, 0.0, atol=0.25)
 
 
 @pytest.mark.parametrize("angles", [{"steering_deg": 20.0}, {"trapezoid_deg": 20.0}])

@@ -500,7 +500,6 @@ def steering_fields(probe: Probe) -> dict[str, Any]:
         "steering_sin": np.sin(probe.steering_rad),
         "steering_cos": np.cos(probe.steering_rad),
         "start_mm": float(probe.line_starts_mm(0.0)),
-        "spread_radius_mm": 0.0 if probe.is_linear else probe.apex_radius_mm + starts.mean(),
         "top_mm": 0.0 if steered else -_FAR_MM,
         "bottom_mm": ends.max() if steered and probe.is_linear else _FAR_MM,
     }

@@ -94,7 +94,6 @@ ACQUISITION = np.dtype(
         ("steering_sin", _FLOAT),  # of the angle of parallel lines to the normal of the face
         ("steering_cos", _FLOAT),
         ("start_mm", _FLOAT),  # displayed depth at which a parallel line in the middle leaves the face
-        ("spread_radius_mm", _FLOAT),  # distance from the apex to the face, on average over the lines
         ("top_mm", _FLOAT),  # of the imaged field
         ("bottom_mm", _FLOAT),
         # wave and beam (Probe.beam_sigma_mm)

@@ -360,14 +360,6 @@ def _is_parallel(probe: Probe) -> bool:
     return isinstance(probe, LinearProbe) and not probe.trapezoid_deg
 
 
-def _spread_radius(probe: Probe) -> float:
-    """Distance from the apex to the face, the mean over the lines where it is not the same for all."""
-    first, _, radius = _geometry(probe)
-    if not isinstance(probe, LinearProbe):
-        return radius
-    return radius * float((1.0 / np.cos(np.linspace(first, -first, probe.scan_lines))).mean())
-
-
 def _steering(probe: Probe) -> dict[str, float]:
     """Lines that leave a flat face obliquely: their depths count from a common surface behind it."""
     tilt = probe.steering_deg * np.pi / 180.0 if isinstance(probe, LinearProbe) else 0.0
@@ -381,7 +373,6 @@ def _steering(probe: Probe) -> dict[str, float]:
         "steering_sin": np.sin(tilt),
         "steering_cos": np.cos(tilt),
         "start_mm": before,
-        "spread_radius_mm": _spread_radius(probe),
         "top_mm": 0.0 if fan or tilt else -1e6,
         "bottom_mm": probe.depth_mm * np.cos(tilt) if tilt else 1e6,
     }
