@@ -28,7 +28,7 @@ _AXIS_STEPS = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint32)
 
 @dataclass(frozen=True)
 class _Strips:
-    """Lines whose echoes follow the path of `line`: `lines`, of which `before` are left of it; for lobes, their table."""
+    """Lines whose echoes follow the path of `line`: `lines`, of which `before` are left of it; `table` of lobes."""
 
     line: int
     lines: int = 1
