@@ -110,9 +110,9 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
         pair_im += LOAD_LANES(edge_im + edges[side] * stride + here);
       }
       if (n > whole) weight = (float)n <= reach ? weight : (floatn)(0.0f);
-      const float phase_re = cosine_[n - first], phase_im = sine_[n - first];
-      sum_re += weight * (phase_re * pair_re + phase_im * pair_im);
-      sum_im += weight * (phase_re * pair_im - phase_im * pair_re);
+      const floatn along = weight * cosine_[n - first], across = weight * sine_[n - first];
+      sum_re = fma(along, pair_re, fma(across, pair_im, sum_re));
+      sum_im = fma(along, pair_im, fma(-across, pair_re, sum_im));
       weight *= ratio;
       ratio *= fall;
     }

@@ -35,6 +35,10 @@ __kernel void scan_convert(__constant const Acquisition *acquisition, __global c
                sample = depth / acquisition->sample_mm;
   const intn inside = (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) &
                       (depth < acquisition->depth_mm) & (y >= acquisition->top_mm) & (y < acquisition->bottom_mm);
+  if (!any(inside)) {
+    for (int j = 0; j < min(LANES, columns - column); j++) image[row * columns + column + j] = 0;
+    return;
+  }
   const intn bin = clamp(TO_INTN(sample), (intn)(0), (intn)(samples - 2));
   const floatn on_line = clamp(place, 0.0f, scan_lines - 1.0f);
   const intn line = TO_INTN(on_line);
@@ -46,7 +50,7 @@ __kernel void scan_convert(__constant const Acquisition *acquisition, __global c
   for (int j = 0; j < LANES; j++)
     for (int n = 0; n < 4; n++) {
       __global const uchar *at = grey + clamp(line_[j] + n - 1, 0, scan_lines - 1) * samples + bin_[j];
-      around[n][j] = inside_[j] ? blend((float)at[0], (float)at[1], part_[j]) : 0.0f;
+      around[n][j] = inside_[j] ? at[0] + part_[j] * ((float)at[1] - at[0]) : 0.0f;
     }
   const floatn a = LOAD_LANES(around[0]), b = LOAD_LANES(around[1]), c = LOAD_LANES(around[2]),
                d = LOAD_LANES(around[3]), t = on_line - TO_FLOATN(line);

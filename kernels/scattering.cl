@@ -97,6 +97,13 @@ typedef struct {
 typedef float4 Echoes;  // [PARTS][PART] left re, im, right re, im
 #endif
 
+// Of LANES vectors with one: (u, v, w) . along; and the line a + t slope.
+inline floatn dot_lanes(floatn u, floatn v, floatn w, float3 along) {
+  return fma(u, (floatn)(along.x), fma(v, (floatn)(along.y), w * along.z));
+}
+
+inline floatn line_lanes(floatn t, float a, float slope) { return fma(t, (floatn)(slope), (floatn)(a)); }
+
 // The hash uses cell indices by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
@@ -313,11 +320,11 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn pu = (TO_FLOATN(cells) * cell - piece->start_u) + (TO_FLOATN(bits_u) + 0.5f) * grain;
     const floatn pv = LOAD_LANES(row_v + begin) + (TO_FLOATN(bits_v) + 0.5f) * grain;
     const floatn pw = LOAD_LANES(row_w + begin) + (TO_FLOATN(bits_w) + 0.5f) * grain;
-    const floatn along = pu * d.x + pv * d.y + pw * d.z;
-    const floatn aside_l = pu * l.x + pv * l.y + pw * l.z;
-    const floatn aside_e = pu * e.x + pv * e.y + pw * e.z;
+    const floatn along = dot_lanes(pu, pv, pw, d);
+    const floatn aside_l = dot_lanes(pu, pv, pw, l);
+    const floatn aside_e = dot_lanes(pu, pv, pw, e);
     const floatn t = (along - piece->low) * piece->span;
-    const floatn right = piece->edge + aside_l * (piece->line0 + t * piece->line1);
+    const floatn right = fma(aside_l, line_lanes(t, piece->line0, piece->line1), (floatn)(piece->edge));
 #ifdef LOBES
     const floatn r2 = 0.0f, curved = 0.0f;  // lobes have random phases
     const intn near = fabs(aside_e) <= piece->reach;
@@ -325,12 +332,12 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     STORE_LANES(piece->path0 + (along - piece->low), path_ + begin);
 #else
     const floatn aside2 = aside_e * aside_e;
-    const floatn r2 = aside2 * (piece->narrow0 + t * piece->narrow1);
-    const floatn curved = aside2 * (piece->curved0 + t * piece->curved1);
+    const floatn r2 = aside2 * line_lanes(t, piece->narrow0, piece->narrow1);
+    const floatn curved = aside2 * line_lanes(t, piece->curved0, piece->curved1);
     const intn near = r2 <= cutoff2;
 #endif
-    const floatn range = along + aside_l * aside_l * piece->bend;
-    const floatn depth = piece->depth0 + range * piece->slope;
+    const floatn range = fma(aside_l, aside_l * piece->bend, along);
+    const floatn depth = line_lanes(range, piece->depth0, piece->slope);
     const floatn place = depth * inverse_sample;
     const floatn bin = floor(place);
     const intn bins = TO_INTN(bin) - piece->first;
@@ -342,14 +349,14 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
       n += counts_[j] & 1;
     }
     const floatn amplitude =
-        exp2_fast(clamp(piece->gain0 + t * piece->gain1 - r2, (floatn)(-100.0f), (floatn)(100.0f)));
+        exp2_fast(clamp(line_lanes(t, piece->gain0, piece->gain1) - r2, (floatn)(-100.0f), (floatn)(100.0f)));
     const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
-    turn(depth * acquisition->cycles_per_mm + curved, &cosine, &sine);
+    turn(fma(depth, (floatn)(acquisition->cycles_per_mm), curved), &cosine, &sine);
     const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
-    const floatn vx = clamp(at.x + pu * ri.x + pv * ri.y + pw * ri.z, (floatn)(0.0f), (floatn)(voxel_top.x));
-    const floatn vy = clamp(at.y + pu * rj.x + pv * rj.y + pw * rj.z, (floatn)(0.0f), (floatn)(voxel_top.y));
-    const floatn vz = clamp(at.z + pu * rk.x + pv * rk.y + pw * rk.z, (floatn)(0.0f), (floatn)(voxel_top.z));
+    const floatn vx = clamp(at.x + dot_lanes(pu, pv, pw, ri), (floatn)(0.0f), (floatn)(voxel_top.x));
+    const floatn vy = clamp(at.y + dot_lanes(pu, pv, pw, rj), (floatn)(0.0f), (floatn)(voxel_top.y));
+    const floatn vz = clamp(at.z + dot_lanes(pu, pv, pw, rk), (floatn)(0.0f), (floatn)(voxel_top.z));
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
     STORE_LANES(bins, bin_ + begin);
     STORE_LANES(place - bin, part_ + begin);

@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
-from SlicerUSSim.Logic.imaging.bmode import downshift, pulse_taps
+from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.diffraction import speckle_height_mm
@@ -424,7 +424,8 @@ class UltrasoundSimulator:
         acquisition["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
         acquisition["interface_is_energy"] = settings.interface_reflection == "energy"
         density = sites_per_mm3(settings, probe)
-        acquisition["downshift"] = downshift(probe) if settings.frequency_downshift else 0.0
+        shift = acquisition["downshift"] = downshift(probe) if settings.frequency_downshift else 0.0
+        acquisition["band_above"] = log_band_above(shift)
         acquisition["cell_mm"] = density ** (-1.0 / 3.0)
         acquisition["seed"] = _mixed(settings.seed)
         # The integral of the squared point spread function is pi^1.5 times the product of the three sigmas.

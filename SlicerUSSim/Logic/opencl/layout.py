@@ -144,6 +144,7 @@ ACQUISITION = np.dtype(
         ("interface_is_energy", _INT),
         ("specular_exponent", _FLOAT),
         ("downshift", _FLOAT),  # part of the frequency that is lost per neper of two-way loss; 0: none
+        ("band_above", _FLOAT),  # log erfc(-f0 / sf): of the part of the transmitted band that is above zero
         # scatterers
         ("cell_mm", _FLOAT),
         ("seed", _UINT),

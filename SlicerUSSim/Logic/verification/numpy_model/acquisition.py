@@ -93,6 +93,9 @@ def acquisition_record(
         "interface_is_energy": settings.interface_reflection == "energy",
         "specular_exponent": settings.specular_exponent,
         "downshift": (_received_bandwidth(probe) / _FWHM) ** 2 if settings.frequency_downshift else 0.0,
+        "band_above": np.log(special.erfc(-_FWHM / _received_bandwidth(probe)))
+        if settings.frequency_downshift
+        else np.log(2.0),
         "cell_mm": np.cbrt(1.0 / density),
         "seed": hash_mix(np.array([settings.seed], np.uint32))[0] ^ np.uint32(0x2545F491),
         "beam_cutoff": settings.beam_cutoff,
