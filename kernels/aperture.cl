@@ -552,10 +552,11 @@ inline float mean_loss(const Lines *lines) {
   return losses / fmax(all, 1e-6f);
 }
 
-// One work-item computes one depth of one screen line. Global size (depths, screen lines).
+// One work-item computes one depth of one screen line. Global size (screen lines, depths): at one depth all lines have
+// about as many points, and compilers that make vectors of neighbouring work-items need alike ones.
 __kernel void screens(__constant const Acquisition *acquisition, __global const float *sums, int with_level,
                       int all_soft, __global float *screens_, __global float *shades, __global float *spreads) {
-  const int node = get_global_id(0), line = get_global_id(1), nodes = acquisition->screen_depths;
+  const int line = get_global_id(0), node = get_global_id(1), nodes = acquisition->screen_depths;
   const float path = (node + 1) * acquisition->screen_step, pitch = acquisition->fan_pitch;
   const Axis axis = axis_of(acquisition, line);
   Lines lines;

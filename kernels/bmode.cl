@@ -17,8 +17,9 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
   __global const float *from_im = im + line * stride + LINE_PAD + sample - reach;
   floatn sum_re = 0.0f, sum_im = 0.0f;
   for (int k = 0; k <= 2 * reach; k++) {
-    sum_re += pulse[k] * LOAD_LANES(from_re + k);
-    sum_im += pulse[k] * LOAD_LANES(from_im + k);
+    const floatn tap = (floatn)(pulse[k]);
+    sum_re = fma(tap, LOAD_LANES(from_re + k), sum_re);
+    sum_im = fma(tap, LOAD_LANES(from_im + k), sum_im);
   }
   if (acquisition->downshift > 0.0f) {  // back to the carrier of the transmitted pulse
     floatn c, s;

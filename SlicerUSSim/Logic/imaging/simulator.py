@@ -148,9 +148,9 @@ class UltrasoundSimulator:
         require_kind("probe", probe, Probe, "a ConvexProbe, LinearProbe or PhasedProbe")
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self.warn_if_slow(probe)
-        self._warn_if_empty(probe, pose)
         timings: dict[str, float] = {}
         frame = self._rendered(probe, pose, display, grid, timings, noise_seed)
+        self._warn_if_empty(probe, pose)  # while the device computes
         with self._timed("download", timings):
             samples = self._sample_count(probe)
             iq, envelope, bmode = (frame.download(name)[:, :samples] for name in ("iq", "envelope", "grey"))
