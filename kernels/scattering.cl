@@ -117,11 +117,11 @@ inline float row_of_depth(__constant const Acquisition *acquisition, float path,
 #ifndef LOBES
 // By how many cycles the phase of the elevational beam, of this sigma, is behind that on its axis, per squared
 // millimetre from there. With it, speckle has the height that it has at the aperture's beam (diffraction.py).
-inline float elevational_cycles(__constant const Acquisition *acquisition, float path, float loss, float sigma) {
+inline float elevational_cycles(__constant const Acquisition *acquisition, float path, float frequency, float sigma) {
   int row;
   const float deeper = row_of_depth(acquisition, path, &row);
   __constant const float *heights = acquisition->speckle_height_mm + row;
-  const float height = blend(heights[0], heights[1], deeper) / frequency_after(acquisition, loss);
+  const float height = blend(heights[0], heights[1], deeper) / frequency;
   if (height <= 0.0f || height >= sigma) return 0.0f;
   return sqrt(1.0f / (height * height) - 1.0f / (sigma * sigma)) / (sigma * 2.0f * TWO_PI);
 }
@@ -609,8 +609,11 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float path_low = segment->path_mm + low, path_high = segment->path_mm + high;
       const float loss_low = segment->loss + segment->loss_per_mm * low;
       const float loss_high = segment->loss + segment->loss_per_mm * high;
-      const float2 sigma_low = sigma_after(acquisition, path_low, loss_low);
-      const float2 sigma_high = sigma_after(acquisition, path_high, loss_high);
+      float band_low, band_high;
+      const float frequency_low = band_after(acquisition, loss_low, &band_low);
+      const float frequency_high = band_after(acquisition, loss_high, &band_high);
+      const float2 sigma_low = sigma_at(acquisition, path_low, 1.0f / frequency_low);
+      const float2 sigma_high = sigma_at(acquisition, path_high, 1.0f / frequency_high);
       const float apart_low = line_distance(acquisition, path_low + line_begins);
       const float apart_high = line_distance(acquisition, path_high + line_begins);
       piece.low = low;
@@ -631,8 +634,8 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float radius_e = acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y);
       piece.narrow0 = 0.5f * LOG2_E / (sigma_low.y * sigma_low.y);
       piece.narrow1 = 0.5f * LOG2_E / (sigma_high.y * sigma_high.y) - piece.narrow0;
-      piece.curved0 = elevational_cycles(acquisition, path_low, loss_low, sigma_low.y);
-      piece.curved1 = elevational_cycles(acquisition, path_high, loss_high, sigma_high.y) - piece.curved0;
+      piece.curved0 = elevational_cycles(acquisition, path_low, frequency_low, sigma_low.y);
+      piece.curved1 = elevational_cycles(acquisition, path_high, frequency_high, sigma_high.y) - piece.curved0;
 #endif
       // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
       // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak.
@@ -641,11 +644,9 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       // Behind a curved mirror the same power is spread over a wider tube.
       const float4 tube_low = tube_after(vload4(0, segment->tube), low);
       const float4 tube_high = tube_after(vload4(0, segment->tube), high);
-      const float band_low = LOG2_E * gain_of_band(acquisition, loss_low);
-      const float band_high = LOG2_E * gain_of_band(acquisition, loss_high);
-      piece.gain0 = gain + band_low - decay * low + 0.5f * log2(sigma_low.x / (tall_low * tube_low.x * tube_low.z)) -
-                    log2(apart_low);
-      piece.gain1 = gain + band_high - decay * high +
+      piece.gain0 = gain + LOG2_E * band_low - decay * low +
+                    0.5f * log2(sigma_low.x / (tall_low * tube_low.x * tube_low.z)) - log2(apart_low);
+      piece.gain1 = gain + LOG2_E * band_high - decay * high +
                     0.5f * log2(sigma_high.x / (tall_high * tube_high.x * tube_high.z)) - log2(apart_high) -
                     piece.gain0;
 
