@@ -64,6 +64,7 @@
 #define PLANE_WORDS 1
 #endif
 
+#define GRAINS 1024.0f      // places of a scatterer along each axis of its cell, in the middle of as many parts
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
 // Quantities common to all scatterers beside one piece of a segment. Vectors are in the order u, v, w of lattice axes.
@@ -290,7 +291,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
                           __global const uint *planes, __global const uint *texture, __global const float *sites,
                           const Piece *piece, const int *cell_u, const uint *row_key, const float *row_v,
                           const float *row_w, int count, Echoes *sum VARIED_PARAMETERS) {
-  const float cell = acquisition->cell_mm, grain = cell / 1024.0f;
+  const float cell = acquisition->cell_mm, grain = cell / GRAINS, first_u = 0.5f * grain - piece->start_u;
 #ifndef LOBES
   const float cutoff2 = 0.5f * LOG2_E * acquisition->beam_cutoff * acquisition->beam_cutoff;
 #endif
@@ -317,9 +318,9 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
                 bits_w = (key >> (10 * w)) & 0x3ffu;
-    const floatn pu = (TO_FLOATN(cells) * cell - piece->start_u) + (TO_FLOATN(bits_u) + 0.5f) * grain;
-    const floatn pv = LOAD_LANES(row_v + begin) + (TO_FLOATN(bits_v) + 0.5f) * grain;
-    const floatn pw = LOAD_LANES(row_w + begin) + (TO_FLOATN(bits_w) + 0.5f) * grain;
+    const floatn pu = fma(TO_FLOATN(bits_u), (floatn)(grain), fma(TO_FLOATN(cells), (floatn)(cell), (floatn)(first_u)));
+    const floatn pv = fma(TO_FLOATN(bits_v), (floatn)(grain), LOAD_LANES(row_v + begin));
+    const floatn pw = fma(TO_FLOATN(bits_w), (floatn)(grain), LOAD_LANES(row_w + begin));
     const floatn along = dot_lanes(pu, pv, pw, d);
     const floatn aside_l = dot_lanes(pu, pv, pw, l);
     const floatn aside_e = dot_lanes(pu, pv, pw, e);
@@ -482,6 +483,8 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
                         : 0.5f * (high - low) * fabs(d.y - along_band * d.z) + radius_l * fabs(l.y - along_band * l.z);
 
   const float base_u = 0.5f * cell - start.x;
+  // Of rows, the first place of their cells
+  const float first_v = 0.5f * cell / GRAINS - start.y, first_w = 0.5f * cell / GRAINS - start.z;
   int waiting = 0;
   for (int cw = w_low; cw <= w_high; cw++) {
     const float v_here = band_v + along_band * cw * cell, v_next = v_here + along_band * cell;
@@ -503,12 +506,12 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
       SPREAD(int, cells_, TO_INTN(floor(to)) - u_low + 1);
       for (int j = 0; j < min(LANES, v_last - cv + 1); j++) {
         const uint key = (uint)(cv + j) * step_v + (uint)cw * step_w;
-        const float place_v = (cv + j) * cell - start.y;
+        const float place_v = (cv + j) * cell + first_v;
         for (int cu = 0; cu < cells_[j]; cu += LANES) {
           STORE_LANES(u_low_[j] + cu + LANE_INDEX, cell_u + waiting);
           STORE_LANES((uintn)(key), row_key + waiting);
           STORE_LANES((floatn)(place_v), row_v + waiting);
-          STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
+          STORE_LANES((floatn)(cw * cell + first_w), row_w + waiting);
           waiting += min(LANES, cells_[j] - cu);
           if (waiting >= BATCH) {
             scatter_batch(acquisition, voxels, planes, texture, sites, piece, cell_u, row_key, row_v, row_w, BATCH,
