@@ -552,10 +552,11 @@ inline float mean_loss(const Lines *lines) {
   return losses / fmax(all, 1e-6f);
 }
 
-// One work-item computes one depth of one screen line. Global size (depths, screen lines).
+// One work-item computes one depth of one screen line. Global size (screen lines, depths): at one depth all lines have
+// about as many points, and compilers that make vectors of neighbouring work-items need alike ones.
 __kernel void screens(__constant const Acquisition *acquisition, __global const float *sums, int with_level,
                       int all_soft, __global float *screens_, __global float *shades, __global float *spreads) {
-  const int node = get_global_id(0), line = get_global_id(1), nodes = acquisition->screen_depths;
+  const int line = get_global_id(0), node = get_global_id(1), nodes = acquisition->screen_depths;
   const float path = (node + 1) * acquisition->screen_step, pitch = acquisition->fan_pitch;
   const Axis axis = axis_of(acquisition, line);
   Lines lines;
@@ -647,7 +648,8 @@ __kernel void keep_levels(__constant const Acquisition *acquisition, __global co
   const int node = get_global_id(0), line = get_global_id(1), at = line * acquisition->screen_depths + node;
   const float path = (node + 1) * acquisition->screen_step, spread = spreads[2 * at];
   const float traced_lines = (float)(acquisition->traced_lines - 1) / (acquisition->screen_lines - 1);
-  const float sigma = lateral_sigma(acquisition, path) / (line_distance(acquisition, path) * traced_lines);
+  const float apart = line_distance(acquisition, path + traced_start(acquisition, line * traced_lines));
+  const float sigma = lateral_sigma(acquisition, path) / (apart * traced_lines);
   spreads[2 * at + 1] = sqrt(mean_passed(acquisition, screens_, node, line, sigma) /
                              mean_passed(acquisition, screens_, node, line, sigma * spread));
 }
@@ -655,8 +657,9 @@ __kernel void keep_levels(__constant const Acquisition *acquisition, __global co
 // The factor by which the power of speckle would change where the axes of neighbouring lines come together to the part
 // `ratio` of their distance: a scatterer is then in the strips of several lines, which add up with phases that differ
 // by `turns` from one to the next (docs/physics.md#beams-from-an-aperture).
-inline float gathered_power(__constant const Acquisition *acquisition, float path, float ratio, float turns) {
-  const float apart = 0.5f * line_distance(acquisition, path) / lateral_sigma(acquisition, path);
+inline float gathered_power(__constant const Acquisition *acquisition, float path, float apart_mm, float ratio,
+                            float turns) {
+  const float apart = 0.5f * apart_mm / lateral_sigma(acquisition, path);
   // Their depths differ, too, by a part of the pulse. Its deviation is 2.3548 / (2 pi bandwidth) cycles.
   const float later = 1.3341168f * acquisition->fractional_bandwidth * turns;
   const float decay = apart * apart + later * later;
@@ -766,16 +769,17 @@ __kernel void beams(__constant const Acquisition *acquisition, __global const fl
   const float4 right_shade = vload4((before + 1) * depths + number - 1, shades);
   float4 own = left_shade + (place - before) * (right_shade - left_shade);
   const float path = number * acquisition->screen_step;
+  const float apart = line_distance(acquisition, path + traced_start(acquisition, (float)line));
   if (!all_soft) {
-    const float lines_per_mm = per_line / line_distance(acquisition, path);
+    const float lines_per_mm = per_line / apart;
     const float2 mean = mean_shades(acquisition, shades, number - 1, place, path, lines_per_mm);
     beam.x += mean.x - own.x;
     own.xy = mean;
   }
   vstore4(own, to, shade);
   const float4 per_strip = (right - left) * per_line;  // from line to line
-  const float apart = line_distance(acquisition, path), tilt = beam.z / path;
+  const float tilt = beam.z / path;
   const float turns = acquisition->cycles_per_mm * (per_strip.y - (apart + per_strip.z) * tilt);
-  beam.x += 0.5f * log_fast(gathered_power(acquisition, path, 1.0f + per_strip.z / apart, turns));
+  beam.x += 0.5f * log_fast(gathered_power(acquisition, path, apart, 1.0f + per_strip.z / apart, turns));
   vstore4(beam, to, beams_);
 }

@@ -64,35 +64,30 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
   find_spread(acquisition, spreads, centre, s, &spread, &factor);
   __global const float *of_line = losses + LOSS_WORDS * line * (acquisition->samples / LOSS_STEP + 1);
   const floatn stretch = 1.0f / frequency_at(of_line, sample);
-  const floatn apart = line_distance_lanes(acquisition, s);
+  const floatn apart = line_distance_lanes(acquisition, s + start);
   const floatn sigma = spread * lateral_sigma_lanes_at(acquisition, s, stretch);
   floatn step = apart / sigma;  // between traced lines, in sigmas
   floatn step2 = step * step;
   floatn narrow2 = fmax(1.0f - step2 / 6.0f, 0.25f);  // (sigma of these weights / sigma of the beam)^2
-  floatn exponent = -0.5f * LOG2_E * step2 / narrow2;
+  const floatn apart2 = step2 / narrow2;              // squared distance of traced lines in sigmas of these weights
   const floatn reach = ceil(acquisition->beam_cutoff * sigma / apart);
-  SPREAD(float, reach_, reach);
-  float longest = 0.0f, shortest = 1e6f;
-  for (int n = 0; n < LANES; n++) {
-    longest = fmax(longest, reach_[n]);
-    shortest = fmin(shortest, reach_[n]);
-  }
-  const int last = min((int)longest, max(centre, acquisition->traced_lines - 1 - centre));
+  const int last = min((int)largest(reach), max(centre, acquisition->traced_lines - 1 - centre));
   // Up to here both edges of a pair are there, for all lanes.
-  const int whole = min((int)shortest, min(centre - 1, acquisition->traced_lines - 2 - centre));
+  const int whole = min((int)smallest(reach), min(centre - 1, acquisition->traced_lines - 2 - centre));
   // By how much the phase turns at one step from the axis; at the middle between stored frequencies.
   const int node = sample / LOSS_STEP;
   const float middle = fmax((node + 0.5f) * LOSS_STEP * acquisition->sample_mm - start, 0.0f);
   __global const float *stored = of_line + LOSS_WORDS * node + 2;
   const float frequency = 0.5f * (stored[0] + stored[LOSS_WORDS]);
   SPREAD(float, spread_, spread);
-  const float across = line_distance(acquisition, middle) / spread_[0];
+  const float across = line_distance(acquisition, middle + start) / spread_[0];
   const float curved = lateral_curvature(acquisition, middle, 1.0f / frequency) * across * across;
   const float turns = curved / (2.0f * TWO_PI);
   // Edge `edge` is half a step before traced line `edge`. Edges come in pairs, n + 1/2 lines to either side. Their
   // weights w are a Gaussian by recurrence: w(n + 1) = w(n) ratio(n).
-  const floatn fall = exp2_fast(max(2.0f * exponent, -60.0f));
-  floatn weight = exp2_fast(max(0.25f * exponent, -60.0f)), ratio = fall;
+  const floatn fall = exp2_fast(max(-LOG2_E * apart2, -60.0f)),
+               first_weight = exp2_fast(max(-0.125f * LOG2_E * apart2, -60.0f));
+  floatn weight = first_weight, ratio = fall;
   int here = LINE_PAD + sample;
   floatn sum_re = 0.0f, sum_im = 0.0f;
   for (int first = 0; first <= last; first += LANES) {
@@ -110,18 +105,17 @@ __kernel void lateral_beam(__constant const Acquisition *acquisition, __global c
         pair_im += LOAD_LANES(edge_im + edges[side] * stride + here);
       }
       if (n > whole) weight = (float)n <= reach ? weight : (floatn)(0.0f);
-      const float phase_re = cosine_[n - first], phase_im = sine_[n - first];
-      sum_re += weight * (phase_re * pair_re + phase_im * pair_im);
-      sum_im += weight * (phase_re * pair_im - phase_im * pair_re);
+      const floatn along = weight * cosine_[n - first], across = weight * sine_[n - first];
+      sum_re = fma(along, pair_re, fma(across, pair_im, sum_re));
+      sum_im = fma(along, pair_im, fma(-across, pair_re, sum_im));
       weight *= ratio;
       ratio *= fall;
     }
   }
-  const floatn apart2 = step2 / narrow2;
-  const floatn straight = exp2_fast(max(-0.25f * LOG2_E * apart2, -60.0f));
+  const floatn straight = first_weight * first_weight;
   const floatn bent = exp2_fast(max(-0.25f * LOG2_E * (apart2 + curved * curved / apart2), -60.0f));
-  const floatn kept = (2.0f + bent) / (2.0f + straight);
-  floatn scale = rsqrt(kept) * factor * step * rsqrt(narrow2) * sqrt(spread) * 0.39894228f;  // 1 / sqrt(2 pi)
+  // 1 / sqrt(2 pi), with 1 / sqrt(kept) for kept = (2 + bent) / (2 + straight)
+  const floatn scale = 0.39894228f * factor * sqrt(apart2 * spread * (2.0f + straight) / (2.0f + bent));
   STORE_LANES(sum_re * scale, to_re + line * stride + here);
   STORE_LANES(sum_im * scale, to_im + line * stride + here);
 }

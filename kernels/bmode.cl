@@ -17,8 +17,9 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
   __global const float *from_im = im + line * stride + LINE_PAD + sample - reach;
   floatn sum_re = 0.0f, sum_im = 0.0f;
   for (int k = 0; k <= 2 * reach; k++) {
-    sum_re += pulse[k] * LOAD_LANES(from_re + k);
-    sum_im += pulse[k] * LOAD_LANES(from_im + k);
+    const floatn tap = (floatn)(pulse[k]);
+    sum_re = fma(tap, LOAD_LANES(from_re + k), sum_re);
+    sum_im = fma(tap, LOAD_LANES(from_im + k), sum_im);
   }
   if (acquisition->downshift > 0.0f) {  // back to the carrier of the transmitted pulse
     floatn c, s;
@@ -72,19 +73,20 @@ __kernel void compress(__constant const Acquisition *acquisition, __global const
 }
 
 // Mean grey level over `width` samples about each sample, the depth range of one pixel of the image. Single samples
-// would alias the speckle into black dashes. Beyond its ends a line repeats its first and last sample.
-__kernel void average_depth(__global const uchar *grey, __global uchar *smooth, int samples, int width) {
+// would alias the speckle into black dashes. Beyond its ends a line repeats its first and last sample of the image,
+// which has `shown` of them: the pulse is not whole in those behind.
+__kernel void average_depth(__global const uchar *grey, __global uchar *smooth, int samples, int shown, int width) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   __global const uchar *row = grey + line * samples;
   const int first = sample - width / 2;
   floatn sum = 0.0f;
-  if (first >= 0 && first + width - 1 + LANES <= samples) {
+  if (first >= 0 && first + width - 1 + LANES <= shown) {
     for (int k = 0; k < width; k++) sum += GREY_LANES(row + first + k);
   } else {
     float ends[LANES];
     for (int lane = 0; lane < LANES; lane++) {
       ends[lane] = 0.0f;
-      for (int k = 0; k < width; k++) ends[lane] += row[clamp(first + k + lane, 0, samples - 1)];
+      for (int k = 0; k < width; k++) ends[lane] += row[clamp(first + k + lane, 0, shown - 1)];
     }
     sum = LOAD_LANES(ends);
   }

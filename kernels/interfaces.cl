@@ -62,6 +62,7 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
   const int line = get_global_id(0), rays = acquisition->elevational_rays;
   const float pulse = acquisition->fractional_bandwidth * 0.42466090f;  // 1 / (2 sqrt(2 ln 2))
   const float per_mm = TWO_PI * acquisition->cycles_per_mm;
+  const float start = traced_start(acquisition, (float)line);
   __global Wall *my_walls = walls + line * rays * MAX_HITS;
   int walls_found = 0;
   float farthest = 0.0f;
@@ -71,7 +72,7 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
       __global const Hit *hit = hits + slot * MAX_HITS + h;
       const float2 sigma = beam_sigma(acquisition, hit->path_mm);
       // Near the apex of a phased array all lines are within the beam, and every second, fourth ... is enough.
-      float step = line_distance(acquisition, hit->path_mm);
+      float step = line_distance(acquisition, hit->path_mm + start);
       int every = 1;
       for (; 8.0f * step < sigma.x && every < 64; every *= 2) step *= 2.0f;
       if (line % every) continue;

@@ -164,11 +164,14 @@ inline float next_border(__global const ushort *voxels, __global const uchar *gr
     const float8 ahead = min(*inside + stride * (float8)(1, 2, 3, 4, 5, 6, 7, 8), (float8)(last + 1e-4f));
     const float8 sigma = elevation_sigma8(acquisition, course->path + ahead);
     const float8 x =
-        clamp(course->start.x + ahead * course->step.x + sigma * course->aside.x, (float8)(0.0f), (float8)(top.x));
+        clamp(fma(sigma, (float8)(course->aside.x), fma(ahead, (float8)(course->step.x), (float8)(course->start.x))),
+              (float8)(0.0f), (float8)(top.x));
     const float8 y =
-        clamp(course->start.y + ahead * course->step.y + sigma * course->aside.y, (float8)(0.0f), (float8)(top.y));
+        clamp(fma(sigma, (float8)(course->aside.y), fma(ahead, (float8)(course->step.y), (float8)(course->start.y))),
+              (float8)(0.0f), (float8)(top.y));
     const float8 z =
-        clamp(course->start.z + ahead * course->step.z + sigma * course->aside.z, (float8)(0.0f), (float8)(top.z));
+        clamp(fma(sigma, (float8)(course->aside.z), fma(ahead, (float8)(course->step.z), (float8)(course->start.z))),
+              (float8)(0.0f), (float8)(top.z));
     const int8 i = convert_int8(x), j = convert_int8(y), k = convert_int8(z);
     int here[8], differs = 0;
     vstore8((k * ny + j) * nx + i, 0, here);
@@ -438,7 +441,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       const float front_decay = decay_in(acquisition, front);
       const float depth_per_mm =
           acquisition->reference_speed_m_s / (is_under ? front.speed_of_sound_m_s : here.speed_of_sound_m_s);
-      const float to_depth = (acquisition->depth_mm - ray.depth) / depth_per_mm;
+      const float to_depth = (acquisition->traced_mm - ray.depth) / depth_per_mm;
       const float to_piece = ray.piece < 0 ? 2.0f * to_depth : (ray.piece + 1) * acquisition->screen_step - ray.path;
       const float2 span =
           volume_span(acquisition, &course, 3.0f + fabs(quantile) * 4.0f / acquisition->voxel_mm, to_depth);
@@ -560,7 +563,7 @@ __kernel void trace(__constant const Acquisition *acquisition, __global const us
       const int is_bent = !is_under && is_strong && !(is_beam && !bends(front_speed, behind_speed));
       const float path = ray.path + border;
       float depth = ray.depth + border * depth_per_mm, log_attenuation = ray.log_attenuation - spent;
-      const int leaves = depth >= acquisition->depth_mm;
+      const int leaves = depth >= acquisition->traced_mm;
       if (!is_strong_border)
         gives_back(&ray, decay_in(acquisition, here), decay_in(acquisition, behind), border - since, path);
       ray.soft += ray.strong == THROUGH ? border * front_decay : spent;

@@ -6,7 +6,7 @@
 // beam width, and linear interpolation would be visible as spokes in the far field.
 // Buffers: grey uchar [scan line][samples]; image uchar [row][column], 0 outside the field.
 
-#include "common.clh"
+#include "display.clh"
 
 // atan(x / y) for y > 0, to 2e-6 rad: a thousandth of the spacing of scan lines.
 inline floatn angle_of(floatn x, floatn y) {
@@ -35,22 +35,32 @@ __kernel void scan_convert(__constant const Acquisition *acquisition, __global c
                sample = depth / acquisition->sample_mm;
   const intn inside = (place >= -0.5f) & (place <= scan_lines - 0.5f) & (depth >= 0.0f) &
                       (depth < acquisition->depth_mm) & (y >= acquisition->top_mm) & (y < acquisition->bottom_mm);
+  if (!ANY_LANE(inside)) {
+    for (int j = 0; j < min(LANES, columns - column); j++) image[row * columns + column + j] = 0;
+    return;
+  }
   const intn bin = clamp(TO_INTN(sample), (intn)(0), (intn)(samples - 2));
   const floatn on_line = clamp(place, 0.0f, scan_lines - 1.0f);
   const intn line = TO_INTN(on_line);
-  SPREAD(int, inside_, inside);
-  SPREAD(int, bin_, bin);
-  SPREAD(int, line_, line);
-  SPREAD(float, part_, fmin(sample - TO_FLOATN(bin), 1.0f));
-  float around[4][LANES];  // the grey levels of the four lines about each pixel, at its depth
-  for (int j = 0; j < LANES; j++)
-    for (int n = 0; n < 4; n++) {
-      __global const uchar *at = grey + clamp(line_[j] + n - 1, 0, scan_lines - 1) * samples + bin_[j];
-      around[n][j] = inside_[j] ? blend((float)at[0], (float)at[1], part_[j]) : 0.0f;
+  const floatn part = fmin(sample - TO_FLOATN(bin), 1.0f);
+  floatn around[4];  // the grey levels of the four lines about each pixel, at its depth
+  for (int n = 0; n < 4; n++) {
+    SPREAD(int, at, clamp(line + (n - 1), (intn)(0), (intn)(scan_lines - 1)) * samples + bin);
+    uchar near[LANES], far[LANES];
+    for (int j = 0; j < LANES; j++) {
+      near[j] = grey[at[j]];
+      far[j] = grey[at[j] + 1];
     }
-  const floatn a = LOAD_LANES(around[0]), b = LOAD_LANES(around[1]), c = LOAD_LANES(around[2]),
-               d = LOAD_LANES(around[3]), t = on_line - TO_FLOATN(line);
+    const floatn level = GREY_LANES(near);
+    around[n] = fma(part, GREY_LANES(far) - level, level);
+  }
+  const floatn a = around[0], b = around[1], c = around[2], d = around[3], t = on_line - TO_FLOATN(line);
   const floatn value = b + 0.5f * t * (c - a + t * (2.0f * a - 5.0f * b + 4.0f * c - d + t * (3.0f * (b - c) + d - a)));
-  SPREAD(float, value_, clamp(value, 0.0f, 255.0f) + 0.5f);
-  for (int j = 0; j < min(LANES, columns - column); j++) image[row * columns + column + j] = (uchar)value_[j];
+  const floatn shown = inside ? clamp(value, 0.0f, 255.0f) + 0.5f : (floatn)(0.0f);
+  if (columns - column >= LANES) {
+    STORE_GREY(shown, image + row * columns + column);
+    return;
+  }
+  SPREAD(float, shown_, shown);
+  for (int j = 0; j < columns - column; j++) image[row * columns + column + j] = (uchar)shown_[j];
 }

@@ -64,6 +64,7 @@
 #define PLANE_WORDS 1
 #endif
 
+#define GRAINS 1024.0f      // places of a scatterer along each axis of its cell, in the middle of as many parts
 #define BATCH (16 * LANES)  // cells waiting to be computed; rows are packed end to end so that every lane has work
 
 // Quantities common to all scatterers beside one piece of a segment. Vectors are in the order u, v, w of lattice axes.
@@ -97,6 +98,13 @@ typedef struct {
 typedef float4 Echoes;  // [PARTS][PART] left re, im, right re, im
 #endif
 
+// Of LANES vectors with one: (u, v, w) . along; and the line a + t slope.
+inline floatn dot_lanes(floatn u, floatn v, floatn w, float3 along) {
+  return fma(u, (floatn)(along.x), fma(v, (floatn)(along.y), w * along.z));
+}
+
+inline floatn line_lanes(floatn t, float a, float slope) { return fma(t, (floatn)(slope), (floatn)(a)); }
+
 // The hash uses cell indices by lattice axis (0, 1, 2), not by u, v, w: the same scatterer from every direction.
 inline uint axis_step(int axis) { return axis == 0 ? 0x9E3779B1u : axis == 1 ? 0x85EBCA77u : 0xC2B2AE3Du; }
 
@@ -110,11 +118,11 @@ inline float row_of_depth(__constant const Acquisition *acquisition, float path,
 #ifndef LOBES
 // By how many cycles the phase of the elevational beam, of this sigma, is behind that on its axis, per squared
 // millimetre from there. With it, speckle has the height that it has at the aperture's beam (diffraction.py).
-inline float elevational_cycles(__constant const Acquisition *acquisition, float path, float loss, float sigma) {
+inline float elevational_cycles(__constant const Acquisition *acquisition, float path, float frequency, float sigma) {
   int row;
   const float deeper = row_of_depth(acquisition, path, &row);
   __constant const float *heights = acquisition->speckle_height_mm + row;
-  const float height = blend(heights[0], heights[1], deeper) / frequency_after(acquisition, loss);
+  const float height = blend(heights[0], heights[1], deeper) / frequency;
   if (height <= 0.0f || height >= sigma) return 0.0f;
   return sqrt(1.0f / (height * height) - 1.0f / (sigma * sigma)) / (sigma * 2.0f * TWO_PI);
 }
@@ -283,7 +291,7 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
                           __global const uint *planes, __global const uint *texture, __global const float *sites,
                           const Piece *piece, const int *cell_u, const uint *row_key, const float *row_v,
                           const float *row_w, int count, Echoes *sum VARIED_PARAMETERS) {
-  const float cell = acquisition->cell_mm, grain = cell / 1024.0f;
+  const float cell = acquisition->cell_mm, grain = cell / GRAINS, first_u = 0.5f * grain - piece->start_u;
 #ifndef LOBES
   const float cutoff2 = 0.5f * LOG2_E * acquisition->beam_cutoff * acquisition->beam_cutoff;
 #endif
@@ -310,14 +318,14 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     // Jitter is defined by lattice axis: u, v, w use the bits of the axis they represent.
     const uintn bits_u = (key >> (10 * u)) & 0x3ffu, bits_v = (key >> (10 * v)) & 0x3ffu,
                 bits_w = (key >> (10 * w)) & 0x3ffu;
-    const floatn pu = (TO_FLOATN(cells) * cell - piece->start_u) + (TO_FLOATN(bits_u) + 0.5f) * grain;
-    const floatn pv = LOAD_LANES(row_v + begin) + (TO_FLOATN(bits_v) + 0.5f) * grain;
-    const floatn pw = LOAD_LANES(row_w + begin) + (TO_FLOATN(bits_w) + 0.5f) * grain;
-    const floatn along = pu * d.x + pv * d.y + pw * d.z;
-    const floatn aside_l = pu * l.x + pv * l.y + pw * l.z;
-    const floatn aside_e = pu * e.x + pv * e.y + pw * e.z;
+    const floatn pu = fma(TO_FLOATN(bits_u), (floatn)(grain), fma(TO_FLOATN(cells), (floatn)(cell), (floatn)(first_u)));
+    const floatn pv = fma(TO_FLOATN(bits_v), (floatn)(grain), LOAD_LANES(row_v + begin));
+    const floatn pw = fma(TO_FLOATN(bits_w), (floatn)(grain), LOAD_LANES(row_w + begin));
+    const floatn along = dot_lanes(pu, pv, pw, d);
+    const floatn aside_l = dot_lanes(pu, pv, pw, l);
+    const floatn aside_e = dot_lanes(pu, pv, pw, e);
     const floatn t = (along - piece->low) * piece->span;
-    const floatn right = piece->edge + aside_l * (piece->line0 + t * piece->line1);
+    const floatn right = fma(aside_l, line_lanes(t, piece->line0, piece->line1), (floatn)(piece->edge));
 #ifdef LOBES
     const floatn r2 = 0.0f, curved = 0.0f;  // lobes have random phases
     const intn near = fabs(aside_e) <= piece->reach;
@@ -325,12 +333,12 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     STORE_LANES(piece->path0 + (along - piece->low), path_ + begin);
 #else
     const floatn aside2 = aside_e * aside_e;
-    const floatn r2 = aside2 * (piece->narrow0 + t * piece->narrow1);
-    const floatn curved = aside2 * (piece->curved0 + t * piece->curved1);
+    const floatn r2 = aside2 * line_lanes(t, piece->narrow0, piece->narrow1);
+    const floatn curved = aside2 * line_lanes(t, piece->curved0, piece->curved1);
     const intn near = r2 <= cutoff2;
 #endif
-    const floatn range = along + aside_l * aside_l * piece->bend;
-    const floatn depth = piece->depth0 + range * piece->slope;
+    const floatn range = fma(aside_l, aside_l * piece->bend, along);
+    const floatn depth = line_lanes(range, piece->depth0, piece->slope);
     const floatn place = depth * inverse_sample;
     const floatn bin = floor(place);
     const intn bins = TO_INTN(bin) - piece->first;
@@ -342,14 +350,14 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
       n += counts_[j] & 1;
     }
     const floatn amplitude =
-        exp2_fast(clamp(piece->gain0 + t * piece->gain1 - r2, (floatn)(-100.0f), (floatn)(100.0f)));
+        exp2_fast(clamp(line_lanes(t, piece->gain0, piece->gain1) - r2, (floatn)(-100.0f), (floatn)(100.0f)));
     const floatn echo = amplitude * (1.0f - TO_FLOATN((random >> 14) & 2u));
     floatn cosine, sine;
-    turn(depth * acquisition->cycles_per_mm + curved, &cosine, &sine);
+    turn(fma(depth, (floatn)(acquisition->cycles_per_mm), curved), &cosine, &sine);
     const float3 at = piece->at_start, ri = piece->row_i, rj = piece->row_j, rk = piece->row_k;
-    const floatn vx = clamp(at.x + pu * ri.x + pv * ri.y + pw * ri.z, (floatn)(0.0f), (floatn)(voxel_top.x));
-    const floatn vy = clamp(at.y + pu * rj.x + pv * rj.y + pw * rj.z, (floatn)(0.0f), (floatn)(voxel_top.y));
-    const floatn vz = clamp(at.z + pu * rk.x + pv * rk.y + pw * rk.z, (floatn)(0.0f), (floatn)(voxel_top.z));
+    const floatn vx = clamp(at.x + dot_lanes(pu, pv, pw, ri), (floatn)(0.0f), (floatn)(voxel_top.x));
+    const floatn vy = clamp(at.y + dot_lanes(pu, pv, pw, rj), (floatn)(0.0f), (floatn)(voxel_top.y));
+    const floatn vz = clamp(at.z + dot_lanes(pu, pv, pw, rk), (floatn)(0.0f), (floatn)(voxel_top.z));
     const intn ix = TO_INTN(vx), iy = TO_INTN(vy), iz = TO_INTN(vz);
     STORE_LANES(bins, bin_ + begin);
     STORE_LANES(place - bin, part_ + begin);
@@ -475,6 +483,8 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
                         : 0.5f * (high - low) * fabs(d.y - along_band * d.z) + radius_l * fabs(l.y - along_band * l.z);
 
   const float base_u = 0.5f * cell - start.x;
+  // Of rows, the first place of their cells
+  const float first_v = 0.5f * cell / GRAINS - start.y, first_w = 0.5f * cell / GRAINS - start.z;
   int waiting = 0;
   for (int cw = w_low; cw <= w_high; cw++) {
     const float v_here = band_v + along_band * cw * cell, v_next = v_here + along_band * cell;
@@ -496,12 +506,12 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
       SPREAD(int, cells_, TO_INTN(floor(to)) - u_low + 1);
       for (int j = 0; j < min(LANES, v_last - cv + 1); j++) {
         const uint key = (uint)(cv + j) * step_v + (uint)cw * step_w;
-        const float place_v = (cv + j) * cell - start.y;
+        const float place_v = (cv + j) * cell + first_v;
         for (int cu = 0; cu < cells_[j]; cu += LANES) {
           STORE_LANES(u_low_[j] + cu + LANE_INDEX, cell_u + waiting);
           STORE_LANES((uintn)(key), row_key + waiting);
           STORE_LANES((floatn)(place_v), row_v + waiting);
-          STORE_LANES((floatn)(cw * cell - start.z), row_w + waiting);
+          STORE_LANES((floatn)(cw * cell + first_w), row_w + waiting);
           waiting += min(LANES, cells_[j] - cu);
           if (waiting >= BATCH) {
             scatter_batch(acquisition, voxels, planes, texture, sites, piece, cell_u, row_key, row_v, row_w, BATCH,
@@ -547,6 +557,7 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
   const int block = first / PIECE_BLOCK * PIECE_BLOCK;
   const float block_low = (block - 1) * acquisition->sample_mm;
   const float block_high = (block + PIECE_BLOCK) * acquisition->sample_mm;
+  const float line_begins = traced_start(acquisition, (float)line);
 
   int count = min(segment_counts[line], MAX_SEGMENTS);
   for (int index = 0; index < count; index++) {
@@ -590,7 +601,7 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
     const float longest = 0.4f * fmin(acquisition->transmit_waist, acquisition->elevation_rayleigh);
 #endif
     const int pieces = max(1, (int)ceil((segment_high - segment_low) / longest));
-    const float to_apex = segment->path_mm + (acquisition->linear ? 1e6f : acquisition->apex_radius_mm);
+    const float to_apex = segment->path_mm + (acquisition->linear ? 1e6f : acquisition->apex_radius_mm + line_begins);
     float high = segment_low;
     for (int n = 0; n < pieces;) {
       const float low = high, next_high = blend(segment_low, segment_high, (float)(n + 1) / pieces);
@@ -601,12 +612,16 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float path_low = segment->path_mm + low, path_high = segment->path_mm + high;
       const float loss_low = segment->loss + segment->loss_per_mm * low;
       const float loss_high = segment->loss + segment->loss_per_mm * high;
-      const float2 sigma_low = sigma_after(acquisition, path_low, loss_low);
-      const float2 sigma_high = sigma_after(acquisition, path_high, loss_high);
-      const float apart_low = line_distance(acquisition, path_low), apart_high = line_distance(acquisition, path_high);
+      float band_low, band_high;
+      const float frequency_low = band_after(acquisition, loss_low, &band_low);
+      const float frequency_high = band_after(acquisition, loss_high, &band_high);
+      const float2 sigma_low = sigma_at(acquisition, path_low, 1.0f / frequency_low);
+      const float2 sigma_high = sigma_at(acquisition, path_high, 1.0f / frequency_high);
+      const float apart_low = line_distance(acquisition, path_low + line_begins);
+      const float apart_high = line_distance(acquisition, path_high + line_begins);
       piece.low = low;
       piece.span = 1.0f / fmax(high - low, 1e-6f);
-      piece.bend = acquisition->linear ? 0.0f : 0.5f / fmax(acquisition->apex_radius_mm + path_low, 1.0f);
+      piece.bend = acquisition->linear ? 0.0f : 0.5f / fmax(to_apex + low, 1.0f);
       piece.edge = (line - left_line + 0.5f) / lines;
       piece.line0 = 1.0f / (lines * apart_low);
       piece.line1 = 1.0f / (lines * apart_high) - piece.line0;
@@ -622,8 +637,8 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       const float radius_e = acquisition->beam_cutoff * fmax(sigma_low.y, sigma_high.y);
       piece.narrow0 = 0.5f * LOG2_E / (sigma_low.y * sigma_low.y);
       piece.narrow1 = 0.5f * LOG2_E / (sigma_high.y * sigma_high.y) - piece.narrow0;
-      piece.curved0 = elevational_cycles(acquisition, path_low, loss_low, sigma_low.y);
-      piece.curved1 = elevational_cycles(acquisition, path_high, loss_high, sigma_high.y) - piece.curved0;
+      piece.curved0 = elevational_cycles(acquisition, path_low, frequency_low, sigma_low.y);
+      piece.curved1 = elevational_cycles(acquisition, path_high, frequency_high, sigma_high.y) - piece.curved0;
 #endif
       // Unit energy of the point spread function for all widths: sqrt(1 / (sigma_l sigma_e)) times the scale. The
       // weights of beam.cl have unit sum, that is apart / (sqrt(2 pi) sigma_l) at the peak.
@@ -632,11 +647,9 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
       // Behind a curved mirror the same power is spread over a wider tube.
       const float4 tube_low = tube_after(vload4(0, segment->tube), low);
       const float4 tube_high = tube_after(vload4(0, segment->tube), high);
-      const float band_low = LOG2_E * gain_of_band(acquisition, loss_low);
-      const float band_high = LOG2_E * gain_of_band(acquisition, loss_high);
-      piece.gain0 = gain + band_low - decay * low + 0.5f * log2(sigma_low.x / (tall_low * tube_low.x * tube_low.z)) -
-                    log2(apart_low);
-      piece.gain1 = gain + band_high - decay * high +
+      piece.gain0 = gain + LOG2_E * band_low - decay * low +
+                    0.5f * log2(sigma_low.x / (tall_low * tube_low.x * tube_low.z)) - log2(apart_low);
+      piece.gain1 = gain + LOG2_E * band_high - decay * high +
                     0.5f * log2(sigma_high.x / (tall_high * tube_high.x * tube_high.z)) - log2(apart_high) -
                     piece.gain0;
 

@@ -66,9 +66,10 @@ __kernel void side_lobes(__constant const Acquisition *acquisition, __global con
                          float unit_least, float unit_slope) {
   const int sample = get_global_id(0) * LANES, here = LINE_PAD + sample, lines = acquisition->scan_lines;
   // One path length for all lines and LANES: with steered lines that of the middle line, from where it leaves the face.
+  // (At one displayed depth all lines are equally far apart.)
   const float depth_mm = (sample / LOSS_STEP * LOSS_STEP + 0.5f * LOSS_STEP) * acquisition->sample_mm;
   const float s = fmax(depth_mm - line_start(acquisition, 0.5f * (lines - 1)), 0.0f);
-  const float apart = line_distance(acquisition, s) * acquisition->lateral_rays;
+  const float apart = line_distance(acquisition, depth_mm) * acquisition->lateral_rays;
   const float unit = fmax(unit_least, unit_slope * s), main_beam = lateral_sigma(acquisition, s);
   const int dense = (lines + LOBE_NODES - 1) / LOBE_NODES;
   const int step = clamp((int)(NODE_DISTANCE * unit / apart), dense, lines), nodes = (lines + step - 1) / step;

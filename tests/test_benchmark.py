@@ -72,7 +72,7 @@ def test_scatterers_are_counted_by_the_volume_of_the_beam(solid):
     tree = solid.trace(probe, pose)
     inside = (tree.segment_line >= 0) & (tree.segment_line <= 63)
     found, looked_at = scatterer_counts(solid.device_frame(probe, pose), tree.segments[inside], solid.device.chunk)
-    depth = np.linspace(0, 30, 1001)
+    depth = np.linspace(0, float(solid.acquisition(probe, pose)["traced_mm"]), 1001)
     height = 2 * solid.settings.beam_cutoff * probe.beam_sigma_mm(depth)[1]
     width = np.deg2rad(50) * (30 + depth) * 64 / 63  # half a strip beyond either edge
     expected = sites_per_mm3(solid.settings, probe) * trapezoid(width * height, depth)

@@ -28,7 +28,7 @@ from SlicerUSSim.Logic import (
     segment_mri,
 )
 from SlicerUSSim.Logic.imaging.compounding import sweep_grid
-from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning
+from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning, SlowScatterersWarning
 from SlicerUSSim.Logic.tissue import read_label_map
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import MAX_LABEL
@@ -556,3 +556,17 @@ def test_a_simulator_follows_changed_probes_settings_and_tissues_and_keeps_no_ch
         found = kept.simulate(seen, pose).iq
         expected = UltrasoundSimulator(labels, kept.medium.tissues, settings_).simulate(seen, pose).iq
         np.testing.assert_array_equal(found, expected)
+
+
+def test_so_many_scatterers_that_an_image_takes_long_are_a_warning():
+    labels, pose = block(lambda x, y, z: np.ones_like(x)), rigid(np.eye(3), [0, -60, 0])
+    with warnings.catch_warnings():  # as an error, before the image is computed
+        warnings.simplefilter("error")
+        dense = simulator(labels, SPECKLE, scatterers_per_mm3=200_000.0)
+        with pytest.raises(SlowScatterersWarning, match=r"200000: 2\.5e\+09 cells .* about 25 s on .* none, 33 for"):
+            dense.simulate(PROBES["convex"], pose)
+        with pytest.raises(SlowScatterersWarning):
+            dense.volume(PROBES["convex"], [pose])
+        for enough in (None, 500.0):
+            simulator(labels, SPECKLE, scatterers_per_mm3=enough).simulate(PROBES["convex"], pose)
+        simulator(labels, SPECKLE, scatterers_per_mm3=200_000.0, scattering=False).simulate(PROBES["convex"], pose)

@@ -86,7 +86,7 @@ class SimulationSettings(Declared):
         "Sites of the scatterer lattice per cubic millimetre; none: eight in the probe's smallest resolution cell",
         unit="1/mm³", bounds=(0.1, 200_000), can_be_none=True,
         note="Eight are enough for developed speckle, and there are at least 4 per mm³; the lattice is fixed in the "
-        "patient for a given probe",
+        "patient for a given probe. So many that an image takes more than about 5 s on two cores are a warning",
         source="The paper's Rayleigh test uses cells of 20 µm (125000/mm³), of which mu1 keeps 1 %",
     )  # fmt: skip
     partial_volume: bool | None = parameter(

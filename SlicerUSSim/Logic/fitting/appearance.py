@@ -91,6 +91,7 @@ class AppearanceModel:
         #: Tissues with varied scatterers, in the order of the bases, and with varied attenuation, in that of the paths
         self.scattering = [n for n, p in self.varied.items() if p & SCATTERING]
         self.attenuating = [n for n, p in self.varied.items() if _ATTENUATION in p]
+        simulator.warn_if_slow(probe)
         self._check_memory()
         device = self.device
         mixing = device.kernels("appearance.cl", device.lanes)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .reuse import ReusedSimulator as ReusedSimulator
     from .simulator import (
         EmptyViewWarning as EmptyViewWarning,
+        SlowScatterersWarning as SlowScatterersWarning,
         TreeOverflowWarning as TreeOverflowWarning,
         UltrasoundSimulator as UltrasoundSimulator,
     )

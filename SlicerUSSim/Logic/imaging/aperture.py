@@ -60,7 +60,7 @@ class Aperture(Stage):
             self._fans, fan, frame.acquisition_buffer, frame.medium.voxel_buffer, acoustics, all_soft, sums, few=True
         )
         self.device.run(
-            self._screens, (depths, lines), frame.acquisition_buffer, sums, np.int32(with_level), all_soft,
+            self._screens, (lines, depths), frame.acquisition_buffer, sums, np.int32(with_level), all_soft,
             frame.screens, shades, frame.spreads, few=True,
         )  # fmt: skip
         self.device.run(self._keep_levels, (depths, lines), frame.acquisition_buffer, frame.screens, frame.spreads)

@@ -109,6 +109,11 @@ def downshift(probe: Probe) -> float:
     return (probe.received_bandwidth / FWHM_PER_SIGMA) ** 2
 
 
+def log_band_above(shift: float) -> float:
+    """log erfc(-f0 / sf) of the transmitted band, whose `shift` is that of `downshift`: twice its part above zero."""
+    return float(np.log(2.0) + log_ndtr(np.sqrt(2.0 / shift))) if shift else float(np.log(2.0))
+
+
 def gain_of_band(shift: float, loss: np.ndarray) -> np.ndarray:
     """By how many nepers the band of a pulse has more amplitude than its centre alone, after `loss` nepers both ways.
 

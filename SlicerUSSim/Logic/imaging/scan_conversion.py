@@ -25,6 +25,7 @@ class ScanConverter(Stage):
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the conversion of one frame: its `image`."""
         grid, (lines, samples) = frame.grid, frame.line_shape
+        sample_mm = float(frame.acquisition["sample_mm"])
         frame.image = self.workspace.get("image", grid.rows * grid.columns)
         smooth = self.workspace.get("smooth", lines * samples)
         self.device.run(
@@ -33,7 +34,8 @@ class ScanConverter(Stage):
             frame.grey,
             smooth,
             np.int32(samples),
-            np.int32(max(round(grid.pixel_spacing_mm[1] / float(frame.acquisition["sample_mm"])), 1)),
+            np.int32(np.ceil(float(frame.acquisition["depth_mm"]) / sample_mm)),
+            np.int32(max(round(grid.pixel_spacing_mm[1] / sample_mm), 1)),
         )
         self.device.run(
             self.convert,

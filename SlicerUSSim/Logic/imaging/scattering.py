@@ -216,6 +216,14 @@ def sites_per_mm3(settings: SimulationSettings, probe: Probe) -> float:
     return float(np.clip(_SITES_PER_CELL / probe.smallest_cell_mm3(), _LEAST_PER_MM3, PAPER_SITES_PER_MM3))
 
 
+def cells_in_view(settings: SimulationSettings, probe: Probe) -> float:
+    """Cells of the scatterer lattice within the beams of one image in tissue without reflections."""
+    depth = np.linspace(0.0, probe.depth_mm, 65)
+    across = 2.0 * settings.beam_cutoff * probe.beam_sigma_mm(depth)[1]
+    width = probe.scan_lines * probe.line_distance_mm(depth)
+    return sites_per_mm3(settings, probe) * float(trapezoid(across * width, depth))
+
+
 def lattice_sites(tissues: np.ndarray, acquisition: np.ndarray) -> np.ndarray:
     """(labels, 2) float32: share of lattice cells with a scatterer, in 1/65536, and its amplitude, by layout.TISSUE.
 

@@ -6,6 +6,7 @@ import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -18,7 +19,7 @@ from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging import stages
 from SlicerUSSim.Logic.imaging.aperture import Aperture, aperture_fields
-from SlicerUSSim.Logic.imaging.bmode import downshift
+from SlicerUSSim.Logic.imaging.bmode import downshift, log_band_above, pulse_taps
 from SlicerUSSim.Logic.imaging.compounding import Compounder, sweep_grid
 from SlicerUSSim.Logic.imaging.contact import line_contact
 from SlicerUSSim.Logic.imaging.diffraction import speckle_height_mm
@@ -26,7 +27,7 @@ from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.medium import Medium, as_labels
 from SlicerUSSim.Logic.imaging.noise import stirred
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
-from SlicerUSSim.Logic.imaging.scattering import sites_per_mm3
+from SlicerUSSim.Logic.imaging.scattering import cells_in_view, sites_per_mm3
 from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import DeviceFrame, Stage
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 
 #: Beyond all fields
 _FAR_MM = 1e6
+#: Cells of the scatterer lattice per image, about 5 s on two cores, and per second there
+_MANY_CELLS, _CELLS_PER_S = 5e8, 1e8
 _log = logging.getLogger(__name__)
 
 StageKind = TypeVar("StageKind", bound=Stage)
@@ -50,6 +53,10 @@ StageKind = TypeVar("StageKind", bound=Stage)
 
 class EmptyViewWarning(UserWarning):
     """The imaged field is completely outside the volume; the image has no echoes of tissue."""
+
+
+class SlowScatterersWarning(UserWarning):
+    """The lattice of scatterers is so dense that an image takes long."""
 
 
 class TreeOverflowWarning(UserWarning):
@@ -134,14 +141,16 @@ class UltrasoundSimulator:
         `grid` gives the pixels, for example those of a real image; by default they cover the bounding box of the imaged
         field, with display.image_size pixels. `noise_seed` selects the amplifier noise (noise.py): 0 depends only on
         the settings' seed, seed_of_pose(probe_to_ras) also on the pose.
-        Warns with EmptyViewWarning and returns a black image if the field is outside the volume.
+        Warns with EmptyViewWarning and returns a black image if the field is outside the volume, and with
+        SlowScatterersWarning if scatterers_per_mm3 is so high that it takes more than seconds on a CPU.
         Raises SimulationError for a pose that is not rigid and a noise_seed that is not a whole number of 32 bits.
         """
         require_kind("probe", probe, Probe, "a ConvexProbe, LinearProbe or PhasedProbe")
         pose = check_rigid("probe_to_ras", probe_to_ras)
-        self._warn_if_empty(probe, pose)
+        self.warn_if_slow(probe)
         timings: dict[str, float] = {}
         frame = self._rendered(probe, pose, display, grid, timings, noise_seed)
+        self._warn_if_empty(probe, pose)  # while the device computes
         with self._timed("download", timings):
             samples = self._sample_count(probe)
             iq, envelope, bmode = (frame.download(name)[:, :samples] for name in ("iq", "envelope", "grey"))
@@ -282,6 +291,7 @@ class UltrasoundSimulator:
         require_kind("probe", probe, Probe, "a ConvexProbe, LinearProbe or PhasedProbe")
         require_kind("poses", poses, Iterable, "of (4, 4) probe_to_ras")
         poses = list(poses)
+        self.warn_if_slow(probe)
         grid = like if like is not None else sweep_grid(probe, poses, spacing_mm)
         _log.info(
             "%d images are compounded in %s voxels %s", len(poses), "x".join(map(str, grid.array.shape[::-1])),
@@ -392,7 +402,11 @@ class UltrasoundSimulator:
         acquisition["fractional_bandwidth"] = probe.received_bandwidth
         acquisition["cycles_per_mm"] = self._cycles_per_mm(probe)
         acquisition["sample_mm"] = self._sample_mm(probe)
-        acquisition["samples"] = -(-self._sample_count(probe) // block) * block
+        # The last samples of the image have echoes from half a pulse behind it. Borders are found by labels, up to a
+        # voxel behind where they are.
+        behind = pulse_taps(axial_sigma / self._sample_mm(probe)).size // 2
+        acquisition["samples"] = -(-(self._sample_count(probe) + behind) // block) * block
+        acquisition["traced_mm"] = probe.displayed_mm + behind * self._sample_mm(probe) + medium.labels.spacing_mm.min()
         acquisition["wavefront_curvature"] = CURVED if settings.wavefront_curvature else 0.0
         for name, value in transmit_fields(probe).items():
             acquisition[name] = value
@@ -410,7 +424,8 @@ class UltrasoundSimulator:
         acquisition["interface_gain"] = 10.0 ** (settings.interface_gain_db / 20.0)
         acquisition["interface_is_energy"] = settings.interface_reflection == "energy"
         density = sites_per_mm3(settings, probe)
-        acquisition["downshift"] = downshift(probe) if settings.frequency_downshift else 0.0
+        shift = acquisition["downshift"] = downshift(probe) if settings.frequency_downshift else 0.0
+        acquisition["band_above"] = log_band_above(shift)
         acquisition["cell_mm"] = density ** (-1.0 / 3.0)
         acquisition["seed"] = _mixed(settings.seed)
         # The integral of the squared point spread function is pi^1.5 times the product of the three sigmas.
@@ -429,6 +444,22 @@ class UltrasoundSimulator:
 
     def _sample_count(self, probe: Probe) -> int:
         return int(np.ceil(probe.displayed_mm / self._sample_mm(probe)))
+
+    def warn_if_slow(self, probe: Probe) -> None:
+        """Warn if the density that was set makes an image of so many scatterers."""
+        density = self.settings.scatterers_per_mm3
+        if density is None or not self.settings.scattering:
+            return
+        cells = cells_in_view(self.settings, probe)
+        if cells > _MANY_CELLS:
+            automatic = sites_per_mm3(replace(self.settings, scatterers_per_mm3=None), probe)
+            warnings.warn(
+                f"scatterers_per_mm3 is {density:g}: {cells:.1e} cells of the lattice per image, about "
+                f"{cells / _CELLS_PER_S:.0f} s on two cores of a CPU; none, {automatic:.0f} for this probe, is enough "
+                "for developed speckle",
+                SlowScatterersWarning,
+                stacklevel=3,
+            )
 
     def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
         """Warn if the volume has no labels, or the bounding box of the imaged field, in voxels, does not meet it."""
@@ -496,7 +527,6 @@ def steering_fields(probe: Probe) -> dict[str, Any]:
         "steering_sin": np.sin(probe.steering_rad),
         "steering_cos": np.cos(probe.steering_rad),
         "start_mm": float(probe.line_starts_mm(0.0)),
-        "spread_radius_mm": 0.0 if probe.is_linear else probe.apex_radius_mm + starts.mean(),
         "top_mm": 0.0 if steered else -_FAR_MM,
         "bottom_mm": ends.max() if steered and probe.is_linear else _FAR_MM,
     }

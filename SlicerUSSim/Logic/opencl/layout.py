@@ -86,14 +86,14 @@ ACQUISITION = np.dtype(
         ("first_line", _FLOAT),
         ("line_spacing", _FLOAT),
         ("scan_lines", _INT),
-        ("depth_mm", _FLOAT),  # displayed, up to which lines are computed
+        ("depth_mm", _FLOAT),  # displayed, of the image
+        ("traced_mm", _FLOAT),  # displayed, up to which rays are traced: half a pulse and a voxel beyond the image
         # steering of a linear array (line_start in common.clh)
         ("steered", _INT),
         ("flat_face", _INT),
         ("steering_sin", _FLOAT),  # of the angle of parallel lines to the normal of the face
         ("steering_cos", _FLOAT),
         ("start_mm", _FLOAT),  # displayed depth at which a parallel line in the middle leaves the face
-        ("spread_radius_mm", _FLOAT),  # distance from the apex to the face, on average over the lines
         ("top_mm", _FLOAT),  # of the imaged field
         ("bottom_mm", _FLOAT),
         # wave and beam (Probe.beam_sigma_mm)
@@ -102,7 +102,7 @@ ACQUISITION = np.dtype(
         ("reference_speed_m_s", _FLOAT),
         ("cycles_per_mm", _FLOAT),
         ("sample_mm", _FLOAT),
-        ("samples", _INT),  # rounded up to whole chunks
+        ("samples", _INT),  # up to traced_mm, rounded up to whole blocks
         ("transmit_zones", _INT),  # 0: focused at every depth, with transmit_sigma[0] at least
         ("transmit_sigma", _FLOAT, CONSTANTS["MAX_ZONES"]),
         ("transmit_focus", _FLOAT, CONSTANTS["MAX_ZONES"]),
@@ -144,6 +144,7 @@ ACQUISITION = np.dtype(
         ("interface_is_energy", _INT),
         ("specular_exponent", _FLOAT),
         ("downshift", _FLOAT),  # part of the frequency that is lost per neper of two-way loss; 0: none
+        ("band_above", _FLOAT),  # log erfc(-f0 / sf): of the part of the transmitted band that is above zero
         # scatterers
         ("cell_mm", _FLOAT),
         ("seed", _UINT),

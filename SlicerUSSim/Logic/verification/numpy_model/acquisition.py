@@ -33,7 +33,9 @@ def acquisition_record(
     first, spacing, radius = _geometry(probe)
     lateral, guard = _traced_lines(probe, settings)
     traced = 2 * guard + 1 + lateral * (probe.scan_lines - 1)
-    samples = int(np.ceil(_steering(probe)["depth_mm"] / sample_mm(probe, settings)))
+    step = sample_mm(probe, settings)
+    behind = len(pulse_taps(axial_sigma_mm(probe, settings) / step)) // 2  # half a pulse, in samples
+    samples = int(np.ceil(_steering(probe)["depth_mm"] / step)) + behind
     membrane = medium.tissues.membrane
     elevational, elevational_length = _elevation(probe)
     density = settings.scatterers_per_mm3 or _automatic_density(probe)
@@ -59,11 +61,12 @@ def acquisition_record(
         "line_spacing": spacing,
         "scan_lines": probe.scan_lines,
         **_steering(probe),
+        "traced_mm": _steering(probe)["depth_mm"] + behind * step + medium.voxel_mm,
         "frequency_mhz": _received_mhz(probe),
         "fractional_bandwidth": _received_bandwidth(probe),
         "reference_speed_m_s": settings.reference_speed_m_s,
         "cycles_per_mm": _cycles_per_mm(probe, settings),
-        "sample_mm": sample_mm(probe, settings),
+        "sample_mm": step,
         "samples": int(np.ceil(samples / CONSTANTS["BLOCK"])) * CONSTANTS["BLOCK"],
         **_transmit(probe),
         "wavefront_curvature": 0.6 if settings.wavefront_curvature else 0.0,
@@ -90,6 +93,9 @@ def acquisition_record(
         "interface_is_energy": settings.interface_reflection == "energy",
         "specular_exponent": settings.specular_exponent,
         "downshift": (_received_bandwidth(probe) / _FWHM) ** 2 if settings.frequency_downshift else 0.0,
+        "band_above": np.log(special.erfc(-_FWHM / _received_bandwidth(probe)))
+        if settings.frequency_downshift
+        else np.log(2.0),
         "cell_mm": np.cbrt(1.0 / density),
         "seed": hash_mix(np.array([settings.seed], np.uint32))[0] ^ np.uint32(0x2545F491),
         "beam_cutoff": settings.beam_cutoff,
@@ -357,14 +363,6 @@ def _is_parallel(probe: Probe) -> bool:
     return isinstance(probe, LinearProbe) and not probe.trapezoid_deg
 
 
-def _spread_radius(probe: Probe) -> float:
-    """Distance from the apex to the face, the mean over the lines where it is not the same for all."""
-    first, _, radius = _geometry(probe)
-    if not isinstance(probe, LinearProbe):
-        return radius
-    return radius * float((1.0 / np.cos(np.linspace(first, -first, probe.scan_lines))).mean())
-
-
 def _steering(probe: Probe) -> dict[str, float]:
     """Lines that leave a flat face obliquely: their depths count from a common surface behind it."""
     tilt = probe.steering_deg * np.pi / 180.0 if isinstance(probe, LinearProbe) else 0.0
@@ -378,7 +376,6 @@ def _steering(probe: Probe) -> dict[str, float]:
         "steering_sin": np.sin(tilt),
         "steering_cos": np.cos(tilt),
         "start_mm": before,
-        "spread_radius_mm": _spread_radius(probe),
         "top_mm": 0.0 if fan or tilt else -1e6,
         "bottom_mm": probe.depth_mm * np.cos(tilt) if tilt else 1e6,
     }

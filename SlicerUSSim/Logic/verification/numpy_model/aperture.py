@@ -270,7 +270,8 @@ class Screens:
         """(screen lines, depths) factors that leave every line its mean power, whatever the width of its beam."""
         lines, beam = np.arange(len(nepers)), Beam(self.acquisition)
         traced = (self.fields["traced_lines"] - 1) / (len(nepers) - 1)
-        sigma = beam.lateral_sigma(paths) / (beam.line_distance(paths) * traced)
+        starts = beam.traced_start(lines * traced)
+        sigma = beam.lateral_sigma(paths) / (beam.line_distance(paths + starts[:, None]) * traced)
 
         def passed(width: np.ndarray) -> np.ndarray:
             places = [lines[:, None] + row * width for row in _ROWS]
@@ -346,12 +347,15 @@ class Lit:
     def __init__(self, acquisition: np.ndarray, screens: np.ndarray) -> None:
         self.acquisition, self.screens, self.beam = acquisition, screens, Beam(acquisition)
 
-    def shades(self, place: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """(n, 2) nepers at places among the screen lines and at depths (n,), and behind the last end before them."""
+    def shades(self, place: np.ndarray, depth: np.ndarray, apart: np.ndarray) -> np.ndarray:
+        """(n, 2) nepers at places among the screen lines and at depths (n,), and behind the last end before them.
+
+        Traced lines are `apart` mm (n,).
+        """
         acquisition = self.acquisition
         path = f32(depth + 1) * acquisition["screen_step"]
         per_line = f32(len(self.screens) - 1) / f32(acquisition["traced_lines"] - 1)
-        per_mm = per_line / self.beam.line_distance(path)
+        per_mm = per_line / apart
         extra = self._extra_variance(path)
         nearest = [self._between(place + row * np.sqrt(2.0) * np.sqrt(extra) * per_mm, depth) for row in _ROWS]
         away = np.min([np.abs(pair[..., 7]) for left, right, _ in nearest for pair in (left, right)], axis=0)

@@ -101,8 +101,9 @@ class Beam:
         return np.sqrt(np.maximum(share * (receive2 ** f32(-2) - transmit2 ** f32(-2)), f32(0)))
 
     def line_distance(self, s: np.ndarray) -> np.ndarray:
+        """Between neighbouring traced lines at path length s plus where they begin (line_start)."""
         step = self.acquisition["line_spacing"] / f32(self.acquisition["lateral_rays"])
-        along = np.ones_like(s) if self.acquisition["linear"] else self.acquisition["spread_radius_mm"] + s
+        along = np.ones_like(s) if self.acquisition["linear"] else self.acquisition["apex_radius_mm"] + s
         return np.maximum(step * along, f32(1e-4))
 
     def line_start(self, line: np.ndarray | int) -> np.ndarray:
@@ -114,3 +115,8 @@ class Beam:
         if acquisition["linear"]:
             return acquisition["start_mm"] + position * acquisition["steering_sin"] / acquisition["steering_cos"]
         return acquisition["apex_radius_mm"] * (f32(1) / np.cos(position) - f32(1))
+
+    def traced_start(self, line: np.ndarray) -> np.ndarray:
+        """The same of traced lines."""
+        scan_line = f32(line - int(self.acquisition["guard_lines"])) / f32(self.acquisition["lateral_rays"])
+        return f32(self.line_start(scan_line))

@@ -28,8 +28,9 @@ _AXIS_STEPS = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint32)
 
 @dataclass(frozen=True)
 class _Strips:
-    """The lines whose echoes follow one path: `lines`, of which `before` are left of it; for lobes, their table."""
+    """Lines whose echoes follow the path of `line`: `lines`, of which `before` are left of it; `table` of lobes."""
 
+    line: int
     lines: int = 1
     before: int = 0
     block: int = CONSTANTS["BLOCK"]  # samples with linear interpolation of widths and gains
@@ -43,7 +44,7 @@ def scatterer_lines(
     """(2 traced lines, samples) complex64 impulses of all scatterers, on the left and right edges of every strip."""
     lines = np.zeros((2 * int(acquisition["traced_lines"]), int(acquisition["samples"])), np.complex128)
     for segment, line in zip(segments, segment_lines, strict=True):
-        _add_segment(acquisition, labels, tissues, segment, lines[2 * line : 2 * line + 2], _Strips())
+        _add_segment(acquisition, labels, tissues, segment, lines[2 * line : 2 * line + 2], _Strips(line))
     return lines.astype(np.complex64)
 
 
@@ -64,7 +65,7 @@ def lobe_lines(
         first = line // together * together
         count = min(together, traced - first)
         if line == first + count // 2:
-            strips = _Strips(count, line - first, 4 * CONSTANTS["BLOCK"], table, quiet)
+            strips = _Strips(line, count, line - first, 4 * CONSTANTS["BLOCK"], table, quiet)
             _add_segment(acquisition, labels, tissues, segment, lines[2 * first : 2 * (first + count)], strips)
     return lines.astype(np.complex64)
 
@@ -91,7 +92,8 @@ def _add_block(acquisition, labels, tissues, segment, first: int, sums: np.ndarr
     waist = acquisition["transmit_waist"]
     longest = waist if strips.table is not None else f32(0.4) * np.minimum(waist, acquisition["elevation_rayleigh"])
     pieces = max(1, int(np.ceil((high - low) / longest)))
-    to_apex = segment["path_mm"] + (f32(1e6) if acquisition["linear"] else acquisition["apex_radius_mm"])
+    begins = Beam(acquisition).traced_start(np.asarray(strips.line))
+    to_apex = segment["path_mm"] + (f32(1e6) if acquisition["linear"] else acquisition["apex_radius_mm"] + begins)
     ends = [low]
     for n in range(1, pieces + 1):
         next_end = low + f32(n) / f32(pieces) * (high - low)
@@ -107,9 +109,9 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     beam = Beam(acquisition)
     path = segment["path_mm"] + np.array([low, high])
     loss = segment["loss"] + segment["loss_per_mm"] * np.array([low, high])
-    frequency = beam.frequency_after(loss)
+    frequency, begins = beam.frequency_after(loss), beam.traced_start(np.asarray(strips.line))
     lateral, elevation, apart = (
-        beam.lateral_sigma(path, frequency), beam.elevation_sigma(path, frequency), beam.line_distance(path)
+        beam.lateral_sigma(path, frequency), beam.elevation_sigma(path, frequency), beam.line_distance(path + begins)
     )  # fmt: skip
     narrow = f32(0.5) * LOG2_E / (elevation * elevation)
     curved = beam.elevational_cycles(path, frequency)
@@ -148,7 +150,11 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     one_over = f32(1) / (strips.lines * apart)
     right = f32((strips.before + 0.5) / strips.lines) + aside_l * (one_over[0] + t * (one_over[1] - one_over[0]))
     r2 = aside_e * aside_e * (narrow[0] + t * (narrow[1] - narrow[0]))
-    bend = f32(0) if acquisition["linear"] else f32(0.5) / np.maximum(acquisition["apex_radius_mm"] + path[0], f32(1))
+    bend = (
+        f32(0)
+        if acquisition["linear"]
+        else f32(0.5) / np.maximum(acquisition["apex_radius_mm"] + begins + path[0], f32(1))
+    )
     depth = segment["depth_mm"] + (along + aside_l * aside_l * bend) * segment["depth_per_mm"]
     place = depth * (f32(1) / acquisition["sample_mm"])
     bins = np.floor(place).astype(int) - first
@@ -299,10 +305,11 @@ def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndar
     """Add every hit to the scan lines near it, as a Gaussian patch of a plane (docs/physics.md#3-rays)."""
     beam, rays = Beam(acquisition), acquisition["elevational_rays"].astype(np.float32)
     # Of lines much closer than the beam is wide, only some: at least four, at most eight per standard deviation
-    crowd = np.floor(np.log2(beam.lateral_sigma(hits["path_mm"]) / beam.line_distance(hits["path_mm"]) / f32(4)))
+    apart = beam.line_distance(hits["path_mm"] + beam.traced_start(hit_lines))
+    crowd = np.floor(np.log2(beam.lateral_sigma(hits["path_mm"]) / apart / f32(4)))
     crowd = 2 ** np.clip(crowd, 0, 6).astype(int)
-    hits, hit_lines, crowd = (values[hit_lines % crowd == 0] for values in (hits, hit_lines, crowd))
-    step = beam.line_distance(hits["path_mm"]) * f32(crowd)
+    hits, hit_lines, crowd, apart = (values[hit_lines % crowd == 0] for values in (hits, hit_lines, crowd, apart))
+    step = apart * f32(crowd)
     lateral, elevational = beam.lateral_sigma(hits["path_mm"]), beam.elevation_sigma(hits["path_mm"])
     width = np.sqrt(lateral * lateral + step * step / f32(12))
     per_slope = f32(2 * np.pi) * acquisition["cycles_per_mm"]
@@ -437,10 +444,11 @@ def lateral_beam(
         of_line = spreads[left] + (line - left) * (spreads[left + 1] - spreads[left])
         spread, factor = (f32(np.interp(s, nodes, of_line[:, n])) for n in range(2))
         sigma = spread * beam.lateral_sigma(s, frequencies[n])
-        step = beam.line_distance(s) / sigma
+        apart = beam.line_distance(s + start)
+        step = apart / sigma
         narrow2 = np.maximum(f32(1) - step * step / f32(6), f32(0.25))
         scale = factor * step / np.sqrt(narrow2) * np.sqrt(spread) * f32(0.39894228)
-        reach = np.ceil(acquisition["beam_cutoff"] * sigma / beam.line_distance(s)) + f32(0.5)
+        reach = np.ceil(acquisition["beam_cutoff"] * sigma / apart) + f32(0.5)
         away = np.arange(len(edges), dtype=np.float32)[:, None] + f32(0.5) - f32(centre)
         near = np.flatnonzero(np.abs(away[:, 0]) <= reach.max())
         weights = np.exp(f32(-0.5) * step * step / narrow2 * away[near] ** 2) * (np.abs(away[near]) <= reach)
@@ -448,7 +456,7 @@ def lateral_beam(
         blocks = np.arange(len(s)) // 16
         middle = np.maximum((f32(16) * f32(blocks) + f32(8)) * acquisition["sample_mm"] - start, f32(0))
         of_block = frequencies[n].reshape(-1, 16).mean(axis=1)[blocks]
-        curved = beam.lateral_curvature(middle, of_block) * (beam.line_distance(middle) / spread) ** 2
+        curved = beam.lateral_curvature(middle, of_block) * (beam.line_distance(middle + start) / spread) ** 2
         weights = weights * np.exp(np.complex64(-0.5j) * curved * away[near] ** 2)
         apart2 = step * step / narrow2
         kept = 2.0 + np.exp(-0.25 * apart2 - 0.25 * curved**2 / apart2)

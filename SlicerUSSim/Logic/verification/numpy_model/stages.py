@@ -171,7 +171,8 @@ def scan_conversion(frame: TwinFrame) -> None:
     record, grid, grey = frame.acquisition, frame.grid, frame.grey
     width = max(round(grid.pixel_spacing_mm[1] / float(record["sample_mm"])), 1)
     lines, samples = grey.shape
-    around = np.clip(np.arange(samples)[:, None] + np.arange(width) - width // 2, 0, samples - 1)
+    last = int(np.ceil(float(record["depth_mm"]) / float(record["sample_mm"]))) - 1  # of the image
+    around = np.clip(np.arange(samples)[:, None] + np.arange(width) - width // 2, 0, last)
     grey = (grey[:, around].mean(axis=2) + 0.5).astype(np.uint8).astype(np.float32)
     x = grid.left_mm + (np.arange(grid.columns) + 0.5) * grid.pixel_spacing_mm[0]
     y = grid.top_mm + (np.arange(grid.rows)[:, None] + 0.5) * grid.pixel_spacing_mm[1]

@@ -152,8 +152,7 @@ class Tracer:
 
     def _starts(self, line: np.ndarray) -> np.ndarray:
         """Displayed depths at which traced lines leave the face."""
-        scan_line = f32(line - int(self.acquisition["guard_lines"])) / f32(self.acquisition["lateral_rays"])
-        return f32(Beam(self.acquisition).line_start(scan_line))
+        return Beam(self.acquisition).traced_start(line)
 
     # ---- pieces of a beam ------------------------------------------------------------------------------------------
 
@@ -166,18 +165,18 @@ class Tracer:
         left, right = (self.screens[before + n, np.maximum(number - 1, 0)] for n in (0, 1))
         beam = left + (place - before.astype(np.float32))[:, None] * (right - left)
         path, per_strip = f32(np.maximum(number, 1)) * acquisition["screen_step"], (right - left) * per_line
-        apart = Beam(acquisition).line_distance(path)
+        apart = Beam(acquisition).line_distance(path + self._starts(line))
         turns = acquisition["cycles_per_mm"] * (per_strip[:, 1] - (apart + per_strip[:, 2]) * (beam[:, 2] / path))
-        shades = self._lit.shades(place, np.maximum(number - 1, 0))
+        shades = self._lit.shades(place, np.maximum(number - 1, 0), apart)
         beam[:, 0] += shades[:, 0] - beam[:, 4]
         beam[:, 4:6] = shades
-        beam[:, 0] += f32(0.5) * log(self._gathered_power(path, f32(1) + per_strip[:, 2] / apart, turns))
+        beam[:, 0] += f32(0.5) * log(self._gathered_power(path, apart, f32(1) + per_strip[:, 2] / apart, turns))
         return np.where(number[:, None] == 0, f32(0), beam)
 
-    def _gathered_power(self, path: np.ndarray, ratio: np.ndarray, turns: np.ndarray) -> np.ndarray:
-        """How power would change where axes come together to the part `ratio` of their distance; `turns` per line."""
+    def _gathered_power(self, path: np.ndarray, apart: np.ndarray, ratio: np.ndarray, turns: np.ndarray) -> np.ndarray:
+        """How power would change where axes `apart` mm come together to the part `ratio` of that; `turns` per line."""
         beam, width = Beam(self.acquisition), f32(1.3341168) * self.acquisition["fractional_bandwidth"]
-        decay = (f32(0.5) * beam.line_distance(path) / beam.lateral_sigma(path)) ** 2 + (width * turns) ** 2
+        decay = (f32(0.5) * apart / beam.lateral_sigma(path)) ** 2 + (width * turns) ** 2
         n = np.arange(1, _MOST_GATHERED, dtype=np.float32)[:, None]
         common, weight = np.maximum(f32(1) - n * np.abs(ratio), f32(0)), np.exp(-decay * n * n)
         terms = common * np.where(weight < 1e-3, f32(0), weight) * np.cos(f32(2 * np.pi) * n * turns)
@@ -311,7 +310,7 @@ class Tracer:
             rays.label[unknown] = self.labels.at(self._place(some, zero[unknown]))
         medium = np.where(rays.strong == _UNDER, rays.front, rays.label)
         rays.depth_per_mm = acquisition["reference_speed_m_s"] / self.tissues["speed_of_sound_m_s"][medium]
-        rays.to_depth = (acquisition["depth_mm"] - rays.depth) / rays.depth_per_mm
+        rays.to_depth = (acquisition["traced_mm"] - rays.depth) / rays.depth_per_mm
         to_piece = f32(rays.piece) * acquisition["screen_step"] + acquisition["screen_step"] - rays.path
         rays.to_piece = np.where(rays.piece < 0, f32(np.inf), to_piece)
         margin = f32(3) + np.abs(rays.quantile) * f32(4) / self.voxel_mm
@@ -484,7 +483,7 @@ class Tracer:
         shortened = written >= 0
         lengths = self._segments[-1]["length_mm"]
         lengths[written[shortened]] = np.maximum(lengths[written[shortened]] - back[shortened], f32(0))
-        keep = rays.depth + border * rays.depth_per_mm < acquisition["depth_mm"]
+        keep = rays.depth + border * rays.depth_per_mm < acquisition["traced_mm"]
         seen = self.seen
         strong_border = ~(is_soft(seen[rays.label], seen[other]) & bool(acquisition["aperture_beams"]))
         front = seen[self._front(rays)]

@@ -180,7 +180,7 @@ def _carried(simulator, probe, phantom: Phantom) -> tuple[np.ndarray, np.ndarray
     lines = np.unique(tree.segment_line)
     cut = tree.cut_weight[:, 0].astype(float)
     ends = tree.segments["depth_mm"] + tree.segments["length_mm"] * tree.segments["depth_per_mm"]
-    leaf = ends > probe.depth_mm - 1e-3
+    leaf = ends > float(simulator.acquisition(probe, phantom.probe_to_ras)["traced_mm"]) - 1e-3
     totals, branches = [], []
     for n, line in enumerate(lines):
         here = tree.segment_line == line

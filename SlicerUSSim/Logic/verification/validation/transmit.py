@@ -15,12 +15,14 @@ from SlicerUSSim.Logic.probe.arrays import LinearProbe, Probe
 from SlicerUSSim.Logic.probe.beam import FWHM_PER_SIGMA, LEAKED, MAIN_LOBE
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.verification.measurement import correlation, depth_window, echo_near, full_width, level_db
-from SlicerUSSim.Logic.verification.phantoms import Echo, uniform_speckle, wires_and_cysts
+from SlicerUSSim.Logic.verification.phantoms import Echo, Phantom, uniform_speckle, wires_and_cysts
 from SlicerUSSim.Logic.verification.validation.checks import PROBES, Check, Outcome, Row
 from SlicerUSSim.Logic.verification.validation.pictures import Curve, Plot, View, draw_plots, draw_views
 from SlicerUSSim.Logic.verification.validation.speckle import SPECKLE
 
 _FINE = 481  # scan lines, for profiles across a wire
+#: Lines that differ most in where they begin
+_WIDE = LinearProbe(36.0, 40.0, scan_lines=240, focus_mm=25.0, elevation_focus_mm=25.0, trapezoid_deg=45.0)
 _STEERED: dict[str, Probe] = {
     "trapezoid": LinearProbe(36.0, 52.0, scan_lines=241, focus_mm=30.0, elevation_focus_mm=30.0, trapezoid_deg=18.0),
     "to the right": LinearProbe(36.0, 52.0, scan_lines=241, focus_mm=30.0, elevation_focus_mm=30.0, steering_deg=15.0),
@@ -127,7 +129,30 @@ def steered_lines(rotation: np.ndarray, device) -> Outcome:
         level = 10 * np.log10(SPECKLE.scatterer_variance)
         rows.append(Row(f"level of speckle, {name}", "dB", level, level_db(inside), 1.0))
         views.append(View(name, phantom, probe, simulator.simulate(probe, phantom.probe_to_ras)))
+    rows += _levels_of_lines(tissue, device)
     return Outcome(tuple(rows), partial(draw_views, views=views))
+
+
+def _levels_of_lines(tissue: Phantom, device) -> list[Row]:
+    """Near the face and deeper, the level of speckle along the inner and outer lines of a wide trapezoid."""
+    frames = [
+        UltrasoundSimulator(tissue.labels, tissue.tissues, SimulationSettings(seed=seed), device).simulate(
+            _WIDE, tissue.probe_to_ras
+        )
+        for seed in range(8)
+    ]
+    count, dz = _WIDE.scan_lines, frames[0].sample_interval_mm
+    starts = _WIDE.line_starts_mm(_WIDE.line_positions())
+    level, rows = 10 * np.log10(SPECKLE.scatterer_variance), []
+    for depths in ((3.0, 9.0), (20.0, 30.0)):
+        spans = [slice(*(round((start + depth) / dz) for depth in depths)) for start in starts]
+        power = [np.mean([np.mean(np.abs(frame.iq[n, span]) ** 2) for frame in frames]) for n, span in enumerate(spans)]
+        inner = np.abs(np.arange(count) - 0.5 * (count - 1)) < count / 6
+        for name, lines in (("inner", inner), ("outer", ~inner)):
+            found = 10 * np.log10(np.mean(np.array(power)[lines]))
+            text = f"level at {depths[0]:.0f} to {depths[1]:.0f} mm, {name} lines of a trapezoid of 45 degrees"
+            rows.append(Row(text, "dB", level, float(found), 0.3))
+    return rows
 
 
 def harmonic(rotation: np.ndarray, device) -> Outcome:
