@@ -40,6 +40,13 @@ _WETTER = _level("estimate: white matter, a fifth of the way to CSF, as its wate
 _DEAD = _level("estimate: white matter, two fifths of the way to cyst")
 _LIQUID = _level("estimate: CSF with protein, a quarter to a third of its way to plasma")
 
+# A border between labels is smooth, and its echo misses the probe where it is oblique. Bone is a bright line at all
+# angles, since its surface is rough; scatterers in its first millimetre stand for that.
+_ROUGH_BONE = _level(
+    "some 20 dB above soft tissue, for its rough surface, which is bright also where it is oblique to the beam: by eye "
+    "as in real ultrasound of bone; what lies deeper than a millimetre or two is lost by attenuation"
+)
+
 # Grey and white matter share Szabo's speed of sound for brain and one impedance: published differences between them are
 # smaller than those between publications, and would refract rays at a border that is not a sharp interface.
 # fmt: off
@@ -73,7 +80,7 @@ TISSUES: dict[str, Tissue] = {
         _tissue("leptomeninges", 1541.0, "as brain: too thin to matter", 1.607, "as brain", 0.54, "as brain",
                 0.90, 0.0, 0.50, _level("about 9 dB above white matter: arachnoid, pia, vessels in sulci; ependyma")),
         _tissue("skull", 2814.0, f"skull, {_ITIS}", 5.37, f"1908 kg/m3 {_DENSITY}", 7.8, f"skull, {_DUCK}",
-                0.50, 0.0, 0.30, _level("masked by its own surface echo")),
+                5.0, 0.0, 3.0, _ROUGH_BONE),
         _tissue("scalp", 1624.0, f"skin, {_ITIS}", 1.80, f"skin 1109 kg/m3 {_DENSITY}", 0.80, f"skin, {_DUCK}",
                 0.60, 0.0, 0.30, _level("echogenic skin and fat")),
         _tissue("skin", 1624.0, f"skin, {_ITIS}", 1.80, f"1109 kg/m3 {_DENSITY}", 0.80, f"skin, {_DUCK}",
@@ -106,8 +113,8 @@ TISSUES: dict[str, Tissue] = {
         _tissue("lung", 949.3, f"inflated, {_ITIS}", 0.374, f"inflated, 394 kg/m3 {_DENSITY}", 20.1,
                 f"inflated, 115.5 Np/m at 0.5 MHz, {_ITIS}; measurements disagree (Ultrasound Med. Biol. 28 (2002) "
                 "1209-1216)", 0.50, 0.0, 0.30, _level("masked by its own surface echo")),
-        _tissue("bone", 3198.0, _SZABO, 6.364, f"1990 kg/m3, {_SZABO}", 3.54, _SZABO, 0.50, 0.0, 0.30,
-                _level("masked by its own surface echo")),
+        _tissue("bone", 3198.0, _SZABO, 6.364, f"1990 kg/m3, {_SZABO}", 3.54, _SZABO, 5.0, 0.0, 3.0,
+                _ROUGH_BONE),
         _tissue("cancellous bone", 1675.0, f"fast wave in human calcaneus, {_HOFFMAN}", 1.973,
                 f"1178 kg/m3 ({_ITIS}) x speed of sound", 20.0,
                 f"4 (human calcaneus, {_HOFFMAN}) to 43 (human femur, Anderson et al. 2010, ibid.)",
