@@ -170,3 +170,12 @@ def test_what_cannot_be_opened_changes_nothing(head):  # noqa: F811
         bench.logic.openCraniotomy(bench.whole, mine, probe_transform_node=bench.probe)
     bench.presenter.closeCraniotomy()
     assert "has no opening, or the labels before it are gone" in bench.view.errors[-1]
+
+
+def test_the_probe_is_placed_at_the_chosen_view(head):  # noqa: F811
+    bench = Bench(head)
+    bench.presenter.setValue("scene.view", "temporal-left")
+    bench.presenter.placeAtView()
+    place = (np.linalg.inv(TURN) @ node_to_world(bench.probe))[:3, 3]
+    world = node_to_world(bench.probe)[:3, 3] - TURN[:3, 3]
+    assert np.linalg.norm(place) == pytest.approx(78.0, abs=2.0) and world[0] < -70 and not bench.view.errors

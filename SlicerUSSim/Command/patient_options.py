@@ -51,12 +51,14 @@ map_option = click.option(
     "totalsegmentator-v1, totalsegmentator-mr, totalsegmentator-tissues, ussim, brats-2022, brats. May be repeated.",
 )  # fmt: skip
 
-#: A pose that is chosen
+#: A pose that is chosen; and those of mri.views.VIEWS
 AUTO = "auto"
+STANDARD_VIEWS = ("temporal", "temporal-left", "fontanelle", "fontanelle-sagittal")
 pose_option = click.option(
     "--pose", required=True,
-    help='File with probe_to_ras (4 x 4 in JSON, 16 numbers in text, or a Slicer transform), or "auto": a coronal '
-    "view through a craniotomy, of what --add laid over the labels if there is something.",
+    help='File with probe_to_ras (4 x 4 in JSON, 16 numbers in text, or a Slicer transform), "auto": a coronal '
+    "view through a craniotomy, of what --add laid over the labels if there is something, or a standard view: "
+    f"{', '.join(STANDARD_VIEWS)}.",
 )  # fmt: skip
 
 
@@ -184,8 +186,8 @@ class Examination:
 def open_examination(patient: PatientOptions, pose: np.ndarray | str | None = None) -> Examination:
     """The Examination of a command's options. An MRI is segmented, with a progress bar.
 
-    `pose` is a (4, 4) probe_to_ras, or AUTO: a view through a craniotomy, of what --add laid over the labels if there
-    is something.
+    `pose` is a (4, 4) probe_to_ras, one of STANDARD_VIEWS, or AUTO: a view through a craniotomy, of what --add laid
+    over the labels if there is something.
     Fast checks come before slow computations. Raises SimulationError for inconsistent options.
     """
     import logging  # imported here to keep --help fast
@@ -286,11 +288,16 @@ def _placed(
 ) -> _Placed:  # fmt: skip
     """The probe at its pose on a patient; `before` are the labels without what --add laid over them."""
     from SlicerUSSim.Logic.mri.craniotomy import default_pose
+    from SlicerUSSim.Logic.mri.views import view_pose
 
     labels, names, settings = added.labels, added.tissue_names, preset.settings
     if isinstance(pose, str):
         target = added.centre_ras(before)
-        pose = default_pose(labels, names, preset.probe, is_open=craniotomy.is_wanted, target_ras=target)
+        pose = (
+            view_pose(labels, names, pose, is_open=craniotomy.is_wanted)
+            if pose != AUTO
+            else default_pose(labels, names, preset.probe, is_open=craniotomy.is_wanted, target_ras=target)
+        )
     labels = craniotomy.on(labels, names, preset.probe, pose)
     if "skin" in names and not craniotomy.is_wanted and not patient.gives_contact:
         note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--contact-gap)")
@@ -301,16 +308,16 @@ def _placed(
 def open_examination_at(patient: PatientOptions, pose: str) -> tuple[Examination, np.ndarray]:
     """(Examination, (4, 4) probe_to_ras) of a command's options.
 
-    The pose "auto" is a view through a craniotomy, of what --add laid over the labels if there is something.
+    The pose is a file, AUTO or one of STANDARD_VIEWS, see open_examination.
     """
     from SlicerUSSim.Logic.tracked.pose_files import read_pose
 
-    given = None if pose == AUTO else read_pose(pose)
+    is_chosen = pose == AUTO or pose in STANDARD_VIEWS
     require(
-        given is not None or patient.segmentation["contrast"] != CT,
-        "--pose is auto, which is a craniotomy, and the image is a CT (--ct), expected a file with the pose",
+        not is_chosen or patient.segmentation["contrast"] != CT,
+        f"--pose is {pose}, which is on a head, and the image is a CT (--ct), expected a file with the pose",
     )
-    examination = open_examination(patient, AUTO if given is None else given)
+    examination = open_examination(patient, pose if is_chosen else read_pose(pose))
     return examination, required(examination.probe_to_ras, "the examination has no pose")
 
 

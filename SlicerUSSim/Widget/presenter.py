@@ -331,6 +331,13 @@ class PanelPresenter:
             self._put_probe(self.view.sliceNode())
         self.view.refresh()
 
+    def placeAtView(self) -> None:
+        """Place the probe where the chosen standard view is seen from; create its transform if needed."""
+        with self.shown():
+            require(self.logic.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
+            self._put_probe(view=self.logic.parameters.panel.view)
+        self.view.refresh()
+
     def simulate(self) -> None:
         """Simulate one image, into the chosen volume or a new one."""
         with self.shown():
@@ -452,11 +459,11 @@ class PanelPresenter:
             self._notes.append(f"{chosen.GetName()!r} has data of others and is kept; the result is {node.GetName()!r}")
         return node
 
-    def _put_probe(self, slice_node=None) -> None:
+    def _put_probe(self, slice_node=None, view: str | None = None) -> None:
         """Place the probe's transform, or a new one if none is selected."""
         parameters = self.logic.parameters
         with self._made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
-            self.logic.placeProbe(parameters.labels, probe, slice_node)
+            self.logic.placeProbe(parameters.labels, probe, slice_node, view=view)
         parameters.probe_transform = probe
         display = display_of(probe)
         if display is not None:

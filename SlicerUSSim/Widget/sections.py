@@ -106,6 +106,14 @@ def _probe() -> tuple[Row, ...]:
             ),
             Control("sliceView", "choice", tip="Slice view in which the probe is placed and the image is shown"),
         ),
+        (
+            button(
+                "placeAtView", "Place at view",
+                "Place the probe where the view on the right is seen from, on the skin if it is labelled",
+                enabled="canSimulate",
+            ),
+            value("scene.view"),
+        ),
         value("scene.show_in_slice"),
     )  # fmt: skip
 

@@ -31,6 +31,7 @@ class Buttons:
             "openCraniotomyButton": loading.open_craniotomy,
             "closeCraniotomyButton": loading.close_craniotomy,
             "placeButton": loading.place_probe,
+            "placeAtViewButton": loading.place_at_view,
             "assignTissueButton": self._assign_tissue,
         }
 

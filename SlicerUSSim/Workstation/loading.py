@@ -155,6 +155,11 @@ class Loading:
         self._presenter.placeProbe()
         self._probe.look()
 
+    def place_at_view(self) -> None:
+        """Place the probe where the chosen standard view is seen from."""
+        self._presenter.placeAtView()
+        self._probe.look()
+
     def show_title(self) -> None:
         """Show the name of the patient on the page."""
         with self._shared.changing() as now:

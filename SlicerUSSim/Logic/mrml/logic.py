@@ -30,6 +30,7 @@ from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.views import view_pose
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import (
     closed_labels,
     flap_centre,
@@ -481,17 +482,22 @@ class UltrasoundSceneLogic:
                 shown.SetAndObserveTransformNodeID(proxy.GetID())
         return count
 
-    def placeProbe(self, labels_node, probe_transform_node, slice_node=None, target_ras=None) -> None:
+    def placeProbe(
+        self, labels_node, probe_transform_node, slice_node=None, target_ras=None, *, view: str | None = None
+    ) -> None:
         """Put the probe on the surface of the labelled tissue, with its axis inwards.
 
         With a slice node the image is in that slice, with its depth towards the bottom of the view, aimed at
         `target_ras` (default: the middle of the view). Without one it is a coronal view through a parasagittal
         craniotomy: on a brain, upright on the skin of a whole head, or on the brain in the middle of an opening.
+        `view` is one of mri.views.VIEWS instead, as "temporal".
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
         patient = self._patient(labels_node)
         surface = Volume(patient.labels.array, np.linalg.inv(patient.world_to_patient) @ patient.labels.ijk_to_ras)
-        if slice_node is None:
+        if view is not None:
+            pose = view_pose(surface, patient.names, view)
+        elif slice_node is None:
             pose = default_pose(
                 surface, patient.names, self.preset.probe, is_open=is_opened(labels_node),
                 opening_ras=flap_centre(labels_node),

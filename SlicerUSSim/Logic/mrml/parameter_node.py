@@ -14,6 +14,7 @@ from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, param
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.mri.settings import MRI_CONTRASTS, SegmentationSettings
+from SlicerUSSim.Logic.mri.views import VIEWS
 
 MODULE_NAME = "USSim"
 _OWNER = "scene"
@@ -35,6 +36,10 @@ class PanelSettings(Declared):
     craniotomy_mm: float | None = parameter(
         None, "Diameter", "Diameter of the disc under the probe that is opened; none: as wide as its face needs",
         unit="mm", bounds=(5.0, 150.0), shown=Shown(4.0, 150.0, 1.0, none_at=4.0), can_be_none=True,
+    )  # fmt: skip
+    view: str = parameter(
+        next(iter(VIEWS)), "View", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),
+        choices=tuple(VIEWS), shown=True,
     )  # fmt: skip
     preset: str = parameter("", "Preset", "The JSON text of a Preset; empty: the default")
 
