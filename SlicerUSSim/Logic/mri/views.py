@@ -29,7 +29,7 @@ class View:
 #: coronal images are seen from the front, with the patient's right on their left
 VIEWS = {
     "temporal": View(
-        "axial, through the right temporal bone: midbrain, third ventricle, the other hemisphere; 2 MHz",
+        "axial, through the right temporal bone: midline, ventricles, the other hemisphere; 2 MHz",
         (1.0, 0.1, 0.1), (0.0, -1.0, 0.0),
     ),
     "temporal-left": View(
