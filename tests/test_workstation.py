@@ -516,6 +516,7 @@ def test_segment_labels_the_mri_anew_and_says_what_it_cannot(page):
         eventually(page, lambda on=on: np.array_equal(pixels(page), before) == on)
         assert not errors(page) and pixels(page).mean() > 5
     classes = page.locator("#classesSpinBox")
+    assert classes.input_value() == "" and classes.get_attribute("placeholder") == "none"  # it was 2, out of its range
     for count in ("4", "3"):
         classes.fill(count)
         classes.blur()
@@ -523,6 +524,10 @@ def test_segment_labels_the_mri_anew_and_says_what_it_cannot(page):
         if count == "4":
             click(page, "#segmentButton")
             assert "classes is 4, expected 3 for contrast t1" in shown_errors(page)
+    classes.fill("")
+    classes.blur()
+    eventually(page, lambda: shown(page, "classesSpinBox") == 2)  # which stands for none
+    assert classes.input_value() == ""
 
 
 def test_a_changed_tissue_changes_the_image_and_nonsense_is_refused(page):

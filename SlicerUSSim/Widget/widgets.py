@@ -74,6 +74,8 @@ def _number(control: Control) -> Any:
     # For whole numbers too: a seed can exceed the range of a QSpinBox.
     result = _with_range(qt.QDoubleSpinBox(), control)
     result.setProperty("keyboardTracking", False)
+    if control.range.none_at == control.range.low:  # the lowest number stands for none
+        result.setProperty("specialValueText", "none")
     return result
 
 

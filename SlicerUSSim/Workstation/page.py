@@ -170,6 +170,11 @@ def _control(control: Control) -> None:
         shown = f"{key} === null ? '' : +Number({key}).toFixed({control.decimals})" if kind == "number" else key
         limits = f'min="{low:.10g}" max="{high:.10g}" step="{control.range.step:g}"'
         limits = limits if kind == "number" else f'placeholder="{escape(control.hint)}"'
+        none_at = control.range.none_at
+        if kind == "number" and none_at is not None:  # an empty field, and not a number that means it
+            limits += ' placeholder="none"'
+            shown = f"{key} === null || {key} <= {none_at:.10g} ? '' : +Number({key}).toFixed({control.decimals})"
+            value = f"$event.target.value === '' ? {none_at:.10g} : Number($event.target.value)"
         html.Div(
             f"""<label for="{name}">{escape(control.label)}{unit}</label>
             <input type="{kind}" id="{name}" {limits}
