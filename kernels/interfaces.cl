@@ -8,9 +8,9 @@
 // by the part `carried`, and the phase over the patch lowers it. For a plane the sum over the patches is that over the
 // whole beam, whatever their number; small targets keep the width of the beam.
 //
-// Buffers: hits, hit_counts (raytracing.cl); walls Wall [traced line][elevational ray * MAX_HITS] with wall_counts, and
-// wall_reach int [traced line], the largest `reach` of a line's walls; re, im float [scan line][stride]: complex
-// baseband impulses (beam.cl).
+// Buffers: hits, hit_counts (raytracing.cl); centres float [elevational ray] (raytracing.py, ray_centres); walls Wall
+// [traced line][elevational ray * MAX_HITS] with wall_counts, and wall_reach int [traced line], the largest `reach` of
+// a line's walls; re, im float [scan line][stride]: complex baseband impulses (beam.cl).
 
 #include "common.clh"
 
@@ -40,25 +40,29 @@ inline float bent_patch(float per_mm, float slope, float bend, float variance, f
   return phase * phase * variance / zones;
 }
 
-// Radians from one hit to the next, laterally, and over a standard deviation of the beam, elevationally, up to which a
-// sum over hits is the integral, also at the upper frequencies of a pulse. Laterally no fewer: in a fan of lines a
-// plane is not one against the depth, and a patch that is moved far has the slope of another line.
+// Radians from one hit to the next, laterally, and over a standard deviation of the beam, elevationally, of which a sum
+// over hits is the integral, also at the upper frequencies of a pulse. Laterally no fewer: in a fan of lines a plane is
+// not one against the depth, and a patch that is moved far has the slope of another line.
 #define MOST_PER_STEP 2.6f
-#define MOST_ASIDE 1.3f
+#define MOST_ASIDE 0.7f
 
-// The part by which a patch's centre of phase is moved: `least`, and on steeper walls so much that at most `most` of
-// `phase` is left to the sum over the patches. Walls that bend within the beam, by `turning` radians, are seen where
-// they are square to it, and a plane there is not what is found beside that.
-inline float part_carried(float least, float phase, float most, float turning) {
-  const float flat = 1.0f / (1.0f + 16.0f * turning * turning);
-  const float more = 1.0f - most / fmax(fabs(phase), most) - least;
-  return fmin(least + flat * fmax(more, 0.0f), 1.0f);
+// How far a wall is a plane that bends by `turning` radians within the beam. Others are seen where they are square to
+// it, and a plane there is not what is found beside that.
+inline float flatness(float turning) { return 1.0f / (1.0f + 16.0f * turning * turning); }
+
+// The part by which a patch's centre of phase is moved: `least`, and on steeper walls, where they are `flat`, so much
+// that less than `most` of `phase` is left to the sum over the patches. It changes smoothly with the phase: in a fan of
+// lines neighbours see a plane under other angles, and where the parts of their patches jump the sum is not the
+// integral.
+inline float part_carried(float least, float phase, float most, float flat) {
+  const float share = phase / most;
+  return least + flat * (1.0f - least) * (1.0f - rsqrt(1.0f + share * share));
 }
 
 // One work-item computes the walls of one traced line.
 __kernel void find_walls(__constant const Acquisition *acquisition, __global const Hit *hits,
-                         __global const int *hit_counts, __global Wall *walls, __global int *wall_counts,
-                         __global int *wall_reach) {
+                         __global const int *hit_counts, __global const float *centres, __global Wall *walls,
+                         __global int *wall_counts, __global int *wall_reach) {
   const int line = get_global_id(0), rays = acquisition->elevational_rays;
   const float pulse = acquisition->fractional_bandwidth * 0.42466090f;  // 1 / (2 sqrt(2 ln 2))
   const float per_mm = TWO_PI * acquisition->cycles_per_mm;
@@ -83,16 +87,18 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
       // A patch has a deviation of 0.45 steps: aliases of planes are then below -35 dB at one frequency. The beam times
       // the patch would be wider than the beam; this width gives a row of hits, each a strip one step wide, the beam's.
       const float width2 = sigma2 + step * step / 12.0f;
-      const float carried =
-          part_carried(0.2025f * step * step / width2, across * step, MOST_PER_STEP, per_mm * bend * sigma2);
+      const float flat = flatness(per_mm * bend * sigma2), flat_aside = flatness(per_mm * bend * sigma.y * sigma.y);
+      const float carried = part_carried(0.2025f * step * step / width2, across * step, MOST_PER_STEP, flat);
       const float inside = fmax(1.0f - (1.0f - carried) * (1.0f - carried) * width2 / sigma2, 0.0f);
       // The strata of the elevational rays are 2.5 / rays deviations wide in the middle and 7 / rays outside.
-      const float carried_aside =
-          part_carried(10.0f / (rays * rays), aside * sigma.y, MOST_ASIDE, per_mm * bend * sigma.y * sigma.y);
+      const float carried_aside = part_carried(10.0f / (rays * rays), aside * sigma.y, MOST_ASIDE, flat_aside);
       const float inside_aside = 1.0f - (1.0f - carried_aside) * (1.0f - carried_aside);
+      // Where flat, from the centre of the ray's stratum: rays are shifted in it from line to line, and the sum over
+      // shifted ones differs from the integral, the more so in steep walls.
+      const float centre = hit->elevational_mm + flat_aside * (centres[ray] * sigma.y - hit->elevational_mm);
       Wall wall;
       wall.echo = hit->echo * exp_fast(gain_of_band(acquisition, hit->loss));
-      wall.depth_mm = hit->depth_mm - carried_aside * hit->elevational_slope * hit->elevational_mm;
+      wall.depth_mm = hit->depth_mm - hit->elevational_slope * (hit->elevational_mm - (1.0f - carried_aside) * centre);
       const float inside2 =
           bent_patch(per_mm, hit->lateral_slope, bend, inside * sigma2, &wall.depth_mm) +
           bent_patch(per_mm, hit->elevational_slope, bend, inside_aside * sigma.y * sigma.y, &wall.depth_mm);

@@ -38,6 +38,7 @@ from SlicerUSSim.Logic.verification.numpy_model.acquisition import (
     line_roots,
     noise_key,
     pulse_taps,
+    stratum_centres,
 )
 from tests.conftest import block, rigid
 
@@ -298,6 +299,7 @@ def test_the_record_of_a_frame_follows_from_the_equations(name, settings):
     np.testing.assert_allclose(raytracing.line_roots(record), line_roots(expected), atol=1e-5)
     traced, rays = int(record["traced_lines"]), int(record["elevational_rays"])
     np.testing.assert_allclose(raytracing.beam_quantiles(traced, rays), elevational_quantiles(traced, rays), atol=1e-5)
+    np.testing.assert_allclose(raytracing.ray_centres(rays), stratum_centres(np.arange(rays), rays), atol=1e-5)
     assert noise.noise_key(record, 12345) == noise_key(expected, 12345)
 
 

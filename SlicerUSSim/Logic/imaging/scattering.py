@@ -9,6 +9,7 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from SlicerUSSim.Logic.imaging.diffraction import lobes_of
+from SlicerUSSim.Logic.imaging.raytracing import ray_centres
 from SlicerUSSim.Logic.imaging.side_lobes import DARK, Tables, elevational_lobe_record, lines_together
 from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
@@ -126,6 +127,8 @@ class InterfaceEchoes(Stage):
         kernels = device.kernels("interfaces.cl")
         self._find, self._add = kernels["find_walls"], kernels["interface_echoes"]
         self.workspace = Workspace(device)
+        self._centres_of = 0  # rays
+        self._centres: Buffer
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the interface echoes of one frame, unless they are off; they are added to `scanned`."""
@@ -136,9 +139,12 @@ class InterfaceEchoes(Stage):
         walls = get("walls", traced * rays * CONSTANTS["MAX_HITS"] * WALL.itemsize), get("counts", 4 * traced)
         reach = get("reach", 4 * traced)
         tree, scanned = frame.tree, frame.scanned
+        if self._centres_of != rays:
+            self._centres, self._centres_of = self.device.upload(ray_centres(rays)), rays
         self.device.run(
-            self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, *walls, reach, few=True
-        )
+            self._find, (traced,), frame.acquisition_buffer, tree.hits, tree.hit_counts, self._centres, *walls, reach,
+            few=True,
+        )  # fmt: skip
         self.device.run(
             self._add,
             (_SLICES if self.device.info.kind == "GPU" else 1, frame.line_shape[0]),

@@ -205,8 +205,14 @@ def line_roots(acquisition: np.ndarray) -> np.ndarray:
 def elevational_quantiles(traced: int, rays: int) -> np.ndarray:
     """(traced, rays) float32 positions of the rays in the elevational beam, in its standard deviations."""
     line, ray = np.arange(traced)[:, None], np.arange(rays)
-    place_in_stratum = 0.05 + 0.9 * ((0.5 + line * _GOLDEN) % 1.0)
+    place_in_stratum = 0.5 + 0.7 * ((0.5 + line * _GOLDEN) % 1.0 - 0.5)
     return special.ndtri((ray + place_in_stratum) / rays).astype(np.float32)
+
+
+def stratum_centres(strata: np.ndarray, rays: int) -> np.ndarray:
+    """float32 middle quantiles of strata 0 to rays - 1, in standard deviations; all of them have the variance 1."""
+    middle = special.ndtri((np.arange(rays) + 0.5) / rays)
+    return (middle / np.maximum(np.sqrt(np.mean(middle**2)), 1e-6)).astype(np.float32)[strata]
 
 
 def pulse_taps(sigma: float) -> np.ndarray:

@@ -6,8 +6,10 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS
+from SlicerUSSim.Logic.verification.numpy_model.acquisition import stratum_centres
 from SlicerUSSim.Logic.verification.numpy_model.beam import Beam
 from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     LOG2_E,
@@ -22,7 +24,7 @@ from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
 from SlicerUSSim.Logic.verification.numpy_model.lobes import Table
 
 # Radians that the sum over hits has at most: from line to line, and over an elevational sigma (interfaces.cl)
-_MOST_PER_STEP, _MOST_ASIDE = f32(2.6), f32(1.3)
+_MOST_PER_STEP, _MOST_ASIDE = f32(2.6), f32(0.7)
 _AXIS_STEPS = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint32)
 
 
@@ -316,25 +318,20 @@ def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndar
     stretch = np.minimum(f32(1) + hits["lateral_slope"] ** 2, f32(10))
     bend = hits["curvature"] * stretch * np.sqrt(stretch)
     # How far the centre of phase moves towards the scan line, and the fraction of the squared phase inside a patch
+    flat = [f32(1) / (f32(1) + f32(16) * (per_slope * bend * sigma**2) ** 2) for sigma in (lateral, elevational)]
     carried = [
-        _carried(
-            (f32(0.45) * step / width) ** 2,
-            per_slope * hits["lateral_slope"] * step,
-            _MOST_PER_STEP,
-            per_slope * bend * lateral**2,
-        ),
-        _carried(
-            f32(10) / (rays * rays),
-            per_slope * hits["elevational_slope"] * elevational,
-            _MOST_ASIDE,
-            per_slope * bend * elevational**2,
-        ),
+        _carried((f32(0.45) * step / width) ** 2, per_slope * hits["lateral_slope"] * step, _MOST_PER_STEP, flat[0]),
+        _carried(f32(10) / (rays * rays), per_slope * hits["elevational_slope"] * elevational, _MOST_ASIDE, flat[1]),
     ]
     within = [
         np.maximum(f32(1) - ((f32(1) - carried[0]) * width / lateral) ** 2, f32(0)),
         f32(1) - (f32(1) - carried[1]) ** 2,
     ]
-    depth = hits["depth_mm"] - carried[1] * hits["elevational_slope"] * hits["elevational_mm"]
+    # Flat walls are summed over the middles of the rays' strata, whatever the shifts of a line.
+    strata = np.floor(special.ndtr(hits["elevational_mm"] / elevational) * rays).astype(int)
+    middle = stratum_centres(np.clip(strata, 0, int(rays) - 1), int(rays)) * elevational
+    aside = hits["elevational_mm"] + flat[1] * (middle - hits["elevational_mm"])
+    depth = hits["depth_mm"] - hits["elevational_slope"] * (hits["elevational_mm"] - (f32(1) - carried[1]) * aside)
     whole, inside, zones = f32(0), f32(0), []
     for part, sigma, axis in zip(within, (lateral, elevational), ("lateral", "elevational"), strict=True):
         slope, variance = hits[f"{axis}_slope"], part * sigma * sigma
@@ -370,11 +367,9 @@ def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndar
         np.add.at(sums, bins[near] + 1, echo * part)
 
 
-def _carried(least: np.ndarray, phase: np.ndarray, most: np.ndarray, turning: np.ndarray) -> np.ndarray:
+def _carried(least: np.ndarray, phase: np.ndarray, most: np.ndarray, flat: np.ndarray) -> np.ndarray:
     """Part by which a patch's centre of phase moves: on steep flat walls more, so that sums have few radians."""
-    flat = f32(1) / (f32(1) + f32(16) * turning * turning)
-    more = f32(1) - most / np.maximum(np.abs(phase), most) - least
-    return np.minimum(least + flat * np.maximum(more, f32(0)), f32(1))
+    return least + flat * (f32(1) - least) * (f32(1) - f32(1) / np.sqrt(f32(1) + (phase / most) ** 2))
 
 
 def _patch_echo(acquisition: np.ndarray, phase2: np.ndarray, inside2: np.ndarray) -> np.ndarray:

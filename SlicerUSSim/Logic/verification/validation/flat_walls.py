@@ -14,7 +14,7 @@ from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
-from SlicerUSSim.Logic.probe.arrays import PROBES, LinearProbe
+from SlicerUSSim.Logic.probe.arrays import PROBES, LinearProbe, Probe
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.verification.measurement import depth_window
 from SlicerUSSim.Logic.verification.phantoms import FLUID, Phantom, layered, reflection_coefficient
@@ -33,6 +33,11 @@ _PROBE = cast(
 _TURNS = {1.0: 3.0, 2.0: 3.0, 3.0: 3.0, 5.0: 1.5, 8.0: 1.5, 15.0: 1.5, 30.0: 1.5}
 #: Planes tilted by so much to the beam: the level along them does not vary by more dB
 _TILT_DEG, _VARIATION_DB = 5.0, 3.0
+
+#: Planes tilted to the axis, in degrees, about azimuths from the image plane, in voxels turned as numbered; and
+#: the dB re a square wall down to which single lines are compared, which change by less than the second
+_FLANKS, _FLANK_FLOOR_DB, _CHANGE_DB = ((5.0, 347.0, 11), (5.0, 200.0, 12), (12.0, 50.0, 13)), -30.0, 1.5
+_LINES = (96, 191, 381)
 
 #: The same of layers, by their thickness in voxels. Single lines lose up to 7 dB where it is two voxels (physics.md).
 _LAYER_TURNS = {
@@ -87,6 +92,57 @@ def turned_planes(rotation: np.ndarray, device) -> Outcome:
         curves.append(Curve(f"{spacing:g} mm", turns, np.array(lowest), turns, 0.0 * turns))
     plot = Plot("plane facing the beam", "voxels turned by [degrees]", "lowest echo [dB]", curves)
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
+
+
+def _along_plane(simulator: UltrasoundSimulator, probe: Probe, pose: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Peak in dB on the lines of a probe that meet a plane within 14 mm of its axis; nan on others.
+
+    The plane lies _DEPTH_MM deep on the axis and has the unit normal (3,) in the frame of the probe.
+    """
+    frame = simulator.simulate(probe, pose)
+    origins, directions = probe.origins_mm(), probe.directions()
+    path = ((np.array([0.0, _DEPTH_MM, 0.0]) - origins) @ normal) / (directions @ normal)
+    is_near = (path > 0.0) & (np.abs((origins + path[:, None] * directions)[:, 0]) < 14.0)
+    peaks = np.full(len(path), np.nan)
+    for line in np.flatnonzero(is_near):
+        first, last = (max(round((path[line] + off) / frame.sample_interval_mm), 0) for off in (-3.0, 3.0))
+        peaks[line] = np.abs(frame.iq[line, first : last + 1]).max(initial=1e-12)
+    return 20 * np.log10(peaks)
+
+
+def flanks_and_lines(rotation: np.ndarray, device) -> Outcome:
+    """Single lines on the flanks of planes in turned voxels, drawn with more and more scan lines."""
+    probes = {name: replace(probe, frequency_mhz=5.0, band_mhz=None) for name, probe in PROBES.items()}
+    square = 20 * np.log10(reflection_coefficient(FLUID, BEHIND)) + _SETTINGS.interface_gain_db
+    rows = []
+    for spacing, (tilt, azimuth, grid) in itertools.product((0.5, 1.0), _FLANKS):
+        across, up = np.sin(np.radians(tilt)), np.cos(np.radians(tilt))
+        normal = np.array([across * np.cos(np.radians(azimuth)), up, across * np.sin(np.radians(azimuth))])
+        turned = rotation @ Rotation.random(random_state=grid).as_matrix()
+        phantom = layered(
+            [FLUID, BEHIND], [_DEPTH_MM], turned, spacing_mm=spacing, half_width_mm=36.0, half_thickness_mm=30.0
+        )
+        # The phantom's plane is square to its probe: the probe is turned so that the plane has the normal.
+        motion = np.eye(4)
+        motion[:3, :3] = Rotation.align_vectors([[0.0, 1.0, 0.0]], [normal])[0].as_matrix()
+        motion[:3, 3] = [0.0, _DEPTH_MM, 0.0] - motion[:3, :3] @ [0.0, _DEPTH_MM, 0.0]
+        simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
+        for name, probe in probes.items():
+            if probe.depth_mm < _DEPTH_MM + 10.0:
+                continue
+            levels = np.array(
+                [
+                    _along_plane(simulator, replace(probe, scan_lines=lines), phantom.probe_to_ras @ motion, normal)[
+                        :: (lines - 1) // (_LINES[0] - 1)
+                    ]
+                    for lines in _LINES
+                ]
+            )
+            seen = (levels - square).min(axis=0) > _FLANK_FLOOR_DB
+            change = float(np.ptp(levels[:, seen], axis=0).max(initial=0.0))
+            what = f"{tilt:g} degrees about {azimuth:g}, {spacing:g} mm, {name} ({np.count_nonzero(seen)} lines)"
+            rows.append(Row(f"change of single lines, {what}", "dB", 0.0, change, _CHANGE_DB, "at most"))
+    return Outcome(tuple(rows))
 
 
 def flat_layers(rotation: np.ndarray, device) -> Outcome:
@@ -159,6 +215,11 @@ def walls_near_ends(rotation: np.ndarray, device) -> Outcome:
 CHECKS = (
     Check(
         "turned planes", "A plane that faces the beam has the same level wherever its voxels are turned.", turned_planes
+    ),
+    Check(
+        "flanks and lines",
+        "Single lines on the flank of a wall do not depend on the number of scan lines.",
+        flanks_and_lines,
     ),
     Check(
         "flat layers", "Both walls of a layer have the level of a plane, wherever its voxels are turned.", flat_layers
