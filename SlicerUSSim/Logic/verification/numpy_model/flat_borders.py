@@ -13,6 +13,8 @@ _VIEW, _THIN_SHARE = f32(3.5), 0.35  # voxels from a thin layer to where it is l
 MOST_TURNED = f32(0.85)  # cosine of the angle between estimates of a layer's normal
 _END_REACH = f32(28)  # voxels to the ends of the volume, along a plane
 _SAMPLES_APART = f32(20)  # voxels
+# Normals of layers of voxels, by the size of their components, whose steps are suppressed
+_LAYERS = ((0, 0, 1), (0, 1, 1), (1, 1, 1), (0, 1, 2), (1, 1, 2), (1, 2, 2))
 _WEIGHTS = f32([0.35, 0.7, 1.0, 0.7, 0.35])  # of samples along an axis
 
 
@@ -173,6 +175,17 @@ def _beyond_plane(voxel, on, towards) -> np.ndarray:
     return dot(on - voxel, towards)
 
 
+def _along_layers(normal) -> np.ndarray:
+    """How far planes of (n, 3) unit normals lie along layers of voxels: at right angles to an axis or a diagonal."""
+    size = np.sort(np.abs(normal), axis=-1)
+    found = np.zeros(len(normal), np.float32)
+    for across in _LAYERS:
+        apart = 1.0 / np.linalg.norm(across)
+        first, last = (np.cos(np.radians(angle * apart)) for angle in (5.0, 4.0))
+        found = np.maximum(found, ramp(first, last, size @ f32(np.multiply(across, apart))))
+    return found
+
+
 class FlatBorders:
     """What the indicators at half the resolution know of a volume of `dims` voxels."""
 
@@ -217,26 +230,20 @@ class FlatBorders:
         return at
 
     def _whole(self, voxel, plane: Borders, on, before, behind) -> tuple[Borders, np.ndarray]:
-        """Planes nearly along the voxels from samples over their steps, and places on them."""
-        count, rows = len(voxel), np.arange(len(voxel))
+        """Planes nearly along layers of voxels from samples over their steps, and places on them."""
+        count = len(voxel)
         found, normal = plane.at(slice(None)), plane.towards
         size = np.abs(normal)
-        upright = np.where(size[:, 0] > 0.9, 0, np.where(size[:, 1] > 0.9, 1, 2))
-        half_way = f32(0.5) * f32(self.dims) - f32(0.5)
-        low = np.minimum(f32(0.5) + _END_REACH, half_way)
-        high = np.maximum(f32(self.dims) - f32(1.5) - _END_REACH, half_way)
-        margin = np.minimum(f32(16), f32(0.5) * (high - low))
-        middle = np.clip(voxel, low + margin, high - margin)
-        apart = np.minimum(_SAMPLES_APART, f32(0.5) * np.minimum(middle - low, high - middle))
+        upright = size.argmax(axis=-1)
+        middle, across, certainty = self._axial(voxel, normal, on, upright)
+        oblique = np.flatnonzero(size.max(axis=-1) <= 0.9)
+        if len(oblique):
+            parts = self._diagonal(normal[oblique], on[oblique], upright[oblique])
+            middle[oblique], across[:, oblique], certainty[oblique] = parts
         places, normals = np.zeros((2, len(_WEIGHTS) ** 2, count, 3), np.float32)
-        sure = np.ones(count, bool)
+        sure = certainty > 0
         for sample in range(len(places)):
-            at, rise = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
-            for side, steps in enumerate((sample % 5 - 2, sample // 5 - 2)):
-                axis = (upright + 1 + side) % 3
-                at[rows, axis] = middle[rows, axis] + apart[rows, axis] * f32(steps)
-                rise += normal[rows, axis] * (at[rows, axis] - on[rows, axis])
-            at[rows, upright] = on[rows, upright] - rise / normal[rows, upright]
+            at = middle + f32(sample % 5 - 2) * across[0] + f32(sample // 5 - 2) * across[1]
             border = self.widest(at, normal, before, behind, 4.0)
             sure &= border.confidence >= 0.5
             normals[sample], places[sample] = border.towards, at + border.overshoot[:, None] * border.towards
@@ -245,8 +252,43 @@ class FlatBorders:
         on = (weights * places).sum(axis=0) / weights.sum()
         farthest = np.abs(_beyond_plane(places, on, found.towards)).max(axis=0)
         found.curvature = np.zeros(count, np.float32)
-        found.confidence = np.where(sure, f32(1) - ramp(0.7, 1.0, farthest), f32(0))
+        found.confidence = np.where(sure, certainty * (f32(1) - ramp(0.7, 1.0, farthest)), f32(0))
         return found, on
+
+    def _axial(self, voxel, normal, on, upright) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(middle (n, 3), steps across (2, n, 3), certainty (n,)) of the samples of planes along an axis."""
+        rows, half_way = np.arange(len(voxel)), f32(0.5) * f32(self.dims) - f32(0.5)
+        low = np.minimum(f32(0.5) + _END_REACH, half_way)
+        high = np.maximum(f32(self.dims) - f32(1.5) - _END_REACH, half_way)
+        margin = np.minimum(f32(16), f32(0.5) * (high - low))
+        clipped = np.clip(voxel, low + margin, high - margin)
+        apart = np.minimum(_SAMPLES_APART, f32(0.5) * np.minimum(clipped - low, high - clipped))
+        middle, across = on.copy(), np.zeros((2, len(voxel), 3), np.float32)
+        rise = np.zeros(len(voxel), np.float32)
+        steepest = normal[rows, upright]
+        for side in range(2):
+            axis = (upright + 1 + side) % 3
+            middle[rows, axis] = clipped[rows, axis]
+            rise += normal[rows, axis] * (clipped[rows, axis] - on[rows, axis])
+            across[side, rows, axis] = apart[rows, axis]
+            across[side, rows, upright] = -apart[rows, axis] * normal[rows, axis] / steepest
+        middle[rows, upright] -= rise / steepest
+        return middle, across, np.ones(len(voxel), np.float32)
+
+    def _diagonal(self, normal, on, upright) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same of planes along diagonals."""
+        up = np.eye(3, dtype=np.float32)[upright]
+        first = unit(up - dot(up, normal)[:, None] * normal)
+        across = np.stack([first, np.cross(normal, first)]).astype(np.float32)
+        extent = np.abs(across).sum(axis=0)
+        reach = _END_REACH * np.sqrt(np.maximum(f32(1) - normal * normal, f32(0)))
+        low, high = f32(0.5) + reach, f32(self.dims) - f32(1.5) - reach
+        half_way, margin = f32(0.5) * (low + high), f32(16) * extent
+        inside = np.clip(on, np.minimum(low + margin, half_way), np.maximum(high - margin, half_way))
+        middle = inside - dot(inside - on, normal)[:, None] * normal
+        room = (np.minimum(middle - low, high - middle) / (f32(2) * extent)).min(axis=-1)
+        apart = np.clip(room, f32(0), _SAMPLES_APART)
+        return middle, across * apart[:, None], ramp(3.0, 6.0, apart)
 
     def straighten(self, voxel, borders: Borders, before, behind) -> None:
         """Planes near an end as they are farther inside, and those nearly along the voxels as they are on the whole.
@@ -259,7 +301,7 @@ class FlatBorders:
         planes.towards = normal
         shift, _ = _away_from_ends(self.dims, voxel, planes)
         near_end = dot(shift, shift) > f32(0.25)
-        alignment = ramp(0.9961947, 0.9975641, np.abs(normal).max(axis=-1))
+        alignment = _along_layers(normal)
         some = np.flatnonzero((size >= 1e-6) & (near_end | (alignment * borders.confidence > 0)))
         if len(some) == 0:
             return

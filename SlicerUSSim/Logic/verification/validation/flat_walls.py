@@ -34,6 +34,10 @@ _TURNS = {1.0: 3.0, 2.0: 3.0, 3.0: 3.0, 5.0: 1.5, 8.0: 1.5, 15.0: 1.5, 30.0: 1.5
 #: Planes tilted by so much to the beam: the level along them does not vary by more dB
 _TILT_DEG, _VARIATION_DB = 5.0, 3.0
 
+#: Layers of voxels at right angles to diagonals, and degrees by which planes are turned from them. The steps of one
+#: turned by 1 degree from (1, 1, 1) are 33 voxels long; between them a Gaussian sees the layer.
+_DIAGONALS, _FROM_DIAGONAL = ((0, 1, 1), (1, 1, 1), (0, 1, 2), (1, 1, 2)), (0.8, 1.2, 1.8)
+
 #: Planes tilted to the axis, in degrees, about azimuths from the image plane, in voxels turned as numbered; and
 #: the dB re a square wall down to which single lines are compared, which change by less than the second
 _FLANKS, _FLANK_FLOOR_DB, _CHANGE_DB = ((5.0, 347.0, 11), (5.0, 200.0, 12), (12.0, 50.0, 13)), -30.0, 1.5
@@ -94,6 +98,30 @@ def turned_planes(rotation: np.ndarray, device) -> Outcome:
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
 
 
+def planes_along_diagonals(rotation: np.ndarray, device) -> Outcome:
+    """Planes tilted to the beam and nearly at right angles to diagonals of the voxels."""
+    rows = []
+    for spacing, across in itertools.product((0.5, 1.0), _DIAGONALS):
+        variations = []
+        for angle in _FROM_DIAGONAL:
+            # The orientation of the phantom about its normal is that of this run.
+            to_diagonal = Rotation.align_vectors([across], [[0.0, 1.0, 0.0]])[0]
+            off = Rotation.from_euler("x", angle, degrees=True)
+            spin = Rotation.from_rotvec([0.0, 0.5 + Rotation.from_matrix(rotation).magnitude(), 0.0])
+            phantom = layered(
+                [FLUID, BEHIND], [_DEPTH_MM], (to_diagonal * off * spin).as_matrix(), spacing_mm=spacing,
+                half_width_mm=60.0 * spacing + 10.0, half_thickness_mm=60.0 * spacing,
+            )  # fmt: skip
+            simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
+            tilted = phantom.probe_to_ras @ _tilt_about(_DEPTH_MM, _TILT_DEG)
+            variations.append(float(np.ptp(_levels(simulator.simulate(_PROBE, tilted), _DEPTH_MM, 3.0))))
+        worst = int(np.argmax(variations))
+        what = f"{_FROM_DIAGONAL[worst]:g} degrees from {across}, {spacing:g} mm"
+        quantity = f"largest variation along a plane tilted by {_TILT_DEG:g} degrees, {what}"
+        rows.append(Row(quantity, "dB", 0.0, variations[worst], _VARIATION_DB, "at most"))
+    return Outcome(tuple(rows))
+
+
 def _along_plane(simulator: UltrasoundSimulator, probe: Probe, pose: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Peak in dB on the lines of a probe that meet a plane within 14 mm of its axis; nan on others.
 
@@ -118,7 +146,7 @@ def flanks_and_lines(rotation: np.ndarray, device) -> Outcome:
     for spacing, (tilt, azimuth, grid) in itertools.product((0.5, 1.0), _FLANKS):
         across, up = np.sin(np.radians(tilt)), np.cos(np.radians(tilt))
         normal = np.array([across * np.cos(np.radians(azimuth)), up, across * np.sin(np.radians(azimuth))])
-        turned = rotation @ Rotation.random(random_state=grid).as_matrix()
+        turned = rotation @ Rotation.from_quat(np.random.default_rng(grid).normal(size=4)).as_matrix()
         phantom = layered(
             [FLUID, BEHIND], [_DEPTH_MM], turned, spacing_mm=spacing, half_width_mm=36.0, half_thickness_mm=30.0
         )
@@ -215,6 +243,11 @@ def walls_near_ends(rotation: np.ndarray, device) -> Outcome:
 CHECKS = (
     Check(
         "turned planes", "A plane that faces the beam has the same level wherever its voxels are turned.", turned_planes
+    ),
+    Check(
+        "planes along diagonals",
+        "A plane has the same level along itself, also nearly at right angles to a diagonal of the voxels.",
+        planes_along_diagonals,
     ),
     Check(
         "flanks and lines",
