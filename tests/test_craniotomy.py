@@ -11,7 +11,7 @@ from PIL import Image
 
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Logic import SimulationError, Volume
-from SlicerUSSim.Logic.mri.craniotomy import disc_opening, file_opening, opened, polygon_opening
+from SlicerUSSim.Logic.mri.craniotomy import disc_opening, file_opening, mask_opening, opened, polygon_opening
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.placement import pose_looking_at
 from SlicerUSSim.Logic.tissue.own_files import write_label_files
@@ -90,6 +90,74 @@ def test_what_is_no_craniotomy_is_refused(head, tmp_path):
     Volume(np.zeros((4, 4, 4), np.uint8), np.eye(4)).write(tmp_path / "empty.nrrd")
     with pytest.raises(SimulationError, match=r"empty\.nrrd: is empty, or lies outside"):
         file_opening(head, NAMES, str(tmp_path / "empty.nrrd"))
+
+
+def test_an_opening_that_is_none_is_refused(head, tmp_path):
+    """The whole head was removed by its own label map or MRI, and bone behind the probe, or of the face, was opened."""
+    behind = pose_looking_at((0.0, 0.0, 60.0), (0.0, 0.0, 120.0))
+    with pytest.raises(SimulationError, match=r"begins 1\d\d mm behind the probe, which is in the head or looks out"):
+        disc_opening(head, NAMES, behind, 30.0)
+    with pytest.raises(SimulationError, match=r"no brain under the craniotomy within 60 mm \(it begins 2\d\d mm below"):
+        disc_opening(head, NAMES, pose_looking_at((0.0, 0.0, 320.0), (0.0, 0.0, 0.0)), 30.0)
+    for diameter in (-5.0, 1e9, np.nan):
+        with pytest.raises(SimulationError, match=r"diameter of the craniotomy is .* mm, expected 5 to 150"):
+            disc_opening(head, NAMES, TOP, diameter)
+    with pytest.raises(SimulationError, match="has 6 different values, expected a mask of the opening"):
+        mask_opening(head, head, "labels")
+    with pytest.raises(SimulationError, match=r"removes \d+ ml of skin and skull, expected 500 or less"):
+        opened(head, NAMES, head.array > 2)
+    soft = head.with_array(np.where(disc_opening(head, NAMES, TOP, 30.0), 0.9, 1e-6))
+    np.testing.assert_array_equal(mask_opening(head, soft, "soft"), disc_opening(head, NAMES, TOP, 30.0))
+    far = head.with_array(
+        np.where(places_of(head)[..., 0] > 70.0, np.where(head.array == 0, 3, head.array), head.array)
+    )
+    with pytest.raises(SimulationError, match=r"lies \d+ mm from the brain, expected 30 or less"):
+        opened(far, NAMES, (places_of(head) > [70.0, 45.0, 45.0]).all(axis=-1))
+
+
+def places_of(labels: Volume) -> np.ndarray:
+    k, j, i = np.indices(labels.array.shape)
+    return np.stack([i, j, k], axis=-1) @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"coordinateSystem": "IJK"}, "coordinateSystem is 'IJK', expected LPS or RAS"),
+        ({"coordinateUnits": "cm"}, "coordinateUnits is 'cm', expected mm"),
+        ({"type": "Plane"}, "is a markup of type 'Plane', expected one of ClosedCurve, Curve, Fiducial"),
+        (None, "has 2 markups, expected one"),
+    ],
+)
+def test_a_markup_that_would_be_read_otherwise_is_refused(change, message, head, tmp_path):
+    points = [{"position": [x, y, 78.0]} for x, y in ((-20, -10), (20, -10), (20, 10), (-20, 10))]
+    points.append({"position": [0.0, 0.0, 0.0], "positionStatus": "undefined"})
+    markup = {"type": "ClosedCurve", "coordinateSystem": "LPS", "controlPoints": points}
+    path = tmp_path / "curve.mrk.json"
+    path.write_text(json.dumps({"markups": [markup]}))
+    gone = places(head, file_opening(head, NAMES, str(path)))
+    assert gone[:, 2].min() > 30.0  # the point that is not placed takes no part
+    path.write_text(json.dumps({"markups": [markup, markup] if change is None else [markup | change]}))
+    with pytest.raises(SimulationError, match=message):
+        file_opening(head, NAMES, str(path))
+
+
+def test_the_probe_stands_on_the_brain_in_the_opening_of_a_file(head, tmp_path):
+    """It stood under closed bone, and showed the brain all the same."""
+    write_label_files(tmp_path / "head.nii.gz", head, TissueTable.brain().for_names(NAMES))
+    side = pose_looking_at((-80.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    mask = disc_opening(head, NAMES, side, 40.0).astype(np.uint8)
+    head.with_array(mask).write(tmp_path / "hole.nii.gz")
+    through, told = image(tmp_path, "--pose", "auto", "--craniotomy", str(tmp_path / "hole.nii.gz"))
+    assert "about R -69, A 0, S 0 mm are replaced" in told.replace("-0,", "0,").replace("-0 ", "0 ")
+    assert "bone lie behind" not in told and through.mean() > 10.0
+    pose = side.copy()
+    pose[:3, 3] = (-59.0, 0.0, 0.0)
+    (tmp_path / "pose.json").write_text(json.dumps(pose.tolist()))
+    _, told = image(tmp_path, "--pose", str(tmp_path / "pose.json"))
+    assert "mm of bone lie behind the face of the probe, which stands in a closed skull" in told
+    _, told = image(tmp_path, "--pose", str(tmp_path / "pose.json"), "--craniotomy", "disc:10")
+    assert "mm wide and does not fit through" in told
 
 
 def image(tmp_path, *arguments) -> tuple[np.ndarray, str]:

@@ -179,3 +179,30 @@ def test_the_probe_is_placed_at_the_chosen_view(head):  # noqa: F811
     place = (np.linalg.inv(TURN) @ node_to_world(bench.probe))[:3, 3]
     world = node_to_world(bench.probe)[:3, 3] - TURN[:3, 3]
     assert np.linalg.norm(place) == pytest.approx(78.0, abs=2.0) and world[0] < -70 and not bench.view.errors
+
+
+def test_place_follows_the_labels_and_takes_the_largest_piece(head):  # noqa: F811
+    bench = Bench(head)
+    bench.presenter.openCraniotomy()
+    moved = bench.add("LinearTransform", "moved")
+    moved.SetMatrixTransformToParent(vtk_matrix(np.array([[1.0, 0, 0, 100], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])))
+    bench.labels.SetAndObserveTransformNodeID(moved.GetID())
+    bench.logic.placeProbe(bench.labels, bench.probe)
+    place = node_to_world(bench.probe)[:3, 3] - [100.0, 0.0, 0.0]
+    np.testing.assert_allclose(place, [0.0, 0.0, 60.0], atol=4.0)
+    (model,) = nodes_of_class(bench.scene, "vtkMRMLModelNode")
+    assert model.GetParentTransformNode() is moved
+
+
+def test_the_labels_themselves_are_no_opening_and_edits_are_not_lost_unsaid(head):  # noqa: F811
+    bench = Bench(head)
+    bench.logic.parameters.opening = bench.whole
+    bench.presenter.openCraniotomy()
+    assert "the labels themselves, expected a node with the opening alone" in bench.view.errors[-1]
+    bench.logic.parameters.opening = None
+    bench.presenter.openCraniotomy()
+    first = bench.labels
+    first.GetImageData().SetScalarComponentFromDouble(56, 56, 56, 0, 2.0)
+    first.GetImageData().Modified()
+    bench.presenter.openCraniotomy()
+    assert bench.labels is not first and f"what was edited in {'LabelMapVolume'}" in bench.presenter.notes()

@@ -69,13 +69,13 @@ class Craniotomy:
         return self.source in (AUTO, DISC)
 
     def on(self, labels: Volume, names: Sequence[str], probe: Probe, probe_to_ras: np.ndarray | None) -> Volume:
-        """Labels 1, 2, ... called `names` with the opening; says what was removed.
+        """Labels 1, 2, ... called `names` with the opening; says what was removed. The pose is needed for a disc alone.
 
         Raises SimulationError where that cannot be done.
         """
         if not self.is_wanted:
             return labels
-        from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm, disc_opening, file_opening, opened
+        from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm, disc_opening, file_opening, middle_of, opened
 
         if self.needs_pose:
             if probe_to_ras is None:
@@ -84,8 +84,15 @@ class Craniotomy:
                 )
             diameter = self.diameter_mm or disc_diameter_mm(probe)
             opening, what = disc_opening(labels, names, probe_to_ras, diameter), f"a disc of {diameter:.0f} mm"
+            face = max(probe.face_mm, probe.elevation_aperture_mm)
+            if diameter < face:
+                what += f" (the face of the probe is {face:.0f} mm wide and does not fit through)"
         else:
             opening, what = file_opening(labels, names, self.source), self.source
         found, millilitres = opened(labels, names, opening)
-        note(f"craniotomy: {what}; {millilitres:.1f} ml of skin, scalp and skull are replaced by the coupling medium")
+        right, front, up = middle_of(labels, found)
+        note(
+            f"craniotomy: {what}; {millilitres:.1f} ml of skin, scalp and skull about R {right:.0f}, A {front:.0f}, "
+            f"S {up:.0f} mm are replaced by the coupling medium"
+        )
         return found

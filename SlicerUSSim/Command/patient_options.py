@@ -287,18 +287,24 @@ def _placed(
     pose: np.ndarray | str | None,
 ) -> _Placed:  # fmt: skip
     """The probe at its pose on a patient; `before` are the labels without what --add laid over them."""
-    from SlicerUSSim.Logic.mri.craniotomy import default_pose
+    from SlicerUSSim.Logic.mri.craniotomy import default_pose, middle_of
     from SlicerUSSim.Logic.mri.views import view_pose
 
     labels, names, settings = added.labels, added.tissue_names, preset.settings
+    whole, at = labels, None
+    if isinstance(pose, str) and craniotomy.is_wanted and not craniotomy.needs_pose:
+        labels = craniotomy.on(whole, names, preset.probe, None)
+        at = middle_of(whole, labels)
     if isinstance(pose, str):
         target = added.centre_ras(before)
-        pose = (
-            view_pose(labels, names, pose, is_open=craniotomy.is_wanted)
-            if pose != AUTO
-            else default_pose(labels, names, preset.probe, is_open=craniotomy.is_wanted, target_ras=target)
-        )
-    labels = craniotomy.on(labels, names, preset.probe, pose)
+        if pose == AUTO:
+            pose = default_pose(
+                labels, names, preset.probe, is_open=craniotomy.is_wanted, opening_ras=at, target_ras=target
+            )
+        else:
+            pose = view_pose(labels, names, pose, is_open=craniotomy.is_wanted)
+    if at is None:
+        labels = craniotomy.on(labels, names, preset.probe, pose)
     if "skin" in names and not craniotomy.is_wanted and not patient.gives_contact:
         note(f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (--contact-gap)")
         settings = replace(settings, contact_gap_mm=GEL_MM)

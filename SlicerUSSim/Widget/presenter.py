@@ -225,7 +225,7 @@ class PanelPresenter:
             mri = required(parameters.mri, "no MRI chosen, expected a scalar volume")
             if self._notes_of not in (None, mri.GetID()):  # also if this fails: they are about another patient
                 self.setNotes()
-            told = self._forget_other_brain(mri)
+            told = self._forget_other_brain(mri) + self._closed_again()
             others, untold = self._second_mri()
             with self._replaceable(f"{mri.GetName()} tissues", mri) as labels:
                 result = self.logic.segment(
@@ -251,6 +251,16 @@ class PanelPresenter:
             return []
         parameters.mask = None
         return [f"{mask.GetName()!r} is the mask of another MRI and was not used"]
+
+    def _closed_again(self) -> list[str]:
+        """Choose the labels before the opening, into which Segment writes; a line about it."""
+        chosen: Any = self.logic.parameters.labels
+        if chosen is None or self.logic.closedLabels(chosen) is chosen:
+            return []
+        closed = self.logic.closedLabels(chosen)
+        self.logic.hideOpening(chosen)
+        self.logic.parameters.labels = closed
+        return [f"the skull is closed again; {chosen.GetName()!r} still has the opening in the tissues before"]
 
     def _second_mri(self) -> tuple[dict[str, Any], list[str]]:
         """({contrast: node}, lines about it)"""
@@ -298,6 +308,7 @@ class PanelPresenter:
             parameters.labels = node
             kept = [line for line in self._notes if not line.startswith(_OPENED)]
             self._notes, self._labels_said = [*kept, *self.logic.notes], node.GetID()
+            self._notes += _checks(self.logic.warnings)
         self.view.refresh()
 
     def closeCraniotomy(self) -> None:

@@ -10,11 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.distances import distance_to
 from SlicerUSSim.Logic.mri.outside import OUTSIDE
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, sample
@@ -24,6 +26,14 @@ from SlicerUSSim.Logic.probe.surface import PatientSurface
 REMOVED = tuple(name for name in OUTSIDE if name != "air")
 #: An opening reaches this far below the brain's surface in its middle, times its half-width: the surface is curved
 _BELOW = 1.0
+#: Where the brain may begin under the probe, or under a polygon, mm: a probe on the brain has the skull behind its face
+_BRAIN_MM = (-40.0, 60.0)
+#: Markups of 3D Slicer whose points are a polygon
+_POLYGONS = ("ClosedCurve", "Curve", "Fiducial")
+#: Diameters of discs, mm; and more than a craniotomy removes, ml
+DIAMETERS_MM, _MOST_ML = (5.0, 150.0), 500.0
+#: Half of what an opening removes must be so near to the brain, mm
+_NEAR_BRAIN_MM = 30.0
 #: A face needs so much more room than it is wide, mm
 ROOM_MM = 10.0
 
@@ -36,8 +46,13 @@ def without_outside(labels: Volume, names: Sequence[str]) -> Volume:
 def disc_opening(labels: Volume, names: Sequence[str], probe_to_ras: np.ndarray, diameter_mm: float) -> np.ndarray:
     """(k, j, i) bool: a cylinder about the axis of a probe at this pose (4, 4), from outside to the brain.
 
-    Raises SimulationError if there is no brain under it.
+    Raises SimulationError for a diameter out of DIAMETERS_MM, and if there is no brain under the probe.
     """
+    low, high = DIAMETERS_MM
+    require(
+        low <= diameter_mm <= high,
+        f"the diameter of the craniotomy is {diameter_mm:g} mm, expected {low:g} to {high:g}",
+    )
     places = _in_probe(labels, probe_to_ras)
     across = np.hypot(places[..., 0], places[..., 2])
     within = across <= 0.5 * diameter_mm
@@ -80,13 +95,20 @@ def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
 
 
 def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
-    """(k, j, i) bool of a mask on any grid (not 0 is open), called `name` in errors.
+    """(k, j, i) bool of a mask on any grid (not 0 is open; above 1/2 of values from 0 to 1), called `name` in errors.
 
-    Raises SimulationError for one that is empty or lies elsewhere.
+    Raises SimulationError for what is no mask, and for one that is empty or lies elsewhere.
     """
+    values = np.unique(mask.array[np.isfinite(mask.array)])
+    is_soft = bool(values.size) and float(values[0]) >= 0.0 and float(values[-1]) <= 1.0
+    require(
+        values.size <= 2 or is_soft,
+        f"{name}: has {values.size} different values, expected a mask of the opening (0 and one other, or 0 to 1)",
+    )
+    inside = mask.array > 0.5 if is_soft else np.nan_to_num(mask.array) != 0
     k, j, i = np.indices(labels.array.shape)
     ras = np.stack([i, j, k], axis=-1) @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
-    opening = sample(mask.with_array((mask.array != 0).astype(np.uint8)), ras, order=0) > 0
+    opening = sample(mask.with_array(inside.astype(np.uint8)), ras, order=0) > 0
     require(bool(opening.any()), f"{name}: is empty, or lies outside of the patient, expected a mask of the opening")
     return opening
 
@@ -125,10 +147,31 @@ def opened(labels: Volume, names: Sequence[str], opening: np.ndarray) -> tuple[V
     removed = opening & _is_any(labels, names, REMOVED)
     require(
         bool(removed.any()),
-        f"the craniotomy removes nothing, expected {', '.join(REMOVED)} in it; it is off the head, or --outside was "
-        "not used",
+        f"the craniotomy removes nothing, expected {', '.join(REMOVED)} in it; it is off the head or in the brain, the "
+        "image cuts the head there, or only a brain is labelled (--outside labels the rest)",
     )
-    return labels.with_array(np.where(removed, 0, labels.array)), float(removed.sum() * labels.voxel_ml)
+    millilitres = float(removed.sum() * labels.voxel_ml)
+    require(
+        millilitres <= _MOST_ML,
+        f"the craniotomy removes {millilitres:.0f} ml of skin and skull, expected {_MOST_ML:g} or less; is it "
+        "the mask of an opening?",
+    )
+    brain = without_outside(labels, names).array > 0
+    if brain.any():
+        away = float(np.median(distance_to(brain, labels.spacing_mm)[removed]))
+        require(
+            away <= _NEAR_BRAIN_MM,
+            f"what the craniotomy removes lies {away:.0f} mm from the brain, expected {_NEAR_BRAIN_MM:g} or less: it "
+            "is not over the brain",
+        )
+    return labels.with_array(np.where(removed, 0, labels.array)), millilitres
+
+
+def middle_of(before: Volume, after: Volume) -> np.ndarray:
+    """(3,) RAS mm, the middle of the largest piece that an opening removed from labels."""
+    parts, _ = ndimage.label(before.array != after.array)  # type: ignore[misc]
+    largest = parts == np.bincount(parts.ravel())[1:].argmax() + 1
+    return before.ijk_to_ras[:3] @ np.append(np.argwhere(largest).mean(axis=0)[::-1], 1.0)
 
 
 def _is_any(labels: Volume, names: Sequence[str], which: Sequence[str]) -> np.ndarray:
@@ -146,16 +189,36 @@ def _deepest(labels: Volume, names: Sequence[str], within: np.ndarray, depth: np
     """Depth in mm to which an opening reaches: that of the uppermost brain in it, and as far as the brain is curved."""
     brain = within & (without_outside(labels, names).array > 0)
     require(bool(brain.any()), "there is no brain under the craniotomy, expected one; move it or the probe")
-    return float(depth[brain].min()) + _BELOW * radius_mm
+    begins = float(depth[brain].min())
+    low, high = _BRAIN_MM
+    require(
+        begins <= high,
+        f"there is no brain under the craniotomy within {high:g} mm (it begins {begins:.0f} mm below), expected one; "
+        "move it or the probe",
+    )
+    require(
+        begins >= low,
+        f"the brain under the craniotomy begins {-begins:.0f} mm behind the probe, which is in the head or looks out "
+        "of it, expected one before it; move or turn the probe",
+    )
+    return begins + _BELOW * radius_mm
 
 
 def _control_points(path: str) -> np.ndarray:
     """(points, 3) RAS mm of the first markup of a .mrk.json file of 3D Slicer."""
     values = read_json(path)
     try:
-        markup = values["markups"][0]
-        points = np.array([point["position"] for point in markup["controlPoints"]], float).reshape(-1, 3)
+        markup, *others = values["markups"]
+        placed = [point for point in markup["controlPoints"] if point.get("positionStatus", "defined") == "defined"]
+        points = np.array([point["position"] for point in placed], float).reshape(-1, 3)
     except (KeyError, IndexError, TypeError, ValueError):
         require(False, f"{path}: has no points, expected a markup of 3D Slicer (.mrk.json), such as a closed curve")
         raise
-    return points if str(markup.get("coordinateSystem", "LPS")).upper() in ("RAS", "1") else points @ LPS_TO_RAS[:3, :3]
+    require(not others, f"{path}: has {len(others) + 1} markups, expected one")
+    kind, frame, unit = (
+        markup.get(*entry) for entry in (("type", ""), ("coordinateSystem", "LPS"), ("coordinateUnits", "mm"))
+    )
+    require(kind in _POLYGONS, f"{path}: is a markup of type {kind!r}, expected one of {', '.join(_POLYGONS)}")
+    require(frame in ("LPS", "RAS"), f"{path}: coordinateSystem is {frame!r}, expected LPS or RAS")
+    require(unit == "mm", f"{path}: coordinateUnits is {unit!r}, expected mm")
+    return points if frame == "RAS" else points @ LPS_TO_RAS[:3, :3]

@@ -9,7 +9,7 @@ from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D, vtkWindowedSincPolyDataF
 
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.mri.craniotomy import mask_opening, polygon_opening
+from SlicerUSSim.Logic.mri.craniotomy import mask_opening, middle_of, polygon_opening
 from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, node_labels
 from SlicerUSSim.Logic.mrml.nodes import display_of, named, node_to_world, require_node
 from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_result
@@ -18,6 +18,8 @@ from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_resul
 OPENING_CLASSES = ("vtkMRMLMarkupsNode", *LABEL_CLASSES)
 #: References of opened labels: to the labels before, and to the model of the removed piece
 _CLOSED, _FLAP = "SlicerUSSim.closed", "SlicerUSSim.flap"
+#: Attribute of opened labels: R, A, S mm of the middle of the piece, in their own frame
+_MIDDLE = "SlicerUSSim.middle"
 _FLAP_COLOR = (0.95, 0.75, 0.35)
 
 
@@ -47,6 +49,7 @@ def opening_of(opening_node: Any, labels: Volume, names: tuple[str, ...], world_
             labels, names, _points(opening_node) @ world_to_labels[:3, :3].T + world_to_labels[:3, 3]
         )
     mask, _ = node_labels(opening_node)
+    mask = mask.with_array((mask.array != 0).astype(np.uint8))
     placed = Volume(mask.array, world_to_labels @ node_to_world(opening_node) @ mask.ijk_to_ras)
     return mask_opening(labels, placed, named(opening_node))
 
@@ -65,6 +68,8 @@ def _points(markups_node: Any) -> np.ndarray:
 
 def show_flap(labels_node: Any, removed: Volume) -> Any:
     """The model node with the surface of what an opening removed, (k, j, i) bool, which opened labels refer to."""
+    middle = middle_of(removed.with_array(np.zeros_like(removed.array)), removed)
+    labels_node.SetAttribute(_MIDDLE, " ".join(f"{mm:.6g}" for mm in middle))
     scene = labels_node.GetScene()
     model = labels_node.GetNodeReference(_FLAP)
     if model is None or not may_replace_result(model):
@@ -73,9 +78,8 @@ def show_flap(labels_node: Any, removed: Volume) -> Any:
         )
         labels_node.SetNodeReferenceID(_FLAP, model.GetID())
     model.SetAndObservePolyData(_surface(removed))
-    parent = labels_node.GetParentTransformNode()
-    model.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
     mark_as_result(model)
+    follow_labels(labels_node)
     display = display_of(model)
     if display is not None:
         display.SetColor(*_FLAP_COLOR)
@@ -94,12 +98,19 @@ def hide_flap(labels_node: Any) -> None:
 
 
 def flap_centre(labels_node: Any) -> np.ndarray | None:
-    """(3,) world RAS mm, the middle of the piece that was removed; None without one."""
-    model = labels_node.GetNodeReference(_FLAP)
-    surface = None if model is None or not is_opened(labels_node) else model.GetPolyData()
-    if surface is None or surface.GetNumberOfPoints() == 0:
+    """(3,) world RAS mm, the middle of the largest piece that was removed; None without one."""
+    text = labels_node.GetAttribute(_MIDDLE) if is_opened(labels_node) else None
+    if text is None:
         return None
-    return (node_to_world(model) @ [*surface.GetCenter(), 1.0])[:3]
+    follow_labels(labels_node)
+    return (node_to_world(labels_node) @ [*map(float, text.split()), 1.0])[:3]
+
+
+def follow_labels(labels_node: Any) -> None:
+    """Put the model of the removed piece under the transform of the labels, which may have changed."""
+    model, parent = labels_node.GetNodeReference(_FLAP), labels_node.GetParentTransformNode()
+    if model is not None and may_replace_result(model) and model.GetParentTransformNode() is not parent:
+        model.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
 
 
 def _surface(removed: Volume) -> Any:

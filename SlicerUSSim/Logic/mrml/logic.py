@@ -46,6 +46,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import (
     Patient,
     PatientReader,
     labels_version,
+    node_labels,
     read_labels,
     read_mask,
     write_labels,
@@ -348,6 +349,11 @@ class UltrasoundSceneLogic:
         require_node(output_node, *LABEL_CLASSES, use="output of Open skull")
         require(closed is not output_node, f"labels and output are both {named(closed)}, expected different nodes")
         require(
+            opening_node is None or opening_node not in (closed, labels_node, output_node),
+            f"opening is {named(opening_node)}, the labels themselves, expected a node with the opening alone",
+        )
+        is_left_out = closed is not labels_node and not self.mayReplace(labels_node)
+        require(
             self.mayReplace(output_node),
             f"{named(output_node)} was not made by this module, or edited since, and is not replaced; choose another "
             "node",
@@ -364,11 +370,16 @@ class UltrasoundSceneLogic:
         if opening_node is not None:
             opening = self._work.do(lambda: opening_of(opening_node, placed, names, world_to_labels))
             what = named(opening_node)
+            if opening_node.IsA("vtkMRMLSegmentationNode"):
+                what += f" with {', '.join(node_labels(opening_node)[1].values())}"
         else:
             pose, probe = world_to_labels @ probe_pose(probe_transform_node), self.preset.probe
             diameter = disc_diameter_mm(probe) if diameter_mm is None else diameter_mm
             opening = self._work.do(lambda: disc_opening(placed, names, pose, diameter))
             what = f"a disc of {diameter:.0f} mm under the probe"
+            face = max(probe.face_mm, probe.elevation_aperture_mm)
+            if diameter < face:
+                what += f", through which its face of {face:.0f} mm does not fit"
         result, millilitres = self._work.do(lambda: opened(placed, names, opening))
         found = labels.with_array(result.array)
         texture = None
@@ -383,6 +394,11 @@ class UltrasoundSceneLogic:
             f"{named(output_node)}, and {named(closed)} stays as it is",
         )
         self.warnings = ()
+        if is_left_out:
+            self.warnings = (
+                f"what was edited in {named(labels_node)} is not in {named(output_node)}, which is {named(closed)} "
+                "with the opening",
+            )
         return millilitres
 
     def closedLabels(self, labels_node):
