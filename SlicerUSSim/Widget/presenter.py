@@ -302,7 +302,7 @@ class PanelPresenter:
             kind = "Segmentation" if closed.IsA("vtkMRMLSegmentationNode") else "LabelMapVolume"
             with self._made(again, kind, f"{closed.GetName()} with craniotomy") as node:
                 self.logic.openCraniotomy(
-                    closed, node, probe_transform_node=parameters.probe_transform, opening_node=parameters.opening,
+                    chosen, node, probe_transform_node=parameters.probe_transform, opening_node=parameters.opening,
                     diameter_mm=parameters.panel.craniotomy_mm,
                 )  # fmt: skip
             parameters.labels = node
