@@ -71,6 +71,17 @@ def test_a_skull_is_smooth_where_its_outer_table_is_not_to_be_seen():
     assert not (found.labels == 5)[patch].any()
 
 
+def test_a_head_that_the_image_cuts_is_said_to_be():
+    """The probe looked through where there is no bone, and nothing said so."""
+    mri, brain, _ = round_head()
+    assert find_outside(mri, brain).warnings == ()
+    for part, side in ((np.s_[:105], "top"), (np.s_[:, :, 12:], "left"), (np.s_[:, :-10], "front")):
+        found = find_outside(Volume(mri.array[part].copy(), mri.ijk_to_ras), brain[part])
+        (line,) = found.warnings
+        assert line.startswith(f"the image cuts the head ({side} ") and "do not put a probe there" in line
+    assert find_outside(Volume(mri.array[10:].copy(), mri.ijk_to_ras), brain[10:]).warnings == ()  # the neck
+
+
 def test_the_tissues_of_the_brain_go_first():
     mri, brain, _ = round_head()
     labels = mri.with_array(np.where(brain, 2, 0).astype(np.uint8))

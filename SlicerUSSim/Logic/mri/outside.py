@@ -36,6 +36,8 @@ _BESIDE_MM = (2.0, 30.0)
 _SKIN_MM, _MARROW_MM, _LEAST_SKULL_MM, _LARGEST_SKULL_MM = 2.0, 3.5, 2.5, 14.0
 #: A skull is smooth at this scale
 _SMOOTH_MM = 6.0
+#: Area of a head at a face of the image from which it is cut there
+_CUT_CM2 = 4.0
 #: Near the faces of an image no air is labelled
 _FACES_MM = 8.0
 #: Tables of the skull over its marrow
@@ -53,6 +55,8 @@ class Outside:
     labels: np.ndarray
     #: Intensity below which it is bone or air
     dark: float
+    #: What a user should check, one line each
+    warnings: tuple[str, ...] = ()
 
     def text(self, voxel_ml: float) -> str:
         """One line for the user: "outside the brain: skin 240 ml, scalp 1100 ml, ..."."""
@@ -130,7 +134,27 @@ def find_outside(mri: Volume, brain: np.ndarray) -> Outside:
     labels[~head | inner] = 0
     whole = np.zeros(mri.array.shape, np.uint8)
     whole[box] = labels
-    return Outside(whole, float(dark))
+    return Outside(whole, float(dark), _cut(whole, mri))
+
+
+def _cut(labels: np.ndarray, mri: Volume) -> tuple[str, ...]:
+    """A line about the faces of the image at which the head ends, other than the lower one, as in a neck."""
+    lines = []
+    for axis, direction in enumerate(mri.ijk_to_ras[:3, :3].T[::-1]):
+        area = mri.voxel_ml * 10.0 / mri.spacing_mm[::-1][axis]  # cm2 of a voxel
+        for end, sign in ((0, -1.0), (-1, 1.0)):
+            along = int(np.abs(direction).argmax())
+            is_up = bool(direction[along] * sign > 0)
+            square_cm = float((np.take(labels, end, axis=axis) > 0).sum()) * area
+            if square_cm > _CUT_CM2 and (along != 2 or is_up):
+                side = (("left", "right"), ("back", "front"), ("bottom", "top"))[along][is_up]
+                lines.append(f"{side} {square_cm:.0f} cm2")
+    if not lines:
+        return ()
+    return (
+        f"the image cuts the head ({', '.join(lines)}): there it has no skin, and what is missing of its skull lets a "
+        "beam in; do not put a probe there",
+    )
 
 
 def _at_faces(box: list[slice], mri: Volume) -> np.ndarray:

@@ -319,6 +319,7 @@ def segment_mri(
         around = find_outside(images[0], foreground)
         whole, tissue_names = around.over(whole, tissue_names)
         notes.append(around.text(mri.voxel_ml))
+        warnings += around.warnings
         timed("outside the brain")
     for line in notes:
         _log.info("%s", line)
