@@ -43,7 +43,7 @@ inline float bent_patch(float per_mm, float slope, float bend, float variance, f
 // Radians from one hit to the next, laterally, and over a standard deviation of the beam, elevationally, of which a sum
 // over hits is the integral, also at the upper frequencies of a pulse. Laterally no fewer: in a fan of lines a plane is
 // not one against the depth, and a patch that is moved far has the slope of another line.
-#define MOST_PER_STEP 2.6f
+#define MOST_PER_STEP 3.0f
 #define MOST_ASIDE 0.7f
 
 // How far a wall is a plane that bends by `turning` radians within the beam. Others are seen where they are square to
@@ -99,8 +99,11 @@ __kernel void find_walls(__constant const Acquisition *acquisition, __global con
       Wall wall;
       wall.echo = hit->echo * exp_fast(gain_of_band(acquisition, hit->loss));
       wall.depth_mm = hit->depth_mm - hit->elevational_slope * (hit->elevational_mm - (1.0f - carried_aside) * centre);
+      // In a fan of lines a plane is bent: the depth along it grows to both sides.
+      const float apart = line_distance(acquisition, hit->path_mm);
+      const float fan = (2.0f * stretch - 1.0f) * (line_distance(acquisition, hit->path_mm + 1.0f) / apart - 1.0f);
       const float inside2 =
-          bent_patch(per_mm, hit->lateral_slope, bend, inside * sigma2, &wall.depth_mm) +
+          bent_patch(per_mm, hit->lateral_slope, bend + fan, inside * sigma2, &wall.depth_mm) +
           bent_patch(per_mm, hit->elevational_slope, bend, inside_aside * sigma.y * sigma.y, &wall.depth_mm);
       // Of a bent patch only the Fresnel zone contributes. The mean curvature says nothing of its direction; laterally,
       // where patches are wide, this is within 2 dB of theory for spheres and for cylinders along and across the plane.

@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.verification.numpy_model.labels import Labels
 from SlicerUSSim.Logic.verification.numpy_model.lobes import Table
 
 # Radians that the sum over hits has at most: from line to line, and over an elevational sigma (interfaces.cl)
-_MOST_PER_STEP, _MOST_ASIDE = f32(2.6), f32(0.7)
+_MOST_PER_STEP, _MOST_ASIDE = f32(3.0), f32(0.7)
 _AXIS_STEPS = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint32)
 
 
@@ -332,20 +332,23 @@ def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndar
     middle = stratum_centres(np.clip(strata, 0, int(rays) - 1), int(rays)) * elevational
     aside = hits["elevational_mm"] + flat[1] * (middle - hits["elevational_mm"])
     depth = hits["depth_mm"] - hits["elevational_slope"] * (hits["elevational_mm"] - (f32(1) - carried[1]) * aside)
-    whole, inside, zones = f32(0), f32(0), []
-    for part, sigma, axis in zip(within, (lateral, elevational), ("lateral", "elevational"), strict=True):
+    whole, inside = f32(0), f32(0)
+    # Laterally, a plane is bent against the depths of a fan of lines.
+    fan = beam.line_distance(hits["path_mm"] + f32(1)) / beam.line_distance(hits["path_mm"]) - f32(1)
+    bends = (bend + (f32(2) * stretch - f32(1)) * fan, bend)
+    for part, sigma, bent, axis in zip(within, (lateral, elevational), bends, ("lateral", "elevational"), strict=True):
         slope, variance = hits[f"{axis}_slope"], part * sigma * sigma
-        turning = per_slope * bend * variance
-        zones.append(f32(1) + turning * turning)
+        turning = per_slope * bent * variance
+        zones = f32(1) + turning * turning
         whole = whole + (per_slope * slope * sigma) ** 2
-        inside = inside + (per_slope * slope) ** 2 * variance / zones[-1]
-        depth = depth - f32(0.5) * per_slope * slope * slope * turning * variance / zones[-1]
+        inside = inside + (per_slope * slope) ** 2 * variance / zones
+        depth = depth - f32(0.5) * per_slope * slope * slope * turning * variance / zones
     share = _patch_echo(acquisition, whole, inside)
     depth_per_line = carried[0] * hits["lateral_slope"] * step
     strength = (
         hits["echo"]
         * exp(beam.gain_of_band(hits["loss"]))
-        * zones[0] ** f32(-0.25)
+        * (f32(1) + (per_slope * bend * within[0] * lateral * lateral) ** 2) ** f32(-0.25)
         * share
         * step
         / width
