@@ -727,6 +727,7 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
         open_section(page, "Craniotomy")
         assert page.locator("#closeCraniotomyButton").is_disabled()
         click(page, "#openCraniotomyButton")
+        eventually(page, lambda: "craniotomy: a disc of" in shown(page, "notesLabel"))
         settled(page)
         page.evaluate("window.trame.trigger('press', ['placeButton'])")  # on the brain, in the middle of the opening
         settled(page)
@@ -735,6 +736,7 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
         assert through.mean() > shut.mean() + 5.0
         assert np.array_equal(run_again(script_of(page), tmp_path), through)
         click(page, "#closeCraniotomyButton")
+        eventually(page, lambda: "craniotomy: " not in shown(page, "notesLabel"))
         settled(page)
         assert not errors(page) and "craniotomy: " not in shown(page, "notesLabel")
         assert page.locator("#closeCraniotomyButton").is_disabled()
