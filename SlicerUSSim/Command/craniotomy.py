@@ -75,7 +75,14 @@ class Craniotomy:
         """
         if not self.is_wanted:
             return labels
-        from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm, disc_opening, file_opening, middle_of, opened
+        from SlicerUSSim.Logic.mri.craniotomy import (
+            disc_diameter_mm,
+            disc_opening,
+            face_width_mm,
+            file_opening,
+            middle_of,
+            opened,
+        )
 
         if self.needs_pose:
             if probe_to_ras is None:
@@ -84,7 +91,7 @@ class Craniotomy:
                 )
             diameter = self.diameter_mm or disc_diameter_mm(probe)
             opening, what = disc_opening(labels, names, probe_to_ras, diameter), f"a disc of {diameter:.0f} mm"
-            face = max(probe.face_mm, probe.elevation_aperture_mm)
+            face = face_width_mm(probe)
             if diameter < face:
                 what += f" (the face of the probe is {face:.0f} mm wide and does not fit through)"
         else:

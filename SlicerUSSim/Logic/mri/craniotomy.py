@@ -113,9 +113,14 @@ def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
     return opening
 
 
+def face_width_mm(probe: Probe) -> float:
+    """The larger side of a probe's face."""
+    return max(probe.face_mm, probe.elevation_aperture_mm)
+
+
 def disc_diameter_mm(probe: Probe) -> float:
     """Diameter of a disc through which a probe reaches the brain."""
-    return max(probe.face_mm, probe.elevation_aperture_mm) + ROOM_MM
+    return face_width_mm(probe) + ROOM_MM
 
 
 def default_pose(

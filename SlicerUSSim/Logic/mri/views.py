@@ -10,6 +10,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.craniotomy import without_outside
+from SlicerUSSim.Logic.probe.placement import pose_looking_at
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 
 
@@ -63,10 +64,4 @@ def view_pose(labels: Volume, names: Sequence[str], view: str, *, is_open: bool 
     far = centre + 1000.0 * outward
     found = surface.hit(far, centre)
     face = surface.nearest(far) if found is None else found
-    axis = -surface.normal(face)
-    lateral = np.asarray(chosen.lateral) - axis * (axis @ np.asarray(chosen.lateral))
-    lateral /= np.linalg.norm(lateral)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([lateral, axis, np.cross(lateral, axis)], axis=1)
-    pose[:3, 3] = face
-    return pose
+    return pose_looking_at(face, face - surface.normal(face), chosen.lateral)

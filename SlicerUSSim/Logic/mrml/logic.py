@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.mri.addable import require_addable
-from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_diameter_mm, disc_opening, opened
+from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_diameter_mm, disc_opening, face_width_mm, opened
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
@@ -377,7 +377,7 @@ class UltrasoundSceneLogic:
             diameter = disc_diameter_mm(probe) if diameter_mm is None else diameter_mm
             opening = self._work.do(lambda: disc_opening(placed, names, pose, diameter))
             what = f"a disc of {diameter:.0f} mm under the probe"
-            face = max(probe.face_mm, probe.elevation_aperture_mm)
+            face = face_width_mm(probe)
             if diameter < face:
                 what += f", through which its face of {face:.0f} mm does not fit"
         result, millilitres = self._work.do(lambda: opened(placed, names, opening))
