@@ -272,3 +272,19 @@ def test_a_point_in_a_scene_makes_a_proposal_that_is_applied_when_confirmed():
     added = logic.addTissues(labels, lesions)
     laid = added.labels.array == added.tissue_names.index("tumour") + 1
     assert dice(laid, true) >= 0.75
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.3])
+def test_without_an_atlas_a_removed_field_is_told_as_what_may_hide_a_lesion(bias):
+    rng = np.random.default_rng(1)
+    size = (12, 90, 90)
+    x = np.linspace(-1.0, 1.0, size[2])[None, None, :]
+    waves = np.sin(np.indices(size)[1] * 0.35)
+    image = np.where(waves > 0.75, 150.0, np.where(waves > 0.0, 600.0, 450.0)) * (1.0 + bias * x)
+    mri = Volume((image + 12.0 * rng.standard_normal(size)).astype(np.float32), np.eye(4))
+    mask = Volume(np.ones(size, np.uint8), np.eye(4))
+    segmentation = segment_mri(mri, mask=mask)
+    assert segmentation.atlas is None
+    with pytest.raises(SimulationError, match="looks healthy") as refused:
+        grow_lesion(segmentation, (45.0, 2.0, 6.0))
+    assert ("--no-bias-correction" in str(refused.value)) == bool(bias)

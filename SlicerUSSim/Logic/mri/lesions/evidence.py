@@ -41,6 +41,8 @@ class Evidence:
     deviations: np.ndarray
     #: The registered atlas; None without one
     atlas: AtlasFit | None
+    #: Whether a bias field was found, and removed
+    had_field: bool = False
 
     @property
     def grid(self) -> Volume:

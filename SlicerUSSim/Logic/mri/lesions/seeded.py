@@ -396,4 +396,9 @@ def _what_is_at(segmentation: Segmentation, index: np.ndarray, doubts: list[str]
     remedy = "; if it is a lesion all the same, say what it is, as R,A,S=tumour"
     if named is not None:
         remedy = f"; what looks like its surroundings has no border: draw a mask, and give it with --add {named}=MASK"
+    if evidence.had_field and evidence.atlas is None:
+        remedy += (
+            "; without an atlas a large lesion can be taken for a bias field, which was removed: try without bias "
+            "correction (--no-bias-correction)"
+        )
     return f"{name} that looks healthy{why}, expected a point in a lesion{remedy}"
