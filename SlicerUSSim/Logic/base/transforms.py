@@ -8,10 +8,15 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 
 #: (4, 4) for homogeneous points in millimetres: from LPS, the convention of ITK, to RAS; its own inverse.
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+#: Farthest from the origin that a coordinate may be, millimetres, where single precision still has .01
+MOST_MM = 1e5
 
 
 def check_affine(name: str, matrix, expected: str = "a 4x4 affine matrix") -> np.ndarray:
-    """`matrix` as a new (4, 4) float64 array. Raises SimulationError unless it is affine, of finite numbers."""
+    """`matrix` as a new (4, 4) float64 array.
+
+    Raises SimulationError unless it is affine, of finite numbers, and moves by at most MOST_MM.
+    """
     try:
         array = np.array(matrix, dtype=np.float64)
     except (TypeError, ValueError):
@@ -21,6 +26,8 @@ def check_affine(name: str, matrix, expected: str = "a 4x4 affine matrix") -> np
     require(
         np.allclose(array[3], [0, 0, 0, 1], atol=1e-6), f"{name} has last row {array[3].tolist()}, expected 0 0 0 1"
     )
+    farthest = float(np.abs(array[:3, 3]).max())
+    require(farthest <= MOST_MM, f"{name} moves by {farthest:.3g} mm, expected at most {MOST_MM:g} mm along every axis")
     return array
 
 

@@ -11,13 +11,19 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
+from SlicerUSSim.Logic.base.errors import SimulationError, reader, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import (
     messages_withheld,
     require_own_voxels,
     require_space,
     why_unreadable,
     written_whole,
+)
+from SlicerUSSim.Logic.base.headers import (
+    require_bytes,
+    require_readable_name,
+    require_sound_header,
+    require_spacing,
 )
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
 from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry, require_complete, require_written
@@ -129,6 +135,7 @@ class Volume:
     # ---- files -------------------------------------------------------------------------------------------------
 
     @classmethod
+    @reader
     def read(cls, path: str | os.PathLike) -> Volume:
         """Read NIfTI, NRRD, MetaImage, MINC 1 and 2, FreeSurfer's MGZ, VTI, or DICOM: a folder with one volume, or any
         image of it.
@@ -136,6 +143,7 @@ class Volume:
         Raises SimulationError for a missing or unreadable file and for an image that is not 3D and scalar.
         """
         require_path(path)
+        require_readable_name(path)
         path, doubts = Path(path), ()
         require(path.exists(), f"{path}: no such file or folder")
         if path.suffix.lower() == ".vti":
@@ -156,6 +164,7 @@ class Volume:
             array, ijk_to_ras = _read_minc1(path)
             _require_volume(array.shape[::-1], str(path))
             volume = cls(array, ijk_to_ras)
+        require_spacing(str(path), tuple(volume.spacing_mm))
         _log_size(volume, path)
         return replace(volume, name=str(path), doubts=doubts)
 
@@ -276,11 +285,12 @@ class Volume:
     def _read_vti(cls, path: Path) -> Volume:
         from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
-        reader = vtkXMLImageDataReader()
-        require(bool(reader.CanReadFile(str(path))), f"{path}: cannot be read as a VTK image")
-        reader.SetFileName(str(path))
-        reader.Update()
-        return cls.from_vtk(reader.GetOutput())
+        require_sound_header(path)
+        file = vtkXMLImageDataReader()
+        require(bool(file.CanReadFile(str(path))), f"{path}: cannot be read as a VTK image")
+        file.SetFileName(str(path))
+        file.Update()
+        return cls.from_vtk(file.GetOutput())
 
     def _write_vti(self, path: Path, made_by: str | None) -> None:
         from vtkmodules.vtkCommonCore import vtkStringArray
@@ -333,6 +343,7 @@ def require_image_name(path: Path, also: tuple[str, ...] = ()) -> None:
     require(not twice, f"{path}: has the ending {nifti} after another one; ITK would write a file of another name")
 
 
+@reader
 def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """((k, j, i) voxels, (4, 4) ijk_to_ras) of an image file, which may have only one slice.
 
@@ -349,13 +360,20 @@ def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     return sitk.GetArrayFromImage(image), _itk_ijk_to_ras(image)
 
 
+@reader
 def read_itk_image(path: Path):
     """A SimpleITK image of any file that ITK can read. Raises SimulationError, naming the file, for others."""
     import SimpleITK as sitk
 
+    require_readable_name(path)
+    require_sound_header(path)
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
+    file = sitk.ImageFileReader()
+    file.SetFileName(str(path))
     try:
-        image = sitk.ReadImage(str(path))
+        file.ReadImageInformation()
+        require_bytes(path, file.GetSize(), file.GetNumberOfComponents())
+        image = file.Execute()
     except RuntimeError as error:
         reason = why_unreadable(path) or str(error).strip().splitlines()[-1]
         if "No such file" in reason and path.exists():  # ITK's words for voxels that it could not read

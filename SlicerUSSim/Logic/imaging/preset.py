@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parameter_of, parameters_of, short
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import reader, require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.own_outputs import MARK
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
@@ -99,6 +99,7 @@ class Preset:
         return cls(**sections)
 
     @classmethod
+    @reader
     def read(cls, path: str | os.PathLike) -> Preset:
         """Read a preset from JSON. Raises SimulationError for a missing, unreadable or invalid file."""
         return cls.from_dict(read_json(path), str(path))

@@ -11,7 +11,7 @@ import logging
 import re
 from pathlib import Path
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.errors import SimulationError, reader, require
 from SlicerUSSim.Logic.base.segments import segments_of
 
 _log = logging.getLogger(__name__)
@@ -50,6 +50,7 @@ def names_of_file(path: Path) -> tuple[dict[int, str], str]:
     return {}, ""
 
 
+@reader
 def read_names(path: Path) -> dict[int, str]:
     """{label: name} of a table; lines that have no label and name are skipped.
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import built, kind_of, parameters_of, short
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
+from SlicerUSSim.Logic.base.errors import SimulationError, reader, require, require_kind
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -215,6 +215,7 @@ class TissueTable(Mapping[int, Tissue]):
         return cls(table, membrane)
 
     @classmethod
+    @reader
     def read(cls, path: str | os.PathLike) -> TissueTable:
         """Read a table from JSON. Raises SimulationError for a missing, unreadable or invalid file."""
         return cls.from_dict(read_json(path), str(path))

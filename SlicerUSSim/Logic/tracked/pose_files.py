@@ -9,15 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Logic.base.errors import SimulationError, reader, require, required
 from SlicerUSSim.Logic.base.files import read_json, write_json
-from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, check_rigid, is_singular
+from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, MOST_MM, check_affine, check_rigid, is_singular
 
 _log = logging.getLogger(__name__)
 
 _ITK_SUFFIXES = (".tfm", ".h5", ".hdf5", ".mat")
 
 
+@reader
 def read_pose(path: str | os.PathLike) -> np.ndarray:
     """(4, 4) probe_to_ras from a file.
 
@@ -42,6 +43,7 @@ def read_pose(path: str | os.PathLike) -> np.ndarray:
     return check_rigid(f"{path}: probe_to_ras", _numbers(path))
 
 
+@reader
 def read_matrix(path: str | os.PathLike) -> np.ndarray:
     """(4, 4) affine matrix, such as a calibration, from a text file of sixteen numbers by rows or from JSON rows.
 
@@ -76,9 +78,18 @@ def _starts_like_itk(path: Path) -> bool:
         return file.read(8) == b"#Insight"
 
 
+def _is_text(content: bytes) -> bool:
+    try:
+        return "\0" not in content.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+
+
 def _read_itk(path: Path) -> np.ndarray:
     import SimpleITK as sitk
 
+    if path.suffix.lower() not in (".h5", ".hdf5", ".mat"):  # ITK crashes on NUL, and ends a number at other bytes
+        require(_is_text(path.read_bytes()), f"{path}: is not a text, expected an ITK transform")
     try:
         transform = sitk.ReadTransform(str(path))
     except RuntimeError as error:
@@ -96,6 +107,7 @@ def _read_itk(path: Path) -> np.ndarray:
     return check_rigid(f"{path}: transform", LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS)
 
 
+@reader
 def read_transform(path: str | os.PathLike) -> np.ndarray:
     """(4, 4) affine map from a file: all formats of read_pose, or a linear MNI .xfm, which may scale.
 
@@ -107,6 +119,7 @@ def read_transform(path: str | os.PathLike) -> np.ndarray:
     return read_pose(path)
 
 
+@reader
 def read_tags(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray | None]:
     """((n, 3), (n, 3) or None) RAS points of an MNI .tag file: landmarks in one or two volumes, as in BITE and RESECT.
 
@@ -128,6 +141,8 @@ def read_tags(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray | None]:
             require(not numbers, f"{path}: a point has {len(numbers)} numbers, expected {per_point}")
     require(bool(rows), f"{path}: has no points, expected at least one")
     array = np.array(rows)
+    farthest = float(np.abs(array).max())
+    require(farthest <= MOST_MM, f"{path}: has a coordinate of {farthest:.3g} mm, expected at most {MOST_MM:g} mm")
     return array[:, :3], (array[:, 3:] if per_point == 6 else None)
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
+from SlicerUSSim.Logic.base.errors import SimulationError, reader, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
@@ -186,6 +186,7 @@ class TrackedSequence:
     # ---- files -------------------------------------------------------------------------------------------------
 
     @classmethod
+    @reader
     def read(cls, path: str | os.PathLike) -> TrackedSequence:
         """Read a sequence metafile (.igs.mha, .seq.mha, .mhd, .nrrd), compressed or not, in any image orientation.
 
@@ -304,6 +305,7 @@ def frame_numbers(text: str, count: int) -> list[int]:
     return numbers
 
 
+@reader
 def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """{"ImageToProbe": (4, 4), ...} from the <CoordinateDefinitions> of a Plus configuration file (XML).
 

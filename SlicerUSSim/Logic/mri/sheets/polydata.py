@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import reader, require
 from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
 from SlicerUSSim.Logic.base.own_outputs import mark_of
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
@@ -159,6 +159,7 @@ def _mark_of(data: vtkPolyData) -> str:
     return mark_of(vtk_to_numpy(corners.GetData()) if corners.GetNumberOfPoints() else np.zeros(0, np.float32))
 
 
+@reader
 def read_surfels(path: str | os.PathLike) -> Surfels:
     """The surfels of a .vtp by write_surfels. Raises SimulationError for a file that is none."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
@@ -166,14 +167,14 @@ def read_surfels(path: str | os.PathLike) -> Surfels:
 
     require(Path(path).is_file(), f"{path}: no such file")
     require(Path(path).suffix.lower() == ".vtp", f"{path}: expected a .vtp that `ussim segment --sheets` has written")
-    reader = vtkXMLPolyDataReader()
+    file = vtkXMLPolyDataReader()
     with messages_withheld():
-        require(reader.CanReadFile(str(path)) == 1, f"{path}: is no VTK surface")
+        require(file.CanReadFile(str(path)) == 1, f"{path}: is no VTK surface")
         require(_has_end(Path(path)), f"{path}: is incomplete; copy or write it again")
-        reader.SetFileName(str(path))
-        reader.Update()
-        require(reader.GetErrorCode() == 0, f"{path}: is damaged; copy or write it again")
-        cells = reader.GetOutput().GetCellData()
+        file.SetFileName(str(path))
+        file.Update()
+        require(file.GetErrorCode() == 0, f"{path}: is damaged; copy or write it again")
+        cells = file.GetOutput().GetCellData()
         arrays = []
         for entry in fields(Surfels):
             array = cells.GetArray(entry.name)

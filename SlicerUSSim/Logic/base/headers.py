@@ -1,0 +1,219 @@
+"""What must hold of the header of an image before ITK or VTK reads it: they crash, hang or fill the memory otherwise.
+
+MetaIO allocates tables for the number of dimensions that a header promises, ITK's orthogonalisation does not end for
+directions of 1e308, and VTK's XML reader allocates what the extent says.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from pathlib import Path
+from xml.parsers import expat
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require, shown_path
+
+#: Voxels of the largest image: 2000 slices of 1024 x 1024
+MOST_VOXELS = 2**31
+#: Deflate turns at most 1032 bytes into one (zlib, "An Explanation of the Deflate Algorithm"), and headers are small
+_MOST_EXPANSION = 1100
+#: Formats with all voxels in one file, compressed by deflate or not at all
+_ONE_FILE = (".mha", ".nii", ".nii.gz", ".nrrd", ".mgz", ".mgh", ".vti")
+#: Largest coordinate, direction and voxel size that is read, in any unit of length
+_MOST = 1e9
+#: The part of a file in which its header ends; sequences have some hundred bytes for every image
+_MOST_HEADER_BYTES = 2**26
+#: Millimetres that voxels may have along an axis, and those that suggest that the file is in metres
+_SPACING_MM, _LIKE_METRES = (0.01, 50.0), (1e-4, 9e-3)
+_DIMENSIONS = range(2, 5)
+
+
+def require_readable_name(path: str | os.PathLike) -> None:
+    """Raise SimulationError for a name that ITK and VTK cannot take: with bytes that are not UTF-8, or with NUL."""
+    text, shown = str(path), shown_path(path)
+    require(shown == text, f"{shown}: its name has bytes that are not UTF-8, expected a name in UTF-8")
+    require("\0" not in text, f"{text!r}: its name has a NUL, expected a file name")
+
+
+def require_sound_header(path: Path) -> None:
+    """Raise SimulationError for a MetaImage or VTI file whose header is none that can be read.
+
+    Files of other formats pass, and so do files whose voxels are missing, of which ITK and VTK say so.
+    """
+    suffix = path.suffix.lower()
+    if suffix in (".mha", ".mhd"):
+        _require_metaimage(path)
+    elif suffix == ".vti":
+        _require_vti(path)
+
+
+def require_bytes(path: Path, size: tuple[int, ...], bytes_per_voxel: int = 1) -> None:
+    """Raise SimulationError for an image of more voxels than are read, or than its file can hold.
+
+    `bytes_per_voxel` are the least that it may have.
+    """
+    voxels = math.prod(int(n) for n in size)
+    text = "x".join(str(n) for n in size)
+    require(voxels <= MOST_VOXELS, f"{path}: has {text} voxels, expected at most {MOST_VOXELS} in all")
+    if path.is_file() and path.name.lower().endswith(_ONE_FILE):
+        most = _MOST_EXPANSION * max(path.stat().st_size, 1)
+        require(
+            voxels * bytes_per_voxel <= most,
+            f"{path}: promises {text} voxels, {voxels * bytes_per_voxel} bytes, which its {path.stat().st_size} bytes "
+            "cannot hold; copy or export it again",
+        )
+
+
+def require_spacing(name: str, spacing_mm: tuple[float, ...]) -> None:
+    """Raise SimulationError for voxels smaller than .01 mm or larger than 50 mm, as of lengths in another unit."""
+    low, high = _SPACING_MM
+    if all(low <= mm <= high for mm in spacing_mm):
+        return
+    hint = ""
+    if all(_LIKE_METRES[0] <= mm <= _LIKE_METRES[1] for mm in spacing_mm):
+        hint = "; its lengths look like metres: set the unit, or multiply them by 1000"
+    elif all(low <= mm / 1000.0 <= high for mm in spacing_mm):
+        hint = "; its lengths look like micrometres: set the unit, or divide them by 1000"
+    shown = " x ".join(f"{mm:.3g}" for mm in spacing_mm)
+    raise SimulationError(f"{name}: has voxels of {shown} mm, expected {low:g} to {high:g} mm along every axis{hint}")
+
+
+# ---- MetaImage -------------------------------------------------------------------------------------------------------
+
+
+def _require_metaimage(path: Path) -> None:
+    fields = _metaimage_fields(path)
+    dimensions = _whole(path, fields, "NDims")
+    require(
+        len(dimensions) == 1 and dimensions[0] in _DIMENSIONS,
+        f"{path}: NDims is {fields.get('NDims', 'missing')[:40]}, expected 2, 3 or 4",
+    )
+    count = dimensions[0]
+    size = _whole(path, fields, "DimSize")
+    require(
+        len(size) == count and min(size) > 0,
+        f"{path}: DimSize is {fields.get('DimSize', 'missing')[:80]!r}, expected {count} numbers above 0",
+    )
+    require(
+        math.prod(size) <= MOST_VOXELS, f"{path}: has {'x'.join(map(str, size))} voxels, expected at most {MOST_VOXELS}"
+    )
+    for name in ("ElementNumberOfChannels", "HeaderSize", "CompressedDataSize"):
+        if name in fields:
+            value = _whole(path, fields, name)
+            low, high = (1, 256) if name == "ElementNumberOfChannels" else (-1, 2**48)
+            require(
+                len(value) == 1 and low <= value[0] <= high, f"{path}: {name} is {fields[name][:40]!r}, expected a size"
+            )
+    for names, many in _GEOMETRY:
+        for name in names:
+            if name in fields:
+                _require_numbers(path, name, fields[name], count**2 if many else count)
+
+
+#: Fields with a number for every axis, or for every pair of them, and their older names
+_GEOMETRY = (
+    (("ElementSpacing", "ElementSize", "Offset", "Position", "Origin", "CenterOfRotation"), False),
+    (("TransformMatrix", "Rotation", "Orientation"), True),
+)
+
+
+def _metaimage_fields(path: Path) -> dict[str, str]:
+    """The fields of a header, without those of the images of a sequence, whose values may be anything in UTF-8."""
+    fields: dict[str, str] = {}
+    read = 0
+    with path.open("rb") as file:
+        for line in file:
+            read += len(line)
+            require(read <= _MOST_HEADER_BYTES, f"{path}: its header does not end, expected a line ElementDataFile")
+            try:
+                text = line.decode("utf-8")
+            except UnicodeDecodeError:
+                raise SimulationError(f"{path}: its header is not text, expected lines in UTF-8") from None
+            name, equals, value = (part.strip() for part in text.partition("="))
+            require("\0" not in text, f"{path}: its header is not text, expected lines as NDims = 3")
+            if equals and not name.startswith("Seq_Frame"):
+                fields[name] = value
+            if name == "ElementDataFile":
+                return fields
+    raise SimulationError(f"{path}: its header has no line ElementDataFile, expected a MetaImage")
+
+
+def _whole(path: Path, fields: dict[str, str], name: str) -> list[int]:
+    text = fields.get(name, "")
+    require(
+        re.fullmatch(r"[-+]?\d{1,18}(\s+[-+]?\d{1,18})*", text),
+        f"{path}: {name} is {text[:80]!r}, expected whole numbers",
+    )
+    return [int(part) for part in text.split()]
+
+
+def _require_numbers(path: Path, name: str, text: str, count: int) -> None:
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        values = []
+    require(
+        len(values) == count and all(abs(value) <= _MOST for value in values),
+        f"{path}: {name} is {text[:80]!r}, expected {count} numbers of at most {_MOST:g}",
+    )
+
+
+# ---- VTI -------------------------------------------------------------------------------------------------------------
+
+
+def _require_vti(path: Path) -> None:
+    header = _vti_header(path)
+    whole = _extent(path, header.get("WholeExtent", ""), "WholeExtent")
+    size = tuple(high - low + 1 for low, high in zip(whole[::2], whole[1::2], strict=True))
+    require_bytes(path, size)
+    for name, count in (("Origin", 3), ("Spacing", 3), ("Direction", 9)):
+        if name in header:
+            _require_numbers(path, name, header[name], count)
+    if "Piece" in header:
+        piece = _extent(path, header["Piece"], "the extent of its piece")
+        require(
+            all(w <= p for w, p in zip(whole[::2], piece[::2], strict=True))
+            and all(p <= w for w, p in zip(whole[1::2], piece[1::2], strict=True)),
+            f"{path}: the extent of its piece is {header['Piece']!r}, expected one within {header['WholeExtent']!r}",
+        )
+
+
+def _vti_header(path: Path) -> dict[str, str]:
+    """The attributes of the image in a VTI file, and the extent of its first piece as "Piece"."""
+    found: dict[str, str] = {}
+    parser = expat.ParserCreate()
+
+    def started(name: str, attributes: dict[str, str]) -> None:
+        if name == "ImageData":
+            found.update(attributes)
+        elif name == "Piece":
+            found.setdefault("Piece", attributes.get("Extent", ""))
+
+    parser.StartElementHandler = started
+    with path.open("rb") as file:
+        while "Piece" not in found:
+            chunk = file.read(4096)
+            if not chunk:
+                break
+            try:
+                parser.Parse(chunk)
+            except expat.ExpatError as error:
+                if "Piece" in found:  # what follows may be voxels, which are no XML
+                    break
+                raise SimulationError(f"{path}: cannot be read as a VTK image ({error})") from None
+    require("WholeExtent" in found, f"{path}: cannot be read as a VTK image (it has no <ImageData WholeExtent=...>)")
+    return found
+
+
+def _extent(path: Path, text: str, name: str) -> list[int]:
+    require(
+        re.fullmatch(r"\s*[-+]?\d{1,9}(\s+[-+]?\d{1,9}){5}\s*", text),
+        f"{path}: {name} is {text[:80]!r}, expected six numbers",
+    )
+    values = [int(part) for part in text.split()]
+    require(
+        all(low <= high for low, high in zip(values[::2], values[1::2], strict=True)),
+        f"{path}: {name} is {text!r}, expected a last index that is not below the first, along every axis",
+    )
+    return values

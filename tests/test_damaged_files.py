@@ -1,0 +1,166 @@
+"""Files whose headers made ITK and VTK crash, hang or allocate everything, and what else fuzzing found."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from hypothesis import given, settings, strategies as st
+
+from SlicerUSSim.Logic import SimulationError, Volume
+from SlicerUSSim.Logic.tissue import TissueTable
+from SlicerUSSim.Logic.tracked.pose_files import read_pose, read_tags
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+
+ARRAY = (np.arange(6 * 5 * 4) % 200).reshape(6, 5, 4).astype(np.int16)
+#: What numbers of a header are replaced by
+EVIL = (
+    "1e6",
+    "1e308",
+    "-1e308",
+    "4294967296",
+    "2147483647",
+    "999999999999999999999",
+    "-1",
+    "0",
+    "nan",
+    "inf",
+    "",
+    "3 3 3 3",
+)
+
+
+def written(folder: Path, suffix: str) -> Path:
+    path = folder / f"image{suffix}"
+    Volume(ARRAY, np.diag([1.0, 1.0, 2.0, 1.0])).write(path)
+    return path
+
+
+def with_bytes(path: Path, old: bytes, new: bytes) -> Path:
+    content = path.read_bytes()
+    assert content.count(old) >= 1
+    path.write_bytes(content.replace(old, new, 1))
+    return path
+
+
+def refused(path: Path, words: str, read=Volume.read) -> None:
+    with pytest.raises(SimulationError, match=re.escape(words)) as error:
+        read(path)
+    assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (b"NDims = 3", b"NDims = 1000000", "NDims is 1000000, expected 2, 3 or 4"),
+        (b"NDims = 3", b"NDims = 999999999999999999999", "NDims is '999999999999999999999'"),
+        (b"NDims = 3", b"NDims = -1e308", "NDims is '-1e308', expected whole numbers"),
+        (b"-1 0 0 0 -1 0 0 0 1", b"-1 0 0 0 -1 0 0 1e308 1", "TransformMatrix is"),
+        (b"-1 0 0 0 -1 0 0 0 1", b"-1 0 0 0 -1 0 0 nan 1", "TransformMatrix is"),
+        (b"DimSize = 4 5 6", b"DimSize = 4 5 4294967296", "has 4x5x4294967296 voxels, expected at most"),
+        (b"DimSize = 4 5 6", b"DimSize = 4 5 600000", "which its"),
+        (b"DimSize = 4 5 6", b"DimSize = 4 5", "DimSize is '4 5', expected 3 numbers above 0"),
+        (b"ElementSpacing = 1 1 2", b"ElementSpacing = 1 1 \xff", "is not text"),
+        (b"ElementDataFile", b"ElementDataPile", "its header"),
+    ],
+)
+def test_a_metaimage_that_no_reader_survives_is_refused(tmp_path, old, new, words):
+    refused(with_bytes(written(tmp_path, ".mha"), old, new), words)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 999999999 0 4 0 5"', "voxels, expected at most"),
+        (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 9999 0 9999 0 5"', "which its"),
+        (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 3 0 4 5 0"', "WholeExtent is"),
+        (b'WholeExtent="0 3 0 4 0 5"', b'WholeExtent="0 3 0 4 0 2"', "the extent of its piece is"),
+        (b'Spacing="1 1 2"', b'Spacing="1 1 1e308"', "Spacing is '1 1 1e308'"),
+        (b"<ImageData", b"<ImageDada", "cannot be read as a VTK image"),
+    ],
+)
+def test_a_vti_that_no_reader_survives_is_refused(tmp_path, old, new, words):
+    refused(with_bytes(written(tmp_path, ".vti"), old, new), words)
+
+
+@pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".vti", ".nii"])
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(data=st.data())
+def test_numbers_of_a_header_are_replaced_and_what_is_read_is_an_image_or_one_line(tmp_path_factory, suffix, data):
+    path = written(tmp_path_factory.mktemp("file"), suffix)
+    content = bytearray(path.read_bytes())
+    if suffix == ".nii":
+        place = data.draw(st.integers(0, 347))
+        content[place] = data.draw(st.integers(0, 255))
+    else:
+        places = list(re.finditer(rb"[-+0-9.eE]+", bytes(content[:600])))
+        match = data.draw(st.sampled_from(places))
+        content[match.start() : match.end()] = data.draw(st.sampled_from(EVIL)).encode()
+    path.write_bytes(content)
+    try:
+        volume = Volume.read(path)
+    except SimulationError as error:
+        assert "\n" not in str(error) and str(path) in str(error)
+    else:
+        assert np.isfinite(volume.ijk_to_ras).all()
+
+
+@pytest.mark.parametrize(
+    ("mm", "words"),
+    [(0.001, "look like metres"), (1000.0, "look like micrometres"), (70.0, "expected 0.01 to 50 mm along every axis")],
+)
+def test_voxels_in_another_unit_are_refused_with_the_unit(tmp_path, mm, words):
+    image = sitk.GetImageFromArray(ARRAY)
+    image.SetSpacing([mm] * 3)
+    path = tmp_path / "image.mha"
+    sitk.WriteImage(image, str(path))
+    refused(path, words)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of bytes")
+def test_a_name_that_is_not_utf8_is_refused(tmp_path):
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/a\xff.nii"))
+    path.write_bytes(written(tmp_path, ".nii").read_bytes())
+    with pytest.raises(SimulationError, match="its name has bytes that are not UTF-8") as error:
+        Volume.read(path)
+    str(error.value).encode()
+
+
+def test_fields_of_a_sequence_that_are_not_text_are_one_line(tmp_path):
+    path = tmp_path / "s.igs.mha"
+    images = np.zeros((2, 8, 8), np.uint8)
+    TrackedSequence(images, ({"ImageToReference": np.eye(4)},) * 2, np.arange(2.0)).write(path)
+    refused(with_bytes(path, b"Seq_Frame0000", b"Seq_\xff\xferame0000"), "is not text", TrackedSequence.read)
+    path = tmp_path / "s.seq.nrrd"
+    TrackedSequence(images, ({"ImageToReference": np.eye(4)},) * 2, np.arange(2.0)).write(path)
+    content = path.read_bytes()
+    start = content.index(b"\n\n") + 20
+    path.write_bytes(content[:start] + b"\x55\xaa" + content[start + 2 :])
+    refused(path, "cannot be read", TrackedSequence.read)
+
+
+@pytest.mark.parametrize("damage", [b"\0", b"\xff"])
+def test_a_transform_that_is_not_text_is_one_line(tmp_path, damage):
+    path = tmp_path / "pose.tfm"
+    sitk.WriteTransform(sitk.Euler3DTransform((0, 0, 0), 0.1, 0.2, 0.3, (1, 2, 3)), str(path))
+    read_pose(path)
+    refused(with_bytes(path, b"0.1", b"0" + damage + b"1"), "is not a text", read_pose)
+
+
+@pytest.mark.parametrize(
+    "text", ["1" + "0" * 400, '{"tissues": 5}', '{"tissues": {"1": {"name": "csf", "sources": 5}}}']
+)
+def test_a_table_of_other_content_is_one_line(tmp_path, text):
+    path = tmp_path / "tissues.json"
+    path.write_text(text)
+    refused(path, "", TissueTable.read)
+
+
+def test_tags_that_are_no_numbers_are_one_line(tmp_path):
+    path = tmp_path / "points.tag"
+    path.write_text("MNI Tag Point File\nVolumes = 1;\nPoints =\n 1 2 1e999;\n")
+    refused(path, "", read_tags)
