@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import tempfile
+import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.files import make_folder, read_json, write_json
+from SlicerUSSim.Logic.base.files import hash_of_file, make_folder, partial_folder, put_on_disk, read_json, write_json
 
 #: Entry of the summary: {file name: hash, as it was written}
 _FILES = "files_sha256"
@@ -21,7 +20,7 @@ def require_own_results(folder: Path, names: Iterable[str], summary: str) -> Non
     written = _written(folder, summary)
     for name in (*names, summary):
         path = folder / name
-        is_ours = bool(written) if name == summary else path.exists() and written.get(name) == _hash_of(path)
+        is_ours = bool(written) if name == summary else path.exists() and written.get(name) == hash_of_file(path)
         require(
             not path.exists() or is_ours,
             f"{path}: exists and is not as this command wrote it, so it is not replaced; choose another folder (--out)",
@@ -54,12 +53,15 @@ def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
             try:
                 yield partial, content
                 files = sorted(file for file in partial.iterdir() if file.name != summary)
-                hashes = _written(folder, summary) | {file.name: _hash_of(file) for file in files}
+                hashes = _written(folder, summary) | {file.name: hash_of_file(file) for file in files}
                 write_json(partial / summary, {**content, _FILES: hashes})
             except SimulationError as error:  # the user knows no temporary folder
                 raise SimulationError(str(error).replace(str(partial), str(folder))) from None
             for file in (*files, partial / summary):
+                put_on_disk(file)
+            for file in (*files, partial / summary):
                 os.replace(file, folder / file.name)
+            put_on_disk(folder)
     except BaseException:
         if is_new:
             with suppress(OSError):  # not empty
@@ -70,12 +72,10 @@ def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
 @contextmanager
 def _temporary_folder(folder: Path) -> Iterator[Path]:
     try:
-        temporary = tempfile.TemporaryDirectory(dir=folder, prefix=".results-")
+        temporary = partial_folder(folder)
     except OSError as error:
         raise SimulationError(f"{folder}: cannot be written to ({error.strerror})") from None
-    with temporary as name:
-        yield Path(name)
-
-
-def _hash_of(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    try:
+        yield temporary
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

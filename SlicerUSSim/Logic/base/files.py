@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gzip
+import hashlib
 import json
 import os
+import platform
 import re
 import shutil
 import sys
@@ -19,6 +21,10 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require, require_path
 _DEEPEST_NESTING = 16
 #: The first number in a NIfTI-2 file, its header's size: https://nifti.nimh.nih.gov/nifti-2
 _NIFTI2_HEADER = 540
+#: Beginning of the names of folders for what is not complete yet
+_PARTIAL = ".ussim-"
+#: Suffixes of headers with voxels in a second file, and endings of that
+_HEADERS, _VOXELS = (".mhd", ".nhdr"), (".raw.gz", ".zraw", ".raw")
 
 
 def require_place(path: Path) -> None:
@@ -26,24 +32,6 @@ def require_place(path: Path) -> None:
     require(path.parent.is_dir(), f"{path}: the folder {path.parent} does not exist")
     require(not path.is_dir(), f"{path}: is a folder, expected a file name")
     require(os.access(path.parent, os.W_OK), f"{path}: cannot be written (no permission in {path.parent})")
-    require_own_voxels(path)
-
-
-def require_own_voxels(path: Path) -> None:
-    """Raise SimulationError for a new header whose file of voxels would replace that of another image."""
-    if path.exists():
-        return
-    for voxels in _files_of_voxels(path):
-        require(
-            not voxels.exists(),
-            f"{voxels}: has the voxels of another image, and {path.name} would replace them; give another name",
-        )
-
-
-def _files_of_voxels(path: Path) -> list[Path]:
-    """Names that the second file of an image with this header may have."""
-    is_header = path.suffix.lower() in (".mhd", ".nhdr")
-    return [path.with_suffix(suffix) for suffix in (".raw", ".zraw", ".raw.gz")] if is_header else []
 
 
 def require_folder(path: str | os.PathLike) -> None:
@@ -102,28 +90,111 @@ def _flush_stderr() -> None:
 def written_whole(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path to write to; it replaces `path` only if the block succeeds.
 
-    Raises SimulationError naming `path` if it cannot be written.
+    All of it is on the disk before it replaces anything, so that after a crash or a power cut the file is the old or
+    the new one. The voxels of a .mhd or .nhdr get a name of their own, by their content, and the header that names them
+    comes last; those of the header before are removed then. Raises SimulationError naming `path` if it cannot be
+    written.
     """
     path = Path(path)
     require_place(path)
     try:
-        folder = tempfile.mkdtemp(prefix=".ussim-", dir=path.parent)
+        folder = partial_folder(path.parent)
     except OSError as error:
         raise SimulationError(f"{path}: cannot be written ({error.strerror})") from None
     try:
-        yield Path(folder) / path.name
-        written = sorted(Path(folder).iterdir())
-        for file in written:  # .mhd and .nhdr have a second file
-            is_own = file.name == path.name or file.name in (voxels.name for voxels in _files_of_voxels(path))
-            require(is_own, f"{path}: would be written as {file.name}; give another name")
-        for file in written:
-            file.replace(path.parent / file.name)
+        yield folder / path.name
+        _put_in_place(folder, path)
     except (OSError, RuntimeError) as error:
         raise SimulationError(f"{path}: cannot be written ({str(error).strip().splitlines()[-1]})") from None
     finally:
-        for file in Path(folder).iterdir():
-            file.unlink()
-        os.rmdir(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def partial_folder(parent: Path) -> Path:
+    """A new folder in another for what is not complete yet; those of runs that were killed are removed.
+
+    Raises OSError if there is no room or permission.
+    """
+    host = hashlib.sha256(platform.node().encode()).hexdigest()[:6]  # folders may be shared between computers
+    for old in parent.glob(f"{_PARTIAL}{host}-*-*"):
+        number = old.name.split("-")[2]
+        if number.isdecimal() and not _is_running(int(number)):
+            shutil.rmtree(old, ignore_errors=True)
+    return Path(tempfile.mkdtemp(prefix=f"{_PARTIAL}{host}-{os.getpid()}-", dir=parent))
+
+
+def _is_running(number: int) -> bool:
+    """Whether a process of this number runs; where that cannot be asked without harm, it is taken to."""
+    if os.name != "posix" or number <= 0:
+        return True
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # it is another user's
+        return True
+    return True
+
+
+def put_on_disk(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk. Raises OSError if they cannot be."""
+    if path.is_dir() and os.name != "posix":  # elsewhere folders cannot be opened
+        return
+    opened = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
+
+
+def _put_in_place(folder: Path, path: Path) -> None:
+    """Move what was written in `folder` under the name of `path` to it."""
+    main = folder / path.name
+    if path.suffix.lower() in _HEADERS:
+        _name_by_content(main)
+    for file in folder.iterdir():
+        is_own = file.name == path.name or _is_voxels_of(file.name, path)
+        require(is_own, f"{path}: would be written as {file.name}; give another name")
+    voxels = sorted(file for file in folder.iterdir() if file != main)
+    for file in (*voxels, main):
+        put_on_disk(file)
+    for file in (*voxels, main):  # the header, which names the voxels, last
+        file.replace(path.parent / file.name)
+    put_on_disk(path.parent)
+    if path.suffix.lower() in _HEADERS:
+        named = {file.name for file in voxels}
+        for file in path.parent.iterdir():
+            if _is_voxels_of(file.name, path) and file.name not in named:
+                file.unlink(missing_ok=True)
+
+
+def _name_by_content(header: Path) -> None:
+    """Give the file of voxels beside a header a name by its content, also in the header."""
+    for file in sorted(header.parent.iterdir()):
+        ending = next((end for end in _VOXELS if file.name == header.stem + end), None)
+        if ending is None:
+            continue
+        name = f"{header.stem}.{hash_of_file(file)[:16]}{ending}"
+        line = re.compile(
+            rb"^((?:ElementDataFile\s*=|data file:)\s*)" + re.escape(os.fsencode(file.name)), re.MULTILINE
+        )
+        text, count = line.subn(rb"\g<1>" + os.fsencode(name), header.read_bytes())
+        if count != 1:
+            raise OSError(f"its header does not name {file.name}")
+        header.write_bytes(text)
+        file.rename(file.with_name(name))
+
+
+def _is_voxels_of(name: str, header: Path) -> bool:
+    """Whether a name is one of voxels that this program wrote for a header."""
+    endings = "|".join(re.escape(end) for end in _VOXELS)
+    is_header = header.suffix.lower() in _HEADERS
+    return is_header and re.fullmatch(rf"{re.escape(header.stem)}\.[0-9a-f]{{16}}({endings})", name) is not None
+
+
+def hash_of_file(path: Path) -> str:
+    """SHA-256 of what is in a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def read_json(path: str | os.PathLike, most_bytes: int = 4 * 2**20):

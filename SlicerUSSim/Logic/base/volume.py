@@ -14,7 +14,6 @@ from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_
 from SlicerUSSim.Logic.base.errors import SimulationError, reader, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import (
     messages_withheld,
-    require_own_voxels,
     require_space,
     why_unreadable,
     written_whole,
@@ -211,7 +210,6 @@ class Volume:
         """
         path = Path(path)
         require_image_name(path)
-        require_own_voxels(path)
         suffix = path.suffix.lower()
         if suffix == ".mnc":  # HDF5 leaves a torso on a full disk without an error, and may end the program later
             require_space(path, self.array.nbytes)

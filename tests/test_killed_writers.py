@@ -1,0 +1,105 @@
+"""Writers that are killed, or fail, at every step: the file is the old or the new one, and the next run cleans up."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
+
+_STEPS = """
+import errno, os, shutil, sys
+from pathlib import Path
+import numpy as np
+from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Logic.base.files import write_json
+import SimpleITK, nrrd
+
+place, name, how = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
+path = place / name
+
+
+def write(value):
+    if name.endswith(".json"):
+        write_json(path, {"values": [value] * 500})
+    elif ".seq." in name or ".igs." in name:
+        images = np.full((3, 20, 30), value, np.uint8)
+        TrackedSequence(images, ({"ImageToReference": np.eye(4)},) * 3, np.arange(3.0)).write(path)
+    else:
+        Volume(np.full((6, 7, 8), value, np.int16), np.eye(4)).write(path)
+
+
+def value_of():
+    if name.endswith(".json"):
+        values = eval(path.read_text())["values"]
+    elif ".seq." in name or ".igs." in name:
+        values = TrackedSequence.read(path).images.ravel().tolist()
+    else:
+        values = Volume.read(path).array.ravel().tolist()
+    assert len(set(values)) == 1, "halves of two runs"
+    return values[0]
+
+
+def stop_at(step):
+    left = [step]
+
+    def counted(function):
+        def call(*arguments, **more):
+            left[0] -= 1
+            if left[0] < 0:
+                if how == "kill":
+                    os._exit(9)
+                if left[0] == -1:
+                    raise OSError(errno.ENOSPC, "No space left on device")
+            return function(*arguments, **more)
+        return call
+
+    for owner, function in ((os, "fsync"), (os, "replace"), (os, "rename"), (os, "mkdir"), (os, "unlink")):
+        setattr(owner, function, counted(getattr(owner, function)))
+    for function in ("write_bytes", "write_text", "unlink"):
+        setattr(Path, function, counted(getattr(Path, function)))
+
+
+write(1)
+steps = 0
+for step in range(60):
+    child = os.fork()
+    if child == 0:
+        stop_at(step)
+        try:
+            write(2)
+        except SimulationError as error:
+            assert str(path) in str(error) and "\\n" not in str(error)
+            os._exit(7)
+        os._exit(0)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert status in (0, 7, 9), status
+    found = value_of()
+    assert found in (1, 2) and (status != 0 or found == 2), (step, status, found)
+    if how == "fail":
+        assert not list(place.glob(".ussim-*")), "something is left of a run that failed"
+    if status == 0:
+        break
+    steps += 1
+    write(1)
+    left = sorted(file.name for file in place.iterdir())
+    assert len(left) <= 2 and value_of() == 1, left
+else:
+    raise AssertionError("it never succeeds")
+print("steps", steps)
+"""
+
+
+@pytest.mark.parametrize("how", ["kill", "fail"])
+@pytest.mark.parametrize(
+    "name", ["v.nii.gz", "v.nrrd", "v.mha", "v.mhd", "v.nhdr", "v.vti", "s.igs.mha", "s.seq.nrrd", "t.json"]
+)
+def test_at_every_step_the_file_is_the_old_or_the_new_one(name, how, tmp_path: Path):
+    done = subprocess.run([sys.executable, "-c", _STEPS, tmp_path, name, how], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-1500:]
+    assert int(done.stdout.split()[-1]) >= 3
