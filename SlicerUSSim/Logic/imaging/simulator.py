@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from threading import RLock
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -132,6 +133,8 @@ class UltrasoundSimulator:
         self._iq_made_for: tuple | None = None
         #: Measure every stage (Frame.timings_ms); the host then waits for each stage.
         self.profiling = False
+        # Threads may share a simulator: its buffers hold one frame at a time
+        self._lock = RLock()
 
     def simulate(
         self,
@@ -156,14 +159,15 @@ class UltrasoundSimulator:
         pose = check_rigid("probe_to_ras", probe_to_ras)
         self.warn_if_slow(probe)
         timings: dict[str, float] = {}
-        frame = self._rendered(probe, pose, display, grid, timings, noise_seed)
-        self._warn_if_empty(probe, pose)  # while the device computes
-        self._warn_if_behind_bone(pose)
-        with self._timed("download", timings):
-            samples = self._sample_count(probe)
-            iq, envelope, bmode = (frame.download(name)[:, :samples] for name in ("iq", "envelope", "grey"))
-            image = frame.download("image")
-            self._warn_if_overflown()
+        with self._lock:
+            frame = self._rendered(probe, pose, display, grid, timings, noise_seed)
+            self._warn_if_empty(probe, pose)  # while the device computes
+            self._warn_if_behind_bone(pose)
+            with self._timed("download", timings):
+                samples = self._sample_count(probe)
+                iq, envelope, bmode = (frame.download(name)[:, :samples] for name in ("iq", "envelope", "grey"))
+                image = frame.download("image")
+                self._warn_if_overflown()
 
         return Frame(
             iq=iq,
@@ -191,7 +195,8 @@ class UltrasoundSimulator:
 
         If only the display, the noise or the pixels have changed since the last frame, its echoes are reused.
         """
-        return self._rendered(probe, pose, display, grid, {} if timings is None else timings, noise_seed).image
+        with self._lock:
+            return self._rendered(probe, pose, display, grid, {} if timings is None else timings, noise_seed).image
 
     def forget_echoes(self) -> None:
         """Recompute the rays and echoes of the next frame, even if nothing has changed.
@@ -242,8 +247,9 @@ class UltrasoundSimulator:
     def trace(self, probe: Probe, probe_to_ras: np.ndarray) -> RayTree:
         """The ray tree, on the host: segments along the beam axes and interface hits."""
         pose = check_rigid("probe_to_ras", probe_to_ras)
-        self.trace_rays(self.device_frame(probe, pose, buffer=self._acquisition_buffer))
-        return self.tracer.download()
+        with self._lock:
+            self.trace_rays(self.device_frame(probe, pose, buffer=self._acquisition_buffer))
+            return self.tracer.download()
 
     def trace_rays(self, frame: DeviceFrame, with_level: bool = True) -> None:
         """Enqueue the stages up to the ray tree of `frame`; `with_level` as in Aperture.run."""
@@ -312,8 +318,9 @@ class UltrasoundSimulator:
         for number, pose in enumerate(poses):
             pose = check_rigid("probe_to_ras", pose)
             self._warn_if_empty(probe, pose)
-            image = self.render(probe, pose, display, pixels, noise_seed=number)
-            compounder.add_buffer(image, pixels, pose)
+            with self._lock:  # for one image, so that others need not wait for the volume
+                image = self.render(probe, pose, display, pixels, noise_seed=number)
+                compounder.add_buffer(image, pixels, pose)
             # One image is prepared while the device computes the previous one, and no more than one.
             done = self.device.mark()
             if before is not None:
@@ -326,7 +333,8 @@ class UltrasoundSimulator:
 
     def set_tissues(self, tissues: TissueTable) -> None:
         """Change tissue parameters without rebuilding the medium."""
-        self.medium.set_tissues(tissues)
+        with self._lock:
+            self.medium.set_tissues(tissues)
 
     @contextmanager
     def with_tissues(self, tissues: TissueTable) -> Iterator[None]:

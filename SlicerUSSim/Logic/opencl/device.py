@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import warnings
 from collections import deque
 from functools import lru_cache
 from pathlib import Path
+from threading import RLock
 from time import perf_counter
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -33,7 +35,8 @@ class Device:
     """An opened OpenCL device: its context, its in-order queue and its built programs.
 
     Use `Device.get(choice)`, which creates one per device and process, so that programs are built once.
-    With `profiling = True` the events of all kernels are kept until `take_profile()`.
+    With `profiling = True` the events of all kernels are kept until `take_profile()`. Threads may share it; a process
+    that is forked from one that has a Device cannot use it.
     """
 
     def __init__(self, info: DeviceInfo) -> None:
@@ -59,10 +62,13 @@ class Device:
         self._events: list[tuple[str, Event]] = []
         self._writes: deque[Event] = deque(maxlen=64)
         self._kernels: dict[tuple, dict[str, Kernel]] = {}
+        # A kernel keeps its arguments until it is enqueued, and all simulators of a device share it
+        self._lock = RLock()
 
     @staticmethod
     def get(device: DeviceChoice = None) -> Device:
         """The Device for a choice (see choose_device); the same object for the same hardware."""
+        _require_not_forked()
         if isinstance(device, Device):
             return device
         info, reason = choose_device(device)
@@ -76,7 +82,11 @@ class Device:
 
         `defines` are preprocessor names that select a variant. Raises SimulationError if the build fails.
         """
-        key = (file_name, lanes, *defines)
+        with self._lock:
+            return self._built((file_name, lanes, *defines))
+
+    def _built(self, key: tuple) -> dict[str, Kernel]:
+        file_name, lanes, *defines = key
         if key in self._kernels:
             _log.debug("%s (%s): built before in this process", file_name, ", ".join(map(str, key[1:])))
         else:
@@ -118,13 +128,16 @@ class Device:
         """
         apart = self.info.kind != "GPU" and (heavy or (few and self._is_pocl))
         local_size = (1,) * len(global_size) if apart else None
-        event = kernel(self.queue, global_size, local_size, *arguments)
-        if self.profiling:
-            self._events.append((kernel.function_name, event))
+        _require_not_forked()
+        with self._lock:
+            event = kernel(self.queue, global_size, local_size, *arguments)
+            if self.profiling:
+                self._events.append((kernel.function_name, event))
 
     def upload(self, array: np.ndarray) -> Buffer:
         """A new read-only device buffer holding a copy of `array`."""
         flags = self.cl.mem_flags
+        _require_not_forked()
         self._check_size(array.nbytes)
         return self.cl.Buffer(self.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=np.ascontiguousarray(array))
 
@@ -153,6 +166,7 @@ class Device:
 
     def write(self, buffer: Buffer, array: np.ndarray) -> None:
         """Enqueue copying `array` into a buffer that is at least as large, without waiting for completion."""
+        _require_not_forked()
         # An event keeps its array alive, and its destructor waits for the copy.
         event = self.cl.enqueue_copy(self.queue, buffer, array.copy(), is_blocking=False)
         self._writes.append(event)
@@ -165,6 +179,7 @@ class Device:
 
     def download(self, buffer: Buffer, shape: int | tuple[int, ...], dtype) -> np.ndarray:
         """A new host array with the buffer's content; waits for all commands enqueued before."""
+        _require_not_forked()
         array = np.empty(shape, dtype)
         if array.nbytes:
             self.cl.enqueue_copy(self.queue, array, buffer)
@@ -190,6 +205,25 @@ class Device:
 
 #: One per device and process
 _opened: dict[DeviceInfo, Device] = {}
+_is_forked = False
+
+
+def _after_fork() -> None:
+    global _is_forked
+    _is_forked = bool(_opened)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def _require_not_forked() -> None:
+    """Raise SimulationError in a fork of a process with a Device: it would hang without the runtime's threads."""
+    if _is_forked:
+        raise SimulationError(
+            "this process is a fork of one that uses OpenCL, whose threads it lacks; start processes anew, for example "
+            'by multiprocessing.get_context("spawn"), or fork before the first simulation'
+        )
 
 
 def _was_cached(program: Program) -> bool:
