@@ -570,3 +570,16 @@ def test_so_many_scatterers_that_an_image_takes_long_are_a_warning():
         for enough in (None, 500.0):
             simulator(labels, SPECKLE, scatterers_per_mm3=enough).simulate(PROBES["convex"], pose)
         simulator(labels, SPECKLE, scatterers_per_mm3=200_000.0, scattering=False).simulate(PROBES["convex"], pose)
+
+
+def test_a_probe_that_would_take_minutes_is_refused_with_the_numbers():
+    """Its values are all allowed, and an image did not return in 45 s."""
+    labels = block(lambda x, y, z: np.ones_like(x), half_mm=(10, 10, 10))
+    probe = replace(
+        PROBES["phased"], frequency_mhz=30.0, depth_mm=300.0, elevation_aperture_mm=100.0, elevation_focus_mm=1.0
+    )
+    words = r"30 MHz, elevation aperture 100 mm, elevation focus 1 mm\): .* cells .* expected at most 3e\+10"
+    small = simulator(labels, SPECKLE)
+    for use in (lambda: small.simulate(probe, np.eye(4)), lambda: small.volume(probe, [np.eye(4)])):
+        with pytest.raises(SimulationError, match=words):
+            use()

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
 #: Beyond all fields
 _FAR_MM = 1e6
-#: Cells of the scatterer lattice per image, about 5 s on two cores, and per second there
-_MANY_CELLS, _CELLS_PER_S = 5e8, 1e8
+#: Cells of the scatterer lattice per image: about 5 s on two cores, what is not begun, and per second there
+_MANY_CELLS, _MOST_CELLS, _CELLS_PER_S = 5e8, 3e10, 1e8
 #: How far behind the face bone is looked for, and how much of it says that the face is in a closed skull, mm
 _BEHIND_MM, _BONE_BEHIND_MM = 40.0, 2
 _log = logging.getLogger(__name__)
@@ -152,8 +152,9 @@ class UltrasoundSimulator:
         the settings' seed, seed_of_pose(probe_to_ras) also on the pose.
         Warns with EmptyViewWarning and returns a black image if the field is outside the volume, with
         BehindBoneWarning if bone lies behind the face, and with
-        SlowScatterersWarning if scatterers_per_mm3 is so high that it takes more than seconds on a CPU.
-        Raises SimulationError for a pose that is not rigid and a noise_seed that is not a whole number of 32 bits.
+        SlowScatterersWarning if there are so many scatterers that it takes more than seconds on a CPU.
+        Raises SimulationError if it would take minutes, for a pose that is not rigid and a noise_seed that is not a
+        whole number of 32 bits.
         """
         require_kind("probe", probe, Probe, "a ConvexProbe, LinearProbe or PhasedProbe")
         pose = check_rigid("probe_to_ras", probe_to_ras)
@@ -462,20 +463,29 @@ class UltrasoundSimulator:
         return int(np.ceil(probe.displayed_mm / self._sample_mm(probe)))
 
     def warn_if_slow(self, probe: Probe) -> None:
-        """Warn if the density that was set makes an image of so many scatterers."""
-        density = self.settings.scatterers_per_mm3
-        if density is None or not self.settings.scattering:
+        """Warn if an image has so many scatterers that it takes seconds.
+
+        Raises SimulationError, before anything is computed, if it would take minutes.
+        """
+        if not self.settings.scattering:
             return
         cells = cells_in_view(self.settings, probe)
-        if cells > _MANY_CELLS:
-            automatic = sites_per_mm3(replace(self.settings, scatterers_per_mm3=None), probe)
-            warnings.warn(
-                f"scatterers_per_mm3 is {density:g}: {cells:.1e} cells of the lattice per image, about "
-                f"{cells / _CELLS_PER_S:.0f} s on two cores of a CPU; none, {automatic:.0f} for this probe, is enough "
-                "for developed speckle",
-                SlowScatterersWarning,
-                stacklevel=3,
+        if cells <= _MANY_CELLS:
+            return
+        density = self.settings.scatterers_per_mm3
+        automatic = sites_per_mm3(replace(self.settings, scatterers_per_mm3=None), probe)
+        if density is not None:
+            what = f"scatterers_per_mm3 is {density:g}"
+            remedy = f"none, {automatic:.0f} for this probe, is enough for developed speckle"
+        else:
+            what = (
+                f"the probe needs {automatic:.0f} scatterers per mm³ ({probe.frequency_mhz:g} MHz, elevation aperture "
+                f"{probe.elevation_aperture_mm:g} mm, elevation focus {probe.elevation_focus_mm:g} mm)"
             )
+            remedy = "a smaller elevation aperture, a deeper elevation focus or a smaller depth takes less"
+        many = f"{cells:.1e} cells of the lattice per image, about {cells / _CELLS_PER_S:.0f} s on two cores of a CPU"
+        require(cells <= _MOST_CELLS, f"{what}: {many}, expected at most {_MOST_CELLS:.0e} cells; {remedy}")
+        warnings.warn(f"{what}: {many}; {remedy}", SlowScatterersWarning, stacklevel=3)
 
     def _warn_if_empty(self, probe: Probe, pose: np.ndarray) -> None:
         """Warn if the volume has no labels, or the bounding box of the imaged field, in voxels, does not meet it."""
