@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import os
+import struct
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +18,7 @@ from SlicerUSSim.Logic import LinearProbe, SimulationError, TissueTable, Ultraso
 from SlicerUSSim.Logic.opencl import runtimes
 from SlicerUSSim.Logic.opencl.device import Device, kernel_folder
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device, faster_hint
-from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, require_linker
+from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, remove_damaged_kernels, require_linker
 from SlicerUSSim.Logic.opencl.runtimes import register_pip_runtimes
 from SlicerUSSim.Logic.probe import pose_looking_at
 from tests.conftest import SPECKLE, block, rigid, simulator
@@ -302,3 +304,62 @@ sys.exit(status)
 def test_a_fork_says_that_it_cannot_use_the_device_and_does_not_hang():
     done = subprocess.run([sys.executable, "-c", _FORK], capture_output=True, text=True, timeout=300)
     assert done.returncode == 5, (done.returncode, done.stderr[-800:])
+
+
+def cached_program(folder: Path, name: str, library: bytes, bitcode: bytes) -> Path:
+    program = folder / "AB" / name
+    place = program / "scatter" / "36-16-1"
+    place.mkdir(parents=True)
+    (place / "scatter.so").write_bytes(library)
+    (program / "program.bc").write_bytes(bitcode)
+    return program
+
+
+def test_incomplete_files_of_pocls_cache_are_removed_before_they_end_the_process(tmp_path):
+    table, sections = 128, 3
+    elf = b"\x7fELF".ljust(40, b"\0") + struct.pack("<Q", table) + b"\0" * 10 + struct.pack("<HH", 64, sections)
+    elf = elf.ljust(table + 64 * sections, b"\0")
+    bitcode = b"BC\xc0\xde" + struct.pack("<II", 1, 4) + b"\0" * 16
+    sound = cached_program(tmp_path, "sound", elf, bitcode)
+    damaged = [
+        cached_program(tmp_path, f"damaged{n}", *files)
+        for n, files in enumerate(
+            [(elf[:-1], bitcode), (b"", bitcode), (elf, bitcode[:-1]), (elf, b""), (elf, bitcode + b"1234")]
+        )
+    ]
+    assert remove_damaged_kernels(tmp_path) == len(damaged)
+    assert sound.exists() and not any(program.exists() for program in damaged)
+    assert remove_damaged_kernels(tmp_path / "none") == 0
+
+
+_CACHED = """
+import numpy as np
+from SlicerUSSim.Logic import LinearProbe, TissueTable, UltrasoundSimulator, Volume
+from SlicerUSSim.Logic.probe import pose_looking_at
+
+labels = Volume(np.ones((20, 20, 20), np.uint8), np.eye(4))
+simulator = UltrasoundSimulator(labels, TissueTable.named(["liver"]))
+pose = pose_looking_at((10, 10, 19), (10, 10, 0))
+print(simulator.simulate(LinearProbe(width_mm=10, depth_mm=10, scan_lines=16), pose).image.sum())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="where caches are")
+@pytest.mark.parametrize("keep", [0.5, 0.0])
+def test_damaged_caches_are_built_again(keep, tmp_path):
+    """Half of a file, as of a killed process or a full disk: an abort or a KeyError for ever."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "HOME": str(tmp_path)}
+    environment.pop("POCL_CACHE_DIR", None)
+
+    def image() -> str:
+        done = subprocess.run([sys.executable, "-c", _CACHED], env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-800:]
+        return done.stdout
+
+    expected = image()
+    files = [file for file in tmp_path.rglob("*") if file.is_file() and file.suffix != ".icd"]
+    assert files
+    for file in files:
+        os.truncate(file, int(keep * file.stat().st_size))
+    assert image() == expected and image() == expected

@@ -29,6 +29,8 @@ _log = logging.getLogger(__name__)
 DeviceChoice: TypeAlias = "str | DeviceInfo | Device | None"
 
 _ZERO = np.zeros(1, np.float32)
+#: How often a program is built whose cached file is damaged
+_ATTEMPTS = 4
 
 
 class Device:
@@ -45,10 +47,11 @@ class Device:
         self.info = info
         self._is_pocl = "Portable Computing Language" in info.platform
         if self._is_pocl:
-            from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, require_linker
+            from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, remove_damaged_kernels, require_linker
 
             require_linker(info.handle.platform.version)
             name_unknown_processor(info.handle)
+            remove_damaged_kernels()
         try:
             self.context = cl.Context([info.handle])
             self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
@@ -98,23 +101,44 @@ class Device:
             options += [f"-D{name}" for name in defines]
             if self.lanes > 1 and "Intel" in self.info.platform:
                 options.append("-DNO_IMPLICIT_VECTORS")
+            program, kernels = self._build(file_name, source, options)
+            _log.debug(
+                "%s: %s in %.0f ms with %s", file_name,
+                "taken from pyopencl's cache" if _was_cached(program) else "built",
+                (perf_counter() - started) * 1e3, " ".join(options),
+            )  # fmt: skip
+            self._kernels[key] = kernels
+        return self._kernels[key]
+
+    def _build(self, file_name: str, source: str, options: list[str]) -> tuple[Program, dict[str, Kernel]]:
+        """The program of a source, and its kernels, once more under another name where what is cached is damaged."""
+        why = ""
+        for attempt in range(_ATTEMPTS):
+            again = [f"-DBUILT_AGAIN={attempt}"] if attempt else []  # another entry of every cache
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", self.cl.CompilerWarning)  # runtimes emit them for successful builds
-                    program = self.cl.Program(self.context, source).build(options=options)
+                    program = self.cl.Program(self.context, source).build(options=[*options, *again])
+                kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
             except self.cl.Error as error:
                 lines = [line.strip() for line in str(error).splitlines() if "error:" in line] or [str(error)]
                 raise SimulationError(
                     f"OpenCL device {self.info} cannot build {file_name} ({lines[0]}); try another device "
                     "(`ussim devices` lists them)"
                 ) from error
-            _log.debug(
-                "%s: %s in %.0f ms with %s", file_name,
-                "taken from pyopencl's cache" if _was_cached(program) else "built",
-                (perf_counter() - started) * 1e3, " ".join(options),
-            )  # fmt: skip
-            self._kernels[key] = {kernel.function_name: kernel for kernel in program.all_kernels()}
-        return self._kernels[key]
+            except Exception as error:  # pyopencl raises whatever pickle does
+                why = f"{type(error).__name__}: {error}"
+            else:
+                # The runtime of a damaged file has a program without them, and says nothing
+                missing = set(re.findall(r"^(?:__)?kernel\s+void\s+(\w+)", source, re.MULTILINE)) - kernels.keys()
+                if not missing:
+                    return program, kernels
+                why = f"it lacks {', '.join(sorted(missing))}"
+            _log.warning("the cached program of %s is damaged (%s): it is built again", file_name, why)
+        raise SimulationError(
+            f"OpenCL device {self.info} cannot build {file_name} ({why}); its cache of programs may be damaged: delete "
+            "~/.cache/pocl and ~/.cache/pyopencl"
+        )
 
     def run(
         self, kernel: Kernel, global_size: tuple[int, ...], *arguments, heavy: bool = False, few: bool = False

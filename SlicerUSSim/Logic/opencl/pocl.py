@@ -1,4 +1,4 @@
-"""Workarounds for PoCL 3.0: a processor name that its compiler supports, and a check for a linker.
+"""Workarounds for PoCL 3.0: a processor name that its compiler supports, and checks for a linker and of its cache.
 
 LLVM 14 calls a processor it does not know "generic" (AMD Zen 5, for instance). PoCL passes that name to clang, which
 rejects it: "unknown target CPU 'generic'" (pocl/pocl issue 1049, open since 2022). Zen 4 it takes for Zen 3, which has
@@ -87,6 +87,57 @@ def require_linker(version: str) -> None:
         "PoCL, the OpenCL runtime in use, links its kernels with `ld` and libgcc, which are not installed; on Debian "
         "and Ubuntu run: sudo apt-get install gcc libc6-dev",
     )
+
+
+def remove_damaged_kernels(folder: Path | None = None) -> int:
+    """Remove programs with an incomplete file from PoCL's cache, which would end the process; returns their number.
+
+    `folder` is by default the cache that PoCL uses.
+    """
+    folder = _cache() if folder is None else folder
+    removed = 0
+    for program in folder.glob("??/*"):
+        files = [file for pattern in ("program.bc", "*/*/*.so") for file in program.glob(pattern)]
+        try:
+            is_damaged = not all(_is_complete(file) for file in files)
+        except OSError:  # another process has removed it
+            continue
+        if is_damaged:
+            _log.warning("%s: has an incomplete file, as of a process that was killed; it is removed", program)
+            shutil.rmtree(program, ignore_errors=True)
+            removed += 1
+    return removed
+
+
+def _cache() -> Path:
+    """As pocl_cache_init_topdir of lib/CL/pocl_cache.c has it."""
+    if "POCL_CACHE_DIR" in os.environ:
+        return Path(os.environ["POCL_CACHE_DIR"])
+    own = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(own) / "pocl" / "kcache"
+
+
+def _is_complete(file: Path) -> bool:
+    """Whether a shared library or a file of LLVM bitcode is as long as it says."""
+    with file.open("rb") as opened:
+        size = os.fstat(opened.fileno()).st_size
+        start = opened.read(64)
+        if file.suffix == ".so":  # ELF, 64 bits: its table of sections is the last thing in it
+            if len(start) < 64 or start[:4] != b"\x7fELF":
+                return False
+            (table,) = struct.unpack_from("<Q", start, 40)
+            each, count = struct.unpack_from("<HH", start, 58)
+            return table > 0 and table + each * count <= size
+        if start[:4] != b"BC\xc0\xde":  # or its wrapper, which is not written here
+            return False
+        place = 4
+        while place < size:  # blocks, each with its length in words after the word with its number
+            opened.seek(place)
+            head = opened.read(8)
+            if len(head) < 8:
+                return False
+            place += 8 + 4 * struct.unpack_from("<I", head, 4)[0]
+        return place == size
 
 
 def _processor_flags() -> set[str]:

@@ -12,6 +12,7 @@ import os
 import re
 import sys
 import zlib
+from contextlib import closing, suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -28,11 +29,31 @@ def load_pyopencl():
     """Import pyopencl with all installed runtimes visible to its ICD loader. Raises SimulationError without it."""
     if "pyopencl" not in sys.modules:
         register_pip_runtimes()
+        _remove_damaged_calls()
     try:
         import pyopencl
     except ImportError as error:
         raise SimulationError(f"pyopencl cannot be imported ({error}); install it with: pip install pyopencl") from None
     return pyopencl
+
+
+def _remove_damaged_calls() -> None:
+    """Remove pyopencl's store of generated calls if it is damaged: pyopencl fails on it for ever."""
+    import sqlite3
+
+    import platformdirs
+
+    folder = Path(platformdirs.user_cache_dir("pytools", "pytools"))
+    for file in folder.glob("pdict-*pyopencl*.sqlite"):
+        try:
+            with closing(sqlite3.connect(file)) as store:
+                is_sound = store.execute("PRAGMA quick_check").fetchone() == ("ok",)
+        except sqlite3.DatabaseError as error:
+            is_sound = isinstance(error, sqlite3.OperationalError)  # locked, or not to be opened
+        if not is_sound:
+            _log.warning("%s: is damaged, and is removed", file)
+            with suppress(OSError):
+                file.unlink()
 
 
 def register_pip_runtimes() -> None:
