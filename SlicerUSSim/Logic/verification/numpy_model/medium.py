@@ -143,8 +143,8 @@ class HostMedium:
         voxel = np.stack(np.unravel_index(at, distance.shape)[::-1], -1).astype(np.float32)
         narrow = f32((distance.ravel()[at] - 127.5) / per_voxel)
         found = narrow
-        full = SmoothGrid(self.smooth, CONSTANTS["WIDE_VARIANCE"], 0.9, 2.5)
-        halved = SmoothGrid(self.smoother, CONSTANTS["WIDEST_VARIANCE"], 0.99, 1.25)
+        full = SmoothGrid(self.smooth, 8.91, 0.9, 2.5)
+        halved = SmoothGrid(self.smoother, 18.29, 0.99, 1.25)
         for grid, place, scale in ((full, voxel, 1), (halved, f32(0.5) * voxel - f32(0.25), 2)):
             border = grid.border_of(place, np.full(len(at), fluid))
             wide = f32(-scale) * border.overshoot
