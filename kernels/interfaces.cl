@@ -53,10 +53,10 @@ inline float flatness(float turning) { return 1.0f / (1.0f + 16.0f * turning * t
 // The part by which a patch's centre of phase is moved: `least`, and on steeper walls, where they are `flat`, so much
 // that less than `most` of `phase` is left to the sum over the patches. It changes smoothly with the phase: in a fan of
 // lines neighbours see a plane under other angles, and where the parts of their patches jump the sum is not the
-// integral.
+// integral. A single hit, or one far from the next, is all of the beam: no patch is moved farther than to its middle.
 inline float part_carried(float least, float phase, float most, float flat) {
-  const float share = phase / most;
-  return least + flat * (1.0f - least) * (1.0f - rsqrt(1.0f + share * share));
+  const float share = phase / most, part = fmin(least, 1.0f);
+  return part + flat * (1.0f - part) * (1.0f - rsqrt(1.0f + share * share));
 }
 
 // One work-item computes the walls of one traced line.

@@ -215,6 +215,22 @@ def test_a_plane_nearly_at_right_angles_to_a_diagonal_of_the_voxels_keeps_its_le
     assert np.ptp(levels) < 3.0, np.round(levels[::8], 1)
 
 
+@pytest.mark.parametrize("rays", [1, 2, 3, 32])
+@pytest.mark.parametrize("angle_deg", [4.0, 9.0, 20.0])
+def test_few_elevational_rays_see_a_plane_as_many_do(rays, angle_deg):
+    """A plane oblique out of the image. With one or two rays it was too bright, or its lines were no numbers."""
+    slope = np.tan(np.radians(angle_deg))
+    wall = block(lambda x, y, z: y > slope * z, half_mm=(16, 12, 16), spacing_mm=0.5)
+    probe, hard = replace(PROBE, width_mm=16.0, depth_mm=35.0, scan_lines=65), Tissue("wall", 1540.0, 1.8, 0.0)
+    levels = []
+    for number in (7, rays):
+        sim = simulator(wall, hard, scattering=False, elevational_rays=number)
+        iq = sim.simulate(probe, rigid(np.eye(3), [0, -20, 0])).iq
+        assert np.isfinite(iq).all()
+        levels.append(20.0 * np.log10(np.maximum(np.abs(iq[24:41]).max(axis=1), 0.1)))  # of a square one: 44 - 22 dB
+    np.testing.assert_allclose(levels[1], levels[0], atol=1.0)
+
+
 def test_a_ball_is_seen_on_and_between_the_lines():
     """Smaller than the distance between lines, it is square to the beam at one point only."""
     ball = block(lambda x, y, z: x**2 + y**2 + z**2 < 0.6**2, half_mm=(3, 3, 3), spacing_mm=0.1)

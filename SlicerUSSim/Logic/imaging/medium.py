@@ -100,8 +100,8 @@ class Medium:
         #: As given
         self.membership = membership
         padded = self._laid_over(tissues)
-        self._upload(padded, tissues)
         self._upload_groups(padded)
+        self._upload(padded, tissues)
         self.has_texture = texture is not None
         self.texture_buffer = device.upload(
             np.zeros(1, np.uint32) if texture is None else np.pad(texture, _PAD, constant_values=128 << 16)
@@ -143,21 +143,19 @@ class Medium:
     def set_tissues(self, tissues: TissueTable) -> None:
         """Change tissue parameters; voxels are uploaded only for a new membrane position or new acoustic groups."""
         self._check(tissues)
-        if _membrane_shape(tissues) != _membrane_shape(self.tissues):
-            _log.debug("the membrane has changed: voxels are uploaded again")
-            closed_before = self.found
+        groups_before, closed_before = self.rows["group"], self.found
+        self.rows = self._tissue_rows(tissues)
+        new_membrane = _membrane_shape(tissues) != _membrane_shape(self.tissues)
+        new_groups = not np.array_equal(self.rows["group"], groups_before)
+        if new_membrane or new_groups:
+            _log.debug("the %s changed: voxels are uploaded again", "membrane" if new_membrane else "acoustic groups")
             padded = self._laid_over(tissues)
-            self._upload(padded, tissues)
-            if self.found is not None or closed_before is not None:
+            if new_groups or self.found is not None or closed_before is not None:
                 self._upload_groups(padded)
+            self._upload(padded, tissues)
         elif self.sheets is not None and looks_of(tissues) != looks_of(self.tissues):
             _log.debug("what sheets are made of has changed: voxels are uploaded again")
             self._upload(self._laid_over(tissues), tissues)
-        groups_before = self.rows["group"]
-        self.rows = self._tissue_rows(tissues)
-        if not np.array_equal(self.rows["group"], groups_before):
-            _log.debug("the acoustic groups have changed: voxels are uploaded again")
-            self._upload_groups(self._laid_over(tissues))
         self.device.write(self.tissue_buffer, self.rows)
         self.version += 1
         self.tissues = tissues
@@ -298,9 +296,43 @@ class Medium:
         smooth = np.clip(smooth, 0.0, 1.0, out=smooth)
         smooth *= len(share) - 1
         distance = table[np.rint(smooth, out=smooth).astype(np.uint16)]
+        self._flatten(distance, tissues, fluids, unit / 0.75)
         reach = 0.5 * membrane.thickness_mm / sigma_mm * unit
         _keep_membrane_inside(distance, reach)
         return distance, reach
+
+    def _flatten(self, distance: np.ndarray, tissues: TissueTable, fluids: tuple[int, ...], per_voxel: float) -> None:
+        """Place the border of (k, j, i) uint8 `distance` by the wide Gaussians of acoustic groups where it is flat.
+
+        The narrow one follows the steps of a plane between layers of voxels. Only for a group of fluids alone, and in
+        voxels that are cubes.
+        """
+        spacing = self.labels.spacing_mm
+        fluid = fluid_group(self.rows["group"], self.present, fluids)
+        if not 0 <= fluid < self.smooth_groups or spacing.max() > 1.02 * spacing.min():
+            return
+        points = np.flatnonzero((distance > 0) & (distance < 255)).astype(np.int32)
+        if not len(points):
+            return
+        before = ((distance.ravel()[points] - np.float32(127.5)) / np.float32(per_voxel)).astype(np.float32)
+        flat = self.device.zeros(before.nbytes)
+        self.device.write(flat, before)
+        self.device.run(
+            self.device.kernels("membrane.cl")["flatten_membrane"], (len(points),), self.smooth_buffer,
+            *(np.int32(n) for n in self.dims), np.int32(self.smooth_groups), np.int32(fluid),
+            self.device.upload(points), flat,
+        )  # fmt: skip
+        after = self.device.download(flat, len(points), np.float32)
+        distance.ravel()[points] = np.rint(np.clip(127.5 + per_voxel * after, 0.0, 255.0)).astype(np.uint8)
+
+
+def fluid_group(group_of: np.ndarray, present: np.ndarray, fluids: tuple[int, ...]) -> int:
+    """The acoustic group of the first of `present` (labels) that is one of `fluids`, if all its labels are; else -1."""
+    labels = [0, *(int(label) for label in present)]
+    for label in present:
+        if label in fluids and all(other in fluids for other in labels if group_of[other] == group_of[label]):
+            return int(group_of[label])
+    return -1
 
 
 def as_labels(array: np.ndarray) -> np.ndarray:

@@ -371,8 +371,9 @@ def add_interfaces(acquisition: np.ndarray, hits: np.ndarray, hit_lines: np.ndar
 
 
 def _carried(least: np.ndarray, phase: np.ndarray, most: np.ndarray, flat: np.ndarray) -> np.ndarray:
-    """Part by which a patch's centre of phase moves: on steep flat walls more, so that sums have few radians."""
-    return least + flat * (f32(1) - least) * (f32(1) - f32(1) / np.sqrt(f32(1) + (phase / most) ** 2))
+    """Part by which a patch's centre of phase moves, <= 1: on steep flat walls more, so that sums have few radians."""
+    part = np.minimum(least, f32(1))
+    return part + flat * (f32(1) - part) * (f32(1) - f32(1) / np.sqrt(f32(1) + (phase / most) ** 2))
 
 
 def _patch_echo(acquisition: np.ndarray, phase2: np.ndarray, inside2: np.ndarray) -> np.ndarray:

@@ -11,7 +11,9 @@ from SlicerUSSim.Logic.opencl.layout import CONSTANTS, TISSUE
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 from SlicerUSSim.Logic.verification.numpy_model.drawn import DrawnPlanes
+from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, ramp
 from SlicerUSSim.Logic.verification.numpy_model.sheets import Sheets
+from SlicerUSSim.Logic.verification.numpy_model.smoothed_borders import SmoothGrid
 
 WIDE_SIGMA, HALVED_SIGMA = 3.0, 4.0  # of the Gaussians for smoothing the indicators, voxels of their grids
 _LOSSY = 2.0  # dB/(cm MHz) of tissues that are groups of their own
@@ -115,6 +117,7 @@ class HostMedium:
         steps = np.rint(np.clip(share, 0.0, 1.0) * _SHARES) / _SHARES
         sigmas = np.clip(special.ndtri(steps), -_FARTHEST, _FARTHEST)
         distance, reach = np.rint(127.5 + per_sigma * sigmas), 0.5 * membrane.thickness_mm / sigma_mm * per_sigma
+        self._flatten(distance, fluids, spacing_mm, per_sigma / 0.75)
         # Outside the volume, where look-ups find its margin, there is no membrane.
         margin = np.ones(distance.shape, bool)
         margin[1:-1, 1:-1, 1:-1] = False
@@ -122,6 +125,32 @@ class HostMedium:
         distance[margin & (distance < 127.5)] = np.minimum(distance, np.floor(below))[margin & (distance < 127.5)]
         distance[margin & (distance > 127.5)] = np.maximum(distance, np.floor(above))[margin & (distance > 127.5)]
         return distance.astype(np.uint8), reach
+
+    def _flatten(self, distance: np.ndarray, fluids: list[int], spacing_mm: np.ndarray, per_voxel: float) -> None:
+        """Where a fluid's border is flat it is placed by the wide Gaussians, which do not see the voxels' steps."""
+        group, labels = self.rows["group"], {0, *np.unique(self.label[1:-1, 1:-1, 1:-1]).tolist()}
+        counts = {label: (self.label[1:-1, 1:-1, 1:-1] == label).sum() for label in labels}
+        alone = [
+            label for label in labels
+            if label in fluids and counts[label] and {n for n in labels if group[n] == group[label]} <= set(fluids)
+        ]  # fmt: skip
+        if not alone or spacing_mm.max() > 1.02 * spacing_mm.min():
+            return
+        fluid = int(group[max(alone, key=lambda label: counts[label])])
+        if fluid >= self.smooth_groups:
+            return
+        at = np.flatnonzero((distance > 0) & (distance < 255))
+        voxel = np.stack(np.unravel_index(at, distance.shape)[::-1], -1).astype(np.float32)
+        narrow = f32((distance.ravel()[at] - 127.5) / per_voxel)
+        found = narrow
+        full = SmoothGrid(self.smooth, 8.91, 0.9, 2.5)
+        halved = SmoothGrid(self.smoother, 18.29, 0.99, 1.25)
+        for grid, place, scale in ((full, voxel, 1), (halved, f32(0.5) * voxel - f32(0.25), 2)):
+            border = grid.border_of(place, np.full(len(at), fluid))
+            wide = f32(-scale) * border.overshoot
+            sure = border.confidence * (f32(1) - ramp(0.6, 0.9, np.abs(wide - narrow)))
+            found = found + sure * (wide - found)
+        distance.ravel()[at] = np.rint(np.clip(127.5 + per_voxel * found, 0.0, 255.0))
 
 
 def _tissue_rows(tissues: TissueTable, present: list[int]) -> np.ndarray:

@@ -133,6 +133,12 @@ class SmoothGrid:
         found.sigma[known], found.share[known], found.bent[known] = 0, np.nan, 0
         return found
 
+    def border_of(self, voxel, group) -> Borders:
+        """Borders of one group, for each of (n, 3) positions, against all others."""
+        if self.dims.min() < 4:
+            return Borders.none(len(voxel))
+        return self._border(voxel, group, group, _OF_BEFORE, self.farthest)[0]
+
     def _border(self, voxel, before, behind, way, farthest) -> tuple[Borders, np.ndarray]:
         """From D of one way, with the sum of both indicators."""
         found, seen = Borders.none(len(voxel)), self.differences(voxel, before, behind, way)
