@@ -712,14 +712,43 @@ def test_the_script_gives_the_same_image_pixel_by_pixel(page, tmp_path):
     assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
 
-def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
+def round_head(folder: Path) -> Volume:
+    """A brain in skull and skin, whose labels are written to labels.nii.gz with their table."""
     axis = np.arange(-84.0, 85.0, 3.0)
     radius = np.sqrt(sum(place**2 for place in np.meshgrid(axis, axis, axis)))
     matrix = np.diag([3.0, 3.0, 3.0, 1.0])
     matrix[:3, 3] = axis[0]
-    labels = np.select([radius < 60, radius < 70, radius < 78], [1, 2, 3], 0).astype(np.uint8)
-    Volume(labels, matrix).write(tmp_path / "labels.nii.gz")
-    TissueTable.brain(("grey matter", "skull", "skin")).write(tmp_path / "labels.json")
+    labels = Volume(np.select([radius < 60, radius < 70, radius < 78], [1, 2, 3], 0).astype(np.uint8), matrix)
+    labels.write(folder / "labels.nii.gz")
+    TissueTable.brain(("grey matter", "skull", "skin")).write(folder / "labels.json")
+    return labels
+
+
+@pytest.mark.parametrize("source", ["disc:50", "mask", "curve"])
+def test_the_workstation_begins_with_the_opening_of_its_option(browser, tmp_path, source):
+    labels, given = round_head(tmp_path), source
+    if source == "mask":
+        above = labels.with_array(np.zeros_like(labels.array))
+        above.array[36:, 20:37, 20:37] = 1
+        above.write(given := tmp_path / "mask.nii.gz")
+    elif source == "curve":
+        points = [{"position": [x, y, 78.0]} for x, y in ((-25, -25), (25, -25), (25, 25), (-25, 25))]
+        markup = {"type": "ClosedCurve", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
+        (given := tmp_path / "curve.mrk.json").write_text(json.dumps({"markups": [markup]}))
+    with serving("--labels", str(tmp_path / "labels.nii.gz"), "--craniotomy", str(given)) as address:
+        page = opened(browser, address)
+        settled(page)
+        what = {"disc:50": "a disc of 50 mm", "mask": "mask.nii.gz", "curve": "curve.mrk.json"}[source]
+        assert not errors(page) and f"craniotomy: {what}" in shown(page, "notesLabel").replace("'", "").replace(
+            "LabelMapVolume ", "").replace("MarkupsClosedCurve ", "")  # fmt: skip
+        assert (shown(page, "craniotomySpinBox") == 50.0) == (source == "disc:50")
+        image = np.asarray(Image.open(download(page, "png")), float)
+        assert image[image.shape[0] // 2 :].mean() > 5.0  # the beam reaches the brain
+        page.close()
+
+
+def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
+    round_head(tmp_path)
     with serving("--labels", str(tmp_path / "labels.nii.gz")) as address:
         page = opened(browser, address)
         settled(page)
@@ -1055,6 +1084,9 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
         (["--labels", "{head}", "--contrast", "t2"], "head.nii.gz: is a label map, and --contrast is for an MRI"),
         (["--labels", "{head}", "--ct"], "head.nii.gz: is a label map, and --ct is for a CT"),
         (["{head}", "--map", "24=csf"], "--map is for a label map, expected --labels too"),
+        (["{head}", "--craniotomy", "disc:30"], "--craniotomy is disc:30, and only a brain is labelled, expected"),
+        (["{head}", "--outside", "--craniotomy", "disc:3"], "--craniotomy is 'disc:3', expected disc: and a diameter"),
+        (["{head}", "--outside", "--craniotomy", "{head}"], "head.nii.gz: has "),
     ],
 )
 def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):

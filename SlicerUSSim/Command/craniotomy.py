@@ -64,6 +64,11 @@ class Craniotomy:
         return self.source != NONE
 
     @property
+    def is_file(self) -> bool:
+        """Whether the opening is that of a file."""
+        return self.is_wanted and not self.needs_pose
+
+    @property
     def needs_pose(self) -> bool:
         """Whether the opening lies under the probe."""
         return self.source in (AUTO, DISC)

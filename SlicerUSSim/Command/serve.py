@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option, split_additions
+from SlicerUSSim.Command.craniotomy import Craniotomy, craniotomy_option
 from SlicerUSSim.Command.mri_options import also_option, read_mri, require_other_files, split_also
 from SlicerUSSim.Command.options import ct_option, device_option, mask_option, parameter_option, require_no_mri_options
 from SlicerUSSim.Command.patient_options import map_option
@@ -22,7 +23,7 @@ from SlicerUSSim.Command.sequence_options import (
     to_mri_option,
     transform_option,
 )
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ _PORT = 8080
 @mask_option
 @also_option
 @add_option
+@craniotomy_option
 @click.option("--port", type=click.IntRange(0, 65535), help=f"Port (default: {_PORT}, or a free one if it is taken).")
 @click.option(
     "--host",
@@ -77,6 +79,7 @@ def serve(
     mask: str | None,
     also: tuple[str, ...],
     additions: tuple[str, ...],
+    craniotomy: str,
     port: int | None,
     host: str,
     igtl: str | None,
@@ -113,6 +116,13 @@ def serve(
         require_findable(contrast, skull_strip, mask is not None)
         if mri is None:
             raise SimulationError("--outside is for a whole head, expected an MRI of one; the demo brain has no head")
+    opening = Craniotomy.of(craniotomy)
+    require(
+        not opening.is_wanted or labels is not None or outside,
+        f"--craniotomy is {craniotomy}, and only a brain is labelled, expected --outside too",
+    )
+    if opening.is_file:
+        _require_opening(opening.source)
     if contrast == CT and others:
         raise SimulationError("--also is for an MRI, and the contrast is ct (--ct); leave it out")
     if igtl is not None:
@@ -153,13 +163,24 @@ def serve(
         Files(
             mri=mri, labels=labels, maps=maps, contrast=contrast, mask=mask, skull_strip=skull_strip, outside=outside,
             also=others,
-            additions=masks, preset=chosen_preset,
+            additions=masks, craniotomy=opening.source, craniotomy_mm=opening.diameter_mm, preset=chosen_preset,
             sequence=tracked, sequence_name=Path(sequence).name.split(".")[0] if sequence else "", transform=transform,
             to_ras=to_ras, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
         ),
         device,
     )  # fmt: skip
     _run(workstation.server, host, port)
+
+
+def _require_opening(path: str) -> None:
+    """Raise SimulationError for a file of --craniotomy that is neither a mask nor a polygon."""
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
+
+    if Path(path).suffix.lower() == ".json":
+        polygon_of_file(path)
+    else:
+        is_open(Volume.read(path), path)
 
 
 def _require_workstation() -> None:

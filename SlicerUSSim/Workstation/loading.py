@@ -79,6 +79,7 @@ class Loading:
                     self.add_tissues()
             else:
                 self.segment()
+            self._open_at_start(files)
             if files.sequence is not None:
                 self._take_sequence(files.sequence, files.sequence_name)
 
@@ -144,6 +145,20 @@ class Loading:
                 disc = diameter, pose
             self._opener.opened(source, patient, parameters.labels, disc)
             self._labels_ready()
+
+    def _open_at_start(self, files: Files) -> None:
+        """Open what --craniotomy asks for, and place the probe on the brain in it, as commands do."""
+        parameters: Any = self._logic.parameters
+        if files.craniotomy == "none" or parameters.labels is None:
+            return
+        parameters.panel = replace(parameters.panel, craniotomy_mm=files.craniotomy_mm)
+        if files.craniotomy not in ("auto", "disc:"):
+            parameters.opening = self._opener.opening(files.craniotomy)
+            self.open_craniotomy()
+            self.place_probe()
+            return
+        self._logic.placeProbe(parameters.labels, parameters.probe_transform, will_open=True)
+        self.open_craniotomy()
 
     def close_craniotomy(self) -> None:
         """Go back to the labels without the opening."""

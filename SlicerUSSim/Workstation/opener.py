@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import SECTIONS, Preset
+from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.masks import with_label_names
 from SlicerUSSim.Logic.mri.samples import demo_mri
@@ -57,6 +58,9 @@ class Files:
     skull_strip: str = "auto"
     #: Whether skin, scalp, skull and air are labelled, too
     outside: bool = False
+    #: Opening of skin and skull: none, auto or disc: (under the probe), or a file; and the diameter of the disc
+    craniotomy: str = "none"
+    craniotomy_mm: float | None = None
     #: {contrast: file} of further MRIs of the patient; the first is selected
     also: Mapping[str, str] = field(default_factory=dict)
     #: (tissue, file) of masks that are laid over the labels
@@ -137,6 +141,16 @@ class Opener:
     def mask(self, path: str):
         """A label map node with the mask of a file."""
         return self._label_map(self._volume(path), path, ["inside"])
+
+    def opening(self, path: str):
+        """A node with the opening of a file: a closed curve through the points of a .mrk.json, or a mask."""
+        if not _is_json(Path(path)):
+            return self._label_map(is_open(self._volume(path), path), path, ["opening"])
+        node = self._scene.AddNewNodeByClass("vtkMRMLMarkupsClosedCurveNode", Path(path).name)
+        for point in polygon_of_file(path):
+            node.AddControlPointWorld(*point)
+        node.SetAttribute(FILE, self._place(path))
+        return node
 
     def labels(self, path: str, table: LabelTable | None = None) -> tuple[Any, LabelledTissues]:
         """(label map node, what was recognised) of a file; see label_sources.read_label_file.

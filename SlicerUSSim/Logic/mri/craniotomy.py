@@ -90,7 +90,7 @@ def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
     Raises SimulationError for another file, and for a mask that is empty or lies elsewhere.
     """
     if Path(path).suffix.lower() == ".json":
-        return polygon_opening(labels, names, _control_points(path))
+        return polygon_opening(labels, names, polygon_of_file(path))
     return mask_opening(labels, Volume.read(path), path)
 
 
@@ -99,6 +99,18 @@ def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
 
     Raises SimulationError for what is no mask, and for one that is empty or lies elsewhere.
     """
+    k, j, i = np.indices(labels.array.shape)
+    ras = np.stack([i, j, k], axis=-1) @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
+    opening = sample(is_open(mask, name), ras, order=0) > 0
+    require(bool(opening.any()), f"{name}: is empty, or lies outside of the patient, expected a mask of the opening")
+    return opening
+
+
+def is_open(mask: Volume, name: str) -> Volume:
+    """A mask as uint8, 1 where it is open: not 0, or above 1/2 of values from 0 to 1; `name` as in errors.
+
+    Raises SimulationError for what is no mask.
+    """
     values = np.unique(mask.array[np.isfinite(mask.array)])
     is_soft = bool(values.size) and float(values[0]) >= 0.0 and float(values[-1]) <= 1.0
     require(
@@ -106,11 +118,7 @@ def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
         f"{name}: has {values.size} different values, expected a mask of the opening (0 and one other, or 0 to 1)",
     )
     inside = mask.array > 0.5 if is_soft else np.nan_to_num(mask.array) != 0
-    k, j, i = np.indices(labels.array.shape)
-    ras = np.stack([i, j, k], axis=-1) @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
-    opening = sample(mask.with_array(inside.astype(np.uint8)), ras, order=0) > 0
-    require(bool(opening.any()), f"{name}: is empty, or lies outside of the patient, expected a mask of the opening")
-    return opening
+    return mask.with_array(inside.astype(np.uint8))
 
 
 def face_width_mm(probe: Probe) -> float:
@@ -209,8 +217,11 @@ def _deepest(labels: Volume, names: Sequence[str], within: np.ndarray, depth: np
     return begins + _BELOW * radius_mm
 
 
-def _control_points(path: str) -> np.ndarray:
-    """(points, 3) RAS mm of the first markup of a .mrk.json file of 3D Slicer."""
+def polygon_of_file(path: str) -> np.ndarray:
+    """(points, 3) RAS mm of the markup in a .mrk.json file of 3D Slicer, whose points are a polygon.
+
+    Raises SimulationError for another file, and for several markups, another kind, frame or unit.
+    """
     values = read_json(path)
     try:
         markup, *others = values["markups"]

@@ -499,14 +499,16 @@ class UltrasoundSceneLogic:
         return count
 
     def placeProbe(
-        self, labels_node, probe_transform_node, slice_node=None, target_ras=None, *, view: str | None = None
-    ) -> None:
+        self, labels_node, probe_transform_node, slice_node=None, target_ras=None, *, view: str | None = None,
+        will_open: bool = False,
+    ) -> None:  # fmt: skip
         """Put the probe on the surface of the labelled tissue, with its axis inwards.
 
         With a slice node the image is in that slice, with its depth towards the bottom of the view, aimed at
         `target_ras` (default: the middle of the view). Without one it is a coronal view through a parasagittal
         craniotomy: on a brain, upright on the skin of a whole head, or on the brain in the middle of an opening.
-        `view` is one of mri.views.VIEWS instead, as "temporal".
+        `view` is one of mri.views.VIEWS instead, as "temporal". With `will_open` it is on the brain of a closed head,
+        where openCraniotomy opens a disc under it.
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
         patient = self._patient(labels_node)
@@ -515,7 +517,7 @@ class UltrasoundSceneLogic:
             pose = view_pose(surface, patient.names, view)
         elif slice_node is None:
             pose = default_pose(
-                surface, patient.names, self.preset.probe, is_open=is_opened(labels_node),
+                surface, patient.names, self.preset.probe, is_open=will_open or is_opened(labels_node),
                 opening_ras=flap_centre(labels_node),
             )  # fmt: skip
         else:
@@ -668,6 +670,12 @@ class UltrasoundSceneLogic:
         """
         self.stopLiveUpdate()
         caught: list[Warning] = []
+
+        def version() -> tuple[Hashable, ...]:
+            pose = node_to_world(probe_transform_node).tobytes()
+            return pose, labels_version(labels_node), self.parameters.node.GetMTime()
+
+        before = version()
         self.simulate(labels_node, probe_transform_node, output_node, warned=caught.append)  # raises errors immediately
         if outline_node is not None:
             self.showOutline(outline_node, probe_transform_node)
@@ -677,6 +685,8 @@ class UltrasoundSceneLogic:
         self._live = LiveUpdate(self, nodes, schedule, report, stopped)
         if report is not None:
             report("; ".join(map(str, caught)))
+        if version() != before:  # changed while the first image was computed, before anything was observed
+            self._live.request()
 
     def stopLiveUpdate(self) -> None:
         """End the live update and remove its observers."""
