@@ -29,7 +29,9 @@ from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.mri.sheets.finding import find_sheets, require_findable
+from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.mri.views import view_pose
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import (
     closed_labels,
@@ -72,13 +74,17 @@ from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, shares_version, write_shares
+from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets
 from SlicerUSSim.Logic.probe.placement import pose_in_slice
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
 T = TypeVar("T")
 #: Attribute of a mask node: the ID of the MRI node from which it was extracted
 _BRAIN_OF = "SlicerUSSim.brainOf"
+#: Share of the time in which tissues are segmented, if sheets are looked for after that
+_SEGMENTED = 0.4
 
 
 class AtOnce:
@@ -143,6 +149,7 @@ class UltrasoundSceneLogic:
         #: What the last segment() or addTissues() did, and what a user should check, one line each
         self.notes: tuple[str, ...] = ()
         self.warnings: tuple[str, ...] = ()
+        self._sheets: tuple[Hashable, Surfels] | None = None  # with the version of their node, kinds and frame
         self._texture: tuple[Hashable, Texture | None] | None = None  # with the version of its labels
         self._preset: tuple[str, Preset] = ("", Preset())
         self._live: LiveUpdate | None = None
@@ -182,9 +189,13 @@ class UltrasoundSceneLogic:
         *,
         mask_node=None,
         others: Mapping[str, Any] | None = None,
+        organs_node=None,
         lesions_node=None,
+        sheets: Iterable[str] = (),
+        sheets_node=None,
         overwrite: bool = False,
         keep_mask_at: Path | None = None,
+        keep_sheets_at: Path | None = None,
         classes: int | None = SegmentationSettings.classes,
         contrast: str = SegmentationSettings.contrast,
         filter_radius: int = SegmentationSettings.filter_radius,
@@ -199,8 +210,10 @@ class UltrasoundSceneLogic:
 
         See segmentation.segment_mri, and ct.segment_ct for the contrast "ct". `mask_node` is a label map on the MRI's
         grid, or a segmentation; `others` are volume nodes of the same patient by their contrast. The segments of
-        `lesions_node` are laid over the labels, as by addTissues, but are not in the result. `progress` may raise
-        errors.Cancelled; the nodes are then as they were.
+        `lesions_node` are laid over the labels, as by addTissues, but are not in the result. `organs_node` is a label
+        map or segmentation of organs of a CT. `sheets` are looked for, too (sheets.find_sheets): those with a volume
+        are laid over the labels, the others are written into the model `sheets_node`, which images show if it is the
+        parameter `sheets`. `progress` may raise errors.Cancelled; the nodes are then as they were.
         Raises SimulationError for a node with labels that were not made by this method, or edited since; `overwrite`
         replaces them nevertheless.
         """
@@ -219,17 +232,39 @@ class UltrasoundSceneLogic:
         lesions, skipped = ([], []) if lesions_node is None else self._lesions(lesions_node, mri_node)
         own = [tissue.name for tissue in self.preset.tissues.all_tissues()]
         is_of_brain = has_brain_mask(contrast)
+        wanted = tuple(sheets)
+        if wanted:
+            require_findable(wanted, contrast)
+            require_node(sheets_node, "vtkMRMLModelNode", use="sheets")
+            require_result(sheets_node, "sheets")
+        organs = None if organs_node is None else self._organs(organs_node, mri_node, contrast)
+        report = progress or (lambda share: None)
+        until = _SEGMENTED if wanted else 1.0
         extraction = skull_strip if is_of_brain else "none"
         self._work.do(lambda: require_addable(mri, lesions, mask=mask, skull_strip=extraction, also=own))
         result = self._work.do(
             lambda: segment_image(
-                mri, classes=classes, contrast=contrast, others=volumes, mask=mask, filter_radius=filter_radius,
-                filter_epsilon=filter_epsilon, bias_correction=bias_correction, thin_sulci=thin_sulci,
-                outside=outside, skull_strip=skull_strip, keep_mask_at=keep_mask_at, device=self.device,
-                progress=progress,
+                mri, classes=classes, contrast=contrast, others=volumes, mask=mask, organs=organs,
+                filter_radius=filter_radius, filter_epsilon=filter_epsilon, bias_correction=bias_correction,
+                thin_sulci=thin_sulci, outside=outside, skull_strip=skull_strip,
+                keep_mask_at=keep_mask_at, device=self.device,
+                progress=lambda share: report(until * share),
             )
         )  # fmt: skip
-        added, told = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=is_of_brain)
+        labels, names, found = result.labels, result.tissue_names, None
+        if wanted and isinstance(result, Segmentation):
+            segmentation = result
+            found = self._work.do(
+                lambda: find_sheets(
+                    mri, segmentation, contrast=contrast, kinds=wanted, keep_at=keep_sheets_at,
+                    progress=lambda share: report(until + (1.0 - until) * share),
+                )
+            )  # fmt: skip
+            masks = found.masks()
+            if masks:
+                laid = self._work.do(lambda: add_tissues(labels, names, masks, has_brain_mask=True))
+                labels, names = laid.labels, laid.tissue_names
+        added, told = self._with_lesions(labels, names, lesions, has_brain_mask=is_of_brain)
         shares = self._work.do(lambda: texture_below(result.texture(), mri, result.labels, added.labels))
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         self._write_tissues(labels_node, added, mri_node, shares)
@@ -239,7 +274,10 @@ class UltrasoundSceneLogic:
         self._segmented = _Segmented(
             labels_version(labels_node), added.labels, added.tissue_names, shares, mri, is_of_brain
         )
-        self.notes = (*result.notes, *result.table().splitlines(), *added.messages)
+        if found is not None:
+            write_sheets(sheets_node, found.surfels, mri_node)
+        sheet_notes = () if found is None else found.notes
+        self.notes = (*result.notes, *sheet_notes, *result.table().splitlines(), *added.messages)
         self.warnings = (*result.warnings, *skipped, *added.warnings)
         return result
 
@@ -572,7 +610,7 @@ class UltrasoundSceneLogic:
             images_node, frames, preset.probe, probe_to_world=pose, estimate_geometry=estimate_geometry
         )
         tracked = replace(tracked, poses=[patient.pose(pose) for pose in tracked.poses])
-        texture = self._texture_of(labels_node, patient)
+        texture, sheets = self._texture_of(labels_node, patient), self._sheets_of(labels_node)
 
         def report(step: Progress) -> None:
             if plot is not None:
@@ -582,7 +620,7 @@ class UltrasoundSceneLogic:
 
         def compute() -> Fit:
             return fit(
-                self._simulator(patient, preset, texture),
+                self._simulator(patient, preset, texture, sheets),
                 tracked,
                 free=free,
                 display=preset.display,
@@ -699,6 +737,28 @@ class UltrasoundSceneLogic:
     def _lesions(self, lesions_node, to_frame_of) -> tuple[list[tuple[str, Volume, str]], list[str]]:
         return read_lesions(lesions_node, to_frame_of, self.preset.tissues)
 
+    def _organs(self, organs_node, mri_node, contrast: str) -> LabelledTissues:
+        """The organs of a CT in its own frame. Raises SimulationError beside an MRI."""
+        require(
+            contrast == CT,
+            f"{named(organs_node)} has organs of a CT, and the contrast is {contrast}; choose ct, or no organs",
+        )
+        require_node(organs_node, *LABEL_CLASSES, use="organs")
+        found = read_labels(organs_node, self.preset.tissues)
+        to_mri = np.linalg.inv(node_to_world(mri_node)) @ node_to_world(organs_node)
+        return replace(found, labels=Volume(found.labels.array, to_mri @ found.labels.ijk_to_ras))
+
+    def _sheets_of(self, labels_node) -> Surfels | None:
+        """The chosen sheets of the kinds that are ticked, in the frame of the simulator's labels; None without any."""
+        node, kinds = self.parameters.sheets, self.parameters.sheet.kinds
+        if node is None:
+            return None
+        world_to_labels, _ = pose_in_labels(labels_node, np.eye(4))
+        version = sheets_version(node), kinds, world_to_labels.tobytes()
+        if self._sheets is None or self._sheets[0] != version:
+            self._sheets = version, read_sheets(node, world_to_labels, kinds)
+        return self._sheets[1]
+
     def _with_lesions(
         self,
         labels: Volume,
@@ -754,14 +814,14 @@ class UltrasoundSceneLogic:
     ) -> Frame:
         """The image at a pose; the default seed of its noise depends on the pose."""
         patient, preset = self._patient(labels_node), self.preset
-        texture = self._texture_of(labels_node, patient)
+        texture, sheets = self._texture_of(labels_node, patient), self._sheets_of(labels_node)
         pose = patient.pose(probe_to_world)
         seed = seed_of_pose(pose) if noise_seed is None else noise_seed
 
         def compute() -> tuple[Frame, list[Warning]]:
             # Collected within the work, since Python collects warnings for all threads together.
             with collected_warnings() as caught:
-                simulator = self._simulator(patient, preset, texture)
+                simulator = self._simulator(patient, preset, texture, sheets)
                 return simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed), caught
 
         frame, caught = self._work.do(compute)
@@ -769,10 +829,14 @@ class UltrasoundSceneLogic:
             warned(warning)
         return frame
 
-    def _simulator(self, patient: Patient, preset: Preset, texture: Texture | None) -> UltrasoundSimulator:
+    def _simulator(
+        self, patient: Patient, preset: Preset, texture: Texture | None, sheets: Surfels | None
+    ) -> UltrasoundSimulator:
         """Uses the device and no node; called within the work."""
         tissues = preset.tissues.for_names(patient.names)
-        return self._simulators.get(patient.version, patient.labels, tissues, preset.settings, self.device, texture)
+        return self._simulators.get(
+            patient.version, patient.labels, tissues, preset.settings, self.device, texture, sheets
+        )
 
     def _write_tissues(self, labels_node, added: Added, like_node, texture: Texture | None) -> None:
         """Write labels and what is known of their shares."""
