@@ -18,6 +18,7 @@ from typing import Any
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
+from SlicerUSSim.Logic.mri.settings import GEL_MM
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
@@ -36,6 +37,8 @@ from SlicerUSSim.Widget.sections import CUSTOM_PROBE, SHOWN_PROBES
 _CHECK = "Check: "
 #: Begin of the line about an opening
 _OPENED = "craniotomy: "
+#: Begin of the line about a standard view
+_VIEW = "view: "
 #: Begin of the lines about a proposal
 _PROPOSED = "proposal: "
 _BUSY = "Wait until the work under way is done"
@@ -458,7 +461,16 @@ class PanelPresenter:
 
     def notes(self) -> str:
         """What the last segmentation or addition did, and what a user should check, in lines."""
-        return "\n".join(self._notes)
+        return "\n".join([*self._notes, *self._gel()])
+
+    def _gel(self) -> list[str]:
+        """A line about gel on the skin, if the chosen tissues have it by default."""
+        labels = self.logic.parameters.labels
+        try:
+            is_there = labels is not None and self.logic.settings(labels) != self._preset().settings
+        except SimulationError:  # an empty node, or unknown names: the error is shown by simulate()
+            return []
+        return [f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (Gel on the skin)"] if is_there else []
 
     def setNotes(self, *lines: str) -> None:
         """Replace them by lines about another patient, whose labels are chosen; by none, to forget them."""
@@ -478,7 +490,9 @@ class PanelPresenter:
         """Place the probe where the chosen standard view is seen from; create its transform if needed."""
         with self.shown():
             require(self.logic.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
-            self._put_probe(view=self.logic.parameters.panel.view)
+            line = self._put_probe(view=self.logic.parameters.panel.view)
+            self._notes = [known for known in self._notes if not known.startswith(_VIEW)]
+            self._notes += [f"{_VIEW}{line}"] if line else []
         self.view.refresh()
 
     def simulate(self) -> None:
@@ -602,15 +616,16 @@ class PanelPresenter:
             self._notes.append(f"{chosen.GetName()!r} has data of others and is kept; the result is {node.GetName()!r}")
         return node
 
-    def _put_probe(self, slice_node=None, view: str | None = None) -> None:
-        """Place the probe's transform, or a new one if none is selected."""
+    def _put_probe(self, slice_node=None, view: str | None = None) -> str:
+        """Place the probe's transform, or a new one if none is selected; a line about it, as placeProbe returns."""
         parameters = self.logic.parameters
         with self._made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
-            self.logic.placeProbe(parameters.labels, probe, slice_node, view=view)
+            line = self.logic.placeProbe(parameters.labels, probe, slice_node, view=view)
         parameters.probe_transform = probe
         display = display_of(probe)
         if display is not None:
             display.SetEditorVisibility(self._handles)
+        return line
 
     def _live_nodes(self) -> tuple:
         nodes = self.logic.parameters

@@ -165,6 +165,7 @@ def _probe() -> tuple[Row, ...]:
             value("scene.view"),
         ),
         value("scene.show_in_slice"),
+        value("scene.gel"),
     )  # fmt: skip
 
 

@@ -111,7 +111,10 @@ class Exports:
         require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
         names = read_labels(labels, preset.tissues).names
         return python_script(
-            source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels, self._shown_sheets(source)
+            source,
+            replace(preset, tissues=preset.tissues.for_names(names), settings=self._logic.settings(labels)),
+            in_labels,
+            self._shown_sheets(source),
         )
 
     def _shown_sheets(self, source: LabelSource) -> tuple[str, ...] | str:

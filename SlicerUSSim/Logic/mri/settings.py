@@ -10,6 +10,9 @@ from SlicerUSSim.Logic.base.declaration import Declared, Shown, parameter
 #: Contrasts of MRIs, which segment_mri has; and the name of a CT, which is segment_ct's
 MRI_CONTRASTS, CT = ("t1", "t1gd", "t2", "flair"), "ct"
 
+#: What gel bridges between skin and probe where nothing else is said, mm
+GEL_MM = 3.0
+
 
 @dataclass(frozen=True)
 class SegmentationSettings(Declared):

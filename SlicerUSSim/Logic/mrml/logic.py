@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, collected_warnings, require, required, warn_again
+from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
@@ -29,10 +30,10 @@ from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
+from SlicerUSSim.Logic.mri.settings import CT, GEL_MM, SegmentationSettings
 from SlicerUSSim.Logic.mri.sheets.finding import find_sheets, require_findable
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
-from SlicerUSSim.Logic.mri.views import view_pose
+from SlicerUSSim.Logic.mri.views import opened_view_pose, view_pose
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import (
     closed_labels,
     flap_centre,
@@ -179,6 +180,17 @@ class UltrasoundSceneLogic:
     def tissues(self, labels_node) -> TissueTable:
         """The tissues of a label map or segmentation by name, from the preset's table or else the tissue presets."""
         return self.preset.tissues.for_names(self._patient(labels_node).names)
+
+    def settings(self, labels_node) -> SimulationSettings:
+        """The preset's settings, with gel between skin and probe (GEL_MM) where labels have skin and nobody says more.
+
+        That is: no contact gap, the parameter `gel`, and no opening, which is filled with the coupling medium.
+        """
+        settings = self.preset.settings
+        is_default = settings.contact_gap_mm is None and self.parameters.panel.gel and not is_opened(labels_node)
+        if is_default and "skin" in self._patient(labels_node).names:
+            return replace(settings, contact_gap_mm=GEL_MM)
+        return settings
 
     # ---- single steps ------------------------------------------------------------------------------------------------
 
@@ -539,19 +551,22 @@ class UltrasoundSceneLogic:
     def placeProbe(
         self, labels_node, probe_transform_node, slice_node=None, target_ras=None, *, view: str | None = None,
         will_open: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> str:  # fmt: skip
         """Put the probe on the surface of the labelled tissue, with its axis inwards.
 
         With a slice node the image is in that slice, with its depth towards the bottom of the view, aimed at
         `target_ras` (default: the middle of the view). Without one it is a coronal view through a parasagittal
         craniotomy: on a brain, upright on the skin of a whole head, or on the brain in the middle of an opening.
         `view` is one of mri.views.VIEWS instead, as "temporal". With `will_open` it is on the brain of a closed head,
-        where openCraniotomy opens a disc under it.
+        where openCraniotomy opens a disc under it. Returns a line about a view of labels with an opening, "" otherwise.
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
         patient = self._patient(labels_node)
         surface = Volume(patient.labels.array, np.linalg.inv(patient.world_to_patient) @ patient.labels.ijk_to_ras)
-        if view is not None:
+        line = ""
+        if view is not None and is_opened(labels_node):
+            pose, line = opened_view_pose(surface, patient.names, view)
+        elif view is not None:
             pose = view_pose(surface, patient.names, view)
         elif slice_node is None:
             pose = default_pose(
@@ -562,6 +577,7 @@ class UltrasoundSceneLogic:
             require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
             pose = pose_in_slice(surface, matrix_array(slice_node.GetSliceToRAS()), target_ras)
         set_node_to_world(probe_transform_node, pose)
+        return line
 
     def showOutline(self, model_node, probe_transform_node) -> None:
         """The outline of the imaged field as a model under the probe's transform.
@@ -604,7 +620,7 @@ class UltrasoundSceneLogic:
         the cost during the fit. Nothing else in the scene changes; applyFit adopts the result. `progress` may raise
         errors.Cancelled.
         """
-        patient, preset = self._patient(labels_node), self.preset
+        patient, preset = self._patient(labels_node), replace(self.preset, settings=self.settings(labels_node))
         pose = None if probe_transform_node is None else probe_pose(probe_transform_node)
         tracked = tracked_images(
             images_node, frames, preset.probe, probe_to_world=pose, estimate_geometry=estimate_geometry
@@ -813,7 +829,7 @@ class UltrasoundSceneLogic:
         noise_seed: int | None = None,
     ) -> Frame:
         """The image at a pose; the default seed of its noise depends on the pose."""
-        patient, preset = self._patient(labels_node), self.preset
+        patient, preset = self._patient(labels_node), replace(self.preset, settings=self.settings(labels_node))
         texture, sheets = self._texture_of(labels_node, patient), self._sheets_of(labels_node)
         pose = patient.pose(probe_to_world)
         seed = seed_of_pose(pose) if noise_seed is None else noise_seed

@@ -36,6 +36,11 @@ class PanelSettings(Declared):
         "none", "Its contrast", "Contrast of the second MRI, which is classified together with the first",
         choices=("none", *MRI_CONTRASTS), shown=True,
     )  # fmt: skip
+    gel: bool = parameter(
+        True, "Gel on the skin", "Where tissues have skin, and Contact gap is none, gel fills gaps of up to 3 mm "
+        "between skin and probe, and lines without contact are dark; off: the coupling medium is everywhere",
+        shown=True,
+    )  # fmt: skip
     craniotomy_mm: float | None = parameter(
         None, "Diameter", "Diameter of the disc under the probe that is opened; none: as wide as its face needs",
         unit="mm", bounds=(5.0, 150.0), shown=Shown(4.0, 150.0, 1.0, none_at=4.0), can_be_none=True,
