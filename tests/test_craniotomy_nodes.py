@@ -253,3 +253,25 @@ def test_a_view_is_placed_in_an_opening_that_is_there_and_said_to_be_elsewhere_o
     assert "view: the opening is not where the view temporal is seen from: the probe stands on the skin" in (
         bench.presenter.notes()
     )
+
+
+def test_hidden_segments_of_an_opening_stay_closed_and_are_said_to(head):  # noqa: F811
+    bench = Bench(head)
+    z, _, x = np.indices(head.array.shape)
+    above = (head.array > 2) & (z > 100)
+    opening = bench.add("Segmentation", "opening")
+    both = head.with_array(np.where(above, np.where(x > 56, 2, 1), 0).astype(np.uint8))
+    write_labels(opening, both, ("left", "right"), bench.whole)
+    opening.CreateDefaultDisplayNodes()
+    first, second = opening.GetSegmentation().GetSegmentIDs()
+    bench.logic.parameters.opening = opening
+    opening.GetDisplayNode().SetSegmentVisibility(second, False)
+    bench.presenter.openCraniotomy()
+    assert not bench.view.errors
+    before, after = bench.tissues(bench.whole), bench.tissues(bench.labels)
+    np.testing.assert_array_equal((after != before) & (before == 2), both.array == 1)
+    notes = bench.presenter.notes()
+    assert "with left; " in notes and "what is hidden is not opened: right" in notes
+    opening.GetDisplayNode().SetSegmentVisibility(first, False)
+    bench.presenter.openCraniotomy()
+    assert "all its segments are hidden, expected a visible one to open" in bench.view.errors[-1]

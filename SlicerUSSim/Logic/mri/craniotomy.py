@@ -62,7 +62,8 @@ def disc_opening(labels: Volume, names: Sequence[str], probe_to_ras: np.ndarray,
 def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray) -> np.ndarray:
     """(k, j, i) bool: the prism over a polygon of (points, 3) RAS mm, along the normal of its plane.
 
-    Raises SimulationError for fewer than three points, points on a line, and if there is no brain under it.
+    Raises SimulationError for fewer than three points, points on a line, sides that cross, and if there is no brain
+    under it.
     """
     from skimage.measure import points_in_poly
 
@@ -79,6 +80,14 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
     pose[:3, 3] = middle
     places = _in_probe(labels, pose)
     outline = (points_ras - middle) @ pose[:3, [0, 2]]
+    crossing = _crossing_sides(outline)
+    if crossing is not None:
+        first, second = (f"{side + 1} to {(side + 1) % len(outline) + 1}" for side in crossing)
+        require(
+            False,
+            f"the sides of the polygon from point {first} and from point {second} cross, expected points in their "
+            "order around the opening",
+        )
     inside = points_in_poly(places[..., [0, 2]].reshape(-1, 2), outline).reshape(labels.array.shape)
     radius = 0.5 * float(np.ptp(outline, axis=0).max())
     return inside & (places[..., 1] < _deepest(labels, names, inside, places[..., 1], radius))
@@ -215,6 +224,21 @@ def _deepest(labels: Volume, names: Sequence[str], within: np.ndarray, depth: np
         "of it, expected one before it; move or turn the probe",
     )
     return begins + _BELOW * radius_mm
+
+
+def _crossing_sides(outline: np.ndarray) -> tuple[int, int] | None:
+    """Numbers of the first two sides, from point n to n + 1, of a closed polygon (points, 2) that cross; or None."""
+    start, end = outline, np.roll(outline, -1, axis=0)
+
+    def turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """Sign of the turn from a by b to c; 0 on a line."""
+        (ux, uy), (vx, vy) = np.moveaxis(b - a, -1, 0), np.moveaxis(c - a, -1, 0)
+        return np.sign(ux * vy - uy * vx)
+
+    a, b, c, d = start[:, None], end[:, None], start[None], end[None]
+    crosses = (turn(a, b, c) * turn(a, b, d) < 0) & (turn(c, d, a) * turn(c, d, b) < 0)
+    found = np.argwhere(np.triu(crosses))
+    return None if not len(found) else (int(found[0, 0]), int(found[0, 1]))
 
 
 def polygon_of_file(path: str) -> np.ndarray:

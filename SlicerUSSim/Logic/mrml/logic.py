@@ -48,6 +48,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import (
     LABEL_CLASSES,
     Patient,
     PatientReader,
+    hidden_segments,
     labels_version,
     node_labels,
     read_labels,
@@ -417,11 +418,13 @@ class UltrasoundSceneLogic:
         known = read_shares(closed, labels, names) if was is None else was.texture
         world_to_labels, scaling = pose_in_labels(closed, np.eye(4))
         placed = Volume(labels.array, scaling @ labels.ijk_to_ras)
+        hidden: dict[str, str] = {}
         if opening_node is not None:
             opening = self._work.do(lambda: opening_of(opening_node, placed, names, world_to_labels))
             what = named(opening_node)
             if opening_node.IsA("vtkMRMLSegmentationNode"):
-                what += f" with {', '.join(node_labels(opening_node)[1].values())}"
+                hidden = hidden_segments(opening_node)
+                what += f" with {', '.join(node_labels(opening_node, hidden)[1].values())}"
         else:
             pose, probe = world_to_labels @ probe_pose(probe_transform_node), self.preset.probe
             diameter = disc_diameter_mm(probe) if diameter_mm is None else diameter_mm
@@ -444,8 +447,11 @@ class UltrasoundSceneLogic:
             f"{named(output_node)}, and {named(closed)} stays as it is",
         )
         self.warnings = ()
+        if hidden:
+            names_hidden = ", ".join(hidden.values())
+            self.warnings = (f"of {named(opening_node)} what is hidden is not opened: {names_hidden}",)
         if is_left_out:
-            self.warnings = (
+            self.warnings += (
                 f"what was edited in {named(labels_node)} is not in {named(output_node)}, which is {named(closed)} "
                 "with the opening",
             )
