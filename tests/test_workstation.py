@@ -750,6 +750,28 @@ def test_the_workstation_begins_with_the_opening_of_its_option(browser, tmp_path
         page.close()
 
 
+@pytest.mark.parametrize("what", ["a craniotomy off the head", "an MRI called CT"])
+def test_bad_anatomy_is_one_line_in_the_page_which_goes_on(browser, files, tmp_path, what):
+    round_head(tmp_path)
+    arguments, words = [str(files / "head.nii.gz"), "--ct"], "expected Hounsfield units"
+    if what != "an MRI called CT":
+        arguments = ["--labels", str(tmp_path / "labels.nii.gz"), "--craniotomy", str(files / "far.nii.gz")]
+        words = "is empty, or lies outside of the patient"
+    with serving(*arguments) as address:
+        page = browser.new_page()
+        page.set_default_timeout(1000 * PATIENCE_S)
+        page.goto(address)
+        page.wait_for_function("window.trame?.state?.get !== undefined")
+        eventually(page, lambda: bool(errors(page)))
+        (line,) = errors(page)
+        assert words in line and "\n" not in line
+        if what == "a craniotomy off the head":
+            loaded(page)
+            settled(page)
+            assert page.locator("#closeCraniotomyButton").is_disabled()  # nothing was opened, and images are made
+        page.close()
+
+
 def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
     round_head(tmp_path)
     with serving("--labels", str(tmp_path / "labels.nii.gz")) as address:
