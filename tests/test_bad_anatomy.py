@@ -1,4 +1,4 @@
-"""Bad input for anatomy, at every door: seeds in no lesion, craniotomies off the head, CTs in another unit, MRIs as CTs.
+"""Bad input for anatomy, at every door: seeds in no lesion, craniotomies off the head, CTs in other units, MRIs as CT.
 
 The page has the same presenter as the panel; tests/test_workstation.py has some of these there.
 """

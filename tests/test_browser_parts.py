@@ -425,7 +425,15 @@ def test_a_cine_keeps_time_and_begins_anew_with_another_size():
 
 
 #: Methods of Loading that buttons call
-LOADING = ("segment", "add_tissues", "place_probe", "place_at_view", "open_craniotomy", "close_craniotomy")
+LOADING = (
+    "segment",
+    "add_tissues",
+    "accept_proposal",
+    "place_probe",
+    "place_at_view",
+    "open_craniotomy",
+    "close_craniotomy",
+)
 #: What breaks text that is pasted between quotes.
 NASTY = ["it's", 'a "b"', "back\\slash\\", "two\nlines", "'''", '"""', "\\N{x} {y} %s", "grüße ∎"]
 
