@@ -233,6 +233,34 @@ def test_changes_that_come_while_an_image_is_computed_bring_one_more_of_the_last
     assert images == 2 and not errors and not any(reports)
 
 
+def test_a_probe_that_moves_while_the_first_live_image_is_computed_is_followed(head):
+    async def scenario():
+        tasks = Tasks(print)
+        scene = slicer.vtkMRMLScene()
+        labels, transform, output = (
+            scene.AddNewNodeByClass(f"vtkMRML{kind}Node")
+            for kind in ("LabelMapVolume", "LinearTransform", "ScalarVolume")
+        )
+        write_labels(labels, head.labels, head.tissue_names, labels)
+        logic = UltrasoundSceneLogic(scene, work=tasks)
+        set_node_to_world(transform, craniotomy_pose(head.labels, logic.preset.probe))
+        goes_on = threading.Event()
+        tasks.start(lambda: tasks.do(goes_on.wait))
+        tasks.start(lambda: logic.startLiveUpdate(labels, transform, output, schedule=tasks.start))
+        await asyncio.sleep(0.05)  # the image waits for what is computed before
+        assert logic.lastFrame is None
+        set_node_to_world(transform, turned(probe_pose(transform), rock_deg=20.0))
+        goes_on.set()
+        while not tasks.are_done:
+            await asyncio.sleep(0.01)
+        moved = np.linalg.inv(probe_pose(transform)) @ logic.lastImage().ijk_to_ras
+        logic.stopLiveUpdate()
+        tasks.stop()
+        return np.allclose(moved, logic.lastFrame.grid.slice_to_probe, atol=1e-6)
+
+    assert run_in_loop(scenario)
+
+
 # ---- what page and control share -------------------------------------------------------------------------------------
 
 
@@ -397,7 +425,15 @@ def test_a_cine_keeps_time_and_begins_anew_with_another_size():
 
 
 #: Methods of Loading that buttons call
-LOADING = ("segment", "add_tissues", "place_probe", "place_at_view", "open_craniotomy", "close_craniotomy")
+LOADING = (
+    "segment",
+    "add_tissues",
+    "accept_proposal",
+    "place_probe",
+    "place_at_view",
+    "open_craniotomy",
+    "close_craniotomy",
+)
 #: What breaks text that is pasted between quotes.
 NASTY = ["it's", 'a "b"', "back\\slash\\", "two\nlines", "'''", '"""', "\\N{x} {y} %s", "grüße ∎"]
 

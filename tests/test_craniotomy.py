@@ -200,3 +200,14 @@ def test_another_value_is_one_line(value, message, head, tmp_path):
     arguments = ["simulate", str(tmp_path / "head.nii.gz"), "--pose", "auto", "--craniotomy", value, "-o", "a.png"]
     done = CliRunner().invoke(main, arguments)
     assert done.exit_code == 2 and message in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+def test_a_polygon_whose_sides_cross_is_refused_and_a_bent_one_is_not(head):
+    square = np.array([[-20.0, -10.0, 78.0], [20.0, -10.0, 78.0], [20.0, 10.0, 78.0], [-20.0, 10.0, 78.0]])
+    with pytest.raises(
+        SimulationError, match=r"the sides of the polygon from point 1 to 2 and from point 3 to 4 cross"
+    ):
+        polygon_opening(head, NAMES, square[[0, 2, 1, 3]])
+    bent = np.insert(square, 2, [5.0, 0.0, 80.0], axis=0)  # not convex
+    assert 0 < polygon_opening(head, NAMES, bent).sum() < polygon_opening(head, NAMES, square).sum()
+    assert polygon_opening(head, NAMES, np.repeat(square, 2, axis=0)).any()  # points twice

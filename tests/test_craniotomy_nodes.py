@@ -206,3 +206,72 @@ def test_the_labels_themselves_are_no_opening_and_edits_are_not_lost_unsaid(head
     first.GetImageData().Modified()
     bench.presenter.openCraniotomy()
     assert bench.labels is not first and f"what was edited in {'LabelMapVolume'}" in bench.presenter.notes()
+
+
+def test_gel_is_between_skin_and_probe_as_in_the_commands_unless_the_user_says_otherwise(head):  # noqa: F811
+    bench = Bench(head)
+    bench.move(pose_looking_at((0.0, 0.0, 88.0), (0.0, 0.0, 0.0)))  # 10 mm off the skin
+    image = bench.add("ScalarVolume", "image")
+    gel = bench.logic.simulate(bench.whole, bench.probe, image).image.copy()
+    assert "gel fills gaps of up to 3 mm between skin and probe" in bench.presenter.notes()
+    plain = bench.logic.preset
+    bench.logic.preset = plain.changed("settings", contact_gap_mm=3.0)
+    np.testing.assert_array_equal(bench.logic.simulate(bench.whole, bench.probe, image).image, gel)
+    bench.logic.preset = plain.changed("settings", contact_gap_mm=1.0)
+    assert bench.logic.settings(bench.whole).contact_gap_mm == 1.0 and "gel " not in bench.presenter.notes()
+    bench.logic.preset = plain
+    bench.presenter.setValue("scene.gel", False)
+    immersed = bench.logic.simulate(bench.whole, bench.probe, image).image
+    assert (
+        gel.mean() < 0.5 * immersed.mean() and immersed.max() > gel.max() + 50 and "gel " not in bench.presenter.notes()
+    )
+    bench.presenter.setValue("scene.gel", True)
+    bench.presenter.openCraniotomy()  # filled with saline
+    assert bench.logic.settings(bench.labels).contact_gap_mm is None and "gel " not in bench.presenter.notes()
+    bench.presenter.closeCraniotomy()
+    assert bench.logic.settings(bench.labels).contact_gap_mm == 3.0
+    brain = Bench(head.with_array(np.where(head.array == 2, 2, 0).astype(np.uint8)))
+    assert brain.logic.settings(brain.whole).contact_gap_mm is None
+
+
+def test_a_view_is_placed_in_an_opening_that_is_there_and_said_to_be_elsewhere_otherwise(head):  # noqa: F811
+    bench = Bench(head)
+
+    def radius() -> float:
+        return float(np.linalg.norm((np.linalg.inv(TURN) @ node_to_world(bench.probe))[:3, 3]))
+
+    bench.presenter.setValue("scene.view", "fontanelle")
+    bench.presenter.placeAtView()
+    assert radius() == pytest.approx(78.0, abs=2.0) and "view: " not in bench.presenter.notes()
+    bench.presenter.openCraniotomy()
+    bench.presenter.placeAtView()
+    assert radius() == pytest.approx(60.0, abs=2.0) and not bench.view.errors
+    assert "view: the view fontanelle is seen through the opening" in bench.presenter.notes()
+    bench.presenter.setValue("scene.view", "temporal")
+    bench.presenter.placeAtView()
+    assert radius() == pytest.approx(78.0, abs=2.0) and bench.presenter.notes().count("view: ") == 1
+    assert "view: the opening is not where the view temporal is seen from: the probe stands on the skin" in (
+        bench.presenter.notes()
+    )
+
+
+def test_hidden_segments_of_an_opening_stay_closed_and_are_said_to(head):  # noqa: F811
+    bench = Bench(head)
+    z, _, x = np.indices(head.array.shape)
+    above = (head.array > 2) & (z > 100)
+    opening = bench.add("Segmentation", "opening")
+    both = head.with_array(np.where(above, np.where(x > 56, 2, 1), 0).astype(np.uint8))
+    write_labels(opening, both, ("left", "right"), bench.whole)
+    opening.CreateDefaultDisplayNodes()
+    first, second = opening.GetSegmentation().GetSegmentIDs()
+    bench.logic.parameters.opening = opening
+    opening.GetDisplayNode().SetSegmentVisibility(second, False)
+    bench.presenter.openCraniotomy()
+    assert not bench.view.errors
+    before, after = bench.tissues(bench.whole), bench.tissues(bench.labels)
+    np.testing.assert_array_equal((after != before) & (before == 2), both.array == 1)
+    notes = bench.presenter.notes()
+    assert "with left; " in notes and "what is hidden is not opened: right" in notes
+    opening.GetDisplayNode().SetSegmentVisibility(first, False)
+    bench.presenter.openCraniotomy()
+    assert "all its segments are hidden, expected a visible one to open" in bench.view.errors[-1]

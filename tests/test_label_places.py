@@ -14,6 +14,7 @@ from SlicerUSSim.Logic import SimulationError, Volume
 from SlicerUSSim.Logic.mri import segment_mri
 from SlicerUSSim.Logic.tissue import LabelMapping, read_label_file, read_label_map
 from SlicerUSSim.Logic.tissue.freesurfer import freesurfer_names
+from SlicerUSSim.Logic.tissue.interpolated_labels import share_between
 from SlicerUSSim.Logic.tissue.label_sources import is_label_file
 from SlicerUSSim.Logic.tissue.probability_maps import combined_probability_maps
 from tests.test_label_maps import (
@@ -579,3 +580,39 @@ def test_labels_that_were_interpolated_and_rounded_are_said_and_nearest_neighbou
     linear = linear.with_array(np.where(known, linear.array, 0))
     warnings = read_label_map(linear, mapping=LabelMapping.of("freesurfer")).warnings
     assert any("resampled with interpolation and rounded" in line for line in warnings), warnings
+
+
+@pytest.mark.parametrize("voxel_mm", [2.0, 4.0])
+def test_layers_of_a_head_lie_between_others_and_are_not_said_to_be_interpolated(voxel_mm):
+    """Skin, scalp, skull and marrow are numbered in their order, so that each is between its neighbours' numbers."""
+    names = ("csf", "grey matter", "white matter", "leptomeninges", "skin", "scalp", "skull", "cancellous bone", "air")
+    layers = (
+        (50.0, 3),
+        (62.0, 2),
+        (64.0, 4),
+        (66.0, 1),
+        (67.0, 0),
+        (69.0, 7),
+        (72.0, 8),
+        (75.0, 7),
+        (83.0, 6),
+        (86.0, 5),
+    )
+    axis = np.arange(-92.0, 92.1, voxel_mm)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    radius, labels = np.sqrt(x**2 + y**2 + z**2), np.zeros((len(axis),) * 3, np.uint8)
+    for outer, number in reversed(layers):
+        labels[radius <= outer] = number
+    labels[(np.abs(y) < 12) & (x**2 + (z + 20) ** 2 < 12**2)] = 1
+    labels[(x**2 + (y - 79) ** 2 + (z + 30) ** 2) < 5**2] = 9
+    whole = Volume(labels, np.diag([voxel_mm, voxel_mm, voxel_mm, 1.0]))
+    assert share_between(labels)[0] > (0.17 if voxel_mm > 3 else 0.0)  # by the numbers alone it is doubtful
+    turn = Rotation.from_euler("z", 10, degrees=True).as_matrix()
+    offset = (np.eye(3) - turn) @ np.array(labels.shape) / 2
+    nearest, linear = (
+        whole.with_array(np.rint(ndimage.affine_transform(labels.astype(float), turn, offset, order=order)))
+        for order in (0, 1)
+    )
+    told = [read_label_map(one, dict(enumerate(names, 1))).warnings for one in (whole, nearest, linear)]
+    doubted = [any("resampled with interpolation" in line for line in lines) for lines in told]
+    assert doubted == [False, False, True], told

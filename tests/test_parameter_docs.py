@@ -16,7 +16,7 @@ from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameters_o
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
 from SlicerUSSim.Logic.fitting.settings import FitSettings
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings, SheetSettings
 from SlicerUSSim.Logic.mrml.parameter_node import PanelSettings
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, Probe, probe_kind
 from SlicerUSSim.Logic.probe.beam import Beam
@@ -53,6 +53,8 @@ SECTIONS: list[tuple[str, type[Declared], str]] = [
      "Its `tissue` is an object as in [Tissues](#tissues)."),
     ("Segmentation", SegmentationSettings, "Segmentation of an MRI into tissues, by `ussim segment`, `segment_mri` "
      "and the VTK filter."),
+    ("Sheets", SheetSettings, "Sheets and vessels of a scene, in Slicer and on the page; commands have `--sheets` "
+     "and `--no-sheet` ([sheets.md](sheets.md))."),
     ("Fit", FitSettings, "Fit of simulated to real images ([optimization.md](optimization.md)). For `frames` and "
      "`free`, `ussim optimize` has options of the same names."),
     ("Similarity", SimilaritySettings, "The cost of a fit ([optimization.md](optimization.md#cost-function)); set in "

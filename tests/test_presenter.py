@@ -49,6 +49,9 @@ class PlainView:
     def sliceNode(self):
         return None
 
+    def pickPoint(self, points_node, picked) -> None:
+        self.picking = points_node, picked
+
 
 @pytest.fixture
 def presenter():

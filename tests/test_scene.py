@@ -32,7 +32,7 @@ from SlicerUSSim.Logic.base.errors import Cancelled  # noqa: E402
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
 from SlicerUSSim.Logic.fitting.settings import FitSettings  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings  # noqa: E402
+from SlicerUSSim.Logic.mri.settings import SegmentationSettings, SheetSettings  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, pose_in_labels, set_node_to_world, write_volume  # noqa: E402
@@ -847,6 +847,7 @@ def test_every_declared_setting_is_remembered_one_by_one_and_together(bench):
     assert set(VALUE_PARAMETERS) == {
         *(entry.name for entry in fields(SegmentationSettings)),
         *(f"fit_{entry.name}" for entry in fields(FitSettings)),
+        *(f"sheet_{entry.name}" for entry in fields(SheetSettings)), "lesion_as", "gel",
         "show_in_slice", "preset", "second_contrast", "craniotomy_mm", "view",
     }  # fmt: skip
 

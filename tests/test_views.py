@@ -10,6 +10,7 @@ from PIL import Image
 from SlicerUSSim.Command.cli import main
 from SlicerUSSim.Command.patient_options import STANDARD_VIEWS
 from SlicerUSSim.Logic import SimulationError
+from SlicerUSSim.Logic.mri.craniotomy import disc_opening
 from SlicerUSSim.Logic.mri.views import VIEWS, view_pose
 from SlicerUSSim.Logic.tissue.own_files import write_label_files
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -59,3 +60,20 @@ def test_the_command_stands_where_a_view_is_seen_from(head, tmp_path):  # noqa: 
     assert deep["fontanelle2"] > deep["fontanelle0"] + 5.0  # through the opening alone
     done = CliRunner().invoke(main, ["simulate", str(path), "--pose", "temple", "-o", str(tmp_path / "a.png")])
     assert done.exit_code == 2 and "temple" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["fontanelle", "temporal"])
+def test_with_an_opening_of_a_file_a_view_is_in_it_or_said_to_be_elsewhere(head, tmp_path, name):  # noqa: F811
+    path, mask, out = tmp_path / "head.nii.gz", tmp_path / "mask.nii.gz", tmp_path / "out.png"
+    write_label_files(path, head, TissueTable.brain().for_names(NAMES))
+    head.with_array(disc_opening(head, NAMES, view_pose(head, NAMES, "fontanelle"), 40.0).astype(np.uint8)).write(mask)
+    done = CliRunner().invoke(
+        main, ["simulate", str(path), "--pose", name, "--craniotomy", str(mask), "-o", str(out)]
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    deep = np.asarray(Image.open(out), float)[256:].mean()
+    if name == "fontanelle":
+        assert "the view fontanelle is seen through the opening" in done.stderr and deep > 5.0
+    else:
+        assert "the opening is not where the view temporal is seen from" in done.stderr and deep < 5.0
+    assert "bone lie behind the face" not in done.stderr

@@ -27,14 +27,17 @@ pyigtl = pytest.importorskip("pyigtl", reason="OpenIGTLink comes with pyigtl: pi
 from playwright.sync_api import Page, sync_playwright  # noqa: E402
 
 from SlicerUSSim.Logic import PhasedProbe, TissueTable, UltrasoundSimulator, Volume, segment_mri  # noqa: E402
+from SlicerUSSim.Logic.base.errors import required  # noqa: E402
 from SlicerUSSim.Logic.base.volume import read_array  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, tilt_sweep  # noqa: E402
 from SlicerUSSim.Logic.tissue.own_files import write_label_files  # noqa: E402
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence  # noqa: E402
+from SlicerUSSim.Logic.verification.brain_phantoms import phantom, tissue_maps, with_low_grade_tumour  # noqa: E402
 from SlicerUSSim.Workstation.state import NAMES  # noqa: E402
 from tests.test_label_maps import head  # noqa: E402
+from tests.test_lesion_proposals import CENTRE, needs_atlas  # noqa: E402
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is missing: apt-get install chromium")
@@ -712,14 +715,65 @@ def test_the_script_gives_the_same_image_pixel_by_pixel(page, tmp_path):
     assert np.array_equal(run_again(script_of(page), tmp_path), expected)
 
 
-def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
+def round_head(folder: Path) -> Volume:
+    """A brain in skull and skin, whose labels are written to labels.nii.gz with their table."""
     axis = np.arange(-84.0, 85.0, 3.0)
     radius = np.sqrt(sum(place**2 for place in np.meshgrid(axis, axis, axis)))
     matrix = np.diag([3.0, 3.0, 3.0, 1.0])
     matrix[:3, 3] = axis[0]
-    labels = np.select([radius < 60, radius < 70, radius < 78], [1, 2, 3], 0).astype(np.uint8)
-    Volume(labels, matrix).write(tmp_path / "labels.nii.gz")
-    TissueTable.brain(("grey matter", "skull", "skin")).write(tmp_path / "labels.json")
+    labels = Volume(np.select([radius < 60, radius < 70, radius < 78], [1, 2, 3], 0).astype(np.uint8), matrix)
+    labels.write(folder / "labels.nii.gz")
+    TissueTable.brain(("grey matter", "skull", "skin")).write(folder / "labels.json")
+    return labels
+
+
+@pytest.mark.parametrize("source", ["disc:50", "mask", "curve"])
+def test_the_workstation_begins_with_the_opening_of_its_option(browser, tmp_path, source):
+    labels, given = round_head(tmp_path), source
+    if source == "mask":
+        above = labels.with_array(np.zeros_like(labels.array))
+        above.array[36:, 20:37, 20:37] = 1
+        above.write(given := tmp_path / "mask.nii.gz")
+    elif source == "curve":
+        points = [{"position": [x, y, 78.0]} for x, y in ((-25, -25), (25, -25), (25, 25), (-25, 25))]
+        markup = {"type": "ClosedCurve", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
+        (given := tmp_path / "curve.mrk.json").write_text(json.dumps({"markups": [markup]}))
+    with serving("--labels", str(tmp_path / "labels.nii.gz"), "--craniotomy", str(given)) as address:
+        page = opened(browser, address)
+        settled(page)
+        what = {"disc:50": "a disc of 50 mm", "mask": "mask.nii.gz", "curve": "curve.mrk.json"}[source]
+        assert not errors(page) and f"craniotomy: {what}" in shown(page, "notesLabel").replace("'", "").replace(
+            "LabelMapVolume ", "").replace("MarkupsClosedCurve ", "")  # fmt: skip
+        assert (shown(page, "craniotomySpinBox") == 50.0) == (source == "disc:50")
+        image = np.asarray(Image.open(download(page, "png")), float)
+        assert image[image.shape[0] // 2 :].mean() > 5.0  # the beam reaches the brain
+        page.close()
+
+
+@pytest.mark.parametrize("what", ["a craniotomy off the head", "an MRI called CT"])
+def test_bad_anatomy_is_one_line_in_the_page_which_goes_on(browser, files, tmp_path, what):
+    round_head(tmp_path)
+    arguments, words = [str(files / "head.nii.gz"), "--ct"], "expected Hounsfield units"
+    if what != "an MRI called CT":
+        arguments = ["--labels", str(tmp_path / "labels.nii.gz"), "--craniotomy", str(files / "far.nii.gz")]
+        words = "is empty, or lies outside of the patient"
+    with serving(*arguments) as address:
+        page = browser.new_page()
+        page.set_default_timeout(1000 * PATIENCE_S)
+        page.goto(address)
+        page.wait_for_function("window.trame?.state?.get !== undefined")
+        eventually(page, lambda: bool(errors(page)))
+        (line,) = errors(page)
+        assert words in line and "\n" not in line
+        if what == "a craniotomy off the head":
+            loaded(page)
+            settled(page)
+            assert page.locator("#closeCraniotomyButton").is_disabled()  # nothing was opened, and images are made
+        page.close()
+
+
+def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
+    round_head(tmp_path)
     with serving("--labels", str(tmp_path / "labels.nii.gz")) as address:
         page = opened(browser, address)
         settled(page)
@@ -740,6 +794,66 @@ def test_a_craniotomy_is_opened_and_closed_in_the_page(browser, tmp_path):
         settled(page)
         assert not errors(page) and "craniotomy: " not in shown(page, "notesLabel")
         assert page.locator("#closeCraniotomyButton").is_disabled()
+        page.close()
+
+
+@needs_atlas
+def test_a_click_in_a_lesion_proposes_it_and_accept_lays_it_over_the_tissues(browser, tmp_path):
+    maps = with_low_grade_tumour(required(tissue_maps("mni152"), "no atlas"), CENTRE, 14.0).coarser(2)
+    image = phantom(maps, "flair", noise=0.03, bias=0.0)
+    image.mri.write(tmp_path / "flair.nii.gz")
+    image.mask.write(tmp_path / "mask.nii.gz")
+    arguments = [str(tmp_path / "flair.nii.gz"), "--contrast", "flair", "--mask", str(tmp_path / "mask.nii.gz")]
+    with serving(*arguments) as address:
+        page = opened(browser, address)
+        settled(page)
+        open_section(page, "Lesions")
+        before = shown(page, "notesLabel")
+        assert page.locator("#acceptProposalButton").is_disabled()
+        axial = views(page)[3]
+        click(page, "#pickSeedButton")
+        eventually(page, lambda: "click in the lesion" in state(page, NAMES.messages.status))
+        with heard(page):
+            page.mouse.click(*in_view(axial, 0.05, 0.1))  # beside the head
+        eventually(page, lambda: bool(errors(page)))
+        assert re.search(r"mm outside the (brain|image)", errors(page)[0]), errors(page)
+        page.evaluate("window.trame.trigger('dismiss', [0])")
+        assert shown(page, "proposalSelector") is None and shown(page, "notesLabel") == before
+        click(page, "#pickSeedButton")
+        eventually(page, lambda: "click in the lesion" in state(page, NAMES.messages.status))
+        pose_before = pose(page)
+        with heard(page):
+            page.mouse.click(*in_view(axial, 0.352, 0.507))
+        eventually(page, lambda: "proposal: tumour" in shown(page, "notesLabel"))
+        settled(page)
+        assert not errors(page) and pose(page) == pose_before and shown(page, "lesionsSelector") is None
+        drawn(page)
+        seen = picture(page, required(axial.bounding_box(), "no view"))
+        assert (seen[..., 1] - seen[..., 0] > 15).sum() > 500  # it is shown, green
+        click(page, "#acceptProposalButton")
+        eventually(page, lambda: "added over" in shown(page, "notesLabel"))
+        settled(page)
+        assert not errors(page) and page.locator("#acceptProposalButton").is_disabled()
+        assert "tumour" in [row["name"] for row in state(page, NAMES.panel.tissues)]
+        page.close()
+
+
+def test_the_workstation_finds_sheets_and_its_script_has_them(browser, tmp_path):
+    head_mri(2.0).write(tmp_path / "head.nii.gz")
+    with serving(str(tmp_path / "head.nii.gz"), "--sheets", "auto", "--no-sheet", "ependyma") as address:
+        page = opened(browser, address)
+        settled(page)
+        notes = shown(page, "notesLabel")
+        assert "sulcus: " in notes and "ependyma: " not in notes and not errors(page)
+        assert (tmp_path / "head.sheets.npz").is_file() and not shown(page, "sheetEpendymaCheckBox")
+        expected = np.asarray(Image.open(download(page, "png")))
+        assert np.array_equal(run_again(script_of(page), tmp_path), expected)
+        open_section(page, "Sheets and vessels")
+        with new_image(page):
+            click(page, "#sheetSulcusCheckBox")
+        without = np.asarray(Image.open(download(page, "png")))
+        assert not np.array_equal(without, expected)
+        assert np.array_equal(run_again(script_of(page), tmp_path), without)
         page.close()
 
 
@@ -1055,6 +1169,13 @@ def test_a_server_on_loopback_refuses_pages_of_other_sites(url):
         (["--labels", "{head}", "--contrast", "t2"], "head.nii.gz: is a label map, and --contrast is for an MRI"),
         (["--labels", "{head}", "--ct"], "head.nii.gz: is a label map, and --ct is for a CT"),
         (["{head}", "--map", "24=csf"], "--map is for a label map, expected --labels too"),
+        (["{head}", "--organs", "{head}"], "--organs is for a CT, expected --ct too"),
+        (["{head}", "--contrast", "flair", "--sheets", "auto"], "sheets are not found in contrast 'flair'"),
+        (["{head}", "--sheets", "{head}"], "head.nii.gz: expected a .vtp that `ussim segment --sheets` has written"),
+        (["{head}", "--no-sheet", "falx"], "--no-sheet leaves out some of --sheets; give --sheets, too"),
+        (["{head}", "--craniotomy", "disc:30"], "--craniotomy is disc:30, and only a brain is labelled, expected"),
+        (["{head}", "--outside", "--craniotomy", "disc:3"], "--craniotomy is 'disc:3', expected disc: and a diameter"),
+        (["{head}", "--outside", "--craniotomy", "{head}"], "head.nii.gz: has "),
     ],
 )
 def test_what_cannot_be_served_is_said_in_one_line(files, arguments, message):

@@ -11,6 +11,7 @@ import click
 
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.mri.settings import GEL_MM as GEL_MM
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from SlicerUSSim.Logic.probe import Probe
 
 NONE, AUTO, DISC = "none", "auto", "disc:"
-#: What gel bridges between skin and probe unless --contact-gap says otherwise, mm
-GEL_MM = 3.0
 
 craniotomy_option = click.option(
     "--craniotomy", default=NONE, show_default=True, metavar="none|auto|disc:MM|FILE",
@@ -62,6 +61,11 @@ class Craniotomy:
     def is_wanted(self) -> bool:
         """Whether there is an opening."""
         return self.source != NONE
+
+    @property
+    def is_file(self) -> bool:
+        """Whether the opening is that of a file."""
+        return self.is_wanted and not self.needs_pose
 
     @property
     def needs_pose(self) -> bool:

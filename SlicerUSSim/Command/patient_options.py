@@ -288,7 +288,7 @@ def _placed(
 ) -> _Placed:  # fmt: skip
     """The probe at its pose on a patient; `before` are the labels without what --add laid over them."""
     from SlicerUSSim.Logic.mri.craniotomy import default_pose, middle_of
-    from SlicerUSSim.Logic.mri.views import view_pose
+    from SlicerUSSim.Logic.mri.views import opened_view_pose, view_pose
 
     labels, names, settings = added.labels, added.tissue_names, preset.settings
     whole, at = labels, None
@@ -302,7 +302,11 @@ def _placed(
                 labels, names, preset.probe, is_open=craniotomy.is_wanted, opening_ras=at, target_ras=target
             )
         else:
-            pose = view_pose(labels, names, pose, is_open=craniotomy.is_wanted)
+            if at is None:
+                pose = view_pose(labels, names, pose, is_open=craniotomy.is_wanted)
+            else:
+                pose, line = opened_view_pose(labels, names, pose)
+                note(line)
     if at is None:
         labels = craniotomy.on(labels, names, preset.probe, pose)
     if "skin" in names and not craniotomy.is_wanted and not patient.gives_contact:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from SlicerUSSim.Command.additions import Additions, add_option, split_additions
-from SlicerUSSim.Command.mri_options import also_option, read_mri, require_other_files, split_also
+from SlicerUSSim.Command.craniotomy import Craniotomy, craniotomy_option
+from SlicerUSSim.Command.mri_options import also_option, organs_option, read_mri, require_other_files, split_also
 from SlicerUSSim.Command.options import ct_option, device_option, mask_option, parameter_option, require_no_mri_options
 from SlicerUSSim.Command.patient_options import map_option
 from SlicerUSSim.Command.progress import note
@@ -22,7 +23,8 @@ from SlicerUSSim.Command.sequence_options import (
     to_mri_option,
     transform_option,
 )
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Command.sheets import AUTO, NONE, DrawnSheets, drawn_sheets_option, no_sheet_option
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
 if TYPE_CHECKING:
@@ -47,6 +49,10 @@ _PORT = 8080
 @mask_option
 @also_option
 @add_option
+@organs_option
+@craniotomy_option
+@drawn_sheets_option
+@no_sheet_option
 @click.option("--port", type=click.IntRange(0, 65535), help=f"Port (default: {_PORT}, or a free one if it is taken).")
 @click.option(
     "--host",
@@ -77,6 +83,10 @@ def serve(
     mask: str | None,
     also: tuple[str, ...],
     additions: tuple[str, ...],
+    organs: str | None,
+    craniotomy: str,
+    sheets: str,
+    no_sheets: tuple[str, ...],
     port: int | None,
     host: str,
     igtl: str | None,
@@ -90,7 +100,9 @@ def serve(
     if len(others) > 1:
         raise SimulationError(f"--also is given {len(others)} times, expected one further MRI in the workstation")
     require_other_files(mri, others)
-    files = [file for file in (mri, labels, mask, *(file for _, file in added), *others.values()) if file is not None]
+    files = [
+        file for file in (mri, labels, mask, organs, *(file for _, file in added), *others.values()) if file is not None
+    ]
     # Checked here, so that the error is reported in the terminal and not on the page.
     for file in files:
         if not Path(file).exists():
@@ -98,7 +110,7 @@ def serve(
     if maps:
         from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
 
-        if labels is None:
+        if labels is None and organs is None:
             raise SimulationError("--map is for a label map, expected --labels too")
         LabelMapping.of(maps)
     if labels is not None and mri is None:
@@ -113,6 +125,15 @@ def serve(
         require_findable(contrast, skull_strip, mask is not None)
         if mri is None:
             raise SimulationError("--outside is for a whole head, expected an MRI of one; the demo brain has no head")
+    require(organs is None or contrast == CT, "--organs is for a CT, expected --ct too")
+    drawn = DrawnSheets.of(sheets, no_sheets, is_labels=labels is not None, contrast=contrast)
+    opening = Craniotomy.of(craniotomy)
+    require(
+        not opening.is_wanted or labels is not None or outside,
+        f"--craniotomy is {craniotomy}, and only a brain is labelled, expected --outside too",
+    )
+    if opening.is_file:
+        _require_opening(opening.source)
     if contrast == CT and others:
         raise SimulationError("--also is for an MRI, and the contrast is ct (--ct); leave it out")
     if igtl is not None:
@@ -146,20 +167,37 @@ def serve(
     to_ras = read_to_mri(to_mri) if to_mri else None
 
     _prepare_libraries()
+    from SlicerUSSim.Logic.mri.settings import SheetSettings
     from SlicerUSSim.Workstation.opener import Files
     from SlicerUSSim.Workstation.workstation import Workstation
 
+    sheet_settings = SheetSettings()
+    if sheets != NONE:
+        sheet_settings = SheetSettings.of_kinds(drawn.kinds, find=sheets == AUTO)
     workstation = Workstation(
         Files(
             mri=mri, labels=labels, maps=maps, contrast=contrast, mask=mask, skull_strip=skull_strip, outside=outside,
             also=others,
-            additions=masks, preset=chosen_preset,
+            additions=masks, organs=organs, sheets=None if drawn.read is None else sheets,
+            sheet_settings=sheet_settings,
+            craniotomy=opening.source, craniotomy_mm=opening.diameter_mm, preset=chosen_preset,
             sequence=tracked, sequence_name=Path(sequence).name.split(".")[0] if sequence else "", transform=transform,
             to_ras=to_ras, tracker=igtl, tracker_device=igtl_device, volumes=volumes,
         ),
         device,
     )  # fmt: skip
     _run(workstation.server, host, port)
+
+
+def _require_opening(path: str) -> None:
+    """Raise SimulationError for a file of --craniotomy that is neither a mask nor a polygon."""
+    from SlicerUSSim.Logic.base.volume import Volume
+    from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
+
+    if Path(path).suffix.lower() == ".json":
+        polygon_of_file(path)
+    else:
+        is_open(Volume.read(path), path)
 
 
 def _require_workstation() -> None:

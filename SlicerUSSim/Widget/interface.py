@@ -34,6 +34,10 @@ class PanelView(Protocol):
         """The vtkMRMLSliceNode of the selected slice view, or None."""
         ...
 
+    def pickPoint(self, points_node: Any, picked: Callable[[], None]) -> None:
+        """Let the user show a point in a view; it becomes the last of a markups node, then `picked` is called."""
+        ...
+
     def showChart(self, chart_node) -> None:
         """Show a vtkMRMLPlotChartNode in the plot view."""
         ...

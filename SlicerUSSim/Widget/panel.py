@@ -12,7 +12,7 @@ from typing import Any
 import qt
 import slicer
 
-from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, required
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Widget.controls import Control, by_widget, part_of, shown_by, usable
@@ -49,6 +49,7 @@ class Panel:
         self._cancelled = False
         self._rows: list[TissueRow] = []
         self._blinking = False
+        self._picking: tuple[Any, int] | None = None  # markups node and observer
         #: Controls with their widgets
         self._controls = [(control, getattr(self.ui, name)) for name, control in by_widget(sections).items()]
         #: Actions of buttons that use widgets or dialogs of the panel
@@ -76,6 +77,26 @@ class Panel:
         if not self.presenter.value("scene.show_in_slice"):
             return None
         return next((node for node in self._slice_nodes() if node.GetLayoutName() == wanted), None)
+
+    def pickPoint(self, points_node, picked: Callable[[], None]) -> None:
+        """Slicer's mouse mode for placing one control point; the next point ends it."""
+        markups = getattr(getattr(slicer, "modules", None), "markups", None)  # missing without a main window
+        markups = required(markups, f"place a point of {points_node.GetName()!r}, and press Propose at point")
+        self._stop_picking()
+        tag = points_node.AddObserver(points_node.PointPositionDefinedEvent, lambda *_: self._picked(picked))
+        self._picking = points_node, tag
+        markups.logic().SetActiveList(points_node)
+        markups.logic().StartPlaceMode(False)
+
+    def _picked(self, picked: Callable[[], None]) -> None:
+        self._stop_picking()
+        qt.QTimer.singleShot(0, picked)  # after the markups have done with their event
+
+    def _stop_picking(self) -> None:
+        if self._picking is not None:
+            node, tag = self._picking
+            node.RemoveObserver(tag)
+            self._picking = None
 
     def showChart(self, chart_node) -> None:
         plots = getattr(getattr(slicer, "modules", None), "plots", None)  # missing if Slicer runs without a main window

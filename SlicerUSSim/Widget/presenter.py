@@ -18,8 +18,10 @@ from typing import Any
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, required, user_message
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
+from SlicerUSSim.Logic.mri.settings import GEL_MM
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
+from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
 from SlicerUSSim.Logic.probe.arrays import PROBES
 from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
 from SlicerUSSim.Logic.tissue.names import same_name
@@ -35,6 +37,10 @@ from SlicerUSSim.Widget.sections import CUSTOM_PROBE, SHOWN_PROBES
 _CHECK = "Check: "
 #: Begin of the line about an opening
 _OPENED = "craniotomy: "
+#: Begin of the line about a standard view
+_VIEW = "view: "
+#: Begin of the lines about a proposal
+_PROPOSED = "proposal: "
 _BUSY = "Wait until the work under way is done"
 #: Columns of the tissue table: parameter, heading, tool tip.
 TISSUE_COLUMNS = tuple(
@@ -73,6 +79,8 @@ class PanelPresenter:
         self._labels_said: str | None = None  # ID of the labels that the notes are about
         #: File in which the brain mask of an MRI node is kept beside the MRI's; None: in the scene only
         self.maskFile: Callable[[Any], Path | None] = lambda mri_node: None
+        #: The same of the sheets that were found in it
+        self.sheetsFile: Callable[[Any], Path | None] = lambda mri_node: None
         self._busy = False
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
@@ -227,11 +235,19 @@ class PanelPresenter:
                 self.setNotes()
             told = self._forget_other_brain(mri) + self._closed_again()
             others, untold = self._second_mri()
-            with self._replaceable(f"{mri.GetName()} tissues", mri) as labels:
+            kinds = parameters.sheet.kinds if parameters.sheet.find else ()
+            own_sheets = parameters.sheets if kinds and self._are_own_sheets() else None
+            with (
+                self._made(own_sheets, "Model", f"{mri.GetName()} sheets", wanted=bool(kinds)) as sheets,
+                self._replaceable(f"{mri.GetName()} tissues", mri) as labels,
+            ):
                 result = self.logic.segment(
-                    mri, labels, mask_node=parameters.mask, others=others, lesions_node=parameters.lesions,
-                    keep_mask_at=self.maskFile(mri), progress=progress, **asdict(parameters.segmentation),
+                    mri, labels, mask_node=parameters.mask, others=others, organs_node=parameters.organs,
+                    lesions_node=parameters.lesions, sheets=kinds, sheets_node=sheets,
+                    keep_mask_at=self.maskFile(mri), keep_sheets_at=self.sheetsFile(mri), progress=progress,
+                    **asdict(parameters.segmentation),
                 )  # fmt: skip
+            told += self._take_sheets(sheets)
             self._notes_of, self._checks = mri.GetID(), _checks(result.warnings)
             if (
                 parameters.mask is None
@@ -242,6 +258,28 @@ class PanelPresenter:
                 told.append(f"the brain mask is {brain.GetName()!r}, which Segment uses from now on; edit it as needed")
             self._notes += [*told, *untold]
         self.view.refresh()
+
+    def _are_own_sheets(self) -> bool:
+        """Whether the chosen sheets are of Segment, and not those that a user loaded."""
+        chosen = self.logic.parameters.sheets
+        return chosen is not None and self.logic.mayReplaceResult(chosen)
+
+    def _take_sheets(self, found: Any) -> list[str]:
+        """Choose the sheets that Segment found, or none in place of those of an earlier Segment; a line about it."""
+        parameters = self.logic.parameters
+        before: Any = parameters.sheets
+        if found is not None:
+            parameters.sheets = found
+            lines = [f"images show the sheets in {found.GetName()!r}"]
+            if before not in (None, found):
+                lines.append(f"{before.GetName()!r} was loaded by others and is kept, but not shown any more")
+            return lines
+        if before is None:
+            return []
+        if self._are_own_sheets():
+            parameters.sheets = None
+            return [f"the sheets in {before.GetName()!r}, of an earlier Segment, are not shown any more"]
+        return [f"images show the sheets in {before.GetName()!r}"]
 
     def _forget_other_brain(self, mri: Any) -> list[str]:
         """Deselect the mask that Segment extracted from another MRI; a line about it."""
@@ -289,6 +327,103 @@ class PanelPresenter:
                 self.logic.addTissues(before, parameters.lesions, labels)
             self._notes += self._checks
 
+    # ---- lesions that are proposed -----------------------------------------------------------------------------
+
+    def canPropose(self) -> tuple[bool, str]:
+        """(whether lesions can be proposed on the MRI, the reason if not)"""
+        can, why_not = self.canSegment()
+        if not can:
+            return can, why_not
+        if not self.logic.proposals.knows(self.logic.parameters.mri):
+            return False, "Segment this MRI first"
+        return True, ""
+
+    def canProposeAtPoint(self) -> tuple[bool, str]:
+        """(whether a lesion can be proposed at the point, the reason if not)"""
+        can, why_not = self.canPropose()
+        if can and self.logic.parameters.seed is None:
+            return False, "Choose a point in the lesion"
+        return can, why_not
+
+    def canAccept(self) -> tuple[bool, str]:
+        """(whether there is a proposal to accept or discard, the reason if not)"""
+        if self._busy:
+            return False, _BUSY
+        if self.logic.parameters.proposal is None:
+            return False, "There is no proposal"
+        return True, ""
+
+    def pickSeed(self) -> None:
+        """Let the user show a point in the lesion in a view; then propose the lesion there."""
+        parameters = self.logic.parameters
+        with self.shown():
+            require(parameters.mri is not None, "no MRI chosen, expected the one with the lesion")
+            require(self.logic.proposals.knows(parameters.mri), "segment this MRI first")
+            if parameters.seed is None:
+                parameters.seed = self._add("MarkupsFiducial", "Lesion")
+            self.view.pickPoint(parameters.seed, self.proposeAtPoint)
+        self.view.refresh()
+
+    def proposeAtPoint(self) -> None:
+        """Propose the lesion around the last point of the chosen markups; nothing else is changed."""
+        parameters = self.logic.parameters
+        with self.shown(), self.working("Propose lesion"):
+            tissue = None if parameters.panel.lesion_as == BY_LOOK else parameters.panel.lesion_as
+            seed = required(parameters.seed, "no point chosen, expected one in the lesion")
+            self._show_proposal(self.logic.proposals.growFrom(parameters.mri, seed, tissue))
+        self.view.refresh()
+
+    def proposeLesions(self) -> None:
+        """Propose what looks like lesions in the MRI, without a point; nothing else is changed."""
+        with self.shown(), self.working("Propose lesions"):
+            self._show_proposal(self.logic.proposals.propose(self.logic.parameters.mri))
+        self.view.refresh()
+
+    def _show_proposal(self, node: Any) -> None:
+        """Choose a proposal, or none, and say what it is."""
+        proposals = self.logic.proposals
+        self.logic.parameters.proposal = node
+        if node is not None and display_of(node) is not None:
+            display_of(node).SetVisibility(True)
+        self._forget_proposal()
+        self._notes += [f"{_PROPOSED}{line}" for line in (*proposals.notes, *_checks(proposals.warnings))]
+        if node is not None:
+            self._notes.append(
+                f"{_PROPOSED}look at {node.GetName()!r} over the MRI, correct it, and accept or discard it"
+            )
+
+    def _forget_proposal(self) -> None:
+        self._notes = [line for line in self._notes if not line.startswith(_PROPOSED)]
+
+    def acceptProposal(self) -> None:
+        """Move what is proposed, as it was corrected, to the lesions, and lay these over the tissues."""
+        with self.shown():
+            self.takeProposal()
+        self.view.refresh()
+
+    def takeProposal(self) -> None:
+        """As acceptProposal, but raises errors."""
+        parameters = self.logic.parameters
+        proposal: Any = required(parameters.proposal, "there is no proposal")
+        with self._made(parameters.lesions, "Segmentation", "Lesions") as lesions:
+            self.logic.proposals.confirm(proposal, lesions)
+        parameters.lesions, parameters.proposal = lesions, None
+        self._forget_proposal()
+        if parameters.labels is not None:
+            self.layLesions()
+
+    def discardProposal(self) -> None:
+        """Remove a proposal; nothing else is changed."""
+        parameters = self.logic.parameters
+        with self.shown():
+            proposal = required(parameters.proposal, "there is no proposal")
+            parameters.proposal = None
+            self.logic.scene.RemoveNode(proposal)
+            self._forget_proposal()
+        self.view.refresh()
+
+    # ---- craniotomy --------------------------------------------------------------------------------------------
+
     def openCraniotomy(self) -> None:
         """Open skin and skull under the probe, or where the chosen node says, in labels of their own.
 
@@ -326,7 +461,16 @@ class PanelPresenter:
 
     def notes(self) -> str:
         """What the last segmentation or addition did, and what a user should check, in lines."""
-        return "\n".join(self._notes)
+        return "\n".join([*self._notes, *self._gel()])
+
+    def _gel(self) -> list[str]:
+        """A line about gel on the skin, if the chosen tissues have it by default."""
+        labels = self.logic.parameters.labels
+        try:
+            is_there = labels is not None and self.logic.settings(labels) != self._preset().settings
+        except SimulationError:  # an empty node, or unknown names: the error is shown by simulate()
+            return []
+        return [f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (Gel on the skin)"] if is_there else []
 
     def setNotes(self, *lines: str) -> None:
         """Replace them by lines about another patient, whose labels are chosen; by none, to forget them."""
@@ -346,7 +490,9 @@ class PanelPresenter:
         """Place the probe where the chosen standard view is seen from; create its transform if needed."""
         with self.shown():
             require(self.logic.parameters.labels is not None, "no label map chosen, expected one to put the probe on")
-            self._put_probe(view=self.logic.parameters.panel.view)
+            line = self._put_probe(view=self.logic.parameters.panel.view)
+            self._notes = [known for known in self._notes if not known.startswith(_VIEW)]
+            self._notes += [f"{_VIEW}{line}"] if line else []
         self.view.refresh()
 
     def simulate(self) -> None:
@@ -470,15 +616,16 @@ class PanelPresenter:
             self._notes.append(f"{chosen.GetName()!r} has data of others and is kept; the result is {node.GetName()!r}")
         return node
 
-    def _put_probe(self, slice_node=None, view: str | None = None) -> None:
-        """Place the probe's transform, or a new one if none is selected."""
+    def _put_probe(self, slice_node=None, view: str | None = None) -> str:
+        """Place the probe's transform, or a new one if none is selected; a line about it, as placeProbe returns."""
         parameters = self.logic.parameters
         with self._made(parameters.probe_transform, "LinearTransform", "Probe") as probe:
-            self.logic.placeProbe(parameters.labels, probe, slice_node, view=view)
+            line = self.logic.placeProbe(parameters.labels, probe, slice_node, view=view)
         parameters.probe_transform = probe
         display = display_of(probe)
         if display is not None:
             display.SetEditorVisibility(self._handles)
+        return line
 
     def _live_nodes(self) -> tuple:
         nodes = self.logic.parameters
@@ -511,9 +658,9 @@ class PanelPresenter:
             )
 
     @contextmanager
-    def _made(self, node: Any, kind: str, name: str) -> Iterator[Any]:
-        """`node`, or a new one, which is removed if an exception is raised."""
-        made = node is None
+    def _made(self, node: Any, kind: str, name: str, *, wanted: bool = True) -> Iterator[Any]:
+        """`node`, or a new one, which is removed if an exception is raised; None if none is wanted."""
+        made = node is None and wanted
         if made:
             node = self._add(kind, name)
         try:

@@ -28,6 +28,8 @@ def panel_sections() -> tuple[Section, ...]:
     """The sections in order."""
     return (
         Section("Inputs", True, _inputs()),
+        Section("Sheets and vessels", False, _sheets()),
+        Section("Lesions", False, _lesions()),
         Section("Probe", True, _probe()),
         Section("Craniotomy", False, _craniotomy()),
         Section("Ultrasound", True, (*_of_preset("display"), *values(*_CONSOLE))),
@@ -55,6 +57,11 @@ def _inputs() -> tuple[Row, ...]:
         value("scene.second_contrast"),
         *_of_scene(SceneParameters.segmentation),
         node(
+            "organs", "Organs of a CT",
+            "Label map or segmentation of organs of a CT (contrast ct), such as TotalSegmentator's, on any grid: its "
+            "soft tissues replace muscle and blood",
+        ),
+        node(
             "labels", "Tissues",
             "Segmentation or label map of the tissues: the output of Segment, or your own with names of tissues "
             "(csf, grey matter, white matter, tumour, blood, skull, ...)", new_node="Tissues",
@@ -80,6 +87,49 @@ def _inputs() -> tuple[Row, ...]:
             ),
         ),
         Control("notes", "words", tip="What was found in the MRI, what was done, and what to check", shows="notes"),
+    )  # fmt: skip
+
+
+def _sheets() -> tuple[Row, ...]:
+    return (
+        *_of_scene(SceneParameters.sheet),
+        node(
+            "sheets", "Sheets",
+            "Model of the thin sheets that images show: those that Segment found, or a .vtp of ussim segment --sheets; "
+            "none: the lines of the labels",
+        ),
+    )  # fmt: skip
+
+
+def _lesions() -> tuple[Row, ...]:
+    return (
+        node(
+            "seed", "Point", "Markups whose last point lies in the lesion", new_node="Lesion",
+        ),
+        value("scene.lesion_as"),
+        (
+            button(
+                "pickSeed", "Show the point",
+                "Then click in the lesion, in a slice view: the lesion around it is proposed", enabled="canPropose",
+            ),
+            button(
+                "proposeAtPoint", "Propose at point",
+                "Propose the lesion around the point; the tissues stay as they are",
+                enabled="canProposeAtPoint",
+            ),
+            button(
+                "proposeLesions", "Propose all",
+                "Propose what looks like a lesion, without a point; the tissues stay as they are", enabled="canPropose",
+            ),
+        ),
+        node("proposal", "Proposal", "Segmentation with what is proposed; correct it as needed"),
+        (
+            button(
+                "acceptProposal", "Accept", "Move the proposal to the lesions, and lay them over the tissues",
+                enabled="canAccept",
+            ),
+            button("discardProposal", "Discard", "Remove the proposal", enabled="canAccept"),
+        ),
     )  # fmt: skip
 
 
@@ -115,6 +165,7 @@ def _probe() -> tuple[Row, ...]:
             value("scene.view"),
         ),
         value("scene.show_in_slice"),
+        value("scene.gel"),
     )  # fmt: skip
 
 

@@ -28,6 +28,7 @@ class Buttons:
         self._own_actions: dict[str, Callable[[], None]] = {
             "segmentButton": loading.segment,
             "addTissuesButton": loading.add_tissues,
+            "acceptProposalButton": loading.accept_proposal,
             "openCraniotomyButton": loading.open_craniotomy,
             "closeCraniotomyButton": loading.close_craniotomy,
             "placeButton": loading.place_probe,

@@ -18,11 +18,12 @@ from vtkmodules.vtkCommonCore import vtkOutputWindow
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose
-from SlicerUSSim.Workstation.opener import Opener
-from SlicerUSSim.Workstation.script import python_script
+from SlicerUSSim.Workstation.opener import FILE, Opener
+from SlicerUSSim.Workstation.script import LabelSource, python_script
 
 #: File formats of an image with its geometry.
 FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
@@ -109,7 +110,31 @@ class Exports:
         in_labels, moved = pose_in_labels(labels, probe_pose(transform))
         require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
         names = read_labels(labels, preset.tissues).names
-        return python_script(source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels)
+        return python_script(
+            source,
+            replace(preset, tissues=preset.tissues.for_names(names), settings=self._logic.settings(labels)),
+            in_labels,
+            self._shown_sheets(source),
+        )
+
+    def _shown_sheets(self, source: LabelSource) -> tuple[str, ...] | str:
+        """Kinds of the sheets of Segment that the image shows, or the file with them; () without.
+
+        Raises SimulationError for sheets that are neither.
+        """
+        node, kinds = self._logic.parameters.sheets, self._logic.parameters.sheet.kinds
+        drawn = tuple(kind for kind in KINDS if kind in kinds)
+        if node is None or not drawn:
+            return ()
+        file = node.GetAttribute(FILE)
+        if file and drawn == KINDS:
+            return file
+        require(
+            not file and set(drawn) <= set(source.sheets),
+            f"the image shows sheets of {node.GetName()!r} that the script cannot make, expected those of the last "
+            "Segment, or all of a file",
+        )
+        return drawn
 
 
 def scene_file(app: SlicerApp) -> bytes:

@@ -79,6 +79,16 @@ class ProbeHand:
         self._last_press = (0.0, np.zeros(2))
         self._body = vtkStaticCellLocator()
         self._probe: Probe | None = None
+        self._picked: Callable[[np.ndarray | None], None] | None = None
+
+    def pick(self, picked: Callable[[np.ndarray | None], None] | None) -> None:
+        """Call a function with the point, (3,) in the world, of the next click in a slice view.
+
+        It is called with None if Escape is pressed, or another function takes its place; None: no other one.
+        """
+        before, self._picked = self._picked, picked
+        if before is not None:
+            before(None)
 
     def set_probe(self, probe: Probe) -> None:
         """Use the body of another probe for picking."""
@@ -91,6 +101,9 @@ class ProbeHand:
     def key(self, name: str, fast: bool = False) -> bool:
         """Apply the action of a key. Returns False if the key has none or there is no probe."""
         pose, surface = self._pose(), self._surface()
+        if name == "Escape" and self._picked is not None:
+            self.pick(None)
+            return True
         if name not in KEYS or pose is None:
             return False
         kind, values = KEYS[name]
@@ -140,6 +153,10 @@ class ProbeHand:
         observe(vtkCommand.LeftButtonReleaseEvent, self._released)
 
     def _pressed(self, view: AbstractView) -> bool:
+        if self._picked is not None and isinstance(view, SliceView):
+            picked, self._picked = self._picked, None
+            picked(_in_slice(view, np.array(view.interactor().GetEventPosition(), float)))
+            return True
         pose = self._pose()
         if pose is None:
             return False

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from trame_slicer.core import SlicerApp
 
-from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm
@@ -27,7 +27,7 @@ from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.opener import Files, Opener
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.script import LabelSource
-from SlicerUSSim.Workstation.state import SharedState
+from SlicerUSSim.Workstation.state import ORGANS, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 
 #: Farther from the volume of another patient's tissues, a probe is placed anew
@@ -71,6 +71,11 @@ class Loading:
             for contrast, path in list(files.also.items())[:1]:  # the panel has one
                 parameters.second_mri = self._opener.second_mri(path)
                 parameters.panel = replace(parameters.panel, second_contrast=contrast)
+            if files.organs is not None:
+                self._take_organs(*self._opener.organs(files.organs, files.maps))
+            parameters.sheet = files.sheet_settings
+            if files.sheets is not None:
+                parameters.sheets = self._opener.sheets(files.sheets)
             for tissue, path in files.additions:
                 parameters.lesions = self._opener.lesion_of_file(parameters.lesions, tissue, path)
             if files.labels is not None:
@@ -79,6 +84,7 @@ class Loading:
                     self.add_tissues()
             else:
                 self.segment()
+            self._open_at_start(files)
             if files.sequence is not None:
                 self._take_sequence(files.sequence, files.sequence_name)
 
@@ -96,10 +102,12 @@ class Loading:
                 self._logic.preset = Preset.read(path)
             elif kind == "sequence":
                 self._take_sequence(self._tasks.do(lambda: TrackedSequence.read(path)), Path(path).name.split(".")[0])
+            elif kind == "sheets":
+                self._logic.parameters.sheets = self._opener.sheets(path)
             elif kind == "labels":
                 node, found = self._opener.labels(path, upload.table)
                 self._messages.clear()
-                self._logic.parameters.lesions, self._is_new = None, True
+                self._forget_patient()
                 self._take_labels(node, found)
             else:
                 node = self._opener.mri(path)
@@ -109,6 +117,11 @@ class Loading:
 
     def add(self, name: str, content: bytes, tissue: str) -> None:
         """Add a mask sent by a page to the lesions, and lay them over the tissues."""
+        if tissue == ORGANS:
+            with self._presenter.shown(), self._opener.uploaded({name: content}) as upload:
+                require(upload.kind == "labels", f"{name} is no label map, expected one of organs")
+                self._take_organs(*self._opener.organs(upload.path))
+            return
         with self._presenter.shown(), self._opener.uploaded_mask(name, content) as volume:
             self._lay(volume, tissue, name)
 
@@ -120,15 +133,22 @@ class Loading:
         inputs = parameters.mri, mask, asdict(parameters.segmentation)
         contrast = parameters.panel.second_contrast
         others = {} if parameters.second_mri is None or contrast == "none" else {contrast: parameters.second_mri}
-        lesions = parameters.lesions
+        lesions, organs = parameters.lesions, parameters.organs
+        kinds = parameters.sheet.kinds if parameters.sheet.find else ()
         if self._changed(self._presenter.segment):
-            self._opener.segmented(parameters.labels, *inputs, others, lesions)
+            self._opener.segmented(parameters.labels, *inputs, others, lesions, kinds, organs)
             self._labels_ready()
 
     def add_tissues(self) -> None:
         """Lay the lesions over the tissues."""
         source, patient = self._opener.known_source(self._logic.parameters.labels), self._opener.patient()
         if self._changed(self._presenter.addTissues):
+            self._laid(source, patient)
+
+    def accept_proposal(self) -> None:
+        """Move what is proposed to the lesions, and lay them over the tissues."""
+        source, patient = self._opener.known_source(self._logic.parameters.labels), self._opener.patient()
+        if self._changed(self._presenter.acceptProposal):
             self._laid(source, patient)
 
     def open_craniotomy(self) -> None:
@@ -144,6 +164,20 @@ class Loading:
                 disc = diameter, pose
             self._opener.opened(source, patient, parameters.labels, disc)
             self._labels_ready()
+
+    def _open_at_start(self, files: Files) -> None:
+        """Open what --craniotomy asks for, and place the probe on the brain in it, as commands do."""
+        parameters: Any = self._logic.parameters
+        if files.craniotomy == "none" or parameters.labels is None:
+            return
+        parameters.panel = replace(parameters.panel, craniotomy_mm=files.craniotomy_mm)
+        if files.craniotomy not in ("auto", "disc:"):
+            parameters.opening = self._opener.opening(files.craniotomy)
+            self.open_craniotomy()
+            self.place_probe()
+            return
+        self._logic.placeProbe(parameters.labels, parameters.probe_transform, will_open=True)
+        self.open_craniotomy()
 
     def close_craniotomy(self) -> None:
         """Go back to the labels without the opening."""
@@ -226,13 +260,24 @@ class Loading:
         parameters.mri = parameters.mask = parameters.second_mri = None
         return [f"Check: the MRI {name} was deselected: its intensities do not follow the labels (of another patient?)"]
 
+    def _take_organs(self, node: Any, found: LabelledTissues) -> None:
+        """Choose the label map of organs of a CT, which Segment uses."""
+        self._logic.parameters.organs = node
+        self._presenter.setNotes(f"{node.GetName()}: {found.message}; Segment uses it with the contrast ct")
+
+    def _forget_patient(self) -> None:
+        """Deselect what is of the patient before, when another one is opened."""
+        parameters = self._logic.parameters
+        parameters.lesions = parameters.organs = parameters.sheets = parameters.seed = parameters.proposal = None
+        self._is_new = True
+
     def _take_mri(self, node: Any) -> None:
         parameters = self._logic.parameters
         self._logic.stopLiveUpdate()  # until the new MRI is segmented
         parameters.mri, parameters.labels, parameters.mask = node, None, None
-        parameters.second_mri = parameters.lesions = None  # of the patient before
+        parameters.second_mri = None
+        self._forget_patient()
         self._presenter.setNotes()
-        self._is_new = True
         self.show_title()
         self._views.show_volume(node)
 

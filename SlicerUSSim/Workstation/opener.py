@@ -17,9 +17,13 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import SECTIONS, Preset
+from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
 from SlicerUSSim.Logic.mri.kept_mask import mask_beside
 from SlicerUSSim.Logic.mri.masks import with_label_names
 from SlicerUSSim.Logic.mri.samples import demo_mri
+from SlicerUSSim.Logic.mri.settings import SheetSettings
+from SlicerUSSim.Logic.mri.sheets.kept import sheets_beside
+from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, read_surfels
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
@@ -57,6 +61,14 @@ class Files:
     skull_strip: str = "auto"
     #: Whether skin, scalp, skull and air are labelled, too
     outside: bool = False
+    #: Label map of organs of a CT
+    organs: str | None = None
+    #: A .vtp with thin sheets; and what Segment looks for, and images show
+    sheets: str | None = None
+    sheet_settings: SheetSettings = field(default_factory=SheetSettings)
+    #: Opening of skin and skull: none, auto or disc: (under the probe), or a file; and the diameter of the disc
+    craniotomy: str = "none"
+    craniotomy_mm: float | None = None
     #: {contrast: file} of further MRIs of the patient; the first is selected
     also: Mapping[str, str] = field(default_factory=dict)
     #: (tissue, file) of masks that are laid over the labels
@@ -127,6 +139,27 @@ class Opener:
         path = None if self._files.mri is None else os.path.abspath(self._files.mri)
         return mask_beside(path) if path is not None and mri_node.GetAttribute(FILE) == path else None
 
+    def sheets_file(self, mri_node) -> Path | None:
+        """The same of the sheets that were found in it."""
+        kept = self.mask_file(mri_node)
+        return None if kept is None else sheets_beside(os.path.abspath(str(self._files.mri)))
+
+    def sheets(self, path: str):
+        """A model node with the sheets of a .vtp."""
+        surfels = self._tasks.do(lambda: read_surfels(path))
+        node = self._scene.AddNewNodeByClass("vtkMRMLModelNode", Path(path).name)
+        node.SetAndObservePolyData(as_polydata(surfels))
+        node.SetAttribute(FILE, self._place(path))
+        display_of(node).SetVisibility(False)
+        return node
+
+    def organs(self, path: str, maps: Iterable[str] = ()) -> tuple[Any, LabelledTissues]:
+        """(label map node with the organs of a CT, what was recognised) of a file."""
+        volume, table = self._volume(path), TissueTable({})
+        mapping = LabelMapping.of(maps, table)
+        found = self._tasks.do(lambda: read_label_file(Path(path), volume, mapping, default=table, advice=PAGE))
+        return self._label_map(found.labels, path, found.names), replace(found, message=self._as_known(found.message))
+
     def second_mri(self, path: str):
         """A volume node with a further MRI of the patient."""
         node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", Path(path).name)
@@ -137,6 +170,16 @@ class Opener:
     def mask(self, path: str):
         """A label map node with the mask of a file."""
         return self._label_map(self._volume(path), path, ["inside"])
+
+    def opening(self, path: str):
+        """A node with the opening of a file: a closed curve through the points of a .mrk.json, or a mask."""
+        if not _is_json(Path(path)):
+            return self._label_map(is_open(self._volume(path), path), path, ["opening"])
+        node = self._scene.AddNewNodeByClass("vtkMRMLMarkupsClosedCurveNode", Path(path).name)
+        for point in polygon_of_file(path):
+            node.AddControlPointWorld(*point)
+        node.SetAttribute(FILE, self._place(path))
+        return node
 
     def labels(self, path: str, table: LabelTable | None = None) -> tuple[Any, LabelledTissues]:
         """(label map node, what was recognised) of a file; see label_sources.read_label_file.
@@ -214,16 +257,20 @@ class Opener:
         return self._lesion_files.get(_segments_of(lesions_node))
 
     def segmented(
-        self, labels_node, mri_node, mask_node, options: dict, others: Mapping[str, Any], lesions_node
-    ) -> None:
-        """Record the source of labels that Segment made, from these nodes and {contrast: node}, with the lesions."""
+        self, labels_node, mri_node, mask_node, options: dict, others: Mapping[str, Any], lesions_node,
+        sheets: tuple[str, ...] = (), organs_node=None,
+    ) -> None:  # fmt: skip
+        """Record the source of labels that Segment made, from these nodes and {contrast: node}, with the lesions.
+
+        `sheets` are the kinds that were looked for. Labels with organs have no source.
+        """
         labels_node.SetAttribute(PATIENT, mri_node.GetName())
         file, mask = mri_node.GetAttribute(FILE), None if mask_node is None else _file_of(mask_node)
         self._sources = {}
         additions = self.lesion_files(lesions_node)
-        if file is not None and additions is not None:
+        if file is not None and additions is not None and organs_node is None:
             files = {contrast: _file_of(node) for contrast, node in others.items()}
-            source = LabelSource(file, mask=mask, options=options, others=files, additions=additions)
+            source = LabelSource(file, mask=mask, options=options, others=files, additions=additions, sheets=sheets)
             self._sources[_voxels_of(labels_node)] = source
 
     def added(self, source: LabelSource | None, patient: str, labels_node, lesions_node) -> None:
@@ -315,6 +362,8 @@ class Opener:
         name = path.name.lower()
         if name.endswith(".json"):
             return "preset"
+        if name.endswith(".vtp"):
+            return "sheets"
         if ".igs." in name or ".seq." in name:
             return "sequence"
         volume = self._volumes[str(path)] = self._volume(str(path))

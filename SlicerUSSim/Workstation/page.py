@@ -20,7 +20,7 @@ from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
 from SlicerUSSim.Widget.controls import Control, Section
 from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS
-from SlicerUSSim.Workstation.state import NAMES, PLANES, SLICE_VIEWS, ComparisonMode
+from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode
 
 _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
@@ -139,10 +139,11 @@ def _drawer(sections: tuple[Section, ...]) -> None:
 
 def _open_file() -> None:
     v3.VFileInput(
-        label="Open an MRI, label map (with its table) or tracked sequence", v_model=(NAMES.opened_file, None),
-        multiple=True, density="compact", hide_details=True, variant="outlined", id="open-file", classes="mb-1",
+        label="Open an MRI, label map (with its table), tracked sequence or sheets (.vtp)",
+        v_model=(NAMES.opened_file, None), multiple=True, density="compact",
+        hide_details=True, variant="outlined", id="open-file", classes="mb-1",
     )  # fmt: skip
-    options = "".join(f'<option value="{name}">{_LESION_TEXTS.get(name, name)}</option>' for name in LESIONS)
+    options = "".join(f'<option value="{name}">{_LESION_TEXTS.get(name, name)}</option>' for name in (*LESIONS, ORGANS))
     html.Div(
         f"""<label for="added-as">Add a mask as</label>
         <select id="added-as" v-model="{NAMES.added_as}">{options}</select>""",

@@ -26,6 +26,9 @@ _RATE, _STATUS_EVERY_S = "images per second", 1.0
 _CURVE_POINTS = 150
 
 
+_CLICK = "click in the lesion, in a slice view (Escape: not)"
+
+
 class BrowserPanel:
     """The view of one PanelPresenter on the pages, as Widget/panel.py is in Slicer.
 
@@ -49,6 +52,8 @@ class BrowserPanel:
         self._about_to_compute = about_to_compute
         self._controls = by_widget(sections)
         self._thread = threading.get_ident()
+        #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
+        self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
         self._cancelled = False
         self._status, self._status_until = "", 0.0
         self._table: Any = None  # vtkMRMLTableNode with the costs of a fit
@@ -83,6 +88,19 @@ class BrowserPanel:
     def sliceNode(self) -> None:
         """None: anatomy.py aligns the slice views with the probe."""
         return None
+
+    def pickPoint(self, points_node: Any, picked: Callable[[], None]) -> None:
+        """The next click in a slice view is the point."""
+
+        def clicked(point_world: np.ndarray | None) -> None:
+            self.showStatus("")
+            if point_world is None:
+                return
+            points_node.AddControlPointWorld(*point_world.tolist())
+            self._tasks.start(picked)
+
+        self.pick(clicked)
+        self.showStatus(_CLICK)
 
     def showChart(self, chart_node: Any) -> None:
         """Draw the costs in the table of a chart, and update the curve when the table changes."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pprint import pformat
 from textwrap import indent
@@ -29,7 +29,7 @@ preset = Preset.from_dict(
 )
 probe_to_ras = np.array({pose})
 
-simulator = UltrasoundSimulator(labels, preset.tissues, preset.settings{texture})
+simulator = UltrasoundSimulator(labels, preset.tissues, preset.settings{texture}{sheets})
 frame = simulator.simulate(preset.probe, probe_to_ras, preset.display, noise_seed=seed_of_pose(probe_to_ras))
 frame.to_volume().write("image.nrrd")  # frame.image is a (rows, columns) uint8 array
 print(frame.image.shape, "pixels, mean", frame.image.mean())
@@ -54,6 +54,8 @@ class LabelSource:
     tissue_names: tuple[str, ...] = ()
     #: {contrast: file} of further MRIs
     others: Mapping[str, str] = field(default_factory=dict)
+    #: Kinds of sheets that Segment looked for
+    sheets: tuple[str, ...] = ()
     #: (tissue, file) of the masks added on top
     additions: tuple[tuple[str, str], ...] = ()
     #: Of a craniotomy: diameter of the disc, mm, and the (4, 4) pose of the probe in the frame of the labels
@@ -66,8 +68,13 @@ class LabelSource:
         return tuple(dict.fromkeys(file for file in files if file and not os.path.isabs(file)))
 
 
-def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray) -> str:
-    """A script that simulates an image of these labels with `preset`, whose tissues are by label, at a pose (4, 4)."""
+def python_script(
+    source: LabelSource, preset: Preset, probe_to_ras: np.ndarray, sheets: Sequence[str] | str = ()
+) -> str:
+    """A script that simulates an image of these labels with `preset`, whose tissues are by label, at a pose (4, 4).
+
+    `sheets` are the kinds of those that Segment found which the image shows, or the file with all that it shows.
+    """
     imports, more, lines = ["UltrasoundSimulator", "seed_of_pose"], "", []
     is_demo, is_ct = not source.path, source.options.get("contrast") == CT
     if is_demo:
@@ -100,6 +107,21 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
     texture, names = "segmentation.texture()", "segmentation.tissue_names"
     if source.is_labels:
         names = repr(list(source.tissue_names))
+    surfels = ""
+    if source.sheets:
+        more += "from SlicerUSSim.Logic.mri import add_tissues\nfrom SlicerUSSim.Logic.mri.sheets import find_sheets\n"
+        lines += [
+            f"kinds, contrast = {source.sheets!r}, {source.options['contrast']!r}",
+            "sheets = find_sheets(mri, segmentation, contrast=contrast, kinds=kinds)",
+            f"added = add_tissues(labels, {names}, sheets.masks(), has_brain_mask=True)",
+            "labels = added.labels",
+        ]
+        names = "added.tissue_names"
+    if isinstance(sheets, str):
+        more += "from SlicerUSSim.Logic.mri.sheets.polydata import read_surfels\n"
+        surfels = f", sheets=read_surfels({sheets!r})"
+    elif source.sheets and sheets:
+        surfels = f", sheets=sheets.surfels.of_kind({', '.join(map(repr, sheets))})"
     if source.additions:
         more += "from SlicerUSSim.Logic.mri import add_tissues, read_mask\n"
         masks = ", ".join(f"({name!r}, read_mask({path!r}), {path!r})" for name, path in source.additions)
@@ -119,7 +141,7 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
             f"opening = disc_opening(labels, {names}, np.array({_array(pose)}), {diameter!r})",
             f"labels, _ = opened(labels, {names}, opening)",
         ]
-    is_changed = bool(source.additions) or source.disc is not None
+    is_changed = bool(source.additions) or bool(source.sheets) or source.disc is not None
     if is_changed:
         texture = f"texture_below({texture}, mri, segmentation.labels, labels)"
     settings = preset.settings
@@ -136,6 +158,7 @@ def python_script(source: LabelSource, preset: Preset, probe_to_ras: np.ndarray)
         preset=indent(pformat(_plain(preset), width=112, sort_dicts=False), "    ").strip(),
         pose=_array(probe_to_ras),
         texture=f", texture={texture}" if needs_texture else "",
+        sheets=surfels,
     )
 
 

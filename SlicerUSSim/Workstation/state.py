@@ -25,6 +25,10 @@ PLANES = (IN_PLANE, ACROSS, "Axial", "Coronal", "Sagittal")
 SLICE_VIEWS = {"Red": IN_PLANE, "Yellow": ACROSS, "Green": "Axial"}
 
 
+#: What a file can be added as besides a lesion: the label map of organs of a CT
+ORGANS = "organs of the CT"
+
+
 class ComparisonMode(Enum):
     """How simulated and real image are shown together."""
 

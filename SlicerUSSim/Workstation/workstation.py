@@ -67,7 +67,8 @@ class Workstation:
         self._tracker = Tracker(shared, tasks, self._probe.move)
         self._images = ImageFlow(shared, logic, self._views, self._comparison, cine, self._tracker, stamps)
         opener = Opener(app.scene, logic, tasks, files)
-        presenter.maskFile = opener.mask_file
+        presenter.maskFile, presenter.sheetsFile = opener.mask_file, opener.sheets_file
+        self._panel.pick = self._probe.hand.pick
         self._exports = Exports(app, logic, opener, cine)
         self._loading = Loading(
             shared, app, logic, tasks, opener, presenter, self._messages, self._views, self._probe, self._comparison
@@ -82,7 +83,7 @@ class Workstation:
         self._follow_pages()
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
-        build_page(self.server, sections, self._views.layout, tuple(KEYS))
+        build_page(self.server, sections, self._views.layout, (*KEYS, "Escape"))
 
     def close(self, **_: object) -> None:
         """Close the connection to the tracker and cancel waiting tasks."""

@@ -8,6 +8,7 @@ from collections.abc import Hashable
 from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
 from SlicerUSSim.Logic.opencl.device import DeviceChoice
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
@@ -30,17 +31,18 @@ class ReusedSimulator:
         settings: SimulationSettings,
         device: DeviceChoice = None,
         texture: Texture | None = None,
+        sheets: Surfels | None = None,
     ) -> UltrasoundSimulator:
         """A simulator for these inputs; voxels are considered equal as long as `labels_version` is equal.
 
         Raises SimulationError as UltrasoundSimulator does; the next call then builds a new simulator.
         """
         # Of the settings, only the use of the texture affects data on the device; others apply per frame.
-        wanted = (labels_version, texture, device, settings.partial_volume, settings.mri_modulation_db)
+        wanted = (labels_version, texture, device, sheets, settings.partial_volume, settings.mri_modulation_db)
         if self._simulator is None or self._built_for != wanted:
             _log.debug("a simulator is built: %s", "the first" if self._built_for is None else self._changed(wanted))
             self.forget()
-            self._simulator = UltrasoundSimulator(labels, tissues, settings, device, texture)
+            self._simulator = UltrasoundSimulator(labels, tissues, settings, device, texture, sheets)
             self._built_for = wanted
         elif self._simulator.medium.tissues != tissues:
             self._simulator.set_tissues(tissues)
@@ -48,7 +50,7 @@ class ReusedSimulator:
         return self._simulator
 
     def _changed(self, wanted: tuple) -> str:
-        names = ("labels", "texture", "device", "partial_volume", "mri_modulation_db")
+        names = ("labels", "texture", "device", "sheets", "partial_volume", "mri_modulation_db")
         values = zip(names, wanted, self._built_for or wanted, strict=True)
         return ", ".join(name for name, new, old in values if new != old) + " changed"
 

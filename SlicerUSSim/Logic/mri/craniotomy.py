@@ -62,7 +62,8 @@ def disc_opening(labels: Volume, names: Sequence[str], probe_to_ras: np.ndarray,
 def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray) -> np.ndarray:
     """(k, j, i) bool: the prism over a polygon of (points, 3) RAS mm, along the normal of its plane.
 
-    Raises SimulationError for fewer than three points, points on a line, and if there is no brain under it.
+    Raises SimulationError for fewer than three points, points on a line, sides that cross, and if there is no brain
+    under it.
     """
     from skimage.measure import points_in_poly
 
@@ -79,6 +80,14 @@ def polygon_opening(labels: Volume, names: Sequence[str], points_ras: np.ndarray
     pose[:3, 3] = middle
     places = _in_probe(labels, pose)
     outline = (points_ras - middle) @ pose[:3, [0, 2]]
+    crossing = _crossing_sides(outline)
+    if crossing is not None:
+        first, second = (f"{side + 1} to {(side + 1) % len(outline) + 1}" for side in crossing)
+        require(
+            False,
+            f"the sides of the polygon from point {first} and from point {second} cross, expected points in their "
+            "order around the opening",
+        )
     inside = points_in_poly(places[..., [0, 2]].reshape(-1, 2), outline).reshape(labels.array.shape)
     radius = 0.5 * float(np.ptp(outline, axis=0).max())
     return inside & (places[..., 1] < _deepest(labels, names, inside, places[..., 1], radius))
@@ -90,7 +99,7 @@ def file_opening(labels: Volume, names: Sequence[str], path: str) -> np.ndarray:
     Raises SimulationError for another file, and for a mask that is empty or lies elsewhere.
     """
     if Path(path).suffix.lower() == ".json":
-        return polygon_opening(labels, names, _control_points(path))
+        return polygon_opening(labels, names, polygon_of_file(path))
     return mask_opening(labels, Volume.read(path), path)
 
 
@@ -99,6 +108,18 @@ def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
 
     Raises SimulationError for what is no mask, and for one that is empty or lies elsewhere.
     """
+    k, j, i = np.indices(labels.array.shape)
+    ras = np.stack([i, j, k], axis=-1) @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
+    opening = sample(is_open(mask, name), ras, order=0) > 0
+    require(bool(opening.any()), f"{name}: is empty, or lies outside of the patient, expected a mask of the opening")
+    return opening
+
+
+def is_open(mask: Volume, name: str) -> Volume:
+    """A mask as uint8, 1 where it is open: not 0, or above 1/2 of values from 0 to 1; `name` as in errors.
+
+    Raises SimulationError for what is no mask.
+    """
     values = np.unique(mask.array[np.isfinite(mask.array)])
     is_soft = bool(values.size) and float(values[0]) >= 0.0 and float(values[-1]) <= 1.0
     require(
@@ -106,11 +127,7 @@ def mask_opening(labels: Volume, mask: Volume, name: str) -> np.ndarray:
         f"{name}: has {values.size} different values, expected a mask of the opening (0 and one other, or 0 to 1)",
     )
     inside = mask.array > 0.5 if is_soft else np.nan_to_num(mask.array) != 0
-    k, j, i = np.indices(labels.array.shape)
-    ras = np.stack([i, j, k], axis=-1) @ labels.ijk_to_ras[:3, :3].T + labels.ijk_to_ras[:3, 3]
-    opening = sample(mask.with_array(inside.astype(np.uint8)), ras, order=0) > 0
-    require(bool(opening.any()), f"{name}: is empty, or lies outside of the patient, expected a mask of the opening")
-    return opening
+    return mask.with_array(inside.astype(np.uint8))
 
 
 def face_width_mm(probe: Probe) -> float:
@@ -209,8 +226,26 @@ def _deepest(labels: Volume, names: Sequence[str], within: np.ndarray, depth: np
     return begins + _BELOW * radius_mm
 
 
-def _control_points(path: str) -> np.ndarray:
-    """(points, 3) RAS mm of the first markup of a .mrk.json file of 3D Slicer."""
+def _crossing_sides(outline: np.ndarray) -> tuple[int, int] | None:
+    """Numbers of the first two sides, from point n to n + 1, of a closed polygon (points, 2) that cross; or None."""
+    start, end = outline, np.roll(outline, -1, axis=0)
+
+    def turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """Sign of the turn from a by b to c; 0 on a line."""
+        (ux, uy), (vx, vy) = np.moveaxis(b - a, -1, 0), np.moveaxis(c - a, -1, 0)
+        return np.sign(ux * vy - uy * vx)
+
+    a, b, c, d = start[:, None], end[:, None], start[None], end[None]
+    crosses = (turn(a, b, c) * turn(a, b, d) < 0) & (turn(c, d, a) * turn(c, d, b) < 0)
+    found = np.argwhere(np.triu(crosses))
+    return None if not len(found) else (int(found[0, 0]), int(found[0, 1]))
+
+
+def polygon_of_file(path: str) -> np.ndarray:
+    """(points, 3) RAS mm of the markup in a .mrk.json file of 3D Slicer, whose points are a polygon.
+
+    Raises SimulationError for another file, and for several markups, another kind, frame or unit.
+    """
     values = read_json(path)
     try:
         markup, *others = values["markups"]

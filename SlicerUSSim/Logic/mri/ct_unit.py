@@ -21,6 +21,7 @@ _ONE_NUMBER = 0.2
 #: Least noise of air
 _LEAST_NOISE_HU = 2.0
 _EXPECTED = "expected Hounsfield units (air -1000, water 0, bone 1000)"
+_FOR_MRI = "for an MRI leave --ct out and choose its contrast"
 
 
 def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
@@ -48,12 +49,12 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
     )
     require(
         high - low >= 300.0,
-        f"{found}, {_EXPECTED}; multiply them by the slope of the CT's header; for an MRI leave --ct out",
+        f"{found}, {_EXPECTED}; multiply them by the slope of the CT's header; {_FOR_MRI}",
     )
     require(
         share < _ONE_NUMBER or level < _AIR_HU[1],
         f"{found} and {share:.0%} of them are {level:g}, as in an MRI with a background, or in a CT that was cut "
-        f"off or masked; {_EXPECTED}, uncut; for an MRI leave --ct out and give its --contrast",
+        f"off or masked; {_EXPECTED}, uncut; {_FOR_MRI}",
     )
     inside = values[values > _NOT_LUNG_HU]
     is_tissue = float(np.mean((inside > _TISSUE_HU[0]) & (inside < _TISSUE_HU[1]))) if inside.size else 0.0
@@ -65,8 +66,8 @@ def hounsfield_offset(ct: Volume) -> tuple[float, str | None, str | None]:
     require(
         False,
         f"{found}; 5 % are below {darkest:.4g} and {is_tissue:.0%} of what is no air lies between "
-        f"{_TISSUE_HU[0]:.0f} and {_TISSUE_HU[1]:.0f}, {_EXPECTED}; for an MRI leave --ct out and give its --contrast, "
-        "for a CT apply the slope and intercept of its header",
+        f"{_TISSUE_HU[0]:.0f} and {_TISSUE_HU[1]:.0f}, {_EXPECTED}; {_FOR_MRI}, for "
+        "a CT apply the slope and intercept of its header",
     )
     raise AssertionError
 

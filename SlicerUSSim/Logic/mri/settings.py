@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
 
 from SlicerUSSim.Logic.base.declaration import Declared, Shown, parameter
 
 #: Contrasts of MRIs, which segment_mri has; and the name of a CT, which is segment_ct's
 MRI_CONTRASTS, CT = ("t1", "t1gd", "t2", "flair"), "ct"
+
+#: What gel bridges between skin and probe where nothing else is said, mm
+GEL_MM = 3.0
 
 
 @dataclass(frozen=True)
@@ -51,3 +55,44 @@ class SegmentationSettings(Declared):
 
     def _owner(self) -> str:
         return "segmentation"
+
+
+@dataclass(frozen=True)
+class SheetSettings(Declared):
+    """What a scene looks for with sheets.find_sheets, and what its images show of it."""
+
+    find: bool = parameter(
+        False, "Find sheets and vessels", "Segment also looks for what is ticked below, in a T1 or T2 (about a "
+        "minute); off: images have the lines of the labels, as the paper's model", shown=True,
+    )  # fmt: skip
+    sulcus: bool = parameter(True, "Sulci", "Sulci as thin sheets, also closed ones", shown=True)
+    falx: bool = parameter(True, "Falx", "Falx as a thin sheet", shown=True)
+    tentorium: bool = parameter(True, "Tentorium", "Tentorium as a thin sheet", shown=True)
+    ependyma: bool = parameter(True, "Ependyma", "Walls of the ventricles as thin sheets", shown=True)
+    corpus_callosum: bool = parameter(
+        True, "Corpus callosum", "Corpus callosum as a tissue of its own, from the next Segment on", shown=True
+    )
+    choroid_plexus: bool = parameter(
+        True, "Choroid plexus", "Choroid plexus as enhancing tissue, in a T1 with contrast agent alone; from the next "
+        "Segment on", shown=True,
+    )  # fmt: skip
+    vessels: bool = parameter(
+        True, "Vessels", "Vessels as enhancing tissue, in a T1 with contrast agent alone; from the next Segment on",
+        shown=True,
+    )  # fmt: skip
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Those of sheets.finding.ALL_KINDS that are ticked."""
+        names = (entry.name for entry in fields(self) if entry.name != "find")
+        return tuple(name.replace("_", " ") for name in names if getattr(self, name))
+
+    @classmethod
+    def of_kinds(cls, kinds: Iterable[str], *, find: bool) -> SheetSettings:
+        """With these kinds ticked and the others not."""
+        wanted = set(kinds)
+        names = (entry.name for entry in fields(cls) if entry.name != "find")
+        return cls(find=find, **{name: name.replace("_", " ") in wanted for name in names})
+
+    def _owner(self) -> str:
+        return "sheets"

@@ -10,7 +10,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.craniotomy import without_outside
-from SlicerUSSim.Logic.probe.placement import pose_looking_at
+from SlicerUSSim.Logic.probe.placement import pose_looking_at, sample
 from SlicerUSSim.Logic.probe.surface import PatientSurface
 
 
@@ -44,6 +44,26 @@ VIEWS = {
         "sagittal, through the anterior fontanelle: corpus callosum, cerebellum", (0.0, 0.35, 1.0), (0.0, -1.0, 0.0)
     ),
 }  # fmt: skip
+
+
+#: Bone is looked for so far behind a face in an opening, and so much of it is a closed skull, mm
+_BEHIND_MM, _CLOSED_MM = 40.0, 2
+
+
+def opened_view_pose(labels: Volume, names: Sequence[str], view: str) -> tuple[np.ndarray, str]:
+    """((4, 4) probe_to_ras, a line about it) of one of VIEWS on labels with an opening; errors as view_pose.
+
+    It stands on the brain if the opening is where the view is seen from, and on the skin of the closed skull otherwise.
+    """
+    pose = view_pose(labels, names, view, is_open=True)
+    behind = pose[:3, 3] - np.arange(1.0, _BEHIND_MM)[:, None] * pose[:3, 1]
+    bones = [number for number, name in enumerate(names, 1) if name in ("skull", "bone")]
+    if int(np.isin(sample(labels, behind, order=0), bones).sum()) < _CLOSED_MM:
+        return pose, f"the view {view} is seen through the opening"
+    return view_pose(labels, names, view), (
+        f"the opening is not where the view {view} is seen from: the probe stands on the skin over the closed skull; "
+        "without a view it stands in the opening"
+    )
 
 
 def view_pose(labels: Volume, names: Sequence[str], view: str, *, is_open: bool = False) -> np.ndarray:

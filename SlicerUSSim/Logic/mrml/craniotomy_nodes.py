@@ -10,7 +10,7 @@ from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D, vtkWindowedSincPolyDataF
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.craniotomy import mask_opening, middle_of, polygon_opening
-from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, node_labels
+from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, hidden_segments, node_labels
 from SlicerUSSim.Logic.mrml.nodes import display_of, named, node_to_world, require_node
 from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_result
 
@@ -41,14 +41,20 @@ def set_closed_labels(labels_node: Any, closed_node: Any | None) -> None:
 def opening_of(opening_node: Any, labels: Volume, names: tuple[str, ...], world_to_labels: np.ndarray) -> np.ndarray:
     """(k, j, i) bool of a markups node (the polygon of its points), a label map or a segmentation.
 
-    `world_to_labels` (4, 4) leads to the frame of `labels`. Raises SimulationError for another or an empty node.
+    Segments that are hidden are left out. `world_to_labels` (4, 4) leads to the frame of `labels`. Raises
+    SimulationError for another or an empty node.
     """
     require_node(opening_node, *OPENING_CLASSES, use="opening")
     if opening_node.IsA("vtkMRMLMarkupsNode"):
         return polygon_opening(
             labels, names, _points(opening_node) @ world_to_labels[:3, :3].T + world_to_labels[:3, 3]
         )
-    mask, _ = node_labels(opening_node)
+    hidden = hidden_segments(opening_node) if opening_node.IsA("vtkMRMLSegmentationNode") else {}
+    require(
+        not hidden or len(hidden) < opening_node.GetSegmentation().GetNumberOfSegments(),
+        f"opening {named(opening_node)}: all its segments are hidden, expected a visible one to open",
+    )
+    mask, _ = node_labels(opening_node, hidden)
     mask = mask.with_array((mask.array != 0).astype(np.uint8))
     placed = Volume(mask.array, world_to_labels @ node_to_world(opening_node) @ mask.ijk_to_ras)
     return mask_opening(labels, placed, named(opening_node))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Hashable, Iterable
+from collections.abc import Collection, Hashable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -156,13 +156,24 @@ def read_labels(labels_node, tissues: TissueTable) -> LabelledTissues:
     return found
 
 
-def node_labels(labels_node) -> tuple[Volume, dict[int, str]]:
+def hidden_segments(segmentation_node) -> dict[str, str]:
+    """{ID: name} of the segments of a segmentation that its display hides one by one."""
+    display, segmentation = segmentation_node.GetDisplayNode(), segmentation_node.GetSegmentation()
+    ids = (
+        []
+        if display is None
+        else [name for name in segmentation.GetSegmentIDs() if not display.GetSegmentVisibility(name)]
+    )
+    return {segment_id: segmentation.GetSegment(segment_id).GetName() for segment_id in ids}
+
+
+def node_labels(labels_node, without: Collection[str] = ()) -> tuple[Volume, dict[int, str]]:
     """(labels in the node's own frame, {label: name of its segment or colour}) as they are, whether tissues or not.
 
-    Raises SimulationError for a node without labels.
+    Segments with the IDs `without` are left out. Raises SimulationError for a node without labels.
     """
     if labels_node.IsA("vtkMRMLSegmentationNode"):
-        return _read_segmentation(labels_node)
+        return _read_segmentation(labels_node, without)
     volume, colours = read_volume(labels_node, "label map"), _colour_node(labels_node)
     present = [int(label) for label in np.unique(volume.array) if label]
     if colours is None:
@@ -178,11 +189,12 @@ def _require_segments(segmentation_node, use: str) -> None:
     )
 
 
-def _read_segmentation(segmentation_node) -> tuple[Volume, dict[int, str]]:
+def _read_segmentation(segmentation_node, without: Collection[str] = ()) -> tuple[Volume, dict[int, str]]:
     _require_segments(segmentation_node, "label map")
     segmentation = segmentation_node.GetSegmentation()
     ids, values, names = vtkStringArray(), vtkIntArray(), {}
-    for number, segment_id in enumerate(segmentation.GetSegmentIDs(), 1):
+    shown = [segment_id for segment_id in segmentation.GetSegmentIDs() if segment_id not in without]
+    for number, segment_id in enumerate(shown, 1):
         ids.InsertNextValue(segment_id)
         values.InsertNextValue(number)
         names[number] = segmentation.GetSegment(segment_id).GetName()

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, collected_warnings, require, required, warn_again
+from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
@@ -29,8 +30,10 @@ from SlicerUSSim.Logic.mri.ct import CtSegmentation
 from SlicerUSSim.Logic.mri.modality import has_brain_mask, segment_image
 from SlicerUSSim.Logic.mri.pathology import Added, add_tissues, texture_below
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
-from SlicerUSSim.Logic.mri.settings import SegmentationSettings
-from SlicerUSSim.Logic.mri.views import view_pose
+from SlicerUSSim.Logic.mri.settings import CT, GEL_MM, SegmentationSettings
+from SlicerUSSim.Logic.mri.sheets.finding import find_sheets, require_findable
+from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
+from SlicerUSSim.Logic.mri.views import opened_view_pose, view_pose
 from SlicerUSSim.Logic.mrml.craniotomy_nodes import (
     closed_labels,
     flap_centre,
@@ -45,6 +48,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import (
     LABEL_CLASSES,
     Patient,
     PatientReader,
+    hidden_segments,
     labels_version,
     node_labels,
     read_labels,
@@ -72,13 +76,17 @@ from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, shares_version, write_shares
+from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets
 from SlicerUSSim.Logic.probe.placement import pose_in_slice
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.texture import Texture
 
 T = TypeVar("T")
 #: Attribute of a mask node: the ID of the MRI node from which it was extracted
 _BRAIN_OF = "SlicerUSSim.brainOf"
+#: Share of the time in which tissues are segmented, if sheets are looked for after that
+_SEGMENTED = 0.4
 
 
 class AtOnce:
@@ -143,6 +151,7 @@ class UltrasoundSceneLogic:
         #: What the last segment() or addTissues() did, and what a user should check, one line each
         self.notes: tuple[str, ...] = ()
         self.warnings: tuple[str, ...] = ()
+        self._sheets: tuple[Hashable, Surfels] | None = None  # with the version of their node, kinds and frame
         self._texture: tuple[Hashable, Texture | None] | None = None  # with the version of its labels
         self._preset: tuple[str, Preset] = ("", Preset())
         self._live: LiveUpdate | None = None
@@ -173,6 +182,17 @@ class UltrasoundSceneLogic:
         """The tissues of a label map or segmentation by name, from the preset's table or else the tissue presets."""
         return self.preset.tissues.for_names(self._patient(labels_node).names)
 
+    def settings(self, labels_node) -> SimulationSettings:
+        """The preset's settings, with gel between skin and probe (GEL_MM) where labels have skin and nobody says more.
+
+        That is: no contact gap, the parameter `gel`, and no opening, which is filled with the coupling medium.
+        """
+        settings = self.preset.settings
+        is_default = settings.contact_gap_mm is None and self.parameters.panel.gel and not is_opened(labels_node)
+        if is_default and "skin" in self._patient(labels_node).names:
+            return replace(settings, contact_gap_mm=GEL_MM)
+        return settings
+
     # ---- single steps ------------------------------------------------------------------------------------------------
 
     def segment(
@@ -182,9 +202,13 @@ class UltrasoundSceneLogic:
         *,
         mask_node=None,
         others: Mapping[str, Any] | None = None,
+        organs_node=None,
         lesions_node=None,
+        sheets: Iterable[str] = (),
+        sheets_node=None,
         overwrite: bool = False,
         keep_mask_at: Path | None = None,
+        keep_sheets_at: Path | None = None,
         classes: int | None = SegmentationSettings.classes,
         contrast: str = SegmentationSettings.contrast,
         filter_radius: int = SegmentationSettings.filter_radius,
@@ -199,8 +223,10 @@ class UltrasoundSceneLogic:
 
         See segmentation.segment_mri, and ct.segment_ct for the contrast "ct". `mask_node` is a label map on the MRI's
         grid, or a segmentation; `others` are volume nodes of the same patient by their contrast. The segments of
-        `lesions_node` are laid over the labels, as by addTissues, but are not in the result. `progress` may raise
-        errors.Cancelled; the nodes are then as they were.
+        `lesions_node` are laid over the labels, as by addTissues, but are not in the result. `organs_node` is a label
+        map or segmentation of organs of a CT. `sheets` are looked for, too (sheets.find_sheets): those with a volume
+        are laid over the labels, the others are written into the model `sheets_node`, which images show if it is the
+        parameter `sheets`. `progress` may raise errors.Cancelled; the nodes are then as they were.
         Raises SimulationError for a node with labels that were not made by this method, or edited since; `overwrite`
         replaces them nevertheless.
         """
@@ -219,17 +245,39 @@ class UltrasoundSceneLogic:
         lesions, skipped = ([], []) if lesions_node is None else self._lesions(lesions_node, mri_node)
         own = [tissue.name for tissue in self.preset.tissues.all_tissues()]
         is_of_brain = has_brain_mask(contrast)
+        wanted = tuple(sheets)
+        if wanted:
+            require_findable(wanted, contrast)
+            require_node(sheets_node, "vtkMRMLModelNode", use="sheets")
+            require_result(sheets_node, "sheets")
+        organs = None if organs_node is None else self._organs(organs_node, mri_node, contrast)
+        report = progress or (lambda share: None)
+        until = _SEGMENTED if wanted else 1.0
         extraction = skull_strip if is_of_brain else "none"
         self._work.do(lambda: require_addable(mri, lesions, mask=mask, skull_strip=extraction, also=own))
         result = self._work.do(
             lambda: segment_image(
-                mri, classes=classes, contrast=contrast, others=volumes, mask=mask, filter_radius=filter_radius,
-                filter_epsilon=filter_epsilon, bias_correction=bias_correction, thin_sulci=thin_sulci,
-                outside=outside, skull_strip=skull_strip, keep_mask_at=keep_mask_at, device=self.device,
-                progress=progress,
+                mri, classes=classes, contrast=contrast, others=volumes, mask=mask, organs=organs,
+                filter_radius=filter_radius, filter_epsilon=filter_epsilon, bias_correction=bias_correction,
+                thin_sulci=thin_sulci, outside=outside, skull_strip=skull_strip,
+                keep_mask_at=keep_mask_at, device=self.device,
+                progress=lambda share: report(until * share),
             )
         )  # fmt: skip
-        added, told = self._with_lesions(result.labels, result.tissue_names, lesions, has_brain_mask=is_of_brain)
+        labels, names, found = result.labels, result.tissue_names, None
+        if wanted and isinstance(result, Segmentation):
+            segmentation = result
+            found = self._work.do(
+                lambda: find_sheets(
+                    mri, segmentation, contrast=contrast, kinds=wanted, keep_at=keep_sheets_at,
+                    progress=lambda share: report(until + (1.0 - until) * share),
+                )
+            )  # fmt: skip
+            masks = found.masks()
+            if masks:
+                laid = self._work.do(lambda: add_tissues(labels, names, masks, has_brain_mask=True))
+                labels, names = laid.labels, laid.tissue_names
+        added, told = self._with_lesions(labels, names, lesions, has_brain_mask=is_of_brain)
         shares = self._work.do(lambda: texture_below(result.texture(), mri, result.labels, added.labels))
         require_node(labels_node, *LABEL_CLASSES, use="output of Segment")
         self._write_tissues(labels_node, added, mri_node, shares)
@@ -239,7 +287,10 @@ class UltrasoundSceneLogic:
         self._segmented = _Segmented(
             labels_version(labels_node), added.labels, added.tissue_names, shares, mri, is_of_brain
         )
-        self.notes = (*result.notes, *result.table().splitlines(), *added.messages)
+        if found is not None:
+            write_sheets(sheets_node, found.surfels, mri_node)
+        sheet_notes = () if found is None else found.notes
+        self.notes = (*result.notes, *sheet_notes, *result.table().splitlines(), *added.messages)
         self.warnings = (*result.warnings, *skipped, *added.warnings)
         return result
 
@@ -367,11 +418,13 @@ class UltrasoundSceneLogic:
         known = read_shares(closed, labels, names) if was is None else was.texture
         world_to_labels, scaling = pose_in_labels(closed, np.eye(4))
         placed = Volume(labels.array, scaling @ labels.ijk_to_ras)
+        hidden: dict[str, str] = {}
         if opening_node is not None:
             opening = self._work.do(lambda: opening_of(opening_node, placed, names, world_to_labels))
             what = named(opening_node)
             if opening_node.IsA("vtkMRMLSegmentationNode"):
-                what += f" with {', '.join(node_labels(opening_node)[1].values())}"
+                hidden = hidden_segments(opening_node)
+                what += f" with {', '.join(node_labels(opening_node, hidden)[1].values())}"
         else:
             pose, probe = world_to_labels @ probe_pose(probe_transform_node), self.preset.probe
             diameter = disc_diameter_mm(probe) if diameter_mm is None else diameter_mm
@@ -394,8 +447,11 @@ class UltrasoundSceneLogic:
             f"{named(output_node)}, and {named(closed)} stays as it is",
         )
         self.warnings = ()
+        if hidden:
+            names_hidden = ", ".join(hidden.values())
+            self.warnings = (f"of {named(opening_node)} what is hidden is not opened: {names_hidden}",)
         if is_left_out:
-            self.warnings = (
+            self.warnings += (
                 f"what was edited in {named(labels_node)} is not in {named(output_node)}, which is {named(closed)} "
                 "with the opening",
             )
@@ -499,29 +555,35 @@ class UltrasoundSceneLogic:
         return count
 
     def placeProbe(
-        self, labels_node, probe_transform_node, slice_node=None, target_ras=None, *, view: str | None = None
-    ) -> None:
+        self, labels_node, probe_transform_node, slice_node=None, target_ras=None, *, view: str | None = None,
+        will_open: bool = False,
+    ) -> str:  # fmt: skip
         """Put the probe on the surface of the labelled tissue, with its axis inwards.
 
         With a slice node the image is in that slice, with its depth towards the bottom of the view, aimed at
         `target_ras` (default: the middle of the view). Without one it is a coronal view through a parasagittal
         craniotomy: on a brain, upright on the skin of a whole head, or on the brain in the middle of an opening.
-        `view` is one of mri.views.VIEWS instead, as "temporal".
+        `view` is one of mri.views.VIEWS instead, as "temporal". With `will_open` it is on the brain of a closed head,
+        where openCraniotomy opens a disc under it. Returns a line about a view of labels with an opening, "" otherwise.
         """
         require_node(probe_transform_node, "vtkMRMLLinearTransformNode", use="probe transform")
         patient = self._patient(labels_node)
         surface = Volume(patient.labels.array, np.linalg.inv(patient.world_to_patient) @ patient.labels.ijk_to_ras)
-        if view is not None:
+        line = ""
+        if view is not None and is_opened(labels_node):
+            pose, line = opened_view_pose(surface, patient.names, view)
+        elif view is not None:
             pose = view_pose(surface, patient.names, view)
         elif slice_node is None:
             pose = default_pose(
-                surface, patient.names, self.preset.probe, is_open=is_opened(labels_node),
+                surface, patient.names, self.preset.probe, is_open=will_open or is_opened(labels_node),
                 opening_ras=flap_centre(labels_node),
             )  # fmt: skip
         else:
             require_node(slice_node, "vtkMRMLSliceNode", use="slice view")
             pose = pose_in_slice(surface, matrix_array(slice_node.GetSliceToRAS()), target_ras)
         set_node_to_world(probe_transform_node, pose)
+        return line
 
     def showOutline(self, model_node, probe_transform_node) -> None:
         """The outline of the imaged field as a model under the probe's transform.
@@ -564,13 +626,13 @@ class UltrasoundSceneLogic:
         the cost during the fit. Nothing else in the scene changes; applyFit adopts the result. `progress` may raise
         errors.Cancelled.
         """
-        patient, preset = self._patient(labels_node), self.preset
+        patient, preset = self._patient(labels_node), replace(self.preset, settings=self.settings(labels_node))
         pose = None if probe_transform_node is None else probe_pose(probe_transform_node)
         tracked = tracked_images(
             images_node, frames, preset.probe, probe_to_world=pose, estimate_geometry=estimate_geometry
         )
         tracked = replace(tracked, poses=[patient.pose(pose) for pose in tracked.poses])
-        texture = self._texture_of(labels_node, patient)
+        texture, sheets = self._texture_of(labels_node, patient), self._sheets_of(labels_node)
 
         def report(step: Progress) -> None:
             if plot is not None:
@@ -580,7 +642,7 @@ class UltrasoundSceneLogic:
 
         def compute() -> Fit:
             return fit(
-                self._simulator(patient, preset, texture),
+                self._simulator(patient, preset, texture, sheets),
                 tracked,
                 free=free,
                 display=preset.display,
@@ -668,6 +730,12 @@ class UltrasoundSceneLogic:
         """
         self.stopLiveUpdate()
         caught: list[Warning] = []
+
+        def version() -> tuple[Hashable, ...]:
+            pose = node_to_world(probe_transform_node).tobytes()
+            return pose, labels_version(labels_node), self.parameters.node.GetMTime()
+
+        before = version()
         self.simulate(labels_node, probe_transform_node, output_node, warned=caught.append)  # raises errors immediately
         if outline_node is not None:
             self.showOutline(outline_node, probe_transform_node)
@@ -677,6 +745,8 @@ class UltrasoundSceneLogic:
         self._live = LiveUpdate(self, nodes, schedule, report, stopped)
         if report is not None:
             report("; ".join(map(str, caught)))
+        if version() != before:  # changed while the first image was computed, before anything was observed
+            self._live.request()
 
     def stopLiveUpdate(self) -> None:
         """End the live update and remove its observers."""
@@ -688,6 +758,28 @@ class UltrasoundSceneLogic:
 
     def _lesions(self, lesions_node, to_frame_of) -> tuple[list[tuple[str, Volume, str]], list[str]]:
         return read_lesions(lesions_node, to_frame_of, self.preset.tissues)
+
+    def _organs(self, organs_node, mri_node, contrast: str) -> LabelledTissues:
+        """The organs of a CT in its own frame. Raises SimulationError beside an MRI."""
+        require(
+            contrast == CT,
+            f"{named(organs_node)} has organs of a CT, and the contrast is {contrast}; choose ct, or no organs",
+        )
+        require_node(organs_node, *LABEL_CLASSES, use="organs")
+        found = read_labels(organs_node, self.preset.tissues)
+        to_mri = np.linalg.inv(node_to_world(mri_node)) @ node_to_world(organs_node)
+        return replace(found, labels=Volume(found.labels.array, to_mri @ found.labels.ijk_to_ras))
+
+    def _sheets_of(self, labels_node) -> Surfels | None:
+        """The chosen sheets of the kinds that are ticked, in the frame of the simulator's labels; None without any."""
+        node, kinds = self.parameters.sheets, self.parameters.sheet.kinds
+        if node is None:
+            return None
+        world_to_labels, _ = pose_in_labels(labels_node, np.eye(4))
+        version = sheets_version(node), kinds, world_to_labels.tobytes()
+        if self._sheets is None or self._sheets[0] != version:
+            self._sheets = version, read_sheets(node, world_to_labels, kinds)
+        return self._sheets[1]
 
     def _with_lesions(
         self,
@@ -743,15 +835,15 @@ class UltrasoundSceneLogic:
         noise_seed: int | None = None,
     ) -> Frame:
         """The image at a pose; the default seed of its noise depends on the pose."""
-        patient, preset = self._patient(labels_node), self.preset
-        texture = self._texture_of(labels_node, patient)
+        patient, preset = self._patient(labels_node), replace(self.preset, settings=self.settings(labels_node))
+        texture, sheets = self._texture_of(labels_node, patient), self._sheets_of(labels_node)
         pose = patient.pose(probe_to_world)
         seed = seed_of_pose(pose) if noise_seed is None else noise_seed
 
         def compute() -> tuple[Frame, list[Warning]]:
             # Collected within the work, since Python collects warnings for all threads together.
             with collected_warnings() as caught:
-                simulator = self._simulator(patient, preset, texture)
+                simulator = self._simulator(patient, preset, texture, sheets)
                 return simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed), caught
 
         frame, caught = self._work.do(compute)
@@ -759,10 +851,14 @@ class UltrasoundSceneLogic:
             warned(warning)
         return frame
 
-    def _simulator(self, patient: Patient, preset: Preset, texture: Texture | None) -> UltrasoundSimulator:
+    def _simulator(
+        self, patient: Patient, preset: Preset, texture: Texture | None, sheets: Surfels | None
+    ) -> UltrasoundSimulator:
         """Uses the device and no node; called within the work."""
         tissues = preset.tissues.for_names(patient.names)
-        return self._simulators.get(patient.version, patient.labels, tissues, preset.settings, self.device, texture)
+        return self._simulators.get(
+            patient.version, patient.labels, tissues, preset.settings, self.device, texture, sheets
+        )
 
     def _write_tissues(self, labels_node, added: Added, like_node, texture: Texture | None) -> None:
         """Write labels and what is known of their shares."""

@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, Shown, parameter, parameters_of
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.fitting.settings import FitSettings
-from SlicerUSSim.Logic.mri.settings import MRI_CONTRASTS, SegmentationSettings
+from SlicerUSSim.Logic.mri.lesions.seeded import LESION_TISSUES
+from SlicerUSSim.Logic.mri.settings import MRI_CONTRASTS, SegmentationSettings, SheetSettings
 from SlicerUSSim.Logic.mri.views import VIEWS
 
 MODULE_NAME = "USSim"
+#: Choice of PanelSettings.lesion_as
+BY_LOOK = "by its look"
 _OWNER = "scene"
 S = TypeVar("S", bound=Declared)
 
@@ -33,9 +36,18 @@ class PanelSettings(Declared):
         "none", "Its contrast", "Contrast of the second MRI, which is classified together with the first",
         choices=("none", *MRI_CONTRASTS), shown=True,
     )  # fmt: skip
+    gel: bool = parameter(
+        True, "Gel on the skin", "Where tissues have skin, and Contact gap is none, gel fills gaps of up to 3 mm "
+        "between skin and probe, and lines without contact are dark; off: the coupling medium is everywhere",
+        shown=True,
+    )  # fmt: skip
     craniotomy_mm: float | None = parameter(
         None, "Diameter", "Diameter of the disc under the probe that is opened; none: as wide as its face needs",
         unit="mm", bounds=(5.0, 150.0), shown=Shown(4.0, 150.0, 1.0, none_at=4.0), can_be_none=True,
+    )  # fmt: skip
+    lesion_as: str = parameter(
+        BY_LOOK, "As", "What the lesion at the point is; by its look: what the MRI shows there",
+        choices=(BY_LOOK, *LESION_TISSUES), shown=True,
     )  # fmt: skip
     view: str = parameter(
         next(iter(VIEWS)), "View", "; ".join(f"{name}: {view.tip}" for name, view in VIEWS.items()),
@@ -134,6 +146,13 @@ class SceneParameters:
     labels = NodeParameter("vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     #: Its segments are laid over the labels
     lesions = NodeParameter("vtkMRMLSegmentationNode")
+    #: Label map of organs of a CT
+    organs = NodeParameter("vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
+    #: Thin sheets that images show
+    sheets = NodeParameter("vtkMRMLModelNode")
+    #: Point in a lesion, and what is proposed as lesions
+    seed = NodeParameter("vtkMRMLMarkupsFiducialNode")
+    proposal = NodeParameter("vtkMRMLSegmentationNode")
     #: Of a craniotomy; none: a disc under the probe
     opening = NodeParameter("vtkMRMLMarkupsNode", "vtkMRMLSegmentationNode", "vtkMRMLLabelMapVolumeNode")
     probe_transform = NodeParameter("vtkMRMLLinearTransformNode")
@@ -145,6 +164,7 @@ class SceneParameters:
     image_sequence = NodeParameter("vtkMRMLSequenceNode")
 
     segmentation = SettingsParameter(SegmentationSettings)
+    sheet = SettingsParameter(SheetSettings, "sheet_")
     fit = SettingsParameter(FitSettings, "fit_")
     panel = SettingsParameter(PanelSettings)
 

@@ -45,6 +45,12 @@ class LesionProposals:
         """Take note of a segmentation of an MRI node, on which lesions are proposed from now on."""
         self._last = (mri_node.GetID(), _version(mri_node), result)
 
+    def knows(self, mri_node) -> bool:
+        """Whether lesions can be proposed on an MRI node: it was segmented, and has not changed since."""
+        return mri_node is not None and self._last is not None and self._last[:2] == (
+            mri_node.GetID(), _version(mri_node),
+        )  # fmt: skip
+
     def grow(self, mri_node, seed_world_mm: Sequence[float], tissue: str | None = None):
         """The segmentation node with the lesion around a point in world RAS mm; see seeded.grow_lesion.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy import ndimage
 
@@ -25,6 +27,12 @@ _STEP, _FOREGROUND = 1e-3, 1e-2
 #: and Brodmann's of mricron 0.007 to 0.019, by nearest neighbours at 3 mm up to 0.083, at 5 mm 0.116; interpolated 0.21
 #: (by half a voxel along one axis) to 0.67
 _APART, _BETWEEN, _LEAST_LABELS, _EQUAL = 4, 0.17, 8, 0.3
+#: Layers outside the brain, which lie between others as they are, and are numbered in their order: those over the bone,
+#: which touch each other, the bone, and the air, and the bone, which touches a brain on its inner side
+_OVER_BONE = ("skin", "scalp", "fat", "muscle")
+_BONE = ("skull", "bone", "cancellous bone")
+_AROUND = ("coupling", "air", "water", "gel")
+_OTHER, _EMPTY, _SOFT, _HARD = range(4)
 
 
 def is_interpolated(array: np.ndarray) -> bool:
@@ -72,13 +80,15 @@ def is_smoothed(array: np.ndarray) -> bool:
     return int((counts >= _OF_PLATEAUS * len(flat)).sum()) >= _VALUES
 
 
-def share_between(array: np.ndarray) -> tuple[float, float]:
+def share_between(array: np.ndarray, tissues: Mapping[int, str] | None = None) -> tuple[float, float]:
     """(share of voxels with a number between those of their neighbours, share of equal neighbours).
 
     The first is of voxels between two neighbours along an axis of an array (k, j, i) whose numbers differ by 4 or more;
-    the second of pairs of neighbours of which neither is 0.
+    the second of pairs of neighbours of which neither is 0. With `tissues`, {label: tissue}, layers of a head outside
+    the brain that lie between their neighbours in a body (skin between air and scalp) are not counted in the first.
     """
     part = array[middle(array)].astype(np.int64)
+    kinds = _kinds(int(part.max(initial=0)), tissues or {})
     between = far = equal = pairs = 0
     for axis in range(3):
         along = np.moveaxis(part, axis, 0)
@@ -87,20 +97,39 @@ def share_between(array: np.ndarray) -> tuple[float, float]:
         equal, pairs = equal + int((labelled & (first == second)).sum()), pairs + int(labelled.sum())
         before, here, after = along[:-2], along[1:-1], along[2:]
         is_far = np.abs(before - after) >= _APART
+        before, here, after = before[is_far], here[is_far], after[is_far]
         is_between = (np.minimum(before, after) < here) & (here < np.maximum(before, after))
-        between, far = between + int((is_far & is_between).sum()), far + int(is_far.sum())
+        is_layer = is_between & _is_layer(kinds[before], kinds[here], kinds[after])
+        between, far = between + int((is_between & ~is_layer).sum()), far + int((~is_layer).sum())
     return between / max(1, far), equal / max(1, pairs)
 
 
-def are_interpolated_numbers(array: np.ndarray, n_labels: int) -> bool:
+def are_interpolated_numbers(array: np.ndarray, n_labels: int, tissues: Mapping[int, str] | None = None) -> bool:
     """Whether whole numbers (k, j, i) with so many labels were interpolated and rounded.
 
-    Between two labels are then numbers of others.
+    Between two labels are then numbers of others. `tissues`, {label: tissue} of those that are known, tell layers of a
+    head, which are between others also in an original.
     """
     if n_labels < _LEAST_LABELS:
         return False
-    between, equal = share_between(array)
+    between, equal = share_between(array, tissues)
     return between >= _BETWEEN and equal >= _EQUAL
+
+
+def _kinds(largest: int, tissues: Mapping[int, str]) -> np.ndarray:
+    """(largest + 1,) of _OTHER, _EMPTY, _SOFT and _HARD for the labels from 0 on."""
+    kinds = np.full(largest + 1, _OTHER, np.uint8)
+    for label, tissue in ((0, "coupling"), *tissues.items()):
+        for kind, names in ((_EMPTY, _AROUND), (_SOFT, _OVER_BONE), (_HARD, _BONE)):
+            if label <= largest and tissue in names:
+                kinds[label] = kind
+    return kinds
+
+
+def _is_layer(before: np.ndarray, here: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Whether what is between two others is a layer outside the brain beside what it touches in a body; by kinds."""
+    others = (before == _OTHER).astype(np.uint8) + (after == _OTHER)
+    return ((here == _SOFT) & (others == 0)) | ((here == _HARD) & (others <= 1))
 
 
 def _frequent(levels: np.ndarray) -> float:

@@ -80,7 +80,8 @@ class Findings:
 
     @cached_property
     def _are_interpolated(self) -> bool:
-        return are_interpolated_numbers(self.labels.array, len(self.names))
+        tissues = {label: tissue.name for label, tissue in self.found.items() if tissue is not None}
+        return are_interpolated_numbers(self.labels.array, len(self.names), tissues)
 
     def require_patient(self) -> None:
         """Raise NoPatientError for a mask or lesion, which is no patient, unless the user gave it a tissue."""

@@ -162,7 +162,6 @@ def _mark_of(data: vtkPolyData) -> str:
 @reader
 def read_surfels(path: str | os.PathLike) -> Surfels:
     """The surfels of a .vtp by write_surfels. Raises SimulationError for a file that is none."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
     require(Path(path).is_file(), f"{path}: no such file")
@@ -174,13 +173,23 @@ def read_surfels(path: str | os.PathLike) -> Surfels:
         file.SetFileName(str(path))
         file.Update()
         require(file.GetErrorCode() == 0, f"{path}: is damaged; copy or write it again")
-        cells = file.GetOutput().GetCellData()
-        arrays = []
-        for entry in fields(Surfels):
-            array = cells.GetArray(entry.name)
-            require(
-                array is not None,
-                f"{path}: has no array {entry.name!r} of its cells, expected a file of `ussim segment --sheets`",
-            )
-            arrays.append(np.array(vtk_to_numpy(array)))
+        return surfels_of(file.GetOutput(), str(path))
+
+
+def surfels_of(data: vtkPolyData, source: str) -> Surfels:
+    """The surfels of a surface by as_polydata, as its arrays have them, called `source` in errors.
+
+    Raises SimulationError for another surface.
+    """
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    arrays = []
+    for entry in fields(Surfels):
+        array = data.GetCellData().GetArray(entry.name)
+        require(
+            array is not None,
+            f"{source}: has no array {entry.name!r} of its cells, expected a file of `ussim segment --sheets`",
+        )
+        kind = np.uint8 if entry.name == "kind" else np.float32
+        arrays.append(np.array(vtk_to_numpy(array), kind))
     return Surfels(*arrays)

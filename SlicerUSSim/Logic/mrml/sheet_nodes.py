@@ -1,0 +1,69 @@
+"""Sheets in a scene: a model with a square for each surfel, which Segment writes or a user loads from a .vtp."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable
+from typing import Any
+
+import numpy as np
+from vtkmodules.util.numpy_support import vtk_to_numpy
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of
+from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
+from SlicerUSSim.Logic.mrml.nodes import display_of, named, node_to_world, require_node
+from SlicerUSSim.Logic.mrml.own_results import mark_as_result
+
+
+def write_sheets(model_node, surfels: Surfels, mri_node) -> None:
+    """Write sheets, in the own frame of an MRI node, into a model node beside it, hidden at first."""
+    model_node.SetAndObservePolyData(as_polydata(surfels))
+    parent = mri_node.GetParentTransformNode()
+    model_node.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
+    mark_as_result(model_node)
+    is_new = model_node.GetDisplayNode() is None
+    display = display_of(model_node)
+    if is_new and display is not None:
+        display.SetVisibility(False)
+        display.SetScalarVisibility(True)
+        display.SetBackfaceCulling(False)
+
+
+def sheets_version(model_node) -> Hashable:
+    """A value that changes with the sheets of a model and with its place; None for no node."""
+    if model_node is None or model_node.GetPolyData() is None:
+        return None
+    return model_node.GetID(), model_node.GetPolyData().GetMTime(), node_to_world(model_node).tobytes()
+
+
+def read_sheets(model_node, world_to_labels: np.ndarray, kinds: Iterable[str]) -> Surfels:
+    """Sheets of some kinds, in the frame to which a (4, 4) linear transform leads from the world.
+
+    Places and normals are those of the squares, which a hardened transform moves. Raises SimulationError for another
+    node, and for a model of something else.
+    """
+    require_node(model_node, "vtkMRMLModelNode", use="sheets")
+    data: Any = model_node.GetPolyData()
+    if data is None or data.GetNumberOfCells() == 0:
+        return Surfels.joined([])
+    surfels = surfels_of(data, f"sheets {named(model_node)}")
+    points, squares = data.GetPoints().GetData(), data.GetPolys().GetConnectivityArray()
+    corners = vtk_to_numpy(points)[np.asarray(vtk_to_numpy(squares), np.int64)]
+    require(
+        len(corners) == 4 * len(surfels),
+        f"sheets {named(model_node)} has cells that are no squares, expected a model of `ussim segment --sheets`",
+    )
+    moved = world_to_labels @ node_to_world(model_node)
+    corners = corners.reshape(-1, 4, 3).astype(float) @ moved[:3, :3].T + moved[:3, 3]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    volume = abs(float(np.linalg.det(moved[:3, :3])))  # of a unit cube; what is in a sheet grows by it
+    is_whole = (area > 1e-9) & (surfels.area > 1e-9)
+    thickness = surfels.thickness[is_whole] * volume * surfels.area[is_whole] / area[is_whole]
+    chosen = surfels.chosen(is_whole)
+    placed = Surfels(
+        corners[is_whole].mean(axis=1).astype(np.float32),
+        (normal[is_whole] / area[is_whole, None]).astype(np.float32),
+        thickness.astype(np.float32), chosen.confidence, area[is_whole].astype(np.float32), chosen.kind,
+    )  # fmt: skip
+    return placed.of_kind(*(kind for kind in KINDS if kind in set(kinds)))

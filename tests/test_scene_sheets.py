@@ -1,0 +1,258 @@
+"""Sheets, organs of a CT and proposals of lesions in a scene, as module and page have them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core: pip install '.[slicer]'")
+
+from SlicerUSSim.Logic import TissueTable, UltrasoundSimulator, Volume, segment_mri  # noqa: E402
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix  # noqa: E402
+from SlicerUSSim.Logic.imaging.noise import seed_of_pose  # noqa: E402
+from SlicerUSSim.Logic.mri.settings import SheetSettings  # noqa: E402
+from SlicerUSSim.Logic.mri.sheets import KINDS, Surfels, find_sheets  # noqa: E402
+from SlicerUSSim.Logic.mri.sheets.finding import ALL_KINDS  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import node_to_world, write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets  # noqa: E402
+from SlicerUSSim.Logic.verification.ct_phantoms import lower_chest  # noqa: E402
+from tests.test_craniotomy_nodes import TURN  # noqa: E402
+from tests.test_lesion_nodes import HEAD, Scene  # noqa: E402
+from tests.test_lesion_proposals import CENTRE, brain, needs_atlas  # noqa: E402
+
+
+def some_surfels() -> Surfels:
+    """Squares of all kinds, at random places with random normals."""
+    rng = np.random.default_rng(3)
+    normal = rng.normal(size=(40, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    parts = [
+        Surfels.of(kind, rng.uniform(-40, 40, (10, 3)), normal[10 * n :][:10], rng.uniform(0.2, 1, 10), 0.7, 0.8)
+        for n, kind in enumerate(KINDS)
+    ]  # fmt: skip
+    return Surfels.joined(parts)
+
+
+@pytest.mark.parametrize("how", ["under a transform", "hardened", "scaled"])
+def test_sheets_lie_where_transforms_of_their_model_put_them(how):
+    bench, surfels = Scene(), some_surfels()
+    model = bench.add("Model", "sheets")
+    write_sheets(model, surfels, bench.mri)
+    matrix = TURN if how != "scaled" else np.diag([2.0, 1.0, 1.0, 1.0])
+    transform = bench.add("LinearTransform", "turn")
+    transform.SetMatrixTransformToParent(vtk_matrix(matrix))
+    before = sheets_version(model)
+    model.SetAndObserveTransformNodeID(transform.GetID())
+    if how == "hardened":
+        model.HardenTransform()
+        assert model.GetParentTransformNode() is None
+    assert sheets_version(model) != before
+    found = read_sheets(model, np.eye(4), KINDS)
+    np.testing.assert_allclose(found.place, surfels.place @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-3)
+    normal = surfels.normal @ np.linalg.inv(matrix[:3, :3])
+    length = np.linalg.norm(normal, axis=1)
+    cosine = np.abs((found.normal * normal).sum(axis=1)) / length
+    np.testing.assert_allclose(cosine, 1.0, atol=1e-4)
+    np.testing.assert_allclose(found.thickness, surfels.thickness / length, rtol=1e-3)  # twice as thick along x alone
+    assert set(read_sheets(model, np.eye(4), ["falx"]).kind) == {KINDS.index("falx")}
+
+
+def bench_with_probe() -> tuple[Scene, object]:
+    bench = Scene("LabelMapVolume")
+    presenter = bench.presenter(label_maps=True)
+    bench.logic.preset = bench.logic.preset.changed("probe", scan_lines=48)
+    return bench, presenter
+
+
+def test_segment_finds_sheets_and_images_show_them_as_those_of_the_command():
+    bench, presenter = bench_with_probe()
+    parent = bench.add("LinearTransform", "to world")
+    parent.SetMatrixTransformToParent(vtk_matrix(TURN))
+    bench.mri.SetAndObserveTransformNodeID(parent.GetID())
+    parameters = bench.logic.parameters
+    presenter.setValue("scene.sheet_find", True)
+    presenter.setValue("scene.thin_sulci", False)
+    presenter.segment()
+    assert not presenter.view.errors, presenter.view.errors
+    model = parameters.sheets
+    assert model.GetName() == "Head sheets" and not model.GetDisplayNode().GetVisibility()
+    np.testing.assert_allclose(node_to_world(model), TURN)
+    assert "sulcus: " in presenter.notes() and "images show the sheets in 'Head sheets'" in presenter.notes()
+    assert presenter.view.shares[-1] == 1.0 and np.all(np.diff(presenter.view.shares) >= 0)
+    presenter.placeProbe()
+    presenter.simulate()
+    shown = bench.logic.lastFrame.image
+
+    mri = HEAD
+    result = segment_mri(mri, classes=None, thin_sulci=False)
+    sheets = find_sheets(mri, result, contrast="t1")
+    preset, pose = bench.logic.preset, np.linalg.inv(TURN) @ node_to_world(parameters.probe_transform)
+    simulator = UltrasoundSimulator(
+        result.labels, TissueTable.brain(result.tissue_names), preset.settings, texture=result.texture(),
+        sheets=sheets.surfels,
+    )  # fmt: skip
+    expected = simulator.simulate(preset.probe, pose, preset.display, noise_seed=seed_of_pose(pose)).image
+
+    for kind in KINDS:
+        presenter.setValue(f"scene.sheet_{kind}", False)
+    presenter.simulate()
+    without = bench.logic.lastFrame.image
+    assert np.abs(without.astype(int) - shown).mean() > 10.0 * np.abs(shown.astype(int) - expected).mean()
+    parameters.sheets = None
+    presenter.simulate()
+    np.testing.assert_array_equal(bench.logic.lastFrame.image, without)
+
+    parameters.sheets = model
+    presenter.setValue("scene.sheet_find", False)
+    presenter.segment()
+    assert parameters.sheets is None and "of an earlier Segment, are not shown any more" in presenter.notes()
+
+
+def test_sheets_of_a_user_are_kept_and_a_model_of_something_else_is_one_line():
+    bench, presenter = bench_with_probe()
+    parameters = bench.logic.parameters
+    mine = bench.add("Model", "mine")
+    write_sheets(mine, some_surfels(), bench.mri)
+    mine.RemoveAttribute("SlicerUSSim.result")  # as loaded from a file
+    parameters.sheets = mine
+    presenter.segment()
+    assert parameters.sheets is mine and "images show the sheets in 'mine'" in presenter.notes()
+    count = mine.GetPolyData().GetNumberOfCells()
+    presenter.setValue("scene.sheet_find", True)
+    presenter.segment()
+    assert parameters.sheets is not mine and mine.GetPolyData().GetNumberOfCells() == count
+    assert "'mine' was loaded by others and is kept, but not shown any more" in presenter.notes()
+    presenter.placeProbe()
+    presenter.simulate()
+    parameters.sheets = parameters.outline  # a model without sheets
+    presenter.simulate()
+    (line,) = presenter.view.errors
+    assert line.startswith("sheets Model 'Ultrasound outline': has no array 'place' of its cells, expected a file of")
+
+
+def test_what_has_no_sheets_is_said_before_anything_is_computed():
+    bench, presenter = bench_with_probe()
+    presenter.setValue("scene.sheet_find", True)
+    for contrast, words in (("flair", "sheets are not found in contrast 'flair'"), ("ct", "in contrast 'ct'")):
+        presenter.setValue("scene.contrast", contrast)
+        presenter.segment()
+        assert words in presenter.view.errors[-1] and presenter.view.shares == []
+    assert bench.logic.parameters.labels is None and bench.logic.parameters.sheets is None
+    names = {node.GetName() for node in (bench.scene.GetNthNode(n) for n in range(bench.scene.GetNumberOfNodes()))}
+    assert "Head sheets" not in names
+
+
+def test_the_settings_of_sheets_name_what_can_be_found():
+    assert SheetSettings().kinds == ALL_KINDS and not SheetSettings().find
+    chosen = SheetSettings.of_kinds(["falx", "corpus callosum"], find=True)
+    assert chosen.kinds == ("falx", "corpus callosum") and chosen.find
+
+
+# ---- organs of a CT --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["LabelMapVolume", "Segmentation"])
+def test_organs_of_a_ct_are_laid_over_its_tissues_wherever_their_node_lies(kind):
+    bench, phantom = Scene(), lower_chest((4.0, 4.0, 4.0))
+    write_volume(bench.mri, phantom.ct)
+    liver = Volume((phantom.organs.array == 5).astype(np.uint8), np.linalg.inv(TURN) @ phantom.organs.ijk_to_ras)
+    assert liver.array.sum() > 1000
+    organs = bench.add(kind, "organs")
+    write_labels(organs, liver, ("liver",), organs)
+    parent = bench.add("LinearTransform", "to world")
+    parent.SetMatrixTransformToParent(vtk_matrix(TURN))
+    organs.SetAndObserveTransformNodeID(parent.GetID())
+    presenter, parameters = bench.presenter(label_maps=True), bench.logic.parameters
+    parameters.organs = organs
+    presenter.segment()
+    assert "has organs of a CT, and the contrast is t1" in presenter.view.errors[-1]
+    presenter.setValue("scene.contrast", "ct")
+    presenter.segment()
+    assert len(presenter.view.errors) == 1 and "organs: liver" in presenter.notes()
+    laid = bench.voxels("liver", parameters.labels)
+    assert 0.6 * liver.array.sum() < laid <= liver.array.sum()
+
+
+# ---- lesions that are proposed ---------------------------------------------------------------------------------------
+
+
+def proposing() -> tuple[Scene, object, np.ndarray]:
+    """A scene whose MRI was segmented, with a tumour at CENTRE; its (k, j, i) voxels."""
+    segmentation, true = brain("low")
+    bench = Scene("LabelMapVolume")
+    write_volume(bench.mri, segmentation.labels)
+    presenter = bench.presenter(label_maps=True)
+    write_labels(bench.labels, segmentation.labels, segmentation.tissue_names, bench.mri)
+    bench.logic.parameters.labels = bench.labels
+    return bench, presenter, true
+
+
+@needs_atlas
+def test_a_point_shown_in_a_view_proposes_a_lesion_that_is_laid_over_the_tissues_when_it_is_accepted():
+    bench, presenter, true = proposing()
+    parameters = bench.logic.parameters
+    assert presenter.canPropose() == (False, "Segment this MRI first")
+    presenter.pickSeed()
+    assert "segment this MRI first" in presenter.view.errors.pop()
+    bench.logic.proposals.segmented(bench.mri, brain("low")[0])
+    assert presenter.canPropose()[0] and presenter.canProposeAtPoint() == (False, "Choose a point in the lesion")
+    presenter.pickSeed()
+    node, picked = presenter.view.picking
+    assert node is parameters.seed and not presenter.canAccept()[0]
+    node.AddControlPointWorld(0.0, 0.0, 300.0)
+    picked()
+    assert "300" not in presenter.notes() and "mm outside the image" in presenter.view.errors.pop()
+    assert parameters.proposal is None
+    node.AddControlPointWorld(*CENTRE)
+    picked()
+    assert not presenter.view.errors and parameters.proposal is not None and presenter.canAccept()[0]
+    assert "proposal: tumour" in presenter.notes() and "accept or discard it" in presenter.notes()
+    assert parameters.proposal.GetDisplayNode().GetVisibility()
+    with pytest.raises(ValueError, match="not in tuple"):  # nothing is laid over the tissues
+        bench.voxels("tumour", parameters.labels)
+    presenter.acceptProposal()
+    assert not presenter.view.errors and parameters.proposal is None and "proposal: " not in presenter.notes()
+    laid = bench.voxels("tumour", parameters.labels)
+    assert 0.6 * true.sum() < laid < 1.4 * true.sum()
+    assert list(parameters.lesions.GetSegmentation().GetSegmentIDs())
+
+
+@needs_atlas
+def test_a_proposal_without_a_point_is_discarded_and_a_named_one_is_taken_at_the_users_word():
+    bench, presenter, _ = proposing()
+    parameters = bench.logic.parameters
+    bench.logic.proposals.segmented(bench.mri, brain("low")[0])
+    presenter.proposeLesions()
+    first = parameters.proposal
+    assert first is not None and not presenter.view.errors
+    presenter.discardProposal()
+    assert parameters.proposal is None and first.GetScene() is None and "proposal: " not in presenter.notes()
+    parameters.seed = bench.add("MarkupsFiducial", "point")
+    parameters.seed.AddControlPointWorld(*CENTRE)
+    presenter.setValue("scene.lesion_as", "oedema")
+    presenter.proposeAtPoint()
+    segmentation = parameters.proposal.GetSegmentation()
+    assert [segmentation.GetSegment(name).GetName() for name in segmentation.GetSegmentIDs()] == ["oedema"]
+    bench.logic.proposals.segmented(bench.mri, brain("healthy")[0])
+    presenter.proposeLesions()
+    assert parameters.proposal is None and "proposal: no lesion proposed" in presenter.notes()
+
+
+@needs_atlas
+@pytest.mark.parametrize(
+    ("seed", "words"),
+    [
+        ((28.0, -22.0, 28.0), "white matter that looks healthy"),
+        ((0.0, 0.0, -70.0), "mm outside the brain"),
+        ((4.0, 8.0, 16.0), "fluid that looks like CSF"),
+    ],
+)
+def test_a_point_in_no_lesion_is_one_line_and_proposes_nothing(seed, words):
+    bench, presenter, _ = proposing()
+    bench.logic.proposals.segmented(bench.mri, brain("healthy")[0])
+    bench.logic.parameters.seed = bench.add("MarkupsFiducial", "point")
+    bench.logic.parameters.seed.AddControlPointWorld(*seed)
+    presenter.proposeAtPoint()
+    (line,) = presenter.view.errors
+    assert words in line and "\n" not in line and bench.logic.parameters.proposal is None
