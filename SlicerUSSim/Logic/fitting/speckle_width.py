@@ -70,6 +70,8 @@ class SpeckleWidth:
 def log_speckle_correlation(distance: np.ndarray, sigma: float) -> np.ndarray:
     """Autocorrelation of the log of developed speckle at a distance; both in one unit.
 
+    >>> import numpy as np
+    >>> from SlicerUSSim.Logic.fitting.speckle_width import log_speckle_correlation
     >>> float(log_speckle_correlation(np.array([0.5 * 1.823]), 1.0)[0].round(3))
     0.5
     """

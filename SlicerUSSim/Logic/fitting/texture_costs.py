@@ -119,6 +119,7 @@ def texture_misfit(
 
     >>> import numpy as np
     >>> from scipy import ndimage
+    >>> from SlicerUSSim.Logic.fitting import texture_misfit
     >>> noise = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(200, 200)), 1.0)
     >>> speckle = np.clip(128 + 150 * noise, 0, 255).astype(np.uint8)
     >>> coarse = np.clip(128 + 300 * ndimage.gaussian_filter(noise, 1.5), 0, 255).astype(np.uint8)
