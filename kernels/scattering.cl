@@ -294,7 +294,7 @@ inline float gain_on_membrane(__constant const Acquisition *acquisition, __globa
 #ifdef UNEVEN
 // By how much tissue varies at LANES places in the patient, as factors of amplitudes. `uneven` are words of the tissue
 // at each place, [word][lane].
-inline floatn unevenness(uint seed, const float *uneven, floatn x, floatn y, floatn z) {
+inline floatn unevenness(uint seed, const float *uneven, int has_specks, floatn x, floatn y, floatn z) {
   floatn level = LOAD_LANES(uneven + 2 * LANES);
   // g: normal numbers at the corners of lattice cells, with trilinear weights, over the root of the weights' squares
   const floatn per_mm = LOAD_LANES(uneven);
@@ -313,17 +313,17 @@ inline floatn unevenness(uint seed, const float *uneven, floatn x, floatn y, flo
   const floatn squares = fma(fx, fx, (1.0f - fx) * (1.0f - fx)) * fma(fy, fy, (1.0f - fy) * (1.0f - fy)) *
                          fma(fz, fz, (1.0f - fz) * (1.0f - fz));
   level = fma(LOAD_LANES(uneven + LANES), sum / sqrt(squares), level);
-  // A speck fills the cell that it is in
-  const floatn cells = LOAD_LANES(uneven + 3 * LANES);
-  const floatn sx = x * cells, sy = y * cells, sz = z * cells;
-  const floatn jx = floor(sx), jy = floor(sy), jz = floor(sz);
-  const uintn bits = hash_mixn((TO_UINTN(TO_INTN(jx)) * axis_step(0) + TO_UINTN(TO_INTN(jy)) * axis_step(1) +
-                                TO_UINTN(TO_INTN(jz)) * axis_step(2)) ^
-                               (seed + 0xB5297A4Du));
-  const floatn rx = sx - jx - 0.5f, ry = sy - jy - 0.5f, rz = sz - jz - 0.5f;
-  const floatn near = fmax(1.0f - 4.0f * fma(rx, rx, fma(ry, ry, rz * rz)), 0.0f);
-  const intn is_speck = TO_FLOATN(bits >> 16) + 0.5f < LOAD_LANES(uneven + 4 * LANES);
-  level += is_speck ? LOAD_LANES(uneven + 5 * LANES) * near : (floatn)(0.0f);
+  if (has_specks) {  // which fill the cell that they are in
+    const floatn cells = LOAD_LANES(uneven + 3 * LANES);
+    const floatn sx = x * cells, sy = y * cells, sz = z * cells;
+    const floatn jx = floor(sx), jy = floor(sy), jz = floor(sz);
+    const uintn place = TO_UINTN(TO_INTN(jx)) * axis_step(0) + TO_UINTN(TO_INTN(jy)) * axis_step(1) +
+                        TO_UINTN(TO_INTN(jz)) * axis_step(2);
+    const floatn drawn = TO_FLOATN(hash_mixn(place ^ (seed + 0xB5297A4Du)) >> 16) + 0.5f;
+    const floatn rx = sx - jx - 0.5f, ry = sy - jy - 0.5f, rz = sz - jz - 0.5f;
+    const floatn near = fmax(1.0f - 4.0f * fma(rx, rx, fma(ry, ry, rz * rz)), 0.0f);
+    level += drawn < LOAD_LANES(uneven + 4 * LANES) ? LOAD_LANES(uneven + 5 * LANES) * near : (floatn)(0.0f);
+  }
   return exp2_fast(clamp(level, (floatn)(-30.0f), (floatn)(30.0f)));
 }
 #endif
@@ -450,15 +450,17 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 #ifdef UNEVEN
   for (int i = 0; i < n; i += LANES) {
     float places[3][LANES], words[UNEVEN_WORDS * LANES];
+    int has_specks = 0;
     for (int lane = 0; lane < LANES; lane++) {
       const int at = min(i + lane, n - 1);
       for (int axis = 0; axis < 3; axis++) places[axis][lane] = place_[axis * BATCH + chosen[at]];
       __global const float *uneven = sites + 3 * MAX_TISSUES + UNEVEN_WORDS * label_[at];
       for (int word = 0; word < 6; word++) words[word * LANES + lane] = uneven[word];
+      has_specks |= uneven[3] > 0.0f;
     }
-    STORE_LANES(
-        unevenness(acquisition->seed, words, LOAD_LANES(places[0]), LOAD_LANES(places[1]), LOAD_LANES(places[2])),
-        uneven_ + i);
+    STORE_LANES(unevenness(acquisition->seed, words, has_specks, LOAD_LANES(places[0]), LOAD_LANES(places[1]),
+                           LOAD_LANES(places[2])),
+                uneven_ + i);
   }
 #endif
 
