@@ -1,4 +1,4 @@
-"""Echogenicity that varies within a tissue (docs/physics.md#uneven-tissue): texture and specks, fixed in the patient."""
+"""Echogenicity that varies within a tissue (docs/physics.md#uneven-tissue): texture and specks, fixed in it."""
 
 from __future__ import annotations
 

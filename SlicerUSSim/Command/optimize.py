@@ -32,7 +32,8 @@ _STATE_BYTES = 2**30
     multiple=True,
     metavar="NAME[=LOW:HIGH]",
     help='Free parameters: "display", "tissues" (echogenicity and attenuation of each tissue that the images show), a '
-    'tissue, or a parameter ("gain_db", "white matter.mu0"), optionally with bounds; may be repeated (default: display '
+    'tissue, a group of the display ("smoothing", "map", "sliders", "line gains"), or a parameter ("gain_db", "white '
+    'matter.mu0"), optionally with bounds; may be repeated (default: display '
     "and tissues).",
 )
 @gathered(settings=FitSettings)

@@ -162,8 +162,8 @@ def _line_gain(number: int) -> Any:
 
 def _map_slope(where: str) -> Any:
     return parameter(
-        1.0, f"Map at {where}", f"Slope of the grey map at {where}, relative to that at half of white", bounds=(0.02, 8),
-        shown=Shown(0.05, 4, 0.05, is_slider=True),
+        1.0, f"Map at {where}", f"Slope of the grey map at {where}, relative to that at half of white",
+        bounds=(0.02, 8), shown=Shown(0.05, 4, 0.05, is_slider=True),
         fit=Fit(0.1, 3, tolerance=0.15, is_logarithmic=True, on_request=True), note="Multiplies that of grey_map",
     )  # fmt: skip
 
@@ -205,7 +205,8 @@ class DisplaySettings(Declared):
         fit=Fit(-120, -30, tolerance=3.0),
     )  # fmt: skip
     smoothing_axial_mm: float = parameter(
-        0.0, "Smoothing along lines", "Sigma of a Gaussian along the lines that smooths the envelope before compression",
+        0.0, "Smoothing along lines",
+        "Sigma of a Gaussian along the lines that smooths the envelope before compression",
         unit="mm", bounds=(0, 3), shown=Shown(0, 1, 0.01, is_slider=True),
         fit=Fit(0.0, 0.3, tolerance=0.03, on_request=True), note="0.06 to 0.1 is as good as 3 to 5 compounded looks",
     )  # fmt: skip

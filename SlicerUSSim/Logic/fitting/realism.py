@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import written_whole
 from SlicerUSSim.Logic.base.own_outputs import save_marked_png
 from SlicerUSSim.Logic.base.settings import DisplaySettings
@@ -29,6 +29,7 @@ from SlicerUSSim.Logic.fitting.image_similarity import Similarity, similarity
 from SlicerUSSim.Logic.fitting.sheet_contrast import LineContrast, line_contrast, sheet_points, wall_points
 from SlicerUSSim.Logic.fitting.speckle_width import SpeckleWidth, extrema_density_cm2, speckle_widths
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
+from SlicerUSSim.Logic.imaging.grey_map import EstimatedMap, estimate_grey_map
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.placement import slice_under_probe
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -79,6 +80,8 @@ class Looks:
     level: np.ndarray = field(repr=False)
     #: {name of the tissue: by angle to the beam}
     lines: dict[str, list[LineContrast]]
+    #: None where the images have too few grey levels
+    grey_map: EstimatedMap | None
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
@@ -87,6 +90,12 @@ class Looks:
             "maxima_per_cm2": self.maxima_per_cm2,
             "tissues": {name: grey.to_dict() for name, grey in self.tissues.items()},
             "level": {"depth_mm": self.depth_mm.tolist(), "grey": self.level.tolist()},
+            "grey_map": self.grey_map
+            and {
+                "grey": self.grey_map.level.tolist(),
+                "slope": self.grey_map.slope.tolist(),
+                **self.grey_map.changes(),
+            },
             "lines": {name: [vars(line) for line in lines] for name, lines in self.lines.items()},
         }
 
@@ -150,6 +159,13 @@ class Realism:
             heads = ["images", "mean", "deviation", "skewness", "1 %", "99 %", "maxima/cm²", "histogram misfit"]
             tables.append((f"Grey levels of {tissue}; all but the mean less the local mean", heads, rows))
         half = 0.5 * (real.depth_mm[1] - real.depth_mm[0]) if len(real.depth_mm) > 1 else 0.0
+        greys = (15, 30, 45, 60, 80, 100, 160, 200)
+        maps = [
+            [name, *(_text(looks.grey_map.at(grey)) for grey in greys)]
+            for name, looks in self.looks.items()
+            if looks.grey_map is not None
+        ]
+        tables.append(("Slope of the grey map relative to that at 130", ["grey level", *map(str, greys)], maps))
         level_heads = ["depth, mm", *(f"{d - half:.0f}-{d + half:.0f}" for d in real.depth_mm)]
         level = [[name, *(_text(g, 0) for g in looks.level)] for name, looks in self.looks.items()]
         tables.append(("Mean grey level", level_heads, level))
@@ -320,7 +336,15 @@ def _looks_of(
         band_mm,
         level,
         lines,
+        _grey_map_of(images, tracked),
     )
+
+
+def _grey_map_of(images: Sequence[np.ndarray], tracked: TrackedImages) -> EstimatedMap | None:
+    try:
+        return estimate_grey_map(images, tracked.grid.pixel_spacing_mm, tracked.mask)
+    except SimulationError:
+        return None
 
 
 def _depth_of_pixels(tracked: TrackedImages) -> np.ndarray:

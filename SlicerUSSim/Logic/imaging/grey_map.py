@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 
 from SlicerUSSim.Logic.base.declaration import parameter_of
@@ -22,22 +23,23 @@ from SlicerUSSim.Logic.base.settings import DisplaySettings
 KNOTS = (0.0, 64.0, 128.0, 255.0)
 #: Slopes at the other three, of the maps of DisplaySettings.grey_map: as estimated from a scanner of an exposed brain
 #: (RESECT) and from one of a spine phantom (Plus)
-GREY_MAPS = {"linear": (1.0, 1.0, 1.0), "soft": (0.5, 0.74, 1.6), "contrast": (0.12, 0.74, 0.85)}
+GREY_MAPS = {"linear": (1.0, 1.0, 1.0), "soft": (0.48, 0.76, 1.5), "contrast": (0.08, 0.65, 0.85)}
 #: Entries of the table for the device
 TABLE_SIZE = 1024
 #: Steps of the integral over grey levels
-_STEPS = 4096
-#: For the estimate: half-width of windows in mm, grey levels between which it is made, and pixels of a level at least
-_WINDOW_MM, _DARKEST, _LEAST_PIXELS = 3.0, 12.0, 400
-#: Grey levels about which it is made
+_STEPS = 16384
+#: For the estimate: width of windows, in which anatomy hardly varies; grey levels, how far medians may be from them,
+#: and windows that one needs
+_WINDOW_MM = 2.0
 _LEVELS = np.arange(15.0, 226.0, 5.0)
+_NEAR, _LEAST_WINDOWS = 6.0, 30
 
 
 @dataclass(frozen=True)
 class EstimatedMap:
     """The slope of a scanner's grey map."""
 
-    #: (levels,) grey levels, and the slope there relative to that at 130; NaN where the images have too few pixels
+    #: (levels,) grey levels, and the slope there relative to that at 130; NaN where the images have too few windows
     level: np.ndarray
     slope: np.ndarray
     #: Of DisplaySettings: slopes at the knots relative to that at half of white
@@ -77,34 +79,33 @@ def estimate_grey_map(
     """The grey map of a scanner from its images (rows, columns) uint8 alone.
 
     Developed speckle has the same distribution in decibels at every level, so its distribution of grey levels is as
-    wide as the map is steep there. Around every pixel the median and the distance between the 25th and the 75th
-    percentile are taken; the median of these distances over pixels of one median is the slope. Below grey level 30 it
-    is too low, since speckle is clipped at black. `pixel_spacing_mm` is (column, row); `mask` (rows, columns) bool is
-    the imaged field (default: all).
+    wide as the map is steep there: in windows of 2 mm, the median distance of the quartiles over all windows of one
+    median is the slope. Below grey level 30 it is too low, since speckle is clipped at black. `pixel_spacing_mm` is
+    (column, row); `mask` (rows, columns) bool is the imaged field (default: all).
 
     Raises SimulationError where images have too few levels to compare.
     """
     require(len(images) > 0, "no image, expected at least one for a grey map")
-    size = [max(int(2.0 * _WINDOW_MM / spacing) | 1, 3) for spacing in pixel_spacing_mm[::-1]]
-    medians, spreads = [], []
+    size = tuple(max(int(_WINDOW_MM / spacing) | 1, 3) for spacing in pixel_spacing_mm[::-1])
+    quartiles = []
     for image in images:
         image = np.asarray(image)
-        require(image.ndim == 2, f"an image has shape {image.shape}, expected (rows, columns)")
-        inside = np.ones(image.shape, bool) if mask is None else np.asarray(mask, bool)
-        # Windows that are cut by the field have fewer pixels, and black ones
-        inside = np.asarray(ndimage.binary_erosion(inside, np.ones(size)))[::2, ::2]
-        low, middle, high = (
-            ndimage.percentile_filter(image, p, size=size)[::2, ::2][inside].astype(float) for p in (25, 50, 75)
+        require(
+            image.ndim == 2 and min(np.subtract(image.shape, size)) >= 0,
+            f"an image has shape {image.shape}, expected (rows, columns) larger than a window of {size}",
         )
-        medians.append(middle)
-        spreads.append(high - low)
-    median, spread = np.concatenate(medians), np.concatenate(spreads)
+        inside = np.ones(image.shape, bool) if mask is None else np.asarray(mask, bool)
+        step = max(size[0] // 3, 1)
+        # Windows that are cut by the field have fewer pixels, and black ones
+        whole = sliding_window_view(inside, size)[::step, ::step].all(axis=(2, 3))
+        windows = sliding_window_view(image, size)[::step, ::step][whole]
+        quartiles.append(np.percentile(windows.reshape(len(windows), -1), (25, 50, 75), axis=1))
+    low, median, high = np.concatenate(quartiles, axis=1)
     slope = np.full(len(_LEVELS), np.nan)
     for n, level in enumerate(_LEVELS):
-        near = np.abs(median - level) <= 5.0
-        if np.count_nonzero(near) >= _LEAST_PIXELS and level >= _DARKEST:
-            # Sheets and borders widen a distribution, never narrow it
-            slope[n] = np.percentile(spread[near], 40)
+        near = np.abs(median - level) <= _NEAR
+        if np.count_nonzero(near) >= _LEAST_WINDOWS:
+            slope[n] = np.median((high - low)[near])
     known = np.isfinite(slope) & (slope > 0.0)
     if known.sum() < 4 or np.ptp(_LEVELS[known]) < 40.0:
         raise SimulationError("the images have too few grey levels for a grey map, expected dark and bright tissue")
@@ -127,7 +128,7 @@ def _slopes(display: DisplaySettings) -> tuple[float, float, float]:
     return named[0] * display.map_black, named[1] * display.map_dark, named[2] * display.map_white
 
 
-@cache
+@lru_cache(maxsize=64)  # a fit tries many
 def _table(slopes: tuple[float, float, float]) -> np.ndarray:
     # dy = slope(y) dx: x is the integral of 1 / slope
     grey = np.linspace(0.0, 255.0, _STEPS + 1)
