@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from SlicerUSSim.Logic import DisplaySettings, SimulationError, TissueTable
-from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS, TISSUE_BOUNDS, FreeParameters, all_names
+from SlicerUSSim.Logic.fitting.parameters import TISSUE_BOUNDS, FreeParameters, all_names
 
 TISSUES, DISPLAY = TissueTable.brain(), DisplaySettings()
 

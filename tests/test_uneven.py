@@ -80,8 +80,15 @@ def test_mean_power_is_kept(changes):
     assert 10 * np.log10(np.mean(ratios)) == pytest.approx(0.0, abs=max(0.1, 2.5 * error))
 
 
-@pytest.mark.parametrize("values", [{"texture_db": 3.0}, {"texture_db": 8.0}, {"specks_per_mm3": 0.05, "speck_db": 14.0},
-                                    {"texture_db": 4.0, "specks_per_mm3": 0.02, "speck_db": 12.0}])  # fmt: skip
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"texture_db": 3.0},
+        {"texture_db": 8.0},
+        {"specks_per_mm3": 0.05, "speck_db": 14.0},
+        {"texture_db": 4.0, "specks_per_mm3": 0.02, "speck_db": 12.0},
+    ],
+)
 def test_mean_square_of_the_gain_is_one_within_a_tenth_of_a_decibel(values):
     places = np.random.default_rng(0).uniform(-400, 400, (3_000_000, 3))
     power = factors(rows(**values), places).astype(float) ** 2
@@ -151,7 +158,7 @@ def test_specks_make_a_bright_tail():
 
 
 def test_fits_vary_the_echogenicity_of_uneven_tissue_exactly():
-    """The signal is linear in amplitudes whatever factor each scatterer has: bases of a fit are those of the simulator."""
+    """The signal is linear in amplitudes, whatever factor each scatterer has: bases of fits are the simulator's."""
     made = simulator(UNEVEN)
     model = AppearanceModel(made, PROBE, [POSE], {"speckle": ["mu0", "sigma0"]})
     display = DisplaySettings(noise_db=None)
