@@ -24,7 +24,7 @@ def _level(text: str) -> str:
 
 
 # How echogenicity varies within tissues of the brain, by trial: with a soft grey map and the envelope smoothed, these
-# give the speckle of a real brain its size, number of grains, bright tail and deviation. Other organs were not compared.
+# give the speckle of a real brain its size, number of grains, bright tail and deviation. No other organ was compared.
 _FROM_SPECKLE = _level("by trial, from the speckle of a real sweep of a brain (docs/realism.md)")
 _WITH_VESSELS = {"texture_db": 3.5, "texture_mm": 0.8, "specks_per_mm3": 0.005, "speck_db": 14.0}
 _WITH_SPECKS = {**_WITH_VESSELS, "specks_per_mm3": 0.01}
