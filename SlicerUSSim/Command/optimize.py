@@ -88,7 +88,8 @@ def optimize(
     with Curve("optimize") as curve:
         found = fit(
             simulator, tracked.images, free=names, display=tracked.examination.display,
-            register=settings.register, speckle=settings.speckle, max_evaluations=settings.evaluations, restarts=settings.restarts,
+            register=settings.register, speckle=settings.speckle, max_evaluations=settings.evaluations,
+            restarts=settings.restarts,
             progress=curve, resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
             checkpoint=(lambda reached: write_json(state, reached)) if state else None,
         )  # fmt: skip

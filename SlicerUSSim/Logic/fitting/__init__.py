@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .report import write_report as write_report
     from .search import Progress as Progress
     from .settings import FitSettings as FitSettings
+    from .speckle_fit import SpeckleFit as SpeckleFit, fit_speckle as fit_speckle
     from .speckle_width import SpeckleWidth as SpeckleWidth, speckle_widths as speckle_widths
     from .texture_costs import (
         TextureMisfit as TextureMisfit,

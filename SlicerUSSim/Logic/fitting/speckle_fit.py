@@ -53,8 +53,9 @@ class SpeckleFit:
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
+        shown = (*_NAMES, "grey_map", "map_black", "map_dark", "map_white")
         return {
-            **{name: getattr(self.display, name) for name in (*_NAMES, "grey_map", "map_black", "map_dark", "map_white")},
+            **{name: getattr(self.display, name) for name in shown},
             "texture_factor": self.texture_factor,
             "grey_map_found": self.has_map,
             "before": vars(self.before),
