@@ -115,8 +115,8 @@ def _trio(
     difference = _png(np.clip(127.5 + 0.5 * (after.astype(float) - real), 0, 255).astype(np.uint8))
     caption = (
         f"Image {number}: cost {was.total:.4f} → {is_now.total:.4f} (histograms {was.bhattacharyya:.3f} → "
-        f"{is_now.bhattacharyya:.3f}, difference {was.sad:.3f} → {is_now.sad:.3f}), texture T1 {texture_was.autocorrelation:.3f} → "
-        f"{texture.autocorrelation:.3f}, T2 {texture_was.extrema:.2f} → {texture.extrema:.2f}"
+        f"{is_now.bhattacharyya:.3f}, difference {was.sad:.3f} → {is_now.sad:.3f}), texture T1 "
+        f"{texture_was.autocorrelation:.3f} → {texture.autocorrelation:.3f}, T2 {texture_was.extrema:.2f} → {texture.extrema:.2f}"
     )
     return f"""<figure class="case">
 <figcaption>{caption}</figcaption>
