@@ -116,7 +116,8 @@ def _trio(
     caption = (
         f"Image {number}: cost {was.total:.4f} → {is_now.total:.4f} (histograms {was.bhattacharyya:.3f} → "
         f"{is_now.bhattacharyya:.3f}, difference {was.sad:.3f} → {is_now.sad:.3f}), texture T1 "
-        f"{texture_was.autocorrelation:.3f} → {texture.autocorrelation:.3f}, T2 {texture_was.extrema:.2f} → {texture.extrema:.2f}"
+        f"{texture_was.autocorrelation:.3f} → {texture.autocorrelation:.3f}, "
+        f"T2 {texture_was.extrema:.2f} → {texture.extrema:.2f}"
     )
     return f"""<figure class="case">
 <figcaption>{caption}</figcaption>
