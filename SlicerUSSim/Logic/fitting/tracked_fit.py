@@ -50,8 +50,8 @@ class Fit:
     before: list[np.ndarray] = field(repr=False)
     after: list[np.ndarray] = field(repr=False)
     #: T1 and T2 of each image (texture_costs.py), before and after
-    texture_before: list[TextureMisfit]
-    texture_after: list[TextureMisfit]
+    texture_before: list[TextureMisfit] = field(default_factory=list)
+    texture_after: list[TextureMisfit] = field(default_factory=list)
     #: None unless the speckle was fitted
     speckle: SpeckleFit | None = None
 
