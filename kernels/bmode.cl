@@ -31,12 +31,13 @@ __kernel void convolve_pulse(__global const float *re, __global const float *im,
   STORE_PAIRS(sum_re, sum_im, iq + 2 * (line * samples + sample));
 }
 
-// Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC is `tgc` [sample], in dB.
-// `ringing`, float2 [sample], is added to every line: the reverberation at the face. Both count from where the line
-// leaves it.
+// Amplifier noise, time gain compensation, envelope, log compression, eight bits. TGC is `tgc` [sample], in dB, and
+// `line_gains` [scan line] are added to it. `ringing`, float2 [sample], is added to every line: the reverberation at
+// the face. Both count from where the line leaves it.
 __kernel void compress(__constant const Acquisition *acquisition, __global const float *iq, int samples,
                        __global const float *ringing, float noise, uint noise_seed, __global const float *tgc,
-                       float level_of_white_db, Display display, __global float *envelope, __global uchar *grey) {
+                       __global const float *line_gains, float level_of_white_db, Display display,
+                       __global float *envelope, __global uchar *grey) {
   int sample = get_global_id(0) * LANES, line = get_global_id(1);
   int here = line * samples + sample;
   floatn re, im;
@@ -58,6 +59,7 @@ __kernel void compress(__constant const Acquisition *acquisition, __global const
     ring_im = LOAD_LANES(shifted_im);
     tgc_db = LOAD_LANES(shifted_db);
   }
+  tgc_db += line_gains[line];
   re += ring_re;
   im += ring_im;
   const intn index = sample + LANE_INDEX;

@@ -28,11 +28,14 @@
 // With FOUND defined, planes have two words: some are of sheets that were found in the MRI (sheets.clh). Beside these
 // nothing else is membrane.
 //
+// With UNEVEN defined, some tissues have an echogenicity that varies within them (unevenness.py).
+//
 // Buffers: voxels, segments as in raytracing.cl; planes uint [k][j][i] of sheets.cl (one element without sheets);
 // texture uint [k][j][i] (one element without TEXTURE); sites float2 [label], the share of cells with a scatterer, in
-// 1/65536, and its amplitude, with LOBES behind them whether it is dark; re, im float [2 traced line + side][stride];
-// with VARIED also [part] before these, and part_of int [label], -1 for a tissue in none; with LOBES lobes float
-// [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the distance of the last column [LOBE_DEPTHS].
+// 1/65536, and its amplitude, behind them whether it is dark (with LOBES), behind that UNEVEN_WORDS of unevenness.py;
+// re, im float [2 traced line + side][stride]; with VARIED also [part] before these, and part_of int [label], -1 for a
+// tissue in none; with LOBES lobes float [LOBE_DEPTHS][LOBE_DISTANCES], and behind them the distance of the last column
+// [LOBE_DEPTHS].
 
 #include "common.clh"
 #include "sheets.clh"
@@ -72,12 +75,15 @@ typedef struct {
   float3 direction, lateral, elevational;
   float3 at_start, row_i, row_j, row_k;  // voxel index = at_start + rows * (offset from the segment's start)
   float start_u, low, span;              // first path length of this piece, 1 / its length
-  float narrow0, narrow1;                // elevational exponent of two per mm^2 at the near end, and its change
-  float curved0, curved1;                // elevational phase in cycles per mm^2, likewise
-  float gain0, gain1;                    // amplitude as an exponent of two, likewise
-  float line0, line1;                    // 1 / distance of traced lines, likewise
-  float edge;                            // of the strip that begins there: distance re its width
-  float bend;                            // 1 / (2 radius) of the surfaces of equal range
+#ifdef UNEVEN
+  float start_v, start_w;
+#endif
+  float narrow0, narrow1;  // elevational exponent of two per mm^2 at the near end, and its change
+  float curved0, curved1;  // elevational phase in cycles per mm^2, likewise
+  float gain0, gain1;      // amplitude as an exponent of two, likewise
+  float line0, line1;      // 1 / distance of traced lines, likewise
+  float edge;              // of the strip that begins there: distance re its width
+  float bend;              // 1 / (2 radius) of the surfaces of equal range
   float depth0, slope;
   float from_mm, to_mm;  // path lengths whose scatterers belong to this piece
   int u, v, w, first;
@@ -285,6 +291,43 @@ inline float gain_on_membrane(__constant const Acquisition *acquisition, __globa
   return level * exp2_scalar(max(acquisition->membrane_exponent * log2_scalar(fmax(cosine, 1e-6f)), -100.0f));
 }
 
+#ifdef UNEVEN
+// By how much tissue varies at LANES places in the patient, as factors of amplitudes. `uneven` are words of the tissue
+// at each place, [word][lane].
+inline floatn unevenness(uint seed, const float *uneven, int has_specks, floatn x, floatn y, floatn z) {
+  floatn level = LOAD_LANES(uneven + 2 * LANES);
+  // g: normal numbers at the corners of lattice cells, with trilinear weights, over the root of the weights' squares
+  const floatn per_mm = LOAD_LANES(uneven);
+  const floatn px = x * per_mm, py = y * per_mm, pz = z * per_mm;
+  const floatn ix = floor(px), iy = floor(py), iz = floor(pz);
+  const floatn fx = px - ix, fy = py - iy, fz = pz - iz;
+  const uintn key = TO_UINTN(TO_INTN(ix)) * axis_step(0) + TO_UINTN(TO_INTN(iy)) * axis_step(1) +
+                    TO_UINTN(TO_INTN(iz)) * axis_step(2);
+  floatn sum = 0.0f;
+  for (int corner = 0; corner < 8; corner++) {
+    const int dx = corner & 1, dy = (corner >> 1) & 1, dz = corner >> 2;
+    const uint step = dx * axis_step(0) + dy * axis_step(1) + dz * axis_step(2);
+    const floatn weight = (dx ? fx : 1.0f - fx) * (dy ? fy : 1.0f - fy) * (dz ? fz : 1.0f - fz);
+    sum = fma(weight, gaussian(hash_mixn((key + step) ^ (seed + 0x68E31DA4u))), sum);
+  }
+  const floatn squares = fma(fx, fx, (1.0f - fx) * (1.0f - fx)) * fma(fy, fy, (1.0f - fy) * (1.0f - fy)) *
+                         fma(fz, fz, (1.0f - fz) * (1.0f - fz));
+  level = fma(LOAD_LANES(uneven + LANES), sum / sqrt(squares), level);
+  if (has_specks) {  // which fill the cell that they are in
+    const floatn cells = LOAD_LANES(uneven + 3 * LANES);
+    const floatn sx = x * cells, sy = y * cells, sz = z * cells;
+    const floatn jx = floor(sx), jy = floor(sy), jz = floor(sz);
+    const uintn place = TO_UINTN(TO_INTN(jx)) * axis_step(0) + TO_UINTN(TO_INTN(jy)) * axis_step(1) +
+                        TO_UINTN(TO_INTN(jz)) * axis_step(2);
+    const floatn drawn = TO_FLOATN(hash_mixn(place ^ (seed + 0xB5297A4Du)) >> 16) + 0.5f;
+    const floatn rx = sx - jx - 0.5f, ry = sy - jy - 0.5f, rz = sz - jz - 0.5f;
+    const floatn near = fmax(1.0f - 4.0f * fma(rx, rx, fma(ry, ry, rz * rz)), 0.0f);
+    level += drawn < LOAD_LANES(uneven + 4 * LANES) ? LOAD_LANES(uneven + 5 * LANES) * near : (floatn)(0.0f);
+  }
+  return exp2_fast(clamp(level, (floatn)(-30.0f), (floatn)(30.0f)));
+}
+#endif
+
 // Three passes over a batch, each without unpredictable branches: vectors of all cells; labels of the scatterers that
 // contribute; their echoes, one after the other.
 inline void scatter_batch(__constant const Acquisition *acquisition, __global const ushort *voxels,
@@ -308,6 +351,9 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 #ifdef LOBES
   float away_[BATCH], path_[BATCH];
 #endif
+#ifdef UNEVEN
+  float place_[3 * BATCH], uneven_[BATCH + LANES];
+#endif
   ushort chosen[BATCH + 1];
   int n = 0;
   for (int begin = 0; begin < count; begin += LANES) {
@@ -321,6 +367,11 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
     const floatn pu = fma(TO_FLOATN(bits_u), (floatn)(grain), fma(TO_FLOATN(cells), (floatn)(cell), (floatn)(first_u)));
     const floatn pv = fma(TO_FLOATN(bits_v), (floatn)(grain), LOAD_LANES(row_v + begin));
     const floatn pw = fma(TO_FLOATN(bits_w), (floatn)(grain), LOAD_LANES(row_w + begin));
+#ifdef UNEVEN
+    STORE_LANES(pu + piece->start_u, place_ + u * BATCH + begin);
+    STORE_LANES(pv + piece->start_v, place_ + v * BATCH + begin);
+    STORE_LANES(pw + piece->start_w, place_ + w * BATCH + begin);
+#endif
     const floatn along = dot_lanes(pu, pv, pw, d);
     const floatn aside_l = dot_lanes(pu, pv, pw, l);
     const floatn aside_e = dot_lanes(pu, pv, pw, e);
@@ -396,6 +447,23 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
 #endif
   }
 
+#ifdef UNEVEN
+  for (int i = 0; i < n; i += LANES) {
+    float places[3][LANES], words[UNEVEN_WORDS * LANES];
+    int has_specks = 0;
+    for (int lane = 0; lane < LANES; lane++) {
+      const int at = min(i + lane, n - 1);
+      for (int axis = 0; axis < 3; axis++) places[axis][lane] = place_[axis * BATCH + chosen[at]];
+      __global const float *uneven = sites + 3 * MAX_TISSUES + UNEVEN_WORDS * label_[at];
+      for (int word = 0; word < 6; word++) words[word * LANES + lane] = uneven[word];
+      has_specks |= uneven[3] > 0.0f;
+    }
+    STORE_LANES(unevenness(acquisition->seed, words, has_specks, LOAD_LANES(places[0]), LOAD_LANES(places[1]),
+                           LOAD_LANES(places[2])),
+                uneven_ + i);
+  }
+#endif
+
   for (int i = 0; i < n; i++) {
     const int j = chosen[i], label = label_[i];
     const float2 site = vload2(label, sites);
@@ -410,6 +478,9 @@ inline void scatter_batch(__constant const Acquisition *acquisition, __global co
           gain_on_membrane(acquisition, voxels + here, planes + (acquisition->sheet_label < 0 ? 0 : PLANE_WORDS * here),
                            piece, (float3)(fx_[j], fy_[j], fz_[j]));
     }
+#ifdef UNEVEN
+    strength *= uneven_[i];
+#endif
     int part = 0;
 #ifdef VARIED
     part = part_of[label];
@@ -535,10 +606,11 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
-__kernel void scatter(__constant const Acquisition *acquisition, __global const ushort *voxels,
-                      __global const uint *planes, __global const uint *texture, __global const float *sites,
-                      __global const Segment *segments, __global const int *segment_counts, __global float *re,
-                      __global float *im, int stride VARIED_PARAMETERS LOBE_PARAMETERS) {
+__kernel void
+scatter(__constant const Acquisition *acquisition, __global const ushort *voxels, __global const uint *planes,
+        __global const uint *texture, __global const float *sites, __global const Segment *segments,
+        __global const int *segment_counts, __global float *re, __global float *im,
+        int stride VARIED_PARAMETERS LOBE_PARAMETERS) {
   const int chunk = get_global_id(0), first = chunk * CHUNK;
 #ifdef LOBES
   const int left_line = get_global_id(1) * together, lines = min(together, acquisition->traced_lines - left_line);
@@ -588,6 +660,9 @@ __kernel void scatter(__constant const Acquisition *acquisition, __global const 
     piece.u = u, piece.v = v, piece.w = w;
     piece.direction = d, piece.lateral = l, piece.elevational = e;
     piece.start_u = start.x;
+#ifdef UNEVEN
+    piece.start_v = start.y, piece.start_w = start.z;
+#endif
     piece.at_start = affine_point(m, (float3)(segment->start[0], segment->start[1], segment->start[2]));
     piece.row_i = (float3)(m[u], m[v], m[w]);
     piece.row_j = (float3)(m[4 + u], m[4 + v], m[4 + w]);

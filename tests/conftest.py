@@ -19,8 +19,10 @@ from tests.shared_data import SHARED as SHARED, needs_shared as needs_shared
 hypothesis.settings.register_profile("ussim", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("ussim")
 
-#: Speckle without attenuation, so that statistics do not change with depth; and fluids without scatterers.
-SPECKLE = replace(TISSUES["white matter"], name="speckle", attenuation_db_cm_mhz=0.0)
+#: Even speckle without attenuation, so that statistics do not change with depth; and fluids without scatterers.
+SPECKLE = replace(
+    TISSUES["white matter"], name="speckle", attenuation_db_cm_mhz=0.0, texture_db=0.0, specks_per_mm3=0.0
+)
 FLUID = Tissue("fluid", 1540.0, 1.54, 0.0)
 
 

@@ -501,7 +501,7 @@ def test_the_script_of_an_mri_has_its_mask_and_options_and_the_texture_if_it_is_
     hard = Preset().changed("settings", partial_volume=False)
     plain = python_script(source, hard, np.eye(4))
     assert """Volume.read("it's here.nii")""" in plain and "mask=Volume.read('mask.nii')" in plain
-    assert "contrast='t2'" in plain and "texture" not in plain
+    assert "contrast='t2'" in plain and "texture=" not in plain
     hybrid = hard.changed("settings", mri_modulation_db=1.0)
     for preset in (Preset(), hybrid):  # the page keeps the shares of the tissues
         assert "texture=segmentation.texture()" in python_script(source, preset, np.eye(4))

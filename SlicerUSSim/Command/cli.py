@@ -18,6 +18,7 @@ from SlicerUSSim.Command.devices import devices
 from SlicerUSSim.Command.optimize import optimize
 from SlicerUSSim.Command.options import verbose_option
 from SlicerUSSim.Command.progress import note
+from SlicerUSSim.Command.realism import realism
 from SlicerUSSim.Command.segment import segment
 from SlicerUSSim.Command.serve import serve
 from SlicerUSSim.Command.simulate import simulate
@@ -67,7 +68,7 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__
         note(f"ussim: warning: {message}")
 
 
-for command in (bench, demo, devices, optimize, segment, serve, simulate, sweep, validate, volume):
+for command in (bench, demo, devices, optimize, realism, segment, serve, simulate, sweep, validate, volume):
     main.add_command(verbose_option(command))
 verbose_option(main)
 

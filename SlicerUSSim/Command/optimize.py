@@ -32,7 +32,8 @@ _STATE_BYTES = 2**30
     multiple=True,
     metavar="NAME[=LOW:HIGH]",
     help='Free parameters: "display", "tissues" (echogenicity and attenuation of each tissue that the images show), a '
-    'tissue, or a parameter ("gain_db", "white matter.mu0"), optionally with bounds; may be repeated (default: display '
+    'tissue, a group of the display ("smoothing", "map", "sliders", "line gains"), or a parameter ("gain_db", "white '
+    'matter.mu0"), optionally with bounds; may be repeated (default: display '
     "and tissues).",
 )
 @gathered(settings=FitSettings)
@@ -87,7 +88,8 @@ def optimize(
     with Curve("optimize") as curve:
         found = fit(
             simulator, tracked.images, free=names, display=tracked.examination.display,
-            register=settings.register, max_evaluations=settings.evaluations, restarts=settings.restarts,
+            register=settings.register, speckle=settings.speckle, max_evaluations=settings.evaluations,
+            restarts=settings.restarts,
             progress=curve, resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
             checkpoint=(lambda reached: write_json(state, reached)) if state else None,
         )  # fmt: skip
@@ -137,6 +139,11 @@ def _write_report(
     )  # fmt: skip
 
 
+def _mean(values: list[float]) -> float:
+    known = [value for value in values if value == value]  # not NaN
+    return sum(known) / len(known) if known else float("nan")
+
+
 def _tell(found: Fit) -> None:
     """Print the result, one line for the cost and one for each parameter."""
     if found.registration:
@@ -144,6 +151,22 @@ def _tell(found: Fit) -> None:
         click.echo(f"moved by {moved.shift_mm:.2f} mm and {moved.turn_deg:.2f} degrees")
     result = found.appearance
     click.echo(f"cost {result.cost_before:.4f} -> {result.cost_after:.4f} ({result.evaluations} evaluations)")
+    before, after = (
+        [_mean([getattr(one, name) for one in misfits]) for name in ("autocorrelation", "extrema")]
+        for misfits in (found.texture_before, found.texture_after)
+    )
+    click.echo(f"texture T1 {before[0]:.3f} -> {after[0]:.3f}, T2 {before[1]:.2f} -> {after[1]:.2f}")
+    if found.speckle is not None:
+        shown = found.speckle.display
+        click.echo(
+            f"speckle: smoothing {shown.smoothing_axial_mm:.3f} mm, {shown.smoothing_lateral_deg:.2f} degrees; texture "
+            f"x {found.speckle.texture_factor:g}; grey map "
+            + (
+                f"{shown.map_black:.2f} {shown.map_dark:.2f} {shown.map_white:.2f}"
+                if found.speckle.has_map
+                else "as given"
+            )
+        )
     for parameter in result.parameters:
         spread = result.identifiability[parameter.name]
         note = ""

@@ -122,8 +122,9 @@ class FitPresenter:
             labels, settings = parameters.labels, parameters.fit
             found = panel.logic.optimize(
                 labels, parameters.real, probe_transform_node=parameters.probe_transform, frames=self._frames(),
-                free=free, register=settings.register, estimate_geometry=settings.estimate,
-                max_evaluations=settings.evaluations, restarts=settings.restarts, plot=plot, progress=report,
+                free=free, register=settings.register, speckle=settings.speckle,
+                estimate_geometry=settings.estimate, max_evaluations=settings.evaluations,
+                restarts=settings.restarts, plot=plot, progress=report,
             )  # fmt: skip
             self._fit, self._before = (found, labels), None
             self.summary = _in_words(found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from SlicerUSSim.Logic.base.declaration import Declared, Fit, Shown, parameter
 
@@ -141,6 +142,32 @@ class SimulationSettings(Declared):
         return self.partial_volume is True or self.mri_modulation_db != 0.0
 
 
+def _depth_gain(number: int) -> Any:
+    """One of eight sliders."""
+    return parameter(
+        0.0, f"Gain at depth {number}", f"Slider {number} of 8 of the gain by depth, from the face to the image depth",
+        unit="dB", bounds=(-60, 60), shown=Shown(-30, 30, 0.5, is_slider=True),
+        fit=Fit(-15, 15, tolerance=2.0, on_request=True),
+    )  # fmt: skip
+
+
+def _line_gain(number: int) -> Any:
+    """One of five knots across the field."""
+    return parameter(
+        0.0, f"Gain of lines {number}",
+        f"Knot {number} of 5 of the gain by scan line, from the left to the right: poor contact is dark", unit="dB",
+        bounds=(-60, 60), shown=Shown(-30, 30, 0.5, is_slider=True), fit=Fit(-15, 15, tolerance=2.0, on_request=True),
+    )  # fmt: skip
+
+
+def _map_slope(where: str) -> Any:
+    return parameter(
+        1.0, f"Map at {where}", f"Slope of the grey map at {where}, relative to that at half of white",
+        bounds=(0.02, 8), shown=Shown(0.05, 4, 0.05, is_slider=True),
+        fit=Fit(0.1, 3, tolerance=0.15, is_logarithmic=True, on_request=True), note="Multiplies that of grey_map",
+    )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class DisplaySettings(Declared):
     """Settings of a scanner's console.
@@ -177,6 +204,45 @@ class DisplaySettings(Declared):
         unit="dB", bounds=(-300, 100), shown=Shown(-150, 0, is_slider=True, none_at=-150.0), option="noise",
         fit=Fit(-120, -30, tolerance=3.0),
     )  # fmt: skip
+    smoothing_axial_mm: float = parameter(
+        0.0, "Smoothing along lines",
+        "Sigma of a Gaussian along the lines that smooths the envelope before compression",
+        unit="mm", bounds=(0, 3), shown=Shown(0, 1, 0.01, is_slider=True),
+        fit=Fit(0.0, 0.3, tolerance=0.03, on_request=True), note="0.06 to 0.1 is as good as 3 to 5 compounded looks",
+    )  # fmt: skip
+    smoothing_lateral_deg: float = parameter(
+        0.0, "Smoothing across lines",
+        "Sigma of a Gaussian across the lines that smooths the envelope: an angle at the apex of a sector, and on a "
+        "linear array seen from the focal depth",
+        unit="°", bounds=(0, 5), shown=Shown(0, 2, 0.01, is_slider=True),
+        fit=Fit(0.0, 0.8, tolerance=0.06, on_request=True),
+    )  # fmt: skip
+    edge_enhancement: float = parameter(
+        0.0, "Edge enhancement", "Part of the difference of grey levels to their mean within half a millimetre, added",
+        bounds=(0, 4), shown=Shown(0, 2, 0.05, is_slider=True), fit=Fit(0.0, 1.5, tolerance=0.1, on_request=True),
+    )  # fmt: skip
+    grey_map: str = parameter(
+        "linear", "Grey map",
+        "From decibels to grey levels. linear: log compression alone. soft: flat near black, steep near white, as of a "
+        "scanner of brains. contrast: very flat near black, then straight",
+        choices=("linear", "soft", "contrast"), shown=True, option="grey-map",
+    )  # fmt: skip
+    map_black: float = _map_slope("black")
+    map_dark: float = _map_slope("a quarter of white")
+    map_white: float = _map_slope("white")
+    depth_gain_1_db: float = _depth_gain(1)
+    depth_gain_2_db: float = _depth_gain(2)
+    depth_gain_3_db: float = _depth_gain(3)
+    depth_gain_4_db: float = _depth_gain(4)
+    depth_gain_5_db: float = _depth_gain(5)
+    depth_gain_6_db: float = _depth_gain(6)
+    depth_gain_7_db: float = _depth_gain(7)
+    depth_gain_8_db: float = _depth_gain(8)
+    line_gain_1_db: float = _line_gain(1)
+    line_gain_2_db: float = _line_gain(2)
+    line_gain_3_db: float = _line_gain(3)
+    line_gain_4_db: float = _line_gain(4)
+    line_gain_5_db: float = _line_gain(5)
     image_size: tuple[int, int] | None = parameter(
         None, "Image size", "Rows and columns of the image; none: 512 rows and square pixels",
         unit="pixels", bounds=(8, 8192),

@@ -1,4 +1,4 @@
-"""Fit of simulated to real images: image similarity, free parameters, search, registration, report.
+"""Fit of simulated to real images: image similarity, free parameters, search, registration, report, realism.
 
 `fit` is the complete fit to tracked images; `optimize_appearance` is the optimisation without registration.
 """
@@ -16,10 +16,18 @@ if TYPE_CHECKING:
     )
     from .optimization import AppearanceResult as AppearanceResult, optimize_appearance as optimize_appearance
     from .parameters import FreeParameters as FreeParameters
+    from .realism import Realism as Realism, measure_realism as measure_realism, neighbours_of as neighbours_of
     from .registration import Registration as Registration, register_poses as register_poses
     from .report import write_report as write_report
     from .search import Progress as Progress
     from .settings import FitSettings as FitSettings
+    from .speckle_fit import SpeckleFit as SpeckleFit, fit_speckle as fit_speckle
+    from .speckle_width import SpeckleWidth as SpeckleWidth, speckle_widths as speckle_widths
+    from .texture_costs import (
+        TextureMisfit as TextureMisfit,
+        TextureReference as TextureReference,
+        texture_misfit as texture_misfit,
+    )
     from .tracked_fit import Fit as Fit, fit as fit
 
 lazy_exports(globals())

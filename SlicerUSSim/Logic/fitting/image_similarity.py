@@ -97,9 +97,9 @@ def similarity(
     0.0
     """
     settings = SimilaritySettings(patch_mm, bins, sad_weight)
-    a, b = _as_image("first image", a), _as_image("second image", b)
+    a, b = as_image("first image", a), as_image("second image", b)
     require(a.shape == b.shape, f"the images have shapes {a.shape} and {b.shape}, expected equal shapes")
-    inside = _as_mask(mask, a.shape)
+    inside = as_mask(mask, a.shape)
     rows, columns = settings.patch_pixels(a.shape, pixel_spacing_mm)
     down, across = -(-a.shape[0] // rows), -(-a.shape[1] // columns)
     patch = (np.arange(a.shape[0]) // rows)[:, None] * across + (np.arange(a.shape[1]) // columns)[None, :]
@@ -126,14 +126,14 @@ class PatchComparison:
         pixel_spacing_mm: tuple[float, float],
         settings: SimilaritySettings,
     ) -> None:
-        reference = _as_image("reference", reference)
+        reference = as_image("reference", reference)
         self.shape, self.settings, self.device = reference.shape, settings, device
         self.patch = settings.patch_pixels(reference.shape, pixel_spacing_mm)
         self.patches = tuple(-(-size // step) for size, step in zip(self.shape, self.patch, strict=True))
         self.kernel = device.kernels("similarity.cl")["compare_patches"]
         self._reference = device.upload(reference)
         #: (rows, columns) bool, the pixels that are compared
-        self.inside = _as_mask(mask, reference.shape)
+        self.inside = as_mask(mask, reference.shape)
         self._inside = device.upload(self.inside.astype(np.uint8))
         self._workspace = Workspace(device)
 
@@ -162,13 +162,14 @@ class PatchComparison:
 
     def of(self, image: np.ndarray) -> Similarity:
         """The cost of an image on the host, (rows, columns) uint8."""
-        image = _as_image("image", image)
+        image = as_image("image", image)
         require(image.shape == self.shape, f"the image has shape {image.shape}, expected that of the reference")
         self.run(self.device.upload(image))
         return self.result()
 
 
-def _as_image(name: str, image: np.ndarray) -> np.ndarray:
+def as_image(name: str, image: np.ndarray) -> np.ndarray:
+    """(rows, columns) uint8, contiguous. Raises SimulationError that names it for anything else."""
     image = np.asarray(image)
     require(
         image.ndim == 2 and image.dtype == np.uint8 and image.size > 0,
@@ -177,7 +178,8 @@ def _as_image(name: str, image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image)
 
 
-def _as_mask(mask: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:
+def as_mask(mask: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:
+    """(rows, columns) bool of this shape, all pixels for None. Raises SimulationError for another shape or none."""
     if mask is None:
         return np.ones(shape, bool)
     mask = np.asarray(mask, bool)

@@ -1,8 +1,9 @@
 """Free parameters of an optimisation: names, physical bounds, conversion from numbers to tissues and display.
 
 A name is one of DISPLAY_BOUNDS ("gain_db"), or a tissue with one of TISSUE_BOUNDS ("white matter.mu0") or with
-"echogenicity_db". "display" means all of DISPLAY_BOUNDS but those on request (Fit.on_request), a tissue's name all of
-its parameters in TISSUE_BOUNDS, and "tissues" the echogenicity and attenuation of every tissue with scatterers.
+"echogenicity_db". "display" means all of DISPLAY_BOUNDS but those on request (Fit.on_request), of which GROUPS have
+names; a tissue's name all of its parameters in TISSUE_BOUNDS, and "tissues" the echogenicity and attenuation of every
+tissue with scatterers.
 
 Speckle shows a tissue's Var = p (1 - p) mu0^2 + p sigma0^2 and not mu0, mu1 and sigma0 one by one. Echogenicity,
 10 log10 Var, varies with a common factor of mu0 and sigma0, so it replaces three parameters by the one that is seen.
@@ -36,6 +37,8 @@ TISSUE_BOUNDS: dict[str, Bounds] = {name: (e.fit.low, e.fit.high) for name, e in
 SCATTERING = frozenset(("mu0", "mu1", "sigma0"))
 #: All tissues, each by what an image shows of it
 TISSUES = "tissues"
+#: Groups of parameters of the display that are free on request, and how their names begin
+GROUPS = {"smoothing": "smoothing_", "map": "map_", "sliders": "depth_gain_", "line gains": "line_gain_"}
 #: Var of a tissue, by a common factor of mu0 and sigma0. The bounds are relative to the table's value: gain changes an
 #: image as all levels together do, but for interfaces, and with wide bounds sulci, the brightest, can end up black.
 ECHOGENICITY = Declaration(
@@ -216,6 +219,8 @@ def _meant_by(name: str, tissues: TissueTable) -> list[tuple[str, Bounds]]:
     if name == "display":
         declared = {known: cast(Fit, entry.fit) for known, entry in DISPLAY_PARAMETERS.items() if entry.fit}
         return [(known, DISPLAY_BOUNDS[known]) for known, search in declared.items() if not search.on_request]
+    if name in GROUPS:
+        return [(known, bounds) for known, bounds in DISPLAY_BOUNDS.items() if known.startswith(GROUPS[name])]
     if name in DISPLAY_BOUNDS:
         return [(name, DISPLAY_BOUNDS[name])]
     if name == TISSUES:
@@ -227,8 +232,8 @@ def _meant_by(name: str, tissues: TissueTable) -> list[tuple[str, Bounds]]:
     owner = next((entry for entry in known if same_name(entry, tissue)), None)
     if owner is None:
         raise SimulationError(
-            f"no free parameter {name!r}, expected display, tissues, {', '.join(DISPLAY_BOUNDS)}, or a tissue "
-            f"({', '.join(known)}), alone or with .{', .'.join((ECHOGENICITY.name, *TISSUE_BOUNDS))}"
+            f"no free parameter {name!r}, expected display, tissues, {', '.join((*DISPLAY_BOUNDS, *GROUPS))}, or "
+            f"a tissue ({', '.join(known)}), alone or with .{', .'.join((ECHOGENICITY.name, *TISSUE_BOUNDS))}"
         )
     if attribute == ECHOGENICITY.name:
         require(

@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.own_outputs import marked_html
 from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import STAGES, AppearanceResult
 from SlicerUSSim.Logic.fitting.parameters import Parameter
+from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
 from SlicerUSSim.Logic.imaging.figures import require_matplotlib
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.probe.placement import slice_under_probe
@@ -48,6 +49,11 @@ def write_report(
     """
     require_matplotlib()
     images = [np.where(tracked.mask, image, 0).astype(np.uint8) for image in tracked.images]
+    references = [TextureReference(image, tracked.grid.pixel_spacing_mm, tracked.mask) for image in tracked.images]
+    textures = [
+        [reference.misfit(image) for reference, image in zip(references, simulated, strict=True)]
+        for simulated in (before, after)
+    ]
     fill = {
         "title": html.escape(title),
         "subtitle": html.escape(subtitle),
@@ -58,9 +64,16 @@ def write_report(
         "evaluations": str(result.evaluations),
         "seconds": f"{result.seconds:.1f}",
         "images": "\n".join(
-            _trio(number, real, old, new, *similarities)
-            for number, real, old, new, *similarities in zip(
-                tracked.numbers, images, before, after, result.similarity_before, result.similarity_after, strict=True
+            _trio(number, real, old, new, *misfits)
+            for number, real, old, new, *misfits in zip(
+                tracked.numbers,
+                images,
+                before,
+                after,
+                result.similarity_before,
+                result.similarity_after,
+                *textures,
+                strict=True,
             )
         ),
         "histograms": _histograms(tracked, before, after, simulator),
@@ -95,12 +108,16 @@ def grey_levels_per_tissue(
     return {name: np.concatenate(pixels) for name, pixels in found.items()}
 
 
-def _trio(number: int, real: np.ndarray, before: np.ndarray, after: np.ndarray, was, is_now) -> str:
+def _trio(
+    number: int, real: np.ndarray, before: np.ndarray, after: np.ndarray, was, is_now, texture_was, texture
+) -> str:
     before_png, after_png, real_png = (_png(image) for image in (before, after, real))
     difference = _png(np.clip(127.5 + 0.5 * (after.astype(float) - real), 0, 255).astype(np.uint8))
     caption = (
         f"Image {number}: cost {was.total:.4f} → {is_now.total:.4f} (histograms {was.bhattacharyya:.3f} → "
-        f"{is_now.bhattacharyya:.3f}, difference {was.sad:.3f} → {is_now.sad:.3f})"
+        f"{is_now.bhattacharyya:.3f}, difference {was.sad:.3f} → {is_now.sad:.3f}), texture T1 "
+        f"{texture_was.autocorrelation:.3f} → {texture.autocorrelation:.3f}, "
+        f"T2 {texture_was.extrema:.2f} → {texture.extrema:.2f}"
     )
     return f"""<figure class="case">
 <figcaption>{caption}</figcaption>

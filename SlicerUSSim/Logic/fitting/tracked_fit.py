@@ -10,13 +10,20 @@ from functools import partial
 import numpy as np
 
 from SlicerUSSim.Logic.base.settings import DisplaySettings
-from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings
+from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings, similarity
 from SlicerUSSim.Logic.fitting.optimization import AppearanceResult, optimize_appearance
 from SlicerUSSim.Logic.fitting.parameters import Bounds
 from SlicerUSSim.Logic.fitting.registration import Registration, register_poses
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.seen import parameters_seen
 from SlicerUSSim.Logic.fitting.settings import FitSettings
+from SlicerUSSim.Logic.fitting.speckle_fit import (
+    SpeckleFit,
+    fit_speckle,
+    with_estimated_map,
+    with_preset_texture,
+)
+from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
@@ -42,11 +49,21 @@ class Fit:
     #: (rows, columns) uint8, simulated before and after the fit, with the parameters and poses of each
     before: list[np.ndarray] = field(repr=False)
     after: list[np.ndarray] = field(repr=False)
+    #: T1 and T2 of each image (texture_costs.py), before and after
+    texture_before: list[TextureMisfit] = field(default_factory=list)
+    texture_after: list[TextureMisfit] = field(default_factory=list)
+    #: None unless the speckle was fitted
+    speckle: SpeckleFit | None = None
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
         found = {} if self.registration is None else {"registration": self.registration.to_dict()}
-        return {**self.appearance.to_dict(), **found, "numbers": self.tracked.numbers}
+        speckle = {} if self.speckle is None else {"speckle": self.speckle.to_dict()}
+        texture = [
+            {"before": _plain(before), "after": _plain(after)}
+            for before, after in zip(self.texture_before, self.texture_after, strict=True)
+        ]
+        return {**self.appearance.to_dict(), **found, **speckle, "texture": texture, "numbers": self.tracked.numbers}
 
 
 def fit(
@@ -56,6 +73,7 @@ def fit(
     free: Iterable[str] | Mapping[str, Bounds | None],
     display: DisplaySettings | None = None,
     register: bool = False,
+    speckle: bool = False,
     max_evaluations: int = FitSettings.evaluations,
     restarts: int = FitSettings.restarts,
     seed: int = 0,
@@ -67,8 +85,9 @@ def fit(
     """Fit display and tissue parameters (optimization.optimize_appearance) and, with `register`, the poses.
 
     Registration requires similar images and the fit requires poses. Short fits and registrations therefore alternate,
-    followed by the complete fit at the resulting poses. Of the free parameters, "tissues" means those that the images
-    can show (seen.py). `resume` and `checkpoint` are those of the complete fit.
+    followed by the complete fit at the resulting poses. With `speckle`, a short fit with the real images' grey map is
+    followed by fit_speckle, and the complete fit begins there. Of the free parameters, "tissues" means those that the
+    images can show (seen.py). `resume` and `checkpoint` are those of the complete fit.
     Raises SimulationError as those do.
     """
     display = display or DisplaySettings()
@@ -76,7 +95,7 @@ def fit(
     masks = [tracked.mask] * len(tracked.images)
     given = tracked
     appearance_at = partial(
-        optimize_appearance, simulator, tracked.probe, references=tracked.images, free=free, display=display,
+        optimize_appearance, simulator, tracked.probe, references=tracked.images, free=free,
         grid=tracked.grid, masks=masks, seed=seed, settings=settings, progress=progress,
     )  # fmt: skip
     registration = None
@@ -85,14 +104,79 @@ def fit(
             register_poses, simulator, tracked.probe, references=tracked.images, grid=tracked.grid, masks=masks,
             settings=settings, progress=progress,
         )  # fmt: skip
-        short = partial(appearance_at, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1))
+        short = partial(
+            appearance_at, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1)
+        )
         tracked, registration = _registered(simulator, tracked, short, step_from)
-    appearance = appearance_at(
-        tracked.poses, restarts=restarts, max_evaluations=max_evaluations, resume=resume, checkpoint=checkpoint
-    )
-    before = simulated(simulator, given, simulator.medium.tissues, display)
+    begun = simulator.medium.tissues
+    start, found = display, None
+    if speckle:
+        found = _speckle_of(simulator, tracked, display, free, seed, settings, max_evaluations, progress)
+        start = _at_the_levels_of(found.display, display)
+    with simulator.with_tissues(begun if found is None else _at_the_levels_of_tissues(found.tissues, begun)):
+        appearance = appearance_at(
+            tracked.poses, display=start, restarts=restarts, max_evaluations=max_evaluations, resume=resume,
+            checkpoint=checkpoint,
+        )  # fmt: skip
+    before = simulated(simulator, given, begun, display)
     after = simulated(simulator, tracked, appearance.tissues, appearance.display)
-    return Fit(appearance, registration, tracked, before, after)
+    if speckle:
+        was = _similarities(given, before, settings or SimilaritySettings())
+        appearance = replace(appearance, similarity_before=was, cost_before=float(np.mean([one.total for one in was])))
+    references = [TextureReference(image, tracked.grid.pixel_spacing_mm, tracked.mask) for image in tracked.images]
+    textures = ([r.misfit(i) for r, i in zip(references, images, strict=True)] for images in (before, after))
+    return Fit(appearance, registration, tracked, before, after, *textures, speckle=found)
+
+
+def _speckle_of(
+    simulator: UltrasoundSimulator,
+    tracked: TrackedImages,
+    display: DisplaySettings,
+    free: Iterable[str] | Mapping[str, Bounds | None],
+    seed: int,
+    settings: SimilaritySettings | None,
+    max_evaluations: int,
+    progress: Callable[[Progress], None] | None,
+) -> SpeckleFit:
+    """The grey map of the real images, a short fit with it, and the speckle there."""
+    tissues = with_preset_texture(simulator.medium.tissues)
+    shown, has_map = with_estimated_map(display, tracked)
+    with simulator.with_tissues(tissues):
+        first = optimize_appearance(
+            simulator, tracked.probe, tracked.poses, references=tracked.images, free=free, display=shown,
+            grid=tracked.grid, masks=[tracked.mask] * len(tracked.images), seed=seed, settings=settings,
+            restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1), progress=progress,
+        )  # fmt: skip
+    return replace(fit_speckle(simulator, tracked, first.tissues, first.display), has_map=has_map)
+
+
+def _at_the_levels_of(found: DisplaySettings, given: DisplaySettings) -> DisplaySettings:
+    """What was found of the speckle, with the rest as given: the complete fit begins at the user's values."""
+    names = ("smoothing_axial_mm", "smoothing_lateral_deg", "grey_map", "map_black", "map_dark", "map_white")
+    return replace(given, **{name: getattr(found, name) for name in names})
+
+
+def _at_the_levels_of_tissues(found: TissueTable, given: TissueTable) -> TissueTable:
+    for tissue in given.all_tissues():
+        of = found.tissue(tissue.name)
+        names = ("texture_db", "texture_mm", "specks_per_mm3", "speck_db")
+        given = given.with_tissue(replace(tissue, **{name: getattr(of, name) for name in names}))
+    return given
+
+
+def _similarities(tracked: TrackedImages, images: list[np.ndarray], settings: SimilaritySettings) -> list[Similarity]:
+    return [
+        similarity(
+            image, real, tracked.grid.pixel_spacing_mm, patch_mm=settings.patch_mm, bins=settings.bins,
+            sad_weight=settings.sad_weight, mask=tracked.mask & tracked.grid.field(tracked.probe),
+        )
+        for image, real in zip(images, tracked.images, strict=True)
+    ]  # fmt: skip
+
+
+def _plain(misfit: TextureMisfit) -> dict:
+    values = {"t1": misfit.autocorrelation, "t2": misfit.extrema}
+    return {name: value if np.isfinite(value) else None for name, value in values.items()}
 
 
 def _registered(

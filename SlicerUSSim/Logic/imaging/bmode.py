@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB
+from SlicerUSSim.Logic.imaging.console import gains_across, gains_along
 from SlicerUSSim.Logic.imaging.noise import noise_key
 from SlicerUSSim.Logic.imaging.signals import RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
@@ -141,6 +142,8 @@ class Compressor(Stage):
         self._ringing: tuple[tuple, Buffer] | None = None
         #: Likewise of the time-gain compensation
         self._gains: tuple[tuple, Buffer] | None = None
+        #: Of the gain by line
+        self._across: tuple[bytes, Buffer] | None = None
 
     def run(self, frame: DeviceFrame) -> None:
         """Enqueue the grey levels of every line: the frame's `envelope` and `grey`."""
@@ -159,6 +162,7 @@ class Compressor(Stage):
             np.float32(noise),
             np.uint32(noise_key(acquisition, frame.noise_seed)),
             self._compensation(frame),
+            self._line_gains(frame),
             np.float32(FULL_SCALE_DB - display.gain_db),
             frame.display_record,
             frame.envelope,
@@ -179,13 +183,22 @@ class Compressor(Stage):
         """float32 [sample] dB of time-gain compensation, from where a line leaves the face."""
         display, samples, rises_mm = frame.display, frame.line_shape[1], frame.display.tgc_reach * frame.probe.depth_mm
         sample_mm, mhz, shift = (float(frame.acquisition[n]) for n in ("sample_mm", "frequency_mhz", "downshift"))
-        key = (samples, rises_mm, display.tgc_db_cm_mhz, sample_mm, mhz, shift)
+        depth_mm = np.arange(samples) * sample_mm
+        sliders = gains_along(display, depth_mm, frame.probe.depth_mm)
+        key = (samples, rises_mm, display.tgc_db_cm_mhz, sample_mm, mhz, shift, sliders.tobytes())
         if self._gains is None or self._gains[0] != key:
-            path_cm = 0.2 * np.minimum(np.arange(samples) * sample_mm, rises_mm)  # both ways
+            path_cm = 0.2 * np.minimum(depth_mm, rises_mm)  # both ways
             loss = display.tgc_db_cm_mhz * mhz * path_cm / DB_PER_NEPER
             gains = DB_PER_NEPER * (loss - gain_of_band(shift, loss))
-            self._gains = key, self.device.upload(gains.astype(np.float32))
+            self._gains = key, self.device.upload((gains + sliders).astype(np.float32))
         return self._gains[1]
+
+    def _line_gains(self, frame: DeviceFrame) -> Buffer:
+        """float32 [scan line] dB."""
+        gains = gains_across(frame.display, frame.line_shape[0])
+        if self._across is None or self._across[0] != gains.tobytes():
+            self._across = gains.tobytes(), self.device.upload(gains)
+        return self._across[1]
 
     def work(self, frame: FrameInputs, tree: RayTree) -> Work:
         lines, samples = frame.line_shape

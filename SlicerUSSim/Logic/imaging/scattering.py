@@ -13,6 +13,7 @@ from SlicerUSSim.Logic.imaging.raytracing import ray_centres
 from SlicerUSSim.Logic.imaging.side_lobes import DARK, Tables, elevational_lobe_record, lines_together
 from SlicerUSSim.Logic.imaging.signals import EchoLines, RayTree
 from SlicerUSSim.Logic.imaging.stage import SAMPLE_BYTES, DeviceFrame, FrameInputs, Stage, Work
+from SlicerUSSim.Logic.imaging.unevenness import is_uneven, unevenness_table
 from SlicerUSSim.Logic.opencl.device import Device, Workspace
 from SlicerUSSim.Logic.opencl.layout import ACQUISITION, CONSTANTS, HIT, WALL
 
@@ -44,7 +45,8 @@ class Scatterers(Stage):
     def __init__(self, device: Device) -> None:
         super().__init__(device)
         self.lines = EchoLines(device)
-        self._sites = [device.empty(12 * CONSTANTS["MAX_TISSUES"]) for _ in range(2)]
+        size = 4 * (3 + CONSTANTS["UNEVEN_WORDS"]) * CONSTANTS["MAX_TISSUES"]
+        self._sites = [device.empty(size) for _ in range(2)]
         self._lobes = device.empty(ACQUISITION.itemsize)
         self._tables = Tables(device)
 
@@ -67,7 +69,11 @@ class Scatterers(Stage):
         end = [] if part_of is None else [part_of]
         variant = (["TEXTURE"] if frame.medium.has_texture else []) + (["VARIED"] if part_of is not None else [])
         variant += ["FOUND"] if frame.medium.found is not None else []
-        self.device.write(self._sites[0], lattice_sites(tissues, frame.acquisition))
+        variant += ["UNEVEN"] if is_uneven(tissues) else []
+        uneven, none_dark = unevenness_table(tissues).ravel(), np.zeros(CONSTANTS["MAX_TISSUES"], np.float32)
+        self.device.write(
+            self._sites[0], np.concatenate([lattice_sites(tissues, frame.acquisition).ravel(), none_dark, uneven])
+        )
         self._enqueue(
             frame, lines, frame.acquisition_buffer, self._sites[0],
             [*variant, f"CHUNK={self.device.chunk}"], (samples // self.device.chunk, traced), end,
@@ -78,7 +84,8 @@ class Scatterers(Stage):
             chunk, together = _LOBE_CHUNKS * self.device.chunk, lines_together(record, frame.probe)
             table = self._tables.get(frame.probe, np.append(lobes.elevational, lobes.reach_mm))
             dark = frame.medium.quieter(DARK).astype(np.float32)
-            self.device.write(self._sites[1], np.append(lattice_sites(tissues, record), dark))
+            sites = np.concatenate([lattice_sites(tissues, record).ravel(), dark, uneven])
+            self.device.write(self._sites[1], sites)
             self._enqueue(
                 frame, lines, self._lobes, self._sites[1], [*variant, "LOBES", f"CHUNK={chunk}"],
                 (-(-samples // chunk), -(-traced // together)), [*end, table, np.int32(together)],

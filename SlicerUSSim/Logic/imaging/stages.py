@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from SlicerUSSim.Logic.imaging.aperture import Aperture
 from SlicerUSSim.Logic.imaging.bmode import Compressor, PulseFilter
+from SlicerUSSim.Logic.imaging.console import EdgeEnhancement, EnvelopeSmoothing, GreyMapping
 from SlicerUSSim.Logic.imaging.raytracing import RayTracer
 from SlicerUSSim.Logic.imaging.scan_conversion import ScanConverter
 from SlicerUSSim.Logic.imaging.scattering import InterfaceEchoes, LateralBeam, Scatterers
@@ -19,4 +20,6 @@ IMPULSE_STAGES: tuple[type[Stage], ...] = (Aperture, RayTracer, Scatterers)
 #: adds the interfaces to the one of the fixed tissues
 LINEAR_STAGES: tuple[type[Stage], ...] = (LateralBeam, SideLobes, InterfaceEchoes, PulseFilter)
 #: From the baseband signal to pixels
-DISPLAY_STAGES: tuple[type[Stage], ...] = (Compressor, ScanConverter)
+DISPLAY_STAGES: tuple[type[Stage], ...] = (
+    Compressor, EnvelopeSmoothing, GreyMapping, EdgeEnhancement, ScanConverter,
+)  # fmt: skip

@@ -613,13 +613,16 @@ class UltrasoundSceneLogic:
         frames: Sequence[int] | None = None,
         free: Iterable[str] | Mapping[str, tuple[float, float] | None] = ("display", "tissues"),
         register: bool = False,
+        speckle: bool = False,
         estimate_geometry: bool = False,
         max_evaluations: int = FitSettings.evaluations,
         restarts: int = FitSettings.restarts,
         plot: CostPlot | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> Fit:
-        """Fit display and tissue parameters, and with `register` the poses, to real images; see fitting.fit.
+        """Fit display and tissue parameters, with `register` the poses and with `speckle` the speckle, to real images.
+
+        See fitting.fit.
 
         `images_node` is a sequence of images with its browser's transforms, a volume of one slice, or a 3D ultrasound
         volume, resampled in the image plane. `frames` are numbers of images (default: six, evenly spaced). `plot` shows
@@ -647,6 +650,7 @@ class UltrasoundSceneLogic:
                 free=free,
                 display=preset.display,
                 register=register,
+                speckle=speckle,
                 restarts=restarts,
                 max_evaluations=max_evaluations,
                 progress=report,
@@ -662,7 +666,10 @@ class UltrasoundSceneLogic:
         """Adopt probe, display and tissues of a fit in the preset; returns the previous preset, for reverting."""
         before = self.preset
         tissues = before.tissues
-        for name in found.appearance.parameters.varied():
+        changed = set(found.appearance.parameters.varied())
+        if found.speckle is not None:  # which gives tissues a texture
+            changed |= {tissue.name for tissue in found.speckle.tissues.all_tissues() if tissue.texture_db > 0.0}
+        for name in sorted(changed):
             tissues = tissues.with_tissue(found.appearance.tissues.tissue(name))
         self.preset = replace(before, probe=found.tracked.probe, display=found.appearance.display, tissues=tissues)
         return before

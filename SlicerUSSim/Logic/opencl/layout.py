@@ -39,6 +39,7 @@ CONSTANTS = {
     "SHEET_LEVEL_STEP_DB": 0.25,
     "SHEET_REFLECTION_STEP": 0.008,
     "TEXTURE_STEP_DB": 0.1,  # of the gain in texture.py
+    "UNEVEN_WORDS": 8,  # per label, of unevenness.py
     "MAX_SEGMENTS": 256,  # per traced line
     "MAX_HITS": 96,  # per traced ray
     "SOFT_SPEED": 0.105,  # largest relative difference of speed of sound at a soft border (common.clh), ...
@@ -161,6 +162,10 @@ TISSUE = np.dtype(
         ("attenuation_db_cm_mhz", _FLOAT),
         ("scatterer_share", _FLOAT),  # p = 1 - Phi(mu1)
         ("scatterer_variance", _FLOAT),
+        ("texture_db", _FLOAT),
+        ("texture_mm", _FLOAT),
+        ("specks_per_mm3", _FLOAT),
+        ("speck_db", _FLOAT),
         ("group", _INT),  # tissues of one speed and impedance: no interface between them
         ("is_fluid", _INT),  # of the membrane's fluids
     ]

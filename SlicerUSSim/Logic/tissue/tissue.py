@@ -1,8 +1,8 @@
 """Tissue and Membrane: acoustic parameters.
 
-A tissue has six parameters (docs/physics.md#5-scatterers): speed of sound, impedance, attenuation, and the
+A tissue has the paper's six parameters (docs/physics.md#5-scatterers): speed of sound, impedance, attenuation, and the
 scatterers' mu0, mu1 and sigma0. A scatterer exists where T1 >= mu1 and has amplitude mu0 + sigma0 T0, with T0, T1 ~
-N(0, 1).
+N(0, 1). Four more say how its echogenicity varies within it (docs/physics.md#uneven-tissue).
 """
 
 from __future__ import annotations
@@ -56,6 +56,23 @@ class Tissue(Declared):
         0.0, "Deviation", "Standard deviation of the scatterers' amplitude", symbol="σ₀", bounds=(0, 100),
         fit=Fit(0.02, 1.0, tolerance=0.05, is_logarithmic=True), source=_ECHOGENICITY,
     )  # fmt: skip
+    texture_db: float = parameter(
+        0.0, "Texture", "Standard deviation of the echogenicity within the tissue, in decibels; 0: even", unit="dB",
+        symbol="σₜ", bounds=(0, 8), source="0 in the paper",
+        note="Fixed in the patient. The tissue's mean power stays the same. A slice averages over its thickness, so "
+        "that images show about half of it",
+    )  # fmt: skip
+    texture_mm: float = parameter(
+        0.5, "Texture length", "Distance at which the echogenicity's correlation is one half, and radius of specks",
+        unit="mm", symbol="ℓₜ", bounds=(0.1, 20),
+    )  # fmt: skip
+    specks_per_mm3: float = parameter(
+        0.0, "Specks", "Bright specks per cubic millimetre, as of small vessels and calcifications", unit="1/mm³",
+        symbol="nₛ", bounds=(0, 10), note="At most one in a cube of twice the texture length",
+    )  # fmt: skip
+    speck_db: float = parameter(
+        0.0, "Speck level", "How much brighter a speck is in its middle", unit="dB", symbol="Δₛ", bounds=(0, 30)
+    )
     sources: Mapping[str, str] = parameter(
         default_factory=dict, label="Sources", tip="Source of each value, by parameter", compare=False
     )

@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.verification.numpy_model.elementary import (
     exp,
     exp2,
     f32,
+    gaussian,
     hash_mix,
     turn,
 )
@@ -173,6 +174,10 @@ def _add_piece(acquisition, labels, tissues, segment, first, low, high, belongs,
     voxel = np.stack([at[n] + p[0] * r[0] + p[1] * r[1] + p[2] * r[2] for n, r in enumerate(rows)], axis=-1)
     label, of_sheet = drawn_labels(acquisition, labels, voxel, random, segment["direction"])
     share, level = (of_label[label] for of_label in _site_statistics(tissues, float(cell)))
+    if _is_uneven(tissues):
+        places = np.empty((len(label), 3), np.float32)
+        places[:, order] = np.stack([x + start[n] for n, x in enumerate(p)], axis=-1)
+        level = level * unevenness(acquisition["seed"], tissues[label], places)
     exists = (random >> np.uint32(16)).astype(np.float32) + f32(0.5) < share
     strength = np.where(exists, level, f32(0)) * np.where((random >> np.uint32(15)) & np.uint32(1), f32(-1), f32(1))
     if strips.table is not None:
@@ -215,6 +220,53 @@ def _site_statistics(tissues: np.ndarray, cell_mm: float) -> tuple[np.ndarray, n
     with np.errstate(divide="ignore", invalid="ignore"):
         amplitude = np.sqrt(tissues["scatterer_variance"].astype(float) / (count / 65536.0))
     return count.astype(np.float32), np.where(count > 0, amplitude, 0.0).astype(np.float32)
+
+
+def _is_uneven(tissues: np.ndarray) -> bool:
+    return bool(np.any((tissues["texture_db"] > 0) | ((tissues["specks_per_mm3"] > 0) & (tissues["speck_db"] > 0))))
+
+
+def unevenness(seed, rows: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(n,) float32 factors of amplitudes at (n, 3) places in the patient (RAS mm), of these layout.TISSUE rows (n,)."""
+    length = np.maximum(rows["texture_mm"].astype(float), 1e-6)
+    textured = rows["texture_db"] > 0
+    specked = (rows["specks_per_mm3"] > 0) & (rows["speck_db"] > 0)
+    share = np.minimum(np.rint(65536.0 * rows["specks_per_mm3"].astype(float) * (2.0 * length) ** 3), 65536.0)
+
+    def keys(index: np.ndarray, word: int) -> np.ndarray:
+        steps = (index.astype(np.int64).astype(np.uint32) * _AXIS_STEPS).sum(axis=-1, dtype=np.uint32)
+        return hash_mix(steps ^ np.uint32((int(seed) + word) % 2**32))
+
+    # The lattice on which the correlation is one half a length away
+    place = places * f32(0.754 / length)[:, None]
+    corner = np.floor(place)
+    part = place - corner
+    total, squares = np.zeros(len(places), np.float32), np.zeros(len(places), np.float32)
+    for step in itertools.product((0, 1), repeat=3):
+        weight = np.where(np.array(step) == 1, part, f32(1) - part).prod(axis=1)
+        total = total + weight * gaussian(keys(corner + np.array(step), 0x68E31DA4))
+        squares = squares + weight * weight
+    level_db = np.where(textured, rows["texture_db"] * total / np.sqrt(squares), f32(0))
+    place = places * f32(0.5 / length)[:, None]
+    middle = np.floor(place) + f32(0.5)
+    near = np.maximum(f32(1) - f32(4) * ((place - middle) ** 2).sum(axis=1), f32(0))
+    drawn = (keys(np.floor(place), 0xB5297A4D) >> np.uint32(16)).astype(np.float32) + f32(0.5) < share
+    level_db = level_db + np.where(specked & drawn, rows["speck_db"] * near, f32(0))
+    # Power that both add on average: of a log-normal variable, and of spheres in a box, by Gauss-Legendre quadrature
+    neper = np.where(textured, rows["texture_db"], 0) * np.log(10.0) / 10.0
+    power = np.exp(0.5 * neper.astype(float) ** 2)
+    for bright in np.unique(rows["speck_db"][specked]):
+        here = specked & (rows["speck_db"] == bright)
+        power[here] *= 1.0 + share[here] / 65536.0 * (_power_of_speck(float(bright)) - 1.0)
+    return (10.0 ** (level_db / 20.0) / np.sqrt(power)).astype(np.float32)
+
+
+def _power_of_speck(bright_db: float) -> float:
+    """Mean over the cube of side 2 of 10^(bright (1 - r^2) / 10) in the unit sphere and 1 outside: by spheres."""
+    radius, weights = np.polynomial.legendre.leggauss(60)
+    radius, weights = 0.5 * (radius + 1.0), 0.5 * weights
+    inside = (weights * 4.0 * np.pi * radius**2 * 10.0 ** (0.1 * bright_db * (1.0 - radius**2))).sum() / 8.0
+    return float(inside + 1.0 - np.pi / 6.0)
 
 
 def _cells_of_box(acquisition, start, d, side, e, low, high, radius_l, radius_e) -> np.ndarray:

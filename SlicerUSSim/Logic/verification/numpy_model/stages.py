@@ -160,6 +160,12 @@ def b_mode(frame: TwinFrame) -> None:
     tgc_db = rising * (2.0 * display.tgc_db_cm_mhz * float(record["frequency_mhz"]) * float(record["sample_mm"]) * 0.1)
     neper_db = 20.0 / np.log(10.0)
     tgc_db = tgc_db - neper_db * Beam(record).gain_of_band(tgc_db / neper_db).astype(float)
+    sliders = [getattr(display, f"depth_gain_{n}_db") for n in range(1, 9)]
+    middles = (np.arange(8) + 0.5) * frame.probe.depth_mm / 8.0
+    tgc_db = tgc_db + np.interp(np.maximum(below, 0) * float(record["sample_mm"]), middles, sliders)
+    across = np.linspace(0.0, 4.0, len(iq))
+    knots = [getattr(display, f"line_gain_{n}_db") for n in range(1, 6)]
+    tgc_db = tgc_db + np.interp(across, np.arange(5), knots)[:, None]
     frame.envelope = (np.sqrt(power) * 10.0 ** (tgc_db / 20.0)).astype(np.float32)
     level_db = 10.0 * np.log10(power) + tgc_db
     value = 255.0 * (1.0 + (level_db - (FULL_SCALE_DB - display.gain_db)) / display.dynamic_range_db)

@@ -45,7 +45,7 @@ DEPTHS_MM = (10.0, 30.0, 46.0)
 SEEDS = range(8)
 #: The brain's echogenic tissues, and the ends of what fits try and the paper has
 TISSUES_OF_SPECKLE = {
-    tissue.name: replace(tissue, attenuation_db_cm_mhz=0.0)
+    tissue.name: replace(tissue, attenuation_db_cm_mhz=0.0, texture_db=0.0, specks_per_mm3=0.0)
     for tissue in TissueTable.brain().all_tissues()
     if tissue.scatterer_variance > 0.0
 } | {
@@ -266,6 +266,25 @@ def one_line_on(probe: Probe) -> np.ndarray:
     return motion
 
 
+def uneven(rotation: np.ndarray, device) -> Outcome:
+    """The level of a tissue whose echogenicity varies, re the same scatterers without."""
+    rows = []
+    for name, changes in {
+        "texture 3.5 dB, 0.8 mm": {"texture_db": 3.5, "texture_mm": 0.8},
+        "texture 6 dB, 0.5 mm": {"texture_db": 6.0, "texture_mm": 0.5},
+        "specks 14 dB, 0.02/mm3": {"specks_per_mm3": 0.02, "speck_db": 14.0, "texture_mm": 0.5},
+    }.items():
+        power = np.zeros(2)
+        for seed in range(3 * len(SEEDS)):
+            for place, tissue in enumerate((SPECKLE, replace(SPECKLE, **changes))):
+                phantom, (simulator,) = _simulators(rotation, device, tissue, seeds=(seed,))
+                frame = simulator.simulate(PROBES["linear"], phantom.probe_to_ras)
+                power[place] += 10.0 ** (0.1 * level_db(frame.iq[:, 64:-64]))
+        change = float(10.0 * np.log10(power[1] / power[0]))
+        rows.append(Row(f"level re even tissue, {name}", "dB", 0.0, change, 0.1))
+    return Outcome(tuple(rows))
+
+
 def echogenicity(rotation: np.ndarray, device) -> Outcome:
     """Var = p (1 - p) mu0^2 + p sigma0^2 alone sets the level."""
     rows = []
@@ -346,6 +365,7 @@ CHECKS = (
     ),
     Check("speckle coherence", "The scatterers are the same at every pose.", coherence),
     Check("echogenicity", "Var = p (1 - p) mu0^2 + p sigma0^2 alone sets the level.", echogenicity),
+    Check("uneven tissue", "Texture and specks within a tissue keep its mean power within 0.1 dB.", uneven),
     Check(
         "rayleigh",
         "Fully developed speckle has a Rayleigh envelope (the paper's Fig. 4: 1250 scatterers per mm^3 on 20 um).",

@@ -1,0 +1,164 @@
+"""fit_speckle: grey map, smoothing of the envelope and texture of tissue from real images (docs/realism.md#fit).
+
+In the order in which they can be told apart: the grey map from the real images alone; then smoothing and texture by the
+costs of texture T1 + T2 / 2 (texture_costs.py), to which the paper's cost is nearly blind. T2 counts grains and has no
+gradient, so the search uses none; it is short, since few parameters are left. The probe's frequency, bandwidth and
+aperture stay: widths of speckle alone do not tell them from smoothing and texture, nor frequency from bandwidth.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import optimize
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
+from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS
+from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
+from SlicerUSSim.Logic.imaging.grey_map import estimate_grey_map
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.tissue.presets import TISSUES
+from SlicerUSSim.Logic.tissue.table import TissueTable
+from SlicerUSSim.Logic.tissue.tissue import Tissue
+from SlicerUSSim.Logic.tracked.images import TrackedImages
+
+_log = logging.getLogger(__name__)
+
+_NAMES = ("smoothing_axial_mm", "smoothing_lateral_deg")
+#: Where the search for them begins, and the first step
+_START, _STEP = (0.06, 0.25), (0.04, 0.12)
+#: Factors of the texture's deviation that are tried, and evaluations of the smoothing for each
+_FACTORS, _EVALUATIONS = (1.0, 0.5, 1.4, 0.0), (24, 14, 14, 14)
+_MOST_TEXTURE_DB = 8.0
+
+
+@dataclass(frozen=True)
+class SpeckleFit:
+    """Display and tissues with the speckle of real images."""
+
+    display: DisplaySettings
+    tissues: TissueTable
+    #: Factor of the tissues' texture_db
+    texture_factor: float
+    #: Mean over the images, before and after
+    before: TextureMisfit
+    after: TextureMisfit
+    #: Whether the real images had enough grey levels for a map
+    has_map: bool
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON."""
+        shown = (*_NAMES, "grey_map", "map_black", "map_dark", "map_white")
+        return {
+            **{name: getattr(self.display, name) for name in shown},
+            "texture_factor": self.texture_factor,
+            "grey_map_found": self.has_map,
+            "before": vars(self.before),
+            "after": vars(self.after),
+        }  # fmt: skip
+
+
+def with_estimated_map(display: DisplaySettings, tracked: TrackedImages) -> tuple[DisplaySettings, bool]:
+    """The display with the grey map of the real images, and whether they have enough grey levels for one."""
+    try:
+        found = estimate_grey_map(tracked.images, tracked.grid.pixel_spacing_mm, tracked.mask)
+    except SimulationError as error:
+        _log.warning("no grey map: %s", error)
+        return display, False
+    _log.info("grey map: slopes %.2f at black, %.2f at a quarter, %.2f at white", *found.changes().values())
+    return replace(display, grey_map="linear", **found.changes()), True
+
+
+def with_preset_texture(tissues: TissueTable) -> TissueTable:
+    """The table in which even tissues vary as the presets of their names do."""
+    for tissue in tissues.all_tissues():
+        preset = TISSUES.get(tissue.name)
+        if preset is not None and preset.texture_db > 0.0 and tissue.texture_db == 0.0:
+            changes = {
+                name: getattr(preset, name) for name in ("texture_db", "texture_mm", "specks_per_mm3", "speck_db")
+            }
+            tissues = tissues.with_tissue(replace(tissue, **changes))
+    return tissues
+
+
+def fit_speckle(
+    simulator: UltrasoundSimulator,
+    tracked: TrackedImages,
+    tissues: TissueTable,
+    display: DisplaySettings,
+    progress: Callable[[float], None] | None = None,
+) -> SpeckleFit:
+    """Fit smoothing and texture at these levels of tissues and display, which should fit the images already.
+
+    `progress` gets the part done. Raises SimulationError if no patch of the images is bright enough in both.
+    """
+    spacing = tracked.grid.pixel_spacing_mm
+    references = [TextureReference(image, spacing, tracked.mask) for image in tracked.images]
+    with simulator.with_tissues(tissues):
+        model = AppearanceModel(simulator, tracked.probe, tracked.poses, {}, tracked.grid)
+    done, total = 0, sum(_EVALUATIONS)
+
+    def misfit(table: TissueTable, shown: DisplaySettings) -> TextureMisfit:
+        return _mean([r.misfit(model.image(n, table, shown)) for n, r in enumerate(references)])
+
+    before = misfit(tissues, display)
+    if not np.isfinite(before.total):
+        raise SimulationError("no patch of the real images is as bright as 15 grey levels, expected some for speckle")
+    candidates: list[tuple[float, float, DisplaySettings, TissueTable, TextureMisfit]] = []
+    start = np.array(_START)
+    has_texture = any(tissue.texture_db > 0.0 for tissue in tissues.all_tissues())
+    for factor, evaluations in zip(_FACTORS, _EVALUATIONS, strict=True):
+        if factor != 1.0 and not has_texture:
+            continue
+        table = _scaled(tissues, factor)
+        if factor != 1.0:
+            model.anchor(table)
+
+        def cost(values: np.ndarray, table: TissueTable = table) -> float:
+            nonlocal done
+            done += 1
+            if progress is not None:
+                progress(min(done / total, 1.0))
+            total_misfit = misfit(table, _smoothed(display, values)).total
+            return total_misfit if np.isfinite(total_misfit) else 10.0
+
+        simplex = np.array([start, start + [_STEP[0], 0.0], start + [0.0, _STEP[1]]])
+        found = optimize.minimize(
+            cost, start, method="Nelder-Mead",
+            options={"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-3, "fatol": 1e-4},
+        )  # fmt: skip
+        shown = _smoothed(display, found.x)
+        candidates.append((float(found.fun), factor, shown, table, misfit(table, shown)))
+        start = np.array([getattr(shown, name) for name in _NAMES])
+        _log.info("texture x %.2g: T1 + T2 / 2 is %.3f with smoothing %.3f mm, %.2f degrees", factor, found.fun, *start)
+    # The table as it is, with nothing smoothed, is a candidate as well
+    candidates.append((before.total, 1.0, display, tissues, before))
+    _, factor, shown, table, after = min(candidates, key=lambda candidate: candidate[0])
+    return SpeckleFit(shown, table, factor, before, after, True)
+
+
+def _smoothed(display: DisplaySettings, values: Sequence[float] | np.ndarray) -> DisplaySettings:
+    bounded = {name: float(np.clip(value, *DISPLAY_BOUNDS[name])) for name, value in zip(_NAMES, values, strict=True)}
+    return replace(display, **bounded)
+
+
+def _scaled(tissues: TissueTable, factor: float) -> TissueTable:
+    def changed(tissue: Tissue) -> Tissue:
+        return replace(tissue, texture_db=min(factor * tissue.texture_db, _MOST_TEXTURE_DB))
+
+    for tissue in tissues.all_tissues():
+        if tissue.texture_db > 0.0:
+            tissues = tissues.with_tissue(changed(tissue))
+    return tissues
+
+
+def _mean(misfits: Sequence[TextureMisfit]) -> TextureMisfit:
+    known = [m for m in misfits if np.isfinite(m.total)]
+    if not known:
+        return TextureMisfit(float("nan"), float("nan"))
+    return TextureMisfit(float(np.mean([m.autocorrelation for m in known])), float(np.mean([m.extrema for m in known])))

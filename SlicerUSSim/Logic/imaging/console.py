@@ -1,0 +1,205 @@
+"""Host code of kernels/console.cl: what a scanner does to the envelope and to grey levels, each off by default."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import ndimage
+
+from SlicerUSSim.Logic.base.settings import FULL_SCALE_DB, DisplaySettings
+from SlicerUSSim.Logic.imaging.grey_map import TABLE_SIZE, grey_table, is_linear
+from SlicerUSSim.Logic.imaging.signals import RayTree
+from SlicerUSSim.Logic.imaging.stage import DeviceFrame, FrameInputs, HostFrame, Stage, Work
+from SlicerUSSim.Logic.opencl.device import Device, Workspace
+
+if TYPE_CHECKING:
+    from pyopencl import Buffer
+
+#: Sigmas at which a Gaussian of the smoothing is cut off, and samples or lines that it has to either side at most
+_CUT_OFF, _MOST_TAPS = 2.6, 128
+#: Of edge enhancement: samples of a line and lines in the mean to either side, and the mean's half length in mm
+_EDGE_SAMPLES, _EDGE_LINES, _EDGE_MM = 4, 1, 0.5
+
+
+class EnvelopeSmoothing(Stage):
+    """Smooths the envelope along the lines and across them, after detection and before compression."""
+
+    name = "smoothing"
+
+    def __init__(self, device: Device) -> None:
+        super().__init__(device)
+        kernels = device.kernels("console.cl", device.lanes)
+        self._along, self._across = kernels["smooth_along"], kernels["smooth_across"]
+        self.workspace = Workspace(device)
+        #: Taps by their standard deviation
+        self._taps: dict[float, Buffer] = {}
+
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the smoothing: the frame's `envelope`."""
+        lines, samples = frame.line_shape
+        sigmas = smoothing_sigmas(frame)
+        size = samples // self.device.lanes, lines
+        for name, kernel, sigma in zip(("along", "across"), (self._along, self._across), sigmas, strict=True):
+            if sigma == 0.0:
+                continue
+            smooth = self.workspace.get(name, 4 * lines * samples)
+            reach = np.int32(len(gaussian_taps(sigma)) // 2)
+            self.device.run(kernel, size, frame.envelope, self._uploaded(sigma), reach, np.int32(samples), smooth)
+            frame.envelope = smooth
+
+    def _uploaded(self, sigma: float) -> Buffer:
+        if sigma not in self._taps:
+            if len(self._taps) > 16:  # a fit tries many
+                self._taps.clear()
+            self._taps[sigma] = self.device.upload(gaussian_taps(sigma))
+        return self._taps[sigma]
+
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        lines, samples = frame.line_shape
+        taps = [len(gaussian_taps(sigma)) for sigma in smoothing_sigmas(frame) if sigma > 0.0]
+        return Work(8 * len(taps) * lines * samples, 2 * sum(taps) * lines * samples)
+
+    def on_host(self, frame: HostFrame) -> None:
+        for axis, sigma in zip((1, 0), smoothing_sigmas(frame), strict=True):
+            if sigma > 0.0:
+                taps = gaussian_taps(sigma).astype(float)
+                frame.envelope = ndimage.correlate1d(
+                    frame.envelope.astype(float), taps, axis=axis, mode="nearest"
+                ).astype(np.float32)
+
+
+class GreyMapping(Stage):
+    """Log compression of an envelope that was smoothed, and of any by a grey map."""
+
+    name = "grey map"
+
+    def __init__(self, device: Device) -> None:
+        super().__init__(device)
+        self.kernel = device.kernels("console.cl", device.lanes)["map_grey"]
+        self.workspace = Workspace(device)
+        # The table of the last display
+        self._made_for: bytes | None = None
+        self._table: Buffer
+
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the grey levels: the frame's `grey`."""
+        if not _maps(frame):
+            return
+        table = grey_table(frame.display)
+        if self._made_for != table.tobytes():
+            self._table, self._made_for = self.device.upload(table), table.tobytes()
+        lines, samples = frame.line_shape
+        grey = self.workspace.get("grey", lines * samples)
+        self.device.run(
+            self.kernel,
+            (samples // self.device.lanes, lines),
+            frame.envelope,
+            self._table,
+            np.int32(TABLE_SIZE),
+            np.float32(FULL_SCALE_DB - frame.display.gain_db),
+            frame.display_record,
+            np.int32(samples),
+            grey,
+        )
+        frame.grey = grey
+
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        lines, samples = frame.line_shape
+        return Work(5 * lines * samples, 30 * lines * samples) if _maps(frame) else Work(0, 0)
+
+    def on_host(self, frame: HostFrame) -> None:
+        if not _maps(frame):
+            return
+        level_db = 20.0 * np.log10(np.maximum(frame.envelope.astype(float), 1e-15))
+        part = 1.0 + (level_db - (FULL_SCALE_DB - frame.display.gain_db)) / frame.display.dynamic_range_db
+        grey = np.interp(part, np.linspace(0.0, 1.0, TABLE_SIZE), grey_table(frame.display))
+        frame.grey = (grey + 0.5).astype(np.uint8)
+
+
+class EdgeEnhancement(Stage):
+    """Adds the difference of grey levels to the mean around them: borders and speckle get sharper."""
+
+    name = "edges"
+
+    def __init__(self, device: Device) -> None:
+        super().__init__(device)
+        self.kernel = device.kernels("console.cl", device.lanes)["enhance_edges"]
+        self.workspace = Workspace(device)
+
+    def run(self, frame: DeviceFrame) -> None:
+        """Enqueue the enhancement: the frame's `grey`."""
+        if frame.display.edge_enhancement == 0.0:
+            return
+        lines, samples = frame.line_shape
+        sharp = self.workspace.get("grey", lines * samples)
+        self.device.run(
+            self.kernel,
+            (samples // self.device.lanes, lines),
+            frame.grey,
+            np.int32(samples),
+            np.int32(_edge_step(frame)),
+            frame.display_record,
+            sharp,
+        )
+        frame.grey = sharp
+
+    def work(self, frame: FrameInputs, tree: RayTree) -> Work:
+        if frame.display.edge_enhancement == 0.0:
+            return Work(0, 0)
+        lines, samples = frame.line_shape
+        return Work(2 * lines * samples, (2 * _EDGE_SAMPLES + 1) * (2 * _EDGE_LINES + 1) * lines * samples)
+
+    def on_host(self, frame: HostFrame) -> None:
+        if frame.display.edge_enhancement == 0.0:
+            return
+        lines, samples = frame.grey.shape
+        step, grey = _edge_step(frame), frame.grey.astype(float)
+        across = np.clip(np.arange(lines)[:, None] + np.arange(-_EDGE_LINES, _EDGE_LINES + 1), 0, lines - 1)
+        along = np.arange(samples)[:, None] + step * np.arange(-_EDGE_SAMPLES, _EDGE_SAMPLES + 1)
+        mean = grey[:, np.clip(along, 0, samples - 1)].mean(axis=2)[across].mean(axis=1)
+        sharp = grey + frame.display.edge_enhancement * (grey - mean)
+        frame.grey = (np.clip(sharp, 0.0, 255.0) + 0.5).astype(np.uint8)
+
+
+def smoothing_sigmas(frame: FrameInputs) -> tuple[float, float]:
+    """Sigmas of the smoothing along the lines in samples and across them in lines; 0 for none.
+
+    The lateral one is an angle, at the apex of a sector. On a linear array, whose lines have one distance, it is that
+    seen from the depth of the focus.
+    """
+    display, probe = frame.display, frame.probe
+    along = display.smoothing_axial_mm / float(frame.acquisition["sample_mm"])
+    angle = float(np.deg2rad(display.smoothing_lateral_deg))
+    if probe.is_linear and probe.focus_mm is not None:
+        angle *= probe.focus_mm
+    return along if along >= 0.2 else 0.0, across if (across := angle / probe.line_spacing) >= 0.1 else 0.0
+
+
+def gaussian_taps(sigma: float) -> np.ndarray:
+    """(2 reach + 1,) float32 Gaussian of standard deviation `sigma` and sum 1."""
+    reach = min(max(int(np.ceil(_CUT_OFF * sigma)), 1), _MOST_TAPS)
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return (taps / taps.sum()).astype(np.float32)
+
+
+def gains_along(display: DisplaySettings, depth_mm: np.ndarray, image_depth_mm: float) -> np.ndarray:
+    """(samples,) dB of the eight sliders of the gain by depth, straight between their middles."""
+    sliders = [getattr(display, f"depth_gain_{n}_db") for n in range(1, 9)]
+    places = (np.arange(8) + 0.5) / 8.0 * image_depth_mm
+    return np.interp(depth_mm, places, sliders)
+
+
+def gains_across(display: DisplaySettings, lines: int) -> np.ndarray:
+    """(lines,) float32 dB of the gain by line, from the first to the last, straight between five knots."""
+    knots = [getattr(display, f"line_gain_{n}_db") for n in range(1, 6)]
+    return np.interp(np.linspace(0.0, 1.0, lines), np.linspace(0.0, 1.0, 5), knots).astype(np.float32)
+
+
+def _maps(frame: FrameInputs) -> bool:
+    return any(smoothing_sigmas(frame)) or not is_linear(frame.display)
+
+
+def _edge_step(frame: FrameInputs) -> int:
+    """Samples between those of the mean."""
+    return max(round(_EDGE_MM / _EDGE_SAMPLES / float(frame.acquisition["sample_mm"])), 1)

@@ -1,0 +1,222 @@
+"""What a scanner's console does to an image (imaging/console.py, grey_map.py): off by default, and free in fits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from SlicerUSSim.Logic import (
+    ConvexProbe,
+    DisplaySettings,
+    LinearProbe,
+    SimulationError,
+    TissueTable,
+    TrackedSequence,
+    optimize_appearance,
+)
+from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, speckle_widths
+from SlicerUSSim.Logic.imaging.grey_map import GREY_MAPS, TABLE_SIZE, estimate_grey_map, grey_table, slope_at
+from SlicerUSSim.Logic.probe import ImageGrid, probe_from_dict
+from SlicerUSSim.Logic.tracked import TrackedImages
+from SlicerUSSim.Logic.verification.numpy_model import NumpyModel
+from tests.conftest import SHARED, SPECKLE, block, needs_shared, rigid, simulator
+
+EVEN = replace(SPECKLE, texture_db=0.0, specks_per_mm3=0.0)
+SMALL = LinearProbe(8, 12, scan_lines=24, frequency_mhz=4, focus_mm=40, elevation_focus_mm=40)
+POSE = rigid(np.eye(3), [0.0, -6.0, 0.0])
+EVERYTHING = DisplaySettings(
+    smoothing_axial_mm=0.15, smoothing_lateral_deg=0.6, edge_enhancement=0.8, grey_map="soft", map_dark=0.7,
+    depth_gain_2_db=4.0, depth_gain_7_db=-6.0, line_gain_1_db=-9.0, line_gain_4_db=3.0, noise_db=-30.0,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def small():
+    labels = block(lambda x, y, z: 1 + (y > 0), (12, 12, 6))
+    return simulator(labels, EVEN, replace(EVEN, name="more", mu0=1.0), scatterers_per_mm3=4.0)
+
+
+@pytest.fixture(scope="module")
+def solid():
+    return simulator(block(lambda x, y, z: np.ones_like(x), (40, 40, 12)), EVEN)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"smoothing_axial_mm": 0.0, "smoothing_lateral_deg": 0.0}, {"edge_enhancement": 0.0},
+     {"grey_map": "linear", "map_dark": 1.0}, {"smoothing_axial_mm": 2.5}],
+)  # fmt: skip
+@pytest.mark.parametrize("probe", [SMALL, ConvexProbe(20.0, 40.0, 12.0, scan_lines=24, frequency_mhz=4.0)])
+def test_the_kernels_do_what_numpy_does(small, probe, changes):
+    display = replace(EVERYTHING, **changes)
+    image = small.simulate(probe, POSE, display).image
+    difference = np.abs(image.astype(int) - NumpyModel(small).simulate(probe, POSE, display))
+    assert (difference <= 2).mean() > 0.97 and image.max() > 60
+    assert (
+        np.abs(image.astype(int) - small.simulate(probe, POSE, DisplaySettings(noise_db=-30.0)).image) > 8
+    ).mean() > 0.3
+
+
+def test_off_by_default_and_without_effect_on_the_echoes(small):
+    """The baseband signal is the same, so that frames are displayed again and fits keep their bases."""
+    plain, other = small.simulate(SMALL, POSE), small.simulate(SMALL, POSE, EVERYTHING)
+    np.testing.assert_array_equal(plain.iq, other.iq)
+    np.testing.assert_array_equal(small.simulate(SMALL, POSE).image, plain.image)
+    assert DisplaySettings().grey_map == "linear" and DisplaySettings().smoothing_axial_mm == 0.0
+
+
+def test_smoothing_widens_speckle_by_its_sigma(solid):
+    """A Gaussian of sigma t adds 2 t^2 to the s^2 of the correlation of intensities; smoothed speckle has another law,
+    as compounded looks have, by which its log is up to a quarter wider."""
+    probe = LinearProbe(30, 40, scan_lines=181)
+    grid = ImageGrid.for_probe(probe, None)
+    pose = rigid(np.eye(3), [0, -30, 0])
+    plain, smooth = (
+        speckle_widths([solid.simulate(probe, pose, d).image], probe, grid, [20.0], reach_mm=15.0)[0]
+        for d in (DisplaySettings(), DisplaySettings(smoothing_axial_mm=0.15, smoothing_lateral_deg=0.6))
+    )
+    for before, after, sigma in (
+        (plain.axial_mm, smooth.axial_mm, 0.15),
+        (plain.lateral_mm, smooth.lateral_mm, np.deg2rad(0.6) * probe.focus_mm),
+    ):
+        assert 0.9 * np.hypot(before, np.sqrt(2) * sigma) < after < 1.6 * np.hypot(before, np.sqrt(2) * sigma)
+
+
+def test_smoothing_fills_the_black_between_grains(solid):
+    probe, pose = LinearProbe(30, 40, scan_lines=181), rigid(np.eye(3), [0, -30, 0])
+    plain, smooth = (
+        solid.simulate(probe, pose, DisplaySettings(smoothing_axial_mm=a, smoothing_lateral_deg=b)).image[
+            60:-60, 60:-60
+        ]
+        for a, b in ((0.0, 0.0), (0.1, 0.34))
+    )
+    below = [float(np.median(i) - np.percentile(i, 1)) for i in (plain.astype(float), smooth.astype(float))]
+    assert below[1] < 0.75 * below[0]
+
+
+@pytest.mark.parametrize("number", [1, 5, 8])
+def test_a_slider_changes_the_level_at_its_depth_and_not_elsewhere(solid, number):
+    probe, pose = LinearProbe(30, 40, scan_lines=91), rigid(np.eye(3), [0, -30, 0])
+    display = DisplaySettings(noise_db=None, tgc_db_cm_mhz=0.0)
+    frames = [solid.simulate(probe, pose, d) for d in (display, replace(display, **{f"depth_gain_{number}_db": 7.0}))]
+    depth = np.arange(frames[0].envelope.shape[1]) * frames[0].sample_interval_mm
+    change = 20 * np.log10(frames[1].envelope / frames[0].envelope).mean(axis=0)
+    middle = (number - 0.5) * 5.0
+    np.testing.assert_allclose(change[np.abs(depth - middle) < 0.05], 7.0, atol=0.1)
+    np.testing.assert_allclose(change[(np.abs(depth - middle) > 5.1) & (depth < 40.0)], 0.0, atol=1e-3)
+
+
+def test_gain_by_line_goes_from_left_to_right(solid):
+    probe, pose = LinearProbe(30, 40, scan_lines=101), rigid(np.eye(3), [0, -30, 0])
+    plain, dark = (
+        solid.simulate(probe, pose, DisplaySettings(noise_db=None, **g)) for g in ({}, {"line_gain_1_db": -12.0})
+    )
+    change = 20 * np.log10(dark.envelope / plain.envelope).mean(axis=1)
+    np.testing.assert_allclose(change[[0, 12, 25, 100]], [-12.0, -12.0 * 13 / 25, 0.0, 0.0], atol=0.05)
+
+
+@pytest.mark.parametrize("name", GREY_MAPS)
+@pytest.mark.parametrize("slopes", [(1.0, 1.0, 1.0), (0.1, 3.0, 0.1), (3.0, 0.1, 3.0)])
+def test_every_grey_map_rises_from_black_to_white(name, slopes):
+    table = grey_table(DisplaySettings(grey_map=name, map_black=slopes[0], map_dark=slopes[1], map_white=slopes[2]))
+    assert table.shape == (TABLE_SIZE,) and table[0] == 0.0 and table[-1] == pytest.approx(255.0)
+    assert (np.diff(table) > 0.0).all()
+    wanted = slope_at(table, tuple(np.multiply(GREY_MAPS[name], slopes)))
+    np.testing.assert_allclose((np.diff(table) / np.diff(table)[500])[20:-20] * wanted[500], wanted[20:-21], rtol=0.08)
+
+
+def test_a_straight_map_is_log_compression(solid):
+    np.testing.assert_allclose(grey_table(DisplaySettings()), np.linspace(0, 255, TABLE_SIZE), atol=1e-3)
+    probe, pose = LinearProbe(30, 40, scan_lines=91), rigid(np.eye(3), [0, -30, 0])
+    plain = solid.simulate(probe, pose).image.astype(int)
+    # By way of the table: a map that is straight but for what is beyond any float
+    nearly = solid.simulate(probe, pose, DisplaySettings(map_white=1.0 + 1e-6)).image
+    assert np.abs(plain - nearly).max() <= 1
+
+
+def shown_speckle(slopes, seed=0, pixel_mm=0.2) -> np.ndarray:
+    """Developed speckle from dark to bright, by a grey map with these slopes."""
+    random = np.random.default_rng(seed)
+    parts = [ndimage.gaussian_filter(random.normal(size=(400, 500)), (1.2, 2.5)) for _ in range(2)]
+    power = parts[0] ** 2 + parts[1] ** 2
+    level = 10.0 * np.log10(power / power.mean()) + np.linspace(-42.0, -8.0, 500)
+    table = grey_table(DisplaySettings(map_black=slopes[0], map_dark=slopes[1], map_white=slopes[2]))
+    return np.interp(1.0 + level / 60.0, np.linspace(0, 1, TABLE_SIZE), table).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize("slopes", [(1.0, 1.0, 1.0), (0.5, 0.75, 1.6), (0.25, 0.7, 0.9)])
+def test_the_grey_map_is_found_in_images_alone(slopes):
+    found = estimate_grey_map([shown_speckle(slopes, seed) for seed in range(4)], (0.2, 0.2))
+    for grey in (45.0, 60.0, 80.0, 100.0, 160.0, 180.0):
+        wanted = slope_at(np.array([grey, 130.0]), slopes)
+        assert found.at(grey) == pytest.approx(float(wanted[0] / wanted[1]), rel=0.15)
+    assert found.map_dark == pytest.approx(slopes[1], rel=0.15)
+    assert set(found.changes()) == {"map_black", "map_dark", "map_white"}
+
+
+def test_a_grey_map_needs_several_levels():
+    with pytest.raises(SimulationError, match="too few grey levels"):
+        estimate_grey_map([np.full((200, 200), 80, np.uint8)], (0.2, 0.2))
+    with pytest.raises(SimulationError, match="no image"):
+        estimate_grey_map([], (0.2, 0.2))
+
+
+@needs_shared
+def test_the_grey_maps_of_two_scanners_are_those_found_by_trial():
+    """A brain, and a spine phantom as the control: another scanner, another map."""
+    greys = (15, 30, 45, 60, 80, 100, 160, 200)
+    sequence = TrackedSequence.read(SHARED / "SpinePhantomFreehand.igs.mha")
+    from SlicerUSSim.Logic.tracked.field import estimate_field
+
+    field = estimate_field(sequence.images, (0.1, 0.1))
+    images = [np.ascontiguousarray(image[field.window]) for image in sequence.images[::4]]
+    phantom = estimate_grey_map(images, (0.1, 0.1), field.mask[field.window])
+    found = np.array([phantom.at(grey) for grey in greys])
+    np.testing.assert_allclose(found, (0.18, 0.36, 0.55, 0.71, 0.91, 0.95, 0.98, 0.87), atol=0.19)
+    if not (SHARED / "brain_sweep").is_dir():
+        pytest.skip("the real sweep is not there")
+    from SlicerUSSim.Logic.base.files import read_json
+
+    probe = probe_from_dict(read_json(SHARED / "brain_sweep" / "probe.json"), "probe")
+    brain = TrackedImages.of(TrackedSequence.read(SHARED / "brain_sweep" / "brain_sweep.igs.mha"), probe=probe)
+    estimate = estimate_grey_map(brain.images[::3], brain.grid.pixel_spacing_mm, brain.mask)
+    found = np.array([estimate.at(grey) for grey in greys])
+    np.testing.assert_allclose(found, (0.54, 0.55, 0.62, 0.71, 0.81, 0.93, 1.14, 1.35), atol=0.12)
+
+
+def test_fits_find_what_the_console_does(solid):
+    """Smoothing, map and a slider of the true image, from their defaults, each free by its own name."""
+    probe, pose = LinearProbe(24, 30, scan_lines=64), rigid(np.eye(3), [0, -30, 0])
+    truth = DisplaySettings(
+        map_dark=0.5, map_white=1.5, depth_gain_6_db=8.0, smoothing_axial_mm=0.12, image_size=(150, 120)
+    )
+    image = solid.simulate(probe, pose, truth).image
+    result = optimize_appearance(
+        solid, probe, [pose], [image], display=DisplaySettings(image_size=(150, 120)), max_evaluations=250,
+        free=["map_dark", "map_white", "depth_gain_6_db", "smoothing_axial_mm"], restarts=0,
+    )  # fmt: skip
+    assert result.cost_after < 0.25 * result.cost_before
+    assert result.display.depth_gain_6_db == pytest.approx(8.0, abs=1.5)
+    assert result.display.smoothing_axial_mm == pytest.approx(0.12, abs=0.04)
+
+
+def test_names_stand_for_what_is_not_on_request(solid):
+    names = FreeParameters.of(["display"], TissueTable({1: EVEN}), DisplaySettings()).names
+    assert names == ["gain_db", "dynamic_range_db", "tgc_db_cm_mhz", "noise_db"]
+    sliders = FreeParameters.of(["sliders"], TissueTable({1: EVEN}), DisplaySettings()).names
+    assert sliders == [f"depth_gain_{n}_db" for n in range(1, 9)]
+    assert FreeParameters.of(["map"], TissueTable({1: EVEN}), DisplaySettings()).names == [
+        "map_black",
+        "map_dark",
+        "map_white",
+    ]
+
+
+def test_bases_of_a_fit_have_the_console(small):
+    model = AppearanceModel(small, SMALL, [POSE], {"more": ["mu0"]})
+    display = replace(EVERYTHING, noise_db=None)
+    expected = small.simulate(SMALL, POSE, display, model.grid(display)).image
+    assert (np.abs(model.image(0, small.medium.tissues, display).astype(int) - expected) <= 1).mean() > 0.999

@@ -1,0 +1,283 @@
+"""The yardstick of realism (docs/realism.md): costs of texture, width of speckle, grey levels, lines, controls."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy import ndimage
+
+from SlicerUSSim.Command.cli import main
+from SlicerUSSim.Logic import (
+    ConvexProbe,
+    DisplaySettings,
+    LinearProbe,
+    PhasedProbe,
+    SimulationError,
+    SimulationSettings,
+    TissueTable,
+    TrackedSequence,
+    UltrasoundSimulator,
+    segment_mri,
+    similarity,
+)
+from SlicerUSSim.Logic.base.files import write_json
+from SlicerUSSim.Logic.fitting import TextureReference, measure_realism, neighbours_of, speckle_widths, texture_misfit
+from SlicerUSSim.Logic.fitting.grey_statistics import grey_of_tissues, level_by_depth
+from SlicerUSSim.Logic.fitting.realism import BLURRED, NEIGHBOURS, REAL, UNIFORM, blurred
+from SlicerUSSim.Logic.fitting.sheet_contrast import line_contrast, sheet_points, wall_points
+from SlicerUSSim.Logic.fitting.speckle_width import log_speckle_correlation
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.probe import ImageGrid
+from SlicerUSSim.Logic.tracked import TrackedImages
+from SlicerUSSim.Logic.verification.twins import make_twin
+from tests.conftest import SHARED, SPECKLE, block, needs_shared, rigid
+
+SPACING = 0.2, 0.2
+GRID = ImageGrid(300, 240, -24.0, 0.0, SPACING)
+PROBE = LinearProbe(48.0, 60.0, scan_lines=160)
+
+
+def speckle(sigma_mm, seed=0, shape=(300, 240), spacing=SPACING, range_db=55.0) -> np.ndarray:
+    """Log-compressed developed speckle whose amplitude has this sigma, (axial, lateral) mm."""
+    random = np.random.default_rng(seed)
+    # A filter of sigma s gives the correlation of amplitudes exp(-d^2 / 4 s^2)
+    sigma = [s / pixel for s, pixel in zip(sigma_mm, spacing[::-1], strict=True)]
+    parts = [ndimage.gaussian_filter(random.normal(size=shape), sigma, mode="wrap") for _ in range(2)]
+    power = parts[0] ** 2 + parts[1] ** 2
+    return np.clip(150.0 + 255.0 / range_db * 10.0 * np.log10(power / power.mean()), 0, 255).astype(np.uint8)
+
+
+def test_texture_costs_see_what_the_papers_cost_takes_for_a_neighbour():
+    """The blurred image is about as near as another realisation by the paper's cost, and far by those of texture."""
+    image, other = speckle((0.3, 0.8), 0), speckle((0.3, 0.8), 1)
+    soft = blurred(image)
+    assert similarity(soft, image, SPACING).total < 1.5 * similarity(other, image, SPACING).total
+    near, far = texture_misfit(other, image, SPACING), texture_misfit(soft, image, SPACING)
+    assert near.autocorrelation < 0.05 and near.extrema < 0.15
+    assert far.autocorrelation > 4 * near.autocorrelation and far.extrema > 8 * near.extrema
+    assert texture_misfit(image, image, SPACING).total == 0.0
+
+
+@pytest.mark.parametrize("changed", [(0.3, 1.2), (0.45, 0.8), (0.2, 0.5)])
+def test_texture_cost_is_least_at_the_true_width(changed):
+    image = speckle((0.3, 0.8), 0)
+    same = texture_misfit(speckle((0.3, 0.8), 5), image, SPACING).total
+    assert texture_misfit(speckle(changed, 5), image, SPACING).total > 2.0 * same
+
+
+def test_texture_cost_ignores_dark_patches_and_what_is_outside():
+    image, other = speckle((0.3, 0.8), 0), speckle((0.3, 0.8), 1)
+    mask = np.ones(image.shape, bool)
+    mask[:, 150:] = False
+    outside = np.where(mask, other, 255 * (np.indices(other.shape).sum(axis=0) % 2)).astype(np.uint8)
+    assert texture_misfit(outside, image, SPACING, mask) == texture_misfit(other, image, SPACING, mask)
+    dark = (image // 16).astype(np.uint8)
+    nothing = texture_misfit(dark, dark, SPACING)
+    assert np.isnan(nothing.autocorrelation) and np.isnan(nothing.extrema)
+
+
+def test_texture_reference_refuses_other_shapes_and_types():
+    reference = TextureReference(speckle((0.3, 0.8)), SPACING)
+    with pytest.raises(SimulationError, match="shape"):
+        reference.misfit(np.zeros((4, 4), np.uint8))
+    with pytest.raises(SimulationError, match="uint8"):
+        texture_misfit(np.zeros((4, 4)), np.zeros((4, 4), np.uint8), SPACING)
+
+
+def test_law_is_that_of_log_compressed_speckle():
+    """Against a Monte-Carlo estimate of the correlation of the logs of two exponential variables."""
+    random = np.random.default_rng(0)
+    one, independent = random.normal(size=(2, 400_000, 2))  # real and imaginary parts
+    for distance in (0.5, 1.0, 2.0):
+        correlation = np.exp(-0.25 * distance**2)  # of amplitudes
+        other = correlation * one + np.sqrt(1.0 - correlation**2) * independent
+        logs = [np.log((signal**2).sum(axis=1)) for signal in (one, other)]
+        measured = np.corrcoef(*logs)[0, 1]
+        assert float(log_speckle_correlation(np.array([distance]), 1.0)[0]) == pytest.approx(measured, abs=0.01)
+
+
+@pytest.mark.parametrize("sigma", [(0.25, 0.6), (0.35, 1.5), (0.5, 1.0)])
+def test_width_of_known_speckle(sigma):
+    """The percentile that keeps texture out is below the mean of windows, the more the fewer grains one has."""
+    images = [speckle(sigma, seed) for seed in range(2)]
+    for width in speckle_widths(images, PROBE, GRID, [15.0, 30.0, 45.0]):
+        assert 0.75 * sigma[0] < width.axial_mm < 1.03 * sigma[0]
+        assert 0.8 * sigma[1] < width.lateral_mm < 1.03 * sigma[1]
+
+
+def test_width_of_speckle_is_not_widened_by_structure_larger_than_it():
+    """Slow bright bands, as of tissue, in both directions; without the means that are subtracted it were +40 %."""
+    rows, columns = np.indices((300, 240)) * 0.2
+    images = [
+        np.clip(0.7 * speckle((0.3, 0.8), seed) + 12.0 * np.sin(rows / 2.5) + 12.0 * np.sin(columns / 4.0), 0, 255)
+        .astype(np.uint8)
+        for seed in range(2)
+    ]  # fmt: skip
+    (width,) = speckle_widths(images, PROBE, GRID, [30.0], reach_mm=25.0)
+    assert 0.75 * 0.3 < width.axial_mm < 1.1 * 0.3 and 0.75 * 0.8 < width.lateral_mm < 1.1 * 0.8
+
+
+@pytest.mark.parametrize(
+    "probe",
+    [LinearProbe(36, 50, scan_lines=181), ConvexProbe(30.0, 60.0, 50.0, scan_lines=400),
+     PhasedProbe(80.0, 50.0, scan_lines=256)],
+)  # fmt: skip
+def test_width_of_simulated_speckle_is_that_of_the_probe(probe):
+    """-4 to +9 % axially and -6 to +14 % laterally were found by trial (here up to 18: lines are interpolated)."""
+    solid = block(lambda x, y, z: np.ones_like(x), half_mm=(50, 40, 12))
+    images = [
+        UltrasoundSimulator(
+            solid, TissueTable({0: SPECKLE, 1: SPECKLE}), SimulationSettings(seed=seed, ring_down=False)
+        )
+        .simulate(probe, rigid(np.eye(3), [0, -30, 0]), DisplaySettings(tgc_db_cm_mhz=0.0))
+        .image
+        for seed in range(2)
+    ]
+    grid = ImageGrid.for_probe(probe, None)
+    for width in speckle_widths(images, probe, grid, [20.0, 42.0], reach_mm=4.0):
+        assert width.axial_mm == pytest.approx(probe.axial_sigma_mm, rel=0.13)
+        near = probe.speckle_sigma_mm(width.depth_mm + np.linspace(-6.0, 6.0, 13)).mean()
+        assert width.lateral_mm == pytest.approx(near, rel=0.19)
+
+
+def test_images_without_speckle_have_no_width():
+    (width,) = speckle_widths([np.full((300, 240), 90, np.uint8)], PROBE, GRID, [30.0])
+    assert np.isnan(width.axial_mm) and width.windows == 0
+
+
+def test_grey_levels_of_tissues_tell_bright_tails():
+    rows = np.indices((300, 240))[0]
+    region = np.where(rows < 150, 1, 2)
+    random = np.random.default_rng(0)
+    grey = np.where(
+        rows < 150, 100 + 12 * random.normal(size=region.shape), 60 + 18 * random.exponential(size=region.shape)
+    )
+    image = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    found = grey_of_tissues(
+        [image], [region], {1: "even", 2: "spotted", 3: "absent"}, GRID, np.ones(region.shape, bool)
+    )
+    assert list(found) == ["even", "spotted"]
+    assert found["even"].mean == pytest.approx(100, abs=1) and found["even"].deviation == pytest.approx(12, rel=0.05)
+    assert found["even"].skewness == pytest.approx(0.0, abs=0.05) and found["spotted"].skewness == pytest.approx(
+        2, rel=0.15
+    )
+    assert found["spotted"].percentile_99 > 2.5 * abs(found["spotted"].percentile_1)
+    assert found["even"].histogram.sum() == pytest.approx(1.0, abs=1e-3)
+
+
+def test_level_by_depth_follows_the_beams():
+    """Rings about the apex of a convex array, not rows, have one depth."""
+    probe = ConvexProbe(30.0, 60.0, 50.0)
+    grid = ImageGrid.for_probe(probe, (300, 340))
+    columns, rows = np.meshgrid(np.arange(340), np.arange(300))
+    x, y = (grid.image_to_probe @ np.stack([columns, rows, 0 * rows, 1 + 0 * rows]).reshape(4, -1))[:2]
+    depth = np.hypot(x, y + 30.0).reshape(rows.shape) - 30.0
+    image = np.clip(4.0 * depth, 0, 255).astype(np.uint8)
+    at, level = level_by_depth([image], probe, grid, grid.field(probe))
+    np.testing.assert_allclose(level[1:-1], 4.0 * at[1:-1], atol=2.0)
+
+
+@pytest.mark.parametrize(("contrast", "sigma_mm"), [(60.0, 0.5), (90.0, 0.8)])
+def test_contrast_and_width_of_a_sheet(contrast, sigma_mm):
+    """A line across the beam, between two 45 degrees to it, over noise."""
+    rows, columns = np.indices((300, 240)) * 0.2
+    away = np.where(columns < 24.0, rows - 30.0, (rows - 30.0 - (columns - 24.0)) / np.sqrt(2.0))
+    labels = (np.abs(away) < 0.5).astype(np.uint8)
+    noise = 6.0 * np.random.default_rng(0).normal(size=labels.shape)
+    image = np.clip(60 + contrast * np.exp(-0.5 * (away / sigma_mm) ** 2) + noise, 0, 255).astype(np.uint8)
+    inside = np.ones(labels.shape, bool)
+    found = line_contrast([image], [sheet_points(labels, [1], GRID)], PROBE, GRID, inside)
+    assert [line.angle_deg for line in found] == [(0, 30), (30, 60)]
+    for line in found:
+        assert line.contrast == pytest.approx(contrast, rel=0.15) and line.chance < 0.2 * contrast
+        assert line.width_mm == pytest.approx(2.355 * sigma_mm, rel=0.25)
+    nothing = np.clip(60 + noise, 0, 255).astype(np.uint8)
+    for line in line_contrast([nothing], [sheet_points(labels, [1], GRID)], PROBE, GRID, inside):
+        assert line.contrast == pytest.approx(line.chance, abs=3.0)
+
+
+def test_contrast_of_a_wall_is_above_the_tissue_and_not_above_the_fluid():
+    rows, _ = np.indices((300, 240)) * 0.2
+    labels = (np.abs(rows - 30.0) < 6.0).astype(np.uint8)
+    edge = np.exp(-0.5 * ((np.abs(rows - 30.0) - 6.0) / 0.5) ** 2)
+    image = np.clip(np.where(labels, 0.0, 80.0) + 70.0 * edge, 0, 255).astype(np.uint8)
+    (line,) = line_contrast([image], [wall_points(labels, [1], GRID)], PROBE, GRID, np.ones(labels.shape, bool))
+    assert line.angle_deg == (0, 30) and 55 < line.contrast <= 75
+
+
+@pytest.fixture(scope="module")
+def twin():
+    segmentation = segment_mri(head_mri(2.0))
+    probe = PhasedProbe(70.0, 50.0, scan_lines=128)
+    return make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
+
+
+def test_realism_of_the_images_themselves_is_perfect_and_controls_are_not(twin):
+    tracked = TrackedImages.of(twin.sequence(), probe=twin.probe)
+    sequence = twin.sequence()
+    found = measure_realism(
+        tracked, {"itself": tracked.images}, twin.simulator, neighbours=neighbours_of(sequence, tracked)
+    )
+    assert found.mean("itself")["sum"] == 0.0
+    assert set(found.costs) == {"itself", UNIFORM, BLURRED, NEIGHBOURS}
+    for control in (UNIFORM, BLURRED, NEIGHBOURS):
+        assert found.mean(control)["paper"] > 0.05
+    assert found.mean(BLURRED)["t2"] > 2 * found.mean(NEIGHBOURS)["t2"]
+    real, uniform = (np.mean([i[tracked.mask].mean() for i in found.images[name]]) for name in (REAL, UNIFORM))
+    assert uniform == pytest.approx(real, abs=1.0)  # at its best gain
+    plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert plain["costs"]["itself"]["mean"]["sum"] == 0.0
+    assert {title.split()[0] for title, _, _ in found.tables()} >= {"Costs", "Width", "Local", "Grey", "Mean"}
+    with pytest.raises(SimulationError, match="name of a control"):
+        measure_realism(tracked, {"real": tracked.images}, twin.simulator)
+    with pytest.raises(SimulationError, match="equal numbers"):
+        measure_realism(tracked, {"one": tracked.images[:1]}, twin.simulator)
+
+
+def test_command_says_numbers_with_controls(twin, tmp_path):
+    twin.simulator.medium.labels.write(tmp_path / "labels.nii.gz")
+    twin.simulator.medium.tissues.write(tmp_path / "labels.json")
+    twin.sequence().write(tmp_path / "tracked.igs.mha")
+    write_json(tmp_path / "probe.json", twin.probe.to_dict())
+    arguments = [
+        "realism", tmp_path / "labels.nii.gz", "--sequence", tmp_path / "tracked.igs.mha", "--probe",
+        tmp_path / "probe.json", "--json", tmp_path / "realism.json", "--picture", tmp_path / "realism.png",
+    ]  # fmt: skip
+    done = CliRunner().invoke(main, list(map(str, arguments)))
+    assert done.exit_code == 0, done.output
+    for words in ("simulated", "uniform tissue", "real neighbours", "real, blurred", "T1", "Width of the speckle"):
+        assert words in done.output
+    assert json.loads((tmp_path / "realism.json").read_text())["costs"]["simulated"]["mean"]["sum"] >= 0.0
+    assert (tmp_path / "realism.png").stat().st_size > 10_000
+
+
+@needs_shared
+def test_costs_of_a_real_sweep_are_those_found_by_trial():
+    """The table of the recipe: neighbours .247 .052 .20, another anatomy .450 .094 .20, blurred .279 .295 1.80."""
+    sweep = SHARED / "brain_sweep"
+    if not sweep.is_dir():
+        pytest.skip("the real sweep is not there")
+    from SlicerUSSim.Logic.base.files import read_json
+    from SlicerUSSim.Logic.probe import probe_from_dict
+
+    sequence = TrackedSequence.read(sweep / "brain_sweep.igs.mha")
+    tracked = TrackedImages.of(sequence, [3, 4, 5, 14], probe=probe_from_dict(read_json(sweep / "probe.json"), "probe"))
+    before, image, after, other = tracked.images
+    spacing = tracked.grid.pixel_spacing_mm
+    reference = TextureReference(image, spacing, tracked.mask)
+    paper = [similarity(i, image, spacing, mask=tracked.mask).total for i in (before, after, other, blurred(image))]
+    texture = [reference.misfit(i) for i in (before, after, other, blurred(image))]
+    assert 0.5 * (paper[0] + paper[1]) == pytest.approx(0.247, abs=0.002)
+    assert paper[2] == pytest.approx(0.450, abs=0.002) and paper[3] == pytest.approx(0.279, abs=0.004)
+    assert 0.5 * (texture[0].autocorrelation + texture[1].autocorrelation) == pytest.approx(0.052, abs=0.004)
+    assert texture[2].autocorrelation == pytest.approx(0.094, abs=0.003)
+    assert texture[3].autocorrelation == pytest.approx(0.295, abs=0.005)
+    assert 0.5 * (texture[0].extrema + texture[1].extrema) == pytest.approx(0.20, abs=0.03)
+    assert texture[2].extrema == pytest.approx(0.20, abs=0.06) and texture[3].extrema == pytest.approx(1.80, abs=0.1)
+    widths = speckle_widths([before, image, after], tracked.probe, tracked.grid, [25.0, 52.0, 68.0], tracked.mask)
+    for width in widths:
+        assert 0.22 < width.axial_mm < 0.33
+        assert width.lateral_mm == pytest.approx(0.020 * (width.depth_mm + 4.5), rel=0.2)
