@@ -606,11 +606,10 @@ inline void scatter_piece(__constant const Acquisition *acquisition, __global co
 #ifdef NO_IMPLICIT_VECTORS
 __attribute__((intel_vec_len_hint(1)))
 #endif
-__kernel void
-scatter(__constant const Acquisition *acquisition, __global const ushort *voxels, __global const uint *planes,
-        __global const uint *texture, __global const float *sites, __global const Segment *segments,
-        __global const int *segment_counts, __global float *re, __global float *im,
-        int stride VARIED_PARAMETERS LOBE_PARAMETERS) {
+__kernel void scatter(__constant const Acquisition *acquisition, __global const ushort *voxels,
+                      __global const uint *planes, __global const uint *texture, __global const float *sites,
+                      __global const Segment *segments, __global const int *segment_counts, __global float *re,
+                      __global float *im, int stride VARIED_PARAMETERS LOBE_PARAMETERS) {
   const int chunk = get_global_id(0), first = chunk * CHUNK;
 #ifdef LOBES
   const int left_line = get_global_id(1) * together, lines = min(together, acquisition->traced_lines - left_line);
