@@ -29,12 +29,6 @@ class FitSettings(Declared):
         "Also fit a rigid transform of the real ultrasound to the MRI; takes longer", shown=True,
         option="register/no-register",
     )  # fmt: skip
-    speckle: bool = parameter(
-        False, "Fit the speckle as well",
-        "Also take the grey map from the real images, and fit the smoothing of the envelope and the tissues' texture "
-        "to the size and number of speckle's grains",
-        shown=True, option="speckle/no-speckle",
-    )  # fmt: skip
     evaluations: int = parameter(
         500, "Evaluations", "Largest number of evaluations of the cost; each takes some milliseconds",
         bounds=(1, 1_000_000), shown=Shown(10, 100_000, 100), option="evaluations",
@@ -42,6 +36,12 @@ class FitSettings(Declared):
     restarts: int = parameter(
         2, "Restarts", "Additional searches with other starting points and speckle, to find equally good fits",
         bounds=(0, 100), option="restarts",
+    )  # fmt: skip
+    speckle: bool = parameter(
+        False, "Fit the speckle as well",
+        "Also take the grey map from the real images, and fit the smoothing of the envelope and the tissues' texture "
+        "to the size and number of speckle's grains",
+        shown=True, option="speckle/no-speckle",
     )  # fmt: skip
 
     @property
