@@ -1129,7 +1129,12 @@ def test_from_other_computers_only_the_token_opens_the_door(browser, files):
         assert (
             status(base) == status(f"{base}?token=wrong") == status(f"{base}index.html") == status(f"{base}ws") == 403
         )
-        assert status(f"{base}?token={token}") == 200
+        with_cookies = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        with with_cookies.open(f"{base}?token={token}", timeout=PATIENCE_S) as answer:
+            assert answer.status == 200 and token not in answer.url  # nor in the history
+            assert answer.headers["X-Content-Type-Options"] == "nosniff"
+            assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
+            assert answer.headers["Referrer-Policy"] == "no-referrer"
         assert status(f"{base}ws?token={token}", Origin="http://elsewhere.example") == 403
         stranger = browser.new_page()
         stranger.goto(f"{base}?token=wrong")
@@ -1139,6 +1144,7 @@ def test_from_other_computers_only_the_token_opens_the_door(browser, files):
         page = opened(browser, f"{base}?token={token}")
         settled(page)
         assert pixels(page).mean() > 5 and not errors(page)
+        assert "token" not in page.url
         page.close()
 
 

@@ -39,6 +39,7 @@ from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.tasks import Tasks
+from SlicerUSSim.Workstation.uploads import require_whole_files
 
 _log = logging.getLogger(__name__)
 
@@ -380,8 +381,10 @@ class Opener:
     def _sent(self, files: Mapping[str, bytes], folder: str) -> Iterator[list[Path]]:
         """The paths of files that a page has sent, {name: content}.
 
-        Errors within the block are about their names, as the user knows them.
+        Errors within the block are about their names, as the user knows them. Before anything is written, raises
+        SimulationError as require_whole_files does.
         """
+        require_whole_files(files)
         self._uploads = {str(Path(folder) / name): name for name in files}
         for path, content in zip(self._uploads, files.values(), strict=True):
             Path(path).write_bytes(content)

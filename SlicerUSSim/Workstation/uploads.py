@@ -1,0 +1,67 @@
+"""What a page may send: files that are whole by themselves, under plain names.
+
+The name is a text from a browser, or from whoever has the token, and becomes a path; a header may name any other file of
+the server's user as its voxels, which would then be shown and saved with the scene.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from SlicerUSSim.Logic.base.errors import require
+
+#: Bytes of the longest name that file systems take, less what is added to it
+_LONGEST_NAME = 200
+#: Bytes that are sent at once
+MOST_BYTES = 2**31
+#: Where headers end that name their voxels
+_HEADER_BYTES = 2**16
+_NRRD = re.compile(rb"^data ?file:\s*(.*)$", re.MULTILINE | re.IGNORECASE)
+_METAIMAGE = re.compile(rb"^ElementDataFile\s*=[ \t]*(.*)$", re.MULTILINE)
+
+
+def require_whole_files(files: Mapping[str, bytes]) -> None:
+    """Raise SimulationError for names that are no plain file names, and for headers that name another file.
+
+    `files` are {name: content} as a page sent them. Nothing has been written yet.
+    """
+    size = sum(map(len, files.values()))
+    require(size <= MOST_BYTES, f"{', '.join(map(_shown, files))}: {size} bytes, expected at most {MOST_BYTES}")
+    for name, content in files.items():
+        require(
+            bool(name) and name not in (".", "..") and not re.search(r"[/\\\0-\x1f\x7f]", name),
+            f"{_shown(name)}: is no plain file name, expected one without slashes and control characters",
+        )
+        length = len(name.encode("utf-8", "replace"))
+        require(
+            length <= _LONGEST_NAME, f"{_shown(name)}: its name has {length} bytes, expected at most {_LONGEST_NAME}"
+        )
+        other = _other_file(name, content)
+        require(
+            other is None,
+            f"{name}: is a header whose voxels are in another file ({other}), which a page cannot send; save it as one "
+            "file, such as .nrrd, .mha or .nii.gz",
+        )
+
+
+def _other_file(name: str, content: bytes) -> str | None:
+    """The file that a header names as its voxels; None for a file that is whole."""
+    lower, start = name.lower(), content[:4]
+    if lower.endswith((".mhd", ".mha")):
+        # Of a sequence the line comes after the fields of all images
+        found = _METAIMAGE.search(content)
+        named = found[1].strip().decode("utf-8", "replace") if found else ""
+        return None if named in ("", "LOCAL", "Local", "local") else _shown(named)
+    if start == b"NRRD":
+        found = _NRRD.search(content.partition(b"\n\n")[0][:_HEADER_BYTES])
+        return _shown(found[1].strip().decode("utf-8", "replace")) if found else None
+    if lower.endswith((".nhdr", ".hdr", ".img")):
+        return "beside it"
+    return None
+
+
+def _shown(text: str) -> str:
+    """A text for a message, short and without control characters."""
+    plain = "".join(letter if letter.isprintable() else "?" for letter in text)
+    return plain if len(plain) <= 60 else f"{plain[:57]}..."
