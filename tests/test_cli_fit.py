@@ -294,7 +294,10 @@ def test_black_images_and_a_sequence_that_is_none_are_refused(folder, tmp_path):
     sequence = TrackedSequence.read(folder / "tracked.igs.mha")
     sequence.with_images([0, 1, 2], np.zeros_like(sequence.images)).write(tmp_path / "black.igs.mha")
     (tmp_path / "none.igs.mha").write_text("no sequence")
-    for name, message in (("black", "image 0 of the sequence is black"), ("none", "cannot be read")):
+    for name, message in (
+        ("black", "image 0 of the sequence is black"),
+        ("none", "has no line ElementDataFile, expected a MetaImage"),
+    ):
         done = ussim(
             "optimize", folder / "labels.nii.gz", "--sequence", tmp_path / f"{name}.igs.mha", "--probe",
             folder / "probe.json", "-o", tmp_path / "result.json",

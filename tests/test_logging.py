@@ -138,6 +138,8 @@ def nifti(path, sform, qform, unit: str = "mm"):
     image.set_qform(*qform)
     image.set_sform(*sform)
     image.header.set_xyzt_units(unit)
+    if sform[0] is not None:
+        image.header.set_zooms(np.linalg.norm(sform[0][:3, :3], axis=0))
     nibabel.save(image, path)
     return Volume.read(path)
 
@@ -164,12 +166,13 @@ def test_orientation_and_unit_of_nifti_are_logged(log, tmp_path, mirrored):
     log.clear()
     nifti(tmp_path / "metres.nii", (matrix @ np.diag([1e-3, 1e-3, 1e-3, 1]), 1), (None, 0), "meter")
     assert "NIfTI in metres" in log.text
+    np.testing.assert_allclose(Volume.read(tmp_path / "metres.nii").spacing_mm, [1.0, 1.5, 2.0], rtol=1e-5)
 
 
 def test_a_size_that_no_patient_has_is_a_warning(log, tmp_path):
-    Volume(np.zeros((20, 20, 20), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1])).write(tmp_path / "small.nrrd")
+    Volume(np.zeros((20, 20, 20), np.uint8), np.diag([0.1, 0.1, 0.1, 1])).write(tmp_path / "small.nrrd")
     Volume.read(tmp_path / "small.nrrd")
-    assert "its size is 0.02x0.02x0.02 mm" in messages(log, logging.WARNING)[0]
+    assert "its size is 2x2x2 mm" in messages(log, logging.WARNING)[0]
 
 
 def test_what_a_sequence_is_taken_for_is_logged(log, files):
@@ -318,8 +321,8 @@ def test_optimize_prints_what_it_found_alone(files, tmp_path):
         "optimize", files / "labels.nii.gz", "--sequence", files / "sweep.igs.mha", "--probe", files / "probe.json",
         "--frames", 1, "--free", "gain_db", "--evaluations", 5, "--restarts", 0, "-o", tmp_path / "fit.json", "-v",
     )  # fmt: skip
-    cost, parameter = result.stdout.splitlines()
-    assert cost.startswith("cost ") and parameter.startswith("gain_db ")
+    cost, texture, parameter = result.stdout.splitlines()
+    assert cost.startswith("cost ") and texture.startswith("texture T1 ") and parameter.startswith("gain_db ")
     assert "wrote" in result.stderr and "ussim: info: fit of 1 images, 1 free parameters: gain_db" in result.stderr
 
 
