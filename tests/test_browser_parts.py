@@ -194,18 +194,23 @@ def test_what_is_called_too_often_is_called_once_more_at_the_end():
     assert min(np.diff(times)) > 0.0999 and len(times) in (4, 5) and numbers[0] == 1 and numbers[-1] == 31
 
 
+def live_scene(head, tasks: Tasks):
+    """(logic, labels, transform of the probe on the head, output volume)."""
+    scene = slicer.vtkMRMLScene()
+    labels, transform, output = (
+        scene.AddNewNodeByClass(f"vtkMRML{kind}Node") for kind in ("LabelMapVolume", "LinearTransform", "ScalarVolume")
+    )
+    write_labels(labels, head.labels, head.tissue_names, labels)
+    logic = UltrasoundSceneLogic(scene, work=tasks)
+    set_node_to_world(transform, craniotomy_pose(head.labels, logic.preset.probe))
+    return logic, labels, transform, output
+
+
 def test_changes_that_come_while_an_image_is_computed_bring_one_more_of_the_last_pose(head):
     async def scenario():
         errors, reports = [], []
         tasks = Tasks(errors.append)
-        scene = slicer.vtkMRMLScene()
-        labels, transform, output = (
-            scene.AddNewNodeByClass(f"vtkMRML{kind}Node")
-            for kind in ("LabelMapVolume", "LinearTransform", "ScalarVolume")
-        )
-        write_labels(labels, head.labels, head.tissue_names, labels)
-        logic = UltrasoundSceneLogic(scene, work=tasks)
-        set_node_to_world(transform, craniotomy_pose(head.labels, logic.preset.probe))
+        logic, labels, transform, output = live_scene(head, tasks)
 
         async def done() -> None:
             while not tasks.are_done:
@@ -236,14 +241,7 @@ def test_changes_that_come_while_an_image_is_computed_bring_one_more_of_the_last
 def test_a_probe_that_moves_while_the_first_live_image_is_computed_is_followed(head):
     async def scenario():
         tasks = Tasks(print)
-        scene = slicer.vtkMRMLScene()
-        labels, transform, output = (
-            scene.AddNewNodeByClass(f"vtkMRML{kind}Node")
-            for kind in ("LabelMapVolume", "LinearTransform", "ScalarVolume")
-        )
-        write_labels(labels, head.labels, head.tissue_names, labels)
-        logic = UltrasoundSceneLogic(scene, work=tasks)
-        set_node_to_world(transform, craniotomy_pose(head.labels, logic.preset.probe))
+        logic, labels, transform, output = live_scene(head, tasks)
         goes_on = threading.Event()
         tasks.start(lambda: tasks.do(goes_on.wait))
         tasks.start(lambda: logic.startLiveUpdate(labels, transform, output, schedule=tasks.start))

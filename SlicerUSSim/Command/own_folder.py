@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.files import hash_of_file, make_folder, partial_folder, put_on_disk, read_json, write_json
+from SlicerUSSim.Logic.base.files import hash_of_file, make_folder, move_into, partial_folder, read_json, write_json
 
 #: Entry of the summary: {file name: hash, as it was written}
 _FILES = "files_sha256"
@@ -49,7 +47,7 @@ def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
     make_folder(folder)
     content: dict = {}
     try:
-        with _temporary_folder(folder) as partial:
+        with partial_folder(folder, "cannot be written to") as partial:
             try:
                 yield partial, content
                 files = sorted(file for file in partial.iterdir() if file.name != summary)
@@ -57,25 +55,9 @@ def results_of(folder: Path, summary: str) -> Iterator[tuple[Path, dict]]:
                 write_json(partial / summary, {**content, _FILES: hashes})
             except SimulationError as error:  # the user knows no temporary folder
                 raise SimulationError(str(error).replace(str(partial), str(folder))) from None
-            for file in (*files, partial / summary):
-                put_on_disk(file)
-            for file in (*files, partial / summary):
-                os.replace(file, folder / file.name)
-            put_on_disk(folder)
+            move_into(folder, [*files, partial / summary])
     except BaseException:
         if is_new:
             with suppress(OSError):  # not empty
                 folder.rmdir()
         raise
-
-
-@contextmanager
-def _temporary_folder(folder: Path) -> Iterator[Path]:
-    try:
-        temporary = partial_folder(folder)
-    except OSError as error:
-        raise SimulationError(f"{folder}: cannot be written to ({error.strerror})") from None
-    try:
-        yield temporary
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

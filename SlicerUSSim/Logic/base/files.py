@@ -12,7 +12,7 @@ import shutil
 import sys
 import tempfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -97,24 +97,32 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
     """
     path = Path(path)
     require_place(path)
+    with partial_folder(path) as folder:
+        try:
+            yield folder / path.name
+            _put_in_place(folder, path)
+        except (OSError, RuntimeError) as error:
+            raise SimulationError(f"{path}: cannot be written ({str(error).strip().splitlines()[-1]})") from None
+
+
+@contextmanager
+def partial_folder(path: Path, problem: str = "cannot be written") -> Iterator[Path]:
+    """A new folder beside the file `path`, or in it if it is a folder, for what is not complete yet.
+
+    It is removed at the end of the block; those of runs that were killed are removed, too. Raises SimulationError,
+    which says the `problem`, without room or permission.
+    """
     try:
-        folder = partial_folder(path.parent)
+        folder = _new_partial_folder(path if path.is_dir() else path.parent)
     except OSError as error:
-        raise SimulationError(f"{path}: cannot be written ({error.strerror})") from None
+        raise SimulationError(f"{path}: {problem} ({error.strerror})") from None
     try:
-        yield folder / path.name
-        _put_in_place(folder, path)
-    except (OSError, RuntimeError) as error:
-        raise SimulationError(f"{path}: cannot be written ({str(error).strip().splitlines()[-1]})") from None
+        yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def partial_folder(parent: Path) -> Path:
-    """A new folder in another for what is not complete yet; those of runs that were killed are removed.
-
-    Raises OSError if there is no room or permission.
-    """
+def _new_partial_folder(parent: Path) -> Path:
     host = hashlib.sha256(platform.node().encode()).hexdigest()[:6]  # folders may be shared between computers
     for old in parent.glob(f"{_PARTIAL}{host}-*-*"):
         number = old.name.split("-")[2]
@@ -136,7 +144,16 @@ def _is_running(number: int) -> bool:
     return True
 
 
-def put_on_disk(path: Path) -> None:
+def move_into(folder: Path, files: Sequence[Path]) -> None:
+    """Move files to a folder, in their order, once all of them are on the disk. Raises OSError."""
+    for file in files:
+        _put_on_disk(file)
+    for file in files:
+        file.replace(folder / file.name)
+    _put_on_disk(folder)
+
+
+def _put_on_disk(path: Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk. Raises OSError if they cannot be."""
     if path.is_dir() and os.name != "posix":  # elsewhere folders cannot be opened
         return
@@ -156,11 +173,7 @@ def _put_in_place(folder: Path, path: Path) -> None:
         is_own = file.name == path.name or _is_voxels_of(file.name, path)
         require(is_own, f"{path}: would be written as {file.name}; give another name")
     voxels = sorted(file for file in folder.iterdir() if file != main)
-    for file in (*voxels, main):
-        put_on_disk(file)
-    for file in (*voxels, main):  # the header, which names the voxels, last
-        file.replace(path.parent / file.name)
-    put_on_disk(path.parent)
+    move_into(path.parent, [*voxels, main])  # the header, which names the voxels, last
     if path.suffix.lower() in _HEADERS:
         named = {file.name for file in voxels}
         for file in path.parent.iterdir():

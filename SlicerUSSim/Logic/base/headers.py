@@ -95,9 +95,7 @@ def _require_metaimage(path: Path) -> None:
         len(size) == count and min(size) > 0,
         f"{path}: DimSize is {fields.get('DimSize', 'missing')[:80]!r}, expected {count} numbers above 0",
     )
-    require(
-        math.prod(size) <= MOST_VOXELS, f"{path}: has {'x'.join(map(str, size))} voxels, expected at most {MOST_VOXELS}"
-    )
+    require_bytes(path, tuple(size))
     for name in ("ElementNumberOfChannels", "HeaderSize", "CompressedDataSize"):
         if name in fields:
             value = _whole(path, fields, name)
