@@ -33,6 +33,7 @@ from SlicerUSSim.Logic import (
     UltrasoundSimulator,
 )
 from SlicerUSSim.Logic.base.volume import Volume, read_array
+from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri import add_tissues, craniotomy
@@ -57,7 +58,7 @@ from trame_server.utils.typed_state import TypedState  # noqa: E402
 
 from SlicerUSSim.Logic.base.declaration import Parameter, Shown  # noqa: E402
 from SlicerUSSim.Logic.mrml import parameter_node  # noqa: E402
-from SlicerUSSim.Logic.mrml.fit_nodes import tracked_images  # noqa: E402
+from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot, tracked_images  # noqa: E402
 from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import AtOnce, UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import node_to_world, probe_pose, read_volume, set_node_to_world, write_volume  # noqa: E402
@@ -347,6 +348,19 @@ def test_a_section_with_a_value_and_a_button_works_on_the_page_without_further_c
     text = page.html
     assert '<label for="marginSpinBox">Margin [mm]</label>' in text and 'min="0" max="20" step="0.5"' in text
     assert "trigger('press', ['extractButton'])" in text and 'id="section-brain"' in text
+
+
+def test_the_text_below_the_costs_has_the_numbers_of_their_curve():
+    shared = SharedState(State(ready=True))
+    logic = UltrasoundSceneLogic(slicer.vtkMRMLScene())
+    panel = BrowserPanel(shared, Messages(shared), logic, AtOnceTasks(), panel_sections(), lambda: None)
+    plot = CostPlot(logic.scene)
+    panel.showChart(plot.chart)
+    for n, cost in enumerate((0.38349999, 0.23449999)):  # .2345 on the curve; rounded at once they end in 3 and 4
+        plot.add(Progress("display", n + 1, 2, cost, cost, {}))
+    plot.draw()
+    assert shared.now.fit.curve == [0.3835, 0.2345]
+    assert shared.now.fit.costs == f"cost {0.3835:.3f} → {0.2345:.3f} after 2 evaluations"
 
 
 def test_what_the_page_does_otherwise_is_there_to_be_done_otherwise():

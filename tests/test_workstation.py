@@ -346,6 +346,8 @@ def open_section(page: Page, title: str) -> None:
     if title not in state(page, NAMES.open_sections):
         page.get_by_role("button", name=title, exact=True).click()
     page.locator(f"#section-{title.replace(' ', '-').lower()}").wait_for()
+    # While it grows, what is pressed moves away between press and release, which is no click
+    page.wait_for_function("() => !document.querySelector('.expand-transition-enter-active')")
 
 
 def shown_errors(page: Page) -> str:
