@@ -16,7 +16,7 @@ from SlicerUSSim.Command.bench import bench
 from SlicerUSSim.Command.demo import demo
 from SlicerUSSim.Command.devices import devices
 from SlicerUSSim.Command.optimize import optimize
-from SlicerUSSim.Command.options import verbose_option
+from SlicerUSSim.Command.options import untrusted_option, verbose_option
 from SlicerUSSim.Command.progress import note
 from SlicerUSSim.Command.realism import realism
 from SlicerUSSim.Command.segment import segment
@@ -69,8 +69,8 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__
 
 
 for command in (bench, demo, devices, optimize, realism, segment, serve, simulate, sweep, validate, volume):
-    main.add_command(verbose_option(command))
-verbose_option(main)
+    main.add_command(untrusted_option(verbose_option(command)))
+untrusted_option(verbose_option(main))
 
 if __name__ == "__main__":
     main()

@@ -5,6 +5,7 @@ Name, help, default and checks of a parameter's option are derived from its decl
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import Field, field, fields
 from functools import wraps
@@ -17,6 +18,7 @@ from click.shell_completion import CompletionItem
 
 from SlicerUSSim.Logic.base.declaration import Declared, Parameter, parameter_of, parameters_of
 from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.reading import UNTRUSTED
 from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
 Command = Callable[..., None]
@@ -59,6 +61,23 @@ def _set_verbosity(ctx: click.Context, _: click.Parameter, count: int) -> None:
     from SlicerUSSim.Command.log import show_log  # imported here to keep --help fast
 
     show_log(ctx, ctx.meta[_VERBOSITY])
+
+
+def untrusted_option(command: click.Command) -> click.Command:
+    """The command with --untrusted, which may be before the subcommand or after it."""
+    command.params.append(
+        click.Option(
+            ["--untrusted"], is_flag=True, expose_value=False, callback=_trust_nothing,
+            help="Read every file in a process of its own, with limits on time and memory: for files of strangers.",
+        )
+    )  # fmt: skip
+    return command
+
+
+def _trust_nothing(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted and not os.environ.get(UNTRUSTED):
+        os.environ[UNTRUSTED] = "1"  # for programs that this one starts, too
+        ctx.find_root().call_on_close(lambda: os.environ.pop(UNTRUSTED, None))
 
 
 # ---- options of declared parameters ----------------------------------------------------------------------------------

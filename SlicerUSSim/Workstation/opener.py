@@ -8,13 +8,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.files import read_json
+from SlicerUSSim.Logic.base.reading import untrusted_folder
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.imaging.preset import SECTIONS, Preset
 from SlicerUSSim.Logic.mri.craniotomy import is_open, polygon_of_file
@@ -326,14 +326,14 @@ class Opener:
     @contextmanager
     def uploaded_mask(self, name: str, content: bytes) -> Iterator[Volume]:
         """The volume of a file with a mask uploaded from a page."""
-        with TemporaryDirectory() as folder, self._sent({name: content}, folder) as (path,):
+        with untrusted_folder() as folder, self._sent({name: content}, folder) as (path,):
             volume = self._mask(str(path))
         yield volume
 
     @contextmanager
     def uploaded(self, files: Mapping[str, bytes]) -> Iterator[Upload]:
         """What a page has sent together, {name: content}: one file, or a label map with the table of its labels."""
-        with TemporaryDirectory() as folder, self._sent(files, folder) as paths:
+        with untrusted_folder() as folder, self._sent(files, folder) as paths:
             presets = [path for path in paths if _is_json(path) and len(paths) == 1 and not _has_tissues_only(path)]
             for path in paths if len(paths) > 1 else ():
                 require(not (_is_json(path) and _has_probe(path)), f"{path.name} is a preset: open it alone")

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
-import inspect
-import logging
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import ParamSpec, TypeVar
+from typing import TypeVar
 
 _T = TypeVar("_T")
-_P = ParamSpec("_P")
-_log = logging.getLogger(__name__)
 
 
 class SimulationError(Exception):
@@ -121,35 +116,6 @@ def about_file(path: str) -> Iterator[None]:
 def shown_path(path: object) -> str:
     """A path as text for messages, in which bytes that are no text are escaped."""
     return str(path).encode("utf-8", "backslashreplace").decode()
-
-
-def reader(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """A function that reads the file `path`: whatever is raised for a file becomes one line with its name.
-
-    What was raised is logged with its traceback at the level debug (`--verbose`).
-    """
-    signature = inspect.signature(function)
-
-    @functools.wraps(function)
-    def read(*args: _P.args, **kwargs: _P.kwargs) -> _T:
-        try:
-            return function(*args, **kwargs)
-        except (Cancelled, OtherFileError):
-            raise
-        except Exception as error:  # libraries document few of theirs, and raise others for damaged files
-            path = shown_path(signature.bind(*args, **kwargs).arguments["path"])
-            if isinstance(error, SimulationError):
-                if path in str(error):
-                    raise
-                raise SimulationError(f"{path}: {error}") from error
-            _log.debug("%s", path, exc_info=True)
-            if isinstance(error, MemoryError):
-                raise SimulationError(f"{path}: cannot be read (it needs more memory than there is)") from None
-            lines = str(error).strip().splitlines()
-            reason = f"{type(error).__name__}: {lines[-1][:200]}" if lines else type(error).__name__
-            raise SimulationError(f"{path}: cannot be read ({reason})") from None
-
-    return read
 
 
 class OtherFileError(SimulationError):

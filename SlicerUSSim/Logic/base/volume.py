@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.dicom import read_dicom_folder, read_series, series_with
-from SlicerUSSim.Logic.base.errors import SimulationError, reader, require, require_package, require_path
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import (
     messages_withheld,
     require_space,
@@ -26,6 +26,7 @@ from SlicerUSSim.Logic.base.headers import (
 )
 from SlicerUSSim.Logic.base.label_numbers import numbers_of
 from SlicerUSSim.Logic.base.nifti import check_numbers, log_nifti_geometry, require_complete, require_written
+from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
 from SlicerUSSim.Logic.base.segments import flattened, segments_of
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, check_affine, is_singular, nearest_rotation
 
@@ -361,9 +362,18 @@ def read_array(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 @reader
 def read_itk_image(path: Path):
     """A SimpleITK image of any file that ITK can read. Raises SimulationError, naming the file, for others."""
+    require_readable_name(path)
+    return _read_hdf5(path) if path.is_file() and starts_like_hdf5(path) else _read_by_itk(path)
+
+
+@in_child  # the library ends the process for some damaged files
+def _read_hdf5(path: Path):
+    return _read_by_itk(path)
+
+
+def _read_by_itk(path: Path):
     import SimpleITK as sitk
 
-    require_readable_name(path)
     require_sound_header(path)
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
     file = sitk.ImageFileReader()

@@ -8,9 +8,10 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from SlicerUSSim.Logic.base.declaration import Parameter, built, kind_of, parameter_of, parameters_of, short
-from SlicerUSSim.Logic.base.errors import reader, require
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import read_json, write_json
 from SlicerUSSim.Logic.base.own_outputs import MARK
+from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.settings import DisplaySettings, SimulationSettings
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, Probe, probe_from_dict, probe_kind
 from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF

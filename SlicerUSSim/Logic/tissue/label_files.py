@@ -11,7 +11,8 @@ import logging
 import re
 from pathlib import Path
 
-from SlicerUSSim.Logic.base.errors import SimulationError, reader, require
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.segments import segments_of
 
 _log = logging.getLogger(__name__)

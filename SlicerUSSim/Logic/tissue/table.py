@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.declaration import built, kind_of, parameters_of, short
-from SlicerUSSim.Logic.base.errors import SimulationError, reader, require, require_kind
+from SlicerUSSim.Logic.base.errors import SimulationError, require, require_kind
 from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.tissue.names import plain_name, tissue_named
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.tissue import Membrane, Tissue

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import SimulationError, reader, require, required
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
 from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, MOST_MM, check_affine, check_rigid, is_singular
 
 _log = logging.getLogger(__name__)
@@ -86,6 +87,15 @@ def _is_text(content: bytes) -> bool:
 
 
 def _read_itk(path: Path) -> np.ndarray:
+    is_hdf5 = path.suffix.lower() in (".h5", ".hdf5") or starts_like_hdf5(path)
+    linear = _linear_map_of_hdf5 if is_hdf5 else _linear_map
+    world_to_probe = linear(path)
+    require(not is_singular(world_to_probe), f"{path}: the transform is singular, expected a rigid one")
+    return check_rigid(f"{path}: transform", LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS)
+
+
+def _linear_map(path: Path) -> np.ndarray:
+    """(4, 4) of a linear ITK transform, in LPS."""
     import SimpleITK as sitk
 
     if path.suffix.lower() not in (".h5", ".hdf5", ".mat"):  # ITK crashes on NUL, and ends a number at other bytes
@@ -103,8 +113,12 @@ def _read_itk(path: Path) -> np.ndarray:
     for axis, unit in enumerate(np.eye(3)):
         world_to_probe[:3, axis] = np.array(transform.TransformPoint(unit.tolist())) - origin
     world_to_probe[:3, 3] = origin
-    require(not is_singular(world_to_probe), f"{path}: the transform is singular, expected a rigid one")
-    return check_rigid(f"{path}: transform", LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS)
+    return world_to_probe
+
+
+@in_child  # ITK ends the process for some damaged files
+def _linear_map_of_hdf5(path: Path) -> np.ndarray:
+    return _linear_map(path)
 
 
 @reader

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import reader, require
+from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
 from SlicerUSSim.Logic.base.own_outputs import mark_of
+from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 
 if TYPE_CHECKING:
