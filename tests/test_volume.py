@@ -126,11 +126,67 @@ def test_images_that_are_not_3d_are_refused(tmp_path, shape):
         Volume.read(tmp_path / "i.nrrd")
 
 
-def test_a_damaged_file_among_those_of_a_series_is_named(tmp_path):
-    write_dicom(Volume(numbered((6, 4, 5)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+@pytest.mark.parametrize("left", [200, 1000, -10])
+@pytest.mark.parametrize("number", [3, 5])
+def test_a_damaged_file_among_those_of_a_series_is_named(tmp_path, number, left):
+    """The volume ended before the last image, which was cut short in a full disk, without a word."""
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    file = tmp_path / f"{number}.dcm"
+    file.write_bytes(file.read_bytes()[:left])
+    with pytest.raises(
+        SimulationError, match=rf": {number}\.dcm cannot be read, which may be an image of the series of 5"
+    ):
+        Volume.read(tmp_path)
+
+
+def test_other_objects_beside_the_images_of_a_series_are_no_damaged_images(tmp_path):
+    volume = Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0]))
+    write_dicom(volume, tmp_path)
     whole = (tmp_path / "3.dcm").read_bytes()
-    (tmp_path / "3.dcm").write_bytes(whole[:200])
-    with pytest.raises(SimulationError, match=r"slices are missing.*; 3\.dcm cannot be read; export"):
+    pixels = whole.index(b"\xe0\x7f\x10\x00")
+    state = whole[:pixels].replace(tag(0x0008, 0x0060) + b"\2\0\0\0MR", tag(0x0008, 0x0060) + b"\2\0\0\0PR")
+    (tmp_path / "state.dcm").write_bytes(state)
+    (tmp_path / "DICOMDIR").write_bytes(whole[:200])
+    np.testing.assert_array_equal(Volume.read(tmp_path).array, volume.array)
+
+
+def tag(group: int, element: int) -> bytes:
+    return group.to_bytes(2, "little") + element.to_bytes(2, "little")
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "words"),
+    [
+        (
+            (0x20, 0x37),
+            b"0\\1\\0\\1\\0\\0",
+            r"has the orientation 0\\1.*, and \d\.dcm 1\\0.*, expected one in all images",
+        ),
+        ((0x20, 0x37), b"2\\0\\0\\0\\1\\0", r"has the orientation 2\\0.*, expected directions .* have length 1"),
+        ((0x20, 0x32), b"nan", r"has the position 'nan.*' \(DICOM tag 0020,0032\), expected 3 numbers"),
+        ((0x28, 0x30), b"0\\0 ", r"has voxels of 0 x 0 mm, expected 0\.01 to 50 mm"),
+        ((0x28, 0x30), b"3\\1 ", r"has the pixel spacing 3\\1, and \d\.dcm 1\\1, expected one in all images"),
+        ((0x28, 0x10), b"\x20\0", r"has the number of rows 32, and \d\.dcm 40, expected one in all images"),
+        ((0x20, 0x32), None, r"has the position '' \(DICOM tag 0020,0032\), expected 3 numbers"),
+        ((0x20, 0x37), None, r"has the orientation '' \(DICOM tag 0020,0037\), expected 6 numbers"),
+    ],
+)
+def test_images_that_are_no_volume_together_are_refused(tmp_path, where, value, words):
+    """Mixed orientations, places and spacings that are missing or no numbers, images of several sizes."""
+    write_dicom(Volume(numbered((6, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path)
+    file = tmp_path / "3.dcm"
+    content = file.read_bytes()
+    at = content.index(tag(*where))
+    if value is None:
+        content = content[:at] + tag(where[0], where[1] + 1 + (where[1] == 0x37)) + content[at + 4 :]
+    else:
+        content = content[: at + 8] + value + content[at + 8 + len(value) :]
+    file.write_bytes(content)
+    with pytest.raises(SimulationError, match=rf"3\.dcm:? {words}"):
+        Volume.read(tmp_path)
+    for path in tmp_path.glob("[45].dcm"):  # of three images as of six
+        path.unlink()
+    with pytest.raises(SimulationError, match=r"3\.dcm|0\.dcm"):
         Volume.read(tmp_path)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
+from SlicerUSSim.Logic.base.headers import require_spacing
 
 _log = logging.getLogger(__name__)
 
@@ -20,6 +21,24 @@ _ONE_FILE = (".nii", ".nii.gz", ".nrrd", ".mha", ".mgz")
 _MOST_FOLDERS = 1000
 #: Spacing that differs by more than this share of the median, and tilt of the stack, that ITK would silently ignore
 _UNEVEN, _TILT_DEG = 0.2, 0.5
+#: Direction cosines that differ by less are the same, as scanners round them
+_SAME_AXES = 1e-3
+#: The part of a file in which modality and series are
+_HEADER_BYTES = 2**16
+
+
+@dataclass(frozen=True)
+class _Tag:
+    """A tag with numbers, and its name in messages."""
+
+    tag: str
+    count: int
+    name: str
+
+
+_POSITION, _ORIENTATION = _Tag("0020|0032", 3, "position"), _Tag("0020|0037", 6, "orientation")
+_SPACING = _Tag("0028|0030", 2, "pixel spacing")
+_ROWS, _COLUMNS = _Tag("0028|0010", 1, "number of rows"), _Tag("0028|0011", 1, "number of columns")
 
 
 @dataclass(frozen=True)
@@ -147,21 +166,26 @@ def _read(series: Series, name: str):
 
 
 def _check_slices(series: Series, name: str) -> None:
-    """Raise SimulationError for slices of several patients, missing or repeated ones, and a tilted stack.
+    """Raise SimulationError for slices of several patients, missing or repeated ones, a tilted stack, and for slices
+    without a place, an orientation or a pixel spacing, or of several.
 
     ITK would make a wrong volume of them.
     """
-    if len(series.files) < 3:
+    if len(series.files) < 2:  # one with many frames has the places of all of them elsewhere in its header
         return
     headers = [_header(file) for file in series.files]
     patients = len({_value(header, "0010|0020") for header in headers})
     require(patients == 1, f"{name}: its images are of {patients} patients by their PatientID, expected one patient")
-    places = [_numbers(header, "0020|0032", 3) for header in headers]
-    axes = _numbers(headers[0], "0020|0037", 6)
-    if axes is None or any(place is None for place in places):
-        return
+    damaged = _damaged_files(series, _value(headers[0], "0008|0060"))
+    require(
+        not damaged,
+        f"{name}: {', '.join(damaged[:4])}{' and others' * (len(damaged) > 4)} cannot be read, which may be "
+        f"{'an image' if len(damaged) == 1 else 'images'} of the series of {len(series.files)}; export the series "
+        f"again, or remove {'it' if len(damaged) == 1 else 'them'} if not",
+    )
+    positions = _places(series, headers, name)
+    axes = _required(series.files[0], headers[0], _ORIENTATION, name)
     normal = np.cross(axes[:3], axes[3:])
-    positions = np.array(places)
     along = np.sort(positions @ normal)
     steps = np.diff(along)
     usual = float(np.median(steps))
@@ -176,8 +200,7 @@ def _check_slices(series: Series, name: str) -> None:
         at = int(wide[0])
         raise SimulationError(
             f"{name}: slices are missing or unevenly spaced at {len(wide)} place{'s' * (len(wide) > 1)}, first "
-            f"{steps[at]:.4g} mm after slice {at + 1} of {len(along)}, expected {usual:.4g} mm"
-            f"{_not_readable(series)}; export the series again"
+            f"{steps[at]:.4g} mm after slice {at + 1} of {len(along)}, expected {usual:.4g} mm; export the series again"
         )
     first, last = positions[np.argmin(positions @ normal)], positions[np.argmax(positions @ normal)]
     direction = last - first
@@ -190,17 +213,65 @@ def _check_slices(series: Series, name: str) -> None:
     )
 
 
-def _not_readable(series: Series) -> str:
-    """Names the DICOM files beside those of a series that have no readable header: "; IM12 cannot be read"."""
+def _places(series: Series, headers: list[dict[str, str]], name: str) -> np.ndarray:
+    """(n, 3) positions of images, whose orientation, pixel spacing and size are found to be the same."""
+    first = series.files[0], headers[0]
+    for file, header in zip(series.files, headers, strict=True):
+        cosines = _required(file, header, _ORIENTATION, name).reshape(2, 3)
+        require(
+            np.abs(cosines @ cosines.T - np.eye(2)).max() < _SAME_AXES,
+            f"{name}: {Path(file).name} has the orientation {_value(header, _ORIENTATION.tag)}, expected directions of "
+            "rows and columns that are perpendicular and have length 1",
+        )
+        require_spacing(f"{name}: {Path(file).name}", tuple(_required(file, header, _SPACING, name)))
+        for wanted, tolerance in ((_ORIENTATION, _SAME_AXES), (_SPACING, 1e-3), (_ROWS, 0.0), (_COLUMNS, 0.0)):
+            here, there = _required(file, header, wanted, name), _required(*first, wanted, name)
+            require(
+                np.abs(here - there).max() <= tolerance,
+                f"{name}: {Path(file).name} has the {wanted.name} {_value(header, wanted.tag)}, and "
+                f"{Path(first[0]).name} {_value(headers[0], wanted.tag)}, expected one in all images of a volume; put "
+                "one volume into a folder of its own",
+            )
+    return np.array([_required(*image, _POSITION, name) for image in zip(series.files, headers, strict=True)])
+
+
+def _required(file: str, header: dict[str, str], wanted: _Tag, name: str) -> np.ndarray:
+    """The numbers of a tag; raises SimulationError if they are missing or no numbers."""
+    found = _numbers(header, wanted.tag, wanted.count)
+    if found is None or not np.isfinite(found).all():
+        raise SimulationError(
+            f"{name}: {Path(file).name} has the {wanted.name} {_value(header, wanted.tag)!r} (DICOM tag "
+            f"{wanted.tag.replace('|', ',')}), expected {wanted.count} number{'s' * (wanted.count > 1)}; without it "
+            "there is no volume"
+        )
+    return found
+
+
+def _damaged_files(series: Series, modality: str) -> list[str]:
+    """Names of the DICOM files beside those of a series that belong to it, or may, and have no readable image.
+
+    Other objects without an image, such as reports and presentation states, have another modality.
+    """
     beside = sorted({Path(file).parent for file in series.files})
     known = {Path(file) for folder in beside for other in _series_of(folder) for file in other.files}
-    bad = [
+    return [
         file.name
         for folder in beside
         for file in sorted(folder.iterdir())
-        if file.is_file() and file not in known and is_dicom(file)
+        if file.is_file() and file not in known and is_dicom(file) and _may_be_of(file, series, modality)
     ]
-    return f"; {', '.join(bad[:4])}{' and others' * (len(bad) > 4)} cannot be read" if bad else ""
+
+
+def _may_be_of(file: Path, series: Series, modality: str) -> bool:
+    if file.name.upper() == "DICOMDIR":
+        return False
+    with file.open("rb") as opened:
+        start = opened.read(_HEADER_BYTES)
+    _, tag, value = start.partition(b"\x08\x00\x60\x00")  # the modality, after four bytes with its length
+    if not tag or len(value) < 4 + len(modality):
+        return True  # it ends before
+    uid = series.uid.split("_")[0].rstrip(".")
+    return value[4:].startswith(modality.encode()) and (uid.encode() in start or b"\x20\x00\x0e\x00" not in start)
 
 
 def _header(file: str) -> dict[str, str]:
