@@ -176,7 +176,7 @@ def _read_xfm(path: Path) -> np.ndarray:
     if re.search(r"Invert_Flag\s*=\s*True", text):
         _log.info("%s: Invert_Flag is set, the matrix is inverted", path)
         matrix = np.linalg.inv(matrix)
-    return matrix
+    return check_affine(f"{path}: Linear_Transform", matrix)
 
 
 def _mni_text(path: Path, first_words: str) -> str:
