@@ -565,3 +565,14 @@ def test_simulate_takes_probes_by_name(labels, tmp_path):
         result.exit_code == 2 and "focal_zones is 4 with transmit 'focus', expected transmit 'zones'" in result.stderr
     )
     assert not (tmp_path / "none.png").exists()
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a file on a full disk is made by Linux")
+@pytest.mark.parametrize("arguments", [["--version"], ["--help"], ["devices"]])
+def test_an_output_on_a_full_disk_is_one_line(arguments):
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(
+            [sys.executable, "-m", "SlicerUSSim.Command", *arguments], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert result.returncode == 2
+    assert result.stderr == "ussim: standard output cannot be written (No space left on device)\n"

@@ -146,6 +146,22 @@ def test_runtimes_are_named_before_pyopencl_is_imported(monkeypatch):
     assert imported == [False]
 
 
+@pytest.mark.parametrize("rounds", [True, False])
+def test_a_device_that_does_not_round_divisions_is_warned_of_once(monkeypatch, caplog, rounds):
+    monkeypatch.setattr(Device, "rounds_divisions", rounds)
+    monkeypatch.setattr("SlicerUSSim.Logic.opencl.device._opened", {})
+    options: list[list[str]] = []
+    build = Device._build
+    monkeypatch.setattr(
+        Device, "_build", lambda self, name, source, given: (options.append(given), build(self, name, source, given))[1]
+    )
+    for _ in range(2):
+        Device.get().kernels("scan_conversion.cl")
+    assert ("-cl-fp32-correctly-rounded-divide-sqrt" in options[0]) == rounds
+    said = [record for record in caplog.records if "does not round divisions" in record.getMessage()]
+    assert len(said) == (not rounds)
+
+
 def test_kernels_are_built_once_and_cached():
     device = Device.get()
     assert Device.get() is device

@@ -569,6 +569,34 @@ def test_what_is_wrong_is_reported_and_can_be_mended(bench):
     assert "'Probe' is not rigid" in reports[-1]
 
 
+def test_live_update_ends_when_images_take_too_long_and_says_why(bench, monkeypatch):
+    """A probe or a device with which an image takes minutes must not hold the application image after image."""
+    loop, reports, ended, now = Loop(), [], [], [0.0]
+    simulate = bench.logic.simulate
+    durations = iter((14.0, 0.1, 12.0, 13.0))  # the first prepares the patient
+
+    def slow(*arguments, **options):
+        now[0] += next(durations)
+        return simulate(*arguments, **options)
+
+    monkeypatch.setattr("SlicerUSSim.Logic.mrml.live.perf_counter", lambda: now[0])
+    monkeypatch.setattr(bench.logic, "simulate", slow)
+    bench.live(schedule=loop, report=reports.append, stopped=lambda: ended.append(1))
+    loop.run()
+    for shift in (1, 2, 3):
+        assert bench.logic.isLive and not ended and "live update ended" not in "".join(reports)
+        put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 0, shift]))
+        loop.run()
+    assert not bench.logic.isLive and ended == [1]
+    assert reports[-1].startswith("live update ended: 2 images in a row took more than 10 s, the last 13 s; simulate")
+    put(bench.probe, ABOVE)
+    assert not loop.waiting
+    monkeypatch.undo()
+    bench.live(schedule=loop)
+    assert bench.logic.isLive
+    bench.logic.stopLiveUpdate()
+
+
 @pytest.mark.parametrize("what", ["labels", "probe", "image", "scene", "stop", "logic"])
 def test_live_update_ends_cleanly_with_its_nodes_its_scene_or_its_logic(bench, what):
     loop, ended = Loop(), []

@@ -120,9 +120,13 @@ def test_only_the_chosen_transform_moves_the_probe_and_only_where_it_is_rigid(li
                 pyigtl.StringMessage("hello", device_name="Text"),
                 transform(matrix=np.diag([2.0, 1.0, 1.0, 1.0])),
                 transform(matrix=np.full((4, 4), np.nan)),
+                transform(matrix=np.eye(4) + 1e6 * np.eye(4, k=3)),  # what trackers send of a tool they have lost
             ):
                 peer.sendall(message.pack())
-            until(lambda: "expected" in ours.status)
+            until(lambda: ours.dropped == 3)
+            assert ours.status.endswith(
+                "moves by 1e+06 mm, expected at most 100000 mm along every axis (3 poses dropped)"
+            )
             peer.sendall(transform().pack())
             until(lambda: poses)
             assert len(poses) == 1 and np.allclose(poses[0], POSE, atol=1e-5)

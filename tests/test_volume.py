@@ -66,7 +66,7 @@ def test_minc2_is_read_as_written_by_itk(tmp_path):
     np.testing.assert_allclose(back.array, numbered(), atol=1e-3)
 
 
-def write_dicom(volume, folder):
+def write_dicom(volume, folder, patient="Nobody"):
     """A series of one file per slice."""
     import SimpleITK as sitk
 
@@ -80,6 +80,7 @@ def write_dicom(volume, folder):
         for tag, value in {
             "0008|0060": "MR", "0020|000e": "1.2.3.4", "0020|000d": "1.2.3", "0020|0013": str(k),
             "0020|0032": "\\".join(map(str, position)), "0020|0037": "1\\0\\0\\0\\1\\0", "0018|0050": "2.5",
+            "0010|0010": patient, "0010|0020": f"{patient} Number4711",
         }.items():  # fmt: skip
             sheet.SetMetaData(tag, value)
         writer.SetFileName(str(folder / f"{k}.dcm"))
@@ -148,6 +149,25 @@ def test_other_objects_beside_the_images_of_a_series_are_no_damaged_images(tmp_p
     (tmp_path / "state.dcm").write_bytes(state)
     (tmp_path / "DICOMDIR").write_bytes(whole[:200])
     np.testing.assert_array_equal(Volume.read(tmp_path).array, volume.array)
+
+
+def test_names_of_patients_stay_out_of_messages_logs_and_files(tmp_path, caplog):
+    caplog.set_level("DEBUG")
+    for patient, depth in (("Doe^Jane", 6), ("Roe^Rick", 7)):
+        write_dicom(Volume(numbered((depth, 40, 50)), np.diag([-1.0, -1.0, 2.5, 1.0])), tmp_path / patient[:3], patient)
+    volume = Volume.read(tmp_path / "Doe")
+    for suffix in (".nii", ".mha", ".nrrd", ".vti", ".mnc"):
+        volume.write(tmp_path / f"out{suffix}")
+    said = caplog.text.encode() + b"".join(path.read_bytes() for path in tmp_path.glob("out*"))
+    (tmp_path / "both").mkdir()
+    for folder in ("Doe", "Roe"):
+        for file in (tmp_path / folder).iterdir():
+            (tmp_path / "both" / f"{folder}{file.name}").write_bytes(file.read_bytes())
+    with pytest.raises(SimulationError) as error:
+        Volume.read(tmp_path / "both")
+    said += str(error.value).replace(str(tmp_path), "").encode()
+    for secret in (b"Jane", b"Rick", b"Number4711"):
+        assert secret not in said
 
 
 def tag(group: int, element: int) -> bytes:

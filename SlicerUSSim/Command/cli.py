@@ -5,7 +5,11 @@ Slow imports are inside the subcommands, so that --help is immediate.
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import os
 import signal
+import sys
 import threading
 import warnings
 from typing import Any
@@ -28,9 +32,23 @@ from SlicerUSSim.Command.volume import volume
 from SlicerUSSim.Logic.base.errors import is_our_warning, user_message
 from SlicerUSSim.Logic.base.version import __version__
 
+#: Errors of a standard output that is a file on a full or broken disk, or closed
+_NO_MORE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF}
+
 
 class _Commands(click.Group):
     """Reports errors caused by the user as one line on stderr, with exit status 2."""
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        try:
+            return super().main(*args, **extra)
+        except OSError as error:
+            if error.filename is not None or error.errno not in _NO_MORE:
+                raise
+            with contextlib.suppress(OSError):  # both may go to the same full disk
+                click.echo(f"ussim: standard output cannot be written ({os.strerror(error.errno)})", err=True)
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115, what is left in its buffer would be tried again at the end
+            sys.exit(2)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import weakref
 from collections.abc import Callable
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import slicer
@@ -16,6 +17,9 @@ _log = logging.getLogger(__name__)
 
 #: Event of an output volume: another live update writes to it from now on.
 _CLAIMED = vtkCommand.UserEvent + 7301
+#: An image that takes longer is not live; the first of a patient or a probe includes its preparation, so the second
+#: in a row ends the update
+_SLOWEST_S, _SLOW_IMAGES = 10.0, 2
 
 
 class LiveNodes(NamedTuple):
@@ -47,6 +51,7 @@ class LiveUpdate:
         self._schedule, self._report, self._stopped = schedule, report, stopped
         self._pending = self._busy = False
         self._logged = ""
+        self._slow = 0  # images in a row
         self._outlined = logic.preset.probe
         self._observed: list[tuple[Any, int]] = []
         self.running = True
@@ -130,6 +135,7 @@ class LiveUpdate:
             return  # changes can occur while the work is done in another thread
         self._pending = False
         self._busy = True
+        begun = perf_counter()
         try:
             caught: list[Warning] = []
             logic.simulate(nodes.labels, nodes.probe_transform, nodes.output, warned=caught.append)
@@ -146,10 +152,19 @@ class LiveUpdate:
                 raise
         finally:
             self._busy = False
+        seconds = perf_counter() - begun
+        self._slow = self._slow + 1 if seconds > _SLOWEST_S else 0
+        if self._slow >= _SLOW_IMAGES:
+            message = (
+                f"live update ended: {_SLOW_IMAGES} images in a row took more than {_SLOWEST_S:g} s, the last "
+                f"{seconds:.0f} s; simulate single images, or use fewer scan lines, less depth or another device"
+            )
         if message and message != self._logged:
             _log.warning("live update: %s", message)
         self._logged = message
         if self._report is not None:
             self._report(message)
+        if self._slow >= _SLOW_IMAGES:
+            self.stop()
         if self._pending and self._schedule is not None and self.running:
             self._schedule(self._run)

@@ -77,8 +77,19 @@ class Device:
         info, reason = choose_device(device)
         if info not in _opened:
             _log.info("OpenCL device: %s; %s", info, reason)
-            _opened[info] = Device(info)
+            opened = _opened[info] = Device(info)
+            if not opened.rounds_divisions:
+                _log.warning(
+                    "%s does not round divisions as IEEE 754 says: its images may differ by a grey level from those of "
+                    "other devices",
+                    info,
+                )
         return _opened[info]
+
+    @property
+    def rounds_divisions(self) -> bool:
+        """Whether divisions and square roots can be rounded as in IEEE 754, as the kernels are on all devices."""
+        return bool(self.info.handle.single_fp_config & self.cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT)
 
     def kernels(self, file_name: str, lanes: int = 1, *defines: str) -> dict[str, Kernel]:
         """The kernels of kernels/`file_name`, built once; each work-item computes a vector of `lanes` values.
@@ -96,7 +107,7 @@ class Device:
             started = perf_counter()
             source = shared_source() + "\n" + _with_includes(kernel_folder(), file_name)
             options = ["-cl-std=CL1.2", "-cl-no-signed-zeros", f"-DLANES={lanes}"]
-            if self.info.handle.single_fp_config & self.cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
+            if self.rounds_divisions:
                 options.append("-cl-fp32-correctly-rounded-divide-sqrt")
             options += [f"-D{name}" for name in defines]
             if self.lanes > 1 and "Intel" in self.info.platform:

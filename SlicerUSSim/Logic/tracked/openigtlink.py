@@ -98,8 +98,8 @@ class TrackerLink:
         self._device, self._image_name = device, image_name
         #: State of the connection, for display
         self.status = ""
-        #: Numbers of poses received and images sent
-        self.received = self.sent = 0
+        #: Numbers of poses used, of poses dropped because they are not rigid or farther than 100 m, and of images sent
+        self.received = self.dropped = self.sent = 0
         self._refused = 0  # poses since the last that was used
         self._passed_over: set[str] = set()
         self._outgoing: bytes | None = None
@@ -165,7 +165,8 @@ class TrackerLink:
 
     def _refuse(self, reason: str) -> None:
         """A pose that is not used. Trackers send many, so the log has the first as a warning."""
-        self.status = reason
+        self.dropped += 1
+        self.status = f"{reason} ({self.dropped} pose{'s' * (self.dropped > 1)} dropped)"
         _log.log(logging.DEBUG if self._refused else logging.WARNING, "OpenIGTLink: pose refused: %s", reason)
         self._refused += 1
 
