@@ -19,7 +19,7 @@ from SlicerUSSim.Logic import DisplaySettings, TissueTable, UltrasoundSimulator,
 from SlicerUSSim.Logic.probe import PROBES, pose_looking_at
 
 FOLDER = Path(__file__).parent / "golden"
-#: Columns and rows of the images: pixels of .2 to 1 mm
+#: Rows and columns of the images: pixels of .2 to 1 mm
 SIZE = (224, 192)
 #: Height of the patient's surface and of the middle, mm
 _TOP = 84.0
