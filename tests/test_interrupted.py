@@ -1,0 +1,118 @@
+"""Ctrl-C at any time: a command ends with one line, and leaves the files as they were or complete."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from SlicerUSSim.Logic import PhasedProbe, TissueTable, TrackedSequence, Volume, segment_mri
+from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.probe import craniotomy_pose
+from SlicerUSSim.Logic.tracked import write_pose
+from SlicerUSSim.Logic.verification.twins import make_twin
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send")]
+
+FIT = "labels.nii.gz --sequence tracked.igs.mha --probe probe.json --free gain_db --restarts 0"
+COMMANDS = {
+    "segment": ("segment mri.nii.gz -o out.nii.gz", {"out.nii.gz": Volume.read}),
+    "simulate": ("simulate labels.nii.gz --pose pose.json -o out.mha", {"out.mha": Volume.read}),
+    "sweep": (
+        "sweep labels.nii.gz --sequence tracked.igs.mha --probe probe.json -o out.igs.mha",
+        {"out.igs.mha": TrackedSequence.read},
+    ),
+    "volume": (
+        "volume labels.nii.gz --pose pose.json --tilt 20 --frames 6 --spacing 1 -o out.nrrd",
+        {"out.nrrd": Volume.read},
+    ),
+    "optimize": (f"optimize {FIT} --evaluations 60 -o out.json", {"out.json": read_json}),
+}
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory) -> dict[str, bytes]:
+    """{name: content} of a patient, a pose, and a twin's images."""
+    place = tmp_path_factory.mktemp("inputs")
+    mri = head_mri(2.0)
+    mri.write(place / "mri.nii.gz")
+    segmentation = segment_mri(mri)
+    probe = PhasedProbe(70.0, 50.0, scan_lines=80)
+    twin = make_twin(segmentation.labels, TissueTable.brain(segmentation.tissue_names), 3, probe=probe)
+    twin.simulator.medium.labels.write(place / "labels.nii.gz")
+    twin.simulator.medium.tissues.write(place / "labels.json")
+    twin.sequence().write(place / "tracked.igs.mha")
+    write_json(place / "probe.json", probe.to_dict())
+    write_pose(place / "pose.json", craniotomy_pose(segmentation.labels, probe))
+    return {path.name: path.read_bytes() for path in place.iterdir()}
+
+
+def start(folder: Path, command: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-m", "SlicerUSSim.Command", *command.split()], cwd=folder, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_that_is_interrupted_leaves_nothing_half_done(name, inputs, tmp_path):
+    command, outputs = COMMANDS[name]
+    for file, content in inputs.items():
+        (tmp_path / file).write_bytes(content)
+    begun = time.monotonic()
+    process = start(tmp_path, command)
+    _, said = process.communicate()
+    assert process.returncode == 0, said
+    usual = time.monotonic() - begun
+    made = {path.name for path in tmp_path.iterdir()} - inputs.keys()
+    assert made >= outputs.keys()
+    interrupted = 0
+    for share in (0.3, 0.6, 0.8, 0.9, 0.97):
+        for file in made:
+            (tmp_path / file).unlink(missing_ok=True)
+        process = start(tmp_path, command)
+        time.sleep(share * usual)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate()
+        # Python itself, which takes the signal before and after the command, ends by it
+        assert process.returncode in (0, 130, -signal.SIGINT), said
+        interrupted += process.returncode == 130
+        left = {path.name for path in tmp_path.iterdir()} - inputs.keys()
+        assert left <= made, "something is left of a run that was interrupted"
+        for file in left & outputs.keys():
+            assert outputs[file](tmp_path / file) is not None
+        if process.returncode == 130:
+            assert said.rstrip().endswith("ussim: interrupted") and "Traceback" not in said
+    assert interrupted
+    for file, content in inputs.items():
+        assert (tmp_path / file).read_bytes() == content
+
+
+def test_a_fit_that_was_interrupted_goes_on_where_it_was(inputs, tmp_path):
+    for file, content in inputs.items():
+        (tmp_path / file).write_bytes(content)
+    command = f"optimize {FIT} --evaluations 40 --state state.json -o out.json"
+    process = start(tmp_path, command)
+    while process.poll() is None and not (tmp_path / "state.json").exists():
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    process.communicate()
+    assert process.returncode in (0, 130)
+    before = len(str(read_json(tmp_path / "state.json", 2**30)))
+    process = start(tmp_path, command)
+    _, said = process.communicate()
+    assert process.returncode == 0, said
+    assert len(str(read_json(tmp_path / "state.json", 2**30))) >= before
+    resumed = read_json(tmp_path / "out.json")
+    process = start(tmp_path, command.replace("--state state.json", "").replace("out.json", "whole.json"))
+    _, said = process.communicate()
+    assert process.returncode == 0, said
+    whole = read_json(tmp_path / "whole.json")
+    assert np.isclose(resumed["cost_after"], whole["cost_after"], rtol=1e-6)
