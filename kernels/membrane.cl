@@ -7,15 +7,19 @@
 // fluids; distance float [point], voxels from it, positive inside, from the narrow Gaussian and replaced. `fluid` is
 // the acoustic group of the fluids.
 
-#include "smoothed_borders.clh"
+#include "flat_borders.clh"
 
-// Replaces the distance where this Gaussian finds one flat border. Which one it is the narrow Gaussian tells.
+// Replaces the distance where this Gaussian finds one flat border, isolated or of a flat layer. Which one it is the
+// narrow Gaussian tells.
 inline float by_wider(Smoothed smoothed, float3 voxel, int fluid, float narrow, float voxels, float distance) {
   if (min(smoothed.dims.x, min(smoothed.dims.y, smoothed.dims.z)) < 4) return distance;
   float both;
   const Border border = border_from(smoothed, voxel, fluid, fluid, OF_BEFORE, &both);
-  const float found = -voxels * border.overshoot;
-  return blend(distance, found, border.confidence * (1.0f - ramp(0.6f, 0.9f, fabs(found - narrow))));
+  const Border layer = layer_border(smoothed, border);
+  const float found = -voxels * border.overshoot, found_layer = -voxels * layer.overshoot;
+  const float sure = border.confidence * (1.0f - ramp(0.6f, 0.9f, fabs(found - narrow)));
+  const float sure_layer = layer.confidence * (1.0f - ramp(0.6f, 0.9f, fabs(found_layer - narrow)));
+  return sure >= sure_layer ? blend(distance, found, sure) : blend(distance, found_layer, sure_layer);
 }
 
 #ifdef NO_IMPLICIT_VECTORS  // Intel's compiler makes wrong distances of this kernel with them

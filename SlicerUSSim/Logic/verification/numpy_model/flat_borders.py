@@ -47,7 +47,7 @@ def _flat_layer(share, gradient, laplacian) -> tuple[np.ndarray, np.ndarray, np.
     return depth - curvature, thickness, curvature
 
 
-def _layer_borders(isolated: Borders, farthest: float) -> Borders:
+def layer_borders(isolated: Borders, farthest: float) -> Borders:
     """Borders in front of or behind a flat layer, from those found as if there was none."""
     found = isolated.at(slice(None))
     found.confidence[:] = 0
@@ -146,7 +146,7 @@ def borders_of_layers(grid: SmoothGrid, voxel, towards, isolated: Borders, befor
         best = _thin_layer_borders(
             grid, voxel[some], towards[some], isolated.at(some), before[some], behind[some], farthest
         )
-        layer = _layer_borders(isolated.at(some), farthest)
+        layer = layer_borders(isolated.at(some), farthest)
     better = (best.confidence < 1) & (layer.confidence > best.confidence)
     best.put(better, layer.at(better))
     found.put(some, best)

@@ -12,6 +12,7 @@ from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS
 from SlicerUSSim.Logic.verification.numpy_model.drawn import DrawnPlanes
 from SlicerUSSim.Logic.verification.numpy_model.elementary import f32, ramp
+from SlicerUSSim.Logic.verification.numpy_model.flat_borders import layer_borders
 from SlicerUSSim.Logic.verification.numpy_model.sheets import Sheets
 from SlicerUSSim.Logic.verification.numpy_model.smoothed_borders import SmoothGrid
 
@@ -147,8 +148,12 @@ class HostMedium:
         halved = SmoothGrid(self.smoother, 18.29, 0.99, 1.25)
         for grid, place, scale in ((full, voxel, 1), (halved, f32(0.5) * voxel - f32(0.25), 2)):
             border = grid.border_of(place, np.full(len(at), fluid))
-            wide = f32(-scale) * border.overshoot
+            layer = layer_borders(border, grid.farthest)
+            wide, of_layer = f32(-scale) * border.overshoot, f32(-scale) * layer.overshoot
             sure = border.confidence * (f32(1) - ramp(0.6, 0.9, np.abs(wide - narrow)))
+            sure_layer = layer.confidence * (f32(1) - ramp(0.6, 0.9, np.abs(of_layer - narrow)))
+            is_isolated = sure >= sure_layer
+            wide, sure = np.where(is_isolated, wide, of_layer), np.where(is_isolated, sure, sure_layer)
             found = found + sure * (wide - found)
         distance.ravel()[at] = np.rint(np.clip(127.5 + per_voxel * found, 0.0, 255.0))
 
