@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,6 +66,8 @@ def optimize(
     """Fit display and tissue parameters to tracked real ultrasound."""
     from SlicerUSSim.Logic.base.files import read_json, write_json
     from SlicerUSSim.Logic.base.own_outputs import write_own_json
+    from SlicerUSSim.Logic.fitting.prediction import predict
+    from SlicerUSSim.Logic.fitting.realism import neighbours_of
     from SlicerUSSim.Logic.fitting.tracked_fit import fit
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
@@ -83,7 +86,7 @@ def optimize(
     if save_transform and not settings.register:
         raise SimulationError("--save-transform needs --register")
     names = dict(_free_parameter(text) for text in free) or dict.fromkeys(settings.free_names)
-    tracked = open_tracked(patient, recording, most=_MOST_IMAGES)
+    tracked = open_tracked(patient, recording, most=_MOST_IMAGES, apart=settings.validate)
     simulator = tracked.examination.simulator
     with Curve("optimize") as curve:
         found = fit(
@@ -93,6 +96,14 @@ def optimize(
             progress=curve, resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
             checkpoint=(lambda reached: write_json(state, reached)) if state else None,
         )  # fmt: skip
+        if tracked.others is not None:
+            near = [neighbours_of(tracked.sequence, images) for images in (tracked.others, tracked.images)]
+            prediction = predict(
+                found, simulator, tracked.others, free=names, display=tracked.examination.display,
+                speckle=settings.speckle, neighbours=near[0], fitted_neighbours=near[1],
+                max_evaluations=settings.evaluations, progress=curve,
+            )  # fmt: skip
+            found = replace(found, prediction=prediction)
     write_own_json(out, found.to_dict())
     if save_preset:
         result = found.appearance
@@ -136,6 +147,7 @@ def _write_report(
     write_report(
         path, found.appearance, found.tracked, found.before, found.after, simulator,
         subtitle=f"{Path(recording.sequence).name} on {Path(patient.source).name}", provenance=provenance,
+        prediction=found.prediction,
     )  # fmt: skip
 
 
@@ -167,6 +179,9 @@ def _tell(found: Fit) -> None:
                 else "as given"
             )
         )
+    if found.prediction is not None:
+        for line in found.prediction.lines():
+            click.echo(line)
     for parameter in result.parameters:
         spread = result.identifiability[parameter.name]
         note = ""

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,6 +28,9 @@ from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureRefere
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.fitting.prediction import Prediction
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +58,8 @@ class Fit:
     texture_after: list[TextureMisfit] = field(default_factory=list)
     #: None unless the speckle was fitted
     speckle: SpeckleFit | None = None
+    #: None unless other images were predicted (prediction.py)
+    prediction: Prediction | None = None
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
@@ -63,7 +69,11 @@ class Fit:
             {"before": _plain(before), "after": _plain(after)}
             for before, after in zip(self.texture_before, self.texture_after, strict=True)
         ]
-        return {**self.appearance.to_dict(), **found, **speckle, "texture": texture, "numbers": self.tracked.numbers}
+        prediction = {} if self.prediction is None else {"prediction": self.prediction.to_dict()}
+        numbers = self.tracked.numbers
+        return {
+            **self.appearance.to_dict(), **found, **speckle, "texture": texture, "numbers": numbers, **prediction
+        }  # fmt: skip
 
 
 def fit(

@@ -49,6 +49,7 @@ class TrackedImages:
         probe: Probe | None = None,
         beam: Probe | None = None,
         most: int | None = None,
+        apart: Sequence[int] = (),
     ) -> TrackedImages:
         """Prepare images of a sequence.
 
@@ -60,6 +61,7 @@ class TrackedImages:
         probe : the probe, if known. Its position in the image is then taken from ImageToProbe, if the sequence has this
             transform in the probe frame (as in sequences written by this package), or else estimated from the images.
             Without `probe` the probe is estimated too.
+        apart : images that are prepared as well, but are not among those of the default choice; see `split`.
         beam : probe whose parameters other than the geometry are used for an estimated probe.
 
         Raises SimulationError for images that do not exist or were not tracked, a skewed or mirrored calibration, a
@@ -69,11 +71,14 @@ class TrackedImages:
             sequence.image_type == "BRIGHTNESS",
             f"the sequence has {sequence.image_type} data, expected B-mode images (BRIGHTNESS)",
         )
-        kept = [n for n in range(len(sequence)) if sequence.has_pose(n, path)] if numbers is None else list(numbers)
-        if numbers is None and 0 < len(kept) < len(sequence):
-            _log.warning("%d of %d images have no %s and are left out", len(sequence) - len(kept), len(sequence), path)
+        tracked = [n for n in range(len(sequence)) if sequence.has_pose(n, path)]
+        kept = [n for n in tracked if n not in apart] if numbers is None else list(numbers)
+        if numbers is None and 0 < len(tracked) < len(sequence):
+            missing = len(sequence) - len(tracked)
+            _log.warning("%d of %d images have no %s and are left out", missing, len(sequence), path)
         if numbers is None and most is not None and len(kept) > most:
             kept = [kept[place] for place in np.linspace(0, len(kept) - 1, most).round().astype(int)]
+        kept += [number for number in apart if number not in kept]
         # If no image was tracked, the error for the first one names the missing transform.
         matrices = [sequence.pose(number, path) for number in kept or [0]]
         chosen = sequence.select(kept)
@@ -97,6 +102,24 @@ class TrackedImages:
         grid = ImageGrid(height, width, float(left), float(top), (float(size[0]), float(size[1])))
         cropped = [np.ascontiguousarray(image[window]) for image in images]
         return cls(field.probe, poses, cropped, grid, mask, kept, field)
+
+    def split(self, apart: Sequence[int]) -> tuple[TrackedImages, TrackedImages]:
+        """(the others, those with the numbers `apart`), as for a fit and its prediction.
+
+        Raises SimulationError if nothing is left, or for numbers that are not among them.
+        """
+        others = [number for number in self.numbers if number not in apart]
+        require(bool(others), "all images are predicted, expected some to fit")
+        return self.only(others), self.only(list(dict.fromkeys(apart)))
+
+    def only(self, numbers: Sequence[int]) -> TrackedImages:
+        """Those with these numbers in the sequence. Raises SimulationError for numbers that are not among them."""
+        unknown = [number for number in numbers if number not in self.numbers]
+        require(not unknown, f"images {_listed(unknown)} are not among {_listed(self.numbers)}")
+        places = [self.numbers.index(number) for number in numbers]
+        return replace(
+            self, poses=[self.poses[n] for n in places], images=[self.images[n] for n in places], numbers=list(numbers)
+        )
 
 
 def _listed(numbers: Sequence[int]) -> str:

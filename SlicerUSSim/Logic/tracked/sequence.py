@@ -305,6 +305,19 @@ def frame_numbers(text: str, count: int) -> list[int]:
     return numbers
 
 
+def checked_apart(text: str, fitted: Sequence[int] | None, count: int) -> list[int]:
+    """Numbers of images that are predicted, from a text as of frame_numbers; an empty one is none.
+
+    Raises SimulationError for other text, and for images that are `fitted` (None: not known) as well.
+    """
+    if not text.strip():
+        return []
+    numbers = list(dict.fromkeys(frame_numbers(text, count)))
+    both = [str(number) for number in numbers if fitted is not None and number in fitted]
+    require(not both, f"images {', '.join(both)} are fitted and predicted, expected others to predict")
+    return numbers
+
+
 @reader
 def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """{"ImageToProbe": (4, 4), ...} from the <CoordinateDefinitions> of a Plus configuration file (XML).
