@@ -1,4 +1,4 @@
-"""Fit and predict (fitting/prediction.py): images that were not fitted, beside a uniform tissue and real neighbours."""
+"""Fit and predict (fitting/held_out.py): images that were not fitted, beside a uniform tissue and real neighbours."""
 
 from __future__ import annotations
 

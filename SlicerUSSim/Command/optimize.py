@@ -66,7 +66,7 @@ def optimize(
     """Fit display and tissue parameters to tracked real ultrasound."""
     from SlicerUSSim.Logic.base.files import read_json, write_json
     from SlicerUSSim.Logic.base.own_outputs import write_own_json
-    from SlicerUSSim.Logic.fitting.prediction import predict
+    from SlicerUSSim.Logic.fitting.held_out import predict
     from SlicerUSSim.Logic.fitting.realism import neighbours_of
     from SlicerUSSim.Logic.fitting.tracked_fit import fit
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
