@@ -91,9 +91,9 @@ def optimize(
     with Curve("optimize") as curve:
         found = fit(
             simulator, tracked.images, free=names, display=tracked.examination.display,
-            register=settings.register, speckle=settings.speckle, max_evaluations=settings.evaluations,
-            restarts=settings.restarts,
-            progress=curve, resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
+            register=settings.register, deform=settings.deform, speckle=settings.speckle,
+            max_evaluations=settings.evaluations, restarts=settings.restarts, progress=curve,
+            resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
             checkpoint=(lambda reached: write_json(state, reached)) if state else None,
         )  # fmt: skip
         if tracked.others is not None:
@@ -145,7 +145,7 @@ def _write_report(
         f"Settings: {simulator.settings}."
     )
     write_report(
-        path, found.appearance, found.tracked, found.before, found.after, simulator,
+        path, found.appearance, found.tracked, found.before, found.after, found.simulator or simulator,
         subtitle=f"{Path(recording.sequence).name} on {Path(patient.source).name}", provenance=provenance,
         prediction=found.prediction,
     )  # fmt: skip
@@ -161,6 +161,12 @@ def _tell(found: Fit) -> None:
     if found.registration:
         moved = found.registration
         click.echo(f"moved by {moved.shift_mm:.2f} mm and {moved.turn_deg:.2f} degrees")
+    if found.deformation is not None:
+        shift = found.deformation
+        click.echo(
+            f"deformed by {shift.mean_mm:.2f} mm in the mean, {shift.largest_mm:.2f} mm at most: cost "
+            f"{shift.cost_before:.4f} -> {shift.cost_after:.4f}"
+        )
     result = found.appearance
     click.echo(f"cost {result.cost_before:.4f} -> {result.cost_after:.4f} ({result.evaluations} evaluations)")
     before, after = (

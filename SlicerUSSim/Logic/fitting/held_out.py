@@ -43,7 +43,8 @@ def predict(
     Parameters
     ----------
     found, simulator : a fit, and the simulator that it was made with.
-    others : other images of the same recording, at the poses as tracked; a registration moves them as well.
+    others : other images of the same recording, at the poses as tracked; a registration moves them as well, and a
+        deformation of the tissues is theirs too.
     free, display, speckle, max_evaluations : as they were for the fit; the uniform tissue is fitted with the same.
     neighbours, fitted_neighbours : per image of `others`, and of the fitted ones, real images near it
         (realism.neighbours_of); without them there is no floor.
@@ -55,10 +56,11 @@ def predict(
         not both,
         f"images {', '.join(map(str, both))} are fitted and predicted, expected others: what was fitted says little",
     )
+    given, simulator = simulator, found.simulator or simulator
     if found.registration is not None:
         others = replace(others, poses=[found.registration.correction @ pose for pose in others.poses])
     result = found.appearance
-    labels, tissues = uniform_tissues(simulator)
+    labels, tissues = uniform_tissues(given)
     plain = replace(simulator.settings, partial_volume=False, mri_modulation_db=0.0)
     uniform = UltrasoundSimulator(labels, tissues, plain, simulator.device)
     control = fit_images(

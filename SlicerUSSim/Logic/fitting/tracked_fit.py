@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.fitting.deformation import Deformation, find_deformation
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings, similarity
 from SlicerUSSim.Logic.fitting.optimization import AppearanceResult, optimize_appearance
 from SlicerUSSim.Logic.fitting.parameters import Bounds
@@ -58,12 +59,17 @@ class Fit:
     texture_after: list[TextureMisfit] = field(default_factory=list)
     #: None unless the speckle was fitted
     speckle: SpeckleFit | None = None
+    #: None unless the tissues were deformed; `simulator` is then that of the deformed patient
+    deformation: Deformation | None = None
+    simulator: UltrasoundSimulator | None = field(default=None, repr=False)
     #: None unless other images were predicted (prediction.py)
     prediction: Prediction | None = None
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
         found = {} if self.registration is None else {"registration": self.registration.to_dict()}
+        if self.deformation is not None:
+            found["deformation"] = self.deformation.to_dict()
         speckle = {} if self.speckle is None else {"speckle": self.speckle.to_dict()}
         texture = [
             {"before": _plain(before), "after": _plain(after)}
@@ -83,6 +89,7 @@ def fit(
     free: Iterable[str] | Mapping[str, Bounds | None],
     display: DisplaySettings | None = None,
     register: bool = False,
+    deform: bool = False,
     speckle: bool = False,
     max_evaluations: int = FitSettings.evaluations,
     restarts: int = FitSettings.restarts,
@@ -95,9 +102,10 @@ def fit(
     """Fit display and tissue parameters (optimization.optimize_appearance) and, with `register`, the poses.
 
     Registration requires similar images and the fit requires poses. Short fits and registrations therefore alternate,
-    followed by the complete fit at the resulting poses. With `speckle`, a short fit with the real images' grey map is
-    followed by fit_speckle, and the complete fit begins there. Of the free parameters, "tissues" means those that the
-    images can show (seen.py). `resume` and `checkpoint` are those of the complete fit.
+    followed by the complete fit at the resulting poses. With `deform`, a short fit and a smooth deformation of the
+    tissues follow (deformation.py), and all else is of the deformed patient. With `speckle`, a short fit with the real
+    images' grey map is followed by fit_speckle, and the complete fit begins there. Of the free parameters, "tissues"
+    means those that the images can show (seen.py). `resume` and `checkpoint` are those of the complete fit.
     Raises SimulationError as those do.
     """
     display = display or DisplaySettings()
@@ -118,24 +126,42 @@ def fit(
             appearance_at, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1)
         )
         tracked, registration = _registered(simulator, tracked, short, step_from)
+    patient, deformation = simulator, None
+    if deform:
+        first = appearance_at(
+            tracked.poses, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1)
+        )
+        with simulator.with_tissues(first.tissues):
+            deformation, patient = find_deformation(
+                simulator, tracked, first.display, settings=settings, progress=progress
+            )
+        if patient is not simulator:
+            patient.set_tissues(simulator.medium.tissues)
+            appearance_at = partial(
+                optimize_appearance, patient, tracked.probe, references=tracked.images, free=free, grid=tracked.grid,
+                masks=masks, seed=seed, settings=settings, progress=progress,
+            )  # fmt: skip
     begun = simulator.medium.tissues
     start, found = display, None
     if speckle:
-        found = _speckle_of(simulator, tracked, display, free, seed, settings, max_evaluations, progress)
+        found = _speckle_of(patient, tracked, display, free, seed, settings, max_evaluations, progress)
         start = _at_the_levels_of(found.display, display)
-    with simulator.with_tissues(begun if found is None else _at_the_levels_of_tissues(found.tissues, begun)):
+    with patient.with_tissues(begun if found is None else _at_the_levels_of_tissues(found.tissues, begun)):
         appearance = appearance_at(
             tracked.poses, display=start, restarts=restarts, max_evaluations=max_evaluations, resume=resume,
             checkpoint=checkpoint,
         )  # fmt: skip
     before = simulated(simulator, given, begun, display)
-    after = simulated(simulator, tracked, appearance.tissues, appearance.display)
-    if speckle:
+    after = simulated(patient, tracked, appearance.tissues, appearance.display)
+    if speckle or deform:
         was = _similarities(given, before, settings or SimilaritySettings())
         appearance = replace(appearance, similarity_before=was, cost_before=float(np.mean([one.total for one in was])))
     references = [TextureReference(image, tracked.grid.pixel_spacing_mm, tracked.mask) for image in tracked.images]
     textures = ([r.misfit(i) for r, i in zip(references, images, strict=True)] for images in (before, after))
-    return Fit(appearance, registration, tracked, before, after, *textures, speckle=found)
+    return Fit(
+        appearance, registration, tracked, before, after, *textures, speckle=found, deformation=deformation,
+        simulator=None if patient is simulator else patient,
+    )  # fmt: skip
 
 
 def _speckle_of(

@@ -116,6 +116,8 @@ class UltrasoundSimulator:
             f"settings are {self.settings!r:.80}, expected SimulationSettings",
         )
         self.device = Device.get(device)
+        #: As given, or None
+        self.texture = texture
         packed = _packed_texture(texture, labels, self.settings)
         membership = None if texture is None else texture.membership()
         self.medium = Medium(labels, tissues, self.device, packed, membership, sheets)

@@ -615,6 +615,7 @@ class UltrasoundSceneLogic:
         validate: Sequence[int] = (),
         free: Iterable[str] | Mapping[str, tuple[float, float] | None] = ("display", "tissues"),
         register: bool = False,
+        deform: bool = False,
         speckle: bool = False,
         estimate_geometry: bool = False,
         max_evaluations: int = FitSettings.evaluations,
@@ -622,7 +623,8 @@ class UltrasoundSceneLogic:
         plot: CostPlot | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> Fit:
-        """Fit display and tissue parameters, with `register` the poses and with `speckle` the speckle, to real images.
+        """Fit display and tissue parameters, with `register` the poses, with `deform` the tissues' place and
+        with `speckle` the speckle, to real images.
 
         See fitting.fit.
 
@@ -655,6 +657,7 @@ class UltrasoundSceneLogic:
                 free=free,
                 display=preset.display,
                 register=register,
+                deform=deform,
                 speckle=speckle,
                 restarts=restarts,
                 max_evaluations=max_evaluations,
