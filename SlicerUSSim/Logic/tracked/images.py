@@ -12,7 +12,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.transforms import check_rigid, nearest_rotation
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.tracked.field import ImagedField, estimate_field
+from SlicerUSSim.Logic.tracked.field import ImagedField, estimate_field, place_field
+from SlicerUSSim.Logic.tracked.hidden import spread_images, visible_part
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 _log = logging.getLogger(__name__)
@@ -64,8 +65,9 @@ class TrackedImages:
         apart : images that are prepared as well, but are not among those of the default choice; see `split`.
         beam : probe whose parameters other than the geometry are used for an estimated probe.
 
-        Raises SimulationError for images that do not exist or were not tracked, a skewed or mirrored calibration, a
-        field that cannot be estimated, and images that are entirely black.
+        Raises SimulationError for images that do not exist or were not tracked, a skewed calibration, a field that
+        cannot be estimated, and images that are entirely black. A calibration that mirrors, saturated images, and what
+        a file cuts off or a scanner draws over the field (hidden.py) are warned of.
         """
         require(
             sequence.image_type == "BRIGHTNESS",
@@ -92,6 +94,9 @@ class TrackedImages:
             require(int(image.max()) > 0, f"image {number} of the sequence is black")
         spacing = _pixel_spacing(matrices[0], path)
         field = _located_field(sequence, images, spacing, probe, beam)
+        seen = visible_part(_as_uint8(spread_images(sequence.images)), field.mask, sequence.coloured)
+        require(bool(seen.any()), "nothing of the probe's field is seen in the images")
+        field = replace(field, mask=seen)
         to_ras = np.eye(4) if reference_to_ras is None else check_rigid("reference_to_ras", reference_to_ras)
         poses = [to_ras @ _probe_pose(matrix, field, path) for matrix in matrices]
         window = rows, columns = field.window
@@ -145,6 +150,11 @@ def _pixel_spacing(image_to_world: np.ndarray, path: str) -> tuple[float, float]
     size = float(np.linalg.norm(x)), float(np.linalg.norm(y))
     require(min(size) > 0, f"{path} is singular, expected an image's axes in millimetres per pixel")
     cosine = abs(float(x @ y)) / (size[0] * size[1])
+    if np.linalg.det(image_to_world[:3, :3]) < 0.0:
+        _log.warning(
+            "%s mirrors: its third axis points against the right hand; if left and right are wrong, its calibration is",
+            path,
+        )
     require(cosine < _SKEW, f"{path} is skewed: the image's axes have a cosine of {cosine:.2g}, expected 0")
     return size
 
@@ -156,11 +166,21 @@ def _located_field(
     probe: Probe | None,
     beam: Probe | None,
 ) -> ImagedField:
+    # All images of the recording show more of the field than the few that are fitted
+    every = _as_uint8(spread_images(sequence.images))
     if probe is None:
         shared = {field.name for field in fields(Probe)}
         known = {} if beam is None else {name: v for name, v in beam.to_dict().items() if name in shared}
         _log.info("no probe is given: its geometry is looked for in the images, the rest is the preset's")
-        return estimate_field(images, spacing, **known)
+        try:
+            return estimate_field(every, spacing, **known)
+        except SimulationError:
+            if len(every) == len(images):
+                raise
+            _log.info(
+                "all images together show no probe's field, as where the depth changes: only the chosen ones count"
+            )
+            return estimate_field(images, spacing, **known)
     if all("ImageToProbe" in entry for entry in sequence.transforms):
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
         # In this package's probe frame the image is upright and in the plane z = 0; a tracker's marker can be anywhere.
@@ -172,7 +192,11 @@ def _located_field(
             _log.info("the probe's place in the images is that of ImageToProbe, which is in the probe's own frame")
             return ImagedField.of(probe, image_to_probe, images.shape[1:])
     _log.info("the probe's place is looked for in the images: no ImageToProbe in the probe's own frame")
-    found = estimate_field(images, spacing)
+    try:
+        found = estimate_field(every, spacing)
+    except SimulationError as error:
+        _log.info("%s; the given probe's field is placed where it covers them best", error)
+        return place_field(every, spacing, probe)
     kinds = found.probe.to_dict()["kind"], probe.to_dict()["kind"]
     require(
         kinds[0] == kinds[1] or {"convex", "phased"} == set(kinds),
