@@ -183,7 +183,8 @@ def find_deformation(
         return mean_cost(one.of(image) for one, image in zip(full, images, strict=True))
 
     def images_of(made: UltrasoundSimulator) -> list[np.ndarray]:
-        return [made.simulate(tracked.probe, pose, display, tracked.grid).image for pose in tracked.poses]
+        still = replace(display, persistence=0.0)
+        return [made.simulate(tracked.probe, pose, still, tracked.grid).image for pose in tracked.poses]
 
     best = Deformation(frame, low, high, np.zeros((int(down), int(across), 2)))
     images = images_of(simulator)

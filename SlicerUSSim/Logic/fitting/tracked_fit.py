@@ -254,5 +254,6 @@ def simulated(
     simulator: UltrasoundSimulator, tracked: TrackedImages, tissues: TissueTable, display: DisplaySettings
 ) -> list[np.ndarray]:
     """(rows, columns) uint8 simulated images on the pixels of the tracked ones."""
+    still = replace(display, persistence=0.0)  # images of a recording need not follow each other
     with simulator.with_tissues(tissues):
-        return [simulator.simulate(tracked.probe, pose, display, tracked.grid).image for pose in tracked.poses]
+        return [simulator.simulate(tracked.probe, pose, still, tracked.grid).image for pose in tracked.poses]
