@@ -188,6 +188,8 @@ def _tell(found: Fit) -> None:
     if found.prediction is not None:
         for line in found.prediction.lines():
             click.echo(line)
+    if found.speckle is not None and found.speckle.spread is not None:
+        click.echo(found.speckle.spread.in_words())
     for parameter in result.parameters:
         spread = result.identifiability[parameter.name]
         note = ""

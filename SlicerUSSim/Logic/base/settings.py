@@ -223,7 +223,7 @@ class DisplaySettings(Declared):
     )  # fmt: skip
     persistence: float = parameter(
         0.0, "Persistence",
-        "Part of the last image that stays in the next one of the same probe: with 0.5 half of what is old goes each time",
+        "Part of the last image that stays in the next one of the same probe: with 0.5 half of what is old goes",
         bounds=(0, 0.98), shown=Shown(0, 0.95, 0.05, is_slider=True),
         note="Of images that follow each other, live and in sweeps; fits and comparisons have none",
     )  # fmt: skip

@@ -59,6 +59,7 @@ def predict(
     given, simulator = simulator, found.simulator or simulator
     if found.registration is not None:
         others = replace(others, poses=[found.registration.correction @ pose for pose in others.poses])
+    others = replace(others, probe=found.tracked.probe)  # whose point spread function a fit may have changed
     result = found.appearance
     labels, tissues = uniform_tissues(given)
     plain = replace(simulator.settings, partial_volume=False, mri_modulation_db=0.0)
@@ -70,7 +71,7 @@ def predict(
     shown = control.appearance
     images = {
         FITTED: simulated(simulator, others, result.tissues, result.display),
-        UNIFORM: simulated(uniform, others, shown.tissues, shown.display),
+        UNIFORM: simulated(uniform, replace(others, probe=control.tracked.probe), shown.tissues, shown.display),
     }
     fitted = {FITTED: found.after, UNIFORM: control.after}
 

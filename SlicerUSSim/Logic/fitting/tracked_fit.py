@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from SlicerUSSim.Logic.fitting.speckle_fit import (
     SpeckleFit,
     fit_speckle,
     with_estimated_map,
+    with_point_spread,
     with_preset_texture,
 )
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
@@ -111,11 +112,15 @@ def fit(
     display = display or DisplaySettings()
     free = parameters_seen(free, simulator, tracked)
     masks = [tracked.mask] * len(tracked.images)
-    given = tracked
-    appearance_at = partial(
-        optimize_appearance, simulator, tracked.probe, references=tracked.images, free=free,
-        grid=tracked.grid, masks=masks, seed=seed, settings=settings, progress=progress,
-    )  # fmt: skip
+    given, patient = tracked, simulator
+
+    def appearance_at(poses: Sequence[np.ndarray], **options: Any) -> AppearanceResult:
+        # Of the patient and the probe as they are by then
+        return optimize_appearance(
+            patient, tracked.probe, poses, references=tracked.images, free=free, grid=tracked.grid, masks=masks,
+            seed=seed, settings=settings, progress=progress, **options,
+        )  # fmt: skip
+
     registration = None
     if register:
         step_from = partial(
@@ -126,7 +131,7 @@ def fit(
             appearance_at, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1)
         )
         tracked, registration = _registered(simulator, tracked, short, step_from)
-    patient, deformation = simulator, None
+    deformation = None
     if deform:
         first = appearance_at(
             tracked.poses, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1)
@@ -137,14 +142,10 @@ def fit(
             )
         if patient is not simulator:
             patient.set_tissues(simulator.medium.tissues)
-            appearance_at = partial(
-                optimize_appearance, patient, tracked.probe, references=tracked.images, free=free, grid=tracked.grid,
-                masks=masks, seed=seed, settings=settings, progress=progress,
-            )  # fmt: skip
     begun = simulator.medium.tissues
     start, found = display, None
     if speckle:
-        found = _speckle_of(patient, tracked, display, free, seed, settings, max_evaluations, progress)
+        found, tracked = _speckle_of(patient, tracked, display, free, seed, settings, max_evaluations, progress)
         start = _at_the_levels_of(found.display, display)
     with patient.with_tissues(begun if found is None else _at_the_levels_of_tissues(found.tissues, begun)):
         appearance = appearance_at(
@@ -173,8 +174,8 @@ def _speckle_of(
     settings: SimilaritySettings | None,
     max_evaluations: int,
     progress: Callable[[Progress], None] | None,
-) -> SpeckleFit:
-    """The grey map of the real images, a short fit with it, and the speckle there."""
+) -> tuple[SpeckleFit, TrackedImages]:
+    """The grey map of the real images, a short fit with it, and the speckle there; the images with their probe."""
     tissues = with_preset_texture(simulator.medium.tissues)
     shown, has_map = with_estimated_map(display, tracked)
     with simulator.with_tissues(tissues):
@@ -183,7 +184,8 @@ def _speckle_of(
             grid=tracked.grid, masks=[tracked.mask] * len(tracked.images), seed=seed, settings=settings,
             restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1), progress=progress,
         )  # fmt: skip
-    return replace(fit_speckle(simulator, tracked, first.tissues, first.display), has_map=has_map)
+    found = replace(fit_speckle(simulator, tracked, first.tissues, first.display), has_map=has_map)
+    return with_point_spread(simulator, tracked, found, first.display)
 
 
 def _at_the_levels_of(found: DisplaySettings, given: DisplaySettings) -> DisplaySettings:
