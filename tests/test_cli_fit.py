@@ -257,9 +257,38 @@ def test_a_volume_with_landmarks_is_cut_where_the_probe_looked(folder, tmp_path)
     assert both.exit_code == 2 and "--cut-tilt and --cut-slide are both given" in both.output
 
 
+def test_images_that_are_not_fitted_are_predicted_beside_controls(folder):
+    """The fit is that without them."""
+    pytest.importorskip("matplotlib", reason="reports need matplotlib: pip install '.[demo]'")
+    plain = ["--frames", "0,2", "--evaluations", 120, "--restarts", 0]
+    report = folder / "predicted.html"
+    done = optimize(folder, *plain, "--validate", "1", "--report", report)
+    assert done.exit_code == 0, done.output
+    result = json.loads((folder / "result.json").read_text())
+    assert result["numbers"] == [0, 2]
+    found = result["prediction"]
+    assert (found["fitted_images"], found["images"]) == ([0, 2], [1])
+    assert set(found["predicted"]) == {"simulated", "uniform tissue", "real neighbours"}
+    assert len(found["predicted"]["simulated"]) == 1 and len(found["predicted"]["real neighbours"]) == 2
+    assert np.mean([cost["paper"] for cost in found["fitted"]["simulated"]]) == pytest.approx(
+        result["cost_after"], abs=2e-3
+    )
+    assert 0.5 < found["of_uniform"] < 1.5  # the phantom looks nearly uniform here
+    assert "fitted: images 0, 2   predicted: images 1" in done.output
+    assert "Images that were not fitted" in report.read_text()
+    assert optimize(folder, *plain).exit_code == 0
+    alone = json.loads((folder / "result.json").read_text())
+    assert alone["cost_after"] == result["cost_after"] and "prediction" not in alone
+    assert optimize(folder, "--evaluations", 5, "--restarts", 0, "--validate", "1").exit_code == 0
+    assert json.loads((folder / "result.json").read_text())["numbers"] == [0, 2]  # all but the predicted one
+
+
 @pytest.mark.parametrize(
     "options, message",
     [
+        (["--frames", "0,1", "--validate", "1:"], "images 1 are fitted and predicted, expected others to predict"),
+        (["--validate", ":"], "all images are predicted, expected some to fit"),
+        (["--validate", "9"], "image 9 does not exist, expected 0 to 2"),
         (["--frames", "9"], "image 9 does not exist, expected 0 to 2"),
         (["--frames", "one"], "frames are 'one', expected numbers such as 0,5,10 or 0:20:5"),
         (["--frames", "5:9"], "frames are '5:9', expected at least one of the 3 images"),

@@ -15,6 +15,7 @@ from SlicerUSSim.Logic import (
     SimulationError,
     TissueTable,
     TrackedSequence,
+    UltrasoundSimulator,
     optimize_appearance,
 )
 from SlicerUSSim.Logic.fitting import AppearanceModel, FreeParameters, speckle_widths
@@ -220,3 +221,25 @@ def test_bases_of_a_fit_have_the_console(small):
     display = replace(EVERYTHING, noise_db=None)
     expected = small.simulate(SMALL, POSE, display, model.grid(display)).image
     assert (np.abs(model.image(0, small.medium.tissues, display).astype(int) - expected) <= 1).mean() > 0.999
+
+
+def test_persistence_keeps_a_part_of_the_last_images():
+    """Of a point that is gone, half stays in each next image; a still scene is shown as it is."""
+    labels = block(lambda x, y, z: 1 + (np.abs(y - 5.0) < 2.0), half_mm=(20, 20, 8))
+    made = UltrasoundSimulator(labels, TissueTable.named(["liver", "bone"]))
+    probe, pose = LinearProbe(20, 30, scan_lines=64), rigid(np.eye(3), [0.0, -18.0, 0.0])
+    away = rigid(np.eye(3), [0.0, -18.0, 2.0])
+    still = DisplaySettings(image_size=(120, 80))
+    lasting = replace(still, persistence=0.5)
+    plain = [made.simulate(probe, at, still).image.astype(float) for at in (pose, away)]
+    shown = [made.simulate(probe, at, lasting).image.astype(float) for at in (pose, pose, away, away, away)]
+    np.testing.assert_array_equal(shown[0], plain[0])
+    np.testing.assert_array_equal(shown[1], plain[0])
+    for number, part in ((2, 0.5), (3, 0.25), (4, 0.125)):
+        np.testing.assert_allclose(shown[number], part * plain[0] + (1.0 - part) * plain[1], atol=0.51)
+    assert np.abs(plain[0] - plain[1]).max() > 20.0
+    # Another probe, another size and no persistence begin anew
+    small = replace(lasting, image_size=(60, 40))
+    first = made.simulate(probe, pose, small).image
+    np.testing.assert_array_equal(first, made.simulate(probe, pose, replace(small, persistence=0.0)).image)
+    np.testing.assert_array_equal(made.simulate(probe, pose, lasting).image, plain[0])

@@ -205,3 +205,143 @@ def test_real_images_show_the_field_of_the_38_mm_probe_that_took_them(name, dept
     sequence = TrackedSequence.read(SHARED / f"{name}.igs.mha")
     field = estimate_field(sequence.images, width_mm=38.0)  # L14-5
     assert field.probe.is_linear and field.probe.depth_mm == pytest.approx(depth, abs=1.0) and field.overlap > 0.99
+
+
+# ---- what hides the field --------------------------------------------------------------------------------------------
+
+
+def recording(probe, count: int = 6, **changes) -> TrackedSequence:
+    """Images of one probe with other speckle each, whose calibration is that of its own frame."""
+    grid = ImageGrid.for_probe(probe, None)
+    inside = grid.field(probe)
+    random = np.random.default_rng(3)
+    images = np.where(inside, random.integers(20, 200, (count, grid.rows, grid.columns)), 0).astype(np.uint8)
+    transforms = ({"ImageToProbe": grid.image_to_probe, "ProbeToReference": np.eye(4)},) * count
+    return TrackedSequence(images, transforms, np.arange(float(count)), **changes)
+
+
+CONVEX = ConvexProbe(40, 60, 80)
+
+
+def test_the_field_is_found_from_all_images_of_a_recording():
+    """The right half is dark in the image that is fitted, as without contact."""
+    sequence = tracked_screen(CONVEX)
+    images = sequence.images.copy()
+    images[0][:, images.shape[2] // 2 :] = 0
+    half = sequence.with_images([0, 1], images)
+    with pytest.raises(SimulationError, match="not a probe's field"):
+        estimate_field(images[:1], (0.1, 0.1))
+    found, whole = TrackedImages.of(half, [0]), TrackedImages.of(sequence, [0])
+    assert found.probe.depth_mm == pytest.approx(whole.probe.depth_mm, abs=0.5)
+    assert found.mask.sum() == pytest.approx(whole.mask.sum(), rel=0.02)
+
+
+@pytest.mark.parametrize("probe", [CONVEX, PhasedProbe(70, 80)])
+def test_one_image_that_is_partly_dark_is_enough_with_a_probe(probe):
+    image, grid = screen(probe)
+    image[: 15 + grid.rows, 60 + 4 * grid.columns // 5 :] = 0
+    image[15 + 2 * grid.rows // 3 :] = 0  # and nothing comes from the depth
+    calibration = np.diag([*grid.pixel_spacing_mm, 1.0, 1.0])
+    calibration[:3, 3] = 3.0, 7.0, -2.0  # of a tracker's marker
+    sequence = TrackedSequence(image[None], ({"ImageToProbe": calibration, "ProbeToReference": np.eye(4)},), [0.0])
+    found = TrackedImages.of(sequence, probe=probe)
+    face = (np.linalg.inv(found.field.image_to_probe) @ [0, 0, 0, 1])[:2]
+    assert np.abs(face - np.linalg.inv(grid.image_to_probe)[:2, 3] - [60, 15]).max() < 5.0
+    with pytest.raises(SimulationError, match="of what is bright in the images, expected at least 85%"):
+        TrackedImages.of(sequence, probe=LinearProbe(8, 20))
+
+
+def test_a_small_radius_is_a_convex_array_and_none_is_a_phased_one():
+    """4.5 mm under 78 mm: with the apex for the face, everything would lie 4.5 mm too deep."""
+    for probe, kind in ((ConvexProbe(4.53, 88, 73.8), "convex"), (PhasedProbe(88, 78.3), "phased")):
+        image, grid = screen(probe)
+        found = estimate_field(image, grid.pixel_spacing_mm).probe
+        assert found.to_dict()["kind"] == kind
+        assert found.depth_mm == pytest.approx(probe.depth_mm, abs=0.6)
+    assert found.apex_radius_mm == 0.0
+
+
+@pytest.mark.parametrize("count", [1, 6])
+def test_what_the_file_cuts_off_is_outside_the_mask(count, caplog):
+    sequence = recording(CONVEX, count)
+    images = sequence.images.copy()
+    edge = images.shape[2] - 60
+    images[:, :, edge:] = 0
+    found = TrackedImages.of(sequence.with_images(range(count), images), probe=CONVEX)
+    assert f"the images end at column {edge - 1}" in caplog.text
+    whole = ImagedField.of(CONVEX, found.field.image_to_probe, images.shape[1:]).mask
+    np.testing.assert_array_equal(found.field.mask[:, :edge], whole[:, :edge])
+    assert not found.field.mask[:, edge:].any() and whole[:, edge:].any()
+    assert found.images[0].shape == found.mask.shape == (found.grid.rows, found.grid.columns)
+
+
+def test_darkness_is_not_a_cut():
+    """Levels that fall with depth and to a side, as tissue's do, stay in the mask."""
+    sequence = recording(CONVEX)
+    rows, columns = (np.arange(size) for size in sequence.images.shape[1:])
+    fall = np.clip(1.1 - rows[:, None] / rows[-1], 0, 1) * np.clip(1.2 - columns / columns[-1], 0, 1)
+    dark = (sequence.images * fall).astype(np.uint8)
+    found = TrackedImages.of(sequence.with_images(range(6), dark), probe=CONVEX)
+    whole = ImagedField.of(CONVEX, found.field.image_to_probe, dark.shape[1:]).mask
+    np.testing.assert_array_equal(found.field.mask, whole)
+
+
+def test_text_and_boxes_in_the_field_are_left_out_and_said(caplog):
+    sequence = recording(CONVEX)
+    images = sequence.images.copy()
+    middle = np.array(images.shape[1:]) // 2
+    text = (slice(middle[0], middle[0] + 12), slice(middle[1], middle[1] + 40))
+    images[(slice(None), *text)][:, 2:9, ::4] = 230
+    box = np.zeros(images.shape[1:], bool)
+    box[middle[0] + 40 : middle[0] + 90, middle[1] - 50 : middle[1] + 20] = True
+    box[middle[0] + 41 : middle[0] + 89, middle[1] - 49 : middle[1] + 19] = False
+    images[:, box] = 180
+    found = TrackedImages.of(sequence.with_images(range(6), images), probe=CONVEX)
+    assert "are the same in all images, as text, rulers, logos and boxes are" in caplog.text
+    assert not found.field.mask[box].any()
+    assert not found.field.mask[text][2:9, ::4].any()
+    clean = ImagedField.of(CONVEX, found.field.image_to_probe, images.shape[1:]).mask
+    assert 0.9 < found.field.mask.sum() / clean.sum() < 1.0
+    assert found.field.mask[middle[0] + 60, middle[1]]  # inside the box the patient is seen
+
+
+def test_colours_are_left_out_and_said(tmp_path, caplog):
+    import SimpleITK as sitk
+
+    sequence = recording(CONVEX, 2)
+    sequence.write(tmp_path / "grey.mha")
+    grey = sitk.ReadImage(str(tmp_path / "grey.mha"))
+    array = np.repeat(sitk.GetArrayFromImage(grey)[..., None], 3, axis=-1)
+    middle = np.array(array.shape[1:3]) // 2
+    flow = (slice(middle[0], middle[0] + 20), slice(middle[1], middle[1] + 30))
+    array[(1, *flow)] = 200, 30, 10
+    colour = sitk.GetImageFromArray(array, isVector=True)
+    for key in grey.GetMetaDataKeys():
+        colour.SetMetaData(key, grey.GetMetaData(key))
+    sitk.WriteImage(colour, str(tmp_path / "colour.mha"))
+    read = TrackedSequence.read(tmp_path / "colour.mha")
+    assert read.coloured is not None and read.coloured.sum() == 600
+    found = TrackedImages.of(read, probe=CONVEX)
+    assert "have colours, as of Doppler or markers: left out" in caplog.text
+    assert not found.field.mask[flow].any()
+    assert TrackedSequence.read(tmp_path / "grey.mha").coloured is None
+
+
+def test_saturated_images_and_a_mirroring_calibration_are_said(caplog):
+    sequence = recording(CONVEX, 2)
+    bright = np.where(sequence.images > 150, 255, sequence.images).astype(np.uint8)
+    flipped = sequence.with_images([0, 1], bright).with_transforms({"ProbeToReference": np.diag([-1.0, 1.0, 1.0, 1.0])})
+    TrackedImages.of(flipped, probe=CONVEX)
+    assert "of the field is at 255 grey levels: the images are saturated" in caplog.text
+    assert "ImageToReference mirrors" in caplog.text
+
+
+@needs_shared
+def test_the_real_sweep_is_cut_at_column_543():
+    sequence = TrackedSequence.read(SHARED / "brain_sweep" / "brain_sweep.igs.mha")
+    found = TrackedImages.of(sequence, [4])
+    probe = found.probe.to_dict()
+    assert probe["kind"] == "convex" and probe["radius_mm"] == pytest.approx(4.53, abs=0.4)
+    assert probe["field_of_view_deg"] == pytest.approx(88.0, abs=1.0)
+    assert probe["depth_mm"] == pytest.approx(73.8, abs=0.4)
+    assert found.field.window[1].stop == 544

@@ -270,8 +270,8 @@ def test_costs_of_a_real_sweep_are_those_found_by_trial():
     reference = TextureReference(image, spacing, tracked.mask)
     paper = [similarity(i, image, spacing, mask=tracked.mask).total for i in (before, after, other, blurred(image))]
     texture = [reference.misfit(i) for i in (before, after, other, blurred(image))]
-    assert 0.5 * (paper[0] + paper[1]) == pytest.approx(0.247, abs=0.002)
-    assert paper[2] == pytest.approx(0.450, abs=0.002) and paper[3] == pytest.approx(0.279, abs=0.004)
+    assert 0.5 * (paper[0] + paper[1]) == pytest.approx(0.247, abs=0.004)
+    assert paper[2] == pytest.approx(0.450, abs=0.004) and paper[3] == pytest.approx(0.279, abs=0.004)
     assert 0.5 * (texture[0].autocorrelation + texture[1].autocorrelation) == pytest.approx(0.052, abs=0.004)
     assert texture[2].autocorrelation == pytest.approx(0.094, abs=0.003)
     assert texture[3].autocorrelation == pytest.approx(0.295, abs=0.005)

@@ -124,6 +124,15 @@ def test_frames_are_chosen_by_number(scene):
         scene.optimize(frames=[9])
 
 
+def test_images_that_are_not_fitted_are_predicted(scene):
+    found = scene.optimize(validate=[1], max_evaluations=60)
+    assert found.tracked.numbers == [0, 2] and found.prediction is not None
+    assert found.prediction.numbers == [1]
+    assert len(found.prediction.predicted["real neighbours"]) == 2
+    with pytest.raises(SimulationError, match="is no sequence, expected one to predict other images"):
+        scene.optimize(scene.volume("none"), validate=[1])
+
+
 def test_cost_is_plotted_in_the_scene(scene, found):
     (chart,) = nodes_of_class(scene.scene, "vtkMRMLPlotChartNode")
     assert chart.GetNumberOfPlotSeriesNodes() == 2

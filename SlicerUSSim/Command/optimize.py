@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,6 +66,8 @@ def optimize(
     """Fit display and tissue parameters to tracked real ultrasound."""
     from SlicerUSSim.Logic.base.files import read_json, write_json
     from SlicerUSSim.Logic.base.own_outputs import write_own_json
+    from SlicerUSSim.Logic.fitting.held_out import predict
+    from SlicerUSSim.Logic.fitting.realism import neighbours_of
     from SlicerUSSim.Logic.fitting.tracked_fit import fit
     from SlicerUSSim.Logic.imaging.figures import require_matplotlib
     from SlicerUSSim.Logic.imaging.preset import Preset
@@ -83,16 +86,24 @@ def optimize(
     if save_transform and not settings.register:
         raise SimulationError("--save-transform needs --register")
     names = dict(_free_parameter(text) for text in free) or dict.fromkeys(settings.free_names)
-    tracked = open_tracked(patient, recording, most=_MOST_IMAGES)
+    tracked = open_tracked(patient, recording, most=_MOST_IMAGES, apart=settings.validate)
     simulator = tracked.examination.simulator
     with Curve("optimize") as curve:
         found = fit(
             simulator, tracked.images, free=names, display=tracked.examination.display,
-            register=settings.register, speckle=settings.speckle, max_evaluations=settings.evaluations,
-            restarts=settings.restarts,
-            progress=curve, resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
+            register=settings.register, deform=settings.deform, speckle=settings.speckle,
+            max_evaluations=settings.evaluations, restarts=settings.restarts, progress=curve,
+            resume=read_json(state, _STATE_BYTES) if state and state.exists() else None,
             checkpoint=(lambda reached: write_json(state, reached)) if state else None,
         )  # fmt: skip
+        if tracked.others is not None:
+            near = [neighbours_of(tracked.sequence, images) for images in (tracked.others, tracked.images)]
+            prediction = predict(
+                found, simulator, tracked.others, free=names, display=tracked.examination.display,
+                speckle=settings.speckle, neighbours=near[0], fitted_neighbours=near[1],
+                max_evaluations=settings.evaluations, progress=curve,
+            )  # fmt: skip
+            found = replace(found, prediction=prediction)
     write_own_json(out, found.to_dict())
     if save_preset:
         result = found.appearance
@@ -134,8 +145,9 @@ def _write_report(
         f"Settings: {simulator.settings}."
     )
     write_report(
-        path, found.appearance, found.tracked, found.before, found.after, simulator,
+        path, found.appearance, found.tracked, found.before, found.after, found.simulator or simulator,
         subtitle=f"{Path(recording.sequence).name} on {Path(patient.source).name}", provenance=provenance,
+        prediction=found.prediction,
     )  # fmt: skip
 
 
@@ -149,6 +161,12 @@ def _tell(found: Fit) -> None:
     if found.registration:
         moved = found.registration
         click.echo(f"moved by {moved.shift_mm:.2f} mm and {moved.turn_deg:.2f} degrees")
+    if found.deformation is not None:
+        shift = found.deformation
+        click.echo(
+            f"deformed by {shift.mean_mm:.2f} mm in the mean, {shift.largest_mm:.2f} mm at most: cost "
+            f"{shift.cost_before:.4f} -> {shift.cost_after:.4f}"
+        )
     result = found.appearance
     click.echo(f"cost {result.cost_before:.4f} -> {result.cost_after:.4f} ({result.evaluations} evaluations)")
     before, after = (
@@ -167,6 +185,11 @@ def _tell(found: Fit) -> None:
                 else "as given"
             )
         )
+    if found.prediction is not None:
+        for line in found.prediction.lines():
+            click.echo(line)
+    if found.speckle is not None and found.speckle.spread is not None:
+        click.echo(found.speckle.spread.in_words())
     for parameter in result.parameters:
         spread = result.identifiability[parameter.name]
         note = ""

@@ -83,12 +83,18 @@ class TrackedExamination:
     sequence: TrackedSequence
     #: The selected images, at their poses in the MRI
     images: TrackedImages
+    #: Those of `apart`, None without
+    others: TrackedImages | None
     #: (4, 4) rigid, from the reference frame of the ultrasound to the MRI; the identity without --to-mri
     reference_to_ras: np.ndarray
 
 
-def open_tracked(patient: PatientOptions, recording: SequenceOptions, most: int | None = None) -> TrackedExamination:
+def open_tracked(
+    patient: PatientOptions, recording: SequenceOptions, most: int | None = None, apart: str = ""
+) -> TrackedExamination:
     """The TrackedExamination of a command's options; `most` is the default number of images.
+
+    `apart` selects other images, in the format of --frames.
 
     Fast checks come before slow computations. Raises SimulationError for inconsistent options.
     """
@@ -97,7 +103,7 @@ def open_tracked(patient: PatientOptions, recording: SequenceOptions, most: int 
     from SlicerUSSim.Logic.base.files import require_place
     from SlicerUSSim.Logic.tracked.field import draw_field
     from SlicerUSSim.Logic.tracked.images import TrackedImages
-    from SlicerUSSim.Logic.tracked.sequence import frame_numbers
+    from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
 
     if recording.field:
         require_place(recording.field)
@@ -110,18 +116,24 @@ def open_tracked(patient: PatientOptions, recording: SequenceOptions, most: int 
         sequence = read_sequence(recording.sequence, recording.calibration)
         examination = open_examination(patient)
         known_probe = examination.probe if patient.gives_probe else None
+    chosen = None if recording.frames is None else frame_numbers(recording.frames, len(sequence))
+    beside = checked_apart(apart, chosen, len(sequence))
     images = TrackedImages.of(
         sequence,
-        None if recording.frames is None else frame_numbers(recording.frames, len(sequence)),
+        chosen,
         path=recording.transform,
         reference_to_ras=to_ras,
         probe=known_probe,
         beam=examination.probe,
         most=most,
+        apart=beside,
     )
+    others = None
+    if beside:
+        images, others = images.split(beside)
     if recording.field:
         draw_field(recording.field, sequence.images[images.numbers[0]], images.field)
-    return TrackedExamination(examination, sequence, images, to_ras)
+    return TrackedExamination(examination, sequence, images, others, to_ras)
 
 
 def read_sequence(path: str, calibration: str | None) -> TrackedSequence:

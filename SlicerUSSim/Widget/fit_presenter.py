@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.mrml.nodes import composite_of, require_node
 from SlicerUSSim.Logic.mrml.own_results import result_called
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.tissue.table import TissueTable
-from SlicerUSSim.Logic.tracked.sequence import frame_numbers
+from SlicerUSSim.Logic.tracked.sequence import checked_apart, frame_numbers
 from SlicerUSSim.Widget.interface import PanelView
 
 _FREE = "scene.fit_free"
@@ -122,8 +122,8 @@ class FitPresenter:
             labels, settings = parameters.labels, parameters.fit
             found = panel.logic.optimize(
                 labels, parameters.real, probe_transform_node=parameters.probe_transform, frames=self._frames(),
-                free=free, register=settings.register, speckle=settings.speckle,
-                estimate_geometry=settings.estimate, max_evaluations=settings.evaluations,
+                validate=self._predicted(), free=free, register=settings.register, deform=settings.deform,
+                speckle=settings.speckle, estimate_geometry=settings.estimate, max_evaluations=settings.evaluations,
                 restarts=settings.restarts, plot=plot, progress=report,
             )  # fmt: skip
             self._fit, self._before = (found, labels), None
@@ -137,6 +137,13 @@ class FitPresenter:
         if not text or not real.IsA("vtkMRMLSequenceNode"):
             return None
         return frame_numbers(text, real.GetNumberOfDataNodes())
+
+    def _predicted(self) -> list[int]:
+        text, real = self._parameters.fit.validate, self._parameters.real
+        if not text.strip():
+            return []
+        require(real.IsA("vtkMRMLSequenceNode"), "a single image leaves none to predict, expected a sequence")
+        return checked_apart(text, self._frames(), real.GetNumberOfDataNodes())
 
     # ---- apply and revert --------------------------------------------------------------------------------------
 
@@ -211,6 +218,11 @@ def _in_words(found: Fit) -> str:
     lines = [f"cost {result.cost_before:.3f} → {result.cost_after:.3f}, {len(found.tracked.images)} images"]
     if found.registration is not None:
         lines.append(f"moved by {found.registration.shift_mm:.1f} mm and {found.registration.turn_deg:.1f}°")
+    if found.prediction is not None:
+        lines += found.prediction.lines()
+    if found.deformation is not None:
+        shift = found.deformation
+        lines.append(f"tissues deformed by {shift.mean_mm:.1f} mm in the mean, {shift.largest_mm:.1f} mm at most")
     for name, value in result.after.items():
         spread = result.identifiability[name]
         line = f"{name}: {result.before[name]:.3g} → {value:.3g}"

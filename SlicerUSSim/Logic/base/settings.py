@@ -221,6 +221,12 @@ class DisplaySettings(Declared):
         0.0, "Edge enhancement", "Part of the difference of grey levels to their mean within half a millimetre, added",
         bounds=(0, 4), shown=Shown(0, 2, 0.05, is_slider=True), fit=Fit(0.0, 1.5, tolerance=0.1, on_request=True),
     )  # fmt: skip
+    persistence: float = parameter(
+        0.0, "Persistence",
+        "Part of the last image that stays in the next one of the same probe: with 0.5 half of what is old goes",
+        bounds=(0, 0.98), shown=Shown(0, 0.95, 0.05, is_slider=True),
+        note="Of images that follow each other, live and in sweeps; fits and comparisons have none",
+    )  # fmt: skip
     grey_map: str = parameter(
         "linear", "Grey map",
         "From decibels to grey levels. linear: log compression alone. soft: flat near black, steep near white, as of a "

@@ -9,6 +9,7 @@ from SlicerUSSim.Logic.base.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from .appearance import AppearanceModel as AppearanceModel
+    from .held_out import predict as predict
     from .image_similarity import (
         Similarity as Similarity,
         SimilaritySettings as SimilaritySettings,
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     )
     from .optimization import AppearanceResult as AppearanceResult, optimize_appearance as optimize_appearance
     from .parameters import FreeParameters as FreeParameters
+    from .prediction import Prediction as Prediction
     from .realism import Realism as Realism, measure_realism as measure_realism, neighbours_of as neighbours_of
     from .registration import Registration as Registration, register_poses as register_poses
     from .report import write_report as write_report

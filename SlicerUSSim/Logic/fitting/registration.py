@@ -116,9 +116,9 @@ def register_poses(
         return dict(zip(NAMES, ((2.0 * np.asarray(units) - 1.0) * ranges).tolist(), strict=True))
 
     comparisons = target_comparisons(simulator.device, probe, grid, references, masks, len(poses), settings)
-    frame = _middle_frame(probe, poses)
+    frame = middle_frame(probe, poses)
     full = _PoseCost(simulator, probe, poses, comparisons, grid, display, correction)
-    coarse_probe, coarse_grid, coarse_references, coarse_masks = _coarser(probe, grid, references, masks)
+    coarse_probe, coarse_grid, coarse_references, coarse_masks = coarser(probe, grid, references, masks)
     coarse_comparisons = [
         PatchComparison(simulator.device, reference, mask, coarse_grid.pixel_spacing_mm, settings)
         for reference, mask in zip(coarse_references, coarse_masks, strict=True)
@@ -191,7 +191,7 @@ class _PoseCost:
             self.simulator.settings = before
 
 
-def _middle_frame(probe: Probe, poses: list[np.ndarray]) -> np.ndarray:
+def middle_frame(probe: Probe, poses: list[np.ndarray]) -> np.ndarray:
     """(4, 4) the axes of the middle image, with the origin in the middle of all imaged fields."""
     centres = [(pose @ [0.0, 0.5 * probe.depth_mm, 0.0, 1.0])[:3] for pose in poses]
     frame = np.array(poses[len(poses) // 2])
@@ -199,7 +199,7 @@ def _middle_frame(probe: Probe, poses: list[np.ndarray]) -> np.ndarray:
     return frame
 
 
-def _coarser(probe: Probe, grid: ImageGrid, references, masks):
+def coarser(probe: Probe, grid: ImageGrid, references, masks):
     """Half the scan lines, and pixels twice as large in both directions."""
     rows, columns = grid.rows // 2, grid.columns // 2
     spacing = 2.0 * grid.pixel_spacing_mm[0], 2.0 * grid.pixel_spacing_mm[1]

@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.own_outputs import marked_html
 from SlicerUSSim.Logic.fitting.identifiability import Spread
 from SlicerUSSim.Logic.fitting.optimization import STAGES, AppearanceResult
 from SlicerUSSim.Logic.fitting.parameters import Parameter
+from SlicerUSSim.Logic.fitting.prediction import Prediction
 from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
 from SlicerUSSim.Logic.imaging.figures import require_matplotlib
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -41,10 +42,12 @@ def write_report(
     title: str = "Simulated ultrasound fitted to real ultrasound",
     subtitle: str = "",
     provenance: str = "",
+    prediction: Prediction | None = None,
 ) -> None:
     """Write the report; on failure an existing file is kept.
 
-    `before` and `after` are the simulated images (rows, columns) for those of `tracked`.
+    `before` and `after` are the simulated images (rows, columns) for those of `tracked`; `prediction` adds the costs of
+    other images with their controls, and the simulated ones.
     Raises SimulationError without matplotlib and if the file cannot be written.
     """
     require_matplotlib()
@@ -63,6 +66,7 @@ def write_report(
         "count": str(len(images)),
         "evaluations": str(result.evaluations),
         "seconds": f"{result.seconds:.1f}",
+        "prediction": "" if prediction is None else _predicted(prediction),
         "images": "\n".join(
             _trio(number, real, old, new, *misfits)
             for number, real, old, new, *misfits in zip(
@@ -131,6 +135,24 @@ def _trio(
 <details><summary class="dim">difference, after minus real</summary>
 <img class="plot" alt="difference" src="{difference}"></details>
 </figure>"""
+
+
+def _predicted(prediction: Prediction) -> str:
+    """A table of the costs on fitted and predicted images, and what it says."""
+    listed = [", ".join(map(str, numbers)) for numbers in (prediction.fitted_numbers, prediction.numbers)]
+    rows = "\n".join(
+        f"<tr><td>{source}</td>"
+        + "".join("<td>–</td>" if np.isnan(v) else f"<td>{v:.3f}</td>" for v in values)
+        + "</tr>"
+        for source, *values in prediction.rows()
+    )
+    return f"""<h2>Images that were not fitted</h2>
+<table><tr><th>images</th><th>fitted ({listed[0]}): cost</th><th>with texture</th>
+<th>predicted ({listed[1]}): cost</th><th>with texture</th></tr>
+{rows}</table>
+<p class="dim">The predicted images cost {prediction.of_uniform:.2f} of what one uniform tissue without anatomy, fitted
+in the same way, costs there; real neighbours are the images before and after in the recording. With texture: + T1 +
+T2 / 2.</p>"""
 
 
 def _explained(parameter: Parameter) -> str:

@@ -2,8 +2,9 @@
 
 In the order in which they can be told apart: the grey map from the real images alone; then smoothing and texture by the
 costs of texture T1 + T2 / 2 (texture_costs.py), to which the paper's cost is nearly blind. T2 counts grains and has no
-gradient, so the search uses none; it is short, since few parameters are left. The probe's frequency, bandwidth and
-aperture stay: widths of speckle alone do not tell them from smoothing and texture, nor frequency from bandwidth.
+gradient, so the search uses none; it is short, since few parameters are left. The probe's bandwidth and
+aperture by the width of the real speckle are a start that is taken only with T2 (point_spread.py): widths alone do not
+tell them from smoothing and texture. Its frequency stays, since no image tells it from the bandwidth.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.base.settings import DisplaySettings
 from SlicerUSSim.Logic.fitting.appearance import AppearanceModel
 from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS
+from SlicerUSSim.Logic.fitting.point_spread import PointSpread, point_spread
+from SlicerUSSim.Logic.fitting.speckle_width import speckle_widths
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
 from SlicerUSSim.Logic.imaging.grey_map import estimate_grey_map
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
@@ -35,6 +38,8 @@ _START, _STEP = (0.06, 0.25), (0.04, 0.12)
 #: Factors of the texture's deviation that are tried, and evaluations of the smoothing for each
 _FACTORS, _EVALUATIONS = (1.0, 0.5, 1.4, 0.0), (24, 14, 14, 14)
 _MOST_TEXTURE_DB = 8.0
+#: Depths at which the width of the real speckle is measured, parts of the image depth
+_WIDTH_DEPTHS = (0.33, 0.5, 0.7, 0.92)
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,8 @@ class SpeckleFit:
     after: TextureMisfit
     #: Whether the real images had enough grey levels for a map
     has_map: bool
+    #: What the width of the real speckle says of the point spread function; None: not looked for
+    spread: PointSpread | None = None
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
@@ -60,6 +67,7 @@ class SpeckleFit:
             "grey_map_found": self.has_map,
             "before": vars(self.before),
             "after": vars(self.after),
+            "point_spread": None if self.spread is None else self.spread.to_dict(),
         }  # fmt: skip
 
 
@@ -92,10 +100,12 @@ def fit_speckle(
     tissues: TissueTable,
     display: DisplaySettings,
     progress: Callable[[float], None] | None = None,
+    factors: Sequence[float] = _FACTORS,
 ) -> SpeckleFit:
     """Fit smoothing and texture at these levels of tissues and display, which should fit the images already.
 
-    `progress` gets the part done. Raises SimulationError if no patch of the images is bright enough in both.
+    `factors` of the texture are tried; `progress` gets the part done. Raises SimulationError if no patch of the images
+    is bright enough in both.
     """
     spacing = tracked.grid.pixel_spacing_mm
     references = [TextureReference(image, spacing, tracked.mask) for image in tracked.images]
@@ -112,7 +122,7 @@ def fit_speckle(
     candidates: list[tuple[float, float, DisplaySettings, TissueTable, TextureMisfit]] = []
     start = np.array(_START)
     has_texture = any(tissue.texture_db > 0.0 for tissue in tissues.all_tissues())
-    for factor, evaluations in zip(_FACTORS, _EVALUATIONS, strict=True):
+    for factor, evaluations in zip(factors, _EVALUATIONS, strict=False):
         if factor != 1.0 and not has_texture:
             continue
         table = _scaled(tissues, factor)
@@ -140,6 +150,37 @@ def fit_speckle(
     candidates.append((before.total, 1.0, display, tissues, before))
     _, factor, shown, table, after = min(candidates, key=lambda candidate: candidate[0])
     return SpeckleFit(shown, table, factor, before, after, True)
+
+
+def with_point_spread(
+    simulator: UltrasoundSimulator, tracked: TrackedImages, first: SpeckleFit, display: DisplaySettings
+) -> tuple[SpeckleFit, TrackedImages]:
+    """The fit of the speckle, and the images with the probe that has it.
+
+    The point spread function by the width of the real speckle is a start only: another fit begins with it, at the
+    texture of `first` and with `display`'s levels, and is taken if T1 + T2 / 2 is lower and T2, the number of grains,
+    not higher.
+    """
+    depths = [share * tracked.probe.depth_mm for share in _WIDTH_DEPTHS]
+    widths = speckle_widths(tracked.images, tracked.probe, tracked.grid, depths, tracked.mask)
+    spread = point_spread(widths, tracked.probe)
+    other = replace(tracked, probe=spread.of(tracked.probe))
+    if other.probe == tracked.probe:
+        return replace(first, spread=spread), tracked
+    try:
+        found = fit_speckle(simulator, other, first.tissues, display, factors=(1.0,))
+    except SimulationError as error:  # with that probe an image would take minutes, or is dark
+        _log.info("the point spread function by the width of the speckle cannot be tried: %s", error)
+        return replace(first, spread=spread), tracked
+    is_better = found.after.total < first.after.total and found.after.extrema <= first.after.extrema
+    spread = replace(spread, is_taken=is_better)
+    _log.info(
+        "%s: T1 %.3f, T2 %.2f with it, %.3f and %.2f without", spread.in_words(), found.after.autocorrelation,
+        found.after.extrema, first.after.autocorrelation, first.after.extrema,
+    )  # fmt: skip
+    if not is_better:
+        return replace(first, spread=spread), tracked
+    return replace(found, texture_factor=first.texture_factor, before=first.before, spread=spread), other
 
 
 def _smoothed(display: DisplaySettings, values: Sequence[float] | np.ndarray) -> DisplaySettings:

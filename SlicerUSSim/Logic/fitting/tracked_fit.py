@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.fitting.deformation import Deformation, find_deformation
 from SlicerUSSim.Logic.fitting.image_similarity import Similarity, SimilaritySettings, similarity
 from SlicerUSSim.Logic.fitting.optimization import AppearanceResult, optimize_appearance
 from SlicerUSSim.Logic.fitting.parameters import Bounds
@@ -21,12 +23,16 @@ from SlicerUSSim.Logic.fitting.speckle_fit import (
     SpeckleFit,
     fit_speckle,
     with_estimated_map,
+    with_point_spread,
     with_preset_texture,
 )
 from SlicerUSSim.Logic.fitting.texture_costs import TextureMisfit, TextureReference
 from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
+
+if TYPE_CHECKING:
+    from SlicerUSSim.Logic.fitting.prediction import Prediction
 
 _log = logging.getLogger(__name__)
 
@@ -54,16 +60,27 @@ class Fit:
     texture_after: list[TextureMisfit] = field(default_factory=list)
     #: None unless the speckle was fitted
     speckle: SpeckleFit | None = None
+    #: None unless the tissues were deformed; `simulator` is then that of the deformed patient
+    deformation: Deformation | None = None
+    simulator: UltrasoundSimulator | None = field(default=None, repr=False)
+    #: None unless other images were predicted (prediction.py)
+    prediction: Prediction | None = None
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
         found = {} if self.registration is None else {"registration": self.registration.to_dict()}
+        if self.deformation is not None:
+            found["deformation"] = self.deformation.to_dict()
         speckle = {} if self.speckle is None else {"speckle": self.speckle.to_dict()}
         texture = [
             {"before": _plain(before), "after": _plain(after)}
             for before, after in zip(self.texture_before, self.texture_after, strict=True)
         ]
-        return {**self.appearance.to_dict(), **found, **speckle, "texture": texture, "numbers": self.tracked.numbers}
+        prediction = {} if self.prediction is None else {"prediction": self.prediction.to_dict()}
+        numbers = self.tracked.numbers
+        return {
+            **self.appearance.to_dict(), **found, **speckle, "texture": texture, "numbers": numbers, **prediction
+        }  # fmt: skip
 
 
 def fit(
@@ -73,6 +90,7 @@ def fit(
     free: Iterable[str] | Mapping[str, Bounds | None],
     display: DisplaySettings | None = None,
     register: bool = False,
+    deform: bool = False,
     speckle: bool = False,
     max_evaluations: int = FitSettings.evaluations,
     restarts: int = FitSettings.restarts,
@@ -85,19 +103,24 @@ def fit(
     """Fit display and tissue parameters (optimization.optimize_appearance) and, with `register`, the poses.
 
     Registration requires similar images and the fit requires poses. Short fits and registrations therefore alternate,
-    followed by the complete fit at the resulting poses. With `speckle`, a short fit with the real images' grey map is
-    followed by fit_speckle, and the complete fit begins there. Of the free parameters, "tissues" means those that the
-    images can show (seen.py). `resume` and `checkpoint` are those of the complete fit.
+    followed by the complete fit at the resulting poses. With `deform`, a short fit and a smooth deformation of the
+    tissues follow (deformation.py), and all else is of the deformed patient. With `speckle`, a short fit with the real
+    images' grey map is followed by fit_speckle, and the complete fit begins there. Of the free parameters, "tissues"
+    means those that the images can show (seen.py). `resume` and `checkpoint` are those of the complete fit.
     Raises SimulationError as those do.
     """
     display = display or DisplaySettings()
     free = parameters_seen(free, simulator, tracked)
     masks = [tracked.mask] * len(tracked.images)
-    given = tracked
-    appearance_at = partial(
-        optimize_appearance, simulator, tracked.probe, references=tracked.images, free=free,
-        grid=tracked.grid, masks=masks, seed=seed, settings=settings, progress=progress,
-    )  # fmt: skip
+    given, patient = tracked, simulator
+
+    def appearance_at(poses: Sequence[np.ndarray], **options: Any) -> AppearanceResult:
+        # Of the patient and the probe as they are by then
+        return optimize_appearance(
+            patient, tracked.probe, poses, references=tracked.images, free=free, grid=tracked.grid, masks=masks,
+            seed=seed, settings=settings, progress=progress, **options,
+        )  # fmt: skip
+
     registration = None
     if register:
         step_from = partial(
@@ -108,24 +131,38 @@ def fit(
             appearance_at, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1)
         )
         tracked, registration = _registered(simulator, tracked, short, step_from)
+    deformation = None
+    if deform:
+        first = appearance_at(
+            tracked.poses, display=display, restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1)
+        )
+        with simulator.with_tissues(first.tissues):
+            deformation, patient = find_deformation(
+                simulator, tracked, first.display, settings=settings, progress=progress
+            )
+        if patient is not simulator:
+            patient.set_tissues(simulator.medium.tissues)
     begun = simulator.medium.tissues
     start, found = display, None
     if speckle:
-        found = _speckle_of(simulator, tracked, display, free, seed, settings, max_evaluations, progress)
+        found, tracked = _speckle_of(patient, tracked, display, free, seed, settings, max_evaluations, progress)
         start = _at_the_levels_of(found.display, display)
-    with simulator.with_tissues(begun if found is None else _at_the_levels_of_tissues(found.tissues, begun)):
+    with patient.with_tissues(begun if found is None else _at_the_levels_of_tissues(found.tissues, begun)):
         appearance = appearance_at(
             tracked.poses, display=start, restarts=restarts, max_evaluations=max_evaluations, resume=resume,
             checkpoint=checkpoint,
         )  # fmt: skip
     before = simulated(simulator, given, begun, display)
-    after = simulated(simulator, tracked, appearance.tissues, appearance.display)
-    if speckle:
+    after = simulated(patient, tracked, appearance.tissues, appearance.display)
+    if speckle or deform:
         was = _similarities(given, before, settings or SimilaritySettings())
         appearance = replace(appearance, similarity_before=was, cost_before=float(np.mean([one.total for one in was])))
     references = [TextureReference(image, tracked.grid.pixel_spacing_mm, tracked.mask) for image in tracked.images]
     textures = ([r.misfit(i) for r, i in zip(references, images, strict=True)] for images in (before, after))
-    return Fit(appearance, registration, tracked, before, after, *textures, speckle=found)
+    return Fit(
+        appearance, registration, tracked, before, after, *textures, speckle=found, deformation=deformation,
+        simulator=None if patient is simulator else patient,
+    )  # fmt: skip
 
 
 def _speckle_of(
@@ -137,8 +174,8 @@ def _speckle_of(
     settings: SimilaritySettings | None,
     max_evaluations: int,
     progress: Callable[[Progress], None] | None,
-) -> SpeckleFit:
-    """The grey map of the real images, a short fit with it, and the speckle there."""
+) -> tuple[SpeckleFit, TrackedImages]:
+    """The grey map of the real images, a short fit with it, and the speckle there; the images with their probe."""
     tissues = with_preset_texture(simulator.medium.tissues)
     shown, has_map = with_estimated_map(display, tracked)
     with simulator.with_tissues(tissues):
@@ -147,7 +184,8 @@ def _speckle_of(
             grid=tracked.grid, masks=[tracked.mask] * len(tracked.images), seed=seed, settings=settings,
             restarts=0, max_evaluations=max(int(_FIRST_SHARE * max_evaluations), 1), progress=progress,
         )  # fmt: skip
-    return replace(fit_speckle(simulator, tracked, first.tissues, first.display), has_map=has_map)
+    found = replace(fit_speckle(simulator, tracked, first.tissues, first.display), has_map=has_map)
+    return with_point_spread(simulator, tracked, found, first.display)
 
 
 def _at_the_levels_of(found: DisplaySettings, given: DisplaySettings) -> DisplaySettings:
@@ -218,5 +256,6 @@ def simulated(
     simulator: UltrasoundSimulator, tracked: TrackedImages, tissues: TissueTable, display: DisplaySettings
 ) -> list[np.ndarray]:
     """(rows, columns) uint8 simulated images on the pixels of the tracked ones."""
+    still = replace(display, persistence=0.0)  # images of a recording need not follow each other
     with simulator.with_tissues(tissues):
-        return [simulator.simulate(tracked.probe, pose, display, tracked.grid).image for pose in tracked.poses]
+        return [simulator.simulate(tracked.probe, pose, still, tracked.grid).image for pose in tracked.poses]

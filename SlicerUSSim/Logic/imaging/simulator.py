@@ -116,6 +116,8 @@ class UltrasoundSimulator:
             f"settings are {self.settings!r:.80}, expected SimulationSettings",
         )
         self.device = Device.get(device)
+        #: As given, or None
+        self.texture = texture
         packed = _packed_texture(texture, labels, self.settings)
         membership = None if texture is None else texture.membership()
         self.medium = Medium(labels, tissues, self.device, packed, membership, sheets)
@@ -131,6 +133,8 @@ class UltrasoundSimulator:
         # The baseband signal of the last frame, and its inputs
         self._iq: Buffer
         self._iq_made_for: tuple | None = None
+        # The images shown so far, weighted by persistence, and for what
+        self._shown: tuple[tuple, np.ndarray] | None = None
         #: Measure every stage (Frame.timings_ms); the host then waits for each stage.
         self.profiling = False
         # Threads may share a simulator: its buffers hold one frame at a time
@@ -147,6 +151,7 @@ class UltrasoundSimulator:
     ) -> Frame:
         """The image of `probe` at the pose `probe_to_ras` (4, 4).
 
+        With display.persistence the image also shows what was in the last ones of this probe, grid and persistence.
         `grid` gives the pixels, for example those of a real image; by default they cover the bounding box of the imaged
         field, with display.image_size pixels. `noise_seed` selects the amplifier noise (noise.py): 0 depends only on
         the settings' seed, seed_of_pose(probe_to_ras) also on the pose.
@@ -167,7 +172,7 @@ class UltrasoundSimulator:
             with self._timed("download", timings):
                 samples = self._sample_count(probe)
                 iq, envelope, bmode = (frame.download(name)[:, :samples] for name in ("iq", "envelope", "grey"))
-                image = frame.download("image")
+                image = self._persisted(frame.download("image"), probe, display, frame.grid)
                 self._warn_if_overflown()
 
         return Frame(
@@ -198,6 +203,20 @@ class UltrasoundSimulator:
         """
         with self._lock:
             return self._rendered(probe, pose, display, grid, {} if timings is None else timings, noise_seed).image
+
+    def _persisted(
+        self, image: np.ndarray, probe: Probe, display: DisplaySettings | None, grid: ImageGrid
+    ) -> np.ndarray:
+        """(rows, columns) uint8 image with what stays of the last ones."""
+        part = 0.0 if display is None else display.persistence
+        made_for = (probe, grid, part)
+        if part == 0.0 or self._shown is None or self._shown[0] != made_for:
+            self._shown = None if part == 0.0 else (made_for, image.astype(np.float32))
+            return image
+        lasting = self._shown[1]  # not rounded: small changes would never arrive
+        lasting *= np.float32(part)
+        lasting += np.float32(1.0 - part) * image
+        return np.rint(lasting).astype(np.uint8)
 
     def forget_echoes(self) -> None:
         """Recompute the rays and echoes of the next frame, even if nothing has changed.

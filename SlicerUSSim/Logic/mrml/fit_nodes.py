@@ -14,6 +14,7 @@ from vtkmodules.vtkCommonMath import vtkMatrix4x4
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
+from SlicerUSSim.Logic.fitting.realism import neighbours_of
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit
 from SlicerUSSim.Logic.mrml.nodes import (
@@ -50,15 +51,19 @@ def tracked_images(
     *,
     probe_to_world: np.ndarray | None = None,
     estimate_geometry: bool = False,
+    apart: Sequence[int] = (),
 ) -> TrackedImages:
     """Real images from a sequence of volumes, from a volume of one slice, or a slice of a 3D volume under the probe.
 
     The poses of a sequence are those of its browser's transforms at the same times. With `estimate_geometry` the
-    geometry of the probe is estimated from the images; its other parameters are those of `probe`.
+    geometry of the probe is estimated from the images; its other parameters are those of `probe`. `apart` are numbers
+    of images that are prepared beside those of the default choice.
     Raises SimulationError for nodes without such images and as TrackedImages does.
     """
     require_node(images_node, "vtkMRMLSequenceNode", "vtkMRMLScalarVolumeNode", use="real images")
-    if images_node.IsA("vtkMRMLSequenceNode"):
+    is_sequence = images_node.IsA("vtkMRMLSequenceNode")
+    require(is_sequence or not apart, f"{named(images_node)} is no sequence, expected one to predict other images")
+    if is_sequence:
         sequence = _sequence(images_node)
     else:
         volume = read_volume(images_node, "real image")
@@ -73,7 +78,12 @@ def tracked_images(
             return TrackedImages.of(sequence, numbers, probe=probe)
         sequence = _of_slices([(volume.array[0], node_to_world(images_node) @ volume.ijk_to_ras)], [0.0])
     known = None if estimate_geometry else probe
-    return TrackedImages.of(sequence, numbers, probe=known, beam=probe, most=MOST_IMAGES)
+    return TrackedImages.of(sequence, numbers, probe=known, beam=probe, most=MOST_IMAGES, apart=apart)
+
+
+def neighbours_in(images_node, tracked: TrackedImages) -> list[list[np.ndarray]] | None:
+    """The images before and after each of `tracked` in its sequence; None if they are not of a sequence node."""
+    return neighbours_of(_sequence(images_node), tracked) if images_node.IsA("vtkMRMLSequenceNode") else None
 
 
 def _sequence(sequence_node) -> TrackedSequence:

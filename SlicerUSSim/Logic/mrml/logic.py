@@ -16,6 +16,7 @@ from SlicerUSSim.Logic.base.settings import SimulationSettings
 from SlicerUSSim.Logic.base.transforms import check_rigid
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
+from SlicerUSSim.Logic.fitting.held_out import predict
 from SlicerUSSim.Logic.fitting.search import Progress
 from SlicerUSSim.Logic.fitting.settings import FitSettings
 from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit
@@ -43,7 +44,7 @@ from SlicerUSSim.Logic.mrml.craniotomy_nodes import (
     set_closed_labels,
     show_flap,
 )
-from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot, tracked_images, write_compared
+from SlicerUSSim.Logic.mrml.fit_nodes import CostPlot, neighbours_in, tracked_images, write_compared
 from SlicerUSSim.Logic.mrml.label_nodes import (
     LABEL_CLASSES,
     Patient,
@@ -611,8 +612,10 @@ class UltrasoundSceneLogic:
         *,
         probe_transform_node=None,
         frames: Sequence[int] | None = None,
+        validate: Sequence[int] = (),
         free: Iterable[str] | Mapping[str, tuple[float, float] | None] = ("display", "tissues"),
         register: bool = False,
+        deform: bool = False,
         speckle: bool = False,
         estimate_geometry: bool = False,
         max_evaluations: int = FitSettings.evaluations,
@@ -620,21 +623,24 @@ class UltrasoundSceneLogic:
         plot: CostPlot | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> Fit:
-        """Fit display and tissue parameters, with `register` the poses and with `speckle` the speckle, to real images.
+        """Fit display and tissue parameters, with `register` the poses, with `deform` the tissues' place and
+        with `speckle` the speckle, to real images.
 
         See fitting.fit.
 
         `images_node` is a sequence of images with its browser's transforms, a volume of one slice, or a 3D ultrasound
-        volume, resampled in the image plane. `frames` are numbers of images (default: six, evenly spaced). `plot` shows
-        the cost during the fit. Nothing else in the scene changes; applyFit adopts the result. `progress` may raise
-        errors.Cancelled.
+        volume, resampled in the image plane. `frames` are numbers of images (default: six, evenly spaced), `validate`
+        those of others, which are predicted beside controls (fitting.predict). `plot` shows the cost during the fit.
+        Nothing else in the scene changes; applyFit adopts the result. `progress` may raise errors.Cancelled.
         """
         patient, preset = self._patient(labels_node), replace(self.preset, settings=self.settings(labels_node))
         pose = None if probe_transform_node is None else probe_pose(probe_transform_node)
         tracked = tracked_images(
-            images_node, frames, preset.probe, probe_to_world=pose, estimate_geometry=estimate_geometry
+            images_node, frames, preset.probe, probe_to_world=pose, estimate_geometry=estimate_geometry, apart=validate
         )
         tracked = replace(tracked, poses=[patient.pose(pose) for pose in tracked.poses])
+        tracked, others = tracked.split(validate) if validate else (tracked, None)
+        near = [neighbours_in(images_node, images) for images in (tracked, others) if images is not None]
         texture, sheets = self._texture_of(labels_node, patient), self._sheets_of(labels_node)
 
         def report(step: Progress) -> None:
@@ -644,17 +650,26 @@ class UltrasoundSceneLogic:
                 progress(step)
 
         def compute() -> Fit:
-            return fit(
-                self._simulator(patient, preset, texture, sheets),
+            simulator = self._simulator(patient, preset, texture, sheets)
+            found = fit(
+                simulator,
                 tracked,
                 free=free,
                 display=preset.display,
                 register=register,
+                deform=deform,
                 speckle=speckle,
                 restarts=restarts,
                 max_evaluations=max_evaluations,
                 progress=report,
             )
+            if others is None:
+                return found
+            prediction = predict(
+                found, simulator, others, free=free, display=preset.display, speckle=speckle, fitted_neighbours=near[0],
+                neighbours=near[1], max_evaluations=max_evaluations, progress=report,
+            )  # fmt: skip
+            return replace(found, prediction=prediction)
 
         try:
             return self._work.do(compute)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, signal
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_between
 from SlicerUSSim.Logic.base.files import written_whole
@@ -25,8 +25,9 @@ _log = logging.getLogger(__name__)
 _DARK = 4
 #: Sides with a smaller angle to the vertical are those of a linear array, degrees.
 _PARALLEL_DEG = 1.5
-#: A phased array has an apex radius below this fraction of the outer radius.
-_POINT_SHARE = 0.06
+#: A phased array has an apex radius below this fraction of the outer radius: 4.5 mm under 78 mm are a small convex
+#: array's, and taken for none the image would begin 4.5 mm early.
+_POINT_SHARE = 0.03
 #: Least overlap of the estimated field with the bright region (intersection over union).
 _LEAST_OVERLAP = 0.85
 
@@ -122,11 +123,49 @@ def estimate_field(
     return replace(field, overlap=overlap)
 
 
+def place_field(images: np.ndarray, pixel_spacing_mm: tuple[float, float], probe: Probe) -> ImagedField:
+    """The field of a known probe at the place where it covers what is bright in the images best; one may be enough.
+
+    Parameters as those of estimate_field. What is bright lies in the field, and begins at the probe's face.
+    Raises SimulationError for black images, and if the field covers less than 0.85 of what is bright.
+    """
+    images = np.asarray(images)
+    stack = images if images.ndim == 3 else images[None]
+    bright = _field_pixels(stack.max(axis=0))
+    scale = np.asarray(pixel_spacing_mm, float)
+    outline = probe.outline_mm()[:, :2]
+    low = np.floor(outline.min(axis=0) / scale).astype(int) - 1
+    size = np.ceil(outline.max(axis=0) / scale).astype(int) + 2 - low
+    x, y = np.meshgrid(*((low[axis] + np.arange(size[axis])) * scale[axis] for axis in (0, 1)))
+    inside = probe.holds(x, y).astype(np.float32)
+    # Just above the face and beside the field it is black, just below the face it is not
+    step = max(round(2.0 / scale[1]), 1)
+    near = inside * (1.0 - np.pad(inside, ((step, 0), (0, 0)))[: inside.shape[0]])
+    covered = signal.fftconvolve(bright.astype(np.float32), inside[::-1, ::-1])
+    at_face = signal.fftconvolve(bright.astype(np.float32), near[::-1, ::-1])
+    row, column = np.unravel_index(np.argmax(covered + at_face), covered.shape)
+    corner = np.array([column - size[0] + 1, row - size[1] + 1])
+    image_to_probe = np.diag([*scale, 1.0, 1.0])
+    image_to_probe[:2, 3] = (low - corner) * scale
+    field = ImagedField.of(probe, image_to_probe, bright.shape)
+    share = float((field.mask & bright).sum() / bright.sum())
+    require(
+        share >= _LEAST_OVERLAP,
+        f"the probe's field covers {share:.0%} of what is bright in the images, expected at least "
+        f"{_LEAST_OVERLAP:.0%}; check its geometry and the calibration",
+    )
+    _log.info("the probe's field covers %.0f %% of what is bright in the images", 100 * share)
+    return replace(field, overlap=float((field.mask & bright).sum() / (field.mask | bright).sum()))
+
+
 def draw_field(path: str | os.PathLike, image: np.ndarray, field: ImagedField) -> None:
     """Write a PNG of an image (rows, columns) with the outline of the field, to check the estimate."""
     from PIL import Image, ImageDraw
 
-    picture = Image.fromarray(np.asarray(image, np.uint8)).convert("RGB")
+    shown = np.repeat(np.asarray(image, np.uint8)[..., None], 3, axis=2)
+    hidden = ImagedField.of(field.probe, field.image_to_probe, field.mask.shape).mask & ~field.mask
+    shown[hidden, 2] = np.maximum(shown[hidden, 2], 110)  # blue: in the field, but cut off or drawn over
+    picture = Image.fromarray(shown)
     draw = ImageDraw.Draw(picture)
     draw.line([tuple(point) for point in field.outline_pixels()], fill=(255, 200, 61), width=2)
     x, y = np.linalg.inv(field.image_to_probe)[:2, 3]

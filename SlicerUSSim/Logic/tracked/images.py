@@ -12,7 +12,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.transforms import check_rigid, nearest_rotation
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.image_grid import ImageGrid
-from SlicerUSSim.Logic.tracked.field import ImagedField, estimate_field
+from SlicerUSSim.Logic.tracked.field import ImagedField, estimate_field, place_field
+from SlicerUSSim.Logic.tracked.hidden import spread_images, visible_part
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 
 _log = logging.getLogger(__name__)
@@ -49,6 +50,7 @@ class TrackedImages:
         probe: Probe | None = None,
         beam: Probe | None = None,
         most: int | None = None,
+        apart: Sequence[int] = (),
     ) -> TrackedImages:
         """Prepare images of a sequence.
 
@@ -60,20 +62,25 @@ class TrackedImages:
         probe : the probe, if known. Its position in the image is then taken from ImageToProbe, if the sequence has this
             transform in the probe frame (as in sequences written by this package), or else estimated from the images.
             Without `probe` the probe is estimated too.
+        apart : images that are prepared as well, but are not among those of the default choice; see `split`.
         beam : probe whose parameters other than the geometry are used for an estimated probe.
 
-        Raises SimulationError for images that do not exist or were not tracked, a skewed or mirrored calibration, a
-        field that cannot be estimated, and images that are entirely black.
+        Raises SimulationError for images that do not exist or were not tracked, a skewed calibration, a field that
+        cannot be estimated, and images that are entirely black. A calibration that mirrors, saturated images, and what
+        a file cuts off or a scanner draws over the field (hidden.py) are warned of.
         """
         require(
             sequence.image_type == "BRIGHTNESS",
             f"the sequence has {sequence.image_type} data, expected B-mode images (BRIGHTNESS)",
         )
-        kept = [n for n in range(len(sequence)) if sequence.has_pose(n, path)] if numbers is None else list(numbers)
-        if numbers is None and 0 < len(kept) < len(sequence):
-            _log.warning("%d of %d images have no %s and are left out", len(sequence) - len(kept), len(sequence), path)
+        tracked = [n for n in range(len(sequence)) if sequence.has_pose(n, path)]
+        kept = [n for n in tracked if n not in apart] if numbers is None else list(numbers)
+        if numbers is None and 0 < len(tracked) < len(sequence):
+            missing = len(sequence) - len(tracked)
+            _log.warning("%d of %d images have no %s and are left out", missing, len(sequence), path)
         if numbers is None and most is not None and len(kept) > most:
             kept = [kept[place] for place in np.linspace(0, len(kept) - 1, most).round().astype(int)]
+        kept += [number for number in apart if number not in kept]
         # If no image was tracked, the error for the first one names the missing transform.
         matrices = [sequence.pose(number, path) for number in kept or [0]]
         chosen = sequence.select(kept)
@@ -87,6 +94,9 @@ class TrackedImages:
             require(int(image.max()) > 0, f"image {number} of the sequence is black")
         spacing = _pixel_spacing(matrices[0], path)
         field = _located_field(sequence, images, spacing, probe, beam)
+        seen = visible_part(_as_uint8(spread_images(sequence.images)), field.mask, sequence.coloured)
+        require(bool(seen.any()), "nothing of the probe's field is seen in the images")
+        field = replace(field, mask=seen)
         to_ras = np.eye(4) if reference_to_ras is None else check_rigid("reference_to_ras", reference_to_ras)
         poses = [to_ras @ _probe_pose(matrix, field, path) for matrix in matrices]
         window = rows, columns = field.window
@@ -97,6 +107,24 @@ class TrackedImages:
         grid = ImageGrid(height, width, float(left), float(top), (float(size[0]), float(size[1])))
         cropped = [np.ascontiguousarray(image[window]) for image in images]
         return cls(field.probe, poses, cropped, grid, mask, kept, field)
+
+    def split(self, apart: Sequence[int]) -> tuple[TrackedImages, TrackedImages]:
+        """(the others, those with the numbers `apart`), as for a fit and its prediction.
+
+        Raises SimulationError if nothing is left, or for numbers that are not among them.
+        """
+        others = [number for number in self.numbers if number not in apart]
+        require(bool(others), "all images are predicted, expected some to fit")
+        return self.only(others), self.only(list(dict.fromkeys(apart)))
+
+    def only(self, numbers: Sequence[int]) -> TrackedImages:
+        """Those with these numbers in the sequence. Raises SimulationError for numbers that are not among them."""
+        unknown = [number for number in numbers if number not in self.numbers]
+        require(not unknown, f"images {_listed(unknown)} are not among {_listed(self.numbers)}")
+        places = [self.numbers.index(number) for number in numbers]
+        return replace(
+            self, poses=[self.poses[n] for n in places], images=[self.images[n] for n in places], numbers=list(numbers)
+        )
 
 
 def _listed(numbers: Sequence[int]) -> str:
@@ -122,6 +150,11 @@ def _pixel_spacing(image_to_world: np.ndarray, path: str) -> tuple[float, float]
     size = float(np.linalg.norm(x)), float(np.linalg.norm(y))
     require(min(size) > 0, f"{path} is singular, expected an image's axes in millimetres per pixel")
     cosine = abs(float(x @ y)) / (size[0] * size[1])
+    if np.linalg.det(image_to_world[:3, :3]) < 0.0:
+        _log.warning(
+            "%s mirrors: its third axis points against the right hand; if left and right are wrong, its calibration is",
+            path,
+        )
     require(cosine < _SKEW, f"{path} is skewed: the image's axes have a cosine of {cosine:.2g}, expected 0")
     return size
 
@@ -133,11 +166,21 @@ def _located_field(
     probe: Probe | None,
     beam: Probe | None,
 ) -> ImagedField:
+    # All images of the recording show more of the field than the few that are fitted
+    every = _as_uint8(spread_images(sequence.images))
     if probe is None:
         shared = {field.name for field in fields(Probe)}
         known = {} if beam is None else {name: v for name, v in beam.to_dict().items() if name in shared}
         _log.info("no probe is given: its geometry is looked for in the images, the rest is the preset's")
-        return estimate_field(images, spacing, **known)
+        try:
+            return estimate_field(every, spacing, **known)
+        except SimulationError:
+            if len(every) == len(images):
+                raise
+            _log.info(
+                "all images together show no probe's field, as where the depth changes: only the chosen ones count"
+            )
+            return estimate_field(images, spacing, **known)
     if all("ImageToProbe" in entry for entry in sequence.transforms):
         image_to_probe = np.array(sequence.transforms[0]["ImageToProbe"])
         # In this package's probe frame the image is upright and in the plane z = 0; a tracker's marker can be anywhere.
@@ -149,7 +192,11 @@ def _located_field(
             _log.info("the probe's place in the images is that of ImageToProbe, which is in the probe's own frame")
             return ImagedField.of(probe, image_to_probe, images.shape[1:])
     _log.info("the probe's place is looked for in the images: no ImageToProbe in the probe's own frame")
-    found = estimate_field(images, spacing)
+    try:
+        found = estimate_field(every, spacing)
+    except SimulationError as error:
+        _log.info("%s; the given probe's field is placed where it covers them best", error)
+        return place_field(every, spacing, probe)
     kinds = found.probe.to_dict()["kind"], probe.to_dict()["kind"]
     require(
         kinds[0] == kinds[1] or {"convex", "phased"} == set(kinds),

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +37,8 @@ _NOT_OURS = (
     "ITK_", "Kinds", "Modality", "NRRD_", "ObjectType", "AnatomicalOrientation", "type", "dimension", "space", "sizes",
     "kinds", "endian", "encoding", "measurement frame", "centers", "spacings", "thicknesses", "axis", "labels", "units",
 )  # fmt: skip
+#: Difference of the components of a pixel, grey levels, from which on it has a colour; below are codecs
+_COLOURED = 24
 _OPPOSITE = {"M": "U", "U": "M", "F": "N", "N": "F"}
 
 
@@ -69,6 +72,8 @@ class TrackedSequence:
     #: Other fields of the file, and of every image
     fields: Mapping[str, str] = field(default_factory=dict)
     frame_fields: tuple[Mapping[str, str], ...] = ()
+    #: (rows, columns) bool, pixels that have a colour in any image, such as Doppler's; None without colours
+    coloured: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         images = np.asarray(self.images)
@@ -198,8 +203,8 @@ class TrackedSequence:
         path = Path(path)
         require(path.is_file(), f"{path}: no such file")
         is_nrrd = path.name.lower().endswith((".nrrd", ".nhdr"))
-        array, header = _read_nrrd(path) if is_nrrd else _read_metaimage(path)
-        return _from_header(array, header, str(path))
+        pixels, header = _read_nrrd(path) if is_nrrd else _read_metaimage(path)
+        return _from_header(pixels, header, str(path))
 
     def write(self, path: str | os.PathLike, compress: bool = True) -> None:
         """Write a sequence metafile; the format follows from the name (SEQUENCE_SUFFIXES).
@@ -306,6 +311,19 @@ def frame_numbers(text: str, count: int) -> list[int]:
     return numbers
 
 
+def checked_apart(text: str, fitted: Sequence[int] | None, count: int) -> list[int]:
+    """Numbers of images that are predicted, from a text as of frame_numbers; an empty one is none.
+
+    Raises SimulationError for other text, and for images that are `fitted` (None: not known) as well.
+    """
+    if not text.strip():
+        return []
+    numbers = list(dict.fromkeys(frame_numbers(text, count)))
+    both = [str(number) for number in numbers if fitted is not None and number in fitted]
+    require(not both, f"images {', '.join(both)} are fitted and predicted, expected others to predict")
+    return numbers
+
+
 @reader
 def read_coordinate_definitions(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """{"ImageToProbe": (4, 4), ...} from the <CoordinateDefinitions> of a Plus configuration file (XML).
@@ -359,9 +377,9 @@ def _numbers(name: str, text: str) -> np.ndarray:
     return _matrix(name, values.reshape(4, 4))
 
 
-def _from_header(array: np.ndarray, header: Mapping[str, str], source: str) -> TrackedSequence:
-    """A sequence from the [n, y, x] pixels of a file and its header fields."""
-    count = len(array)
+def _from_header(pixels: _Pixels, header: Mapping[str, str], source: str) -> TrackedSequence:
+    """A sequence from the pixels of a file and its header fields."""
+    count = len(pixels.grey)
     transforms: list[dict] = [{} for _ in range(count)]
     others: list[dict] = [{} for _ in range(count)]
     timestamps = np.full(count, np.nan)
@@ -403,8 +421,10 @@ def _from_header(array: np.ndarray, header: Mapping[str, str], source: str) -> T
     image_type = header.get(_TYPE, "BRIGHTNESS").strip()
     image_type = "BRIGHTNESS" if image_type == "RGB_COLOR" else image_type
     wanted = "MF" if image_type == "BRIGHTNESS" else "FM"
-    array = _oriented(array, header.get(_ORIENTATION, wanted).strip().upper(), wanted, source)
-    return TrackedSequence(array, tuple(transforms), timestamps, image_type, fields, tuple(others))
+    orientation = header.get(_ORIENTATION, wanted).strip().upper()
+    array = _oriented(pixels.grey, orientation, wanted, source)
+    coloured = None if pixels.coloured is None else _oriented(pixels.coloured[None], orientation, wanted, source)[0]
+    return TrackedSequence(array, tuple(transforms), timestamps, image_type, fields, tuple(others), coloured)
 
 
 def _oriented(array: np.ndarray, orientation: str, wanted: str, source: str) -> np.ndarray:
@@ -426,11 +446,24 @@ def _oriented(array: np.ndarray, orientation: str, wanted: str, source: str) -> 
     return np.ascontiguousarray(array)
 
 
-def _as_images(array: np.ndarray, components: int, source: str) -> np.ndarray:
-    """[n, y, x] from an array with or without a slice axis of length 1, and with a colour axis if components > 1."""
+class _Pixels(NamedTuple):
+    """The pixels of a file, and which of them have a colour."""
+
+    #: [n, y, x]
+    grey: np.ndarray
+    #: (y, x) bool, in any image; None without
+    coloured: np.ndarray | None
+
+
+def _as_images(array: np.ndarray, components: int, source: str) -> _Pixels:
+    """Pixels of an array with or without a slice axis of length 1, and with a colour axis if components > 1."""
+    coloured = None
     if components > 1:
         require(components in (3, 4), f"{source}: has {components} components per pixel, expected 1 or colours")
         _log.info("%s: colours become grey (ITU-R BT.601)", source)
+        spread = array[..., :3].max(axis=-1).astype(int) - array[..., :3].min(axis=-1)
+        coloured = (spread > _COLOURED).reshape(-1, *spread.shape[-2:]).any(axis=0)
+        coloured = coloured if coloured.any() else None
         array = (array[..., :3] @ np.array([0.299, 0.587, 0.114])).round().astype(array.dtype)  # ITU-R BT.601
     if array.ndim == 4:
         require(array.shape[1] == 1, f"{source}: has volumes of {array.shape[1]} slices, expected images")
@@ -438,13 +471,13 @@ def _as_images(array: np.ndarray, components: int, source: str) -> np.ndarray:
     if array.ndim == 2:
         array = array[None]
     require(array.ndim == 3, f"{source}: has {array.ndim} dimensions, expected columns, rows and images")
-    return array
+    return _Pixels(array, coloured)
 
 
 # ---- formats ---------------------------------------------------------------------------------------------------------
 
 
-def _read_metaimage(path: Path) -> tuple[np.ndarray, dict[str, str]]:
+def _read_metaimage(path: Path) -> tuple[_Pixels, dict[str, str]]:
     import SimpleITK as sitk
 
     from SlicerUSSim.Logic.base.volume import read_itk_image
@@ -463,7 +496,7 @@ def _write_metaimage(path: Path, images: np.ndarray, header: Mapping[str, str], 
     sitk.WriteImage(image, str(path), useCompression=compress)
 
 
-def _read_nrrd(path: Path) -> tuple[np.ndarray, dict[str, str]]:
+def _read_nrrd(path: Path) -> tuple[_Pixels, dict[str, str]]:
     require_package("nrrd", "pynrrd", f"{path}: reading NRRD sequences")
     import nrrd
 

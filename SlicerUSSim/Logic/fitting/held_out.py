@@ -1,0 +1,112 @@
+"""predict: judges a fit on images that it has not seen, and a uniform tissue fitted in the same way (prediction.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import require
+from SlicerUSSim.Logic.base.settings import DisplaySettings
+from SlicerUSSim.Logic.fitting.image_similarity import SimilaritySettings, similarity
+from SlicerUSSim.Logic.fitting.parameters import DISPLAY_BOUNDS, GROUPS, TISSUES, Bounds
+from SlicerUSSim.Logic.fitting.prediction import FITTED, Prediction
+from SlicerUSSim.Logic.fitting.realism import NEIGHBOURS, UNIFORM, Cost, uniform_tissues
+from SlicerUSSim.Logic.fitting.search import Progress
+from SlicerUSSim.Logic.fitting.settings import FitSettings
+from SlicerUSSim.Logic.fitting.texture_costs import TextureReference
+from SlicerUSSim.Logic.fitting.tracked_fit import Fit, fit as fit_images, simulated
+from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.tracked.images import TrackedImages
+
+#: Names of the display that a fit of one tissue takes over as they are
+_DISPLAY_NAMES = frozenset((*DISPLAY_BOUNDS, *GROUPS, "display"))
+
+
+def predict(
+    found: Fit,
+    simulator: UltrasoundSimulator,
+    others: TrackedImages,
+    *,
+    free: Iterable[str] | Mapping[str, Bounds | None],
+    display: DisplaySettings | None = None,
+    speckle: bool = False,
+    neighbours: Sequence[Sequence[np.ndarray]] | None = None,
+    fitted_neighbours: Sequence[Sequence[np.ndarray]] | None = None,
+    max_evaluations: int = FitSettings.evaluations,
+    settings: SimilaritySettings | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Prediction:
+    """Judge a fit on images that it has not seen.
+
+    Parameters
+    ----------
+    found, simulator : a fit, and the simulator that it was made with.
+    others : other images of the same recording, at the poses as tracked; a registration moves them as well, and a
+        deformation of the tissues is theirs too.
+    free, display, speckle, max_evaluations : as they were for the fit; the uniform tissue is fitted with the same.
+    neighbours, fitted_neighbours : per image of `others`, and of the fitted ones, real images near it
+        (realism.neighbours_of); without them there is no floor.
+
+    Raises SimulationError for images that were fitted too, and if no tissue has scatterers.
+    """
+    both = sorted(set(found.tracked.numbers) & set(others.numbers))
+    require(
+        not both,
+        f"images {', '.join(map(str, both))} are fitted and predicted, expected others: what was fitted says little",
+    )
+    given, simulator = simulator, found.simulator or simulator
+    if found.registration is not None:
+        others = replace(others, poses=[found.registration.correction @ pose for pose in others.poses])
+    others = replace(others, probe=found.tracked.probe)  # whose point spread function a fit may have changed
+    result = found.appearance
+    labels, tissues = uniform_tissues(given)
+    plain = replace(simulator.settings, partial_volume=False, mri_modulation_db=0.0)
+    uniform = UltrasoundSimulator(labels, tissues, plain, simulator.device)
+    control = fit_images(
+        uniform, found.tracked, free=_free_of_one(free), display=display, speckle=speckle, restarts=0,
+        max_evaluations=max_evaluations, settings=settings, progress=progress,
+    )  # fmt: skip
+    shown = control.appearance
+    images = {
+        FITTED: simulated(simulator, others, result.tissues, result.display),
+        UNIFORM: simulated(uniform, replace(others, probe=control.tracked.probe), shown.tissues, shown.display),
+    }
+    fitted = {FITTED: found.after, UNIFORM: control.after}
+
+    def costs(sources: Mapping[str, Sequence[np.ndarray]], tracked: TrackedImages, near) -> dict[str, list[Cost]]:
+        cost = _costs_against(tracked, settings or SimilaritySettings())
+        table = {name: [cost(image, n) for n, image in enumerate(each)] for name, each in sources.items()}
+        if near is not None:
+            table[NEIGHBOURS] = [cost(image, n) for n, beside in enumerate(near) for image in beside]
+        return table
+
+    return Prediction(
+        list(found.tracked.numbers),
+        list(others.numbers),
+        costs(fitted, found.tracked, fitted_neighbours),
+        costs(images, others, neighbours),
+        images,
+    )
+
+
+def _costs_against(tracked: TrackedImages, settings: SimilaritySettings) -> Callable[[np.ndarray, int], Cost]:
+    spacing, inside = tracked.grid.pixel_spacing_mm, tracked.mask & tracked.grid.field(tracked.probe)
+    references = [TextureReference(image, spacing, tracked.mask) for image in tracked.images]
+
+    def cost(image: np.ndarray, number: int) -> Cost:
+        paper = similarity(
+            image, tracked.images[number], spacing, patch_mm=settings.patch_mm, bins=settings.bins,
+            sad_weight=settings.sad_weight, mask=inside,
+        )  # fmt: skip
+        return Cost(paper, references[number].misfit(image))
+
+    return cost
+
+
+def _free_of_one(free: Iterable[str] | Mapping[str, Bounds | None]) -> dict[str, Bounds | None]:
+    """The free parameters with those of tissues replaced by the one tissue's, by what an image shows of it."""
+    entries = dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
+    shown = {name: bounds for name, bounds in entries.items() if name in _DISPLAY_NAMES}
+    return shown if len(shown) == len(entries) and shown else {**shown, TISSUES: None}
