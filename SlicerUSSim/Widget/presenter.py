@@ -41,6 +41,8 @@ _OPENED = "craniotomy: "
 _VIEW = "view: "
 #: Begin of the lines about a proposal
 _PROPOSED = "proposal: "
+#: What is said of an image that does not follow the probe any more
+FROZEN = "FROZEN"
 _BUSY = "Wait until the work under way is done"
 #: Columns of the tissue table: parameter, heading, tool tip.
 TISSUE_COLUMNS = tuple(
@@ -181,6 +183,11 @@ class PanelPresenter:
         self.view.refresh()
 
     # ---- actions -----------------------------------------------------------------------------------------------
+
+    @property
+    def isBusy(self) -> bool:
+        """Whether work is under way for which live images wait."""
+        return self._busy
 
     def canSegment(self) -> tuple[bool, str]:
         """(whether Segment is enabled, the reason if not)"""
@@ -507,6 +514,8 @@ class PanelPresenter:
             self.logic.showOutline(nodes.outline, nodes.probe_transform)
             if self.view.sliceNode() is not None:
                 self.logic.showInSlice(self.view.sliceNode(), nodes.output, nodes.probe_transform)
+            if not self.logic.isLive:
+                self.logic.holdImage(nodes.output)
         self.view.refresh()
 
     def _say_labels(self, labels: Any) -> None:
@@ -681,7 +690,8 @@ class PanelPresenter:
         self._last_image = now
 
     def _stopped(self) -> None:
-        self.view.showStatus("")
+        taken = self.logic.taken
+        self.view.showStatus("" if taken is None else f"{FROZEN}: {taken.patient}, {taken.time[11:19]} UTC")
         self.view.refresh()
 
     @contextmanager

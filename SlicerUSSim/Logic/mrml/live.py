@@ -46,6 +46,7 @@ class LiveUpdate:
         labels_node, transform_node, output_node = nodes.labels, nodes.probe_transform, nodes.output
         self._schedule, self._report, self._stopped = schedule, report, stopped
         self._pending = self._busy = False
+        self._is_claimed = False  # by another live update, whose image is in the output now
         self._logged = ""
         self._outlined = logic.preset.probe
         self._observed: list[tuple[Any, int]] = []
@@ -53,7 +54,7 @@ class LiveUpdate:
 
         scene = logic.scene
         output_node.InvokeEvent(_CLAIMED)  # stops a live update that wrote to it before
-        self._observe(output_node, _CLAIMED, self.stop)
+        self._observe(output_node, _CLAIMED, self._claimed)
         self._observe(scene, scene.StartCloseEvent, self.stop)
         self._observe(scene, scene.NodeAboutToBeRemovedEvent, self._node_goes, call_data=VTK_OBJECT)
         self._observe(scene, scene.EndBatchProcessEvent, self._batch_ended)
@@ -73,15 +74,21 @@ class LiveUpdate:
             self._observe(labels_node, vtkCommand.ModifiedEvent, self.request)
         self._observe(logic.parameters.node, vtkCommand.ModifiedEvent, self.request)
 
+    def _claimed(self) -> None:
+        self._is_claimed = True
+        self.stop()
+
     def stop(self) -> None:
-        """Remove all observers and node references, and report the end once."""
+        """Remove all observers and node references, freeze the image, and report the end once."""
         if not self.running:
             return
         self.running = False
         for observed, tag in self._observed:
             observed.RemoveObserver(tag)
         self._observed.clear()
-        self._nodes = None
+        nodes, self._nodes, logic = self._nodes, None, self._logic()
+        if nodes is not None and logic is not None and not self._is_claimed and nodes.output.GetScene() is not None:
+            logic.holdImage(nodes.output)
         stopped, self._stopped, self._report = self._stopped, None, None
         if stopped is not None:
             stopped()
