@@ -17,6 +17,7 @@ from SlicerUSSim.Logic.base.declaration import Shown, parameter  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen  # noqa: E402
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, LinearProbe  # noqa: E402
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS  # noqa: E402
 from SlicerUSSim.Widget.controls import by_widget, part_of, shown_by, usable  # noqa: E402
@@ -275,3 +276,16 @@ def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(present
     write_volume(parameters.labels, whole_head())
     presenter.addTissues()  # over the tissues of another patient, which were not simulated yet
     assert "tumour: " in presenter.notes() and checks[0] not in presenter.notes()
+
+
+def test_an_image_that_does_not_follow_the_probe_is_said_to_be_frozen(presenter):
+    presenter.segment()
+    presenter.setValue("probe.scan_lines", 48)
+    presenter.setLive(True)
+    output, probe = presenter.logic.parameters.output, presenter.logic.parameters.probe_transform
+    assert output.GetParentTransformNode() is probe
+    presenter.setLive(False)
+    assert presenter.view.status[-1].startswith("FROZEN: Head, ") and output.GetParentTransformNode() is None
+    presenter.simulate()
+    assert output.GetParentTransformNode() is None and is_frozen(output)
+    assert about_image(output)["patient"] == "Head"

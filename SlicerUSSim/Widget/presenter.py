@@ -479,6 +479,12 @@ class PanelPresenter:
             return []
         return [f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (Gel on the skin)"] if is_there else []
 
+    def forgetPatient(self) -> None:
+        """Release what is kept in memory of the last patient, with notes and fit; nodes stay."""
+        self.logic.forgetPatient()
+        self.fits.forget()
+        self.setNotes()
+
     def setNotes(self, *lines: str) -> None:
         """Replace them by lines about another patient, whose labels are chosen; by none, to forget them."""
         labels: Any = self.logic.parameters.labels

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
@@ -17,7 +16,7 @@ from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm
 from SlicerUSSim.Logic.mri.label_agreement import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import node_to_world, pose_in_labels, probe_pose, read_volume
+from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose, read_volume
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
@@ -25,13 +24,17 @@ from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.opener import Files, Opener
+from SlicerUSSim.Workstation.patient_nodes import remove_patient_nodes
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.state import ORGANS, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 
-#: Farther from the volume of another patient's tissues, a probe is placed anew
-_FAR_MM = 50.0
+#: Roles of nodes of a patient
+_OF_PATIENT = (
+    "mri", "labels", "mask", "second_mri", "lesions", "organs", "sheets", "seed", "proposal", "opening", "real",
+    "transform_sequence", "image_sequence",
+)  # fmt: skip
 
 
 class Loading:
@@ -54,6 +57,7 @@ class Loading:
         self._opener, self._presenter, self._messages = opener, presenter, messages
         self._views, self._probe, self._comparison = views, probe, comparison
         self._is_new = False  # a patient was opened, on whom the probe is not yet
+        self._dropped = ""  # name of an MRI that was closed for labels that are not of it
 
     def begin(self, files: Files) -> None:
         """Load the files with which the workstation was started, and show the first image."""
@@ -79,7 +83,8 @@ class Loading:
             for tissue, path in files.additions:
                 parameters.lesions = self._opener.lesion_of_file(parameters.lesions, tissue, path)
             if files.labels is not None:
-                self._take_labels(*self._opener.labels(files.labels))
+                node, found = self._opener.labels(files.labels)
+                self._take_labels(node, found, self._mri_of(found.labels))
                 if files.additions:
                     self.add_tissues()
             else:
@@ -106,9 +111,10 @@ class Loading:
                 self._logic.parameters.sheets = self._opener.sheets(path)
             elif kind == "labels":
                 node, found = self._opener.labels(path, upload.table)
+                kept = self._mri_of(found.labels)
                 self._messages.clear()
-                self._forget_patient()
-                self._take_labels(node, found)
+                self._forget_patient(node, *kept)
+                self._take_labels(node, found, kept)
             else:
                 node = self._opener.mri(path)
                 self._messages.clear()
@@ -196,8 +202,10 @@ class Loading:
 
     def show_title(self) -> None:
         """Show the name of the patient on the page."""
-        with self._shared.changing() as now:
-            now.title = self._opener.patient()
+        title = self._opener.patient()
+        if self._shared.now.title != title:
+            with self._shared.changing() as now:
+                now.title = title
 
     # ---- implementation ----------------------------------------------------------------------------------------
 
@@ -236,47 +244,81 @@ class Loading:
         action()
         return version() not in (before, None)
 
-    def _take_labels(self, node: Any, found: LabelledTissues) -> None:
+    def _take_labels(self, node: Any, found: LabelledTissues, mris: Sequence[Any] = ()) -> None:
+        """Choose labels; `mris` are the MRIs that they may be of, see _mri_of."""
         parameters: Any = self._logic.parameters
         for warning in found.warnings:
             self._presenter.view.showError(warning)
         checks = [f"Check: {warning}" for warning in found.warnings]
-        checks += self._keep_mri_of(found.labels)
-        if parameters.mri is None:
-            self._views.show_volume(node)
+        if mris:
+            checks.append(f"of the MRI {mris[0].GetName()}, which is shown: its intensities follow the labels")
+        elif self._dropped:
+            checks.append(
+                f"Check: the MRI {self._dropped} was closed: its intensities do not follow the labels (of another "
+                "patient?)"
+            )
+        self._dropped = ""
+        if not mris and parameters.mri is not None:
+            dropped = parameters.mri
+            parameters.mri = parameters.mask = parameters.second_mri = None
+            self._scene.RemoveNode(dropped)
+        elif mris:
+            parameters.mri = mris[0]
+        self._views.show_volume(node if parameters.mri is None else parameters.mri)
         parameters.labels = node
         self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
         self.show_title()
         self._labels_ready()
 
-    def _keep_mri_of(self, labels: Volume) -> list[str]:
-        """Deselect an MRI that does not follow the labels, which may be of another patient; lines about it."""
-        parameters: Any = self._logic.parameters
-        if parameters.mri is None:
+    def _mri_of(self, labels: Volume) -> list[Any]:
+        """The MRI if it follows the labels; otherwise it may be of another patient."""
+        mri: Any = self._logic.parameters.mri
+        self._dropped = ""
+        if mri is None:
             return []
-        mri, name = read_volume(parameters.mri), parameters.mri.GetName()
-        if self._tasks.do(lambda: follows(mri, labels)):
-            return [f"of the MRI {name}, which is shown: its intensities follow the labels"]
-        parameters.mri = parameters.mask = parameters.second_mri = None
-        return [f"Check: the MRI {name} was deselected: its intensities do not follow the labels (of another patient?)"]
+        volume = read_volume(mri)
+        if self._tasks.do(lambda: follows(volume, labels)):
+            return [mri]
+        self._dropped = mri.GetName()
+        return []
 
     def _take_organs(self, node: Any, found: LabelledTissues) -> None:
         """Choose the label map of organs of a CT, which Segment uses."""
         self._logic.parameters.organs = node
         self._presenter.setNotes(f"{node.GetName()}: {found.message}; Segment uses it with the contrast ct")
 
-    def _forget_patient(self) -> None:
-        """Deselect what is of the patient before, when another one is opened."""
+    def close_patient(self) -> None:
+        """Close the patient: nothing of him stays on the page, in the scene or in memory; settings stay."""
         parameters = self._logic.parameters
-        parameters.lesions = parameters.organs = parameters.sheets = parameters.seed = parameters.proposal = None
+        self._messages.clear()
+        self._forget_patient()
+        parameters.mri = parameters.labels = parameters.mask = parameters.second_mri = None
+        self._presenter.setNotes()
+        self.show_title()
+
+    def _forget_patient(self, *new: Any) -> None:
+        """Show, choose and keep nothing of the patient before, when another one is opened; `new` are nodes of his."""
+        parameters = self._logic.parameters
+        self._logic.stopLiveUpdate()
+        self._logic.clearImage(parameters.output)
+        self._comparison.drop()
+        self._probe.forget_patient()
+        self._presenter.forgetPatient()
+        self._opener.forget_patient()
+        kept = [parameters.output, parameters.outline, parameters.probe_transform, *new]
+        for role in _OF_PATIENT:
+            node: Any = getattr(parameters, role)
+            if node not in new:
+                setattr(parameters, role, None)
+        remove_patient_nodes(self._scene, kept)
+        with self._shared.changing() as now:
+            now.fit.curve, now.fit.costs = [], ""
         self._is_new = True
 
     def _take_mri(self, node: Any) -> None:
         parameters = self._logic.parameters
-        self._logic.stopLiveUpdate()  # until the new MRI is segmented
-        parameters.mri, parameters.labels, parameters.mask = node, None, None
-        parameters.second_mri = None
-        self._forget_patient()
+        self._forget_patient(node)
+        parameters.mri = node
         self._presenter.setNotes()
         self.show_title()
         self._views.show_volume(node)
@@ -288,17 +330,8 @@ class Loading:
         self._logic.parameters.real = images
         self._comparison.take(tracked, browser)
 
-    def _probe_is_far(self) -> bool:
-        """Whether the probe lies outside the tissues' volume, as that of a patient in another frame does."""
-        parameters: Any = self._logic.parameters
-        bounds = np.zeros(6)
-        parameters.labels.GetRASBounds(bounds)
-        low, high = bounds[::2] - _FAR_MM, bounds[1::2] + _FAR_MM
-        face = node_to_world(parameters.probe_transform)[:3, 3]
-        return bool(((face < low) | (face > high)).any())
-
     def _labels_ready(self) -> None:
-        if self._logic.parameters.probe_transform is None or (self._is_new and self._probe_is_far()):
+        if self._logic.parameters.probe_transform is None or self._is_new:
             self._presenter.placeProbe()
         self._is_new = False
         self.show_title()

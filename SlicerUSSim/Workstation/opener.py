@@ -29,6 +29,7 @@ from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
 from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
+from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
 from SlicerUSSim.Logic.tissue.label_advice import PAGE
 from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
@@ -45,8 +46,6 @@ _log = logging.getLogger(__name__)
 
 #: Attribute of a node: the file from which it was read; "" for the demo brain, the name alone for one sent by a page.
 FILE = "SlicerUSSim.file"
-#: Attribute of a node with labels: the name of the file with the patient, of the labels themselves or of their MRI.
-PATIENT = "SlicerUSSim.patient"
 
 
 @dataclass(frozen=True)
@@ -289,12 +288,16 @@ class Opener:
         if source is not None and disc is not None:
             self._sources[_voxels_of(labels_node)] = replace(source, disc=disc)
 
+    def forget_patient(self) -> None:
+        """Release what is kept of the last patient."""
+        self._sources, self._lesion_files = {}, {}
+
     def patient(self) -> str:
         """Name of the patient of the chosen labels, or of the MRI if there are none; "" without either."""
         labels, mri = self._logic.parameters.labels, self._logic.parameters.mri
         if labels is not None:
-            return labels.GetAttribute(PATIENT) or labels.GetName()
-        return "" if mri is None else mri.GetName()
+            return patient_of(labels)
+        return "" if mri is None else patient_of(mri)
 
     def known_source(self, labels_node) -> LabelSource | None:
         """The source of labels; None if it is unknown, or there are no labels."""
@@ -392,6 +395,9 @@ class Opener:
             yield list(map(Path, self._uploads))
         except SimulationError as error:
             raise SimulationError(self._as_known(str(error))) from None
+        finally:
+            for path in self._uploads:
+                self._volumes.pop(path, None)
 
     def _as_known(self, text: str) -> str:
         """A message with the names of files as the user knows them, without the temporary folder."""

@@ -19,14 +19,14 @@ from trame_slicer.views import AbstractView
 from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
 from SlicerUSSim.Widget.controls import Control, Section
-from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS
+from SlicerUSSim.Widget.presenter import FROZEN, TISSUE_COLUMNS
 from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode
 
 _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
 MODULE = {
     "serve": {"ussim": str(_STATIC)},
-    "scripts": ["ussim/workstation.js"],
+    "scripts": ["ussim/overlay.js", "ussim/workstation.js"],
     "styles": ["ussim/workstation.css"],
 }
 #: Controls of the panel that are not on the page: its slice views follow the probe, it compares the fit in the
@@ -142,6 +142,11 @@ def _open_file() -> None:
         label="Open an MRI, label map (with its table), tracked sequence or sheets (.vtp)",
         v_model=(NAMES.opened_file, None), multiple=True, density="compact",
         hide_details=True, variant="outlined", id="open-file", classes="mb-1",
+    )  # fmt: skip
+    v3.VBtn(
+        "Close patient", size="small", classes="mb-1", id="close-patient", click="trigger('press', ['closePatient'])",
+        title="Nothing of the patient stays on the page, in the scene or in memory; settings stay",
+        disabled=(f"{NAMES.title} === ''",),
     )  # fmt: skip
     options = "".join(f'<option value="{name}">{_LESION_TEXTS.get(name, name)}</option>' for name in (*LESIONS, ORGANS))
     html.Div(
@@ -330,28 +335,23 @@ def _screens(keys: tuple[str, ...]) -> None:
     simulated = f"{mode} === '{ComparisonMode.SIMULATED.value}'"
     with html.Div(classes=(f"{{'ussim-screens': true, 'ussim-stacked': {there} && {beside}}}",)):
         with html.Div(classes="ussim-screen"):
-            html.Div(f"{{{{ {there} && !({simulated}) ? 'Simulated' : '' }}}}", classes="ussim-caption")
-            with html.Div(
-                classes="ussim-frame", style=(_frame_style(),), id="ultrasound", v_show=f"{NAMES.image} !== null"
-            ):
+            simulated_too = f"<span>{{{{ {there} && !({simulated}) ? 'Simulated, ' : '' }}}}</span>"
+            html.Div(f'{simulated_too}<span id="image-caption"></span>', classes="ussim-caption")
+            html.Div(
+                FROZEN, v_show=NAMES.is_frozen, classes="ussim-frozen", id="frozen",
+                title="The image does not follow the probe: it stays where it was taken",
+            )  # fmt: skip
+            with html.Div(classes="ussim-frame", id="ultrasound"):
                 html.Div(f'<canvas data-stream="simulated" data-keys="{escape(" ".join(keys))}"></canvas>')
                 html.Div(
                     f"""<canvas data-stream="real-over" :class="{{blink: {blink}, difference: {over}}}"></canvas>""",
                     v_show=f"{there} && ({blink} || {over})",
                 )
-                html.Div((_STATIC / "overlay.html").read_text(), v_for=f"us in {NAMES.image} ? [{NAMES.image}] : []")
+                html.Div((_STATIC / "overlay.html").read_text())
         with html.Div(classes="ussim-screen", v_show=f"{there} && {beside}"):
             html.Div(f"Real, {{{{ {NAMES.sequence.name} }}}}", classes="ussim-caption")
-            with html.Div(classes="ussim-frame", style=(_frame_style(),), id="real"):
+            with html.Div(classes="ussim-frame", id="real"):
                 html.Div('<canvas data-stream="real"></canvas>')
-
-
-def _frame_style() -> str:
-    width, height = f"({NAMES.image}?.w ?? 0)", f"({NAMES.image}?.h ?? 1)"
-    return (
-        f"`aspect-ratio: ${{{width}}} / ${{{height}}}; "
-        f"width: min(100cqw - 120px, (100cqh - 40px) * ${{{width} / Math.max({height}, 1)}});`"
-    )
 
 
 def _player() -> None:

@@ -54,6 +54,8 @@ class BrowserPanel:
         self._thread = threading.get_ident()
         #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
+        #: Called when live images may have ended, or begun to wait for other work
+        self.frozen_changed: Callable[[], None] = lambda: None
         self._cancelled = False
         self._status, self._status_until = "", 0.0
         self._table: Any = None  # vtkMRMLTableNode with the costs of a fit
@@ -122,6 +124,7 @@ class BrowserPanel:
             panel.can = {name: is_usable for name, (is_usable, _) in can.items()}
             panel.tips = {name: tip for name, (_, tip) in can.items()}
             now.fit.free = [FreeParameter(name, on) for name, on in presenter.fits.freeParameters()]
+        self.frozen_changed()
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:

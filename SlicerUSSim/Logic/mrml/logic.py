@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from functools import partial
@@ -78,7 +79,15 @@ from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, shares_version, write_shares
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets
-from SlicerUSSim.Logic.mrml.taken_image import PATIENT, TakenImage, freeze, patient_of, remove_image, write_about
+from SlicerUSSim.Logic.mrml.taken_image import (
+    PATIENT,
+    TakenImage,
+    follow,
+    freeze,
+    patient_of,
+    remove_image,
+    write_about,
+)
 from SlicerUSSim.Logic.probe.placement import pose_in_slice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -527,6 +536,20 @@ class UltrasoundSceneLogic:
         taken = self._taken
         if taken is not None and taken.node is output_node and output_node.GetImageData() is not None:
             freeze(taken)
+
+    @contextmanager
+    def imageHeld(self) -> Iterator[None]:
+        """As if Live ended, and goes on after that: in a scene that is saved, the image is where it was taken."""
+        taken = self._taken
+        transform = None if taken is None else taken.node.GetParentTransformNode()
+        if taken is None or transform is None or not self.isLive:
+            yield
+            return
+        freeze(taken)
+        try:
+            yield
+        finally:
+            follow(taken, transform)
 
     def clearImage(self, output_node) -> None:
         """Empty a node with an image of this module, which is not of the present patient or pose."""

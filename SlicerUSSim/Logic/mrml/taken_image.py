@@ -98,6 +98,16 @@ def freeze(taken: TakenImage) -> None:
     node.EndModify(was_modifying)
 
 
+def follow(taken: TakenImage, transform_node) -> None:
+    """Put a frozen image under the probe's transform again."""
+    node = taken.node
+    was_modifying = node.StartModify()
+    node.SetAndObserveTransformNodeID(transform_node.GetID())
+    node.SetIJKToRASMatrix(vtk_matrix(taken.frame.grid.slice_to_probe))
+    node.RemoveAttribute(_FROZEN)
+    node.EndModify(was_modifying)
+
+
 def remove_image(volume_node) -> None:
     """Empty a volume node with an image of this module."""
     was_modifying = volume_node.StartModify()

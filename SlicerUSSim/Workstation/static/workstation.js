@@ -5,9 +5,10 @@
   const measured = []; // milliseconds from an event to the image that shows its effect
   const STAMP_EVERY_MS = 40; // events in between share the stamp of the previous one, which overestimates their latency
   let stamped = 0;
+  let drawnRuler = "null";
   const shown = []; // times at which simulated images were displayed
 
-  const workstation = { measured, shown, measuring: false, images: 0, connected: false };
+  const workstation = { measured, shown, measuring: false, images: 0, image: null, connected: false };
   window.ussim = workstation;
 
   const session = () => window.trame?.client?.getConnection?.()?.getSession?.();
@@ -21,9 +22,14 @@
     if (meta?.number === undefined) return; // a view of Slicer, drawn by its own component
     const canvas = canvasOf(name);
     if (!canvas) return;
-    const bitmap = await createImageBitmap(new Blob([content], { type: meta.type }));
+    const bitmap = meta.blank ? null : await createImageBitmap(new Blob([content], { type: meta.type }));
     if (Number(canvas.dataset.number ?? 0) > meta.number && meta.number > 1) return; // overtaken while it was decoded
     canvas.dataset.number = meta.number;
+    describe(canvas, meta);
+    if (!bitmap) {
+      canvas.getContext("2d", { alpha: false }).clearRect(0, 0, canvas.width, canvas.height);
+      return;
+    }
     if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
       canvas.width = bitmap.width; // only on a change, since it makes the browser redo the layout
       canvas.height = bitmap.height;
@@ -41,6 +47,23 @@
         if (measured.length > 4000) measured.splice(0, 2000);
       }
     });
+  }
+
+  // Frame, ruler and caption of an image; they came with it, and change when it does.
+  function describe(canvas, meta) {
+    const frame = canvas.closest(".ussim-frame");
+    if (canvas.dataset.stream !== "real-over") frame.style.visibility = meta.blank ? "hidden" : "visible";
+    if (meta.ruler && canvas.dataset.stream !== "real-over") {
+      frame.style.setProperty("--w", meta.ruler.w);
+      frame.style.setProperty("--h", meta.ruler.h);
+    }
+    if (canvas.dataset.stream !== "simulated") return;
+    workstation.image = meta.blank ? null : meta;
+    const ruler = JSON.stringify(meta.ruler ?? null);
+    if (ruler !== drawnRuler) window.ussimOverlay(document.getElementById("overlay"), meta.ruler);
+    drawnRuler = ruler;
+    const caption = document.getElementById("image-caption");
+    caption.textContent = meta.blank ? "" : `${meta.patient}, ${meta.time.slice(11, 19)} UTC`;
   }
 
   workstation.summary = (count = 100) => {
