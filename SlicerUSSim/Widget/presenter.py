@@ -19,6 +19,7 @@ from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, r
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.settings import GEL_MM
+from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
@@ -576,7 +577,7 @@ class PanelPresenter:
         if parameters.mri is not None:
             return
         for node in nodes_of_class(self.logic.scene, "vtkMRMLScalarVolumeNode"):
-            if not node.IsA("vtkMRMLLabelMapVolumeNode") and node not in (parameters.output, parameters.real):
+            if fits("mri", node) and node not in (parameters.output, parameters.real):
                 parameters.mri = node
                 return
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Widget.controls import Control, Section, by_widget, part_of, shown_by, usable
@@ -196,7 +197,10 @@ class BrowserPanel:
     def _nodes_for(self, control: Control) -> list[NodeItem]:
         scene = self._logic.scene
         found = [
-            node for name in control.node_classes for node in nodes_of_class(scene, name) if node.GetClassName() == name
+            node
+            for name in control.node_classes
+            for node in nodes_of_class(scene, name)
+            if node.GetClassName() == name and fits(control.node, node)
         ]
         return [NodeItem("None", None), *(NodeItem(node.GetName(), node.GetID()) for node in found)]
 

@@ -16,6 +16,8 @@ _log = logging.getLogger(__name__)
 
 #: Event of an output volume: another live update writes to it from now on.
 _CLAIMED = vtkCommand.UserEvent + 7301
+#: Priority of an observer that is called before others, whose is 0
+_FIRST = 1000.0
 
 
 class LiveNodes(NamedTuple):
@@ -56,7 +58,8 @@ class LiveUpdate:
         output_node.InvokeEvent(_CLAIMED)  # stops a live update that wrote to it before
         self._observe(output_node, _CLAIMED, self._claimed)
         self._observe(scene, scene.StartCloseEvent, self.stop)
-        self._observe(scene, scene.NodeAboutToBeRemovedEvent, self._node_goes, call_data=VTK_OBJECT)
+        # Before Slicer's node selectors, which choose the next node instead: live images would go on into that
+        self._observe(scene, scene.NodeAboutToBeRemovedEvent, self._node_goes, call_data=VTK_OBJECT, priority=_FIRST)
         self._observe(scene, scene.EndBatchProcessEvent, self._batch_ended)
         self._observe(transform_node, transform_node.TransformModifiedEvent, self.request)
         self._observe(labels_node, labels_node.TransformModifiedEvent, self.request)
@@ -97,7 +100,7 @@ class LiveUpdate:
         self._stopped = None
         self.stop()
 
-    def _observe(self, subject, event, method, call_data=None) -> None:
+    def _observe(self, subject, event, method, call_data=None, priority=0.0) -> None:
         weak = weakref.WeakMethod(method)  # a strong reference would keep this object alive as long as the scene
 
         def callback(_subject, _event, *data):
@@ -107,7 +110,7 @@ class LiveUpdate:
 
         if call_data is not None:
             setattr(callback, "CallDataType", call_data)  # noqa: B010, where VTK looks for it
-        self._observed.append((subject, subject.AddObserver(event, callback)))
+        self._observed.append((subject, subject.AddObserver(event, callback, priority)))
 
     def _node_goes(self, node) -> None:
         if any(node is mine for mine in self._nodes or ()):

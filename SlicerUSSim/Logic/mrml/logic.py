@@ -73,7 +73,15 @@ from SlicerUSSim.Logic.mrml.nodes import (
     write_outline,
 )
 from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
-from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_result, require_result
+from SlicerUSSim.Logic.mrml.own_results import (
+    IMAGE,
+    OUTLINE,
+    REGISTRATION,
+    SEQUENCE,
+    mark_as_result,
+    may_replace_result,
+    require_result,
+)
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
@@ -502,7 +510,7 @@ class UltrasoundSceneLogic:
         was_modifying = output_node.StartModify()
         write_about(taken)
         write_image(output_node, taken.frame, probe_transform_node)
-        mark_as_result(output_node)
+        mark_as_result(output_node, IMAGE)
         output_node.EndModify(was_modifying)
         return taken.frame
 
@@ -627,14 +635,14 @@ class UltrasoundSceneLogic:
             image = self.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
             image.UnRegister(None)
             write_image(image, frame)
-            mark_as_result(image)  # the browser's node for the shown image is a copy
+            mark_as_result(image, IMAGE)  # the browser's node for the shown image is a copy
             images.append(image)
             if progress is not None:
                 progress((number + 1) / count)
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
 
         SequenceIndex.of_node(transforms_node).fill(images_node, images)
-        mark_as_result(images_node)
+        mark_as_result(images_node, SEQUENCE)
         if browser_node is not None:
             if not browser_node.IsSynchronizedSequenceNode(images_node, True):
                 browser_node.AddSynchronizedSequenceNode(images_node)
@@ -683,7 +691,7 @@ class UltrasoundSceneLogic:
         require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         require_result(model_node, "outline")
         write_outline(model_node, self.preset.probe, probe_transform_node)
-        mark_as_result(model_node)
+        mark_as_result(model_node, OUTLINE)
 
     def showInSlice(self, slice_node, output_node, probe_transform_node, fit: bool = True) -> None:
         """Move a slice view to the image plane and overlay the image."""
@@ -773,7 +781,7 @@ class UltrasoundSceneLogic:
         require_result(transform_node, "registration")
         to_world = self._fit_to_world(labels_node)
         set_node_to_world(transform_node, to_world @ registration.correction @ np.linalg.inv(to_world))
-        mark_as_result(transform_node)
+        mark_as_result(transform_node, REGISTRATION)
 
     def showFit(self, found: Fit, labels_node, nodes: Mapping[str, object], number: int | None = None) -> None:
         """Write one image of a fit, by default the first, into volume nodes: any of {"real": ..., "before": ...,
