@@ -428,6 +428,7 @@ def test_a_cine_keeps_time_and_begins_anew_with_another_size():
 #: Methods of Loading that buttons call
 LOADING = (
     "segment",
+    "undo_segment",
     "add_tissues",
     "accept_proposal",
     "place_probe",

@@ -252,3 +252,21 @@ def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page,
     page.wait_for_function("window.ussim.image?.patient === 'second.nii.gz'")
     settled(page)
     assert not errors(page)
+
+
+def test_the_last_segment_is_undone_on_the_page(page, files):
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    notes, before = shown(page, "notesLabel"), np.asarray(Image.open(download(page, "png")))
+    thin = shown(page, "thinSulciCheckBox")
+    page.evaluate("on => window.trame.trigger('set', ['thinSulciCheckBox', on])", not thin)
+    with new_image(page):
+        click(page, "#segmentButton")
+        eventually(page, lambda: shown(page, "notesLabel") != notes)
+    assert not np.array_equal(np.asarray(Image.open(download(page, "png"))), before)
+    with new_image(page):
+        click(page, "#undoSegmentButton")
+    assert np.array_equal(np.asarray(Image.open(download(page, "png"))), before) and shown(page, "notesLabel") == notes
+    page.evaluate("on => window.trame.trigger('set', ['thinSulciCheckBox', on])", thin)
+    settled(page)

@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.settings import GEL_MM
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
+from SlicerUSSim.Logic.mrml.labels_before import LabelsBefore
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
@@ -63,6 +64,18 @@ class TissueRow:
     sources: tuple[str, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class _BeforeSegment:
+    """What the last Segment replaced."""
+
+    labels: LabelsBefore
+    #: {role: chosen node}
+    nodes: dict[str, Any]
+    #: vtkPolyData of the sheets
+    sheets: Any
+    notes: tuple[str, ...]
+
+
 class PanelPresenter:
     """Operates on one scene for one view.
 
@@ -85,6 +98,7 @@ class PanelPresenter:
         #: The same of the sheets that were found in it
         self.sheetsFile: Callable[[Any], Path | None] = lambda mri_node: None
         self._busy = False
+        self._before_segment: _BeforeSegment | None = None
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
         #: Fits of simulated to real ultrasound
@@ -241,7 +255,12 @@ class PanelPresenter:
             mri = required(parameters.mri, "no MRI chosen, expected a scalar volume")
             if self._notes_of not in (None, mri.GetID()):  # also if this fails: they are about another patient
                 self.setNotes()
+            nodes, notes = (
+                {role: getattr(parameters, role) for role in ("labels", "mask", "sheets")},
+                tuple(self._notes),
+            )
             told = self._forget_other_brain(mri) + self._closed_again()
+            before = _BeforeSegment(self._labels_before(), nodes, _data_of(parameters.sheets), notes)
             others, untold = self._second_mri()
             kinds = parameters.sheet.kinds if parameters.sheet.find else ()
             own_sheets = parameters.sheets if kinds and self._are_own_sheets() else None
@@ -265,7 +284,44 @@ class PanelPresenter:
                 parameters.mask = brain = self.logic.writeBrain(result, mri)
                 told.append(f"the brain mask is {brain.GetName()!r}, which Segment uses from now on; edit it as needed")
             self._notes += [*told, *untold]
+            self._before_segment = before
         self.view.refresh()
+
+    def canUndoSegment(self) -> tuple[bool, str]:
+        """(whether the last Segment can be undone, the reason if not)"""
+        before, labels = self._before_segment, self.logic.parameters.labels
+        if self._busy:
+            return False, _BUSY
+        if before is None or labels is None:
+            return False, "Nothing was segmented since the scene was opened"
+        if not self.logic.mayReplace(labels):
+            return False, "The tissues were edited after Segment, and are kept"
+        return True, ""
+
+    def undoSegment(self) -> None:
+        """Go back to the tissues, mask, sheets and notes from before the last Segment."""
+        parameters = self.logic.parameters
+        with self.shown():
+            can, why_not = self.canUndoSegment()
+            require(can, why_not)
+            before = required(self._before_segment, why_not)
+            made: Any = parameters.labels
+            before.labels.restore()
+            for role, node in before.nodes.items():
+                setattr(parameters, role, None if node is None or node.GetScene() is None else node)
+            if before.sheets is not None and parameters.sheets is not None:
+                parameters.sheets.SetAndObservePolyData(before.sheets)
+            if made is not before.labels.node:
+                self.logic.scene.RemoveNode(made)
+            self._notes, self._notes_of, self._checks = list(before.notes), None, []
+            self._labels_said = None if parameters.labels is None else parameters.labels.GetID()
+            self._before_segment = None
+        self.view.refresh()
+
+    def _labels_before(self) -> LabelsBefore:
+        labels: Any = self.logic.parameters.labels
+        replaced = labels if labels is not None and self.logic.mayReplace(labels) else None
+        return LabelsBefore(replaced, self._preset().tissues)
 
     def _are_own_sheets(self) -> bool:
         """Whether the chosen sheets are of Segment, and not those that a user loaded."""
@@ -484,6 +540,7 @@ class PanelPresenter:
         """Release what is kept in memory of the last patient, with notes and fit; nodes stay."""
         self.logic.forgetPatient()
         self.fits.forget()
+        self._before_segment = None
         self.setNotes()
 
     def setNotes(self, *lines: str) -> None:
@@ -724,6 +781,10 @@ class PanelPresenter:
                 yield progress
         finally:
             self._busy = False
+
+
+def _data_of(model_node: Any) -> Any:
+    return None if model_node is None else model_node.GetPolyData()
 
 
 def _checks(warnings: Iterable[str]) -> list[str]:

@@ -31,6 +31,7 @@ class Buttons:
         #: By widget, and by name of the page's own buttons
         self._own_actions: dict[str, Callable[[], None]] = {
             "segmentButton": loading.segment,
+            "undoSegmentButton": loading.undo_segment,
             "addTissuesButton": loading.add_tissues,
             "acceptProposalButton": loading.accept_proposal,
             "openCraniotomyButton": loading.open_craniotomy,

@@ -57,6 +57,7 @@ class Loading:
         self._opener, self._presenter, self._messages = opener, presenter, messages
         self._views, self._probe, self._comparison = views, probe, comparison
         self._is_new = False  # a patient was opened, on whom the probe is not yet
+        self._source_before: LabelSource | None = None  # of the labels before the last Segment
         self._dropped = ""  # name of an MRI that was closed for labels that are not of it
 
     def begin(self, files: Files) -> None:
@@ -141,9 +142,24 @@ class Loading:
         others = {} if parameters.second_mri is None or contrast == "none" else {contrast: parameters.second_mri}
         lesions, organs = parameters.lesions, parameters.organs
         kinds = parameters.sheet.kinds if parameters.sheet.find else ()
+        before = self._opener.known_source(parameters.labels)
         if self._changed(self._presenter.segment):
+            self._source_before = before
             self._opener.segmented(parameters.labels, *inputs, others, lesions, kinds, organs)
             self._labels_ready()
+
+    def undo_segment(self) -> None:
+        """Go back to the tissues from before the last Segment."""
+        self._presenter.undoSegment()
+        labels: Any = self._logic.parameters.labels
+        if labels is None:
+            self._logic.clearImage(self._logic.parameters.output)
+            self._probe.forget_patient()
+            self._views.show_volume(self._logic.parameters.mri)
+        else:
+            self._opener.restored(self._source_before, labels)
+            self._labels_ready()
+        self.show_title()
 
     def add_tissues(self) -> None:
         """Lay the lesions over the tissues."""

@@ -280,6 +280,10 @@ class Opener:
         if source is not None and additions is not None:
             self._sources[_voxels_of(labels_node)] = replace(source, additions=additions)
 
+    def restored(self, source: LabelSource | None, labels_node) -> None:
+        """Record the source of labels that are those from before Segment again."""
+        self._sources = {} if source is None else {_voxels_of(labels_node): source}
+
     def opened(
         self, source: LabelSource | None, patient: str, labels_node, disc: tuple[float, np.ndarray] | None
     ) -> None:
