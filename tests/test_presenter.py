@@ -15,9 +15,9 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 
 from SlicerUSSim.Logic.base.declaration import Shown, parameter  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
-from SlicerUSSim.Logic.mrml.label_nodes import read_labels  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import read_volume, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.own_labels import content_of  # noqa: E402
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares  # noqa: E402
 from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
@@ -322,12 +322,13 @@ def _labels_of(labels_node, logic):
 def test_undo_of_the_first_segment_leaves_no_tissues_and_those_of_others_alone(presenter):
     parameters, scene = presenter.logic.parameters, presenter.logic.scene
     own = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "tumour of the user")
-    own.GetSegmentation().AddEmptySegment("tumour", "tumour")
-    parameters.labels = own
+    head = read_volume(parameters.mri)
+    write_labels(own, head.with_array((head.array > head.array.mean()).astype(np.uint8)), ["tumour"], parameters.mri)
+    parameters.labels, content = own, content_of(own)
     presenter.segment()
     made = parameters.labels
-    assert made is not own and own.GetSegmentation().GetSegmentIDs() == ("tumour",)
+    assert made is not own and content_of(own) == content
     presenter.undoSegment()
-    assert parameters.labels is own and made.GetScene() is None and own.GetSegmentation().GetSegmentIDs() == ("tumour",)
+    assert parameters.labels is own and made.GetScene() is None and content_of(own) == content
     presenter.undoSegment()
     assert "Nothing was segmented" in presenter.view.errors[-1]

@@ -80,7 +80,8 @@ def _inputs() -> tuple[Row, ...]:
                 enabled="canSegment",
             ),
             button(
-                "undoSegment", "Undo Segment", "Go back to tissues, mask, sheets and notes from before the last Segment",
+                "undoSegment", "Undo Segment",
+                "Go back to tissues, mask, sheets and notes from before the last Segment",
                 enabled="canUndoSegment",
             ),
             button(
