@@ -24,7 +24,7 @@ from SlicerUSSim.Logic.mrml.labels_before import LabelsBefore
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
-from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
 from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
 from SlicerUSSim.Logic.tissue.names import same_name
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -99,6 +99,7 @@ class PanelPresenter:
         self.sheetsFile: Callable[[Any], Path | None] = lambda mri_node: None
         self._busy = False
         self._before_segment: _BeforeSegment | None = None
+        self._custom_probe: Probe | None = None  # the last one that was none of PROBES
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
         #: Fits of simulated to real ultrasound
@@ -137,12 +138,23 @@ class PanelPresenter:
                 self.logic.preset = preset
 
     def chooseProbe(self, name: str) -> None:
-        """Select a probe of probe.PROBES by its name there or in the panel; CUSTOM_PROBE changes nothing."""
+        """Select a probe of probe.PROBES by its name there or in the panel.
+
+        CUSTOM_PROBE is the last one that was none of them; before there is one, it is said how to make it.
+        """
         with self.shown():
-            if name != CUSTOM_PROBE:
+            before = self._preset().probe
+            if self.probeName() == CUSTOM_PROBE:
+                self._custom_probe = before
+            if name == CUSTOM_PROBE:
+                probe = required(
+                    self._custom_probe, "there is no custom probe yet: change a value of this probe, and it is one"
+                )
+            else:
                 key = SHOWN_PROBES.get(name, name)
                 require(key in PROBES, f"no probe is called {name!r}, expected one of {', '.join(SHOWN_PROBES)}")
-                self.logic.preset = replace(self._preset(), probe=PROBES[key])
+                probe = PROBES[key]
+            self.logic.preset = replace(self._preset(), probe=probe)
         self.view.refresh()
 
     def probeName(self) -> str:

@@ -40,6 +40,8 @@ _IN_PAGE = {
     "savePresetButton": "window.ussim.save('json')",
     "loadPresetButton": "window.document.getElementById('open-file').click()",
 }
+#: What is at the top of the drawer
+_FIRST_SECTION, _FIRST_CONTROLS = "Ultrasound", ("gainSlider", "depthSlider")
 _LESION_TEXTS = {"brats": PAGE_SEVERAL}
 #: Colours of the marks beside the slice views' planes.
 _STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
@@ -107,12 +109,15 @@ def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
             options = "".join(f"<option>{plane}</option>" for plane in PLANES)
             html.Div(
                 f"""<select :value="{NAMES.views.planes}['{name}']" id="plane-{name}"
+                    aria-label="Plane of the {_STRIPES[name]} view"
                     @change="trigger('plane', ['{name}', $event.target.value])">{options}</select>"""
             )
         else:
-            with v3.VBtn(icon=True, size="x-small", variant="text", click="trigger('look')", id="look"):
+            with v3.VBtn(
+                icon=True, size="x-small", variant="text", click="trigger('look')", id="look",
+                title="Turn the camera to the probe", raw_attrs=['aria-label="Turn the camera to the probe"'],
+            ):  # fmt: skip
                 v3.VIcon("mdi-camera-flip-outline")
-                v3.VTooltip("Turn the camera to the probe", activator="parent")
 
 
 # ---- left ------------------------------------------------------------------------------------------------------------
@@ -122,7 +127,7 @@ def _drawer(sections: tuple[Section, ...]) -> None:
     html.Div("Ultrasound Simulator", classes="text-subtitle-1 px-4 pt-2")
     html.Div(f"{{{{ {NAMES.title} }}}}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
     with v3.VExpansionPanels(multiple=True, v_model=(NAMES.open_sections,), variant="accordion"):
-        for section in sections:
+        for section in _in_order(sections):
             with v3.VExpansionPanel(value=section.title):
                 v3.VExpansionPanelTitle(section.title, style="min-height: 36px; font-size: 13px")
                 with v3.VExpansionPanelText(eager=True, id=f"section-{section.title.replace(' ', '-').lower()}"):
@@ -135,6 +140,16 @@ def _drawer(sections: tuple[Section, ...]) -> None:
                         _pose_sliders()
                     if section.title.startswith("Fit"):
                         _cost_curve()
+
+
+def _in_order(sections: tuple[Section, ...]) -> list[Section]:
+    """The sections with what is used while one looks at the image first: gain and depth are not below the fold."""
+    ordered = sorted(sections, key=lambda section: section.title != _FIRST_SECTION)
+    first = list(ordered[0].controls) if ordered[0].title == _FIRST_SECTION else []
+    if first:
+        first.sort(key=lambda control: control.widget not in _FIRST_CONTROLS)
+        ordered[0] = Section(_FIRST_SECTION, True, tuple(first))
+    return ordered
 
 
 def _open_file() -> None:
@@ -202,7 +217,7 @@ def _control(control: Control) -> None:
             options = f"""<option v-for="item in {NAMES.panel.choices}.{name}">{{{{ item }}}}</option>"""
         html.Div(
             f"""<label for="{name}">{escape(control.label)}</label>
-            <select id="{name}" :value="{key} ?? ''"
+            <select id="{name}" :value="{key} ?? ''" aria-label="{escape(control.label or control.tip)}"
             @change="trigger('set', ['{name}', $event.target.value])">{options}</select>""",
             classes="ussim-line", title=control.tip,
         )  # fmt: skip
@@ -235,8 +250,8 @@ def _slider(
         html.Div(label)
         v3.VSlider(
             model_value=(f"{key} ?? {minimum}",), min=(minimum,), max=(maximum,), step=step, density="compact",
-            hide_details=True, thumb_size=12, track_size=2, disabled=(f"{key} === null",), id=f"slider-{name}",
-            update_modelValue=event,
+            name=label, hide_details=True, thumb_size=12, track_size=2, disabled=(f"{key} === null",),
+            id=f"slider-{name}", update_modelValue=event,
         )  # fmt: skip
         html.Div(f"{{{{ {key} === null ? '' : Number({key}).toFixed({decimals}) }}}} {unit}", classes="value")
 
@@ -295,16 +310,16 @@ def _tools() -> None:
     with html.Div(classes="ussim-tool"):
         with v3.VBtn(
             icon=True, size="small", variant="text", id="live",
+            title="Live or frozen", raw_attrs=['aria-label="Live"', f':aria-pressed="{live}"'],
             disabled=(f"{NAMES.panel.can}.liveCheckBox === false",),
             click=f"trigger('set', ['liveCheckBox', !{live}])", color=(f"{live} ? 'success' : undefined",),
         ):  # fmt: skip
             v3.VIcon(icon=(f"{live} ? 'mdi-play-circle' : 'mdi-snowflake'",))
-            v3.VTooltip("Live or frozen", activator="parent")
         v3.VSpacer()
         html.Div("Blend", classes="text-caption")
         v3.VSlider(
             v_model=(NAMES.views.blend,), min=0, max=1, step=0.05, density="compact", hide_details=True, thumb_size=12,
-            track_size=2, style="max-width: 90px", id="blend",
+            track_size=2, style="max-width: 90px; min-width: 60px", id="blend", name="Blend of image and MRI",
         )  # fmt: skip
         for state, name, icon, tip in (
             (NAMES.views.show_tissues, "show-tissues", "mdi-palette", "Colour the tissues in the slice views"),
@@ -313,10 +328,10 @@ def _tools() -> None:
         ):
             with v3.VBtn(
                 icon=True, size="small", variant="text", click=f"{state} = !{state}", id=name,
+                title=tip, raw_attrs=[f'aria-label="{tip}"', f':aria-pressed="{state}"'],
                 color=(f"{state} ? 'primary' : undefined",),
             ):  # fmt: skip
                 v3.VIcon(icon)
-                v3.VTooltip(tip, activator="parent")
         with v3.VMenu():
             with v3.Template(v_slot_activator="{ props }"):
                 v3.VBtn("Export", size="small", v_bind="props", prepend_icon="mdi-download", id="export")
@@ -367,11 +382,14 @@ def _player() -> None:
             title="Cost of the paper for the simulated and the real image; 0 if they are equal",
         )  # fmt: skip
     with html.Div(classes="ussim-bar", v_if=f"{length} > 0", id="player"):
-        with v3.VBtn(icon=True, size="x-small", variant="text", click="trigger('play')", id="play"):
+        with v3.VBtn(
+            icon=True, size="x-small", variant="text", click="trigger('play')", id="play",
+            raw_attrs=[f""":aria-label="{NAMES.sequence.playing} ? 'Stop the sequence' : 'Play the sequence'\""""],
+        ):  # fmt: skip
             v3.VIcon(icon=(f"{NAMES.sequence.playing} ? 'mdi-pause' : 'mdi-play'",))
         v3.VSlider(
             model_value=(number,), min=0, max=(f"Math.max({length} - 1, 1)",), step=1, density="compact",
-            hide_details=True, thumb_size=12, track_size=2, id="sequence-slider",
+            hide_details=True, thumb_size=12, track_size=2, id="sequence-slider", name="Image of the sequence",
             update_modelValue="trigger('show_number', [$event])",
         )  # fmt: skip
         html.Div(f"{{{{ {number} + 1 }}}} of {{{{ {length} }}}}", style="white-space: nowrap", id="sequence-text")

@@ -20,6 +20,7 @@
       add(tick, "line", { x2: (text ? 0.9 : 0.45) * us.size });
       if (text) add(tick, "text", { x: 1.2 * us.size, y: 0.35 * us.size, "font-size": us.size, stroke: "none" }, text);
     }
+    if (us.focus > us.y + us.h) return; // below the image, where other things are
     const shape = `M 0 ${us.focus} l ${-0.9 * us.size} ${-0.5 * us.size} v ${us.size} z`;
     const focus = add(group, "path", { id: "focus-mark", d: shape, fill: "#ffc83d", stroke: "none" });
     add(focus, "title", {}, "Transmit focus");
@@ -37,10 +38,21 @@
     add(bar, "text", { y: 0.3 * us.h + us.size, "font-size": 0.8 * us.size }, `−${us.range}`);
   }
 
+  const LEAST_PX = 11; // of letters, however small the image is
+
+  let drawn = null; // the last ruler, drawn anew for another size on the screen
+
   // Draws what belongs to an image; without a ruler there is none.
-  window.ussimOverlay = (svg, us) => {
+  window.ussimOverlay = (svg, ruler) => {
+    drawn = ruler;
     svg.replaceChildren();
-    if (!us) return;
+    if (!ruler) return;
+    if (!svg.dataset.observed) {
+      svg.dataset.observed = "1";
+      new ResizeObserver(() => window.ussimOverlay(svg, drawn)).observe(svg);
+    }
+    const shownPx = svg.clientHeight || 1;
+    const us = { ...ruler, size: Math.max(ruler.size, (LEAST_PX * ruler.h) / shownPx) };
     svg.setAttribute("viewBox", `${us.x} ${us.y} ${us.w} ${us.h}`);
     add(svg, "rect", { x: us.x, y: us.y, width: us.w, height: us.h, fill: "transparent" });
     const side = { id: "orientation-mark", transform: `translate(${us.x + 1.2 * us.size} ${us.y + 1.2 * us.size})` };

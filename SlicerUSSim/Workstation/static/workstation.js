@@ -83,8 +83,16 @@
       : "Move the probe with the mouse to measure latency";
   }
 
-  const isWriting = (element) =>
-    element && (element.isContentEditable || ["INPUT", "TEXTAREA", "SELECT"].includes(element.tagName));
+  // Whether a key belongs to the focused element: all of a field for text, those that change a slider or a choice.
+  const NOT_TEXT = ["checkbox", "radio", "button", "submit", "file", "range"];
+  const CHANGES = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End", "PageUp", "PageDown", " ", "Enter"];
+  function isTaken(key, element) {
+    if (!element?.closest) return false;
+    const isText = element.tagName === "INPUT" && !NOT_TEXT.includes(element.type);
+    if (isText || element.isContentEditable || element.tagName === "TEXTAREA") return true;
+    const hasValue = element.closest("select, input[type=range], [role=slider], [role=menu], [role=listbox], [role=dialog]");
+    return Boolean(hasValue) && CHANGES.includes(key);
+  }
 
   // The time of a mouse event is sent to the server just before the event itself.
   window.addEventListener(
@@ -97,7 +105,7 @@
     { capture: true, passive: true },
   );
   window.addEventListener("keydown", (event) => {
-    if (isWriting(event.target) || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (event.ctrlKey || event.altKey || event.metaKey || isTaken(event.key, event.target)) return;
     const keys = canvasOf("simulated")?.dataset.keys.split(" ") ?? [];
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (!keys.includes(key)) return;
@@ -123,6 +131,13 @@
     }
   };
 
+  // For screen readers, what trame's own parts lack: names of the rendered views, and leave to zoom.
+  function nameViews() {
+    for (const image of document.querySelectorAll("img.image-display-area:not([alt])")) image.alt = "View of the anatomy";
+    const viewport = document.querySelector("meta[name=viewport]");
+    if (viewport?.content.includes("maximum-scale")) viewport.content = "width=device-width, initial-scale=1";
+  }
+
   function connect() {
     const connection = session();
     if (!connection || !window.trame?.state || !canvasOf("simulated")) {
@@ -133,6 +148,7 @@
     workstation.connected = true;
     window.trame.trigger("page_opened");
     setInterval(showLatency, 300);
+    setInterval(nameViews, 1000);
   }
   connect();
 })();
