@@ -195,7 +195,7 @@ def _control(control: Control) -> None:
         if kind == "number" and none_at is not None:  # an empty field, and not a number that means it
             limits += ' placeholder="none"'
             shown = f"{key} === null || {key} <= {none_at:.10g} ? '' : +Number({key}).toFixed({control.decimals})"
-            value = f"$event.target.value === '' ? {none_at:.10g} : Number($event.target.value)"
+            value = "$event.target.value === '' ? null : Number($event.target.value)"
         html.Div(
             f"""<label for="{name}">{escape(control.label)}{unit}</label>
             <input type="{kind}" id="{name}" {limits}

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Widget.controls import Control, Section, by_widget, part_of, shown_by, usable
+from SlicerUSSim.Widget.controls import Control, Section, by_widget, part_of, shown_by, usable, value_parameter
 from SlicerUSSim.Widget.presenter import PanelPresenter, TissueRow
 from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.observed import Observed
@@ -166,6 +166,13 @@ class BrowserPanel:
 
     def _changed(self, control: Control, value: Any) -> None:
         presenter, parameters = self.presenter, self._logic.parameters
+        none_at = control.range.none_at
+        if control.kind == "number" and none_at is not None:
+            if value is None:  # an empty field
+                value = none_at
+            elif isinstance(value, int | float) and value <= none_at:  # a number that stands for none, but was typed
+                self._refuse(control, value)
+                return
         if value == self._shown_value(control):
             return
         if control.value:
@@ -176,6 +183,16 @@ class BrowserPanel:
         else:
             part_of(presenter, control.action)(value)
         self.refresh()
+
+    def _refuse(self, control: Control, value: float) -> None:
+        """Say that a number is out of the range of its parameter."""
+        declared = value_parameter(control.value)
+        whole = int(value) if float(value).is_integer() else value
+        with self.presenter.shown():
+            declared.checked(control.value.split(".")[0], whole)
+            raise SimulationError(
+                f"{declared.name} is {whole}, expected more than {control.range.none_at:g}, or nothing"
+            )
 
     # ---- helpers -----------------------------------------------------------------------------------------------
 
