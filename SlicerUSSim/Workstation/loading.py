@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.messages import Messages
-from SlicerUSSim.Workstation.opener import Files, Opener
+from SlicerUSSim.Workstation.opener import Files, Opener, Upload
 from SlicerUSSim.Workstation.patient_nodes import remove_patient_nodes
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.script import LabelSource
@@ -102,25 +103,42 @@ class Loading:
         Nothing changes if it cannot be read. An MRI or a label map takes the place of the patient before, of whom no
         lesions, notes and messages stay.
         """
-        with self._presenter.shown(), self._opener.uploaded(files) as upload:
-            path, kind = upload.path, upload.kind
-            if kind == "preset":
-                self._logic.preset = Preset.read(path)
-            elif kind == "sequence":
-                self._take_sequence(self._tasks.do(lambda: TrackedSequence.read(path)), Path(path).name.split(".")[0])
-            elif kind == "sheets":
-                self._logic.parameters.sheets = self._opener.sheets(path)
-            elif kind == "labels":
-                node, found = self._opener.labels(path, upload.table)
-                kept = self._mri_of(found.labels)
+        with self._presenter.shown(), ExitStack() as sent:
+            with self._presenter.view.progress(f"Open {', '.join(files)}"):
+                upload = sent.enter_context(self._opener.uploaded(files))
+                take = self._read(upload)
+            take()
+
+    def _read(self, upload: Upload) -> Callable[[], None]:
+        """Read what a page has sent, and return what takes it, without anything that can fail or be cancelled."""
+        path = upload.path
+        if upload.kind == "preset":
+            preset = Preset.read(path)
+            return lambda: setattr(self._logic, "preset", preset)
+        if upload.kind == "sequence":
+            sequence, name = self._tasks.doAside(lambda: TrackedSequence.read(path)), Path(path).name.split(".")[0]
+            return lambda: self._take_sequence(sequence, name)
+        if upload.kind == "sheets":
+            sheets = self._opener.sheets(path)
+            return lambda: setattr(self._logic.parameters, "sheets", sheets)
+        if upload.kind == "labels":
+            node, found = self._opener.labels(path, upload.table)
+            kept = self._mri_of(found.labels)
+
+            def take_labels() -> None:
                 self._messages.clear()
                 self._forget_patient(node, *kept)
                 self._take_labels(node, found, kept)
-            else:
-                node = self._opener.mri(path)
-                self._messages.clear()
-                self._take_mri(node)
-                self.segment()
+
+            return take_labels
+        mri = self._opener.mri(path)
+
+        def take_mri() -> None:
+            self._messages.clear()
+            self._take_mri(mri)
+            self.segment()
+
+        return take_mri
 
     def add(self, name: str, content: bytes, tissue: str) -> None:
         """Add a mask sent by a page to the lesions, and lay them over the tissues."""
@@ -293,7 +311,7 @@ class Loading:
         if mri is None:
             return []
         volume = read_volume(mri)
-        if self._tasks.do(lambda: follows(volume, labels)):
+        if self._tasks.doAside(lambda: follows(volume, labels)):
             return [mri]
         self._dropped = mri.GetName()
         return []

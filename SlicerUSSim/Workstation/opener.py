@@ -123,7 +123,7 @@ class Opener:
 
     def mri(self, path: str | None):
         """A volume node with the MRI of a file, or with the demo brain."""
-        volume = self._tasks.do(lambda: demo_mri()[0]) if path is None else self._volume(path)
+        volume = self._tasks.doAside(lambda: demo_mri()[0]) if path is None else self._volume(path)
         name = "MNI152 brain" if path is None else Path(path).name
         node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
         write_volume(node, volume)
@@ -146,7 +146,7 @@ class Opener:
 
     def sheets(self, path: str):
         """A model node with the sheets of a .vtp."""
-        surfels = self._tasks.do(lambda: read_surfels(path))
+        surfels = self._tasks.doAside(lambda: read_surfels(path))
         node = self._scene.AddNewNodeByClass("vtkMRMLModelNode", Path(path).name)
         node.SetAndObservePolyData(as_polydata(surfels))
         node.SetAttribute(FILE, self._place(path))
@@ -157,7 +157,7 @@ class Opener:
         """(label map node with the organs of a CT, what was recognised) of a file."""
         volume, table = self._volume(path), TissueTable({})
         mapping = LabelMapping.of(maps, table)
-        found = self._tasks.do(lambda: read_label_file(Path(path), volume, mapping, default=table, advice=PAGE))
+        found = self._tasks.doAside(lambda: read_label_file(Path(path), volume, mapping, default=table, advice=PAGE))
         return self._label_map(found.labels, path, found.names), replace(found, message=self._as_known(found.message))
 
     def second_mri(self, path: str):
@@ -195,7 +195,7 @@ class Opener:
             beside = None if mapping else table_beside(Path(path))
         # A table that came with other labels was not chosen for these, whose numbers mean something else.
         is_chosen = mine.names() not in (Preset().tissues.names(), self._names_of_table)
-        found = self._tasks.do(
+        found = self._tasks.doAside(
             lambda: read_label_file(
                 Path(path), volume, mapping, table=beside, preset=mine if is_chosen else None, default=mine, advice=PAGE
             )
@@ -318,7 +318,7 @@ class Opener:
     def sequence(self, sequence: TrackedSequence, name: str):
         """(TrackedImages, sequence browser node, sequence node of the images)."""
         files, preset = self._files, self._logic.preset
-        tracked = self._tasks.do(
+        tracked = self._tasks.doAside(
             lambda: TrackedImages.of(
                 sequence, path=files.transform, reference_to_ras=files.to_ras, beam=preset.probe,
                 probe=preset.probe if files.preset is not None else None,
@@ -415,7 +415,7 @@ class Opener:
 
     def _volume(self, path: str) -> Volume:
         """The volume of a file, read once."""
-        return self._volumes.pop(path, None) or self._tasks.do(lambda: Volume.read(path))
+        return self._volumes.pop(path, None) or self._tasks.doAside(lambda: Volume.read(path))
 
     def _mask(self, path: str) -> Volume:
         """The same of a mask, with the names of its labels."""

@@ -9,6 +9,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from greenlet import getcurrent, greenlet
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
 from SlicerUSSim.Logic.mrml.fitting_nodes import fits
@@ -57,7 +58,8 @@ class BrowserPanel:
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
         #: Called when live images may have ended, or begun to wait for other work
         self.frozen_changed: Callable[[], None] = lambda: None
-        self._cancelled = False
+        #: Whether the work under way is cancelled, and the task that does it
+        self._under_way: tuple[threading.Event, greenlet] | None = None
         self._status, self._status_until = "", 0.0
         self._table: Any = None  # vtkMRMLTableNode with the costs of a fit
         self._costs = Observed("ModifiedEvent", self._show_costs)
@@ -129,7 +131,8 @@ class BrowserPanel:
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:
-        self._cancelled = False
+        is_cancelled = threading.Event()  # of this work alone: what is abandoned goes on to hear of it
+        before, self._under_way = self._under_way, (is_cancelled, getcurrent())
         reported_percent = 0
         with self._shared.changing() as now:
             now.messages.progress_title, now.messages.progress_percent = title, reported_percent
@@ -137,23 +140,28 @@ class BrowserPanel:
         def report(share: float) -> None:
             nonlocal reported_percent
             percent = int(100 * share)
+            if is_cancelled.is_set():
+                raise Cancelled
             if percent != reported_percent:
                 reported_percent = percent
                 self._in_loop(lambda: self._send_percent(percent))
-            if self._cancelled:
-                raise Cancelled
 
         try:
             yield report
         finally:
+            self._under_way = before
             with self._shared.changing() as now:
                 now.messages.progress_title = ""
 
     # ---- triggers of the page ----------------------------------------------------------------------------------
 
     def cancel(self) -> None:
-        """Stop the work under way."""
-        self._cancelled = True
+        """Stop the work under way, within a second."""
+        under_way = self._under_way
+        if under_way is not None:
+            is_cancelled, waiting = under_way
+            is_cancelled.set()
+            self._tasks.abandonSoon(waiting, lambda: self._under_way is under_way, self._logic.renewSimulator)
 
     def set(self, name: str, value: Any) -> None:
         """Called when the user changes the value of a control."""

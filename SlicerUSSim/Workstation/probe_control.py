@@ -140,7 +140,7 @@ class ProbeControl:
         self._surface_version = version
         volume = read_labels(labels, self._logic.preset.tissues).labels
         placed = Volume(volume.array, node_to_world(labels) @ volume.ijk_to_ras)
-        self.surface = self._tasks.do(lambda: PatientSurface(placed))
+        self.surface = self._tasks.doAside(lambda: PatientSurface(placed))
         self._views.show_surface(self.surface)
         self.show_tissues(self._shared.now.views.show_tissues)
         self._tell()

@@ -569,6 +569,10 @@ class UltrasoundSceneLogic:
         if output_node.GetImageData() is not None:
             remove_image(output_node)
 
+    def renewSimulator(self) -> None:
+        """Make images with another simulator from now on: work that was abandoned may still use the one of before."""
+        self._simulators = ReusedSimulator()
+
     def forgetPatient(self) -> None:
         """Release what is kept in memory of the last patient; nodes stay."""
         self.stopLiveUpdate()
