@@ -63,7 +63,7 @@ def serving(*arguments: str):
     )  # fmt: skip
     try:
         url = server.stdout.readline().strip()
-        assert url.startswith("http://"), server.stderr.read()
+        assert url.startswith("http"), server.stderr.read()
         yield url
         assert server.poll() is None, server.stderr.read()
     finally:
