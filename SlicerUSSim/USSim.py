@@ -188,6 +188,8 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
             self.addObserver(scene, event, self.onSceneStartChange)
         for event in (scene.EndCloseEvent, scene.EndImportEvent):
             self.addObserver(scene, event, self.onSceneEndChange)
+        self.addObserver(scene, scene.NodeAboutToBeRemovedEvent, self.onNodeAboutToBeRemoved, priority=1000.0)
+        self.addObserver(scene, scene.NodeRemovedEvent, self.onNodeRemoved)
 
     def cleanup(self) -> None:
         """Called when the application closes or the module is reloaded."""
@@ -212,6 +214,17 @@ class USSimWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
         """Called just after the scene was closed or imported; connects the panel to it."""
         if self.parent.isEntered:
             self.initializeParameterNode()
+
+    @vtk.calldata_type(vtk.VTK_OBJECT)
+    def onNodeAboutToBeRemoved(self, caller, event, node) -> None:
+        """Called before node selectors hear of a removal; these then choose the next node."""
+        if self.panel is not None:
+            self.panel.nodeGoes(node)
+
+    def onNodeRemoved(self, caller, event) -> None:
+        """Called after a node was removed."""
+        if self.panel is not None:
+            self.panel.nodeGone()
 
     def initializeParameterNode(self) -> None:
         """Ensure that the scene has a parameter node and that the panel shows it."""

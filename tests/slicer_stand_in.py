@@ -15,6 +15,7 @@ from pathlib import Path
 
 import slicer
 from PySide6 import QtCore, QtGui, QtWidgets
+from vtkmodules.vtkCommonCore import VTK_OBJECT
 
 # ---- CTK and MRML widgets --------------------------------------------------------------------------------------------
 
@@ -38,6 +39,16 @@ class CollapsibleButton(QtWidgets.QGroupBox):
 
     text = QtCore.Property(str, lambda self: self.title(), lambda self, text: self.setTitle(text))
     collapsed = QtCore.Property(bool, lambda self: self._collapsed, setCollapsed)
+
+
+def _with_node(method):
+    """An observer whose event comes with a node."""
+
+    def observer(_subject, _event, node) -> None:
+        method(node)
+
+    observer.CallDataType = VTK_OBJECT
+    return observer
 
 
 class SliderWidget(QtWidgets.QWidget):
@@ -90,25 +101,61 @@ class SliderWidget(QtWidgets.QWidget):
     suffix = QtCore.Property(str, lambda self: self._box.suffix(), lambda self, v: self._box.setSuffix(v))
 
 
+class NodeFilter(QtCore.QObject):
+    """qMRMLSortFilterProxyModel: which nodes a selector leaves out."""
+
+    def __init__(self, selector: NodeComboBox) -> None:
+        super().__init__(selector)
+        self._selector, self.hidden = selector, []
+
+    def _hide(self, ids) -> None:
+        self.hidden = list(ids)
+        self._selector._fill()
+
+    hiddenNodeIDs = QtCore.Property("QStringList", lambda self: self.hidden, _hide)  # noqa: N815
+
+
 class NodeComboBox(QtWidgets.QComboBox):
-    """qMRMLNodeComboBox: the nodes of some classes in a scene."""
+    """qMRMLNodeComboBox: the nodes of some classes in a scene.
+
+    Without the current node it chooses the next one, as Qt's combo boxes do when a row is removed, and tells it as if
+    the user had chosen it.
+    """
 
     currentNodeChanged = QtCore.Signal(object)  # noqa: N815
 
     def __init__(self, parent=None) -> None:
         super().__init__(parent)
         self._scene, self._types, self._nodes, self._filling = None, [], [], False
-        self._options = {}
+        self._options, self._filter = {}, NodeFilter(self)
         self.setSizePolicy(QtWidgets.QSizePolicy.Expanding, QtWidgets.QSizePolicy.Fixed)
         self.currentIndexChanged.connect(self._changed)
 
     def setMRMLScene(self, scene) -> None:
         self._scene = scene
         scene.AddObserver(scene.NodeAddedEvent, lambda *_: self._fill())
-        scene.AddObserver(scene.NodeRemovedEvent, lambda *_: self._fill())
+        scene.AddObserver(scene.NodeAboutToBeRemovedEvent, _with_node(self._remove))
         self._fill()
 
+    def sortFilterProxyModel(self) -> NodeFilter:
+        return self._filter
+
+    def _remove(self, node) -> None:
+        """qMRMLSceneModel removes the row before the node is gone."""
+        if node in getattr(self, "_nodes", ()):  # not of one that Qt has deleted
+            at, was_current = self._nodes.index(node), self.currentNode() is node
+            del self._nodes[at]
+            was = self.blockSignals(True)
+            self.removeItem(at)
+            if was_current:
+                self.setCurrentIndex(min(at, len(self._nodes) - 1))
+            self.blockSignals(was)
+            if was_current and not self.signalsBlocked():
+                self.currentNodeChanged.emit(self.currentNode())
+
     def _fill(self) -> None:
+        if self._scene is None:
+            return
         before = self.currentNode()
         self._filling = True
         self.clear()
@@ -116,14 +163,15 @@ class NodeComboBox(QtWidgets.QComboBox):
         self.addItem("None")
         count = self._scene.GetNumberOfNodes()
         for node in (self._scene.GetNthNode(n) for n in range(count)):
-            if node.GetClassName() in self._types:
+            is_hidden = node.GetHideFromEditors() or node.GetID() in self._filter.hidden
+            if node.GetClassName() in self._types and not is_hidden:
                 self._nodes.append(node)
                 self.addItem(node.GetName())
         self._filling = False
         at = self._nodes.index(before) if before in self._nodes else 0
-        self.blockSignals(True)
+        was = self.blockSignals(True)
         self.setCurrentIndex(at)
-        self.blockSignals(False)
+        self.blockSignals(was)
         if self.currentNode() is not before:
             self.currentNodeChanged.emit(self.currentNode())
 

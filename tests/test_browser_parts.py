@@ -77,8 +77,7 @@ from SlicerUSSim.Workstation.panel import BrowserPanel  # noqa: E402
 from SlicerUSSim.Workstation.state import (  # noqa: E402
     NAMES,
     ComparisonMode,
-    DepthTick,
-    ImageGeometry,
+    NodeItem,
     PageState,
     SharedState,
     TissueLine,
@@ -271,10 +270,13 @@ def test_what_control_writes_the_page_has_under_its_name_and_the_other_way_round
     shared.on_change(NAMES.sequence.comparison, seen.append)
     with shared.changing() as now:
         now.panel.tissues = [TissueLine("csf", ["1"], ["a book"])]
-        now.image = ImageGeometry(w=3.0, ticks=[DepthTick(1.0, "")])
-    assert state[NAMES.panel.tissues][0]["values"] == ["1"] and state[NAMES.image]["ticks"][0]["y"] == 1.0
+        now.panel.nodes = {"mriSelector": [NodeItem("head", "1")]}
+    assert (
+        state[NAMES.panel.tissues][0]["values"] == ["1"]
+        and state[NAMES.panel.nodes]["mriSelector"][0]["title"] == "head"
+    )
     assert shared.now.panel.tissues == [TissueLine("csf", ["1"], ["a book"])]
-    assert shared.now.image == ImageGeometry(w=3.0, ticks=[DepthTick(1.0, "")])
+    assert shared.now.panel.nodes == {"mriSelector": [NodeItem("head", "1")]}
     with state:  # as a page does
         state[NAMES.views.blend] = 1
         state[NAMES.sequence.comparison] = "Blink"
@@ -367,7 +369,8 @@ def test_what_the_page_does_otherwise_is_there_to_be_done_otherwise():
     names = set(controls.by_widget(panel_sections()))
     assert names.issuperset(page_of.NOT_SHOWN | set(page_of._IN_PAGE))
     loading = SimpleNamespace(**dict.fromkeys(LOADING))
-    assert names.issuperset(Buttons(None, None, None, panel_sections(), loading)._own_actions)
+    own = set(Buttons(None, None, None, panel_sections(), loading)._own_actions)
+    assert names.issuperset(own - {"closePatient"})
 
 
 def test_only_what_assembles_everything_knows_the_page():
@@ -439,6 +442,7 @@ def test_a_cine_keeps_time_and_begins_anew_with_another_size():
 #: Methods of Loading that buttons call
 LOADING = (
     "segment",
+    "undo_segment",
     "add_tissues",
     "accept_proposal",
     "place_probe",

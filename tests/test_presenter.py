@@ -15,8 +15,12 @@ slicer = pytest.importorskip("slicer", reason="MRML nodes come with slicer-core:
 
 from SlicerUSSim.Logic.base.declaration import Shown, parameter  # noqa: E402
 from SlicerUSSim.Logic.mri.samples import head_mri  # noqa: E402
+from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
-from SlicerUSSim.Logic.mrml.nodes import write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.nodes import read_volume, write_volume  # noqa: E402
+from SlicerUSSim.Logic.mrml.own_labels import content_of  # noqa: E402
+from SlicerUSSim.Logic.mrml.share_nodes import read_shares  # noqa: E402
+from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
 from SlicerUSSim.Logic.probe.arrays import PROBE_KINDS, PROBES, LinearProbe  # noqa: E402
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS  # noqa: E402
 from SlicerUSSim.Widget.controls import by_widget, part_of, shown_by, usable  # noqa: E402
@@ -275,3 +279,56 @@ def test_lesions_leave_the_checks_of_the_tissues_under_them_in_the_notes(present
     write_volume(parameters.labels, whole_head())
     presenter.addTissues()  # over the tissues of another patient, which were not simulated yet
     assert "tumour: " in presenter.notes() and checks[0] not in presenter.notes()
+
+
+def test_an_image_that_does_not_follow_the_probe_is_said_to_be_frozen(presenter):
+    presenter.segment()
+    presenter.setValue("probe.scan_lines", 48)
+    presenter.setLive(True)
+    output, probe = presenter.logic.parameters.output, presenter.logic.parameters.probe_transform
+    assert output.GetParentTransformNode() is probe
+    presenter.setLive(False)
+    assert presenter.view.status[-1].startswith("FROZEN: Head, ") and output.GetParentTransformNode() is None
+    presenter.simulate()
+    assert output.GetParentTransformNode() is None and is_frozen(output)
+    assert about_image(output)["patient"] == "Head"
+
+
+@pytest.mark.parametrize("label_maps", [False, True])
+def test_the_last_segment_can_be_undone(presenter, label_maps):
+    presenter._label_maps = label_maps
+    logic, parameters = presenter.logic, presenter.logic.parameters
+    assert presenter.canUndoSegment() == (False, "Nothing was segmented since the scene was opened")
+    presenter.segment()
+    first, labels, notes = content_of(parameters.labels), parameters.labels, presenter.notes()
+    shares = read_shares(labels, *_labels_of(labels, logic))
+    presenter.setValue("scene.thin_sulci", not presenter.value("scene.thin_sulci"))
+    presenter.segment()
+    assert parameters.labels is labels and content_of(labels) != first
+    assert presenter.canUndoSegment() == (True, "")
+    presenter.undoSegment()
+    assert parameters.labels is labels and content_of(labels) == first and presenter.notes() == notes
+    assert patient_of(labels) == "Head" and logic.mayReplace(labels)
+    again = read_shares(labels, *_labels_of(labels, logic))
+    np.testing.assert_array_equal(again.second_label, shares.second_label)
+    assert not presenter.canUndoSegment()[0] and not presenter.view.errors
+
+
+def _labels_of(labels_node, logic):
+    found = read_labels(labels_node, logic.preset.tissues)
+    return found.labels, found.names
+
+
+def test_undo_of_the_first_segment_leaves_no_tissues_and_those_of_others_alone(presenter):
+    parameters, scene = presenter.logic.parameters, presenter.logic.scene
+    own = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "tumour of the user")
+    head = read_volume(parameters.mri)
+    write_labels(own, head.with_array((head.array > head.array.mean()).astype(np.uint8)), ["tumour"], parameters.mri)
+    parameters.labels, content = own, content_of(own)
+    presenter.segment()
+    made = parameters.labels
+    assert made is not own and content_of(own) == content
+    presenter.undoSegment()
+    assert parameters.labels is own and made.GetScene() is None and content_of(own) == content
+    presenter.undoSegment()
+    assert "Nothing was segmented" in presenter.view.errors[-1]

@@ -6,6 +6,7 @@ import gc
 import json
 import weakref
 from dataclasses import fields, replace
+from datetime import datetime, timezone
 from itertools import pairwise
 
 import numpy as np
@@ -37,6 +38,7 @@ from SlicerUSSim.Logic.mrml.label_nodes import write_labels  # noqa: E402
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic  # noqa: E402
 from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world, pose_in_labels, set_node_to_world, write_volume  # noqa: E402
 from SlicerUSSim.Logic.mrml.parameter_node import VALUE_PARAMETERS  # noqa: E402
+from SlicerUSSim.Logic.mrml.taken_image import about_image, is_frozen, patient_of  # noqa: E402
 from SlicerUSSim.Logic.probe.placement import pose_in_slice  # noqa: E402
 from tests.conftest import FLUID, SPECKLE, block, example, rigid  # noqa: E402
 
@@ -975,3 +977,100 @@ def test_the_example_builds_a_scene_and_saves_it_so_that_it_opens(mni, tmp_path,
     assert nodes.mri.GetImageData().GetDimensions() == (197, 233, 189)
     assert nodes.labels.GetSegmentation().GetNumberOfSegments() == 4
     assert nodes.output.GetParentTransformNode() is nodes.probe_transform and pixels(nodes.output).mean() > 10
+
+
+# ---- what an image is of ---------------------------------------------------------------------------------------------
+
+
+def test_an_image_says_whose_it_is_and_how_and_when_it_was_taken(bench):
+    before = datetime.now(timezone.utc)
+    bench.labels.SetAttribute("SlicerUSSim.patient", "somebody.nii.gz")
+    bench.simulate()
+    about = about_image(bench.image)
+    assert about["patient"] == "somebody.nii.gz" and Preset.from_dict(about["preset"]) == bench.logic.preset
+    np.testing.assert_allclose(about["probe_to_ras"], ABOVE)
+    assert abs((datetime.fromisoformat(about["time"]) - before).total_seconds()) < 60.0
+    assert about_image(bench.labels) == {}
+
+
+def test_segment_names_the_patient_after_the_mri():
+    bench = Bench()
+    mri = volume_node(bench.scene, head_mri(4.0), "head of somebody")
+    tissues = add(bench.scene, "LabelMapVolume", "out")
+    bench.logic.segment(mri, tissues, skull_strip="none")
+    assert patient_of(tissues) == "head of somebody" and patient_of(bench.labels) == "tissues"
+
+
+def test_a_frozen_image_stays_where_it_was_taken(bench, tmp_path):
+    """Under the probe's transform it was shown where the probe had been moved to."""
+    loop = Loop()
+    bench.live(schedule=loop)
+    assert bench.image.GetTransformNodeID() == bench.probe.GetID() and not is_frozen(bench.image)
+    taken = node_to_world(bench.image) @ ijk_to_ras(bench.image)
+    put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 0, 3]))  # of which no image was made before the end
+    bench.logic.stopLiveUpdate()
+    loop.run()
+    put(bench.probe, ABOVE @ rigid(np.eye(3), [4, 0, 3]))
+    assert is_frozen(bench.image) and bench.image.GetTransformNodeID() is None
+    np.testing.assert_allclose(node_to_world(bench.image) @ ijk_to_ras(bench.image), taken, atol=1e-9)
+    np.testing.assert_allclose(bench.logic.lastImage().ijk_to_ras, taken, atol=1e-9)
+    np.testing.assert_allclose(about_image(bench.image)["probe_to_ras"], ABOVE, atol=1e-6)
+    bench.live(schedule=loop)  # and follows again
+    assert bench.image.GetTransformNodeID() == bench.probe.GetID() and not is_frozen(bench.image)
+
+
+def test_an_image_that_another_logic_makes_now_is_not_frozen(bench):
+    bench.live(schedule=Loop())
+    other = UltrasoundSceneLogic(bench.scene)
+    put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 0, 3]))
+    other.startLiveUpdate(bench.labels, bench.probe, bench.image, schedule=Loop())
+    assert not bench.logic.isLive and other.isLive and bench.image.GetTransformNodeID() == bench.probe.GetID()
+    other.stopLiveUpdate()
+
+
+@pytest.mark.parametrize("is_live", [False, True])
+def test_a_simulation_that_fails_leaves_no_old_image(bench, is_live):
+    loop = Loop()
+    bench.live(schedule=loop) if is_live else bench.simulate()
+    assert bench.image.GetImageData() is not None
+    put(bench.probe, np.diag([2.0, 1, 1, 1]))
+    if is_live:
+        assert loop.run() == 1 and bench.logic.isLive
+    else:
+        with pytest.raises(SimulationError, match="not rigid"):
+            bench.simulate()
+    assert bench.image.GetImageData() is None and bench.logic.taken is None and about_image(bench.image) == {}
+    with pytest.raises(SimulationError, match="there is no image"):
+        bench.logic.lastImage()
+    put(bench.probe, ABOVE)
+    loop.run() if is_live else bench.simulate()
+    np.testing.assert_array_equal(pixels(bench.image), expected(ABOVE))
+
+
+def test_a_simulation_that_is_cancelled_leaves_no_old_image(bench, monkeypatch):
+    bench.simulate()
+
+    def cancelled(*_, **__):
+        raise Cancelled
+
+    monkeypatch.setattr(UltrasoundSimulator, "simulate", cancelled)
+    with pytest.raises(Cancelled):
+        bench.simulate()
+    assert bench.image.GetImageData() is None and bench.logic.taken is None
+
+
+def test_an_image_without_tissue_is_known_as_such(bench):
+    bench.simulate()
+    assert not bench.logic.taken.is_empty
+    put(bench.probe, ABOVE @ rigid(np.eye(3), [0, 500, 0]))
+    bench.logic.simulate(bench.labels, bench.probe, bench.image, warned=lambda warning: None)
+    assert bench.logic.taken.is_empty
+
+
+def test_a_patient_is_forgotten(bench):
+    bench.simulate()
+    kept = weakref.ref(bench.logic._simulators._simulator)
+    bench.logic.clearImage(bench.image)
+    bench.logic.forgetPatient()
+    gc.collect()
+    assert kept() is None and bench.logic.taken is None and bench.image.GetImageData() is None

@@ -1050,3 +1050,67 @@ def test_a_scene_loaded_while_the_panel_is_open_is_shown(session, tmp_path):
     assert [s.currentNode() and s.currentNode().GetName() for s in shown] == ["Head", "Head tissues", "Probe"]
     assert ui.gainSlider.property("value") == 9.0 and ui.contrastComboBox.currentText() == "t2"
     assert session.parameters.labels is ui.labelsSelector.currentNode() and not session.app.errors
+
+
+# ---- nothing of others is taken or overwritten -----------------------------------------------------------------------
+
+
+def offered(selector) -> list[str]:
+    return [selector.itemText(n) for n in range(selector.count())]
+
+
+def test_selectors_offer_only_what_fits(session):
+    session.segmented()
+    session.ui.simulateButton.click()
+    flair = session.add("ScalarVolume", "FLAIR")
+    session.logic_module("mrml.nodes").write_volume(flair, session.logic_module("mri.samples").head_mri(6.0))
+    surface = session.add("Model", "skin")
+    surface.SetAndObservePolyData(session.parameters.outline.GetPolyData())
+    for name in ("Red Volume Slice", "Yellow Volume Slice"):
+        session.add("Model", name)
+    session.add("LinearTransform", "Red Slice Transform")
+    session.add("ScalarVolume", "empty")
+    session.panel.refresh()
+    ui = session.ui
+    assert offered(ui.mriSelector) == ["None", "Head", "FLAIR", "empty"]  # no ultrasound
+    assert offered(ui.secondMriSelector) == ["None", "Head", "FLAIR", "empty"]
+    assert offered(ui.outputSelector) == ["None", "Ultrasound", "empty"]
+    assert offered(ui.outlineSelector) == ["None", "Ultrasound outline"]
+    assert offered(ui.sheetsSelector) == ["None", "skin"]
+    assert offered(ui.probeTransformSelector) == ["None", "Probe"]
+
+
+def test_deleting_the_output_while_live_ends_live_and_takes_no_other_volume(session):
+    """Slicer's selector goes on to the next node: live images were then written into the FLAIR of the patient."""
+    session.segmented()
+    session.ui.liveCheckBox.setChecked(True)
+    own = session.add("ScalarVolume", "another image of this module")
+    session.logic.simulate(session.parameters.labels, session.parameters.probe_transform, own)
+    kept = slicer.util.arrayFromVolume(own).copy()
+    flair = session.head()
+    before = slicer.util.arrayFromVolume(flair).copy()
+    session.panel.refresh()
+    assert session.logic.isLive and offered(session.ui.outputSelector)[1:] == ["Ultrasound", own.GetName()]
+    session.scene.RemoveNode(session.parameters.output)
+    session.process()
+    assert not session.logic.isLive and not session.ui.liveCheckBox.isChecked()
+    assert session.parameters.output is None and session.ui.outputSelector.currentNode() is None
+    session.move(5)
+    session.process()
+    assert (slicer.util.arrayFromVolume(flair) == before).all() and (slicer.util.arrayFromVolume(own) == kept).all()
+    assert not session.app.errors
+    session.ui.liveCheckBox.setChecked(True)
+    assert session.parameters.output not in (None, own, flair)
+
+
+def test_the_stand_in_for_the_selector_goes_on_to_the_next_node_as_slicers_does(module):
+    scene = slicer.vtkMRMLScene()
+    selector = stand_in.NodeComboBox()
+    selector.nodeTypes = ["vtkMRMLScalarVolumeNode"]
+    selector.setMRMLScene(scene)
+    first, second = (scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name) for name in ("first", "second"))
+    chosen = []
+    selector.setCurrentNode(first)
+    selector.currentNodeChanged.connect(chosen.append)
+    scene.RemoveNode(first)
+    assert chosen == [second] and selector.currentNode() is second

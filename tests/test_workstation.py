@@ -63,7 +63,7 @@ def serving(*arguments: str):
     )  # fmt: skip
     try:
         url = server.stdout.readline().strip()
-        assert url.startswith("http://"), server.stderr.read()
+        assert url.startswith("http"), server.stderr.read()
         yield url
         assert server.poll() is None, server.stderr.read()
     finally:
@@ -361,7 +361,7 @@ def shown_errors(page: Page) -> str:
 def test_the_page_shows_image_ruler_focus_marks_and_the_anatomy_around_the_probe(page):
     image = pixels(page)
     assert image.shape[0] == 512 and image.mean() > 15
-    us = state(page, NAMES.image)
+    us = page.evaluate("window.ussim.image.ruler")
     assert us["h"] == pytest.approx(70, rel=0.02)  # the depth of the sequence's probe
     for mark in ("depth-ruler", "focus-mark", "orientation-mark", "grey-bar"):
         assert page.locator(f"#{mark}").bounding_box()["width"] > 0
@@ -723,7 +723,9 @@ def test_images_are_exported_as_they_are_seen_with_their_place(page):
     (nrrd, to_ras), (mha, to_ras_mha) = arrays[:2]
     assert np.array_equal(nrrd[0], png) and np.array_equal(mha[0], png) and np.allclose(to_ras, to_ras_mha, atol=1e-4)
     assert np.array_equal(arrays[2].array[0], png) and np.allclose(arrays[2].ijk_to_ras, to_ras, atol=1e-4)
-    assert np.linalg.norm(to_ras[:3, 0]) == pytest.approx(state(page, NAMES.image)["w"] / png.shape[1], rel=1e-4)
+    assert np.linalg.norm(to_ras[:3, 0]) == pytest.approx(
+        page.evaluate("window.ussim.image.ruler.w") / png.shape[1], rel=1e-4
+    )
 
 
 def test_the_script_gives_the_same_image_pixel_by_pixel(page, tmp_path):
@@ -1076,7 +1078,7 @@ def test_an_opened_patient_takes_the_place_of_title_notes_and_warnings(page, fil
     notes = opened_as(tmp_path / "crop.nii.gz")
     assert "crop.nii.gz: FreeSurfer aseg: 8 labels to 3 tissues" in notes and "share" not in notes
     assert "Check: crop.nii.gz: a part of a brain of 1048 ml, cut off at the front" in notes
-    assert "Check: the MRI head.nii.gz was deselected: its intensities do not follow the labels" in notes
+    assert "Check: the MRI head.nii.gz was closed: its intensities do not follow the labels" in notes
     assert shown(page, "mriSelector") is None
     assert errors(page) == [line.removeprefix("Check: ") for line in notes.splitlines() if "cut off" in line]
     assert "/tmp" not in as_shown() and str(tmp_path) not in as_shown()

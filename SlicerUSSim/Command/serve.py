@@ -28,6 +28,8 @@ from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.mri.settings import CT, SegmentationSettings
 
 if TYPE_CHECKING:
+    import ssl
+
     from trame_server import Server
 
 _PORT = 8080
@@ -58,8 +60,10 @@ _PORT = 8080
     "--host",
     default="127.0.0.1",
     show_default=True,
-    help="Address to listen at. Except on the loopback interface, access requires the token in the printed URL.",
+    help="Address to listen at. Access requires the token in the printed URL.",
 )
+@click.option("--cert", type=click.Path(), help="TLS certificate (PEM) for https; with --key. For --host.")
+@click.option("--key", type=click.Path(), help="Its private key (PEM), without a password.")
 @click.option(
     "--igtl",
     help="HOST:PORT of a tracker that sends TRANSFORM messages over OpenIGTLink and receives the images. :PORT waits "
@@ -89,6 +93,8 @@ def serve(
     no_sheets: tuple[str, ...],
     port: int | None,
     host: str,
+    cert: str | None,
+    key: str | None,
     igtl: str | None,
     igtl_device: str | None,
     device: str | None,
@@ -140,6 +146,8 @@ def serve(
         from SlicerUSSim.Logic.tracked.openigtlink import parse_address, require_usable
 
         require_usable(parse_address(igtl))
+    require((cert is None) == (key is None), "--cert and --key are for each other, expected both or none")
+    tls = _tls(cert, key)
     port = _usable_port(host, port)
 
     from SlicerUSSim.Logic.base.volume import Volume
@@ -186,7 +194,7 @@ def serve(
         ),
         device,
     )  # fmt: skip
-    _run(workstation.server, host, port)
+    _run(workstation.server, host, port, tls)
 
 
 def _require_opening(path: str) -> None:
@@ -207,21 +215,35 @@ def _require_workstation() -> None:
             raise SimulationError(f'the workstation needs {name}; install it with: pip install "SlicerUSSim[serve]"')
 
 
-def _run(server: Server | None, host: str, port: int) -> None:
+def _tls(cert: str | None, key: str | None) -> ssl.SSLContext | None:
+    if cert is None or key is None:
+        return None
+    from SlicerUSSim.Workstation.access import tls_context
+
+    return tls_context(cert, key)
+
+
+def _run(server: Server | None, host: str, port: int, tls: ssl.SSLContext | None) -> None:
     """Print the URL and serve until the command is interrupted."""
     import secrets
     import socket
 
-    from SlicerUSSim.Workstation.access import guard, is_loopback
+    from SlicerUSSim.Workstation.access import guard
 
     assert server is not None  # the declared result of trame's get_server includes None
-    token = "" if is_loopback(host) else secrets.token_urlsafe(24)
-    server.controller.on_server_bind.add(lambda wslink: guard(wslink.app, token))
+    token = secrets.token_urlsafe(24)
+
+    def bind(wslink: Any) -> None:
+        guard(wslink.app, token, host)
+        if tls is not None:
+            wslink.config["ssl"] = tls
+
+    server.controller.on_server_bind.add(bind)
 
     def tell(**_: Any) -> None:
         shown = host if host not in ("0.0.0.0", "::") else socket.gethostname()
         shown = f"[{shown}]" if ":" in shown else shown
-        click.echo(f"http://{shown}:{server.port}/" + (f"?token={token}" if token else ""))
+        click.echo(f"http{'' if tls is None else 's'}://{shown}:{server.port}/?token={token}")
 
     server.controller.on_server_ready.add(tell)
     server.start(port=port, host=host, open_browser=False, show_connection_info=False, disable_logging=True, timeout=0)

@@ -69,6 +69,11 @@ class FitPresenter:
         #: Result of the last fit, as text
         self.summary = ""
 
+    def forget(self) -> None:
+        """Forget the last fit, which is of another patient."""
+        self._fit = self._before = None
+        self.summary = ""
+
     # ---- free parameters ---------------------------------------------------------------------------------------
 
     def freeParameters(self) -> list[tuple[str, bool]]:

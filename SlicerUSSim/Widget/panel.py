@@ -13,6 +13,7 @@ import qt
 import slicer
 
 from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, required
+from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
 from SlicerUSSim.Widget.controls import Control, by_widget, part_of, shown_by, usable
@@ -50,6 +51,7 @@ class Panel:
         self._rows: list[TissueRow] = []
         self._blinking = False
         self._picking: tuple[Any, int] | None = None  # markups node and observer
+        self._removed: Any = None  # node that is being removed from the scene
         #: Controls with their widgets
         self._controls = [(control, getattr(self.ui, name)) for name, control in by_widget(sections).items()]
         #: Actions of buttons that use widgets or dialogs of the panel
@@ -133,6 +135,7 @@ class Panel:
                 widget.setEnabled(can)
                 widget.setToolTip(tip)
             if control.node:
+                self._offer_fitting(control, widget)
                 with _silent(widget):
                     widget.setCurrentNode(getattr(self.logic.parameters, control.node))
             elif control.value:
@@ -142,6 +145,16 @@ class Panel:
                     self._show(widget, value)
             elif control.shows:
                 self._show(widget, shown_by(presenter, control.shows))
+
+    def _offer_fitting(self, control: Control, widget: Any) -> None:
+        """Hide the nodes of a selector's classes that do not fit its role."""
+        nodes = {node.GetID(): node for name in control.node_classes for node in nodes_of_class(self.logic.scene, name)}
+        chosen = getattr(self.logic.parameters, control.node)
+        hidden = [key for key, node in nodes.items() if node is not chosen and not fits(control.node, node)]
+        model = widget.sortFilterProxyModel()
+        if list(model.property("hiddenNodeIDs")) != hidden:
+            with _silent(widget):
+                model.setProperty("hiddenNodeIDs", hidden)
 
     # ---- connections -------------------------------------------------------------------------------------------
 
@@ -174,8 +187,20 @@ class Panel:
         return slot
 
     def _choose_node(self, control: Control, widget: Any) -> None:
+        chosen = widget.currentNode()
+        if self._removed is not None and getattr(self.logic.parameters, control.node) is self._removed:
+            chosen = None  # the selector went on to the next node, which the user did not choose
         with self.presenter.shown():
-            setattr(self.logic.parameters, control.node, widget.currentNode())
+            setattr(self.logic.parameters, control.node, chosen)
+
+    def nodeGoes(self, node: Any) -> None:
+        """Called before a node is removed from the scene, and before its selectors hear of it."""
+        self._removed = node
+
+    def nodeGone(self) -> None:
+        """Called after a node was removed from the scene."""
+        self._removed = None
+        self.refresh()
 
     def _set_value(self, control: Control, widget: Any) -> None:
         self.presenter.setValue(control.value, widget.property(_property_of(widget)))

@@ -19,10 +19,12 @@ from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError, require, r
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.segmentation import Segmentation
 from SlicerUSSim.Logic.mri.settings import GEL_MM
+from SlicerUSSim.Logic.mrml.fitting_nodes import fits
+from SlicerUSSim.Logic.mrml.labels_before import LabelsBefore
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, nodes_of_class
 from SlicerUSSim.Logic.mrml.parameter_node import BY_LOOK
-from SlicerUSSim.Logic.probe.arrays import PROBES
+from SlicerUSSim.Logic.probe.arrays import PROBES, Probe
 from SlicerUSSim.Logic.probe.beam import TRANSMIT_OF
 from SlicerUSSim.Logic.tissue.names import same_name
 from SlicerUSSim.Logic.tissue.presets import TISSUES
@@ -41,6 +43,8 @@ _OPENED = "craniotomy: "
 _VIEW = "view: "
 #: Begin of the lines about a proposal
 _PROPOSED = "proposal: "
+#: What is said of an image that does not follow the probe any more
+FROZEN = "FROZEN"
 _BUSY = "Wait until the work under way is done"
 #: Columns of the tissue table: parameter, heading, tool tip.
 TISSUE_COLUMNS = tuple(
@@ -58,6 +62,18 @@ class TissueRow:
     values: tuple[float, ...]
     #: Sources of the values
     sources: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _BeforeSegment:
+    """What the last Segment replaced."""
+
+    labels: LabelsBefore
+    #: {role: chosen node}
+    nodes: dict[str, Any]
+    #: vtkPolyData of the sheets
+    sheets: Any
+    notes: tuple[str, ...]
 
 
 class PanelPresenter:
@@ -82,6 +98,8 @@ class PanelPresenter:
         #: The same of the sheets that were found in it
         self.sheetsFile: Callable[[Any], Path | None] = lambda mri_node: None
         self._busy = False
+        self._before_segment: _BeforeSegment | None = None
+        self._custom_probe: Probe | None = None  # the last one that was none of PROBES
         self._last_image: float | None = None
         self._followed: tuple = ()  # the nodes of the live update
         #: Fits of simulated to real ultrasound
@@ -120,12 +138,23 @@ class PanelPresenter:
                 self.logic.preset = preset
 
     def chooseProbe(self, name: str) -> None:
-        """Select a probe of probe.PROBES by its name there or in the panel; CUSTOM_PROBE changes nothing."""
+        """Select a probe of probe.PROBES by its name there or in the panel.
+
+        CUSTOM_PROBE is the last one that was none of them; before there is one, it is said how to make it.
+        """
         with self.shown():
-            if name != CUSTOM_PROBE:
+            before = self._preset().probe
+            if self.probeName() == CUSTOM_PROBE:
+                self._custom_probe = before
+            if name == CUSTOM_PROBE:
+                probe = required(
+                    self._custom_probe, "there is no custom probe yet: change a value of this probe, and it is one"
+                )
+            else:
                 key = SHOWN_PROBES.get(name, name)
                 require(key in PROBES, f"no probe is called {name!r}, expected one of {', '.join(SHOWN_PROBES)}")
-                self.logic.preset = replace(self._preset(), probe=PROBES[key])
+                probe = PROBES[key]
+            self.logic.preset = replace(self._preset(), probe=probe)
         self.view.refresh()
 
     def probeName(self) -> str:
@@ -182,6 +211,11 @@ class PanelPresenter:
 
     # ---- actions -----------------------------------------------------------------------------------------------
 
+    @property
+    def isBusy(self) -> bool:
+        """Whether work is under way for which live images wait."""
+        return self._busy
+
     def canSegment(self) -> tuple[bool, str]:
         """(whether Segment is enabled, the reason if not)"""
         if self._busy:
@@ -233,7 +267,12 @@ class PanelPresenter:
             mri = required(parameters.mri, "no MRI chosen, expected a scalar volume")
             if self._notes_of not in (None, mri.GetID()):  # also if this fails: they are about another patient
                 self.setNotes()
+            nodes, notes = (
+                {role: getattr(parameters, role) for role in ("labels", "mask", "sheets")},
+                tuple(self._notes),
+            )
             told = self._forget_other_brain(mri) + self._closed_again()
+            before = _BeforeSegment(self._labels_before(), nodes, _data_of(parameters.sheets), notes)
             others, untold = self._second_mri()
             kinds = parameters.sheet.kinds if parameters.sheet.find else ()
             own_sheets = parameters.sheets if kinds and self._are_own_sheets() else None
@@ -257,7 +296,44 @@ class PanelPresenter:
                 parameters.mask = brain = self.logic.writeBrain(result, mri)
                 told.append(f"the brain mask is {brain.GetName()!r}, which Segment uses from now on; edit it as needed")
             self._notes += [*told, *untold]
+            self._before_segment = before
         self.view.refresh()
+
+    def canUndoSegment(self) -> tuple[bool, str]:
+        """(whether the last Segment can be undone, the reason if not)"""
+        before, labels = self._before_segment, self.logic.parameters.labels
+        if self._busy:
+            return False, _BUSY
+        if before is None or labels is None:
+            return False, "Nothing was segmented since the scene was opened"
+        if not self.logic.mayReplace(labels):
+            return False, "The tissues were edited after Segment, and are kept"
+        return True, ""
+
+    def undoSegment(self) -> None:
+        """Go back to the tissues, mask, sheets and notes from before the last Segment."""
+        parameters = self.logic.parameters
+        with self.shown():
+            can, why_not = self.canUndoSegment()
+            require(can, why_not)
+            before = required(self._before_segment, why_not)
+            made: Any = parameters.labels
+            before.labels.restore()
+            for role, node in before.nodes.items():
+                setattr(parameters, role, None if node is None or node.GetScene() is None else node)
+            if before.sheets is not None and parameters.sheets is not None:
+                parameters.sheets.SetAndObservePolyData(before.sheets)
+            if made is not before.labels.node:
+                self.logic.scene.RemoveNode(made)
+            self._notes, self._notes_of, self._checks = list(before.notes), None, []
+            self._labels_said = None if parameters.labels is None else parameters.labels.GetID()
+            self._before_segment = None
+        self.view.refresh()
+
+    def _labels_before(self) -> LabelsBefore:
+        labels: Any = self.logic.parameters.labels
+        replaced = labels if labels is not None and self.logic.mayReplace(labels) else None
+        return LabelsBefore(replaced, self._preset().tissues)
 
     def _are_own_sheets(self) -> bool:
         """Whether the chosen sheets are of Segment, and not those that a user loaded."""
@@ -472,6 +548,13 @@ class PanelPresenter:
             return []
         return [f"gel fills gaps of up to {GEL_MM:g} mm between skin and probe (Gel on the skin)"] if is_there else []
 
+    def forgetPatient(self) -> None:
+        """Release what is kept in memory of the last patient, with notes and fit; nodes stay."""
+        self.logic.forgetPatient()
+        self.fits.forget()
+        self._before_segment = None
+        self.setNotes()
+
     def setNotes(self, *lines: str) -> None:
         """Replace them by lines about another patient, whose labels are chosen; by none, to forget them."""
         labels: Any = self.logic.parameters.labels
@@ -507,6 +590,8 @@ class PanelPresenter:
             self.logic.showOutline(nodes.outline, nodes.probe_transform)
             if self.view.sliceNode() is not None:
                 self.logic.showInSlice(self.view.sliceNode(), nodes.output, nodes.probe_transform)
+            if not self.logic.isLive:
+                self.logic.holdImage(nodes.output)
         self.view.refresh()
 
     def _say_labels(self, labels: Any) -> None:
@@ -561,7 +646,7 @@ class PanelPresenter:
         if parameters.mri is not None:
             return
         for node in nodes_of_class(self.logic.scene, "vtkMRMLScalarVolumeNode"):
-            if not node.IsA("vtkMRMLLabelMapVolumeNode") and node not in (parameters.output, parameters.real):
+            if fits("mri", node) and node not in (parameters.output, parameters.real):
                 parameters.mri = node
                 return
 
@@ -681,7 +766,8 @@ class PanelPresenter:
         self._last_image = now
 
     def _stopped(self) -> None:
-        self.view.showStatus("")
+        taken = self.logic.taken
+        self.view.showStatus("" if taken is None else f"{FROZEN}: {taken.patient}, {taken.time[11:19]} UTC")
         self.view.refresh()
 
     @contextmanager
@@ -707,6 +793,10 @@ class PanelPresenter:
                 yield progress
         finally:
             self._busy = False
+
+
+def _data_of(model_node: Any) -> Any:
+    return None if model_node is None else model_node.GetPolyData()
 
 
 def _checks(warnings: Iterable[str]) -> list[str]:

@@ -80,6 +80,11 @@ def _inputs() -> tuple[Row, ...]:
                 enabled="canSegment",
             ),
             button(
+                "undoSegment", "Undo Segment",
+                "Go back to tissues, mask, sheets and notes from before the last Segment",
+                enabled="canUndoSegment",
+            ),
+            button(
                 "addTissues", "Add to tissues",
                 "Lay the lesions over these tissues; tissues that were not made by Segment, or edited since, are kept: "
                 "the result is then a new node",

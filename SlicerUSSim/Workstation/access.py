@@ -1,12 +1,19 @@
-"""Access to the workstation: only from pages of this server, and from other computers only with the token."""
+"""Access to the workstation: only from pages of this server, and only with the token; see docs/security.md."""
 
 from __future__ import annotations
 
 import hmac
+import logging
+import ssl
 from html import escape
+from pathlib import Path
 from urllib.parse import urlsplit
 
 from aiohttp import web
+
+from SlicerUSSim.Logic.base.errors import SimulationError, require
+
+_log = logging.getLogger(__name__)
 
 _LOOPBACK = {"127.0.0.1", "localhost", "::1"}
 #: Of every answer. Vue compiles the page's templates in the browser, which needs eval; images are data and blobs
@@ -29,31 +36,59 @@ def is_loopback(host: str) -> bool:
     return host in _LOOPBACK
 
 
-def guard(app: web.Application, token: str) -> None:
-    """Refuse requests from pages of other sites and, if there is a `token`, requests without it.
+def tls_context(certificate: str, key: str) -> ssl.SSLContext:
+    """The TLS of a server. Raises SimulationError for files that are no certificate with its key (both PEM)."""
+    for path in (certificate, key):
+        require(Path(path).is_file(), f"{path}: no such file")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(certificate, key, password="")  # rather an error than a question in the terminal
+    except (OSError, ValueError) as error:  # of which SSLError is one
+        raise SimulationError(
+            f"{certificate}, {key}: expected a certificate and its key without a password, both PEM ({error})"
+        ) from None
+    return context
+
+
+def guard(app: web.Application, token: str, host: str) -> None:
+    """Refuse requests from pages of other sites, and those without the token.
 
     The token is first part of the URL and then a cookie, so that requests for the page's files and its web socket carry
-    it too, and the address without it is shown. Without a token the server is on loopback; requests by another host
-    name are then refused as well, since another site can make a name of its own resolve to this computer (DNS
-    rebinding).
+    it too, and the address without it is shown. It is asked on loopback, too, where other users of the computer can
+    connect. There, requests by another host name are refused as well, since another site can make a name of its own
+    resolve to this computer (DNS rebinding).
+
+    Parameters
+    ----------
+    host : at which the server listens.
     """
-    app.middlewares.append(_checker(token))
+    app.middlewares.append(_checker(token, is_loopback(host)))
 
 
-def _checker(token: str):
+def _checker(token: str, is_local: bool):
     @web.middleware
     async def check(request: web.Request, handler):
-        reason = _objection(request, token)
+        reason = _objection(request, token, is_local)
         if reason:
             text = _REFUSED.format(reason=reason)
             return web.Response(status=403, text=text, content_type="text/html", headers=_HEADERS)
-        if token and "token" in request.query and request.path in ("/", "/index.html"):
+        if "token" in request.query and request.path in ("/", "/index.html"):
             # Out of the address bar, the history and what is shown of the screen
             plain = request.rel_url.with_query([pair for pair in request.query.items() if pair[0] != "token"])
             answer = web.HTTPSeeOther(str(plain), headers=_HEADERS)
-            answer.set_cookie(_cookie(request), token, httponly=True, samesite="Strict")
+            answer.set_cookie(_cookie(request), token, httponly=True, samesite="Strict", secure=request.secure)
             return answer
-        response = await handler(request)
+        is_socket = request.path.rstrip("/").endswith("/ws")
+        if is_socket and not web.WebSocketResponse().can_prepare(request):
+            return web.Response(status=400, text="expected a web socket", headers=_HEADERS)
+        try:
+            response = await handler(request)
+        except web.HTTPException as answer:
+            answer.headers.update(_HEADERS)
+            raise
+        except Exception as error:  # wslink's, of a client that did not keep to its protocol or has gone
+            _log.info("a request for %s failed: %s: %s", request.path[:80], type(error).__name__, error)
+            return web.Response(status=400, text="the request was not understood", headers=_HEADERS)
         if not response.prepared:
             response.headers.update(_HEADERS)
         return response
@@ -66,15 +101,18 @@ def _cookie(request: web.Request) -> str:
     return f"ussim_token_{request.url.port}"
 
 
-def _objection(request: web.Request, token: str) -> str:
-    host = urlsplit(f"//{request.host}")
+def _objection(request: web.Request, token: str, is_local: bool) -> str:
     origin = request.headers.get("Origin")
-    if origin is not None and urlsplit(origin).netloc != host.netloc:
+    try:
+        host = urlsplit(f"//{request.host}")
+        from_where = None if origin is None else urlsplit(origin).netloc
+        name = host.hostname or ""
+    except ValueError:
+        return "The request was not understood."
+    if from_where is not None and from_where != host.netloc:
         return "The request came from a page of another site."
-    if not token:
-        if not is_loopback(host.hostname or ""):
-            return f"The host is {escape(request.host[:80])}, expected 127.0.0.1."
-        return ""
+    if is_local and not is_loopback(name):
+        return f"The host is {escape(request.host[:80])}, expected 127.0.0.1."
     given = request.query.get("token", request.cookies.get(_cookie(request), ""))
     if not hmac.compare_digest(given.encode(), token.encode()):
         return "The token is missing or wrong. Use the URL that <code>ussim serve</code> printed."

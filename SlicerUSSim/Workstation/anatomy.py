@@ -26,7 +26,8 @@ from vtkmodules.vtkCommonExecutionModel import vtkTrivialProducer
 
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
-from SlicerUSSim.Logic.mrml.nodes import composite_of, display_of, node_called, read_volume, show_in_slice, write_slice
+from SlicerUSSim.Logic.mrml.nodes import composite_of, display_of, node_called, show_in_slice, write_slice
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.probe.shape import field_polydata, probe_polydata
 from SlicerUSSim.Logic.probe.surface import PatientSurface
@@ -43,6 +44,8 @@ _RESIZED_S = 0.05
 _LAYOUT = "Anatomy"
 #: Names of the nodes for display; they are not saved with the scene.
 _PATIENT, _BODY, _FIELD, _SEEN = "Patient surface", "Probe body", "Ultrasound field", "Ultrasound as shown"
+#: Name of the transform of what is shown of the image: the pose at which it was taken, which the probe may have left
+_POSE = "Pose of the image"
 _SKIN_COLOR, _BODY_COLOR, _RIDGE_COLOR = (0.92, 0.8, 0.72), (0.82, 0.86, 0.9), (1.0, 0.62, 0.18)
 
 
@@ -63,6 +66,7 @@ class AnatomyViews:
         self._followed: tuple[np.ndarray, Probe] | None = None  # probe_to_world
         self._held: SliceView | None = None
         self._fitted: set[str] = set()
+        self._volume_id: str | None = None
         self._blend = 1.0
         self._image = vtkTrivialProducer()
         self._image.SetOutput(Volume(np.zeros((1, 2, 2), np.uint8), np.eye(4)).to_vtk())  # until the first image
@@ -86,6 +90,7 @@ class AnatomyViews:
         for view in (self.threed, *self.slices):
             view.render_window().SetMultiSamples(0)
         for view in self.slices:
+            self._stand_in_plane(view)
             view.interactor().AddObserver(vtkCommand.WindowResizeEvent, self._on_resize(view))
         _node(self.threed).SetUseDepthPeeling(False)
         self.threed.renderer().SetUseDepthPeeling(False)
@@ -113,11 +118,40 @@ class AnatomyViews:
         return self._app.view_manager.get_threed_views()[0]
 
     def show_volume(self, volume_node) -> None:
-        """Show an MRI in the slice views, at full extent."""
-        for view in self.slices:
-            view.set_background_volume_id(None if volume_node is None else volume_node.GetID())
-            view.fit_view_to_content()
+        """Show an MRI in the slice views, at full extent; those that follow the probe are empty until it is there."""
+        self._volume_id = None if volume_node is None else volume_node.GetID()
         self._fitted.clear()
+        self._followed = None
+        for view in self.slices:
+            is_there = self._stand_in_plane(view)
+            view.set_background_volume_id(self._volume_id if is_there else None)
+            if is_there:
+                view.fit_view_to_content()
+
+    def _stand_in_plane(self, view: SliceView) -> bool:
+        """Turn a view to its anatomical plane, as it is called on the page; whether it has one."""
+        plane = self.planes[view.get_singleton_tag()]
+        if plane in (IN_PLANE, ACROSS):
+            return False
+        _node(view).SetOrientation(plane)
+        return True
+
+    def hide_patient(self) -> None:
+        """Show no patient, and no probe, until the next one is there."""
+        self.show_volume(None)
+        self.show_labels(None, False)
+        self.hide_image()
+        for name in (_PATIENT, _BODY):
+            display_of(self._model(name)).SetVisibility(False)
+        self._model(_PATIENT).SetAndObservePolyData(None)
+        self.threed.schedule_render()
+
+    def hide_image(self) -> None:
+        """Show no image in the views."""
+        for view in self.slices:
+            view.set_foreground_volume_id(None)
+        display_of(self._model(_FIELD)).SetVisibility(False)
+        self.threed.schedule_render()
 
     def show_surface(self, surface: PatientSurface) -> None:
         """Show the patient in 3D."""
@@ -126,16 +160,17 @@ class AnatomyViews:
         display = display_of(model)
         display.SetColor(*_SKIN_COLOR)
         display.SetOpacity(0.45)
+        display.SetVisibility(True)
         display.SetVisibility2D(False)
         display.SetBackfaceCulling(True)
 
     def show_probe(self, probe: Probe, transform_node) -> None:
-        """Show the probe's body, and its imaged field with the image as texture, under the probe's transform."""
+        """Show the probe's body under its transform, and prepare its imaged field, which has the image as texture."""
         body, field = self._model(_BODY), self._model(_FIELD)
         body.SetAndObservePolyData(probe_polydata(probe))
         field.SetAndObservePolyData(field_polydata(probe))
-        for model in (body, field):
-            model.SetAndObserveTransformNodeID(transform_node.GetID())
+        body.SetAndObserveTransformNodeID(transform_node.GetID())
+        field.SetAndObserveTransformNodeID(self._pose.GetID())
         colors = node_called(self._app.scene, "ColorTable", _BODY)
         colors.SetSaveWithScene(False)
         colors.SetTypeToUser()
@@ -148,6 +183,7 @@ class AnatomyViews:
         display.SetScalarRangeFlag(display.UseManualScalarRange)
         display.SetScalarRange(0.0, 1.0)
         display.SetScalarVisibility(True)
+        display.SetVisibility(True)
         display.SetVisibility2D(True)
         display.SetSliceIntersectionThickness(1)
         display = display_of(field)
@@ -158,16 +194,17 @@ class AnatomyViews:
         display.SetVisibility2D(False)
         self._fitted.clear()
 
-    def show_image(self, volume_node, field: np.ndarray) -> None:
-        """Show the current image of a volume node, in 3D and blended into the slice views.
+    def show_image(self, taken: TakenImage, field: np.ndarray) -> None:
+        """Show an image where it was taken, in 3D and blended into the slice views.
 
         `field` (rows, columns) bool is the imaged field; outside it the MRI is unchanged.
         """
-        volume = read_volume(volume_node)
+        image = taken.frame.image
         # A copy without zeros inside the field, so that the threshold removes only the pixels outside.
-        seen = volume.with_array(np.where(field, np.maximum(volume.array, 1), 0).astype(np.uint8))
-        shown = self._seen
-        write_slice(shown, seen, volume_node.GetParentTransformNode())
+        seen = np.where(field, np.maximum(image, 1), 0).astype(np.uint8)
+        shown, pose = self._seen, self._pose
+        pose.SetMatrixTransformToParent(vtk_matrix(taken.probe_to_world))
+        write_slice(shown, Volume(seen[None], taken.frame.grid.slice_to_probe), pose)
         if self._image.GetOutputDataObject(0) is not shown.GetImageData():
             self._image.SetOutput(shown.GetImageData())
             display = display_of(shown)
@@ -175,6 +212,7 @@ class AnatomyViews:
             display.SetAutoThreshold(False)
             display.SetThreshold(1, 255)
             display.SetApplyThreshold(True)
+        display_of(self._model(_FIELD)).SetVisibility(True)
         for view in self.slices:
             if view.get_foreground_volume_id() != shown.GetID():
                 view.set_foreground_volume_id(shown.GetID())
@@ -210,6 +248,11 @@ class AnatomyViews:
         """Choose the plane of a slice view."""
         self.planes[name] = plane
         self._fitted.discard(name)
+        if self._followed is not None:
+            self.follow(*self._followed)
+            return
+        view = next(view for view in self.slices if view.get_singleton_tag() == name)
+        view.set_background_volume_id(self._volume_id if self._stand_in_plane(view) else None)
 
     def follow(self, probe_to_world: np.ndarray, probe: Probe) -> None:
         """Move the slice views to the current pose of the probe, (4, 4) probe_to_world."""
@@ -234,9 +277,11 @@ class AnatomyViews:
             else:
                 if fit:
                     node.SetOrientation(plane)
+                    view.set_background_volume_id(self._volume_id)
                     view.fit_view_to_content()
                 node.JumpSliceByOffsetting(*middle)
             if fit and plane in (IN_PLANE, ACROSS):
+                view.set_background_volume_id(self._volume_id)
                 width, height, thickness = node.GetFieldOfView()
                 scale = max((right - left) / width, (bottom - top) / height) * 1.25
                 node.SetFieldOfView(width * scale, height * scale, thickness)
@@ -265,6 +310,13 @@ class AnatomyViews:
     @property
     def _seen(self):
         node = node_called(self._app.scene, "ScalarVolume", _SEEN)
+        node.SetSaveWithScene(False)
+        node.SetHideFromEditors(True)
+        return node
+
+    @property
+    def _pose(self):
+        node = node_called(self._app.scene, "LinearTransform", _POSE)
         node.SetSaveWithScene(False)
         node.SetHideFromEditors(True)
         return node

@@ -11,6 +11,9 @@ from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 
+#: Button of the page that the panel in Slicer, where a scene is closed, does not have
+_CLOSE = "closePatient"
+
 
 class Buttons:
     """Runs the action of a button, by the name of its widget: that of its control, or one specific to the page."""
@@ -23,10 +26,12 @@ class Buttons:
         sections: tuple[Section, ...],
         loading: Loading,
     ) -> None:
-        self._shared, self._tasks, self._presenter = shared, tasks, presenter
+        self._shared, self._tasks, self._presenter, self._loading = shared, tasks, presenter, loading
         self._controls = by_widget(sections)
+        #: By widget, and by name of the page's own buttons
         self._own_actions: dict[str, Callable[[], None]] = {
             "segmentButton": loading.segment,
+            "undoSegmentButton": loading.undo_segment,
             "addTissuesButton": loading.add_tissues,
             "acceptProposalButton": loading.accept_proposal,
             "openCraniotomyButton": loading.open_craniotomy,
@@ -34,11 +39,17 @@ class Buttons:
             "placeButton": loading.place_probe,
             "placeAtViewButton": loading.place_at_view,
             "assignTissueButton": self._assign_tissue,
+            _CLOSE: self._close_patient,
         }
 
     def press(self, name: str) -> None:
         """Called when the user presses a button."""
         self._tasks.start(self._own_actions.get(name) or part_of(self._presenter, self._controls[name].action))
+
+    def _close_patient(self) -> None:
+        with self._presenter.shown():
+            self._loading.close_patient()
+        self._presenter.view.refresh()
 
     def _assign_tissue(self) -> None:
         panel = self._shared.now.panel

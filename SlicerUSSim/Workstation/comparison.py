@@ -67,6 +67,7 @@ class Comparison:
         self._playing: asyncio.Task | None = None
         self._waiting: tuple[RealImages, int, np.ndarray, ImageGrid] | None = None  # to be compared
         self._comparing: asyncio.Task | None = None
+        self._era = 0  # changes when a similarity of before must not be shown any more
         #: For display next to the simulated image, and over it
         self.streams = (ImageStream("real"), ImageStream("real-over"))
 
@@ -100,8 +101,12 @@ class Comparison:
         if self._real is None or self._grid is None or sequence.comparison is ComparisonMode.SIMULATED:
             return
         image, _ = self._real.on_grid(sequence.number, self._grid)
+        width, height = (
+            count * spacing
+            for count, spacing in zip((self._grid.columns, self._grid.rows), self._grid.pixel_spacing_mm, strict=True)
+        )
         for stream in self.streams:
-            stream.send(image)
+            stream.send(image, ruler={"w": width, "h": height})
 
     def compare(self, simulated: np.ndarray, grid: ImageGrid) -> None:
         """Show the similarity of a simulated image to the real one; if images arrive too fast, some are skipped."""
@@ -114,17 +119,40 @@ class Comparison:
         if self._comparing is None:
             self._comparing = get_event_loop().create_task(self._compare_all())
 
+    def sees_nothing(self, grid: ImageGrid | None) -> None:
+        """Show no similarity: there is no image, or one without tissue, of which a number would mean nothing."""
+        self._waiting = None
+        self._era += 1
+        if grid is not None and grid != self._grid:
+            self._grid = grid
+            self.send()
+        with self._shared.changing() as now:
+            now.sequence.similarity = ""
+
+    def drop(self) -> None:
+        """Forget the sequence, which is of another patient."""
+        if self._playing is not None:
+            self.play()
+        self._real = self._browser = None
+        self.sees_nothing(None)
+        for stream in self.streams:
+            stream.clear()
+        with self._shared.changing() as now:
+            now.sequence.length, now.sequence.number, now.sequence.name = 0, 0, ""
+
     async def _compare_all(self) -> None:
         try:
             while self._waiting is not None:
                 (real, number, image, grid), self._waiting = self._waiting, None
+                era = self._era
                 try:
                     found = await asyncio.to_thread(real.compared, number, image, grid)
                     text = f"cost {found.total:.3f} (ρ {found.bhattacharyya:.3f}, SAD {found.sad:.3f})"
                 except SimulationError as error:
                     text = str(error)
-                with self._shared.changing() as now:
-                    now.sequence.similarity = text
+                if era == self._era:
+                    with self._shared.changing() as now:
+                        now.sequence.similarity = text
         finally:
             self._comparing = None
 

@@ -13,38 +13,46 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkOutputWindow
 
-from SlicerUSSim.Logic.base.errors import SimulationError, require
-from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.errors import SimulationError, require, required
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose
+from SlicerUSSim.Logic.mrml.nodes import pose_in_labels
+from SlicerUSSim.Logic.mrml.taken_image import TakenImage
 from SlicerUSSim.Workstation.opener import FILE, Opener
 from SlicerUSSim.Workstation.script import LabelSource, python_script
 
 #: File formats of an image with its geometry.
 FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
+#: Key of a file's header under which is what its image is of, see TakenImage.about
+ABOUT = "SlicerUSSim"
+_NO_IMAGE = "there is no image, expected labels and a probe"
 #: Number of images in a cine loop, and limits of the display time of each, in milliseconds.
 _MOST_IMAGES = 200
 _SHORTEST_MS, _LONGEST_MS = 40, 500
 
 
-def png(image: np.ndarray) -> bytes:
-    """A (rows, columns) uint8 image as a PNG file, without scaling."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
+def png(taken: TakenImage) -> bytes:
+    """An image as a PNG file, without scaling, with what it is of as a text."""
+    buffer, text = io.BytesIO(), PngInfo()
+    text.add_itxt(ABOUT, json.dumps(taken.about()))
+    Image.fromarray(taken.frame.image).save(buffer, "PNG", pnginfo=text)
     return buffer.getvalue()
 
 
-def frame_file(image: Volume, suffix: str) -> bytes:
-    """An image with its position in the patient as a file. Raises SimulationError if not one of FRAME_SUFFIXES."""
+def frame_file(taken: TakenImage, suffix: str) -> bytes:
+    """An image with its position in the patient, and what it is of, as a file.
+
+    Raises SimulationError if `suffix` is not one of FRAME_SUFFIXES.
+    """
     require(suffix in FRAME_SUFFIXES, f"the file type is {suffix!r}, expected {', '.join(FRAME_SUFFIXES)}")
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"frame{suffix}"
-        image.write(path)
+        taken.volume().write(path, about={ABOUT: json.dumps(taken.about())})
         return path.read_bytes()
 
 
@@ -53,15 +61,22 @@ class Cine:
 
     def __init__(self) -> None:
         self._images: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_IMAGES)
+        #: What the last image is of
+        self.about = ""
 
     def __len__(self) -> int:
         return len(self._images)
 
-    def add(self, image: np.ndarray, seconds: float) -> None:
-        """Append a (rows, columns) uint8 image with its time; an image of another size starts a new loop."""
+    def add(self, image: np.ndarray, seconds: float, about: str = "") -> None:
+        """Append a (rows, columns) uint8 image with its time and what it is of; another size starts a new loop."""
         if self._images and self._images[-1][1].shape != image.shape:
-            self._images.clear()
+            self.clear()
         self._images.append((seconds, image))
+        self.about = about
+
+    def clear(self) -> None:
+        """Forget all images."""
+        self._images.clear()
 
     def gif(self) -> bytes:
         """An animated GIF with the original timing. Raises SimulationError for fewer than two images."""
@@ -71,8 +86,9 @@ class Cine:
         first, *others = [Image.fromarray(image) for _, image in self._images]
         buffer = io.BytesIO()
         first.save(
-            buffer, "GIF", save_all=True, append_images=others, duration=waits.round(-1).astype(int).tolist(), loop=0
-        )
+            buffer, "GIF", save_all=True, append_images=others, duration=waits.round(-1).astype(int).tolist(), loop=0,
+            comment=self.about.encode(),
+        )  # fmt: skip
         return buffer.getvalue()
 
 
@@ -90,29 +106,32 @@ class Exports:
         if kind == "json":
             return "preset.json", json.dumps(self._logic.preset.to_dict(), indent=2).encode(), "application/json"
         if kind == "mrb":
-            return "ultrasound.mrb", scene_file(self._app), "application/zip"
+            with self._logic.imageHeld():
+                return "ultrasound.mrb", scene_file(self._app), "application/zip"
         if kind == "gif":
             content = await asyncio.get_running_loop().run_in_executor(None, self._cine.gif)
             return "ultrasound.gif", content, "image/gif"
-        image = self._logic.lastImage()
+        taken = required(self._logic.taken, _NO_IMAGE)
         if kind == "png":
-            return "ultrasound.png", png(image.array[0]), "image/png"
-        return f"ultrasound{kind}", frame_file(image, kind), "application/octet-stream"
+            return "ultrasound.png", png(taken), "image/png"
+        return f"ultrasound{kind}", frame_file(taken, kind), "application/octet-stream"
 
     def script(self) -> str:
         """A Python script that reproduces the image on the screen."""
-        preset = self._logic.preset
         labels: Any = self._logic.parameters.labels
-        transform: Any = self._logic.parameters.probe_transform
-        if labels is None or transform is None:
-            raise SimulationError("there is no image, expected labels and a probe")
-        source = self._opener.source_of(labels)
-        in_labels, moved = pose_in_labels(labels, probe_pose(transform))
+        taken = required(self._logic.taken, _NO_IMAGE)
+        require(labels is not None, _NO_IMAGE)
+        require(
+            self._logic.anatomyOf(labels) == taken.anatomy,
+            "the tissues or sheets have changed since the image was taken, expected those of the image; make a new one",
+        )
+        source, preset = self._opener.source_of(labels), taken.preset
+        in_labels, moved = pose_in_labels(labels, taken.probe_to_world)
         require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
         names = read_labels(labels, preset.tissues).names
         return python_script(
             source,
-            replace(preset, tissues=preset.tissues.for_names(names), settings=self._logic.settings(labels)),
+            replace(preset, tissues=preset.tissues.for_names(names)),
             in_labels,
             self._shown_sheets(source),
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
@@ -13,13 +14,23 @@ from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.export import Cine
 from SlicerUSSim.Workstation.latency import LatencyStamps
-from SlicerUSSim.Workstation.state import DepthTick, ImageGeometry, SharedState
+from SlicerUSSim.Workstation.ruler import description
+from SlicerUSSim.Workstation.state import SharedState
 from SlicerUSSim.Workstation.streams import ImageStream
+from SlicerUSSim.Workstation.tasks import AtMost
 from SlicerUSSim.Workstation.tracker import Tracker
+
+#: Seconds between two updates of Slicer's views, which delay the image.
+_VIEWS_EVERY_S = 0.12
 
 
 class ImageFlow:
-    """Distributes the images of the logic to page, views, comparison, cine loop and tracker."""
+    """Distributes the images of the logic to page, views, comparison, cine loop and tracker.
+
+    Parameters
+    ----------
+    is_busy : whether work is under way for which live images wait.
+    """
 
     def __init__(
         self,
@@ -30,50 +41,56 @@ class ImageFlow:
         cine: Cine,
         tracker: Tracker,
         stamps: LatencyStamps,
+        is_busy: Callable[[], bool],
     ) -> None:
-        self._shared, self._logic, self._views = shared, logic, views
+        self._shared, self._logic, self._views, self._is_busy = shared, logic, views, is_busy
         self._comparison, self._cine, self._tracker, self._stamps = comparison, cine, tracker, stamps
         self._simulated = ImageStream("simulated")
         self._field: tuple[tuple[ImageGrid, Probe], np.ndarray] | None = None
+        self._show_in_views = AtMost(_VIEWS_EVERY_S, self._views_changed)
 
     @property
     def streams(self) -> tuple[ImageStream, ...]:
         """All image streams of the pages, simulated and real."""
         return self._simulated, *self._comparison.streams
 
-    def image_changed(self) -> None:
-        """Distribute the new image."""
-        frame = self._logic.lastFrame
-        if frame is None:
-            return
-        self._simulated.send(frame.image, stamp=self._stamps.computed)
-        self._cine.add(frame.image, perf_counter())
-        self._views.show_image(self._logic.parameters.output, self._field_of(frame.grid))
-        if self._tracker.is_on:
-            self._tracker.send(self._logic.lastImage())
-        self._comparison.compare(frame.image, frame.grid)
+    @property
+    def is_shown(self) -> bool:
+        """Whether Slicer's views have the last image."""
+        return not self._show_in_views.is_waiting
 
-    def tell_geometry(self) -> None:
-        """Update the geometry that the page draws around the image, after a change of probe or display."""
-        preset = self._logic.preset
-        grid = ImageGrid.for_probe(preset.probe, preset.display.image_size)
-        width, height = grid.columns * grid.pixel_spacing_mm[0], grid.rows * grid.pixel_spacing_mm[1]
-        step = 10 if height > 40 else 5
-        ticks = [
-            DepthTick(depth, str(depth) if depth % (2 * step) == 0 else "")
-            for depth in range(0, int(grid.top_mm + height) + 1, step)
-        ]
-        with self._shared.changing() as now:
-            now.image = ImageGeometry(
-                x=grid.left_mm,
-                y=grid.top_mm,
-                w=width,
-                h=height,
-                ticks=ticks,
-                size=height / 36.0,
-                focus=preset.probe.focus_mm or 0.0,
-                range=f"{preset.display.dynamic_range_db:.0f}",
-            )
+    def image_changed(self) -> None:
+        """Distribute the new image, or that there is none any more."""
+        taken = self._logic.taken
+        if taken is None:
+            self.clear()
+            return
+        frame = taken.frame
+        self._simulated.send(frame.image, stamp=self._stamps.computed, **description(taken))
+        self._cine.add(frame.image, perf_counter(), f"{taken.patient}, {taken.time}")
+        self._show_in_views()
+        if self._tracker.is_on:
+            self._tracker.send(taken.volume())
+        if taken.is_empty:
+            self._comparison.sees_nothing(frame.grid)
+        else:
+            self._comparison.compare(frame.image, frame.grid)
+        self.tell_frozen()
+
+    def clear(self) -> None:
+        """Show no image anywhere, since that of before is not of this patient or pose."""
+        self._simulated.clear()
+        self._cine.clear()
+        self._views.hide_image()
+        self._comparison.sees_nothing(None)
+        self.tell_frozen()
+
+    def tell_frozen(self) -> None:
+        """Mark an image that does not follow the probe, since live images ended or wait for other work."""
+        is_frozen = self._logic.taken is not None and (not self._logic.isLive or self._is_busy())
+        if self._shared.now.is_frozen != is_frozen:
+            with self._shared.changing() as now:
+                now.is_frozen = is_frozen
 
     def show_again(self) -> None:
         """Send the current images again, for a page that has just opened."""
@@ -82,9 +99,17 @@ class ImageFlow:
         for view in (self._views.threed, *self._views.slices):
             view.schedule_render()
 
-    def _field_of(self, grid: ImageGrid) -> np.ndarray:
+    def _views_changed(self) -> None:
+        """Show the image in Slicer's views, and turn the slices to it: both are of one moment."""
+        taken = self._logic.taken
+        if taken is not None:
+            self._views.show_image(taken, self._field_of(taken.frame.grid, taken.preset.probe))
+            if self._logic.isLive:
+                self._views.follow(taken.probe_to_world, taken.preset.probe)
+
+    def _field_of(self, grid: ImageGrid, probe: Probe) -> np.ndarray:
         """(rows, columns) bool: the imaged field."""
-        key = grid, self._logic.preset.probe
+        key = grid, probe
         if self._field is None or self._field[0] != key:
-            self._field = key, grid.field(key[1])
+            self._field = key, grid.field(probe)
         return self._field[1]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
@@ -17,21 +17,25 @@ from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm
 from SlicerUSSim.Logic.mri.label_agreement import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
-from SlicerUSSim.Logic.mrml.nodes import node_to_world, pose_in_labels, probe_pose, read_volume
+from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose, read_volume
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.messages import Messages
-from SlicerUSSim.Workstation.opener import Files, Opener
+from SlicerUSSim.Workstation.opener import Files, Opener, Upload
+from SlicerUSSim.Workstation.patient_nodes import remove_patient_nodes
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.state import ORGANS, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 
-#: Farther from the volume of another patient's tissues, a probe is placed anew
-_FAR_MM = 50.0
+#: Roles of nodes of a patient
+_OF_PATIENT = (
+    "mri", "labels", "mask", "second_mri", "lesions", "organs", "sheets", "seed", "proposal", "opening", "real",
+    "transform_sequence", "image_sequence",
+)  # fmt: skip
 
 
 class Loading:
@@ -54,6 +58,8 @@ class Loading:
         self._opener, self._presenter, self._messages = opener, presenter, messages
         self._views, self._probe, self._comparison = views, probe, comparison
         self._is_new = False  # a patient was opened, on whom the probe is not yet
+        self._source_before: LabelSource | None = None  # of the labels before the last Segment
+        self._dropped = ""  # name of an MRI that was closed for labels that are not of it
 
     def begin(self, files: Files) -> None:
         """Load the files with which the workstation was started, and show the first image."""
@@ -79,7 +85,8 @@ class Loading:
             for tissue, path in files.additions:
                 parameters.lesions = self._opener.lesion_of_file(parameters.lesions, tissue, path)
             if files.labels is not None:
-                self._take_labels(*self._opener.labels(files.labels))
+                node, found = self._opener.labels(files.labels)
+                self._take_labels(node, found, self._mri_of(found.labels))
                 if files.additions:
                     self.add_tissues()
             else:
@@ -96,24 +103,42 @@ class Loading:
         Nothing changes if it cannot be read. An MRI or a label map takes the place of the patient before, of whom no
         lesions, notes and messages stay.
         """
-        with self._presenter.shown(), self._opener.uploaded(files) as upload:
-            path, kind = upload.path, upload.kind
-            if kind == "preset":
-                self._logic.preset = Preset.read(path)
-            elif kind == "sequence":
-                self._take_sequence(self._tasks.do(lambda: TrackedSequence.read(path)), Path(path).name.split(".")[0])
-            elif kind == "sheets":
-                self._logic.parameters.sheets = self._opener.sheets(path)
-            elif kind == "labels":
-                node, found = self._opener.labels(path, upload.table)
+        with self._presenter.shown(), ExitStack() as sent:
+            with self._presenter.view.progress(f"Open {', '.join(files)}"):
+                upload = sent.enter_context(self._opener.uploaded(files))
+                take = self._read(upload)
+            take()
+
+    def _read(self, upload: Upload) -> Callable[[], None]:
+        """Read what a page has sent, and return what takes it, without anything that can fail or be cancelled."""
+        path = upload.path
+        if upload.kind == "preset":
+            preset = Preset.read(path)
+            return lambda: setattr(self._logic, "preset", preset)
+        if upload.kind == "sequence":
+            sequence, name = self._tasks.doAside(lambda: TrackedSequence.read(path)), Path(path).name.split(".")[0]
+            return lambda: self._take_sequence(sequence, name)
+        if upload.kind == "sheets":
+            sheets = self._opener.sheets(path)
+            return lambda: setattr(self._logic.parameters, "sheets", sheets)
+        if upload.kind == "labels":
+            node, found = self._opener.labels(path, upload.table)
+            kept = self._mri_of(found.labels)
+
+            def take_labels() -> None:
                 self._messages.clear()
-                self._forget_patient()
-                self._take_labels(node, found)
-            else:
-                node = self._opener.mri(path)
-                self._messages.clear()
-                self._take_mri(node)
-                self.segment()
+                self._forget_patient(node, *kept)
+                self._take_labels(node, found, kept)
+
+            return take_labels
+        mri = self._opener.mri(path)
+
+        def take_mri() -> None:
+            self._messages.clear()
+            self._take_mri(mri)
+            self.segment()
+
+        return take_mri
 
     def add(self, name: str, content: bytes, tissue: str) -> None:
         """Add a mask sent by a page to the lesions, and lay them over the tissues."""
@@ -135,9 +160,24 @@ class Loading:
         others = {} if parameters.second_mri is None or contrast == "none" else {contrast: parameters.second_mri}
         lesions, organs = parameters.lesions, parameters.organs
         kinds = parameters.sheet.kinds if parameters.sheet.find else ()
+        before = self._opener.known_source(parameters.labels)
         if self._changed(self._presenter.segment):
+            self._source_before = before
             self._opener.segmented(parameters.labels, *inputs, others, lesions, kinds, organs)
             self._labels_ready()
+
+    def undo_segment(self) -> None:
+        """Go back to the tissues from before the last Segment."""
+        self._presenter.undoSegment()
+        labels: Any = self._logic.parameters.labels
+        if labels is None:
+            self._logic.clearImage(self._logic.parameters.output)
+            self._probe.forget_patient()
+            self._views.show_volume(self._logic.parameters.mri)
+        else:
+            self._opener.restored(self._source_before, labels)
+            self._labels_ready()
+        self.show_title()
 
     def add_tissues(self) -> None:
         """Lay the lesions over the tissues."""
@@ -196,8 +236,10 @@ class Loading:
 
     def show_title(self) -> None:
         """Show the name of the patient on the page."""
-        with self._shared.changing() as now:
-            now.title = self._opener.patient()
+        title = self._opener.patient()
+        if self._shared.now.title != title:
+            with self._shared.changing() as now:
+                now.title = title
 
     # ---- implementation ----------------------------------------------------------------------------------------
 
@@ -236,47 +278,81 @@ class Loading:
         action()
         return version() not in (before, None)
 
-    def _take_labels(self, node: Any, found: LabelledTissues) -> None:
+    def _take_labels(self, node: Any, found: LabelledTissues, mris: Sequence[Any] = ()) -> None:
+        """Choose labels; `mris` are the MRIs that they may be of, see _mri_of."""
         parameters: Any = self._logic.parameters
         for warning in found.warnings:
             self._presenter.view.showError(warning)
         checks = [f"Check: {warning}" for warning in found.warnings]
-        checks += self._keep_mri_of(found.labels)
-        if parameters.mri is None:
-            self._views.show_volume(node)
+        if mris:
+            checks.append(f"of the MRI {mris[0].GetName()}, which is shown: its intensities follow the labels")
+        elif self._dropped:
+            checks.append(
+                f"Check: the MRI {self._dropped} was closed: its intensities do not follow the labels (of another "
+                "patient?)"
+            )
+        self._dropped = ""
+        if not mris and parameters.mri is not None:
+            dropped = parameters.mri
+            parameters.mri = parameters.mask = parameters.second_mri = None
+            self._scene.RemoveNode(dropped)
+        elif mris:
+            parameters.mri = mris[0]
+        self._views.show_volume(node if parameters.mri is None else parameters.mri)
         parameters.labels = node
         self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
         self.show_title()
         self._labels_ready()
 
-    def _keep_mri_of(self, labels: Volume) -> list[str]:
-        """Deselect an MRI that does not follow the labels, which may be of another patient; lines about it."""
-        parameters: Any = self._logic.parameters
-        if parameters.mri is None:
+    def _mri_of(self, labels: Volume) -> list[Any]:
+        """The MRI if it follows the labels; otherwise it may be of another patient."""
+        mri: Any = self._logic.parameters.mri
+        self._dropped = ""
+        if mri is None:
             return []
-        mri, name = read_volume(parameters.mri), parameters.mri.GetName()
-        if self._tasks.do(lambda: follows(mri, labels)):
-            return [f"of the MRI {name}, which is shown: its intensities follow the labels"]
-        parameters.mri = parameters.mask = parameters.second_mri = None
-        return [f"Check: the MRI {name} was deselected: its intensities do not follow the labels (of another patient?)"]
+        volume = read_volume(mri)
+        if self._tasks.doAside(lambda: follows(volume, labels)):
+            return [mri]
+        self._dropped = mri.GetName()
+        return []
 
     def _take_organs(self, node: Any, found: LabelledTissues) -> None:
         """Choose the label map of organs of a CT, which Segment uses."""
         self._logic.parameters.organs = node
         self._presenter.setNotes(f"{node.GetName()}: {found.message}; Segment uses it with the contrast ct")
 
-    def _forget_patient(self) -> None:
-        """Deselect what is of the patient before, when another one is opened."""
+    def close_patient(self) -> None:
+        """Close the patient: nothing of him stays on the page, in the scene or in memory; settings stay."""
         parameters = self._logic.parameters
-        parameters.lesions = parameters.organs = parameters.sheets = parameters.seed = parameters.proposal = None
+        self._messages.clear()
+        self._forget_patient()
+        parameters.mri = parameters.labels = parameters.mask = parameters.second_mri = None
+        self._presenter.setNotes()
+        self.show_title()
+
+    def _forget_patient(self, *new: Any) -> None:
+        """Show, choose and keep nothing of the patient before, when another one is opened; `new` are nodes of his."""
+        parameters = self._logic.parameters
+        self._logic.stopLiveUpdate()
+        self._logic.clearImage(parameters.output)
+        self._comparison.drop()
+        self._probe.forget_patient()
+        self._presenter.forgetPatient()
+        self._opener.forget_patient()
+        kept = [parameters.output, parameters.outline, parameters.probe_transform, *new]
+        for role in _OF_PATIENT:
+            node: Any = getattr(parameters, role)
+            if node not in new:
+                setattr(parameters, role, None)
+        remove_patient_nodes(self._scene, kept)
+        with self._shared.changing() as now:
+            now.fit.curve, now.fit.costs = [], ""
         self._is_new = True
 
     def _take_mri(self, node: Any) -> None:
         parameters = self._logic.parameters
-        self._logic.stopLiveUpdate()  # until the new MRI is segmented
-        parameters.mri, parameters.labels, parameters.mask = node, None, None
-        parameters.second_mri = None
-        self._forget_patient()
+        self._forget_patient(node)
+        parameters.mri = node
         self._presenter.setNotes()
         self.show_title()
         self._views.show_volume(node)
@@ -288,17 +364,8 @@ class Loading:
         self._logic.parameters.real = images
         self._comparison.take(tracked, browser)
 
-    def _probe_is_far(self) -> bool:
-        """Whether the probe lies outside the tissues' volume, as that of a patient in another frame does."""
-        parameters: Any = self._logic.parameters
-        bounds = np.zeros(6)
-        parameters.labels.GetRASBounds(bounds)
-        low, high = bounds[::2] - _FAR_MM, bounds[1::2] + _FAR_MM
-        face = node_to_world(parameters.probe_transform)[:3, 3]
-        return bool(((face < low) | (face > high)).any())
-
     def _labels_ready(self) -> None:
-        if self._logic.parameters.probe_transform is None or (self._is_new and self._probe_is_far()):
+        if self._logic.parameters.probe_transform is None or self._is_new:
             self._presenter.placeProbe()
         self._is_new = False
         self.show_title()

@@ -29,6 +29,7 @@ from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
 from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
+from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
 from SlicerUSSim.Logic.tissue.label_advice import PAGE
 from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
@@ -45,8 +46,6 @@ _log = logging.getLogger(__name__)
 
 #: Attribute of a node: the file from which it was read; "" for the demo brain, the name alone for one sent by a page.
 FILE = "SlicerUSSim.file"
-#: Attribute of a node with labels: the name of the file with the patient, of the labels themselves or of their MRI.
-PATIENT = "SlicerUSSim.patient"
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ class Opener:
 
     def mri(self, path: str | None):
         """A volume node with the MRI of a file, or with the demo brain."""
-        volume = self._tasks.do(lambda: demo_mri()[0]) if path is None else self._volume(path)
+        volume = self._tasks.doAside(lambda: demo_mri()[0]) if path is None else self._volume(path)
         name = "MNI152 brain" if path is None else Path(path).name
         node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
         write_volume(node, volume)
@@ -147,7 +146,7 @@ class Opener:
 
     def sheets(self, path: str):
         """A model node with the sheets of a .vtp."""
-        surfels = self._tasks.do(lambda: read_surfels(path))
+        surfels = self._tasks.doAside(lambda: read_surfels(path))
         node = self._scene.AddNewNodeByClass("vtkMRMLModelNode", Path(path).name)
         node.SetAndObservePolyData(as_polydata(surfels))
         node.SetAttribute(FILE, self._place(path))
@@ -158,7 +157,7 @@ class Opener:
         """(label map node with the organs of a CT, what was recognised) of a file."""
         volume, table = self._volume(path), TissueTable({})
         mapping = LabelMapping.of(maps, table)
-        found = self._tasks.do(lambda: read_label_file(Path(path), volume, mapping, default=table, advice=PAGE))
+        found = self._tasks.doAside(lambda: read_label_file(Path(path), volume, mapping, default=table, advice=PAGE))
         return self._label_map(found.labels, path, found.names), replace(found, message=self._as_known(found.message))
 
     def second_mri(self, path: str):
@@ -196,7 +195,7 @@ class Opener:
             beside = None if mapping else table_beside(Path(path))
         # A table that came with other labels was not chosen for these, whose numbers mean something else.
         is_chosen = mine.names() not in (Preset().tissues.names(), self._names_of_table)
-        found = self._tasks.do(
+        found = self._tasks.doAside(
             lambda: read_label_file(
                 Path(path), volume, mapping, table=beside, preset=mine if is_chosen else None, default=mine, advice=PAGE
             )
@@ -281,6 +280,10 @@ class Opener:
         if source is not None and additions is not None:
             self._sources[_voxels_of(labels_node)] = replace(source, additions=additions)
 
+    def restored(self, source: LabelSource | None, labels_node) -> None:
+        """Record the source of labels that are those from before Segment again."""
+        self._sources = {} if source is None else {_voxels_of(labels_node): source}
+
     def opened(
         self, source: LabelSource | None, patient: str, labels_node, disc: tuple[float, np.ndarray] | None
     ) -> None:
@@ -289,12 +292,16 @@ class Opener:
         if source is not None and disc is not None:
             self._sources[_voxels_of(labels_node)] = replace(source, disc=disc)
 
+    def forget_patient(self) -> None:
+        """Release what is kept of the last patient."""
+        self._sources, self._lesion_files = {}, {}
+
     def patient(self) -> str:
         """Name of the patient of the chosen labels, or of the MRI if there are none; "" without either."""
         labels, mri = self._logic.parameters.labels, self._logic.parameters.mri
         if labels is not None:
-            return labels.GetAttribute(PATIENT) or labels.GetName()
-        return "" if mri is None else mri.GetName()
+            return patient_of(labels)
+        return "" if mri is None else patient_of(mri)
 
     def known_source(self, labels_node) -> LabelSource | None:
         """The source of labels; None if it is unknown, or there are no labels."""
@@ -311,7 +318,7 @@ class Opener:
     def sequence(self, sequence: TrackedSequence, name: str):
         """(TrackedImages, sequence browser node, sequence node of the images)."""
         files, preset = self._files, self._logic.preset
-        tracked = self._tasks.do(
+        tracked = self._tasks.doAside(
             lambda: TrackedImages.of(
                 sequence, path=files.transform, reference_to_ras=files.to_ras, beam=preset.probe,
                 probe=preset.probe if files.preset is not None else None,
@@ -392,6 +399,9 @@ class Opener:
             yield list(map(Path, self._uploads))
         except SimulationError as error:
             raise SimulationError(self._as_known(str(error))) from None
+        finally:
+            for path in self._uploads:
+                self._volumes.pop(path, None)
 
     def _as_known(self, text: str) -> str:
         """A message with the names of files as the user knows them, without the temporary folder."""
@@ -405,7 +415,7 @@ class Opener:
 
     def _volume(self, path: str) -> Volume:
         """The volume of a file, read once."""
-        return self._volumes.pop(path, None) or self._tasks.do(lambda: Volume.read(path))
+        return self._volumes.pop(path, None) or self._tasks.doAside(lambda: Volume.read(path))
 
     def _mask(self, path: str) -> Volume:
         """The same of a mask, with the names of its labels."""

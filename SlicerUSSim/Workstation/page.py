@@ -19,14 +19,14 @@ from trame_slicer.views import AbstractView
 from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
 from SlicerUSSim.Widget.controls import Control, Section
-from SlicerUSSim.Widget.presenter import TISSUE_COLUMNS
+from SlicerUSSim.Widget.presenter import FROZEN, TISSUE_COLUMNS
 from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode
 
 _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
 MODULE = {
     "serve": {"ussim": str(_STATIC)},
-    "scripts": ["ussim/workstation.js"],
+    "scripts": ["ussim/overlay.js", "ussim/workstation.js"],
     "styles": ["ussim/workstation.css"],
 }
 #: Controls of the panel that are not on the page: its slice views follow the probe, it compares the fit in the
@@ -40,6 +40,8 @@ _IN_PAGE = {
     "savePresetButton": "window.ussim.save('json')",
     "loadPresetButton": "window.document.getElementById('open-file').click()",
 }
+#: What is at the top of the drawer
+_FIRST_SECTION, _FIRST_CONTROLS = "Ultrasound", ("gainSlider", "depthSlider")
 _LESION_TEXTS = {"brats": PAGE_SEVERAL}
 #: Colours of the marks beside the slice views' planes.
 _STRIPES = {"Red": "red", "Yellow": "yellow", "Green": "green"}
@@ -107,12 +109,15 @@ def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
             options = "".join(f"<option>{plane}</option>" for plane in PLANES)
             html.Div(
                 f"""<select :value="{NAMES.views.planes}['{name}']" id="plane-{name}"
+                    aria-label="Plane of the {_STRIPES[name]} view"
                     @change="trigger('plane', ['{name}', $event.target.value])">{options}</select>"""
             )
         else:
-            with v3.VBtn(icon=True, size="x-small", variant="text", click="trigger('look')", id="look"):
+            with v3.VBtn(
+                icon=True, size="x-small", variant="text", click="trigger('look')", id="look",
+                title="Turn the camera to the probe", raw_attrs=['aria-label="Turn the camera to the probe"'],
+            ):  # fmt: skip
                 v3.VIcon("mdi-camera-flip-outline")
-                v3.VTooltip("Turn the camera to the probe", activator="parent")
 
 
 # ---- left ------------------------------------------------------------------------------------------------------------
@@ -122,7 +127,7 @@ def _drawer(sections: tuple[Section, ...]) -> None:
     html.Div("Ultrasound Simulator", classes="text-subtitle-1 px-4 pt-2")
     html.Div(f"{{{{ {NAMES.title} }}}}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
     with v3.VExpansionPanels(multiple=True, v_model=(NAMES.open_sections,), variant="accordion"):
-        for section in sections:
+        for section in _in_order(sections):
             with v3.VExpansionPanel(value=section.title):
                 v3.VExpansionPanelTitle(section.title, style="min-height: 36px; font-size: 13px")
                 with v3.VExpansionPanelText(eager=True, id=f"section-{section.title.replace(' ', '-').lower()}"):
@@ -137,11 +142,26 @@ def _drawer(sections: tuple[Section, ...]) -> None:
                         _cost_curve()
 
 
+def _in_order(sections: tuple[Section, ...]) -> list[Section]:
+    """The sections with what is used while one looks at the image first: gain and depth are not below the fold."""
+    ordered = sorted(sections, key=lambda section: section.title != _FIRST_SECTION)
+    first = list(ordered[0].controls) if ordered[0].title == _FIRST_SECTION else []
+    if first:
+        first.sort(key=lambda control: control.widget not in _FIRST_CONTROLS)
+        ordered[0] = Section(_FIRST_SECTION, True, tuple(first))
+    return ordered
+
+
 def _open_file() -> None:
     v3.VFileInput(
         label="Open an MRI, label map (with its table), tracked sequence or sheets (.vtp)",
         v_model=(NAMES.opened_file, None), multiple=True, density="compact",
         hide_details=True, variant="outlined", id="open-file", classes="mb-1",
+    )  # fmt: skip
+    v3.VBtn(
+        "Close patient", size="small", classes="mb-1", id="close-patient", click="trigger('press', ['closePatient'])",
+        title="Nothing of the patient stays on the page, in the scene or in memory; settings stay",
+        disabled=(f"{NAMES.title} === ''",),
     )  # fmt: skip
     options = "".join(f'<option value="{name}">{_LESION_TEXTS.get(name, name)}</option>' for name in (*LESIONS, ORGANS))
     html.Div(
@@ -175,7 +195,7 @@ def _control(control: Control) -> None:
         if kind == "number" and none_at is not None:  # an empty field, and not a number that means it
             limits += ' placeholder="none"'
             shown = f"{key} === null || {key} <= {none_at:.10g} ? '' : +Number({key}).toFixed({control.decimals})"
-            value = f"$event.target.value === '' ? {none_at:.10g} : Number($event.target.value)"
+            value = "$event.target.value === '' ? null : Number($event.target.value)"
         html.Div(
             f"""<label for="{name}">{escape(control.label)}{unit}</label>
             <input type="{kind}" id="{name}" {limits}
@@ -197,7 +217,7 @@ def _control(control: Control) -> None:
             options = f"""<option v-for="item in {NAMES.panel.choices}.{name}">{{{{ item }}}}</option>"""
         html.Div(
             f"""<label for="{name}">{escape(control.label)}</label>
-            <select id="{name}" :value="{key} ?? ''"
+            <select id="{name}" :value="{key} ?? ''" aria-label="{escape(control.label or control.tip)}"
             @change="trigger('set', ['{name}', $event.target.value])">{options}</select>""",
             classes="ussim-line", title=control.tip,
         )  # fmt: skip
@@ -230,8 +250,8 @@ def _slider(
         html.Div(label)
         v3.VSlider(
             model_value=(f"{key} ?? {minimum}",), min=(minimum,), max=(maximum,), step=step, density="compact",
-            hide_details=True, thumb_size=12, track_size=2, disabled=(f"{key} === null",), id=f"slider-{name}",
-            update_modelValue=event,
+            name=label, hide_details=True, thumb_size=12, track_size=2, disabled=(f"{key} === null",),
+            id=f"slider-{name}", update_modelValue=event,
         )  # fmt: skip
         html.Div(f"{{{{ {key} === null ? '' : Number({key}).toFixed({decimals}) }}}} {unit}", classes="value")
 
@@ -290,16 +310,16 @@ def _tools() -> None:
     with html.Div(classes="ussim-tool"):
         with v3.VBtn(
             icon=True, size="small", variant="text", id="live",
+            title="Live or frozen", raw_attrs=['aria-label="Live"', f':aria-pressed="{live}"'],
             disabled=(f"{NAMES.panel.can}.liveCheckBox === false",),
             click=f"trigger('set', ['liveCheckBox', !{live}])", color=(f"{live} ? 'success' : undefined",),
         ):  # fmt: skip
             v3.VIcon(icon=(f"{live} ? 'mdi-play-circle' : 'mdi-snowflake'",))
-            v3.VTooltip("Live or frozen", activator="parent")
         v3.VSpacer()
         html.Div("Blend", classes="text-caption")
         v3.VSlider(
             v_model=(NAMES.views.blend,), min=0, max=1, step=0.05, density="compact", hide_details=True, thumb_size=12,
-            track_size=2, style="max-width: 90px", id="blend",
+            track_size=2, style="max-width: 90px; min-width: 60px", id="blend", name="Blend of image and MRI",
         )  # fmt: skip
         for state, name, icon, tip in (
             (NAMES.views.show_tissues, "show-tissues", "mdi-palette", "Colour the tissues in the slice views"),
@@ -308,10 +328,10 @@ def _tools() -> None:
         ):
             with v3.VBtn(
                 icon=True, size="small", variant="text", click=f"{state} = !{state}", id=name,
+                title=tip, raw_attrs=[f'aria-label="{tip}"', f':aria-pressed="{state}"'],
                 color=(f"{state} ? 'primary' : undefined",),
             ):  # fmt: skip
                 v3.VIcon(icon)
-                v3.VTooltip(tip, activator="parent")
         with v3.VMenu():
             with v3.Template(v_slot_activator="{ props }"):
                 v3.VBtn("Export", size="small", v_bind="props", prepend_icon="mdi-download", id="export")
@@ -330,28 +350,23 @@ def _screens(keys: tuple[str, ...]) -> None:
     simulated = f"{mode} === '{ComparisonMode.SIMULATED.value}'"
     with html.Div(classes=(f"{{'ussim-screens': true, 'ussim-stacked': {there} && {beside}}}",)):
         with html.Div(classes="ussim-screen"):
-            html.Div(f"{{{{ {there} && !({simulated}) ? 'Simulated' : '' }}}}", classes="ussim-caption")
-            with html.Div(
-                classes="ussim-frame", style=(_frame_style(),), id="ultrasound", v_show=f"{NAMES.image} !== null"
-            ):
+            simulated_too = f"<span>{{{{ {there} && !({simulated}) ? 'Simulated, ' : '' }}}}</span>"
+            html.Div(f'{simulated_too}<span id="image-caption"></span>', classes="ussim-caption")
+            html.Div(
+                FROZEN, v_show=NAMES.is_frozen, classes="ussim-frozen", id="frozen",
+                title="The image does not follow the probe: it stays where it was taken",
+            )  # fmt: skip
+            with html.Div(classes="ussim-frame", id="ultrasound"):
                 html.Div(f'<canvas data-stream="simulated" data-keys="{escape(" ".join(keys))}"></canvas>')
                 html.Div(
                     f"""<canvas data-stream="real-over" :class="{{blink: {blink}, difference: {over}}}"></canvas>""",
                     v_show=f"{there} && ({blink} || {over})",
                 )
-                html.Div((_STATIC / "overlay.html").read_text(), v_for=f"us in {NAMES.image} ? [{NAMES.image}] : []")
+                html.Div((_STATIC / "overlay.html").read_text())
         with html.Div(classes="ussim-screen", v_show=f"{there} && {beside}"):
             html.Div(f"Real, {{{{ {NAMES.sequence.name} }}}}", classes="ussim-caption")
-            with html.Div(classes="ussim-frame", style=(_frame_style(),), id="real"):
+            with html.Div(classes="ussim-frame", id="real"):
                 html.Div('<canvas data-stream="real"></canvas>')
-
-
-def _frame_style() -> str:
-    width, height = f"({NAMES.image}?.w ?? 0)", f"({NAMES.image}?.h ?? 1)"
-    return (
-        f"`aspect-ratio: ${{{width}}} / ${{{height}}}; "
-        f"width: min(100cqw - 120px, (100cqh - 40px) * ${{{width} / Math.max({height}, 1)}});`"
-    )
 
 
 def _player() -> None:
@@ -367,11 +382,14 @@ def _player() -> None:
             title="Cost of the paper for the simulated and the real image; 0 if they are equal",
         )  # fmt: skip
     with html.Div(classes="ussim-bar", v_if=f"{length} > 0", id="player"):
-        with v3.VBtn(icon=True, size="x-small", variant="text", click="trigger('play')", id="play"):
+        with v3.VBtn(
+            icon=True, size="x-small", variant="text", click="trigger('play')", id="play",
+            raw_attrs=[f""":aria-label="{NAMES.sequence.playing} ? 'Stop the sequence' : 'Play the sequence'\""""],
+        ):  # fmt: skip
             v3.VIcon(icon=(f"{NAMES.sequence.playing} ? 'mdi-pause' : 'mdi-play'",))
         v3.VSlider(
             model_value=(number,), min=0, max=(f"Math.max({length} - 1, 1)",), step=1, density="compact",
-            hide_details=True, thumb_size=12, track_size=2, id="sequence-slider",
+            hide_details=True, thumb_size=12, track_size=2, id="sequence-slider", name="Image of the sequence",
             update_modelValue="trigger('show_number', [$event])",
         )  # fmt: skip
         html.Div(f"{{{{ {number} + 1 }}}} of {{{{ {length} }}}}", style="white-space: nowrap", id="sequence-text")

@@ -9,11 +9,13 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from greenlet import getcurrent, greenlet
 
-from SlicerUSSim.Logic.base.errors import Cancelled
+from SlicerUSSim.Logic.base.errors import Cancelled, SimulationError
+from SlicerUSSim.Logic.mrml.fitting_nodes import fits
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import nodes_of_class
-from SlicerUSSim.Widget.controls import Control, Section, by_widget, part_of, shown_by, usable
+from SlicerUSSim.Widget.controls import Control, Section, by_widget, part_of, shown_by, usable, value_parameter
 from SlicerUSSim.Widget.presenter import PanelPresenter, TissueRow
 from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.observed import Observed
@@ -54,7 +56,10 @@ class BrowserPanel:
         self._thread = threading.get_ident()
         #: Calls a function with the point (3,), in the world, of the next click in a slice view, or None
         self.pick: Callable[[Callable[[np.ndarray | None], None]], None] = lambda clicked: None
-        self._cancelled = False
+        #: Called when live images may have ended, or begun to wait for other work
+        self.frozen_changed: Callable[[], None] = lambda: None
+        #: Whether the work under way is cancelled, and the task that does it
+        self._under_way: tuple[threading.Event, greenlet] | None = None
         self._status, self._status_until = "", 0.0
         self._table: Any = None  # vtkMRMLTableNode with the costs of a fit
         self._costs = Observed("ModifiedEvent", self._show_costs)
@@ -122,10 +127,12 @@ class BrowserPanel:
             panel.can = {name: is_usable for name, (is_usable, _) in can.items()}
             panel.tips = {name: tip for name, (_, tip) in can.items()}
             now.fit.free = [FreeParameter(name, on) for name, on in presenter.fits.freeParameters()]
+        self.frozen_changed()
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float], None]]:
-        self._cancelled = False
+        is_cancelled = threading.Event()  # of this work alone: what is abandoned goes on to hear of it
+        before, self._under_way = self._under_way, (is_cancelled, getcurrent())
         reported_percent = 0
         with self._shared.changing() as now:
             now.messages.progress_title, now.messages.progress_percent = title, reported_percent
@@ -133,23 +140,28 @@ class BrowserPanel:
         def report(share: float) -> None:
             nonlocal reported_percent
             percent = int(100 * share)
+            if is_cancelled.is_set():
+                raise Cancelled
             if percent != reported_percent:
                 reported_percent = percent
                 self._in_loop(lambda: self._send_percent(percent))
-            if self._cancelled:
-                raise Cancelled
 
         try:
             yield report
         finally:
+            self._under_way = before
             with self._shared.changing() as now:
                 now.messages.progress_title = ""
 
     # ---- triggers of the page ----------------------------------------------------------------------------------
 
     def cancel(self) -> None:
-        """Stop the work under way."""
-        self._cancelled = True
+        """Stop the work under way, within a second."""
+        under_way = self._under_way
+        if under_way is not None:
+            is_cancelled, waiting = under_way
+            is_cancelled.set()
+            self._tasks.abandonSoon(waiting, lambda: self._under_way is under_way, self._logic.renewSimulator)
 
     def set(self, name: str, value: Any) -> None:
         """Called when the user changes the value of a control."""
@@ -162,6 +174,13 @@ class BrowserPanel:
 
     def _changed(self, control: Control, value: Any) -> None:
         presenter, parameters = self.presenter, self._logic.parameters
+        none_at = control.range.none_at
+        if control.kind == "number" and none_at is not None:
+            if value is None:  # an empty field
+                value = none_at
+            elif isinstance(value, int | float) and value <= none_at:  # a number that stands for none, but was typed
+                self._refuse(control, value)
+                return
         if value == self._shown_value(control):
             return
         if control.value:
@@ -172,6 +191,16 @@ class BrowserPanel:
         else:
             part_of(presenter, control.action)(value)
         self.refresh()
+
+    def _refuse(self, control: Control, value: float) -> None:
+        """Say that a number is out of the range of its parameter."""
+        declared = value_parameter(control.value)
+        whole = int(value) if float(value).is_integer() else value
+        with self.presenter.shown():
+            declared.checked(control.value.split(".")[0], whole)
+            raise SimulationError(
+                f"{declared.name} is {whole}, expected more than {control.range.none_at:g}, or nothing"
+            )
 
     # ---- helpers -----------------------------------------------------------------------------------------------
 
@@ -193,7 +222,10 @@ class BrowserPanel:
     def _nodes_for(self, control: Control) -> list[NodeItem]:
         scene = self._logic.scene
         found = [
-            node for name in control.node_classes for node in nodes_of_class(scene, name) if node.GetClassName() == name
+            node
+            for name in control.node_classes
+            for node in nodes_of_class(scene, name)
+            if node.GetClassName() == name and fits(control.node, node)
         ]
         return [NodeItem("None", None), *(NodeItem(node.GetName(), node.GetID()) for node in found)]
 

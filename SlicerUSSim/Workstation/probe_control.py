@@ -140,14 +140,23 @@ class ProbeControl:
         self._surface_version = version
         volume = read_labels(labels, self._logic.preset.tissues).labels
         placed = Volume(volume.array, node_to_world(labels) @ volume.ijk_to_ras)
-        self.surface = self._tasks.do(lambda: PatientSurface(placed))
+        self.surface = self._tasks.doAside(lambda: PatientSurface(placed))
         self._views.show_surface(self.surface)
         self.show_tissues(self._shared.now.views.show_tissues)
         self._tell()
 
+    def forget_patient(self) -> None:
+        """Forget the surface of a patient, and show neither patient nor probe nor pose until the next one is there."""
+        self.surface = self._surface_version = self._drawn = None
+        self._views.hide_patient()
+        with self._shared.changing() as now:
+            now.pose = None
+
     def draw(self) -> None:
-        """Draw the probe if it or its transform node has changed."""
+        """Draw the probe if it or its transform node has changed, once there is a patient."""
         transform, probe = self._logic.parameters.probe_transform, self._logic.preset.probe
+        if self._logic.parameters.labels is None:
+            return
         if transform is not None and (probe, transform) != self._drawn:
             self._drawn = (probe, transform)
             self.hand.set_probe(probe)
@@ -166,8 +175,9 @@ class ProbeControl:
             self.moved()
 
     def _turn_slices(self) -> None:
+        """Turn the slices to the probe while there are no live images, to which ImageFlow turns them."""
         pose = self.pose()
-        if pose is not None and self._logic.parameters.output is not None:
+        if pose is not None and self.surface is not None and not self._logic.isLive:
             self._views.follow(pose, self._logic.preset.probe)
 
     def _tell_pose(self) -> None:

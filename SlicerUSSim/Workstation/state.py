@@ -68,33 +68,6 @@ class FreeParameter:
     on: bool
 
 
-@dataclass(frozen=True)
-class DepthTick:
-    """A mark of the depth ruler."""
-
-    #: Depth, mm
-    y: float
-    #: Text beside the mark; "" for intermediate marks
-    text: str
-
-
-@dataclass(frozen=True)
-class ImageGeometry:
-    """Where the image lies in the probe frame, mm, and what is drawn around it (static/overlay.html)."""
-
-    x: float = 0.0
-    y: float = 0.0
-    w: float = 0.0
-    h: float = 1.0
-    ticks: list[DepthTick] = field(default_factory=list)
-    #: Size of letters and marks, mm
-    size: float = 1.0
-    #: Depth of the transmit focus, mm
-    focus: float = 0.0
-    #: Dynamic range, dB, as text
-    range: str = ""
-
-
 # ---- shared state, by topic ------------------------------------------------------------------------------------------
 
 
@@ -192,8 +165,8 @@ class PageState:
     #: The same of one file: a mask to add, and the tissue that it is
     added_file: object = None
     added_as: str = LESIONS[0]
-    #: None before the first image
-    image: ImageGeometry | None = None
+    #: Whether there is an image that does not follow the probe
+    is_frozen: bool = False
     #: Pose of the probe on the patient; None without a probe or a patient
     pose: SurfacePose | None = None
     #: Whether the probe is aligned with the surface normal while it slides

@@ -27,6 +27,7 @@ class ImageStream:
         self._waiting: tuple[np.ndarray, dict] | None = None
         self._last: tuple[bytes, dict] | None = None
         self._encoding = False
+        self._era = 0  # changes when images of before must not be shown any more
         #: Number of the last image, starting at 1
         self.count = 0
 
@@ -36,6 +37,14 @@ class ImageStream:
         if not self._encoding:
             self._encoding = True
             get_event_loop().create_task(self._encode_all())
+
+    def clear(self) -> None:
+        """Let the pages show no image; one that is still waiting or encoded is dropped."""
+        self._waiting = None
+        self._era += 1
+        self.count += 1
+        self._last = (b"", {"number": self.count, "blank": True})
+        self._push(*self._last)
 
     @property
     def is_sending(self) -> bool:
@@ -51,7 +60,10 @@ class ImageStream:
         try:
             while self._waiting is not None:
                 (image, about), self._waiting = self._waiting, None
+                era = self._era
                 content = await asyncio.get_running_loop().run_in_executor(None, _jpeg, image)
+                if era != self._era:
+                    continue
                 self.count += 1
                 about = {"type": "image/jpeg", "number": self.count, **about}
                 self._last = (content, about)

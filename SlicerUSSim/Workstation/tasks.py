@@ -6,16 +6,60 @@ Presenter and logic are written as synchronous code. Here they run in greenlets:
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from concurrent.futures import Future
+from queue import SimpleQueue
+from typing import Any, TypeVar
 
 from greenlet import getcurrent, greenlet
 from trame_server.utils.asynchronous import get_event_loop
 
+from SlicerUSSim.Logic.base.errors import Cancelled
 from SlicerUSSim.Logic.mrml.logic import AtOnce
 
 T = TypeVar("T")
+#: Seconds that work has to end by itself after it was cancelled
+_PATIENCE_S = 0.6
+
+
+class _Worker:
+    """A thread that computes one thing after the other. It ends with the program, whatever it is computing."""
+
+    def __init__(self, name: str) -> None:
+        self._queue: SimpleQueue[tuple[Future, Callable[[], Any]] | None] = SimpleQueue()
+        threading.Thread(target=self._run, name=name, daemon=True).start()
+
+    def submit(self, function: Callable[[], Any]) -> Future:
+        future: Future = Future()
+        self._queue.put((future, function))
+        return future
+
+    def end(self) -> None:
+        """Start nothing more, once what is computed now is done."""
+        self._queue.put(None)
+
+    def _run(self) -> None:
+        while (entry := self._queue.get()) is not None:
+            future, function = entry
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                result = function()
+            except BaseException as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+            del entry, future, function  # a patient's data, perhaps
+
+
+class _Waiting:
+    """A greenlet that waits for work."""
+
+    def __init__(self, waiting: greenlet, function: Callable[[], Any], is_aside: bool) -> None:
+        self.greenlet, self.function, self.is_aside = waiting, function, is_aside
+        self.future: Future
+        self.is_abandoned = False
 
 
 class Tasks(AtOnce):
@@ -30,7 +74,9 @@ class Tasks(AtOnce):
         self._failed = failed
         self._loop = get_event_loop()
         # One thread: computations on a device must not be interleaved between tasks.
-        self._executor = ThreadPoolExecutor(1, "ultrasound")
+        self._worker = _Worker("ultrasound")
+        self._aside = _Worker("files and surfaces")
+        self._waiting: list[_Waiting] = []
         self._unfinished = 0
 
     @property
@@ -45,22 +91,72 @@ class Tasks(AtOnce):
 
     def do(self, function: Callable[[], T]) -> T:
         """The result of `function`, called in the worker thread. Outside a task this blocks the event loop."""
+        return self._wait(function, is_aside=False)
+
+    def doAside(self, function: Callable[[], T]) -> T:
+        """The same for what needs no device, such as reading a file: images do not wait for it."""
+        return self._wait(function, is_aside=True)
+
+    def _wait(self, function: Callable[[], T], is_aside: bool) -> T:
         waiting = getcurrent()
         event_loop = waiting.parent
         if event_loop is None:
-            return self._executor.submit(function).result()
-        future = self._loop.run_in_executor(self._executor, function)
-        future.add_done_callback(lambda _: waiting.switch())
-        event_loop.switch()
-        return future.result()
+            return (self._aside if is_aside else self._worker).submit(function).result()
+        entry = _Waiting(waiting, function, is_aside)
+        self._waiting.append(entry)
+        self._submit(entry)
+        try:
+            event_loop.switch()
+        finally:
+            self._waiting.remove(entry)
+        return entry.future.result()
+
+    def _submit(self, entry: _Waiting) -> None:
+        worker = self._aside if entry.is_aside else self._worker
+        entry.future = worker.submit(entry.function)
+        entry.future.add_done_callback(lambda future: self.tell(lambda: self._done(entry, future)))
+
+    def _done(self, entry: _Waiting, future: Future) -> None:
+        if not entry.is_abandoned and future is entry.future:
+            entry.greenlet.switch()
 
     def tell(self, function: Callable[[], None]) -> None:
         """Call `function` soon in the event loop; may be used from any thread."""
         self._loop.call_soon_threadsafe(function)
 
+    def abandonSoon(
+        self, waiting: greenlet, is_under_way: Callable[[], bool], abandoned: Callable[[], None]
+    ) -> None:  # fmt: skip
+        """Let a task that was cancelled go on with Cancelled, even if its work does not hear of it in time.
+
+        The work then ends in its own time, in a thread of its own, and nobody takes its result; what waited behind it
+        is computed by a new thread. `abandoned` is called then.
+        """
+
+        def look() -> None:
+            entry = next((entry for entry in self._waiting if entry.greenlet is waiting), None)
+            if entry is None or entry.future.done() or not is_under_way():
+                return
+            entry.is_abandoned = True
+            if entry.is_aside:
+                self._aside.end()
+                self._aside = _Worker("files and surfaces")
+            else:
+                self._worker.end()
+                self._worker = _Worker("ultrasound")
+            for other in self._waiting:
+                if other.is_aside == entry.is_aside and other.future.cancel():
+                    self._submit(other)
+            abandoned()
+            entry.greenlet.throw(Cancelled)
+
+        self._loop.call_later(_PATIENCE_S, look)
+
     def stop(self) -> None:
-        """Cancel computations that have not started."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        """Start nothing more that waits."""
+        for entry in self._waiting:
+            entry.is_abandoned = True
+            entry.future.cancel()
 
     def _start(self, function: Callable[[], object]) -> None:
         def run() -> None:

@@ -65,7 +65,10 @@ class Workstation:
         self._probe = ProbeControl(shared, logic, tasks, self._views, stamps.probe_moved)
         self._comparison = Comparison(shared, self._probe.move)
         self._tracker = Tracker(shared, tasks, self._probe.move)
-        self._images = ImageFlow(shared, logic, self._views, self._comparison, cine, self._tracker, stamps)
+        self._images = ImageFlow(
+            shared, logic, self._views, self._comparison, cine, self._tracker, stamps, lambda: presenter.isBusy
+        )
+        self._panel.frozen_changed = self._images.tell_frozen
         opener = Opener(app.scene, logic, tasks, files)
         presenter.maskFile, presenter.sheetsFile = opener.mask_file, opener.sheets_file
         self._panel.pick = self._probe.hand.pick
@@ -176,7 +179,8 @@ class Workstation:
     @property
     def _is_at_rest(self) -> bool:
         sending = any(stream.is_sending for stream in self._images.streams)
-        return self._tasks.are_done and self._probe.is_told and not sending and not self._comparison.is_comparing
+        is_told = self._probe.is_told and self._images.is_shown
+        return self._tasks.are_done and is_told and not sending and not self._comparison.is_comparing
 
     # ---- scene -------------------------------------------------------------------------------------------------
 
@@ -206,7 +210,7 @@ class Workstation:
         self._probe_node.watch(parameters.probe_transform)
         self._image_node.watch(parameters.output)
         self._probe.draw()
-        self._images.tell_geometry()
+        self._images.tell_frozen()
         if self._logic.isLive:
             with self._presenter.shown():
                 self._probe.update_surface()

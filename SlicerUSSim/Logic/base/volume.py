@@ -203,10 +203,13 @@ class Volume:
         image.SetDirection(direction.ravel().tolist())
         return image
 
-    def write(self, path: str | os.PathLike, made_by: str | None = None) -> None:
+    def write(
+        self, path: str | os.PathLike, made_by: str | None = None, about: Mapping[str, str] | None = None
+    ) -> None:
         """Write the volume in the format of the suffix; on failure an existing file is kept.
 
         `made_by` is a text about its origin, up to 79 characters, for the file's header (MINC has no place for it).
+        `about` are further lines of it, {key: text without line ends}, of NRRD, MetaImage and VTI.
         Raises SimulationError for an unknown suffix or if the file cannot be written.
         """
         path = Path(path)
@@ -216,7 +219,7 @@ class Volume:
             require_space(path, self.array.nbytes)
         with written_whole(path) as partial, messages_withheld():
             if suffix == ".vti":
-                self._write_vti(partial, made_by)
+                self._write_vti(partial, {**({} if made_by is None else {MADE_BY: made_by}), **(about or {})})
             else:
                 import SimpleITK as sitk
 
@@ -224,6 +227,8 @@ class Volume:
                 is_nifti = path.name.lower().endswith((".nii", ".nii.gz"))
                 if made_by is not None:
                     image.SetMetaData("ITK_FileNotes" if is_nifti else MADE_BY, made_by)
+                for key, text in (about or {}).items():
+                    image.SetMetaData(key, text)
                 sitk.WriteImage(image, str(partial), useCompression=not path.name.lower().endswith(".mhd"))
                 if is_nifti:
                     require_written(partial, self.array.nbytes)
@@ -291,15 +296,15 @@ class Volume:
         file.Update()
         return cls.from_vtk(file.GetOutput())
 
-    def _write_vti(self, path: Path, made_by: str | None) -> None:
+    def _write_vti(self, path: Path, about: Mapping[str, str]) -> None:
         from vtkmodules.vtkCommonCore import vtkStringArray
         from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
         image = self.to_vtk()
-        if made_by is not None:
+        for key, value in about.items():
             text = vtkStringArray()
-            text.SetName(MADE_BY)
-            text.InsertNextValue(made_by)
+            text.SetName(key)
+            text.InsertNextValue(value)
             image.GetFieldData().AddArray(text)
         writer = vtkXMLImageDataWriter()
         writer.SetFileName(str(path))

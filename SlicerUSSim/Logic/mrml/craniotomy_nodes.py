@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.craniotomy import mask_opening, middle_of, polygon_opening
 from SlicerUSSim.Logic.mrml.label_nodes import LABEL_CLASSES, hidden_segments, node_labels
 from SlicerUSSim.Logic.mrml.nodes import display_of, named, node_to_world, require_node
-from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_result
+from SlicerUSSim.Logic.mrml.own_results import FLAP, mark_as_result, may_replace_result
 
 #: Nodes that describe an opening
 OPENING_CLASSES = ("vtkMRMLMarkupsNode", *LABEL_CLASSES)
@@ -84,7 +84,7 @@ def show_flap(labels_node: Any, removed: Volume) -> Any:
         )
         labels_node.SetNodeReferenceID(_FLAP, model.GetID())
     model.SetAndObservePolyData(_surface(removed))
-    mark_as_result(model)
+    mark_as_result(model, FLAP)
     follow_labels(labels_node)
     display = display_of(model)
     if display is not None:

@@ -28,7 +28,7 @@ from SlicerUSSim.Logic.mrml.nodes import (
     require_node,
     write_volume,
 )
-from SlicerUSSim.Logic.mrml.own_results import mark_as_result, require_result
+from SlicerUSSim.Logic.mrml.own_results import COMPARED as COMPARED_RESULT, mark_as_result, require_result
 from SlicerUSSim.Logic.mrml.sequence_nodes import TIME, number_in
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tracked.images import TrackedImages
@@ -217,7 +217,7 @@ def write_compared(nodes: dict, fit: Fit, number: int, to_world: np.ndarray) -> 
     for name, node in nodes.items():
         node.SetAndObserveTransformNodeID(None)
         write_volume(node, Volume(images[name].astype(np.uint8)[None], geometry))
-        mark_as_result(node)
+        mark_as_result(node, COMPARED_RESULT)
         display = display_of(node)
         if display is not None:
             display.SetAutoWindowLevel(False)

@@ -20,6 +20,8 @@ _CLAIMED = vtkCommand.UserEvent + 7301
 #: An image that takes longer is not live; the first of a patient or a probe includes its preparation, so the second
 #: in a row ends the update
 _SLOWEST_S, _SLOW_IMAGES = 10.0, 2
+#: Priority of an observer that is called before others, whose is 0
+_FIRST = 1000.0
 
 
 class LiveNodes(NamedTuple):
@@ -50,6 +52,7 @@ class LiveUpdate:
         labels_node, transform_node, output_node = nodes.labels, nodes.probe_transform, nodes.output
         self._schedule, self._report, self._stopped = schedule, report, stopped
         self._pending = self._busy = False
+        self._is_claimed = False  # by another live update, whose image is in the output now
         self._logged = ""
         self._slow = 0  # images in a row
         self._outlined = logic.preset.probe
@@ -58,9 +61,10 @@ class LiveUpdate:
 
         scene = logic.scene
         output_node.InvokeEvent(_CLAIMED)  # stops a live update that wrote to it before
-        self._observe(output_node, _CLAIMED, self.stop)
+        self._observe(output_node, _CLAIMED, self._claimed)
         self._observe(scene, scene.StartCloseEvent, self.stop)
-        self._observe(scene, scene.NodeAboutToBeRemovedEvent, self._node_goes, call_data=VTK_OBJECT)
+        # Before Slicer's node selectors, which choose the next node instead: live images would go on into that
+        self._observe(scene, scene.NodeAboutToBeRemovedEvent, self._node_goes, call_data=VTK_OBJECT, priority=_FIRST)
         self._observe(scene, scene.EndBatchProcessEvent, self._batch_ended)
         self._observe(transform_node, transform_node.TransformModifiedEvent, self.request)
         self._observe(labels_node, labels_node.TransformModifiedEvent, self.request)
@@ -78,15 +82,21 @@ class LiveUpdate:
             self._observe(labels_node, vtkCommand.ModifiedEvent, self.request)
         self._observe(logic.parameters.node, vtkCommand.ModifiedEvent, self.request)
 
+    def _claimed(self) -> None:
+        self._is_claimed = True
+        self.stop()
+
     def stop(self) -> None:
-        """Remove all observers and node references, and report the end once."""
+        """Remove all observers and node references, freeze the image, and report the end once."""
         if not self.running:
             return
         self.running = False
         for observed, tag in self._observed:
             observed.RemoveObserver(tag)
         self._observed.clear()
-        self._nodes = None
+        nodes, self._nodes, logic = self._nodes, None, self._logic()
+        if nodes is not None and logic is not None and not self._is_claimed and nodes.output.GetScene() is not None:
+            logic.holdImage(nodes.output)
         stopped, self._stopped, self._report = self._stopped, None, None
         if stopped is not None:
             stopped()
@@ -95,7 +105,7 @@ class LiveUpdate:
         self._stopped = None
         self.stop()
 
-    def _observe(self, subject, event, method, call_data=None) -> None:
+    def _observe(self, subject, event, method, call_data=None, priority=0.0) -> None:
         weak = weakref.WeakMethod(method)  # a strong reference would keep this object alive as long as the scene
 
         def callback(_subject, _event, *data):
@@ -105,7 +115,7 @@ class LiveUpdate:
 
         if call_data is not None:
             setattr(callback, "CallDataType", call_data)  # noqa: B010, where VTK looks for it
-        self._observed.append((subject, subject.AddObserver(event, callback)))
+        self._observed.append((subject, subject.AddObserver(event, callback, priority)))
 
     def _node_goes(self, node) -> None:
         if any(node is mine for mine in self._nodes or ()):

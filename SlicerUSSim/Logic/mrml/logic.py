@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,7 +26,7 @@ from SlicerUSSim.Logic.imaging.frame import Frame
 from SlicerUSSim.Logic.imaging.noise import seed_of_pose
 from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.imaging.reuse import ReusedSimulator
-from SlicerUSSim.Logic.imaging.simulator import UltrasoundSimulator
+from SlicerUSSim.Logic.imaging.simulator import EmptyViewWarning, UltrasoundSimulator
 from SlicerUSSim.Logic.mri.addable import require_addable
 from SlicerUSSim.Logic.mri.craniotomy import default_pose, disc_diameter_mm, disc_opening, face_width_mm, opened
 from SlicerUSSim.Logic.mri.ct import CtSegmentation
@@ -72,12 +74,29 @@ from SlicerUSSim.Logic.mrml.nodes import (
     write_outline,
 )
 from SlicerUSSim.Logic.mrml.own_labels import mark_as_made, may_replace
-from SlicerUSSim.Logic.mrml.own_results import mark_as_result, may_replace_result, require_result
+from SlicerUSSim.Logic.mrml.own_results import (
+    IMAGE,
+    OUTLINE,
+    REGISTRATION,
+    SEQUENCE,
+    mark_as_result,
+    may_replace_result,
+    require_result,
+)
 from SlicerUSSim.Logic.mrml.parameter_node import SceneParameters
 from SlicerUSSim.Logic.mrml.proposal_nodes import LesionProposals
 from SlicerUSSim.Logic.mrml.sequence_nodes import SequenceIndex
 from SlicerUSSim.Logic.mrml.share_nodes import read_shares, shares_version, write_shares
 from SlicerUSSim.Logic.mrml.sheet_nodes import read_sheets, sheets_version, write_sheets
+from SlicerUSSim.Logic.mrml.taken_image import (
+    PATIENT,
+    TakenImage,
+    follow,
+    freeze,
+    patient_of,
+    remove_image,
+    write_about,
+)
 from SlicerUSSim.Logic.probe.placement import pose_in_slice
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tissue.table import TissueTable
@@ -156,7 +175,7 @@ class UltrasoundSceneLogic:
         self._texture: tuple[Hashable, Texture | None] | None = None  # with the version of its labels
         self._preset: tuple[str, Preset] = ("", Preset())
         self._live: LiveUpdate | None = None
-        self._last: tuple[Frame, np.ndarray] | None = None  # with the pose of the probe
+        self._taken: TakenImage | None = None
 
     # ---- choices -------------------------------------------------------------------------------------------
 
@@ -193,6 +212,10 @@ class UltrasoundSceneLogic:
         if is_default and "skin" in self._patient(labels_node).names:
             return replace(settings, contact_gap_mm=GEL_MM)
         return settings
+
+    def _effective_preset(self, labels_node) -> Preset:
+        """The preset with the settings that images of these labels have."""
+        return replace(self.preset, settings=self.settings(labels_node))
 
     # ---- single steps ------------------------------------------------------------------------------------------------
 
@@ -478,27 +501,105 @@ class UltrasoundSceneLogic:
         Raises SimulationError, before anything is computed, for an output with data that this module did not make.
         """
         self._check_output(labels_node, output_node)
-        probe_to_world = probe_pose(probe_transform_node)
-        frame = self._frame(labels_node, probe_to_world, warned)
+        try:
+            taken = self._take(labels_node, probe_transform_node, output_node, warned)
+        except BaseException:
+            if may_replace_result(output_node):
+                self.clearImage(output_node)  # an image of before would be taken for that of this pose
+            raise
+        self._taken = taken
+        was_modifying = output_node.StartModify()
+        write_about(taken)
+        write_image(output_node, taken.frame, probe_transform_node)
+        mark_as_result(output_node, IMAGE)
+        output_node.EndModify(was_modifying)
+        return taken.frame
+
+    def _take(
+        self, labels_node, probe_transform_node, output_node, warned: Callable[[Warning], None]
+    ) -> TakenImage:  # fmt: skip
+        warnings: list[Warning] = []
+        probe_to_world, anatomy = probe_pose(probe_transform_node), self.anatomyOf(labels_node)
+        preset, patient = self._effective_preset(labels_node), patient_of(labels_node)
+        frame = self._frame(labels_node, probe_to_world, warnings.append)
         self._check_output(labels_node, output_node)  # nodes may have changed in the meantime
         require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
-        self._last = (frame, probe_to_world)
-        write_image(output_node, frame, probe_transform_node)
-        mark_as_result(output_node)
-        return frame
+        for warning in warnings:
+            warned(warning)
+        is_empty = any(isinstance(warning, EmptyViewWarning) for warning in warnings) or not frame.iq.any()
+        time = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+        return TakenImage(frame, probe_to_world, preset, patient, anatomy, time, is_empty, output_node)
+
+    def anatomyOf(self, labels_node) -> Hashable:
+        """A value that changes with what images show of the patient: labels and sheets."""
+        require_node(labels_node, *LABEL_CLASSES, use="label map")
+        node: Any = self.parameters.sheets
+        sheets = None if node is None else (sheets_version(node), self.parameters.sheet.kinds)
+        return labels_version(labels_node), sheets
+
+    def holdImage(self, output_node) -> None:
+        """Freeze the image that simulate() wrote last into this node: it stays where it was taken.
+
+        Without that it is under the probe's transform, for the next image, and would be shown where the probe is then.
+        """
+        taken = self._taken
+        if taken is not None and taken.node is output_node and output_node.GetImageData() is not None:
+            freeze(taken)
+
+    @contextmanager
+    def imageHeld(self) -> Iterator[None]:
+        """As if Live ended, and goes on after that: in a scene that is saved, the image is where it was taken."""
+        taken = self._taken
+        transform = None if taken is None else taken.node.GetParentTransformNode()
+        if taken is None or transform is None or not self.isLive:
+            yield
+            return
+        freeze(taken)
+        try:
+            yield
+        finally:
+            follow(taken, transform)
+
+    def clearImage(self, output_node) -> None:
+        """Empty a node with an image of this module, which is not of the present patient or pose."""
+        if output_node is None:
+            return
+        require_result(output_node, "output")
+        if self._taken is not None and self._taken.node is output_node:
+            self._taken = None
+        if output_node.GetImageData() is not None:
+            remove_image(output_node)
+
+    def renewSimulator(self) -> None:
+        """Make images with another simulator from now on: work that was abandoned may still use the one of before."""
+        self._simulators = ReusedSimulator()
+
+    def forgetPatient(self) -> None:
+        """Release what is kept in memory of the last patient; nodes stay."""
+        self.stopLiveUpdate()
+        self._simulators.forget()
+        self._patients = PatientReader()
+        self._segmented = self._sheets = self._texture = self._taken = None
+        self._laid = (None, {})
+        self.proposals = LesionProposals(self.scene, lambda work: self._work.do(work))
+        self.notes = self.warnings = ()
+
+    @property
+    def taken(self) -> TakenImage | None:
+        """The last result of simulate(), with all that it is of; None if there is none, or the last one failed."""
+        return self._taken
 
     @property
     def lastFrame(self) -> Frame | None:
         """The last result of simulate()."""
-        return None if self._last is None else self._last[0]
+        return None if self._taken is None else self._taken.frame
 
     def lastImage(self) -> Volume:
         """The image of lastFrame as one slice at the probe's pose of that time (RAS), not its present pose.
 
         Raises SimulationError if there is none.
         """
-        frame, probe_to_world = required(self._last, "there is no image yet, simulate one first")
-        return Volume(frame.image[None], probe_to_world @ frame.grid.slice_to_probe)
+        return required(self._taken, "there is no image yet, simulate one first").volume()
 
     def simulateSequence(
         self,
@@ -539,14 +640,14 @@ class UltrasoundSceneLogic:
             image = self.scene.CreateNodeByClass("vtkMRMLScalarVolumeNode")
             image.UnRegister(None)
             write_image(image, frame)
-            mark_as_result(image)  # the browser's node for the shown image is a copy
+            mark_as_result(image, IMAGE)  # the browser's node for the shown image is a copy
             images.append(image)
             if progress is not None:
                 progress((number + 1) / count)
         require_node(images_node, "vtkMRMLSequenceNode", use="sequence of images")
 
         SequenceIndex.of_node(transforms_node).fill(images_node, images)
-        mark_as_result(images_node)
+        mark_as_result(images_node, SEQUENCE)
         if browser_node is not None:
             if not browser_node.IsSynchronizedSequenceNode(images_node, True):
                 browser_node.AddSynchronizedSequenceNode(images_node)
@@ -595,7 +696,7 @@ class UltrasoundSceneLogic:
         require_node(probe_transform_node, "vtkMRMLTransformNode", use="probe transform")
         require_result(model_node, "outline")
         write_outline(model_node, self.preset.probe, probe_transform_node)
-        mark_as_result(model_node)
+        mark_as_result(model_node, OUTLINE)
 
     def showInSlice(self, slice_node, output_node, probe_transform_node, fit: bool = True) -> None:
         """Move a slice view to the image plane and overlay the image."""
@@ -633,7 +734,7 @@ class UltrasoundSceneLogic:
         those of others, which are predicted beside controls (fitting.predict). `plot` shows the cost during the fit.
         Nothing else in the scene changes; applyFit adopts the result. `progress` may raise errors.Cancelled.
         """
-        patient, preset = self._patient(labels_node), replace(self.preset, settings=self.settings(labels_node))
+        patient, preset = self._patient(labels_node), self._effective_preset(labels_node)
         pose = None if probe_transform_node is None else probe_pose(probe_transform_node)
         tracked = tracked_images(
             images_node, frames, preset.probe, probe_to_world=pose, estimate_geometry=estimate_geometry, apart=validate
@@ -699,7 +800,7 @@ class UltrasoundSceneLogic:
         require_result(transform_node, "registration")
         to_world = self._fit_to_world(labels_node)
         set_node_to_world(transform_node, to_world @ registration.correction @ np.linalg.inv(to_world))
-        mark_as_result(transform_node)
+        mark_as_result(transform_node, REGISTRATION)
 
     def showFit(self, found: Fit, labels_node, nodes: Mapping[str, object], number: int | None = None) -> None:
         """Write one image of a fit, by default the first, into volume nodes: any of {"real": ..., "before": ...,
@@ -857,7 +958,7 @@ class UltrasoundSceneLogic:
         noise_seed: int | None = None,
     ) -> Frame:
         """The image at a pose; the default seed of its noise depends on the pose."""
-        patient, preset = self._patient(labels_node), replace(self.preset, settings=self.settings(labels_node))
+        patient, preset = self._patient(labels_node), self._effective_preset(labels_node)
         texture, sheets = self._texture_of(labels_node, patient), self._sheets_of(labels_node)
         pose = patient.pose(probe_to_world)
         seed = seed_of_pose(pose) if noise_seed is None else noise_seed
@@ -886,6 +987,7 @@ class UltrasoundSceneLogic:
         """Write labels and what is known of their shares."""
         write_labels(labels_node, added.labels, added.tissue_names, like_node)
         mark_as_made(labels_node)
+        labels_node.SetAttribute(PATIENT, patient_of(like_node))
         set_closed_labels(labels_node, None)
         hide_flap(labels_node)
         if texture is not None:

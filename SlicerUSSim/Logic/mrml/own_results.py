@@ -8,19 +8,28 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.vtk_data import matrix_array
 from SlicerUSSim.Logic.mrml.nodes import named, nodes_of_class
 
-#: Attribute of a node, saved with the scene
+#: Attribute of a node, saved with the scene: the kind of result; "1" in scenes of earlier versions
 _RESULT = "SlicerUSSim.result"
+#: Kinds of results
+IMAGE, OUTLINE, SEQUENCE, SHEETS, FLAP, COMPARED, REGISTRATION = (
+    "image", "outline", "sequence", "sheets", "flap", "compared", "registration"
+)  # fmt: skip
 
 
-def mark_as_result(node) -> None:
-    """Record that a volume, model, sequence or transform node holds a result of this module."""
-    if node.GetAttribute(_RESULT) is None:  # an attribute that is set is a change, which observers hear of
-        node.SetAttribute(_RESULT, "1")
+def mark_as_result(node, kind: str) -> None:
+    """Record that a volume, model, sequence or transform node holds a result of this module, of this kind."""
+    if node.GetAttribute(_RESULT) != kind:  # an attribute that is set is a change, which observers hear of
+        node.SetAttribute(_RESULT, kind)
+
+
+def kind_of_result(node) -> str | None:
+    """The kind of the result in a node; None of a node of others, or an empty one."""
+    return node.GetAttribute(_RESULT)
 
 
 def may_replace_result(node) -> bool:
     """Whether a volume, model, sequence or transform node is empty, or holds a result of this module."""
-    return node.GetAttribute(_RESULT) is not None or _is_empty(node)
+    return node.GetAttribute(_RESULT) is not None or is_empty(node)
 
 
 def require_result(node, use: str) -> None:
@@ -40,7 +49,8 @@ def result_called(scene, kind: str, name: str):
     return scene.AddNewNodeByClass(f"vtkMRML{kind}Node", name)
 
 
-def _is_empty(node) -> bool:
+def is_empty(node) -> bool:
+    """Whether a volume, model, sequence or linear transform node has no data."""
     if node.IsA("vtkMRMLSequenceNode"):
         return node.GetNumberOfDataNodes() == 0
     if node.IsA("vtkMRMLLinearTransformNode"):

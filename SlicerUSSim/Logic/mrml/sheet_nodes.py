@@ -12,7 +12,7 @@ from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.mri.sheets.polydata import as_polydata, surfels_of
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 from SlicerUSSim.Logic.mrml.nodes import display_of, named, node_to_world, require_node
-from SlicerUSSim.Logic.mrml.own_results import mark_as_result
+from SlicerUSSim.Logic.mrml.own_results import SHEETS, mark_as_result
 
 
 def write_sheets(model_node, surfels: Surfels, mri_node) -> None:
@@ -20,7 +20,7 @@ def write_sheets(model_node, surfels: Surfels, mri_node) -> None:
     model_node.SetAndObservePolyData(as_polydata(surfels))
     parent = mri_node.GetParentTransformNode()
     model_node.SetAndObserveTransformNodeID(None if parent is None else parent.GetID())
-    mark_as_result(model_node)
+    mark_as_result(model_node, SHEETS)
     is_new = model_node.GetDisplayNode() is None
     display = display_of(model_node)
     if is_new and display is not None:

@@ -5,9 +5,10 @@
   const measured = []; // milliseconds from an event to the image that shows its effect
   const STAMP_EVERY_MS = 40; // events in between share the stamp of the previous one, which overestimates their latency
   let stamped = 0;
+  let drawnRuler = "null";
   const shown = []; // times at which simulated images were displayed
 
-  const workstation = { measured, shown, measuring: false, images: 0, connected: false };
+  const workstation = { measured, shown, measuring: false, images: 0, image: null, connected: false };
   window.ussim = workstation;
 
   const session = () => window.trame?.client?.getConnection?.()?.getSession?.();
@@ -21,9 +22,14 @@
     if (meta?.number === undefined) return; // a view of Slicer, drawn by its own component
     const canvas = canvasOf(name);
     if (!canvas) return;
-    const bitmap = await createImageBitmap(new Blob([content], { type: meta.type }));
+    const bitmap = meta.blank ? null : await createImageBitmap(new Blob([content], { type: meta.type }));
     if (Number(canvas.dataset.number ?? 0) > meta.number && meta.number > 1) return; // overtaken while it was decoded
     canvas.dataset.number = meta.number;
+    describe(canvas, meta);
+    if (!bitmap) {
+      canvas.getContext("2d", { alpha: false }).clearRect(0, 0, canvas.width, canvas.height);
+      return;
+    }
     if (canvas.width !== bitmap.width || canvas.height !== bitmap.height) {
       canvas.width = bitmap.width; // only on a change, since it makes the browser redo the layout
       canvas.height = bitmap.height;
@@ -43,6 +49,23 @@
     });
   }
 
+  // Frame, ruler and caption of an image; they came with it, and change when it does.
+  function describe(canvas, meta) {
+    const frame = canvas.closest(".ussim-frame");
+    if (canvas.dataset.stream !== "real-over") frame.style.visibility = meta.blank ? "hidden" : "visible";
+    if (meta.ruler && canvas.dataset.stream !== "real-over") {
+      frame.style.setProperty("--w", meta.ruler.w);
+      frame.style.setProperty("--h", meta.ruler.h);
+    }
+    if (canvas.dataset.stream !== "simulated") return;
+    workstation.image = meta.blank ? null : meta;
+    const ruler = JSON.stringify(meta.ruler ?? null);
+    if (ruler !== drawnRuler) window.ussimOverlay(document.getElementById("overlay"), meta.ruler);
+    drawnRuler = ruler;
+    const caption = document.getElementById("image-caption");
+    caption.textContent = meta.blank ? "" : `${meta.patient}, ${meta.time.slice(11, 19)} UTC`;
+  }
+
   workstation.summary = (count = 100) => {
     const last = measured.slice(-count);
     const times = shown.filter((time) => time > performance.now() - 2000);
@@ -60,8 +83,16 @@
       : "Move the probe with the mouse to measure latency";
   }
 
-  const isWriting = (element) =>
-    element && (element.isContentEditable || ["INPUT", "TEXTAREA", "SELECT"].includes(element.tagName));
+  // Whether a key belongs to the focused element: all of a field for text, those that change a slider or a choice.
+  const NOT_TEXT = ["checkbox", "radio", "button", "submit", "file", "range"];
+  const CHANGES = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End", "PageUp", "PageDown", " ", "Enter"];
+  function isTaken(key, element) {
+    if (!element?.closest) return false;
+    const isText = element.tagName === "INPUT" && !NOT_TEXT.includes(element.type);
+    if (isText || element.isContentEditable || element.tagName === "TEXTAREA") return true;
+    const hasValue = element.closest("select, input[type=range], [role=slider], [role=menu], [role=listbox], [role=dialog]");
+    return Boolean(hasValue) && CHANGES.includes(key);
+  }
 
   // The time of a mouse event is sent to the server just before the event itself.
   window.addEventListener(
@@ -74,7 +105,7 @@
     { capture: true, passive: true },
   );
   window.addEventListener("keydown", (event) => {
-    if (isWriting(event.target) || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (event.ctrlKey || event.altKey || event.metaKey || isTaken(event.key, event.target)) return;
     const keys = canvasOf("simulated")?.dataset.keys.split(" ") ?? [];
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (!keys.includes(key)) return;
@@ -100,6 +131,13 @@
     }
   };
 
+  // For screen readers, what trame's own parts lack: names of the rendered views, and leave to zoom.
+  function nameViews() {
+    for (const image of document.querySelectorAll("img.image-display-area:not([alt])")) image.alt = "View of the anatomy";
+    const viewport = document.querySelector("meta[name=viewport]");
+    if (viewport?.content.includes("maximum-scale")) viewport.content = "width=device-width, initial-scale=1";
+  }
+
   function connect() {
     const connection = session();
     if (!connection || !window.trame?.state || !canvasOf("simulated")) {
@@ -110,6 +148,7 @@
     workstation.connected = true;
     window.trame.trigger("page_opened");
     setInterval(showLatency, 300);
+    setInterval(nameViews, 1000);
   }
   connect();
 })();

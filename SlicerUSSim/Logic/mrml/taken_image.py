@@ -1,0 +1,119 @@
+"""TakenImage: a simulated image together with all that it is of, and the same as attributes of its volume node.
+
+An image without the name of its patient, its pose and its settings can be taken for one of another patient or place.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.base.volume import Volume
+from SlicerUSSim.Logic.base.vtk_data import vtk_matrix
+from SlicerUSSim.Logic.imaging.frame import Frame
+from SlicerUSSim.Logic.imaging.preset import Preset
+
+#: Attribute of a node with an MRI or labels: the name of the patient; without it the node's own name is
+PATIENT = "SlicerUSSim.patient"
+#: Attributes of the image's volume node: what it is of, as JSON, and whether it stays where it was taken
+_ABOUT, _FROZEN = "SlicerUSSim.image", "SlicerUSSim.frozen"
+
+
+@dataclass(frozen=True, eq=False)
+class TakenImage:
+    """An image that was simulated on nodes of a scene."""
+
+    frame: Frame
+    #: (4, 4) at the time of the image
+    probe_to_world: np.ndarray
+    #: Probe, display, settings and tissues with which it was simulated
+    preset: Preset
+    #: Name of the patient
+    patient: str
+    #: Changes with labels and sheets
+    anatomy: Hashable
+    #: Coordinated universal time, ISO 8601
+    time: str
+    #: Whether there is no tissue in the imaged field
+    is_empty: bool
+    #: The volume node into which it was written
+    node: Any
+
+    @property
+    def image_to_world(self) -> np.ndarray:
+        """(4, 4) from (column, row, 0, 1) of the slice to the world, mm."""
+        return self.probe_to_world @ self.frame.grid.slice_to_probe
+
+    def volume(self) -> Volume:
+        """One slice where it was taken."""
+        return Volume(self.frame.image[None], self.image_to_world)
+
+    def about(self) -> dict[str, object]:
+        """Patient, time, pose and preset, as JSON can hold them."""
+        return {
+            "patient": self.patient,
+            "time": self.time,
+            "probe_to_ras": self.probe_to_world.round(6).tolist(),
+            "preset": self.preset.to_dict(),
+        }
+
+
+def patient_of(node) -> str:
+    """Name of the patient of a node with an MRI or labels."""
+    return node.GetAttribute(PATIENT) or node.GetName() or ""
+
+
+def write_about(taken: TakenImage) -> None:
+    """Keep with the volume node what its image is of; it follows the probe from now on."""
+    taken.node.SetAttribute(_ABOUT, json.dumps(taken.about()))
+    taken.node.RemoveAttribute(_FROZEN)
+
+
+def about_image(volume_node) -> dict[str, Any]:
+    """What the image in a volume node is of, see TakenImage.about; {} of a volume that is no such image."""
+    text = volume_node.GetAttribute(_ABOUT)
+    try:
+        return {} if text is None else json.loads(text)
+    except ValueError:
+        raise SimulationError(f"{volume_node.GetName()!r} has an attribute {_ABOUT} that is not JSON") from None
+
+
+def is_frozen(volume_node) -> bool:
+    """Whether an image stays where it was taken, however the probe moves."""
+    return volume_node.GetAttribute(_FROZEN) is not None
+
+
+def freeze(taken: TakenImage) -> None:
+    """Leave the image of a volume node where it was taken, not under the probe's transform any more."""
+    node = taken.node
+    was_modifying = node.StartModify()
+    node.SetAndObserveTransformNodeID(None)
+    node.SetIJKToRASMatrix(vtk_matrix(taken.image_to_world))
+    node.SetAttribute(_FROZEN, "1")
+    node.EndModify(was_modifying)
+
+
+def follow(taken: TakenImage, transform_node) -> None:
+    """Put a frozen image under the probe's transform again."""
+    node = taken.node
+    was_modifying = node.StartModify()
+    node.SetAndObserveTransformNodeID(transform_node.GetID())
+    node.SetIJKToRASMatrix(vtk_matrix(taken.frame.grid.slice_to_probe))
+    node.RemoveAttribute(_FROZEN)
+    node.EndModify(was_modifying)
+
+
+def remove_image(volume_node) -> None:
+    """Empty a volume node with an image of this module."""
+    was_modifying = volume_node.StartModify()
+    volume_node.SetAndObserveImageData(None)
+    volume_node.SetAndObserveTransformNodeID(None)
+    for name in (_ABOUT, _FROZEN):
+        volume_node.RemoveAttribute(name)
+    volume_node.EndModify(was_modifying)
+    volume_node.InvokeEvent(volume_node.ImageDataModifiedEvent)  # the views show its last image otherwise

@@ -1,0 +1,144 @@
+"""Who may come in: the token on every interface, TLS, and requests that no browser sends."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
+pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
+
+from SlicerUSSim.Logic import TissueTable
+from SlicerUSSim.Logic.mri.samples import head_mri
+from SlicerUSSim.Logic.mri.segmentation import segment_mri
+from SlicerUSSim.Logic.tissue.own_files import write_label_files
+from tests.test_workstation import browser as browser, pixels, pytestmark as pytestmark, settled
+
+needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="OpenSSL makes the certificate")
+
+
+@pytest.fixture(scope="module")
+def labels(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("patient") / "labels.nii.gz"
+    found = segment_mri(head_mri(4.0))
+    write_label_files(path, found.labels, TissueTable.brain(found.tissue_names))
+    return path
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("tls")
+    cert, key = folder / "cert.pem", folder / "key.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", cert, "-days", "2",
+         "-subj", "/CN=localhost"],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    return cert, key
+
+
+class Server:
+    """`ussim serve` as a process."""
+
+    def __init__(self, *arguments) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", "0", *map(str, arguments)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self.url = self.process.stdout.readline().strip()
+        self.port = urlsplit(self.url).port
+        self.token = urlsplit(self.url).query.partition("=")[2]
+
+    def answer(self, request: str) -> str:
+        """The first line of the answer to a request in HTTP's own words."""
+        with socket.create_connection(("127.0.0.1", self.port), timeout=60) as connection:
+            connection.sendall(request.replace("\n", "\r\n").encode())
+            return connection.recv(200).decode(errors="replace").partition("\r\n")[0]
+
+    def end(self) -> str:
+        """What it wrote to its log."""
+        self.process.terminate()
+        return self.process.communicate(timeout=60)[1]
+
+
+def test_on_loopback_too_the_token_is_asked(labels):
+    """Other users of the computer can connect to it."""
+    server = Server("--labels", labels)
+    try:
+        assert len(server.token) >= 32
+        for path in ("", "index.html", "ws", "?token=wrong"):
+            with pytest.raises(urllib.error.HTTPError) as caught:
+                urllib.request.urlopen(f"http://127.0.0.1:{server.port}/{path}", timeout=60)
+            assert caught.value.code == 403
+        assert (
+            server.answer(f"GET /?token={server.token} HTTP/1.1\nHost: 127.0.0.1:{server.port}\n\n").split()[1] == "303"
+        )
+        elsewhere = server.answer(f"GET /?token={server.token} HTTP/1.1\nHost: elsewhere.example\n\n")
+        assert elsewhere.split()[1] == "403"  # a name that another site makes resolve to this computer
+    finally:
+        server.end()
+
+
+def test_requests_that_no_browser_sends_leave_no_traceback(labels):
+    server = Server("--labels", labels)
+    host, token = f"127.0.0.1:{server.port}", server.token
+    socket_of = f"GET /ws?token={token} HTTP/1.1\nHost: {host}\n"
+    upgrade = "Upgrade: websocket\nConnection: Upgrade\nSec-WebSocket-Version: "
+    try:
+        assert server.answer("\x16\x03\x01garbage\n\n").split()[1] == "400"
+        assert server.answer(f"{socket_of}\n").split()[1] == "400"
+        assert server.answer(f"{socket_of}{upgrade}99\nSec-WebSocket-Key: x\n\n").split()[1] == "400"
+        assert server.answer(f"{socket_of}{upgrade}13\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\n\n\x01hello") != ""
+        assert server.answer("GET / HTTP/1.1\nHost: [\n\n").split()[1] in ("400", "403")
+        assert server.answer(f"GET / HTTP/1.1\nHost: {host}\nOrigin: http://[x\n\n").split()[1] == "403"
+        assert server.answer(f"GET /?token={token} HTTP/1.1\nHost: {host}\n\n").split()[1] == "303"  # it goes on
+    finally:
+        log = server.end()
+    assert "Traceback" not in log and "Error" not in log, log
+
+
+@needs_openssl
+def test_with_a_certificate_page_and_images_come_over_tls(browser, labels, certificate):
+    cert, key = certificate
+    server = Server("--labels", labels, "--cert", cert, "--key", key)
+    try:
+        assert server.url.startswith("https://")
+        page = browser.new_page(ignore_https_errors=True)
+        page.set_default_timeout(120_000)
+        sockets = []
+        page.on("websocket", lambda socket: sockets.append(socket.url))
+        page.goto(server.url)
+        page.wait_for_function("window.ussim?.images > 0")
+        settled(page)
+        assert sockets and all(address.startswith("wss://") for address in sockets)
+        assert np.mean(pixels(page)) > 3
+        (cookie,) = [entry for entry in page.context.cookies() if "ussim_token" in entry["name"]]
+        assert cookie["secure"] and cookie["httpOnly"]
+        page.close()
+    finally:
+        server.end()
+
+
+@needs_openssl
+def test_what_is_no_certificate_is_said_in_one_line(labels, certificate, tmp_path):
+    cert, key = certificate
+    for arguments, words in (
+        (["--cert", cert], "--cert and --key are for each other, expected both or none"),
+        (["--cert", cert, "--key", tmp_path / "none.pem"], "none.pem: no such file"),
+        (["--cert", labels, "--key", key], "expected a certificate and its key"),
+        (["--cert", cert, "--key", cert], "expected a certificate and its key"),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--labels", labels, *arguments],
+            capture_output=True, text=True, timeout=120,
+        )  # fmt: skip
+        assert done.returncode == 2 and words in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr

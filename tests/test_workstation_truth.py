@@ -1,0 +1,272 @@
+"""Every picture of the workstation says whose it is, and shows what is there now; nothing of the user's is lost."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
+pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
+
+import slicer
+from PIL import Image
+from vtkmodules.vtkIOXML import vtkXMLImageDataReader
+
+from SlicerUSSim.Logic import Volume
+from SlicerUSSim.Logic.base.volume import read_array
+from SlicerUSSim.Workstation.state import NAMES
+from tests.test_workstation import (
+    browser as browser,
+    click,
+    cost,
+    download,
+    errors,
+    eventually,
+    files as files,
+    fit,
+    new_image,
+    opened,
+    pixels,
+    pose,
+    pytestmark as pytestmark,
+    run_again,
+    script_of,
+    serving,
+    settled,
+    shown,
+    state,
+)
+
+
+@pytest.fixture(scope="module")
+def url(files):
+    with serving(str(files / "head.nii.gz"), "--sequence", str(files / "sweep.igs.mha")) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def first_page(browser, url):
+    problems: list[str] = []
+    yield opened(browser, url, problems), problems
+
+
+@pytest.fixture
+def page(first_page):
+    page, problems = first_page
+    for _ in errors(page):
+        page.evaluate("window.trame.trigger('dismiss', [0])")
+    page.mouse.move(600, 500)
+    if not shown(page, "liveCheckBox"):
+        click(page, "#live")
+        eventually(page, lambda: shown(page, "liveCheckBox"))
+    page.evaluate("window.trame.trigger('press', ['placeButton'])")
+    settled(page)
+    yield page
+    assert not problems
+
+
+def lift_off(page) -> None:
+    """Beyond the volume of the patient."""
+    page.evaluate("() => { for (let n = 0; n < 100; n++) window.trame.trigger('key', ['+', true]); }")
+
+
+# ---- what an image is of ---------------------------------------------------------------------------------------------
+
+
+def test_an_image_comes_with_patient_time_pose_and_ruler(page):
+    image = page.evaluate("window.ussim.image")
+    assert image["patient"] == "head.nii.gz" and image["ruler"]["h"] == pytest.approx(70, rel=0.02)
+    assert np.shape(image["pose"]) == (4, 4) and image["time"].startswith("20")
+    assert page.locator("#image-caption").inner_text() == f"head.nii.gz, {image['time'][11:19]} UTC"
+    with new_image(page):
+        page.keyboard.press("a")
+    after = page.evaluate("window.ussim.image")
+    assert after["pose"] != image["pose"] and after["time"] > image["time"]
+    png = Image.open(download(page, "png"))
+    about = json.loads(png.text["SlicerUSSim"])
+    assert about["patient"] == "head.nii.gz" and about["preset"]["probe"]["kind"] == "phased"
+    np.testing.assert_allclose(about["probe_to_ras"], after["pose"], atol=1e-3)
+    for kind in ("nrrd", "mha"):
+        content = download(page, kind).read_bytes()
+        assert b"head.nii.gz" in content and b"probe_to_ras" in content and b"preset" in content, kind
+    vti = vtkXMLImageDataReader()
+    vti.SetFileName(str(download(page, "vti")))
+    vti.Update()
+    assert json.loads(vti.GetOutput().GetFieldData().GetAbstractArray("SlicerUSSim").GetValue(0)) == about
+    with new_image(page):
+        page.keyboard.press("a")
+    assert "head.nii.gz, 20" in Image.open(download(page, "gif")).info["comment"].decode()
+
+
+def test_ruler_and_image_change_together(page):
+    page.evaluate(
+        """() => { window.drawnWith = []; const draw = CanvasRenderingContext2D.prototype.drawImage;
+        CanvasRenderingContext2D.prototype.drawImage = function (bitmap, ...rest) {
+          if (this.canvas.dataset.stream === 'simulated') {
+            const [, , w, h] = document.getElementById('overlay').getAttribute('viewBox').split(' ').map(Number);
+            window.drawnWith.push([window.ussim.image.ruler.h, h, w / h, bitmap.width / bitmap.height]); }
+          return draw.call(this, bitmap, ...rest); }; }"""
+    )
+    for depth in (50, 90, 70):
+        with new_image(page):
+            page.evaluate("depth => window.trame.trigger('set', ['depthSlider', depth])", depth)
+    drawn_with = page.evaluate("window.drawnWith")
+    assert {round(entry[0] / 10) * 10 for entry in drawn_with} == {50, 70, 90}
+    for of_image, of_ruler, ratio, of_pixels in drawn_with:
+        assert of_image == of_ruler and ratio == pytest.approx(of_pixels, rel=0.02)
+
+
+def test_a_frozen_image_stays_where_it_was_taken_in_every_export(page, tmp_path):
+    assert page.locator("#frozen").is_hidden()
+    click(page, "#live")
+    page.locator("#frozen").wait_for()
+    assert page.locator("#frozen").inner_text() == "FROZEN"
+    settled(page)
+    taken, seen = page.evaluate("window.ussim.image.pose"), pixels(page)
+    for _ in range(4):
+        page.keyboard.press("Shift+ArrowRight")
+    settled(page)
+    assert page.evaluate("window.ussim.image.pose") == taken and np.array_equal(pixels(page), seen)
+    shutil.copy(download(page, "nrrd"), tmp_path / "frozen.nrrd")
+    array, to_ras = read_array(tmp_path / "frozen.nrrd")
+    again = run_again(script_of(page), tmp_path)
+    assert np.array_equal(again, array[0])
+    np.testing.assert_allclose(read_array(tmp_path / "image.nrrd")[1], to_ras, atol=1e-3)
+    node, in_scene = output_of_scene(download(page, "mrb"), tmp_path)
+    np.testing.assert_allclose(in_scene, to_ras, atol=1e-3)
+    assert node.GetAttribute("SlicerUSSim.frozen")
+    click(page, "#live")
+    page.locator("#frozen").wait_for(state="hidden")
+
+
+def output_of_scene(bundle: Path, folder: Path):
+    """(the output volume node, (4, 4) of its slice to the world) of an .mrb."""
+    from trame_slicer.core import SlicerApp
+
+    from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
+    from SlicerUSSim.Logic.mrml.nodes import ijk_to_ras, node_to_world
+
+    shutil.copy(bundle, folder / "scene.mrb")
+    app = SlicerApp()
+    app.register_module_logic(slicer.vtkSlicerSequencesLogic())
+    assert app.io_manager.load_scene(folder / "scene.mrb")
+    output_of_scene.app = app  # keeps its nodes
+    node = UltrasoundSceneLogic(app.scene).parameters.output
+    return node, node_to_world(node) @ ijk_to_ras(node)
+
+
+def test_a_live_image_is_saved_where_it_was_taken_and_follows_the_probe_after_that(page, tmp_path):
+    shutil.copy(download(page, "nrrd"), tmp_path / "live.nrrd")
+    _, in_scene = output_of_scene(download(page, "mrb"), tmp_path)
+    np.testing.assert_allclose(in_scene, read_array(tmp_path / "live.nrrd")[1], atol=1e-3)
+    with new_image(page):
+        page.keyboard.press("a")
+    assert page.locator("#frozen").is_hidden()
+
+
+def test_while_a_fit_runs_the_image_is_marked_frozen(page):
+    fit(page, 100_000)
+    page.locator("#cancel").wait_for()
+    page.locator("#frozen").wait_for()
+    click(page, "#cancel")
+    page.locator("#frozen").wait_for(state="hidden")
+    settled(page)
+
+
+def test_the_cost_is_blank_where_the_probe_sees_nothing(page):
+    """A black image had a lower cost than a real one."""
+    page.evaluate("window.trame.trigger('show_number', [2])")
+    settled(page)
+    assert 0 < cost(page) < 1
+    lift_off(page)
+    settled(page)
+    assert "looks past the volume" in state(page, NAMES.messages.status)
+    assert state(page, NAMES.sequence.similarity) == "" == page.locator("#similarity").inner_text()
+    page.evaluate("window.trame.trigger('show_number', [2])")
+    settled(page)
+    assert 0 < cost(page) < 1
+
+
+def test_a_new_patient_clears_image_ruler_and_cost_at_once_and_the_probe_is_placed_anew(page, files, tmp_path):
+    for _ in range(6):
+        page.keyboard.press("Shift+ArrowLeft")
+    settled(page)
+    moved = pose(page)
+    other = Volume.read(files / "head.nii.gz")
+    shift = np.eye(4)
+    shift[:3, 3] = [0.0, 9.0, -13.0]
+    Volume(other.array, shift @ other.ijk_to_ras).write(tmp_path / "other.nii.gz")
+    page.evaluate(
+        """() => { window.cleared = [];
+        const look = () => { const image = window.ussim.image;
+          window.cleared.push([document.getElementById('title').textContent, image?.patient ?? null,
+            document.getElementById('overlay').children.length, document.getElementById('image-caption').textContent]);
+          if (window.looking) setTimeout(look, 5); };
+        window.looking = true; look(); }"""
+    )
+    page.set_input_files("#open-file", tmp_path / "other.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'other.nii.gz'")
+    settled(page)
+    seen = page.evaluate("() => { window.looking = false; return window.cleared; }")
+    assert ["other.nii.gz", None, 0, ""] in seen, seen[-5:]
+    late = [entry for entry in seen if entry[0] == "other.nii.gz" and entry[1] == "head.nii.gz"]
+    assert len(late) <= 3, late  # the messages about title and image are two
+    assert not errors(page) and state(page, NAMES.sequence.similarity) == ""
+    placed = pose(page)
+    page.evaluate("window.trame.trigger('press', ['placeButton'])")
+    settled(page)
+    assert pose(page) == placed != moved
+
+
+def nodes_of_scene(bundle: Path) -> list[str]:
+    """Names of what an .mrb holds: files, and nodes with the name of a patient."""
+    with zipfile.ZipFile(bundle) as archive:
+        (scene,) = [name for name in archive.namelist() if name.endswith(".mrml")]
+        text = archive.read(scene).decode()
+        return [*archive.namelist(), *re.findall(r'name="([^"]*)"', text)]
+
+
+def test_a_saved_scene_holds_this_patient_only_and_a_patient_can_be_closed(page, files, tmp_path):
+    """A scene held 21 files of three patients."""
+    for name in ("second", "third"):
+        shutil.copy(files / "head.nii.gz", tmp_path / f"{name}.nii.gz")
+        page.set_input_files("#open-file", tmp_path / f"{name}.nii.gz")
+        page.wait_for_function(f"window.ussim.image?.patient === '{name}.nii.gz'")
+        settled(page)
+    held = nodes_of_scene(download(page, "mrb"))
+    assert any("third.nii.gz" in name for name in held)
+    assert not [name for name in held if "second" in name or "head.nii" in name or "sweep" in name], held
+    click(page, "#close-patient")
+    page.wait_for_function("window.ussim.image === null")
+    settled(page)
+    assert page.locator("#title").inner_text() == "" and page.locator("#notesLabel").inner_text() == ""
+    assert shown(page, "mriSelector") is None and not errors(page)
+    assert not [name for name in nodes_of_scene(download(page, "mrb")) if "third" in name]
+    page.set_input_files("#open-file", tmp_path / "second.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'second.nii.gz'")
+    settled(page)
+    assert not errors(page)
+
+
+def test_the_last_segment_is_undone_on_the_page(page, files):
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    notes, before = shown(page, "notesLabel"), np.asarray(Image.open(download(page, "png")))
+    thin = shown(page, "thinSulciCheckBox")
+    page.evaluate("on => window.trame.trigger('set', ['thinSulciCheckBox', on])", not thin)
+    with new_image(page):
+        click(page, "#segmentButton")
+        eventually(page, lambda: shown(page, "notesLabel") != notes)
+    assert not np.array_equal(np.asarray(Image.open(download(page, "png"))), before)
+    with new_image(page):
+        click(page, "#undoSegmentButton")
+    assert np.array_equal(np.asarray(Image.open(download(page, "png"))), before) and shown(page, "notesLabel") == notes
+    page.evaluate("on => window.trame.trigger('set', ['thinSulciCheckBox', on])", thin)
+    settled(page)
