@@ -976,7 +976,13 @@ def test_the_example_builds_a_scene_and_saves_it_so_that_it_opens(mni, tmp_path,
     nodes = UltrasoundSceneLogic(scene).parameters
     assert nodes.mri.GetImageData().GetDimensions() == (197, 233, 189)
     assert nodes.labels.GetSegmentation().GetNumberOfSegments() == 4
-    assert nodes.output.GetParentTransformNode() is nodes.probe_transform and pixels(nodes.output).mean() > 10
+    # Live has ended: the image is where the probe was, and does not move with it
+    assert nodes.output.GetParentTransformNode() is None and pixels(nodes.output).mean() > 10
+    about = about_image(nodes.output)
+    grid = ImageGrid.for_probe(Preset.from_dict(about["preset"]).probe, None)
+    np.testing.assert_allclose(
+        ijk_to_ras(nodes.output), np.array(about["probe_to_ras"]) @ grid.slice_to_probe, atol=1e-3
+    )
 
 
 # ---- what an image is of ---------------------------------------------------------------------------------------------

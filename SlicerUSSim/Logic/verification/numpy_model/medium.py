@@ -148,7 +148,7 @@ class HostMedium:
         halved = SmoothGrid(self.smoother, 18.29, 0.99, 1.25)
         for grid, place, scale in ((full, voxel, 1), (halved, f32(0.5) * voxel - f32(0.25), 2)):
             border = grid.border_of(place, np.full(len(at), fluid))
-            layer = layer_borders(border, grid.farthest)
+            layer = layer_borders(border, float(grid.farthest))
             wide, of_layer = f32(-scale) * border.overshoot, f32(-scale) * layer.overshoot
             sure = border.confidence * (f32(1) - ramp(0.6, 0.9, np.abs(wide - narrow)))
             sure_layer = layer.confidence * (f32(1) - ramp(0.6, 0.9, np.abs(of_layer - narrow)))
