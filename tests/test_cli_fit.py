@@ -77,9 +77,10 @@ def test_optimize_writes_result_report_preset_and_state(folder):
     report = (folder / "report.html").read_text()
     assert report.count("data:image/png;base64,") >= 3 * 4 + 3
     assert not re.search(r"(src|href)=\"(?!data:)", report)  # nothing outside the file
+    assert "<figcaption>real</figcaption>" not in report  # a twin is not real
     for words in (
-        "simulated, before", "real", "Blink", "texture T1", "white matter.mu0", "net attenuation",
-        "Var of white matter", "<td>Mean amplitude μ₀</td>",
+        "simulated, before", "<figcaption>twin</figcaption>", "fitted to twin ultrasound", "Blink", "texture T1",
+        "white matter.mu0", "net attenuation", "Var of white matter", "<td>Mean amplitude μ₀</td>",
         'title="Mean amplitude of the scatterers.', "<td>dB/(cm MHz)</td>",
     ):  # fmt: skip
         assert words in report

@@ -256,7 +256,10 @@ def test_command_says_numbers_with_controls(twin, tmp_path):
 
 @needs_shared
 def test_costs_of_a_real_sweep_are_those_found_by_trial():
-    """The table of the recipe: neighbours .247 .052 .20, another anatomy .450 .094 .20, blurred .279 .295 1.80."""
+    """The table of the recipe: neighbours .247 .052 .20, another anatomy .450 .094 .20, blurred .279 .295 1.80.
+
+    It counted what the file cuts off as black in all images, which made every cost a little lower.
+    """
     sweep = SHARED / "brain_sweep"
     if not sweep.is_dir():
         pytest.skip("the real sweep is not there")
@@ -270,8 +273,8 @@ def test_costs_of_a_real_sweep_are_those_found_by_trial():
     reference = TextureReference(image, spacing, tracked.mask)
     paper = [similarity(i, image, spacing, mask=tracked.mask).total for i in (before, after, other, blurred(image))]
     texture = [reference.misfit(i) for i in (before, after, other, blurred(image))]
-    assert 0.5 * (paper[0] + paper[1]) == pytest.approx(0.247, abs=0.004)
-    assert paper[2] == pytest.approx(0.450, abs=0.004) and paper[3] == pytest.approx(0.279, abs=0.004)
+    assert 0.5 * (paper[0] + paper[1]) == pytest.approx(0.250, abs=0.002)
+    assert paper[2] == pytest.approx(0.455, abs=0.002) and paper[3] == pytest.approx(0.282, abs=0.004)
     assert 0.5 * (texture[0].autocorrelation + texture[1].autocorrelation) == pytest.approx(0.052, abs=0.004)
     assert texture[2].autocorrelation == pytest.approx(0.094, abs=0.003)
     assert texture[3].autocorrelation == pytest.approx(0.295, abs=0.005)

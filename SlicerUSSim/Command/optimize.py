@@ -147,7 +147,7 @@ def _write_report(
     write_report(
         path, found.appearance, found.tracked, found.before, found.after, found.simulator or simulator,
         subtitle=f"{Path(recording.sequence).name} on {Path(patient.source).name}", provenance=provenance,
-        prediction=found.prediction,
+        prediction=found.prediction, reference="twin" if tracked.sequence.is_simulated else "real",
     )  # fmt: skip
 
 

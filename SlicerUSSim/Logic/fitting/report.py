@@ -27,6 +27,8 @@ from SlicerUSSim.Logic.tracked.field import draw_field
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 
 _TEMPLATE = Path(__file__).parent / "report.html"
+#: Stands for what the images of the fit are called
+_REFERENCE = "\0reference\0"
 _PAPER, _INK = "#161616", "#e4e4e4"
 _BEFORE, _AFTER, _REAL = "#8a8a8a", "#ffc83d", "#6db3f2"
 
@@ -39,15 +41,17 @@ def write_report(
     after: list[np.ndarray],
     simulator: UltrasoundSimulator,
     *,
-    title: str = "Simulated ultrasound fitted to real ultrasound",
+    title: str | None = None,
     subtitle: str = "",
     provenance: str = "",
     prediction: Prediction | None = None,
+    reference: str = "real",
 ) -> None:
     """Write the report; on failure an existing file is kept.
 
     `before` and `after` are the simulated images (rows, columns) for those of `tracked`; `prediction` adds the costs of
-    other images with their controls, and the simulated ones.
+    other images with their controls, and the simulated ones. `reference` is what the images of `tracked` are called:
+    those of a twin are not real.
     Raises SimulationError without matplotlib and if the file cannot be written.
     """
     require_matplotlib()
@@ -58,7 +62,7 @@ def write_report(
         for simulated in (before, after)
     ]
     fill = {
-        "title": html.escape(title),
+        "title": html.escape(title or f"Simulated ultrasound fitted to {reference} ultrasound"),
         "subtitle": html.escape(subtitle),
         "cost_before": f"{result.cost_before:.4f}",
         "cost_after": f"{result.cost_after:.4f}",
@@ -79,8 +83,9 @@ def write_report(
                 *textures,
                 strict=True,
             )
-        ),
-        "histograms": _histograms(tracked, before, after, simulator),
+        ).replace(_REFERENCE, html.escape(reference)),
+        "reference": html.escape(reference),
+        "histograms": _histograms(tracked, before, after, simulator, reference),
         "curve": _curve(result),
         "parameters": "\n".join(_parameter_row(result, parameter) for parameter in result.parameters),
         "combinations": "\n".join(
@@ -127,12 +132,12 @@ def _trio(
 <figcaption>{caption}</figcaption>
 <div class="trio"><figure><img alt="before" src="{before_png}"><figcaption>simulated, before</figcaption></figure>
 <figure><img alt="after" src="{after_png}"><figcaption>simulated, after</figcaption></figure>
-<figure><img alt="real" src="{real_png}"><figcaption>real</figcaption></figure></div>
-<div class="compare"><img alt="simulated"><div class="top"><img alt="real"></div><div class="edge"></div>
-<span class="name l">after</span><span class="name r">real</span></div>
-<div class="controls"><input type="range" min="0" max="100" value="50" aria-label="divide simulated and real">
+<figure><img alt="{_REFERENCE}" src="{real_png}"><figcaption>{_REFERENCE}</figcaption></figure></div>
+<div class="compare"><img alt="simulated"><div class="top"><img alt="{_REFERENCE}"></div><div class="edge"></div>
+<span class="name l">after</span><span class="name r">{_REFERENCE}</span></div>
+<div class="controls"><input type="range" min="0" max="100" value="50" aria-label="divide simulated and {_REFERENCE}">
 <select aria-label="simulated image"><option>after</option><option>before</option></select><button>Blink</button></div>
-<details><summary class="dim">difference, after minus real</summary>
+<details><summary class="dim">difference, after minus {_REFERENCE}</summary>
 <img class="plot" alt="difference" src="{difference}"></details>
 </figure>"""
 
@@ -220,7 +225,9 @@ def _curve(result: AppearanceResult) -> str:
     return _figure_png(figure)
 
 
-def _histograms(tracked: TrackedImages, before: list, after: list, simulator: UltrasoundSimulator) -> str:
+def _histograms(
+    tracked: TrackedImages, before: list, after: list, simulator: UltrasoundSimulator, reference: str
+) -> str:
     from matplotlib.figure import Figure
 
     real = grey_levels_per_tissue(tracked, tracked.images, simulator)
@@ -234,7 +241,7 @@ def _histograms(tracked: TrackedImages, before: list, after: list, simulator: Ul
         for pixels, colour, label in (
             (simulated[0][name], _BEFORE, "before"),
             (simulated[1][name], _AFTER, "after"),
-            (real[name], _REAL, "real"),
+            (real[name], _REAL, reference),
         ):
             share = np.bincount(pixels // 8, minlength=32) / pixels.size
             axis.stairs(share, np.arange(0, 257, 8), color=colour, label=label, linewidth=1.6)

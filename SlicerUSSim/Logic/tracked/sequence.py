@@ -21,7 +21,11 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import written_whole
+<<<<<<< HEAD
 from SlicerUSSim.Logic.base.reading import reader
+=======
+from SlicerUSSim.Logic.base.own_outputs import MADE_BY
+>>>>>>> speckle
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
 
@@ -30,6 +34,8 @@ _log = logging.getLogger(__name__)
 #: File name endings that `write` accepts.
 SEQUENCE_SUFFIXES = (".igs.mha", ".seq.mha", ".mha", ".mhd", ".seq.nrrd", ".nrrd")
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
+#: Field of sequences whose images are simulated
+SIMULATED = "SlicerUSSimSimulated"
 _ORIENTATION, _TYPE = "UltrasoundImageOrientation", "UltrasoundImageType"
 _OK = "OK"
 #: Fields of ITK and NRRD files that do not belong to a sequence.
@@ -95,6 +101,11 @@ class TrackedSequence:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether its images say that this package simulated them, as a twin's and those of `ussim sweep` do."""
+        return SIMULATED in self.fields or MADE_BY in self.fields
 
     # ---- poses -------------------------------------------------------------------------------------------------
 

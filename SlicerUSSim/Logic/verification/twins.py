@@ -21,7 +21,7 @@ from SlicerUSSim.Logic.probe.image_grid import ImageGrid
 from SlicerUSSim.Logic.probe.placement import craniotomy_pose, pose_looking_at, sample, surface_point, tilt_sweep
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import Tissue
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Logic.tracked.sequence import SIMULATED, TrackedSequence
 
 #: The tissue with four parameters that differ between twins and are fitted.
 TISSUE = "white matter"
@@ -58,7 +58,8 @@ class Twin:
         """The reference images as a tracked sequence."""
         to_probe = ImageGrid.for_probe(self.probe, self.true_display.image_size).image_to_probe
         transforms = tuple({"ImageToProbe": to_probe, "ProbeToReference": pose} for pose in self.poses)
-        return TrackedSequence(np.stack(self.references), transforms, 0.1 * np.arange(len(self.poses)))
+        times = 0.1 * np.arange(len(self.poses))
+        return TrackedSequence(np.stack(self.references), transforms, times, fields={SIMULATED: f"twin {self.seed}"})
 
 
 def make_twin(
