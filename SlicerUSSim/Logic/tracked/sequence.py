@@ -21,11 +21,8 @@ import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, require_package, require_path
 from SlicerUSSim.Logic.base.files import written_whole
-<<<<<<< HEAD
-from SlicerUSSim.Logic.base.reading import reader
-=======
 from SlicerUSSim.Logic.base.own_outputs import MADE_BY
->>>>>>> speckle
+from SlicerUSSim.Logic.base.reading import reader
 from SlicerUSSim.Logic.base.transforms import check_affine, is_singular
 from SlicerUSSim.Logic.base.volume import Volume
 
