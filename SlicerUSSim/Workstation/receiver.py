@@ -40,7 +40,8 @@ class Receiver:
             return web.Response(status=400, text="expected files")
         files: dict[str, bytes] = {}
         size = 0
-        async for part in await request.multipart():
+        reader = await request.multipart()
+        while (part := await reader.next()) is not None:
             if not isinstance(part, BodyPartReader):
                 return web.Response(status=400, text="expected files")
             content = bytearray()
