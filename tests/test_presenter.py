@@ -188,12 +188,21 @@ def test_every_probe_preset_is_offered_by_a_readable_name(presenter, name):
     assert shown in control.choices and len(control.choices) == len(PROBES) + 1
     assert f"{shown} {PROBES[name].frequency_mhz:g} MHz" in control.tip
     for spelling in (shown, name):  # scripts may use the name in PROBES
-        presenter.chooseProbe(CUSTOM_PROBE)
         presenter.logic.preset = presenter.logic.preset.changed("probe", depth_mm=77.0)
         assert presenter.probeName() == CUSTOM_PROBE
         presenter.chooseProbe(spelling)
         assert presenter.logic.preset.probe == PROBES[name] and presenter.probeName() == shown
+        presenter.chooseProbe(CUSTOM_PROBE)  # back to that of before
+        assert presenter.probeName() == CUSTOM_PROBE and presenter.logic.preset.probe.depth_mm == 77.0
     assert not presenter.view.errors
+
+
+def test_custom_without_a_custom_probe_says_how_to_make_one(presenter):
+    presenter.chooseProbe("linear")
+    presenter._custom_probe = None
+    presenter.chooseProbe(CUSTOM_PROBE)
+    assert presenter.probeName() == "linear"
+    assert presenter.view.errors == ["there is no custom probe yet: change a value of this probe, and it is one"]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import re
 import shutil
 import zipfile
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.base.volume import read_array
+from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_workstation import (
     browser as browser,
@@ -270,3 +272,48 @@ def test_the_last_segment_is_undone_on_the_page(page, files):
     assert np.array_equal(np.asarray(Image.open(download(page, "png"))), before) and shown(page, "notesLabel") == notes
     page.evaluate("on => window.trame.trigger('set', ['thinSulciCheckBox', on])", thin)
     settled(page)
+
+
+def test_an_upload_shows_how_far_it_is_can_be_cancelled_and_images_go_on(page, files):
+    """Of 216 MB nothing was shown for 49 s, and no image came meanwhile."""
+    session = page.context.new_cdp_session(page)
+    session.send("Network.enable")
+    slow = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 2_000_000}
+    session.send("Network.emulateNetworkConditions", slow)
+    before = state(page, NAMES.title)
+    content = np.random.default_rng(0).integers(0, 255, 16_000_000, np.uint8).tobytes()
+    try:
+        page.set_input_files("#open-file", {"name": "big.nrrd", "mimeType": "application/x", "buffer": content})
+        page.locator("#upload-text").wait_for()
+        page.wait_for_function("/Send big.nrrd [1-9][0-9]* %/.test(document.getElementById('upload-text').textContent)")
+        count = page.evaluate("window.ussim.images")
+        page.keyboard.press("a")
+        page.wait_for_function("n => window.ussim.images > n && window.ussim.uploading", arg=count)
+        click(page, "#upload-cancel")
+        page.wait_for_function("!window.ussim.uploading", timeout=1000)
+        assert page.locator("#upload").is_hidden()
+    finally:
+        session.send("Network.emulateNetworkConditions", {**slow, "uploadThroughput": -1})
+    settled(page)
+    assert state(page, NAMES.title) == before and not errors(page)
+
+
+def test_cancel_ends_a_segmentation_within_a_second_and_images_go_on(page, tmp_path):
+    head_mri(1.0).write(tmp_path / "fine.nii.gz")
+    page.set_input_files("#open-file", tmp_path / "fine.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'fine.nii.gz'")
+    settled(page)
+    notes = shown(page, "notesLabel")
+    page.evaluate("window.trame.trigger('set', ['skullStripComboBox', 'atlas'])")
+    page.evaluate("window.trame.trigger('set', ['maskSelector', ''])")
+    settled(page)
+    click(page, "#segmentButton")
+    page.locator("#cancel").wait_for()
+    page.wait_for_timeout(300)
+    start = monotonic()
+    click(page, "#cancel")
+    page.wait_for_function(f"!window.trame.state.get('{NAMES.messages.progress_title}')")
+    took = monotonic() - start
+    with new_image(page):
+        page.keyboard.press("a")
+    assert took < 1.5 and shown(page, "notesLabel") == notes and not errors(page)  # and the page hears of it

@@ -153,10 +153,10 @@ def _in_order(sections: tuple[Section, ...]) -> list[Section]:
 
 
 def _open_file() -> None:
-    v3.VFileInput(
-        label="Open an MRI, label map (with its table), tracked sequence or sheets (.vtp)",
-        v_model=(NAMES.opened_file, None), multiple=True, density="compact",
-        hide_details=True, variant="outlined", id="open-file", classes="mb-1",
+    html.Div(
+        """<label for="open-file">Open files</label>
+        <input type="file" multiple id="open-file" @change="window.ussim.send($event.target, {for: 'open'})">""",
+        classes="ussim-line", title="An MRI, a label map (with its table), a tracked sequence, sheets (.vtp), a preset",
     )  # fmt: skip
     v3.VBtn(
         "Close patient", size="small", classes="mb-1", id="close-patient", click="trigger('press', ['closePatient'])",
@@ -169,9 +169,10 @@ def _open_file() -> None:
         <select id="added-as" v-model="{NAMES.added_as}">{options}</select>""",
         classes="ussim-line", title="Tissue that is laid over the labels where the mask is not 0",
     )  # fmt: skip
-    v3.VFileInput(
-        label="Mask to add, on any grid", v_model=(NAMES.added_file, None), density="compact",
-        hide_details=True, variant="outlined", id="add-file", classes="mb-1",
+    html.Div(
+        f"""<label for="add-file">Mask to add</label><input type="file" id="add-file"
+        @change="window.ussim.send($event.target, {{for: 'add', as: {NAMES.added_as}}})">""",
+        classes="ussim-line", title="On any grid",
     )  # fmt: skip
 
 
@@ -404,6 +405,10 @@ def _status() -> None:
             html.Span(f"{{{{ {messages.progress_title} }}}} {{{{ {messages.progress_percent} }}}} %")
             v3.VProgressLinear(model_value=(messages.progress_percent,), color="orange", style="width: 140px")
             v3.VBtn("Cancel", size="x-small", click="trigger('cancel')", id="cancel")
+        html.Div(
+            """<span id="upload" hidden><span id="upload-text"></span>
+            <button id="upload-cancel" class="ussim-plain">Cancel</button></span>"""
+        )
         html.Span(f"{{{{ {messages.status} }}}}", id="status")
         v3.VSpacer()
         html.Span(f"{{{{ {messages.tracker} }}}}", v_if=messages.tracker, id="tracker")

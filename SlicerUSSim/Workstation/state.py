@@ -160,10 +160,7 @@ class PageState:
     title: str = ""
     #: Titles of the panel's sections that are open
     open_sections: list[str] = field(default_factory=list)
-    #: Files uploaded by the user, as the file input provides them (name, content); None after they were read
-    opened_file: object = None
-    #: The same of one file: a mask to add, and the tissue that it is
-    added_file: object = None
+    #: The tissue that a mask is which is added
     added_as: str = LESIONS[0]
     #: Whether there is an image that does not follow the probe
     is_frozen: bool = False

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, cast
 
 import slicer
@@ -29,6 +28,7 @@ from SlicerUSSim.Workstation.opener import Files, Opener
 from SlicerUSSim.Workstation.page import build_page, view_tools
 from SlicerUSSim.Workstation.panel import BrowserPanel
 from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.receiver import Receiver
 from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
@@ -84,6 +84,8 @@ class Workstation:
         self._parameter_node.watch(logic.parameters.node)
         self._answer_pages(Buttons(shared, tasks, presenter, sections, self._loading), stamps)
         self._follow_pages()
+        receiver = Receiver(self._open_files, self._add_file, self._messages.show)
+        self.server.controller.on_server_bind.add(lambda wslink: receiver.serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
         build_page(self.server, sections, self._views.layout, (*KEYS, "Escape"))
@@ -128,26 +130,15 @@ class Workstation:
         self._shared.on_change(NAMES.views.follow, self._probe.set_follow)
         self._shared.on_change(NAMES.views.show_tissues, self._probe.show_tissues)
         self._shared.on_change(NAMES.sequence.comparison, lambda _: self._comparison.send())
-        self._shared.on_change(NAMES.opened_file, self._file_opened)
-        self._shared.on_change(NAMES.added_file, self._file_added)
 
     def _in_task(self, method: Callable[..., None]) -> Callable[..., None]:
         return lambda *arguments: self._tasks.start(lambda: method(*arguments))
 
-    def _file_opened(self, given: Any) -> None:
-        files = _uploaded(given)
-        if files:
-            with self._shared.changing() as now:
-                now.opened_file = None
-            self._tasks.start(lambda: self._then_refresh(self._loading.open, files))
+    def _open_files(self, files: dict[str, bytes]) -> None:
+        self._tasks.start(lambda: self._then_refresh(self._loading.open, files))
 
-    def _file_added(self, given: Any) -> None:
-        file = next(iter(_uploaded(given).items()), None)
-        if file is not None:
-            tissue = self._shared.now.added_as
-            with self._shared.changing() as now:
-                now.added_file = None
-            self._tasks.start(lambda: self._then_refresh(self._loading.add, *file, tissue))
+    def _add_file(self, name: str, content: bytes, tissue: str) -> None:
+        self._tasks.start(lambda: self._then_refresh(self._loading.add, name, content, tissue))
 
     def _then_refresh(self, method: Callable[..., None], *arguments: object) -> None:
         method(*arguments)
@@ -215,9 +206,3 @@ class Workstation:
             with self._presenter.shown():
                 self._probe.update_surface()
         self._presenter.parametersChanged()
-
-
-def _uploaded(given: Any) -> dict[str, bytes]:
-    """{name: content} of the files of a page's file input."""
-    files = given if isinstance(given, list) else [given]
-    return {Path(file["name"]).name: bytes(file["content"]) for file in files if file and file.get("content")}

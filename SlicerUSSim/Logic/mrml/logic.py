@@ -117,6 +117,10 @@ class AtOnce:
         """The result of `function`, which is slow and does not access nodes. Calls are sequential."""
         return function()
 
+    def doAside(self, function: Callable[[], T]) -> T:
+        """The same of a function that needs no device, such as reading a file, for which images need not wait."""
+        return function()
+
     def tell(self, function: Callable[[], None]) -> None:
         """From within do(): call `function`, which accesses nodes, as soon as possible."""
         function()

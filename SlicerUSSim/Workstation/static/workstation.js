@@ -8,7 +8,7 @@
   let drawnRuler = "null";
   const shown = []; // times at which simulated images were displayed
 
-  const workstation = { measured, shown, measuring: false, images: 0, image: null, connected: false };
+  const workstation = { measured, shown, measuring: false, images: 0, image: null, uploading: 0, connected: false };
   window.ussim = workstation;
 
   const session = () => window.trame?.client?.getConnection?.()?.getSession?.();
@@ -112,6 +112,29 @@
     event.preventDefault();
     window.trame.trigger("key", [key, event.shiftKey]);
   });
+
+  // Sends the files of an input; the bar below the image shows how far they are.
+  workstation.send = (input, purpose) => {
+    const form = new FormData();
+    for (const file of input.files) form.append("file", file, file.name);
+    const names = [...input.files].map((file) => file.name).join(", ");
+    input.value = ""; // so that the same file can be chosen again
+    if (!names) return;
+    const bar = document.getElementById("upload");
+    const request = new XMLHttpRequest();
+    const tell = (percent) => (document.getElementById("upload-text").textContent = `Send ${names} ${percent} %`);
+    workstation.uploading += 1;
+    tell(0);
+    bar.hidden = false;
+    document.getElementById("upload-cancel").onclick = () => request.abort();
+    request.upload.onprogress = ({ loaded, total }) => tell(Math.floor((100 * loaded) / Math.max(total, 1)));
+    request.onloadend = () => {
+      workstation.uploading -= 1;
+      bar.hidden = workstation.uploading === 0;
+    };
+    request.open("POST", `upload?${new URLSearchParams(purpose)}`);
+    request.send(form);
+  };
 
   workstation.save = async (kind) => {
     const result = await window.trame.trigger("export", [kind]);
