@@ -841,6 +841,29 @@ def test_errors_of_a_fit_are_one_line(session):
     assert len(session.app.errors) == 6 and not any("\n" in message for message in session.app.errors)
 
 
+def test_the_panel_predicts_images_that_are_not_fitted(session):
+    with_real_image(session)
+    ui = session.ui
+
+    def predict(text: str) -> None:
+        ui.fitValidateLineEdit.setText(text)
+        ui.fitValidateLineEdit.editingFinished.emit()
+        ui.fitButton.click()
+
+    predict("1")
+    assert session.app.errors == ["a single image leaves none to predict, expected a sequence"]
+    images = session.add("Sequence", "images")
+    for time_s in ("0", "1"):
+        images.SetDataNodeAtValue(session.parameters.real, time_s)
+    session.parameters.real = images
+    predict("1")
+    assert session.parameters.fit_validate == "1" and len(session.app.errors) == 1
+    assert "fitted: images 0   predicted: images 1" in ui.fitLabel.text()
+    assert "of the uniform tissue's" in ui.fitLabel.text()
+    predict("0:2")
+    assert "all images are predicted, expected some to fit" in session.app.errors[1]
+
+
 def test_closing_the_scene_and_leaving_the_module_is_survived(session):
     session.segmented()
     session.ui.liveCheckBox.setChecked(True)
