@@ -60,7 +60,14 @@ python_maximum_signature_line_length = 88
 toc_object_entries_show_parents = "hide"
 
 PAGES = {
-    "Use": ["docs/slicer", "docs/workstation", "docs/security", "docs/probes", "docs/reference/command", "docs/reference/index"],
+    "Use": [
+        "docs/slicer",
+        "docs/workstation",
+        "docs/security",
+        "docs/probes",
+        "docs/reference/command",
+        "docs/reference/index",
+    ],
     "How it works": ["docs/brain", "docs/physics", "docs/optimization", "docs/performance"],
     "Change it": ["docs/architecture", "docs/developer", "CONTRIBUTING", "CHANGELOG"],
 }
