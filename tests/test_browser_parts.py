@@ -341,7 +341,7 @@ def test_a_section_with_a_value_and_a_button_works_on_the_page_without_further_c
     assert shared.now.panel.can["extractButton"] is False and shared.now.panel.tips["extractButton"] == "It is done"
     for value in (77, "wide", None):
         panel.set("marginSpinBox", value)
-        assert "margin_mm is" in shared.now.messages.errors[-1] and logic.parameters.margin_mm == 4.5
+        assert shared.now.messages.errors[-1].startswith("Margin is ") and logic.parameters.margin_mm == 4.5
     assert len(shared.now.messages.errors) == 3
 
     server = get_server("a page with another section", client_type="vue3")

@@ -177,7 +177,7 @@ def test_values_are_shown_in_the_unit_of_the_panel_and_meant_in_their_own(presen
     assert presenter.logic.parameters.fit.evaluations == 70 and not presenter.view.errors
     for wrong in (float("nan"), "many", True, None):
         presenter.setValue("scene.fit_evaluations", wrong)
-        assert "fit_evaluations is" in presenter.view.errors[-1] and presenter.value("scene.fit_evaluations") == 70
+        assert "Evaluations is " in presenter.view.errors[-1] and presenter.value("scene.fit_evaluations") == 70
     assert len(presenter.view.errors) == 4
 
 
@@ -208,7 +208,9 @@ def test_custom_without_a_custom_probe_says_how_to_make_one(presenter):
 @pytest.mark.parametrize(
     ("act", "message"),
     [
-        (lambda p: p.setValue("display.gain_db", 1000.0), "display: gain_db is 1000.0"),
+        (lambda p: p.setValue("display.gain_db", 1000.0), "Gain is 1000 dB, expected a number between -"),
+        (lambda p: p.setValue("display.gain_db", "loud"), "Gain is 'loud', expected a number between -"),
+        (lambda p: p.setValue("probe.depth_mm", -5), "Depth is -5 mm, expected a number between "),
         (lambda p: p.chooseProbe("loud"), "no probe is called 'loud', expected one of phased"),
         (lambda p: p.setTissue("csf", "mu0", "nan"), "tissue 'csf': mu0 is 'nan', expected a number"),
         (lambda p: p.setTissue("bone marrow", "mu0", "1"), "no tissue is called 'bone marrow'"),

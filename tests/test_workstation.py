@@ -583,7 +583,7 @@ def test_gain_probe_and_depth_change_the_image(page):
     assert page.locator("#radiusSpinBox").is_disabled() and probe == "custom" and gain > 5
     page.locator("#widthSpinBox").fill("-5")
     page.locator("#widthSpinBox").blur()
-    assert "width_mm is -5" in shown_errors(page)
+    assert "Width is -5 mm, expected a number between" in shown_errors(page)
     assert float(page.locator("#widthSpinBox").input_value()) > 0
     preset = {"name": "a.json", "mimeType": "application/json", "buffer": _preset(page)}
     with new_image(page):

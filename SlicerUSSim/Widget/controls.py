@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
-from SlicerUSSim.Logic.base.declaration import Parameter, Shown
+from SlicerUSSim.Logic.base.declaration import Parameter, Shown, short
+from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.imaging.preset import preset_parameters
 from SlicerUSSim.Logic.mrml.parameter_node import NODE_PARAMETERS, VALUE_PARAMETERS
 
@@ -188,6 +190,25 @@ def from_shown(declared: Parameter, entered: Any) -> Any:
         return entered
     converted = declared.shown.value(entered)
     return round(converted) if declared.type is int and converted is not None else converted
+
+
+@contextmanager
+def in_words_of(declared: Parameter, entered: Any) -> Iterator[None]:
+    """Within the block, an error about this parameter has its label, and what was entered as it is shown."""
+    try:
+        yield
+    except SimulationError as error:
+        _, is_about_it, rest = str(error).partition(f"{declared.name} is ")
+        if not is_about_it:
+            raise
+        as_db = isinstance(declared.shown, Shown) and declared.shown.as_db
+        unit = "dB" if as_db else declared.unit
+        is_number = isinstance(entered, int | float) and not isinstance(entered, bool)
+        what = f"{entered:g} {unit}".rstrip() if is_number else short(entered)
+        expected = rest.rpartition(", expected ")[2]
+        if as_db and declared.bounds is not None:
+            expected = f"at most {20.0 * math.log10(declared.bounds[1]):.4g} dB"
+        raise SimulationError(f"{declared.label} is {what}, expected {expected}") from error
 
 
 def part_of(presenter: Any, name: str) -> Any:

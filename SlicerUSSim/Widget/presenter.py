@@ -30,7 +30,7 @@ from SlicerUSSim.Logic.tissue.names import same_name
 from SlicerUSSim.Logic.tissue.presets import TISSUES
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tissue.tissue import TISSUE_PARAMETERS, Tissue
-from SlicerUSSim.Widget.controls import SCENE, from_shown, to_shown, value_parameter
+from SlicerUSSim.Widget.controls import SCENE, from_shown, in_words_of, to_shown, value_parameter
 from SlicerUSSim.Widget.fit_presenter import FitPresenter
 from SlicerUSSim.Widget.interface import PanelView
 from SlicerUSSim.Widget.sections import CUSTOM_PROBE, SHOWN_PROBES
@@ -128,7 +128,7 @@ class PanelPresenter:
         """Set a value from its displayed form."""
         declared = value_parameter(name)
         section, attribute = name.split(".")
-        with self.shown():
+        with self.shown(), in_words_of(declared, shown):
             value = from_shown(declared, shown)
             if section == SCENE:
                 setattr(self.logic.parameters, attribute, value)
