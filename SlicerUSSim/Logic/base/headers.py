@@ -19,7 +19,7 @@ MOST_VOXELS = 2**31
 #: Deflate turns at most 1032 bytes into one (zlib, "An Explanation of the Deflate Algorithm"), and headers are small
 _MOST_EXPANSION = 1100
 #: Formats with all voxels in one file, compressed by deflate or not at all
-_ONE_FILE = (".mha", ".nii", ".nii.gz", ".nrrd", ".mgz", ".mgh", ".vti")
+_ONE_FILE = (".mha", ".nii", ".nii.gz", ".nrrd", ".mgz", ".mgh", ".vti", ".dcm", ".ima")
 #: Largest coordinate, direction and voxel size that is read, in any unit of length
 _MOST = 1e9
 #: The part of a file in which its header ends; sequences have some hundred bytes for every image
