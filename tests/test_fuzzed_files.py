@@ -110,7 +110,7 @@ FORMATS = {
     "preset": Format("p.json", Preset().write, Preset.read, 3000),
     "ctbl": Format("n.ctbl", text(COLOURS), read_names, 150),
     "xml": Format("plus.xml", text(PLUS), read_coordinate_definitions, 200),
-    "vtp": Format("s.vtp", lambda path: write_surfels(path, surfels()), read_surfels, 2000),
+    "vtp": Format("s.vtp", lambda path: write_surfels(path, surfels()), read_surfels, 2000, in_child=True),
 }
 
 

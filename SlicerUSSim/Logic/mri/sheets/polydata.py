@@ -12,7 +12,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import require
 from SlicerUSSim.Logic.base.files import messages_withheld, written_whole
 from SlicerUSSim.Logic.base.own_outputs import mark_of
-from SlicerUSSim.Logic.base.reading import reader
+from SlicerUSSim.Logic.base.reading import in_child
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS, Surfels
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def _mark_of(data: vtkPolyData) -> str:
     return mark_of(vtk_to_numpy(corners.GetData()) if corners.GetNumberOfPoints() else np.zeros(0, np.float32))
 
 
-@reader
+@in_child  # VTK ends the process for some damaged files
 def read_surfels(path: str | os.PathLike) -> Surfels:
     """The surfels of a .vtp by write_surfels. Raises SimulationError for a file that is none."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
