@@ -14,6 +14,7 @@ import pytest
 
 from SlicerUSSim.Logic import PhasedProbe, TissueTable, TrackedSequence, Volume, segment_mri
 from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.volume import read_array
 from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.probe import craniotomy_pose
 from SlicerUSSim.Logic.tracked import write_pose
@@ -24,7 +25,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reas
 FIT = "labels.nii.gz --sequence tracked.igs.mha --probe probe.json --free gain_db --restarts 0"
 COMMANDS = {
     "segment": ("segment mri.nii.gz -o out.nii.gz", {"out.nii.gz": Volume.read}),
-    "simulate": ("simulate labels.nii.gz --pose pose.json -o out.mha", {"out.mha": Volume.read}),
+    "simulate": ("simulate labels.nii.gz --pose pose.json -o out.mha", {"out.mha": read_array}),
     "sweep": (
         "sweep labels.nii.gz --sequence tracked.igs.mha --probe probe.json -o out.igs.mha",
         {"out.igs.mha": TrackedSequence.read},
