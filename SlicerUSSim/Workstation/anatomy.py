@@ -309,14 +309,15 @@ class AnatomyViews:
 
     @property
     def _seen(self):
-        node = node_called(self._app.scene, "ScalarVolume", _SEEN)
-        node.SetSaveWithScene(False)
-        node.SetHideFromEditors(True)
-        return node
+        return self._of_page("ScalarVolume", _SEEN)
 
     @property
     def _pose(self):
-        node = node_called(self._app.scene, "LinearTransform", _POSE)
+        return self._of_page("LinearTransform", _POSE)
+
+    def _of_page(self, kind: str, name: str):
+        """The node of a view of the page, which is neither offered nor saved."""
+        node = node_called(self._app.scene, kind, name)
         node.SetSaveWithScene(False)
         node.SetHideFromEditors(True)
         return node
