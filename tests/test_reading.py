@@ -107,7 +107,7 @@ def test_a_file_is_read_here_unless_it_is_not_trusted(file, sent, monkeypatch):
     assert process_of(file) == os.getpid()
     assert process_of(sent) not in (os.getpid(), process_of(sent))
     assert process_of(path=str(sent)) != os.getpid()
-    assert process_always_of(file) != os.getpid()
+    assert process_always_of(file) != os.getpid() != process_always_of(path=file)
     monkeypatch.setenv(UNTRUSTED, "1")
     assert process_of(file) != os.getpid()
     monkeypatch.setenv(UNTRUSTED, "0")

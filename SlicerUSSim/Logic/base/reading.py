@@ -108,12 +108,23 @@ def reader(function: Callable[_P, _T]) -> Callable[_P, _T]:
     What was raised is logged with its traceback at the level debug (`--verbose`). A file that is not trusted, from an
     untrusted_folder or any with UNTRUSTED in the environment, is read in a child process.
     """
+    return _reading(function, always_in_child=False)
+
+
+def in_child(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """A reader whose file is always read in a child process, since its library crashes for damaged ones."""
+    return _reading(function, always_in_child=True)
+
+
+def _reading(function: Callable[_P, _T], *, always_in_child: bool) -> Callable[_P, _T]:
     signature = inspect.signature(function)
 
     @functools.wraps(function)
     def read(*args: _P.args, **kwargs: _P.kwargs) -> _T:
         path = signature.bind(*args, **kwargs).arguments["path"]
         limits = _limits_of(path)
+        if limits is None and always_in_child and not _is_child:
+            limits = ReadingLimits()
         try:
             if limits is not None:
                 return _in_child(read, args, kwargs, Path(path), limits)
@@ -124,23 +135,6 @@ def reader(function: Callable[_P, _T]) -> Callable[_P, _T]:
             raise _about(shown_path(path), error) from (error if isinstance(error, SimulationError) else None)
 
     return read
-
-
-def in_child(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """A reader whose file is always read in a child process, since its library crashes for damaged ones.
-
-    `function` is one at the top of a module, and `path` its first parameter.
-    """
-    read = reader(function)
-
-    @functools.wraps(function)
-    def anywhere(*args: _P.args, **kwargs: _P.kwargs) -> _T:
-        path = Path(str(args[0]))
-        if _is_child:
-            return read(*args, **kwargs)
-        return _in_child(anywhere, args, kwargs, path, _limits_of(path) or ReadingLimits())
-
-    return anywhere
 
 
 def starts_like_hdf5(path: Path) -> bool:
