@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -53,7 +53,7 @@ def smoothed_indicators(
     return smooth
 
 
-def smoothed_members(device: Device, is_member: np.ndarray, sigmas: Sequence[float], cut: float) -> np.ndarray:
+def smoothed_members(device: Device, is_member: np.ndarray, sigmas: Iterable[float], cut: float) -> np.ndarray:
     """(k, j, i) uint16, 65535 for 1: bool `is_member` (k, j, i), smoothed by a Gaussian of `sigmas` (i, j, k) voxels.
 
     It is cut off at `cut` standard deviations. Beyond the volume its outermost voxels are repeated.
