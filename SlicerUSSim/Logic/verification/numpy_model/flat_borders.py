@@ -16,7 +16,9 @@ _SAMPLES_APART = f32(20)  # voxels
 _END_SAMPLE = f32(5)  # voxels from the ends of the volume and its margin
 # Normals of layers of voxels, by the size of their components, whose steps are suppressed
 _LAYERS = ((0, 0, 1), (0, 1, 1), (1, 1, 1), (0, 1, 2), (1, 1, 2), (1, 2, 2))
-_WEIGHTS = f32([0.35, 0.7, 1.0, 0.7, 0.35])  # of samples along an axis
+_SAMPLES = 5  # along each of two axes
+_FALLS = (0.0, 0.3, 0.65)  # of the weights of samples, by steps from their middle
+_LEAST_SAMPLES = 0.2  # the part of them, by weight, from which they tell a plane
 
 
 def _normal_distribution(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -187,6 +189,22 @@ def _along_layers(normal) -> np.ndarray:
     return found
 
 
+def _goes_on(grid: SmoothGrid, voxel, towards, before, behind) -> np.ndarray:
+    """How certain it is that borders go on to all sides as at (n, 3) positions: beside them it is as steep."""
+
+    def steepness(at: np.ndarray) -> np.ndarray:
+        found = grid.differences(at, before, behind, OF_BOTH)
+        return found.steepness / found.seen * np.sqrt(found.variance)
+
+    sigma = f32(np.sqrt(grid.variance))
+    axes = np.eye(3, dtype=np.float32)[np.abs(towards).argmin(axis=-1)]
+    along = unit(np.cross(towards, axes).astype(np.float32))
+    across = np.cross(towards, along).astype(np.float32)
+    beside = [steepness(voxel + sign * sigma * way) for way in (along, across) for sign in (f32(-1), f32(1))]
+    least = np.minimum(np.min(beside, axis=0) / steepness(voxel), f32(1))
+    return ramp(0.96, 0.98, least)
+
+
 class FlatBorders:
     """What the indicators at half the resolution know of a volume of `dims` voxels."""
 
@@ -204,6 +222,15 @@ class FlatBorders:
         better = layer.confidence > found.confidence[less]
         found.put(less[better], layer.at(better))
         return found.doubled()
+
+    def beside_edges(self, at, found: Borders, before, behind) -> None:
+        """Lowers the confidence of borders found at (n, 3) positions at half the resolution where they have an edge."""
+        some = np.flatnonzero((found.confidence > 0) & ~found.is_thin)
+        shift, _ = _away_from_ends(self.dims, f32(2) * at[some] + f32(0.5), found.at(some))
+        some = some[dot(shift, shift) <= f32(0.25)]
+        goes_on = _goes_on(self.halved, at[some], found.towards[some], before[some], behind[some])
+        found.edge[some] = f32(1) - goes_on
+        found.confidence[some] *= f32(1) - found.edge[some]
 
     def _inside(self, plane: Borders, on, before, behind) -> np.ndarray:
         """Moves planes along themselves to where the ends do not bend them. Returns places on them there."""
@@ -236,30 +263,50 @@ class FlatBorders:
         found, normal = plane.at(slice(None)), plane.towards
         size = np.abs(normal)
         upright = size.argmax(axis=-1)
-        middle, across, certainty = self._axial(voxel, normal, on, upright)
+        middle, across, falls, certainty = self._axial(voxel, normal, on, upright)
         axial, oblique = (np.flatnonzero(is_so) for is_so in (size.max(axis=-1) > 0.9, size.max(axis=-1) <= 0.9))
         if len(oblique):
             parts = self._diagonal(normal[oblique], on[oblique], upright[oblique])
             middle[oblique], across[:, oblique], certainty[oblique] = parts
-        places, normals = np.zeros((2, len(_WEIGHTS) ** 2, count, 3), np.float32)
-        sure = certainty > 0
+            falls[:, oblique] = 1
+        places, normals = np.zeros((2, _SAMPLES**2, count, 3), np.float32)
+        weights, whole = np.zeros((_SAMPLES**2, count), np.float32), np.zeros(count, np.float32)
         for sample in range(len(places)):
-            at = middle + f32(sample % 5 - 2) * across[0] + f32(sample // 5 - 2) * across[1]
+            steps = sample % _SAMPLES - 2, sample // _SAMPLES - 2
+            weight = np.ones(count, np.float32)
+            for fall, step in zip(falls, steps, strict=True):
+                weight *= f32(1) - fall * f32(_FALLS[abs(step)])
+            whole += weight
+            at = middle + f32(steps[0]) * across[0] + f32(steps[1]) * across[1]
             border = self.widest(at, normal, before, behind, 4.0)
-            sure &= border.confidence >= 0.5
+            weight *= border.confidence
+            known = np.flatnonzero(weight > 0)
+            weight[known] *= _goes_on(
+                self.halved, f32(0.5) * at[known] - f32(0.25), border.towards[known], before[known], behind[known]
+            )
+            weights[sample] = weight
             normals[sample], places[sample] = border.towards, at + border.overshoot[:, None] * border.towards
-            normals[sample, axial], inwards = self._without_ends(at[axial], border.towards[axial], upright[axial])
-            places[sample, axial] += inwards
-        weights = np.outer(_WEIGHTS, _WEIGHTS).ravel()[:, None, None]
-        found.towards = unit((weights * normals).sum(axis=0))
-        on = (weights * places).sum(axis=0) / weights.sum()
-        farthest = np.abs(_beyond_plane(places, on, found.towards)).max(axis=0)
-        found.curvature = np.zeros(count, np.float32)
-        found.confidence = np.where(sure, certainty * (f32(1) - ramp(0.7, 1.0, farthest)), f32(0))
+            straight = axial[weight[axial] > 0]
+            normals[sample, straight], inwards = self._without_ends(
+                at[straight], border.towards[straight], upright[straight]
+            )
+            places[sample, straight] += inwards
+        total = weights.sum(axis=0)
+        part = total / whole
+        some = np.flatnonzero((part >= _LEAST_SAMPLES) & (certainty > 0))
+        found.confidence[:], found.curvature[:] = 0, 0
+        parts = weights[:, some, None]
+        found.towards[some] = unit((parts * normals[:, some]).sum(axis=0))
+        on = on.copy()
+        on[some] = (parts * places[:, some]).sum(axis=0) / total[some, None]
+        away = np.abs(_beyond_plane(places[:, some], on[some], found.towards[some]))
+        off = (weights[:, some] * ramp(0.7, 1.0, away)).sum(axis=0) / total[some]
+        found.confidence[some] = certainty[some] * (f32(1) - ramp(0.04, 0.08, off))
+        found.confidence[some] *= ramp(_LEAST_SAMPLES, 1.5 * _LEAST_SAMPLES, part[some])
         return found, on
 
-    def _axial(self, voxel, normal, on, upright) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(middle (n, 3), steps across (2, n, 3), certainty (n,)) of the samples of planes along an axis."""
+    def _axial(self, voxel, normal, on, upright) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(middle (n, 3), steps across (2, n, 3), fall of weights (2, n), certainty (n,)) of samples along an axis."""
         rows, half_way = np.arange(len(voxel)), f32(0.5) * f32(self.dims) - f32(0.5)
         low = np.minimum(_END_SAMPLE, half_way)
         high = np.maximum(f32(self.dims) - f32(1) - _END_SAMPLE, half_way)
@@ -267,16 +314,17 @@ class FlatBorders:
         clipped = np.clip(voxel, low + margin, high - margin)
         apart = np.minimum(_SAMPLES_APART, f32(0.5) * np.minimum(clipped - low, high - clipped))
         middle, across = on.copy(), np.zeros((2, len(voxel), 3), np.float32)
-        rise = np.zeros(len(voxel), np.float32)
+        rise, falls = np.zeros(len(voxel), np.float32), np.zeros((2, len(voxel)), np.float32)
         steepest = normal[rows, upright]
         for side in range(2):
             axis = (upright + 1 + side) % 3
             middle[rows, axis] = clipped[rows, axis]
             rise += normal[rows, axis] * (clipped[rows, axis] - on[rows, axis])
             across[side, rows, axis] = apart[rows, axis]
+            falls[side] = ramp(12.0, float(_SAMPLES_APART), apart[rows, axis])
             across[side, rows, upright] = -apart[rows, axis] * normal[rows, axis] / steepest
         middle[rows, upright] -= rise / steepest
-        return middle, across, np.ones(len(voxel), np.float32)
+        return middle, across, falls, np.ones(len(voxel), np.float32)
 
     def _without_ends(self, at, normal, upright) -> tuple[np.ndarray, np.ndarray]:
         """(normals (n, 3), displacements (n, 3) of their places) of planes along an axis as if there were no ends."""
@@ -294,7 +342,7 @@ class FlatBorders:
         return unit(normal), inwards
 
     def _diagonal(self, normal, on, upright) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same of planes along diagonals."""
+        """(middle, steps across, certainty) of those of planes along diagonals."""
         up = np.eye(3, dtype=np.float32)[upright]
         first = unit(up - dot(up, normal)[:, None] * normal)
         across = np.stack([first, np.cross(normal, first)]).astype(np.float32)
@@ -319,22 +367,26 @@ class FlatBorders:
         planes.towards = normal
         shift, _ = _away_from_ends(self.dims, voxel, planes)
         near_end = dot(shift, shift) > f32(0.25)
-        alignment = _along_layers(normal)
-        some = np.flatnonzero((size >= 1e-6) & (near_end | (alignment * borders.confidence > 0)))
+        is_about_axial = np.abs(normal).max(axis=-1) > f32(0.98)
+        alignment = np.maximum(_along_layers(normal), np.where(is_about_axial, borders.edge, f32(0)))
+        some = np.flatnonzero((size >= 1e-6) & (near_end | (alignment * borders.flat > 0)))
         if len(some) == 0:
             return
         voxel, before, behind, normal, alignment = (part[some] for part in (voxel, before, behind, normal, alignment))
         now, plane = planes.at(some), planes.at(some)
+        plane.confidence = plane.flat.copy()
         on = voxel + now.overshoot[:, None] * normal
         ends = np.flatnonzero(near_end[some])
         moved = plane.at(ends)
         on[ends] = self._inside(moved, on[ends], before[ends], behind[ends])
         plane.put(ends, moved)
-        plane.confidence *= f32(1) - ramp(0.003, 0.006, np.abs(plane.curvature))
+        known = np.where(near_end[some], f32(1), f32(1) - alignment * now.edge)
+        plane.confidence *= f32(1) - known * ramp(0.003, 0.006, np.abs(plane.curvature))
         plane.overshoot = _beyond_plane(voxel, on, plane.towards)
         along = np.flatnonzero((alignment > 0) & (plane.confidence > 0))
         whole, middle = self._whole(voxel[along], plane.at(along), on[along], before[along], behind[along])
-        part = alignment[along] * whole.confidence
+        turned = np.minimum(alignment[along], _along_layers(whole.towards))
+        part = np.where(now.edge[along] > 0, turned, alignment[along]) * whole.confidence
         beyond = _beyond_plane(voxel[along], middle, whole.towards)
         plane.overshoot[along] += part * (beyond - plane.overshoot[along])
         plane.towards[along] += part[:, None] * (whole.towards - plane.towards[along])

@@ -81,6 +81,9 @@ class Labels:
         """(towards (n, 3), overshoot (n,), curvature (n,)) of the border between groups near (n, 3) voxel positions."""
         halved = f32(0.5) * voxel - f32(0.25)
         found = self.widest.border(halved, before, behind)
+        flat = found.confidence.copy()
+        self.flat.beside_edges(halved, found, before, behind)
+        edge = found.edge.copy()
         less = np.flatnonzero(found.confidence < 1)
         widest, places, sides = found.at(less), voxel[less], (before[less], behind[less])
         near = self.wide.border(places, *sides)
@@ -93,10 +96,14 @@ class Labels:
         fine.refine(wider)
         near.put(some, fine)
         towards = near.towards / np.maximum(length(near.towards), f32(1e-6))[:, None]
-        layer = borders_of_layers(self.widest, halved[less], towards, widest, *sides).doubled()
+        layer = borders_of_layers(self.widest, halved[less], towards, widest, *sides)
         # In most folds the widest Gaussian sees another direction than the nearest voxels.
         is_fold = (widest.sigma * widest.steepness > f32(0.06)) & (dot(widest.towards, towards) < MOST_TURNED)
         layer.confidence[is_fold] = 0
+        flat[less] = np.maximum(flat[less], layer.confidence)
+        self.flat.beside_edges(halved[less], layer, *sides)
+        edge[less] = np.maximum(edge[less], layer.edge)
+        layer.doubled()
         # A layer among others, as in a fold, is not where the nearest voxels are. Those of a thin one know it less
         # well.
         off, turned = np.abs(layer.overshoot - near.overshoot), dot(layer.towards, towards)
@@ -111,6 +118,7 @@ class Labels:
         near.refine(widest)
         near.confidence, near.beside = widest.confidence, widest.beside
         found.doubled().put(less, near)
+        found.flat, found.edge = flat, edge
         self.flat.straighten(voxel, found, before, behind)
         return found.towards, found.overshoot, found.curvature
 

@@ -41,14 +41,18 @@ class Borders:
     is_thin: np.ndarray
     #: Confidence as a bent border, if the nearest voxels agree on its place
     bent: np.ndarray
+    #: Confidence of being as flat as the widest Gaussian, also where it is near an edge
+    flat: np.ndarray
+    #: How certain it is that it is near one
+    edge: np.ndarray
 
     @classmethod
     def none(cls, count: int) -> Borders:
         """Without any border."""
-        zero, share = np.zeros((8, count), np.float32), np.full(count, np.nan, np.float32)
+        zero, share = np.zeros((10, count), np.float32), np.full(count, np.nan, np.float32)
         return cls(
             np.zeros((count, 3), np.float32), zero[0], zero[1], zero[2], share, zero[3], zero[4], zero[5], zero[6],
-            np.zeros(count, bool), zero[7],
+            np.zeros(count, bool), zero[7], zero[8], zero[9],
         )  # fmt: skip
 
     def at(self, index) -> Borders:

@@ -35,6 +35,8 @@ _TURNS = {1.0: 3.0, 2.0: 3.0, 3.0: 3.0, 5.0: 1.5, 8.0: 1.5, 15.0: 1.5, 30.0: 1.5
 #: of each, and half their voxels of 1 mm across the beam: in the image plane and out of it
 _SMALL_TURNS, _SMALL_MAPS, _SMALL_HALF = (0.3, 0.5, 1.0, 2.0), 8, (40.0, 26.0)
 _SMALL_PROBES = ("convex", "phased", "linear")
+#: Voxels of 1 mm beside the axis at which planes end, out of the image plane, by the turn of the voxels in degrees
+_ENDS = {0.0: (14.0, 18.0, 22.0, 26.0, 30.0, 36.0, 42.0), 2.0: (26.0, 30.0, 36.0, 42.0)}
 
 #: Planes tilted by so much to the beam: the level along them does not vary by more dB
 _TILT_DEG, _VARIATION_DB = 5.0, 3.0
@@ -132,6 +134,42 @@ def planes_in_small_maps(rotation: np.ndarray, device) -> Outcome:
                 lowest[name] = min(lowest[name], float(np.min((along - straight[name])[facing], initial=np.inf)))
         for name, level in lowest.items():
             what = f"turned by {turn:g} degrees, {_SMALL_MAPS} small maps of 1 mm, {name}"
+            rows.append(Row(f"lowest level, {what}", "dB", 0.0, level, 3.0, "at least"))
+    return Outcome(tuple(rows))
+
+
+def planes_with_edges(rotation: np.ndarray, device) -> Outcome:
+    """Planes that face the beam and end beside it, re such that do not, in voxels along them and turned."""
+    probes = {name: replace(PROBES[name], frequency_mhz=5.0, band_mhz=None) for name in _SMALL_PROBES}
+    normal, size = np.array([0.0, 1.0, 0.0]), np.array([100, 60, 100])
+    azimuth = Rotation.from_matrix(rotation).magnitude()
+    table = TissueTable({0: FLUID, 1: FLUID, 2: BEHIND})
+
+    def levels(turn: float, end_mm: float) -> dict[str, np.ndarray]:
+        axis = np.radians(turn) * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_rotvec(axis).as_matrix()
+        centre = 0.5 * (size - 1.0)
+        centre[1] = np.floor(centre[1]) + 0.5  # a face of voxels where they are not turned
+        matrix[:3, 3] = [0.0, _DEPTH_MM, 0.0] - matrix[:3, :3] @ centre
+        index = np.stack(np.meshgrid(*[np.arange(n) for n in size[::-1]], indexing="ij")[::-1], axis=-1)
+        place = index @ matrix[:3, :3].T + matrix[:3, 3]
+        array = 1 + ((place[..., 1] > _DEPTH_MM) & (place[..., 2] < end_mm)).astype(np.uint8)
+        simulator = UltrasoundSimulator(Volume(array, matrix), table, _SETTINGS, device)
+        return {name: _along_plane(simulator, probe, np.eye(4), normal) for name, probe in probes.items()}
+
+    whole = levels(0.0, np.inf)
+    rows = []
+    for turn, ends in _ENDS.items():
+        lowest = {name: (np.inf, 0.0) for name in probes}
+        for end in ends:
+            for name, along in levels(turn, end).items():
+                facing = whole[name] > np.nanmax(whole[name]) - 0.7
+                loss = float(np.min((along - whole[name])[facing], initial=np.inf))
+                lowest[name] = min(lowest[name], (loss, end))
+        for name, (level, end) in lowest.items():
+            where = f"edges {ends[0]:g} to {ends[-1]:g} voxels beside (lowest at {end:g})"
+            what = f"{where}, turned by {turn:g} degrees, {name}"
             rows.append(Row(f"lowest level, {what}", "dB", 0.0, level, 3.0, "at least"))
     return Outcome(tuple(rows))
 
@@ -286,6 +324,11 @@ CHECKS = (
         "planes in small maps",
         "A plane that faces the beam has its level where a small label map has one step of it.",
         planes_in_small_maps,
+    ),
+    Check(
+        "planes with edges",
+        "A plane that faces the beam has its level up to where it ends beside the beam.",
+        planes_with_edges,
     ),
     Check(
         "planes along diagonals",
