@@ -21,6 +21,7 @@ from SlicerUSSim.Logic import (
     Tissue,
     TissueTable,
     UltrasoundSimulator,
+    Volume,
     list_devices,
     seed_of_pose,
 )
@@ -431,3 +432,24 @@ def test_a_wrong_step_is_noticed(compared, monkeypatch, what):
     owner, name, spoil = WRONG_STEPS[what]
     monkeypatch.setattr(owner, name, spoil(getattr(owner, name)))
     assert compared() < 0.99
+
+
+def test_numpy_follows_a_plane_that_ends_beside_the_beam():
+    """It is placed by samples away from its edge; those beyond it, where there is no border, were NaN once."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("xz", [0.4, 0.3], degrees=True).as_matrix()
+    matrix[:3, 3] = [0.0, 25.0, 0.0] - matrix[:3, :3] @ [40.0, 24.5, 32.0]
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in (72, 50, 80)], indexing="ij")[::-1], axis=-1)
+    place = index @ matrix[:3, :3].T + matrix[:3, 3]
+    array = 1 + ((place[..., 1] > 25.0) & (place[..., 2] < 20.0)).astype(np.uint8)
+    front, back = Tissue("front", 1540.0, 1.60, 0.0), Tissue("back", 1540.0, 1.76, 0.0)
+    simulator = UltrasoundSimulator(
+        Volume(array, matrix), TissueTable({0: front, 1: front, 2: back}),
+        SimulationSettings(scattering=False, specular_exponent=0.0),
+    )  # fmt: skip
+    probe = ConvexProbe(60.0, 30.0, 35.0, frequency_mhz=5.0, scan_lines=48)
+    display = DisplaySettings(image_size=(160, 120))
+    image = simulator.simulate(probe, np.eye(4), display).image.astype(int)
+    expected = NumpyModel(simulator).simulate(probe, np.eye(4), display)
+    assert image.max() > 200 and np.isfinite(expected).all()
+    assert (np.abs(image - expected) <= 1).mean() > 0.998 and np.abs(image - expected).max() <= 8
