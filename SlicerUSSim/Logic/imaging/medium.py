@@ -73,7 +73,8 @@ class Medium:
         self.device = device
         self.labels = labels
         array = as_labels(labels.array)
-        counts = np.bincount(array.ravel(), minlength=256)
+        # By plane: bincount converts to eight bytes
+        counts = sum((np.bincount(plane.ravel(), minlength=256) for plane in array), np.zeros(256, np.int64))
         self._counts = counts[: CONSTANTS["MAX_TISSUES"]]
         #: Labels that occur, the most frequent first
         self.present = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
@@ -210,11 +211,10 @@ class Medium:
         if self.found is not None:
             self._add_planes(padded.shape, self.found, bool(len(sheets)))
         distance, self.membrane_reach = self._fluid_distance(padded, tissues, sheets)
-        words = padded.astype(np.uint16)
         lowest, highest = _cell_extremes(padded)
-        same, no_membrane = lowest == highest, True
+        flags = (lowest == highest).view(np.uint8) * np.uint8(CONSTANTS["SAME_LABEL"])
+        no_membrane = np.True_
         if distance is not None:
-            words |= distance.astype(np.uint16) << 8
             lowest, highest = _cell_extremes(distance)
             no_membrane = (lowest > 127.5 + self.membrane_reach) | (highest < 127.5 - self.membrane_reach)
             for k, j, i in np.ndindex(2, 2, 2):  # the cells around these voxels
@@ -222,7 +222,12 @@ class Medium:
         if self.found is not None:
             no_membrane = np.broadcast_to(no_membrane, padded.shape).copy()
             no_membrane.ravel()[cells_around(self.found.voxels[self.found.is_near], padded.shape)] = False
-        words |= np.uint16(CONSTANTS["SAME_LABEL"]) * same | np.uint16(CONSTANTS["NO_MEMBRANE"]) * no_membrane
+        flags |= no_membrane.view(np.uint8) * np.uint8(CONSTANTS["NO_MEMBRANE"])
+        flags |= padded
+        words = np.zeros((*padded.shape, 2), np.uint8)  # of 16 bits, the low one first
+        words[..., 0] = flags
+        if distance is not None:
+            words[..., 1] = distance
         self.voxel_buffer = self.device.upload(words)
 
     def _add_planes(self, shape: tuple[int, ...], found: FoundSheets, has_fitted: bool) -> None:
