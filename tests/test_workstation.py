@@ -12,6 +12,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 from collections import Counter
 from pathlib import Path
 from time import monotonic
@@ -57,9 +58,11 @@ POSE = ("right_deg", "front_deg", "rotate_deg", "rock_deg", "tilt_deg", "lift_mm
 @contextlib.contextmanager
 def serving(*arguments: str):
     """The URL printed by `ussim serve`, while it runs."""
+    state = tempfile.mkdtemp(prefix="ussim-state-")  # of its own: it offers no session of another server
     server = subprocess.Popen(
         [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", "0", *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1", "XDG_STATE_HOME": state},
     )  # fmt: skip
     try:
         url = server.stdout.readline().strip()
@@ -72,6 +75,7 @@ def serving(*arguments: str):
             server.wait(10)
         server.kill()
         server.communicate()
+        shutil.rmtree(state, ignore_errors=True)
 
 
 @pytest.fixture(scope="module")

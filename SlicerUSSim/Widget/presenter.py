@@ -539,6 +539,15 @@ class PanelPresenter:
         """What the last segmentation or addition did, and what a user should check, in lines."""
         return "\n".join([*self._notes, *self._gel()])
 
+    @property
+    def noteLines(self) -> tuple[str, ...]:
+        """The same without what follows from the present choices, for setNotes."""
+        return tuple(self._notes)
+
+    def addNotes(self, *lines: str) -> None:
+        """Add lines to them."""
+        self._notes += lines
+
     def _gel(self) -> list[str]:
         """A line about gel on the skin, if the chosen tissues have it by default."""
         labels = self.logic.parameters.labels

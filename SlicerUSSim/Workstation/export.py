@@ -31,8 +31,8 @@ FRAME_SUFFIXES = (".nrrd", ".mha", ".vti")
 #: Key of a file's header under which is what its image is of, see TakenImage.about
 ABOUT = "SlicerUSSim"
 _NO_IMAGE = "there is no image, expected labels and a probe"
-#: Number of images in a cine loop, and limits of the display time of each, in milliseconds.
-_MOST_IMAGES = 200
+#: Number of images in a cine loop; and limits of the display time of each, in milliseconds.
+MOST_IMAGES = 200
 _SHORTEST_MS, _LONGEST_MS = 40, 500
 
 
@@ -60,9 +60,11 @@ class Cine:
     """A cine loop: the last images, as in a scanner."""
 
     def __init__(self) -> None:
-        self._images: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_IMAGES)
+        self._images: deque[tuple[float, np.ndarray]] = deque(maxlen=MOST_IMAGES)
         #: What the last image is of
         self.about = ""
+        #: Number of images that were ever added, and of loops that were begun
+        self.added = self.loop = 0
 
     def __len__(self) -> int:
         return len(self._images)
@@ -72,11 +74,24 @@ class Cine:
         if self._images and self._images[-1][1].shape != image.shape:
             self.clear()
         self._images.append((seconds, image))
+        self.added += 1
         self.about = about
 
     def clear(self) -> None:
         """Forget all images."""
         self._images.clear()
+        self.loop += 1
+
+    def since(self, added: int) -> list[tuple[float, np.ndarray]]:
+        """(time, image) of those in the loop that were added after the first `added` images."""
+        count = min(max(self.added - added, 0), len(self._images))
+        return list(self._images)[len(self._images) - count :]
+
+    def restore(self, images: list[tuple[float, np.ndarray]], until: float, about: str = "") -> None:
+        """Begin with (time, image) of an earlier loop, the last of which is moved to the time `until`."""
+        self.clear()
+        for seconds, image in images:
+            self.add(image, until + seconds - images[-1][0], about)
 
     def gif(self) -> bytes:
         """An animated GIF with the original timing. Raises SimulationError for fewer than two images."""

@@ -18,6 +18,8 @@ from SlicerUSSim.Logic.mri.label_agreement import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose, read_volume
+from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
+from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Widget.presenter import PanelPresenter
@@ -127,7 +129,7 @@ class Loading:
 
             def take_labels() -> None:
                 self._messages.clear()
-                self._forget_patient(node, *kept)
+                self.forget_patient(node, *kept)
                 self._take_labels(node, found, kept)
 
             return take_labels
@@ -164,7 +166,7 @@ class Loading:
         if self._changed(self._presenter.segment):
             self._source_before = before
             self._opener.segmented(parameters.labels, *inputs, others, lesions, kinds, organs)
-            self._labels_ready()
+            self.labels_ready()
 
     def undo_segment(self) -> None:
         """Go back to the tissues from before the last Segment."""
@@ -176,7 +178,7 @@ class Loading:
             self._views.show_volume(self._logic.parameters.mri)
         else:
             self._opener.restored(self._source_before, labels)
-            self._labels_ready()
+            self.labels_ready()
         self.show_title()
 
     def add_tissues(self) -> None:
@@ -203,7 +205,7 @@ class Loading:
                 diameter = parameters.panel.craniotomy_mm or disc_diameter_mm(self._logic.preset.probe)
                 disc = diameter, pose
             self._opener.opened(source, patient, parameters.labels, disc)
-            self._labels_ready()
+            self.labels_ready()
 
     def _open_at_start(self, files: Files) -> None:
         """Open what --craniotomy asks for, and place the probe on the brain in it, as commands do."""
@@ -222,7 +224,7 @@ class Loading:
     def close_craniotomy(self) -> None:
         """Go back to the labels without the opening."""
         if self._changed(self._presenter.closeCraniotomy):
-            self._labels_ready()
+            self.labels_ready()
 
     def place_probe(self) -> None:
         """Place the probe at a typical craniotomy."""
@@ -265,7 +267,7 @@ class Loading:
         """The lesions now lie over labels of this source and patient."""
         parameters = self._logic.parameters
         self._opener.added(source, patient, parameters.labels, parameters.lesions)
-        self._labels_ready()
+        self.labels_ready()
 
     def _changed(self, action: Callable[[], None]) -> bool:
         """Whether an action has written labels."""
@@ -302,7 +304,7 @@ class Loading:
         parameters.labels = node
         self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
         self.show_title()
-        self._labels_ready()
+        self.labels_ready()
 
     def _mri_of(self, labels: Volume) -> list[Any]:
         """The MRI if it follows the labels; otherwise it may be of another patient."""
@@ -325,12 +327,12 @@ class Loading:
         """Close the patient: nothing of him stays on the page, in the scene or in memory; settings stay."""
         parameters = self._logic.parameters
         self._messages.clear()
-        self._forget_patient()
+        self.forget_patient()
         parameters.mri = parameters.labels = parameters.mask = parameters.second_mri = None
         self._presenter.setNotes()
         self.show_title()
 
-    def _forget_patient(self, *new: Any) -> None:
+    def forget_patient(self, *new: Any) -> None:
         """Show, choose and keep nothing of the patient before, when another one is opened; `new` are nodes of his."""
         parameters = self._logic.parameters
         self._logic.stopLiveUpdate()
@@ -351,11 +353,34 @@ class Loading:
 
     def _take_mri(self, node: Any) -> None:
         parameters = self._logic.parameters
-        self._forget_patient(node)
+        self.forget_patient(node)
         parameters.mri = node
         self._presenter.setNotes()
         self.show_title()
         self._views.show_volume(node)
+
+    def begin_patient(self, *nodes: Any) -> None:
+        """Close the patient before; `nodes` are all of the one that comes."""
+        self._messages.clear()
+        self.forget_patient(*nodes)
+
+    def take_sequence(self, record: SequenceRecord, probe: Probe) -> None:
+        """Use a sequence with its poses, whose images are of this probe."""
+        tracked, browser, images = self._opener.sequence_of(record, probe)
+        self._logic.parameters.real = images
+        self._comparison.take(tracked, browser)
+
+    def show_number(self, number: int) -> None:
+        """Show the real image with this index, and move the probe there."""
+        self._comparison.show(number)
+
+    def show_restored(self, *, is_placed: bool) -> None:
+        """Show the nodes that were chosen; the probe `is_placed`, or is placed now, if there are tissues."""
+        parameters: Any = self._logic.parameters
+        self._views.show_volume(parameters.labels if parameters.mri is None else parameters.mri)
+        self.show_title()
+        if parameters.labels is not None:
+            self.labels_ready(is_placed=is_placed)
 
     def _take_sequence(self, sequence: TrackedSequence, name: str) -> None:
         """Use the probe and the poses of a tracked sequence."""
@@ -364,8 +389,9 @@ class Loading:
         self._logic.parameters.real = images
         self._comparison.take(tracked, browser)
 
-    def _labels_ready(self) -> None:
-        if self._logic.parameters.probe_transform is None or self._is_new:
+    def labels_ready(self, *, is_placed: bool = False) -> None:
+        """Show the image of new labels; the probe `is_placed`, or is placed now if they are of a new patient."""
+        if self._logic.parameters.probe_transform is None or (self._is_new and not is_placed):
             self._presenter.placeProbe()
         self._is_new = False
         self.show_title()

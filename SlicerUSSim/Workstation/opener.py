@@ -28,8 +28,10 @@ from SlicerUSSim.Logic.mrml.label_nodes import read_labels, write_labels
 from SlicerUSSim.Logic.mrml.lesion_nodes import add_lesion
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import display_of, write_volume
+from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
 from SlicerUSSim.Logic.mrml.sequence_nodes import add_sequence
 from SlicerUSSim.Logic.mrml.taken_image import PATIENT, patient_of
+from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tissue.label_advice import PAGE
 from SlicerUSSim.Logic.tissue.label_files import TABLE_SUFFIXES
 from SlicerUSSim.Logic.tissue.label_mapping import LabelMapping
@@ -118,6 +120,8 @@ class Opener:
         self._volumes = dict(files.volumes)  # read, but not yet used
         #: Names of the preset's tissues since the table of a label map was added to them
         self._names_of_table: list[str] | tuple[str, ...] = ()
+        #: The sequence of the patient, which is opened
+        self.opened_sequence: SequenceRecord | None = None
         #: {temporary path: name} of the files that a page has sent last
         self._uploads: dict[str, str] = {}
 
@@ -128,10 +132,7 @@ class Opener:
         node = self._scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", name)
         write_volume(node, volume)
         node.SetAttribute(FILE, "" if path is None else self._place(path))
-        display = display_of(node)
-        display.SetAutoWindowLevel(False)  # the automatic window saturates bright tissue
-        inside = volume.array[volume.array > 0]
-        display.SetWindowLevelMinMax(0.0, 1.1 * float(np.percentile(inside, 99.8)) if inside.size else 1.0)
+        show_all_tissue(node, volume)
         return node
 
     def mask_file(self, mri_node) -> Path | None:
@@ -250,6 +251,10 @@ class Opener:
             self._lesion_files[_segments_of(node)] = (*files, (tissue, file or name))
         return node, lambda: undo(ids)
 
+    def restore_lesions(self, lesions_node, files: tuple[tuple[str, str], ...]) -> None:
+        """Record the (tissue, file) of all lesions of a node that was restored."""
+        self._lesion_files[_segments_of(lesions_node)] = files
+
     def lesion_files(self, lesions_node) -> tuple[tuple[str, str], ...] | None:
         """(tissue, file) of all lesions; None if they are not all of files."""
         if lesions_node is None:
@@ -294,6 +299,7 @@ class Opener:
 
     def forget_patient(self) -> None:
         """Release what is kept of the last patient."""
+        self.opened_sequence = None
         self._sources, self._lesion_files = {}, {}
 
     def patient(self) -> str:
@@ -318,16 +324,23 @@ class Opener:
     def sequence(self, sequence: TrackedSequence, name: str):
         """(TrackedImages, sequence browser node, sequence node of the images)."""
         files, preset = self._files, self._logic.preset
-        tracked = self._tasks.doAside(
-            lambda: TrackedImages.of(
-                sequence, path=files.transform, reference_to_ras=files.to_ras, beam=preset.probe,
-                probe=preset.probe if files.preset is not None else None,
+        probe = preset.probe if files.preset is not None else None
+        return self.sequence_of(SequenceRecord(sequence, name, files.transform, files.to_ras), probe)
+
+    def sequence_of(self, record: SequenceRecord, probe: Probe | None = None):
+        """The same of a record; `probe`, if it is known, is that of its images."""
+        beam, tracked = self._logic.preset.probe, record.tracked
+        if tracked is None:
+            tracked = self._tasks.doAside(
+                lambda: TrackedImages.of(
+                    record.sequence, path=record.path, reference_to_ras=record.to_ras, beam=beam, probe=probe
+                )
             )
-        )  # fmt: skip
         browser, images = add_sequence(
-            self._scene, sequence, name, files.transform, files.to_ras, tracked.poses,
+            self._scene, record.sequence, record.name, record.path, record.to_ras, tracked.poses,
             self._logic.parameters.probe_transform,
         )  # fmt: skip
+        self.opened_sequence = replace(record, tracked=tracked)
         return tracked, browser, images
 
     @contextmanager
@@ -427,6 +440,14 @@ class Opener:
         node.SetAttribute(FILE, self._place(path))
         write_labels(node, volume.with_array(volume.array.astype(np.uint8)), names, node)
         return node
+
+
+def show_all_tissue(mri_node, volume: Volume) -> None:
+    """Choose the grey levels of an MRI; the automatic window saturates bright tissue."""
+    display = display_of(mri_node)
+    display.SetAutoWindowLevel(False)
+    inside = volume.array[volume.array > 0]
+    display.SetWindowLevelMinMax(0.0, 1.1 * float(np.percentile(inside, 99.8)) if inside.size else 1.0)
 
 
 def _is_json(path: Path) -> bool:

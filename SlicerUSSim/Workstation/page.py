@@ -20,13 +20,14 @@ from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
 from SlicerUSSim.Widget.controls import Control, Section
 from SlicerUSSim.Widget.presenter import FROZEN, TISSUE_COLUMNS
+from SlicerUSSim.Workstation.session_page import keep_session, session_offer
 from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode
 
 _STATIC = Path(__file__).parent / "static"
 #: Files that the page loads in addition to those of trame.
 MODULE = {
     "serve": {"ussim": str(_STATIC)},
-    "scripts": ["ussim/overlay.js", "ussim/workstation.js"],
+    "scripts": ["ussim/overlay.js", "ussim/workstation.js", "ussim/session.js"],
     "styles": ["ussim/workstation.css"],
 }
 #: Controls of the panel that are not on the page: its slice views follow the probe, it compares the fit in the
@@ -90,6 +91,7 @@ def build_page(server: Server, sections: tuple[Section, ...], layout: LayoutMana
             _drawer(sections)
         with v3.VMain(style="height: 100vh"), html.Div(classes="ussim-main"):
             with html.Div(classes="ussim-image"):
+                session_offer()
                 _tools()
                 _screens(keys)
                 _player()
@@ -163,6 +165,7 @@ def _open_file() -> None:
         title="Nothing of the patient stays on the page, in the scene or in memory; settings stay",
         disabled=(f"{NAMES.title} === ''",),
     )  # fmt: skip
+    keep_session()
     options = "".join(f'<option value="{name}">{_LESION_TEXTS.get(name, name)}</option>' for name in (*LESIONS, ORGANS))
     html.Div(
         f"""<label for="added-as">Add a mask as</label>

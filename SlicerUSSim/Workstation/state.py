@@ -158,6 +158,13 @@ class PageState:
 
     #: Name of the patient: the file with the labels, or with the MRI from which they are
     title: str = ""
+    #: The question whether a session of before is to be restored; "": there is none
+    offer: str = ""
+    #: Whether this session is kept on the disk, and whether that is possible
+    keeps_session: bool = False
+    can_keep_session: bool = False
+    #: With which a page knows that a server is this one, see access.proof
+    proof_key: str = ""
     #: Titles of the panel's sections that are open
     open_sections: list[str] = field(default_factory=list)
     #: The tissue that a mask is which is added

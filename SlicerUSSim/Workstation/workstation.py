@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 from collections.abc import Callable
+from contextlib import suppress
+from time import perf_counter
 from typing import Any, cast
 
 import slicer
@@ -14,7 +17,9 @@ from trame_slicer.core import SlicerApp
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Widget.sections import panel_sections
+from SlicerUSSim.Workstation.access import proof_key
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
+from SlicerUSSim.Workstation.autosave import Autosave
 from SlicerUSSim.Workstation.buttons import Buttons
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.export import Cine, Exports
@@ -29,6 +34,8 @@ from SlicerUSSim.Workstation.page import build_page, view_tools
 from SlicerUSSim.Workstation.panel import BrowserPanel
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.receiver import Receiver
+from SlicerUSSim.Workstation.restoring import Restoring
+from SlicerUSSim.Workstation.session_store import OwnSession, SessionStore
 from SlicerUSSim.Workstation.state import NAMES, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.tracker import Tracker
@@ -44,9 +51,10 @@ class Workstation:
     ----------
     files : files and options at the start.
     device : see opencl.devices.choose_device.
+    sessions : where sessions are kept; None: nowhere.
     """
 
-    def __init__(self, files: Files, device: str | None = None) -> None:
+    def __init__(self, files: Files, device: str | None = None, sessions: SessionStore | None = None) -> None:
         self.server = cast(Server, get_server("ussim", client_type="vue3"))
         self._files = files
         self._shared = shared = SharedState(self.server.state)
@@ -77,6 +85,16 @@ class Workstation:
             shared, app, logic, tasks, opener, presenter, self._messages, self._views, self._probe, self._comparison
         )  # fmt: skip
 
+        self._session = self._begun_session(sessions)
+        self._autosave = Autosave(
+            self._session, shared, logic, presenter, opener, cine, self._probe.pose, self._messages.show, tasks.tell
+        )
+        self._restoring = Restoring(
+            sessions if self._session is not None else None,
+            shared, app.scene, logic, tasks, opener, presenter, self._loading, self._probe, cine,
+            self._autosave.when_kept, perf_counter,
+        )  # fmt: skip
+
         self._following = False
         self._probe_node = Observed("TransformModifiedEvent", self._probe.moved)
         self._image_node = Observed("ImageDataModifiedEvent", self._images.image_changed)
@@ -90,8 +108,40 @@ class Workstation:
         self.server.controller.on_server_exited.add(self.close)
         build_page(self.server, sections, self._views.layout, (*KEYS, "Escape"))
 
+    def take_token(self, port: int) -> str:
+        """The token of the last server at this port, if it was killed, so that its pages go on; otherwise a new one."""
+        kept = None if self._sessions is None or port == 0 else self._sessions.token_of(port)
+        token = kept or secrets.token_urlsafe(24)
+        with self._shared.changing() as now:
+            now.proof_key = proof_key(token)
+        return token
+
+    def keep_token(self, port: int, token: str) -> None:
+        """Keep the token, in case this server is killed; called once it listens at this port."""
+        if self._session is not None and self._shared.now.keeps_session:
+            with suppress(SimulationError):  # the page then says that a new address is to be opened
+                self._session.keep_address(port, token)
+
+    def end_session(self) -> None:
+        """Called when the server ends as it should; what was kept of the patient stays."""
+        if self._session is not None:
+            self._session.end()
+            self._session = None
+
+    def _begun_session(self, sessions: SessionStore | None) -> OwnSession | None:
+        self._sessions, session = sessions, None
+        if sessions is not None:
+            try:
+                session = sessions.begin()
+            except SimulationError as error:
+                self._messages.show(f"this session is not kept: {error}")
+        with self._shared.changing() as now:
+            now.keeps_session = now.can_keep_session = session is not None
+        return session
+
     def close(self, **_: object) -> None:
         """Close the connection to the tracker and cancel waiting tasks."""
+        self._autosave.end()
         self._logic.stopLiveUpdate()
         self._tracker.stop()
         self._tasks.stop()
@@ -117,6 +167,9 @@ class Workstation:
             "dismiss": self._messages.dismiss,
             "export": self._export,
             "script": self._show_script,
+            "restore_session": self._in_task(lambda: self._then_refresh(self._restoring.restore)),
+            "discard_session": self._in_task(self._restoring.discard),
+            "session_kept": self._session_kept,
             "stamp": stamps.receive,
             "page_opened": self._images.show_again,
             "at_rest": self._at_rest,
@@ -158,6 +211,15 @@ class Workstation:
         with self._presenter.shown(), self._shared.changing() as now:
             now.script.text, now.script.is_open = self._exports.script(), True
 
+    async def _session_kept(self) -> bool:
+        """Wait until the present state is kept on the disk; returns whether it is. For programs that control a page."""
+        while not (self._is_at_rest and self._autosave.is_done):
+            await asyncio.sleep(_LOOK_EVERY_S)
+        self._autosave.look()
+        while not self._autosave.is_done:
+            await asyncio.sleep(_LOOK_EVERY_S)
+        return self._autosave.has_kept
+
     async def _at_rest(self) -> dict[str, int]:
         """Wait until all requests of pages and trackers are done; returns the number of the last image by stream.
 
@@ -179,6 +241,7 @@ class Workstation:
         for stream in self._images.streams:
             self.server.controller.rc_area_register(stream)
         self._tasks.start(self._begin)
+        self._autosave.begin()
 
     def _begin(self) -> None:
         files = self._files
@@ -186,6 +249,7 @@ class Workstation:
             with self._presenter.shown():
                 self._tracker.start(files.tracker, files.tracker_device)
         self._loading.begin(files)
+        self._restoring.offer()  # not before: what is restored takes the place of this patient
         self._panel.refresh()
 
     def _parameters_changed(self) -> None:

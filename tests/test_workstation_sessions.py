@@ -1,0 +1,271 @@
+"""Nothing is lost when the server is killed: sessions are kept, offered and restored, and the page comes back."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
+pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
+
+from SlicerUSSim.Workstation.state import NAMES
+from tests.test_workstation import (
+    browser as browser,
+    click,
+    download,
+    errors,
+    eventually,
+    files as files,
+    loaded,
+    new_image,
+    opened,
+    pixels,
+    pose,
+    pytestmark as pytestmark,
+    settled,
+    shown,
+    state,
+)
+
+
+class Server:
+    """`ussim serve` at one port, which can be killed and started again."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        self.sessions = folder / "slicerussim" / "sessions"
+        self._folder, self._arguments = folder, arguments
+        self.url = ""
+        self.start()
+
+    def start(self, *other: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "SlicerUSSim.Command.cli", "serve", "--port", str(self.port),
+             *(other or self._arguments)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", "XDG_STATE_HOME": str(self._folder)},
+        )  # fmt: skip
+        self.url = self.process.stdout.readline().strip()
+        assert self.url.startswith("http"), self.process.stderr.read()
+
+    def kill(self) -> None:
+        self.process.send_signal(signal.SIGKILL)
+        self.process.communicate()
+
+    def end(self) -> None:
+        self.process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(20)
+        self.process.kill()
+        self.process.communicate()
+
+
+@pytest.fixture
+def server(tmp_path, files):
+    made: list[Server] = []
+
+    def start(*arguments: str) -> Server:
+        made.append(Server(tmp_path / "state", *arguments))
+        return made[-1]
+
+    yield start
+    for one in made:
+        one.end()
+
+
+def kept(page) -> None:
+    """Wait until the present state is on the disk."""
+    assert page.evaluate("window.trame.trigger('session_kept')")
+
+
+def reloaded(page) -> None:
+    """Wait until the page has loaded itself again after its server was killed, and shows an image."""
+    page.wait_for_function("window.ussim && !window.before && window.ussim.images > 0")
+    loaded(page)
+    settled(page)
+
+
+def killed_and_started(server: Server, page, *other: str) -> None:
+    page.evaluate("window.before = true")
+    server.kill()
+    page.locator("#connection-lost").wait_for()
+    server.start(*other)
+
+
+def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, browser, files):
+    own = server(str(files / "head.nii.gz"), "--sequence", str(files / "sweep.igs.mha"))
+    problems: list[str] = []
+    page = opened(browser, own.url, problems)
+    settled(page)
+    assert page.locator("#session-offer").count() == 0
+    # A fit, applied; a tissue, a setting, a view; then the pose, away from the images
+    page.evaluate("window.trame.trigger('set', ['fitEvaluationsSpinBox', 20])")
+    page.evaluate("window.trame.trigger('press', ['fitButton'])")
+    eventually(page, lambda: "cost" in shown(page, "fitLabel"))
+    settled(page)
+    page.evaluate("window.trame.trigger('press', ['applyFitButton'])")
+    page.evaluate("window.trame.trigger('set_tissue', ['white matter', 'mu0', '0.41'])")
+    page.evaluate("window.trame.trigger('set', ['classesSpinBox', 4])")
+    page.evaluate("window.trame.trigger('plane', ['Green', 'Sagittal'])")
+    page.evaluate("window.trame.trigger('show_number', [2])")
+    for _ in range(3):
+        with new_image(page):
+            page.keyboard.press("a")
+    settled(page)
+    was = {
+        "pose": page.evaluate("window.ussim.image.pose"), "sliders": pose(page), "pixels": pixels(page),
+        "values": {name: value for name, value in state(page, NAMES.panel.values).items() if "Selector" not in name},
+        "tissues": state(page, NAMES.panel.tissues), "curve": state(page, NAMES.fit.curve),
+    }  # fmt: skip
+    assert any(row["name"] == "white matter" and "0.41" in row["values"] for row in was["tissues"])
+    cine = page.evaluate("window.ussim.images")
+    kept(page)
+
+    assert not problems
+    killed_and_started(own, page)
+    reloaded(page)
+    problems.clear()  # what it had asked when the server was killed had no answer
+    offer = page.locator("#session-offer-text")
+    offer.wait_for()
+    assert offer.inner_text().startswith("Restore the session of ") and "(head.nii.gz)?" in offer.inner_text()
+    assert pose(page) != was["sliders"]  # nothing is restored unasked
+    click(page, "#restore-session")
+    page.locator("#session-offer").wait_for(state="detached")
+    settled(page)
+    assert not errors(page)
+    np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), was["pose"], atol=1e-3)
+    assert np.array_equal(pixels(page), was["pixels"])
+    values = {name: value for name, value in state(page, NAMES.panel.values).items() if "Selector" not in name}
+    assert {name: (values[name], value) for name, value in was["values"].items() if values[name] != value} == {}
+    assert state(page, NAMES.panel.tissues) == was["tissues"] and state(page, NAMES.fit.curve) == was["curve"]
+    assert state(page, NAMES.views.planes)["Green"] == "Sagittal" and state(page, NAMES.sequence.number) == 2
+    assert state(page, NAMES.panel.can)["revertFitButton"] and cine > 3
+    # The cine loop has the images from before
+    gif = download(page, "gif").read_bytes()
+    assert gif.count(b"\x21\xf9\x04") > 3
+    # and it is kept again; the old one is gone only then
+    kept(page)
+    eventually(page, lambda: len([path for path in own.sessions.iterdir() if (path / "state.json").exists()]) == 1)
+    page.evaluate("window.trame.trigger('press', ['revertFitButton'])")
+    settled(page)
+    assert not errors(page) and not problems
+    page.close()
+
+
+def test_the_folder_is_for_the_user_alone_and_holds_this_patient_only(server, browser, files, tmp_path):
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    kept(page)
+    (session,) = own.sessions.iterdir()
+    for path in (own.sessions.parent, own.sessions, session):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o700, path
+    parts = {path.name.split("-")[0] for path in session.iterdir()}
+    assert parts == {"lock", "address.json", "state.json", "anatomy", "cine"}
+    assert all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in session.iterdir())
+    first = [path.name for path in session.glob("anatomy-*")]
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    kept(page)
+    assert json.loads((session / "state.json").read_text())["patient"] == "head.nii.gz"
+    assert len(list(session.glob("anatomy-*"))) == 1 and not (session / first[0]).exists()
+    # A patient that is closed is not on the disk either, and neither is one who is not to be kept
+    click(page, "#close-patient")
+    settled(page)
+    page.evaluate("window.trame.trigger('session_kept')")
+    assert {path.name for path in session.iterdir()} == {"lock", "address.json"}
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    kept(page)
+    page.locator("#keeps-session").uncheck()
+    settled(page)
+    page.evaluate("window.trame.trigger('session_kept')")
+    assert {path.name for path in session.iterdir()} == {"lock", "address.json"}
+    page.close()
+    own.end()
+    assert not session.exists()  # nothing is left of one without a patient
+
+
+def test_a_session_is_never_put_onto_another_patient(server, browser, files, tmp_path):
+    own = server(str(files / "head.nii.gz"))
+    page = opened(browser, own.url)
+    for _ in range(3):
+        page.keyboard.press("Shift+a")
+    settled(page)
+    kept(page)
+    killed_and_started(own, page, "--labels", str(files / "labels.nii.gz"))
+    reloaded(page)
+    page.locator("#session-offer").wait_for()
+    assert state(page, NAMES.title) == "labels.nii.gz"
+    assert abs(pose(page)["rock_deg"]) < 10  # placed anew on this one
+    assert "(head.nii.gz)?" in page.locator("#session-offer-text").inner_text()
+    click(page, "#restore-session")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    assert state(page, NAMES.title) == "head.nii.gz" and pose(page)["rock_deg"] > 10
+    assert not any("labels" in item["title"] for item in state(page, NAMES.panel.nodes)["labelsSelector"])
+    page.close()
+
+
+def test_what_is_discarded_or_damaged_changes_nothing(server, browser, files):
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    kept(page)
+    (session,) = own.sessions.iterdir()
+    (anatomy,) = session.glob("anatomy-*")
+    killed_and_started(own, page)
+    anatomy.write_bytes(anatomy.read_bytes()[:1000])
+    reloaded(page)
+    before = pixels(page)
+    click(page, "#restore-session")
+    page.locator(".ussim-error").first.wait_for()
+    text = errors(page)[0]
+    assert "is damaged, or of another version" in text and "\n" not in text
+    settled(page)
+    assert np.array_equal(pixels(page), before) and page.locator("#session-offer").count() == 1
+    click(page, "#discard-session")
+    page.locator("#session-offer").wait_for(state="detached")
+    settled(page)
+    assert not session.exists()
+    page.close()
+
+
+def test_a_new_server_with_another_token_is_said_and_not_trusted(server, browser, files):
+    """After an end as it should be the token is a new one; the cookie is sent to no server that cannot prove itself."""
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    before = own.url
+    page.evaluate("window.before = true")
+    own.end()
+    page.locator("#connection-lost").wait_for()
+    own.start()
+    assert own.url != before
+    page.wait_for_function("document.getElementById('connection-lost').textContent.includes('Open the address')")
+    assert page.evaluate("window.before")
+    page.goto(own.url)
+    page.locator("#session-offer").wait_for()  # what was kept is offered nevertheless
+    page.close()
+
+
+def test_without_autosave_nothing_is_on_the_disk(server, browser, files, tmp_path):
+    own = server("--labels", str(files / "labels.nii.gz"), "--no-autosave")
+    page = opened(browser, own.url)
+    settled(page)
+    assert not page.evaluate("window.trame.trigger('session_kept')") and not own.sessions.exists()
+    assert page.locator("#keeps-session").is_disabled()
+    page.close()
