@@ -18,7 +18,7 @@ from SlicerUSSim.Logic.mri.label_agreement import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose, read_volume
-from SlicerUSSim.Logic.mrml.scene_record import SequenceRecord
+from SlicerUSSim.Logic.mrml.scene_record import SceneRecord, SequenceRecord
 from SlicerUSSim.Logic.probe.arrays import Probe
 from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
@@ -29,6 +29,7 @@ from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.opener import Files, Opener, Upload
 from SlicerUSSim.Workstation.patient_nodes import remove_patient_nodes
 from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.state import ORGANS, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
@@ -59,6 +60,8 @@ class Loading:
         self._shared, self._scene, self._logic, self._tasks = shared, app.scene, logic, tasks
         self._opener, self._presenter, self._messages = opener, presenter, messages
         self._views, self._probe, self._comparison = views, probe, comparison
+        #: Shows the patient of a scene, called by a name, in place of the present one
+        self.take_scene: Callable[[SceneRecord, str], None] = lambda record, name: None
         self._is_new = False  # a patient was opened, on whom the probe is not yet
         self._source_before: LabelSource | None = None  # of the labels before the last Segment
         self._dropped = ""  # name of an MRI that was closed for labels that are not of it
@@ -98,7 +101,7 @@ class Loading:
                 self._take_sequence(files.sequence, files.sequence_name)
 
     def open(self, files: Mapping[str, bytes]) -> None:
-        """Open what a page has sent, {name: content}: an MRI, a label map, a tracked sequence or a preset.
+        """Open what a page has sent, {name: content}: an MRI, a label map, a sequence, a scene (.mrb) or a preset.
 
         A label map may come with the table of its labels.
 
@@ -120,6 +123,9 @@ class Loading:
         if upload.kind == "sequence":
             sequence, name = self._tasks.doAside(lambda: TrackedSequence.read(path)), Path(path).name.split(".")[0]
             return lambda: self._take_sequence(sequence, name)
+        if upload.kind == "scene":
+            record = self._tasks.doAside(lambda: read_scene(path))
+            return lambda: self.take_scene(record, Path(path).name)
         if upload.kind == "sheets":
             sheets = self._opener.sheets(path)
             return lambda: setattr(self._logic.parameters, "sheets", sheets)

@@ -40,6 +40,7 @@ from SlicerUSSim.Logic.tissue.label_sources import is_label_file, read_label_fil
 from SlicerUSSim.Logic.tissue.table import TissueTable
 from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Workstation.scene_files import is_scene
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.uploads import require_whole_files
@@ -103,7 +104,7 @@ class Upload:
     """A file that a page has sent."""
 
     path: str
-    #: "preset", "sequence", "labels" or "mri"
+    #: "preset", "sequence", "scene", "sheets", "labels" or "mri"
     kind: str
     #: Of the labels; None without
     table: LabelTable | None = None
@@ -383,6 +384,8 @@ class Opener:
         name = path.name.lower()
         if name.endswith(".json"):
             return "preset"
+        if is_scene(name):
+            return "scene"
         if name.endswith(".vtp"):
             return "sheets"
         if ".igs." in name or ".seq." in name:

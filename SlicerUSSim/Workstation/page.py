@@ -158,7 +158,8 @@ def _open_file() -> None:
     html.Div(
         """<label for="open-file">Open files</label>
         <input type="file" multiple id="open-file" @change="window.ussim.send($event.target, {for: 'open'})">""",
-        classes="ussim-line", title="An MRI, a label map (with its table), a tracked sequence, sheets (.vtp), a preset",
+        classes="ussim-line",
+        title="An MRI, a label map (with its table), a tracked sequence, a scene (.mrb), sheets (.vtp), a preset",
     )  # fmt: skip
     v3.VBtn(
         "Close patient", size="small", classes="mb-1", id="close-patient", click="trigger('press', ['closePatient'])",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 
 from SlicerUSSim.Logic.base.errors import require
 
@@ -43,6 +44,12 @@ def require_whole_files(files: Mapping[str, bytes]) -> None:
             f"{name}: is a header whose voxels are in another file ({other}), which a page cannot send; save it as one "
             "file, such as .nrrd, .mha or .nii.gz",
         )
+
+
+def require_whole_file(path: Path) -> None:
+    """Raise SimulationError for a file of a bundle that is a header whose voxels are in another file."""
+    other = _other_file(path.name, path.read_bytes())
+    require(other is None, f"{path.name}: is a header whose voxels are in another file ({other}), expected one file")
 
 
 def _other_file(name: str, content: bytes) -> str | None:

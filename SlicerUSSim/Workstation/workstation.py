@@ -94,6 +94,7 @@ class Workstation:
             shared, app.scene, logic, tasks, opener, presenter, self._loading, self._probe, cine,
             self._autosave.when_kept, perf_counter,
         )  # fmt: skip
+        self._loading.take_scene = self._restoring.take_scene
 
         self._following = False
         self._probe_node = Observed("TransformModifiedEvent", self._probe.moved)
