@@ -10,16 +10,20 @@ import socket
 import stat
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("trame_slicer", reason="the workstation comes with: pip install '.[serve]'")
 pytest.importorskip("playwright", reason="browser tests need playwright: pip install '.[test]'")
 
+from SlicerUSSim.Logic.base.volume import Volume, read_array
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_workstation import (
+    PATIENCE_S,
     browser as browser,
     click,
     download,
@@ -268,4 +272,58 @@ def test_without_autosave_nothing_is_on_the_disk(server, browser, files, tmp_pat
     settled(page)
     assert not page.evaluate("window.trame.trigger('session_kept')") and not own.sessions.exists()
     assert page.locator("#keeps-session").is_disabled()
+    page.close()
+
+
+def bundled(page, folder: Path) -> np.ndarray:
+    """The image of the exported script, run beside nothing but what was exported with it."""
+    folder.mkdir()
+    with zipfile.ZipFile(download(page, "zip")) as archive:
+        archive.extractall(folder)
+    done = subprocess.run(
+        [sys.executable, "image.py"], cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return read_array(folder / "image.nrrd")[0][0]
+
+
+def test_scripts_run_after_uploads_also_of_files_with_one_name_and_after_a_restart(server, browser, files, tmp_path):
+    """They read files that nobody had any more."""
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    page.set_input_files("#open-file", files / "head.nii.gz")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    mri = Volume.read(files / "head.nii.gz")
+    middle = np.array(mri.array.shape) // 2
+    for number, tissue in enumerate(("tumour", "cyst")):
+        mask = np.zeros(mri.array.shape, np.uint8)
+        mask[tuple(slice(m - 4, m + 4) for m in middle + [8, 8 - 16 * number, 8])] = 1
+        folder = tmp_path / tissue
+        folder.mkdir()
+        mri.with_array(mask).write(folder / "mask.nii.gz")
+        page.select_option("#added-as", tissue)
+        with new_image(page):
+            page.set_input_files("#add-file", folder / "mask.nii.gz")
+        settled(page)
+    assert not errors(page)
+    image = np.asarray(Image.open(download(page, "png")))
+    assert np.array_equal(bundled(page, tmp_path / "script"), image)
+    found = sorted(path.name for path in (tmp_path / "script").iterdir())
+    assert found == ["head.nii.gz", "image.nrrd", "image.py", "mask (2).nii.gz", "mask.nii.gz"]
+    click(page, "#export")
+    click(page, "#export-python")
+    with page.expect_download() as waiting:
+        click(page, "#save-script")
+    assert waiting.value.suggested_filename == "ultrasound.zip"
+    page.get_by_role("button", name="Close", exact=True).click()
+    kept(page)
+    killed_and_started(own, page)
+    reloaded(page)
+    click(page, "#restore-session")
+    page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
+    settled(page)
+    assert np.array_equal(np.asarray(Image.open(download(page, "png"))), image)
+    assert np.array_equal(bundled(page, tmp_path / "again"), image)
     page.close()

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import io
 import logging
+import shutil
 import threading
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from PIL import Image
@@ -57,6 +59,8 @@ class _Taken:
     #: (time, image) that are new, and whether they begin a loop
     cine: list[tuple[float, np.ndarray]]
     is_new_loop: bool
+    #: {name: where it is} of the files that a page has sent
+    sent: dict[str, Path]
 
 
 class Autosave:
@@ -149,8 +153,9 @@ class Autosave:
         fit_now = None if fit is None else (id(fit[0]), id(fit[1]))
         cine = self._cine.loop, self._cine.added
         seen = (
-            anatomy, parameters.node.GetMTime(), None if pose is None else pose.tobytes(), fit_now, id(sequence), cine,
-            repr(page), self._presenter.noteLines,
+            anatomy, tuple(self._opener.sent.files), parameters.node.GetMTime(),
+            None if pose is None else pose.tobytes(), fit_now, id(sequence), cine, repr(page),
+            self._presenter.noteLines,
         )  # fmt: skip
         if seen == self._seen:
             return
@@ -178,6 +183,7 @@ class Autosave:
             sequence if sequence is not self._sequence_seen else None, sequence is not None,
             None if fit is None or fit_now == self._fit_seen else (replace(fit[0], simulator=None), fit[1]),
             fit is not None, self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
+            dict(self._opener.sent.files),
         )  # fmt: skip
         self._seen, self._anatomy_seen, self._sequence_seen, self._fit_seen = seen, anatomy, sequence, fit_now
         self._cine_seen = cine
@@ -228,6 +234,8 @@ class Autosave:
         assert session is not None
         size = 0 if taken.anatomy is None else taken.anatomy.size
         size += 0 if taken.sequence is None else taken.sequence.sequence.images.nbytes
+        known = self._files.get("sent", {})
+        size += sum(path.stat().st_size for name, path in taken.sent.items() if name not in known and path.exists())
         room = session.room()
         if size > room:
             session.clear()
@@ -238,6 +246,7 @@ class Autosave:
             self._put("sequence", taken.sequence)
         if taken.fit is not None:
             self._put("fit", taken.fit)
+        self._files["sent"] = {name: known.get(name) or self._copied(path) for name, path in taken.sent.items()}
         for part, is_there in (("sequence", taken.has_sequence), ("fit", taken.has_fit)):
             if not is_there:
                 self._files.pop(part, None)
@@ -252,6 +261,19 @@ class Autosave:
             del self._chunks[0]
         self._files["cine"] = [name for name, _ in self._chunks]
         session.write_state(taken.patient, self._files, taken.state)
+
+    def _copied(self, path: Path) -> str:
+        """The file of the session that is a copy of one that a page has sent."""
+        self._number += 1
+        name = f"sent-{self._number}"
+        assert self._session is not None
+
+        def copy(file: BinaryIO) -> None:
+            with path.open("rb") as source:
+                shutil.copyfileobj(source, file, 2**20)
+
+        self._session.write(name, copy)
+        return name
 
     def _put(self, part: str, values: Any) -> None:
         self._number += 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import json
+import os
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
@@ -108,7 +109,7 @@ class Cine:
 
 
 class Exports:
-    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, gif, mrb, json; and the script.
+    """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, gif, mrb, json, zip; and the script.
 
     Each is (file name, content, MIME type). Raises SimulationError if there is nothing to export.
     """
@@ -123,6 +124,13 @@ class Exports:
         if kind == "mrb":
             with self._logic.imageHeld():
                 return "ultrasound.mrb", scene_file(self._app), "application/zip"
+        if kind == "zip":
+            text, missing = self._script()
+            sent = self._opener.sent
+            for name in missing:
+                require(name in sent.files, f"{name} was not opened in this page, expected it beside the script")
+            content = await asyncio.get_running_loop().run_in_executor(None, sent.bundle, text, missing)
+            return "ultrasound.zip", content, "application/zip"
         if kind == "gif":
             content = await asyncio.get_running_loop().run_in_executor(None, self._cine.gif)
             return "ultrasound.gif", content, "image/gif"
@@ -131,8 +139,13 @@ class Exports:
             return "ultrasound.png", png(taken), "image/png"
         return f"ultrasound{kind}", frame_file(taken, kind), "application/octet-stream"
 
-    def script(self) -> str:
-        """A Python script that reproduces the image on the screen."""
+    def script(self) -> tuple[str, bool]:
+        """(a Python script that reproduces the image on the screen, whether it needs files that a page has sent)."""
+        text, missing = self._script()
+        return text, bool(missing)
+
+    def _script(self) -> tuple[str, tuple[str, ...]]:
+        """(the script, names of the files that a page has sent which it needs beside it)."""
         labels: Any = self._logic.parameters.labels
         taken = required(self._logic.taken, _NO_IMAGE)
         require(labels is not None, _NO_IMAGE)
@@ -144,12 +157,10 @@ class Exports:
         in_labels, moved = pose_in_labels(labels, taken.probe_to_world)
         require(np.allclose(moved, np.eye(4)), f"the transform of {labels.GetName()!r} scales, expected a rigid one")
         names = read_labels(labels, preset.tissues).names
-        return python_script(
-            source,
-            replace(preset, tissues=preset.tissues.for_names(names)),
-            in_labels,
-            self._shown_sheets(source),
-        )
+        sheets = self._shown_sheets(source)
+        text = python_script(source, replace(preset, tissues=preset.tissues.for_names(names)), in_labels, sheets)
+        needed = (*source.missing, *((sheets,) if isinstance(sheets, str) and not os.path.isabs(sheets) else ()))
+        return text, tuple(dict.fromkeys(needed))
 
     def _shown_sheets(self, source: LabelSource) -> tuple[str, ...] | str:
         """Kinds of the sheets of Segment that the image shows, or the file with them; () without.

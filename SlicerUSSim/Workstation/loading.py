@@ -346,7 +346,7 @@ class Loading:
         self._comparison.drop()
         self._probe.forget_patient()
         self._presenter.forgetPatient()
-        self._opener.forget_patient()
+        self._opener.forget_patient(*new)
         kept = [parameters.output, parameters.outline, parameters.probe_transform, *new]
         for role in _OF_PATIENT:
             node: Any = getattr(parameters, role)

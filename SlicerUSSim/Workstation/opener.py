@@ -42,6 +42,7 @@ from SlicerUSSim.Logic.tracked.images import TrackedImages
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Workstation.scene_files import is_scene
 from SlicerUSSim.Workstation.script import LabelSource
+from SlicerUSSim.Workstation.sent_files import SentFiles
 from SlicerUSSim.Workstation.tasks import Tasks
 from SlicerUSSim.Workstation.uploads import require_whole_files
 
@@ -123,8 +124,11 @@ class Opener:
         self._names_of_table: list[str] | tuple[str, ...] = ()
         #: The sequence of the patient, which is opened
         self.opened_sequence: SequenceRecord | None = None
-        #: {temporary path: name} of the files that a page has sent last
+        #: {temporary path: name} of the files that a page has sent last, and {name: that under which it is kept}
         self._uploads: dict[str, str] = {}
+        self._kept_names: dict[str, str] = {}
+        #: Those of the patient that scripts need
+        self.sent = SentFiles()
 
     def mri(self, path: str | None):
         """A volume node with the MRI of a file, or with the demo brain."""
@@ -249,7 +253,7 @@ class Opener:
             undo()
             raise
         if files is not None:
-            self._lesion_files[_segments_of(node)] = (*files, (tissue, file or name))
+            self._lesion_files[_segments_of(node)] = (*files, (tissue, file or self._kept_names.get(name, name)))
         return node, lambda: undo(ids)
 
     def restore_lesions(self, lesions_node, files: tuple[tuple[str, str], ...]) -> None:
@@ -298,9 +302,10 @@ class Opener:
         if source is not None and disc is not None:
             self._sources[_voxels_of(labels_node)] = replace(source, disc=disc)
 
-    def forget_patient(self) -> None:
-        """Release what is kept of the last patient."""
+    def forget_patient(self, *new: Any) -> None:
+        """Release what is kept of the last patient; `new` are nodes of the next one."""
         self.opened_sequence = None
+        self.sent.forget(node.GetAttribute(FILE) or "" for node in new if node is not None)
         self._sources, self._lesion_files = {}, {}
 
     def patient(self) -> str:
@@ -349,6 +354,7 @@ class Opener:
         """The volume of a file with a mask uploaded from a page."""
         with untrusted_folder() as folder, self._sent({name: content}, folder) as (path,):
             volume = self._mask(str(path))
+            self._keep(path)
         yield volume
 
     @contextmanager
@@ -378,6 +384,12 @@ class Opener:
                 )
                 table = self._table(tables[0])
             yield Upload(str(path), kind, table)
+            if kind in ("mri", "labels", "sheets"):
+                self._keep(path)
+
+    def _keep(self, path: Path) -> None:
+        """Keep a file that a page has sent, for scripts."""
+        self.sent.keep(self._kept_names[path.name], path)
 
     def _kind(self, path: Path) -> str:
         """The kind of a file, as Upload has it."""
@@ -411,6 +423,7 @@ class Opener:
         self._uploads = {str(Path(folder) / name): name for name in files}
         for path, content in zip(self._uploads, files.values(), strict=True):
             Path(path).write_bytes(content)
+        self._kept_names = {name: self.sent.name_for(Path(path)) for path, name in self._uploads.items()}
         try:
             yield list(map(Path, self._uploads))
         except SimulationError as error:
@@ -427,7 +440,8 @@ class Opener:
 
     def _place(self, path: str) -> str:
         """The path of a file; its name alone if a page has sent it."""
-        return self._uploads.get(path) or os.path.abspath(path)
+        name = self._uploads.get(path)
+        return os.path.abspath(path) if name is None else self._kept_names[name]
 
     def _volume(self, path: str) -> Volume:
         """The volume of a file, read once."""

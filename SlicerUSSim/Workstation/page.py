@@ -78,6 +78,7 @@ _EXPORTS = (
     ("gif", "Cine of the last images (GIF)"),
     ("mrb", "Scene for 3D Slicer (MRB)"),
     ("json", "Settings (JSON)"),
+    ("zip", "Python script with its files (ZIP)"),
 )
 
 
@@ -434,6 +435,11 @@ def _script_dialog() -> None:
         with v3.VCardText():
             html.Div(f'<textarea id="ussim-script" class="ussim-script" readonly :value="{script.text}"></textarea>')
         with v3.VCardActions():
+            html.Div(
+                "It reads files that were opened in the page, expected beside it", v_if=script.needs_files,
+                id="script-files", classes="text-caption",
+            )  # fmt: skip
             v3.VSpacer()
+            v3.VBtn("Save with its files", v_if=script.needs_files, click="window.ussim.save('zip')", id="save-script")
             v3.VBtn("Copy", click=f"window.ussim.copy({script.text})", id="copy-script")
             v3.VBtn("Close", click=f"{script.is_open} = false")

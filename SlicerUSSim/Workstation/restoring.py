@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -72,9 +74,13 @@ class Restoring:
         if session is None:
             return
         with self._presenter.shown():
-            with self._presenter.view.progress("Restore the session"):
-                record, fit, images = self._tasks.doAside(lambda: _parts_of(session))
-            self._take(record, session.state, fit, images)
+            with TemporaryDirectory(prefix="ussim-sent-") as folder:
+                with self._presenter.view.progress("Restore the session"):
+                    record, fit, images = self._tasks.doAside(lambda: _parts_of(session))
+                    sent = self._tasks.doAside(lambda: session.copies("sent", Path(folder)))
+                self._take(record, session.state, fit, images)
+                for name, path in sent.items():
+                    self._opener.sent.keep(name, path)
             self._offered = None
             self._show_offer()
             self._when_kept(session.remove)  # by the session of this server; until then it stays on the disk

@@ -77,6 +77,18 @@ class KeptSession:
         except SimulationError as error:
             raise SimulationError(f"the session's {name} {error}") from None
 
+    def copies(self, part: str, folder: Path) -> dict[str, Path]:
+        """{name: copy in a folder} of a part that is {name: its file}. Raises SimulationError for a missing file."""
+        found = {}
+        for number, (name, file) in enumerate(dict(self.state["files"].get(part, {})).items()):
+            require(Path(file).name == file, f"the session names {file!r}, expected a file of its folder")
+            found[str(name)] = folder / str(number)
+            try:
+                shutil.copyfile(self.folder / file, found[str(name)])
+            except OSError as error:
+                raise SimulationError(f"the session's {file} cannot be read ({error.strerror})") from None
+        return found
+
     def remove(self) -> None:
         """Remove it from the disk."""
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -103,7 +115,7 @@ class OwnSession:
         self.write(_STATE, partial(_write_json, values))
         kept = {_STATE, _ADDRESS, _LOCK}
         for entry in files.values():
-            kept |= {entry} if isinstance(entry, str) else set(entry)
+            kept |= {entry} if isinstance(entry, str) else set(entry.values() if isinstance(entry, dict) else entry)
         for path in self.folder.iterdir():
             if path.is_file() and path.name not in kept:
                 path.unlink(missing_ok=True)

@@ -150,6 +150,8 @@ class ScriptState:
 
     text: str = ""
     is_open: bool = False
+    #: Whether it needs files that a page has sent
+    needs_files: bool = False
 
 
 @dataclass

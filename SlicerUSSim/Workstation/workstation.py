@@ -210,7 +210,7 @@ class Workstation:
 
     def _show_script(self) -> None:
         with self._presenter.shown(), self._shared.changing() as now:
-            now.script.text, now.script.is_open = self._exports.script(), True
+            (now.script.text, now.script.needs_files), now.script.is_open = self._exports.script(), True
 
     async def _session_kept(self) -> bool:
         """Wait until the present state is kept on the disk; returns whether it is. For programs that control a page."""
