@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
 from SlicerUSSim.Widget.controls import Control, Section
 from SlicerUSSim.Widget.presenter import FROZEN, TISSUE_COLUMNS
+from SlicerUSSim.Workstation.pose_page import pose_numbers
 from SlicerUSSim.Workstation.session_page import keep_session, session_offer
 from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode
 
@@ -141,6 +142,7 @@ def _drawer(sections: tuple[Section, ...]) -> None:
                             _control(control)
                     if section.title == "Probe":
                         _pose_sliders()
+                        pose_numbers()
                     if section.title.startswith("Fit"):
                         _cost_curve()
 

@@ -19,6 +19,7 @@ class Receiver:
     ----------
     opened : called in the event loop with {name: content} of files to open.
     added : called with the name and the content of a mask to add, and the tissue that it is.
+    posed : called with the name and the content of a file with a pose of the probe.
     refused : called with a line about files that were not taken.
     """
 
@@ -27,8 +28,9 @@ class Receiver:
         opened: Callable[[dict[str, bytes]], None],
         added: Callable[[str, bytes, str], None],
         refused: Callable[[str], None],
+        posed: Callable[[str, bytes], None] = lambda name, content: None,
     ) -> None:
-        self._opened, self._added, self._refused = opened, added, refused
+        self._opened, self._added, self._refused, self._posed = opened, added, refused, posed
 
     def serve(self, app: web.Application) -> None:
         """Answer requests to an application, which is about to start."""
@@ -54,6 +56,8 @@ class Receiver:
             files[part.filename or ""] = bytes(content)
         if files and request.query.get("for") == "add":
             self._added(*next(iter(files.items())), request.query.get("as", ""))
+        elif files and request.query.get("for") == "pose":
+            self._posed(*next(iter(files.items())))
         elif files:
             self._opened(files)
         return web.Response(status=204)

@@ -175,6 +175,9 @@ class PageState:
     is_frozen: bool = False
     #: Pose of the probe on the patient; None without a probe or a patient
     pose: SurfacePose | None = None
+    #: The same as texts: position and angles, and matrix, as pose_files.pose_of_text reads them; "" without a probe
+    pose_numbers: str = ""
+    pose_matrix: str = ""
     #: Whether the probe is aligned with the surface normal while it slides
     upright: bool = True
     #: Whether the latency from mouse to image is measured

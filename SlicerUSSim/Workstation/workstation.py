@@ -32,6 +32,7 @@ from SlicerUSSim.Workstation.observed import Observed
 from SlicerUSSim.Workstation.opener import Files, Opener
 from SlicerUSSim.Workstation.page import build_page, view_tools
 from SlicerUSSim.Workstation.panel import BrowserPanel
+from SlicerUSSim.Workstation.pose_entry import PoseEntry
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.receiver import Receiver
 from SlicerUSSim.Workstation.restoring import Restoring
@@ -71,6 +72,8 @@ class Workstation:
         self._presenter = presenter = self._panel.presenter
         self._views = AnatomyViews(app, self.server, view_tools)
         self._probe = ProbeControl(shared, logic, tasks, self._views, stamps.probe_moved)
+        self._poses = PoseEntry(shared, tasks, presenter, self._probe.pose, self._probe.move)
+        self._probe.told = self._poses.show
         self._comparison = Comparison(shared, self._probe.move)
         self._tracker = Tracker(shared, tasks, self._probe.move)
         self._images = ImageFlow(
@@ -103,7 +106,7 @@ class Workstation:
         self._parameter_node.watch(logic.parameters.node)
         self._answer_pages(Buttons(shared, tasks, presenter, sections, self._loading), stamps)
         self._follow_pages()
-        receiver = Receiver(self._open_files, self._add_file, self._messages.show)
+        receiver = Receiver(self._open_files, self._add_file, self._messages.show, self._open_pose)
         self.server.controller.on_server_bind.add(lambda wslink: receiver.serve(wslink.app))
         self.server.controller.on_server_ready.add(self._ready)
         self.server.controller.on_server_exited.add(self.close)
@@ -158,6 +161,7 @@ class Workstation:
             "set_tissue": self._in_task(self._presenter.setTissue),
             "set_free": self._in_task(self._presenter.fits.setFree),
             "set_pose": probe.set_pose,
+            "type_pose": self._in_task(self._poses.type),
             "key": probe.hand.key,
             "plane": probe.choose_plane,
             "look": probe.look,
@@ -194,6 +198,9 @@ class Workstation:
     def _add_file(self, name: str, content: bytes, tissue: str) -> None:
         self._tasks.start(lambda: self._then_refresh(self._loading.add, name, content, tissue))
 
+    def _open_pose(self, name: str, content: bytes) -> None:
+        self._tasks.start(lambda: self._poses.open(name, content))
+
     def _then_refresh(self, method: Callable[..., None], *arguments: object) -> None:
         method(*arguments)
         self._panel.refresh()
@@ -201,7 +208,10 @@ class Workstation:
     async def _export(self, kind: str) -> list[object] | None:
         """[file name, content, MIME type], or None after an error was shown on the page."""
         try:
-            name, content, mime = await self._exports.export(kind)
+            if kind.startswith("pose."):
+                name, content, mime = *self._poses.file(kind.removeprefix("pose")), "application/octet-stream"
+            else:
+                name, content, mime = await self._exports.export(kind)
         except SimulationError as error:
             self._messages.show(str(error))
             return None

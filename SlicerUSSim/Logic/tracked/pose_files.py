@@ -10,9 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
-from SlicerUSSim.Logic.base.files import read_json, write_json
+from SlicerUSSim.Logic.base.files import read_json, write_json, written_whole
 from SlicerUSSim.Logic.base.reading import in_child, reader, starts_like_hdf5
-from SlicerUSSim.Logic.base.transforms import LPS_TO_RAS, MOST_MM, check_affine, check_rigid, is_singular
+from SlicerUSSim.Logic.base.transforms import (
+    LPS_TO_RAS,
+    MOST_MM,
+    check_affine,
+    check_rigid,
+    is_singular,
+    pose_of_angles,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -70,8 +77,43 @@ def _numbers(path: Path) -> np.ndarray:
 
 
 def write_pose(path: str | os.PathLike, probe_to_ras: np.ndarray) -> None:
-    """Write a pose as JSON; an existing file is replaced only when the new one is complete."""
-    write_json(path, {"probe_to_ras": np.asarray(probe_to_ras).tolist()})
+    """Write a pose, which read_pose reads; an existing file is replaced only when the new one is complete.
+
+    An ITK file (.tfm, .h5, .mat) has the map from world to probe in LPS, as Slicer writes and reads linear transforms;
+    a text file (.txt) sixteen numbers by rows. Others are JSON. Raises SimulationError for a matrix that is not rigid.
+    """
+    path, pose = Path(path), check_rigid("probe_to_ras", probe_to_ras)
+    suffix = path.suffix.lower()
+    if suffix in _ITK_SUFFIXES:
+        _write_itk(path, pose)
+    elif suffix == ".txt":
+        with written_whole(path) as partial:
+            partial.write_text("\n".join(" ".join(map(repr, row)) for row in pose.tolist()) + "\n", encoding="utf-8")
+    else:
+        write_json(path, {"probe_to_ras": pose.tolist()})
+
+
+def pose_of_text(text: str) -> np.ndarray:
+    """(4, 4) probe_to_ras of a text: sixteen numbers by rows, or six: position and angles as in pose_of_angles.
+
+    Raises SimulationError for other texts and for a matrix that is not rigid.
+
+    >>> pose_of_text("10 20 30  0 0 90").round(3).tolist()[0]
+    [0.0, -1.0, 0.0, 10.0]
+    """
+    parts = re.sub(r"[,;\[\]()]", " ", text).split()
+    try:
+        numbers = np.array(parts, float)
+    except ValueError:
+        numbers = np.zeros(0)
+    require(
+        numbers.size in (6, 16) and numbers.size == len(parts),
+        f"the pose is {text.strip()[:60]!r}, expected 6 numbers (R A S in mm, and angles about these axes in degrees) "
+        "or 16 (a 4x4 matrix by rows)",
+    )
+    if numbers.size == 6:
+        return check_rigid("the pose", pose_of_angles(numbers[:3], numbers[3:]))
+    return check_rigid("the pose", numbers.reshape(4, 4))
 
 
 def _starts_like_itk(path: Path) -> bool:
@@ -92,6 +134,17 @@ def _read_itk(path: Path) -> np.ndarray:
     world_to_probe = linear(path)
     require(not is_singular(world_to_probe), f"{path}: the transform is singular, expected a rigid one")
     return check_rigid(f"{path}: transform", LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS)
+
+
+def _write_itk(path: Path, pose: np.ndarray) -> None:
+    import SimpleITK as sitk
+
+    world_to_probe = np.linalg.inv(LPS_TO_RAS @ pose @ LPS_TO_RAS)
+    transform = sitk.AffineTransform(3)
+    transform.SetMatrix(world_to_probe[:3, :3].ravel().tolist())
+    transform.SetTranslation(world_to_probe[:3, 3].tolist())
+    with written_whole(path) as partial:
+        sitk.WriteTransform(transform, str(partial))
 
 
 def _linear_map(path: Path) -> np.ndarray:
