@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -127,6 +129,30 @@ def test_a_file_that_is_no_pose_is_said_by_its_own_name(page, tmp_path):
     page.set_input_files("#open-pose", tmp_path / "no.tfm")
     page.locator(".ussim-error").first.wait_for()
     assert errors(page)[0].startswith("no.tfm: ") and "/tmp" not in errors(page)[0]
+
+
+def test_a_preset_carries_the_pose_if_it_is_wanted(page, tmp_path):
+    open_section(page, "Output")
+    with page.expect_download() as waiting:
+        click(page, "#savePresetButton")
+    assert "probe_to_ras" not in json.loads(Path(waiting.value.path()).read_text())
+    page.locator("#presetPoseCheckBox").check()
+    settled(page)
+    with new_image(page):
+        page.keyboard.press("Shift+d")
+    saved = where(page)
+    with page.expect_download() as waiting:
+        click(page, "#savePresetButton")
+    shutil.copy(waiting.value.path(), tmp_path / "preset.json")
+    np.testing.assert_allclose(json.loads((tmp_path / "preset.json").read_text())["probe_to_ras"], saved, atol=1e-3)
+    page.locator("#presetPoseCheckBox").uncheck()
+    page.evaluate("window.trame.trigger('press', ['placeButton'])")
+    settled(page)
+    assert not np.allclose(where(page), saved, atol=1e-2)
+    page.set_input_files("#open-file", tmp_path / "preset.json")
+    eventually(page, lambda: np.allclose(where(page), saved, atol=1e-3))
+    settled(page)
+    assert not errors(page)
 
 
 def test_without_a_patient_there_is_no_pose(page, files):

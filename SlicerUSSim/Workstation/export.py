@@ -7,6 +7,7 @@ import io
 import json
 import os
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +20,7 @@ from trame_slicer.core import SlicerApp
 from vtkmodules.vtkCommonCore import vtkOutputWindow
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require, required
+from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.sheets.surfels import KINDS
 from SlicerUSSim.Logic.mrml.label_nodes import read_labels
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
@@ -112,15 +114,26 @@ class Exports:
     """The contents of the menu Export, by kind: png, .nrrd, .mha, .vti, gif, mrb, json, zip; and the script.
 
     Each is (file name, content, MIME type). Raises SimulationError if there is nothing to export.
+
+    Parameters
+    ----------
+    preset : the settings to save.
     """
 
-    def __init__(self, app: SlicerApp, logic: UltrasoundSceneLogic, opener: Opener, cine: Cine) -> None:
-        self._app, self._logic, self._opener, self._cine = app, logic, opener, cine
+    def __init__(
+        self,
+        app: SlicerApp,
+        logic: UltrasoundSceneLogic,
+        opener: Opener,
+        cine: Cine,
+        preset: Callable[[], Preset],
+    ) -> None:
+        self._app, self._logic, self._opener, self._cine, self._preset = app, logic, opener, cine, preset
 
     async def export(self, kind: str) -> tuple[str, bytes, str]:
         """Export one kind; slow encoding runs outside the event loop."""
         if kind == "json":
-            return "preset.json", json.dumps(self._logic.preset.to_dict(), indent=2).encode(), "application/json"
+            return "preset.json", json.dumps(self._preset().to_dict(), indent=2).encode(), "application/json"
         if kind == "mrb":
             with self._logic.imageHeld():
                 return "ultrasound.mrb", scene_file(self._app), "application/zip"

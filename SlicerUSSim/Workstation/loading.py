@@ -71,7 +71,7 @@ class Loading:
         parameters = self._logic.parameters
         with self._presenter.shown():
             if files.preset is not None:
-                self._logic.preset = files.preset
+                self._logic.preset = replace(files.preset, probe_to_ras=None)
             parameters.segmentation = replace(
                 parameters.segmentation, contrast=files.contrast, skull_strip=files.skull_strip, outside=files.outside
             )
@@ -99,6 +99,8 @@ class Loading:
             self._open_at_start(files)
             if files.sequence is not None:
                 self._take_sequence(files.sequence, files.sequence_name)
+            elif files.preset is not None and files.preset.probe_to_ras is not None:
+                self._presenter.takePreset(files.preset)
 
     def open(self, files: Mapping[str, bytes]) -> None:
         """Open what a page has sent, {name: content}: an MRI, a label map, a sequence, a scene (.mrb) or a preset.
@@ -119,7 +121,7 @@ class Loading:
         path = upload.path
         if upload.kind == "preset":
             preset = Preset.read(path)
-            return lambda: setattr(self._logic, "preset", preset)
+            return lambda: self._presenter.takePreset(preset)
         if upload.kind == "sequence":
             sequence, name = self._tasks.doAside(lambda: TrackedSequence.read(path)), Path(path).name.split(".")[0]
             return lambda: self._take_sequence(sequence, name)

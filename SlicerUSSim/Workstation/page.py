@@ -20,8 +20,8 @@ from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
 from SlicerUSSim.Widget.controls import Control, Section
 from SlicerUSSim.Widget.presenter import FROZEN, TISSUE_COLUMNS
-from SlicerUSSim.Workstation.pose_page import pose_numbers
-from SlicerUSSim.Workstation.session_page import keep_session, session_offer
+from SlicerUSSim.Workstation.pose_widgets import pose_numbers
+from SlicerUSSim.Workstation.session_widgets import keep_session, session_offer
 from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode
 
 _STATIC = Path(__file__).parent / "static"

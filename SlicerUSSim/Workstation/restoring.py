@@ -78,7 +78,7 @@ class Restoring:
                 with self._presenter.view.progress("Restore the session"):
                     record, fit, images = self._tasks.doAside(lambda: _parts_of(session))
                     sent = self._tasks.doAside(lambda: session.copies("sent", Path(folder)))
-                self._take(record, session.state, fit, images)
+                self._take(record, session.content, fit, images)
                 for name, path in sent.items():
                     self._opener.sent.keep(name, path)
             self._offered = None
@@ -122,7 +122,7 @@ class Restoring:
     def _take(
         self,
         record: SceneRecord,
-        state: Mapping[str, Any],
+        kept: Mapping[str, Any],
         fit: tuple[Fit, Preset | None] | None,
         images: list[tuple[float, np.ndarray]],
     ) -> None:
@@ -132,7 +132,7 @@ class Restoring:
         labels: Any = made.get("labels")
         flap = None if labels is None else labels.GetNodeReference("SlicerUSSim.flap")
         self._loading.begin_patient(*made.values(), *parents, flap)
-        refused = put_values(parameters, state.get("values", {}))
+        refused = put_values(parameters, kept.get("values", {}))
         preset = self._logic.preset
         for role in ROLES:
             if role != "real" or record.sequence is None:
@@ -140,27 +140,27 @@ class Restoring:
         mri, pose = made.get("mri"), record.pose
         if mri is not None:
             show_all_tissue(mri, required(record.nodes["mri"].volume, "the MRI has no voxels"))
-        source = state.get("source")
+        source = kept.get("source")
         if labels is not None and source is not None:
             self._opener.restored(LabelSource.from_dict(source), labels)
-        if parameters.lesions is not None and state.get("lesions") is not None:
-            files = tuple((str(tissue), str(file)) for tissue, file in state["lesions"])
+        if parameters.lesions is not None and kept.get("lesions") is not None:
+            files = tuple((str(tissue), str(file)) for tissue, file in kept["lesions"])
             self._opener.restore_lesions(parameters.lesions, files)
         if pose is not None:
             self._put_probe(pose)
         if record.sequence is not None:
             self._loading.take_sequence(record.sequence, preset.probe)
             self._logic.preset = preset
-        page = state.get("page", {})
+        page = kept.get("page", {})
         self._show_page(page)
         if pose is not None:
             self._put_probe(pose)  # the sequence has moved it
         if fit is not None and labels is not None:
             self._presenter.fits.restore(*fit, labels)
             with self._shared.changing() as now:
-                now.fit.curve, now.fit.costs = [float(cost) for cost in state["curve"]], str(state["costs"])
-        self._cine.restore(images, self._now(), str(state.get("about", "")))
-        self._presenter.setNotes(*map(str, state.get("notes", ())), *refused)
+                now.fit.curve, now.fit.costs = [float(cost) for cost in kept["curve"]], str(kept["costs"])
+        self._cine.restore(images, self._now(), str(kept.get("about", "")))
+        self._presenter.setNotes(*map(str, kept.get("notes", ())), *refused)
         self._loading.show_restored(is_placed=pose is not None)
 
     def _put_probe(self, pose: np.ndarray) -> None:
@@ -191,18 +191,18 @@ class Restoring:
 
 def _parts_of(session: KeptSession) -> tuple[SceneRecord, tuple[Fit, Preset | None] | None, list]:
     """(patient and probe, fit, cine loop) of a session. Raises SimulationError for one that is damaged."""
-    state = session.state
+    content = session.content
     anatomy = session.read("anatomy")
     require(isinstance(anatomy, SceneRecord), "the session has no patient, expected one; discard it")
     sequence = session.read("sequence")
-    pose = state.get("pose")
+    pose = content.get("pose")
     if pose is not None:
         pose = check_rigid("the session's pose", pose)
     record = SceneRecord(anatomy.nodes, {}, pose, sequence if isinstance(sequence, SequenceRecord) else None)
     images = []
-    for name in state["files"].get("cine", []):
-        for seconds, content in session.read_file(str(name)):
-            images.append((float(seconds), _decoded(content)))
+    for name in content["files"].get("cine", []):
+        for seconds, jpeg in session.read_file(str(name)):
+            images.append((float(seconds), _decoded(jpeg)))
     fit: Any = session.read("fit")
     return record, fit, images
 

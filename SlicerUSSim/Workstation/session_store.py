@@ -59,11 +59,12 @@ class KeptSession:
     patient: str
     #: Time of the last autosave, local
     saved: datetime
-    state: dict[str, Any]
+    #: What OwnSession.write_state wrote
+    content: dict[str, Any]
 
     def read(self, part: str) -> Any:
         """A part of it, as OwnSession.write wrote it; None without. Raises SimulationError for a damaged file."""
-        name = self.state["files"].get(part)
+        name = self.content["files"].get(part)
         return None if name is None else self.read_file(str(name))
 
     def read_file(self, name: str) -> Any:
@@ -80,7 +81,7 @@ class KeptSession:
     def copies(self, part: str, folder: Path) -> dict[str, Path]:
         """{name: copy in a folder} of a part that is {name: its file}. Raises SimulationError for a missing file."""
         found = {}
-        for number, (name, file) in enumerate(dict(self.state["files"].get(part, {})).items()):
+        for number, (name, file) in enumerate(dict(self.content["files"].get(part, {})).items()):
             require(Path(file).name == file, f"the session names {file!r}, expected a file of its folder")
             found[str(name)] = folder / str(number)
             try:
@@ -212,10 +213,10 @@ class SessionStore:
 def _read(folder: Path) -> KeptSession | None:
     """The session in a folder; None if there is none that can be restored."""
     try:
-        state = read_json(folder / _STATE, _MOST_STATE_BYTES)
-        require(isinstance(state, dict) and state.get("format") == _FORMAT, "another format")
-        require(isinstance(state.get("files"), dict), "no files")
-        return KeptSession(folder, str(state["patient"]), datetime.fromisoformat(state["saved"]), state)
+        content = read_json(folder / _STATE, _MOST_STATE_BYTES)
+        require(isinstance(content, dict) and content.get("format") == _FORMAT, "another format")
+        require(isinstance(content.get("files"), dict), "no files")
+        return KeptSession(folder, str(content["patient"]), datetime.fromisoformat(content["saved"]), content)
     except (SimulationError, KeyError, ValueError, TypeError):
         return None
 

@@ -83,7 +83,7 @@ class Workstation:
         opener = Opener(app.scene, logic, tasks, files)
         presenter.maskFile, presenter.sheetsFile = opener.mask_file, opener.sheets_file
         self._panel.pick = self._probe.hand.pick
-        self._exports = Exports(app, logic, opener, cine)
+        self._exports = Exports(app, logic, opener, cine, presenter.presetToSave)
         self._loading = Loading(
             shared, app, logic, tasks, opener, presenter, self._messages, self._views, self._probe, self._comparison
         )  # fmt: skip
