@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import monotonic
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -39,6 +40,8 @@ _log = logging.getLogger(__name__)
 
 #: Seconds between two looks at what has changed
 _EVERY_S = 2.0
+#: Seconds after which it is tried again, when it could not be written
+_AGAIN_AFTER_S = 60.0
 #: Of the images of a cine loop, see streams._QUALITY
 _QUALITY = 95
 
@@ -91,6 +94,7 @@ class Autosave:
         self._told, self._in_loop = told, in_loop
         self._is_told = False
         self._is_ended = False
+        self._not_before = 0.0  # time, s
         self._writing: threading.Thread | None = None
         self._when_kept: list[Callable[[], None]] = []
         self._forget()
@@ -138,7 +142,7 @@ class Autosave:
 
     def look(self) -> None:
         """Write what has changed, unless something is being written."""
-        if self._session is None or self._writing is not None:
+        if self._session is None or self._writing is not None or monotonic() < self._not_before:
             return
         parameters = self._logic.parameters
         has_patient = parameters.mri is not None or parameters.labels is not None
@@ -220,6 +224,7 @@ class Autosave:
     def _written(self, line: str) -> None:
         self._writing = None
         if line:
+            self._not_before = monotonic() + _AGAIN_AFTER_S
             self._forget()
             self._tell(line)
 
@@ -232,10 +237,10 @@ class Autosave:
         """Raises SimulationError if it does not fit, or cannot be written; nothing is kept then."""
         session = self._session
         assert session is not None
-        size = 0 if taken.anatomy is None else taken.anatomy.size
-        size += 0 if taken.sequence is None else taken.sequence.sequence.images.nbytes
+        size = self._bytes_of("anatomy") if taken.anatomy is None else taken.anatomy.size
+        size += self._bytes_of("sequence") if taken.sequence is None else taken.sequence.sequence.images.nbytes
         known = self._files.get("sent", {})
-        size += sum(path.stat().st_size for name, path in taken.sent.items() if name not in known and path.exists())
+        size += sum(path.stat().st_size for path in taken.sent.values() if path.exists())
         room = session.room()
         if size > room:
             session.clear()
@@ -261,6 +266,12 @@ class Autosave:
             del self._chunks[0]
         self._files["cine"] = [name for name, _ in self._chunks]
         session.write_state(taken.patient, self._files, taken.state)
+
+    def _bytes_of(self, part: str) -> int:
+        """Bytes of a part that is on the disk."""
+        assert self._session is not None
+        path = self._session.folder / str(self._files.get(part, ""))
+        return path.stat().st_size if path.is_file() else 0
 
     def _copied(self, path: Path) -> str:
         """The file of the session that is a copy of one that a page has sent."""
