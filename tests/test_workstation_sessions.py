@@ -27,18 +27,21 @@ from tests.test_workstation import (
     browser as browser,
     click,
     download,
+    drawn,
     errors,
     eventually,
     files as files,
     loaded,
     new_image,
     opened,
+    picture,
     pixels,
     pose,
     pytestmark as pytestmark,
     settled,
     shown,
     state,
+    views,
 )
 
 
@@ -164,6 +167,31 @@ def test_after_kill_9_the_page_reconnects_by_itself_and_restores_all(server, bro
     page.evaluate("window.trame.trigger('press', ['revertFitButton'])")
     settled(page)
     assert not errors(page) and not problems
+    page.close()
+
+
+def sector_rows(page) -> int:
+    """Rows that the outline of the imaged field covers in the slice view of the image plane."""
+    drawn(page)
+    red, green, blue = np.moveaxis(picture(page, views(page)[1].bounding_box()), -1, 0)
+    rows, _ = np.nonzero((red > 110) & (green > 80) & (blue < 0.6 * green))
+    return int(np.ptp(rows)) if rows.size else 0
+
+
+def test_slices_are_in_the_image_plane_at_start_and_after_a_session_is_restored(server, browser, files):
+    """They were not until the probe had moved."""
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    assert sector_rows(page) > 50
+    kept(page)
+    killed_and_started(own, page)
+    reloaded(page)
+    assert sector_rows(page) > 50
+    click(page, "#restore-session")
+    page.locator("#session-offer").wait_for(state="detached")
+    settled(page)
+    assert sector_rows(page) > 50
     page.close()
 
 

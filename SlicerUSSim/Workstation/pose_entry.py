@@ -48,8 +48,8 @@ class PoseEntry:
         pose = self._pose()
         numbers = matrix = ""
         if pose is not None:
-            numbers = _text(np.concatenate([pose[:3, 3], angles_of_pose(pose)]), 3)
-            matrix = "\n".join(_text(row, 6) for row in pose)
+            numbers = _text(np.concatenate([pose[:3, 3], angles_of_pose(pose)]), 2)
+            matrix = "\n".join(_text(row, 4) for row in pose)
         with self._shared.changing() as now:
             now.pose_numbers, now.pose_matrix = numbers, matrix
 
