@@ -203,3 +203,13 @@ def test_a_scene_that_cannot_be_read_changes_nothing_on_the_page(page, module_sc
     assert errors(page)[0].startswith("bad.mrb: names a file outside itself ('passwd')")
     settled(page)
     assert np.array_equal(pixels(page), before) and state(page, NAMES.title) == title
+
+
+def test_a_scene_that_this_module_was_not_used_in_is_opened_as_its_mri(page, tmp_path):
+    app = app_of_slicer()
+    write_volume(app.scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "T1 of a study"), head_mri(3.0))
+    assert app.io_manager.write_scene(tmp_path / "other.mrb")
+    open_scene(page, tmp_path / "other.mrb")
+    page.wait_for_function("window.ussim.image?.patient === 'T1 of a study'")
+    notes = shown(page, "notesLabel")
+    assert not errors(page) and "other.mrb: a scene" in notes and "white matter" in notes

@@ -135,9 +135,9 @@ class OwnSession:
         """Called when the server ends as it should: its token is not used again."""
         with suppress(OSError):
             (self.folder / _ADDRESS).unlink(missing_ok=True)
-            if not (self.folder / _STATE).exists():
-                shutil.rmtree(self.folder, ignore_errors=True)
-        self._lock.close()
+        self._lock.close()  # before it is removed, which Windows asks for
+        if not (self.folder / _STATE).exists():
+            shutil.rmtree(self.folder, ignore_errors=True)
 
     def room(self) -> int:
         """Bytes that a session may have now."""
