@@ -285,3 +285,21 @@ def test_a_cine_loop_is_kept_from_its_last_images_on(tmp_path):
     autosave.look()
     written(autosave, calls)
     assert len(list(session.folder.glob("cine-*"))) == 1
+
+
+def test_files_of_one_name_of_two_patients_are_not_taken_for_one_another(tmp_path):
+    session, told = Kept(tmp_path / "own"), []
+    session.goes_on.set()
+    autosave, logic, _, calls, _ = autosave_of(session, told)
+    sent = autosave._opener.sent
+    for content in (b"first", b"second"):
+        (tmp_path / "head.nii.gz").write_bytes(content)
+        sent.forget()
+        sent.keep("head.nii.gz", tmp_path / "head.nii.gz")
+        logic.preset = logic.preset.changed("display", gain_db=float(len(content)))
+        autosave.look()
+        written(autosave, calls)
+        files = json.loads((session.folder / "state.json").read_text())["files"]["sent"]
+        assert {name: (session.folder / file).read_bytes() for name, file in files.items()} == {"head.nii.gz": content}
+        assert len(list(session.folder.glob("sent-*"))) == 1
+    assert not told

@@ -14,7 +14,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -104,10 +104,11 @@ class Autosave:
         self._seen: Hashable = None  # when it was written last
         self._anatomy_seen: Hashable = None
         self._sequence_seen: Any = None
-        self._fit_seen: Any = None
+        self._fit_seen: Any = None  # with the preset that Apply replaced; these objects themselves, not their ids
         self._cine_seen = (-1, 0)  # loop, and number of images
         self._number = 0  # of files
         self._files: dict[str, Any] = {}
+        self._sent: dict[Path, str] = {}  # {file that a page has sent: its copy}
         self._chunks: list[tuple[str, int]] = []  # file and number of images
 
     @property
@@ -154,14 +155,15 @@ class Autosave:
         page = self._page()
         pose, fit, sequence = self._pose(), self._presenter.fits.kept(), self._opener.opened_sequence
         anatomy = nodes_version(parameters)
-        fit_now = None if fit is None else (id(fit[0]), id(fit[1]))
+        is_new_fit = fit is not None and not _are_same(fit, self._fit_seen)
+        is_new_sequence = sequence is not None and sequence is not self._sequence_seen
         cine = self._cine.loop, self._cine.added
         seen = (
-            anatomy, tuple(self._opener.sent.files), parameters.node.GetMTime(),
-            None if pose is None else pose.tobytes(), fit_now, id(sequence), cine, repr(page),
+            anatomy, tuple(self._opener.sent.files.items()), parameters.node.GetMTime(),
+            None if pose is None else pose.tobytes(), fit is not None, sequence is not None, cine, repr(page),
             self._presenter.noteLines,
         )  # fmt: skip
-        if seen == self._seen:
+        if seen == self._seen and not is_new_fit and not is_new_sequence:
             return
         try:
             record = SceneRecord(record_nodes(parameters)) if anatomy != self._anatomy_seen else None
@@ -184,12 +186,12 @@ class Autosave:
         is_new_loop = self._cine.loop != self._cine_seen[0]
         taken = _Taken(
             self._opener.patient(), state, record,
-            sequence if sequence is not self._sequence_seen else None, sequence is not None,
-            None if fit is None or fit_now == self._fit_seen else (replace(fit[0], simulator=None), fit[1]),
+            sequence if is_new_sequence else None, sequence is not None,
+            (replace(fit[0], simulator=None), fit[1]) if fit is not None and is_new_fit else None,
             fit is not None, self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
             dict(self._opener.sent.files),
         )  # fmt: skip
-        self._seen, self._anatomy_seen, self._sequence_seen, self._fit_seen = seen, anatomy, sequence, fit_now
+        self._seen, self._anatomy_seen, self._sequence_seen, self._fit_seen = seen, anatomy, sequence, fit
         self._cine_seen = cine
         self._start(lambda: self._write(taken))
 
@@ -239,7 +241,6 @@ class Autosave:
         assert session is not None
         size = self._bytes_of("anatomy") if taken.anatomy is None else taken.anatomy.size
         size += self._bytes_of("sequence") if taken.sequence is None else taken.sequence.sequence.images.nbytes
-        known = self._files.get("sent", {})
         size += sum(path.stat().st_size for path in taken.sent.values() if path.exists())
         room = session.room()
         if size > room:
@@ -251,7 +252,9 @@ class Autosave:
             self._put("sequence", taken.sequence)
         if taken.fit is not None:
             self._put("fit", taken.fit)
-        self._files["sent"] = {name: known.get(name) or self._copied(path) for name, path in taken.sent.items()}
+        # By their places: another patient may have a file of the same name
+        sent = {name: self._sent.get(path) or self._copied(path) for name, path in taken.sent.items()}
+        self._files["sent"] = {name: file for name, file in sent.items() if file is not None}
         for part, is_there in (("sequence", taken.has_sequence), ("fit", taken.has_fit)):
             if not is_there:
                 self._files.pop(part, None)
@@ -273,17 +276,18 @@ class Autosave:
         path = self._session.folder / str(self._files.get(part, ""))
         return path.stat().st_size if path.is_file() else 0
 
-    def _copied(self, path: Path) -> str:
-        """The file of the session that is a copy of one that a page has sent."""
+    def _copied(self, path: Path) -> str | None:
+        """The file of the session that is a copy of one that a page has sent; None if its patient was closed."""
+        try:
+            source = path.open("rb")
+        except FileNotFoundError:
+            return None
         self._number += 1
         name = f"sent-{self._number}"
         assert self._session is not None
-
-        def copy(file: BinaryIO) -> None:
-            with path.open("rb") as source:
-                shutil.copyfileobj(source, file, 2**20)
-
-        self._session.write(name, copy)
+        with source:
+            self._session.write(name, lambda file: shutil.copyfileobj(source, file, 2**20))
+        self._sent[path] = name
         return name
 
     def _put(self, part: str, values: Any) -> None:
@@ -292,6 +296,11 @@ class Autosave:
         assert self._session is not None
         self._session.write(name, lambda file: write_values(file, values))
         self._files[part] = name
+
+
+def _are_same(fit: tuple, other: Any) -> bool:
+    """Whether two results of FitPresenter.kept are of the same objects."""
+    return other is not None and all(one is another for one, another in zip(fit, other, strict=True))
 
 
 def _jpeg(image: np.ndarray) -> bytes:

@@ -36,24 +36,29 @@ def is_scene(name: str) -> bool:
     return name.lower().endswith(".mrb")
 
 
-@in_child
 def read_scene(path: str | os.PathLike) -> SceneRecord:
     """The patient, the choices of the module and the probe in a bundle.
 
     Raises SimulationError for another file, one that names files outside it, and for a scene without a volume.
     """
+    with TemporaryDirectory(prefix="ussim-scene-") as folder:  # of this process, which outlives the child
+        return _read_scene(path, folder)
+
+
+@in_child
+def _read_scene(path: str | os.PathLike, folder: str) -> SceneRecord:
+    """The same, with a folder to unpack it in."""
     import slicer
     from trame_slicer.core import SlicerApp
     from vtkmodules.vtkCommonCore import vtkOutputWindow
 
-    with TemporaryDirectory() as folder:
-        scene_path = _unpacked(Path(path), Path(folder).resolve())
-        app = SlicerApp()
-        app.register_module_logic(cast(Any, slicer).vtkSlicerSequencesLogic())
-        window = vtkOutputWindow.GetInstance()
-        window.SetDisplayModeToNever()
-        require(bool(app.io_manager.load_scene(scene_path)), f"{path}: the scene cannot be read")
-        return record_scene(app.scene)
+    scene_path = _unpacked(Path(path), Path(folder).resolve() / "scene")
+    app = SlicerApp()
+    app.register_module_logic(cast(Any, slicer).vtkSlicerSequencesLogic())
+    window = vtkOutputWindow.GetInstance()
+    window.SetDisplayModeToNever()
+    require(bool(app.io_manager.load_scene(scene_path)), f"{path}: the scene cannot be read")
+    return record_scene(app.scene)
 
 
 def _unpacked(path: Path, folder: Path, depth: int = 0) -> Path:
@@ -90,8 +95,8 @@ def _unpacked(path: Path, folder: Path, depth: int = 0) -> Path:
             require_whole_file(file)
         elif is_scene(file.name):  # a sequence of transforms
             require(depth < _DEEPEST, f"{path}: has bundles in bundles in bundles, expected at most two levels")
-            with TemporaryDirectory() as inner:
-                _unpacked(file, Path(inner).resolve(), depth + 1)
+            with TemporaryDirectory(dir=folder.parent) as inner:
+                _unpacked(file, Path(inner) / "scene", depth + 1)
     return scenes[0]
 
 
