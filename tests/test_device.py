@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import struct
 import subprocess
 import sys
+import textwrap
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -379,3 +381,55 @@ def test_damaged_caches_are_built_again(keep, tmp_path):
     for file in files:
         os.truncate(file, int(keep * file.stat().st_size))
     assert image() == expected and image() == expected
+
+
+def _in_process(script: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """A script in a process of its own, which prints the message of a SimulationError."""
+    caught = f"from SlicerUSSim.Logic import SimulationError\ntry:\n{textwrap.indent(script, '    ')}\n"
+    caught += "except SimulationError as error:\n    print('refused:', error)\n"
+    return subprocess.run(
+        [sys.executable, "-c", caught], env={**os.environ, **environment}, capture_output=True, text=True
+    )
+
+
+_LIMITED = """
+import resource
+from SlicerUSSim.Logic import list_devices
+from SlicerUSSim.Logic.opencl.device import Device
+found = list_devices() if {after} else []
+resource.setrlimit(resource.RLIMIT_AS, (400 * 10**6, resource.RLIM_INFINITY))
+Device.get(found[0] if found else None)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of a process")
+@pytest.mark.parametrize("after", [False, True])
+def test_too_small_an_address_space_is_named(after):
+    """Without this: "no OpenCL device found; run: pip install", or Intel's runtime ends the process."""
+    done = _in_process(_LIMITED.format(after=after))
+    assert done.returncode == 0, done.stderr[-800:]
+    assert re.search(r"refused: .*limited to 400 MB \(ulimit -v\), expected at least \d+ MB", done.stdout), done.stdout
+
+
+def test_a_full_disk_of_the_caches_is_named(monkeypatch):
+    device = Device.get()
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=10**5))
+
+    def fail(*_):
+        raise device.cl.RuntimeError("clBuildProgram", -11, "failed to build the program")
+
+    monkeypatch.setattr(device.cl, "Program", fail)
+    with pytest.raises(SimulationError, match=r"is on a full disk \(0\.1 MB left, expected 4 MB\)\); free some of it"):
+        device.kernels("smoothing.cl", 1, "NEVER_BUILT")
+
+
+def test_a_refused_buffer_names_its_size(monkeypatch):
+    device = Device.get()
+
+    def refuse(*_, **__):
+        raise device.cl.MemoryError("clCreateBuffer", -4, "")
+
+    monkeypatch.setattr(device.cl, "Buffer", refuse)
+    for ask in (lambda: device.empty(3 * 2**20), lambda: device.upload(np.zeros(3 * 2**20, np.uint8))):
+        with pytest.raises(SimulationError, match="has no memory for a buffer of 3 MB; close other programs"):
+            ask()

@@ -95,7 +95,8 @@ def user_message(error: Exception) -> str | None:
     if isinstance(error, SimulationError):
         return str(error)
     if isinstance(error, MemoryError):
-        return "not enough memory; use a smaller or coarser volume"
+        needed = f" ({error})" if str(error) else ""  # numpy says for how many bytes, and of which array
+        return f"not enough memory{needed}; use a smaller or coarser volume"
     if type(error).__module__.startswith("pyopencl"):
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         return f"the OpenCL device failed ({reason}); choose another device (`ussim devices` lists them)"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,11 +40,11 @@ def smoothed_indicators(
     if len(present) < 2:
         return smooth
     *all_but_last, last = sorted(present)
-    workspace = Workspace(device)
+    workspace, wide = Workspace(device), [gaussian_taps(CONSTANTS["WIDE_SIGMA"], WIDE_CUT)] * 3
     # Rows are read a vector at a time, including the last one.
     others = [] if membership is None else [device.upload(np.pad(part.ravel(), (0, 16))) for part in membership]
     for group in all_but_last[:fields]:
-        _smooth(device, workspace, [group_buffer, *others], dims, group, smooth)
+        _smooth(device, workspace, [group_buffer, *others], dims, group, wide, smooth, group * voxels)
         _smooth_halved(device, workspace, dims, group * voxels, fields * voxels + group * halved, smooth)
     if last < fields:
         rest = device.kernels("smoothing.cl")["smooth_rest"]
@@ -53,27 +53,51 @@ def smoothed_indicators(
     return smooth
 
 
-def _smooth(device: Device, workspace: Workspace, groups: Sequence[Buffer], dims, group: int, smooth: Buffer) -> None:
-    """The indicator of one group, from the groups of voxels, and their second groups and shares if they have any."""
+def smoothed_members(device: Device, is_member: np.ndarray, sigmas: Iterable[float], cut: float) -> np.ndarray:
+    """(k, j, i) uint16, 65535 for 1: bool `is_member` (k, j, i), smoothed by a Gaussian of `sigmas` (i, j, k) voxels.
+
+    It is cut off at `cut` standard deviations. Beyond the volume its outermost voxels are repeated.
+    """
+    taps = [gaussian_taps(sigma, cut) for sigma in sigmas]
+    smooth = device.empty(-(-2 * is_member.size // 4) * 4)
+    members = device.upload(np.pad(is_member.view(np.uint8).ravel(), (0, 16)))
+    _smooth(device, Workspace(device), [members], is_member.shape[::-1], 1, taps, smooth, 0)
+    return device.download(smooth, is_member.size, np.uint16).reshape(is_member.shape)
+
+
+def _smooth(
+    device: Device,
+    workspace: Workspace,
+    groups: Sequence[Buffer],
+    dims,
+    group: int,
+    taps: Sequence[np.ndarray],
+    smooth: Buffer,
+    offset: int,
+) -> None:
+    """The indicator of one group, from the groups of voxels, and their second groups and shares if they have any.
+
+    `taps` are those along i, j and k. The result begins at `offset`, in values, of `smooth`.
+    """
     columns, rows, planes = (int(n) for n in dims)
     lanes = device.lanes if columns >= device.lanes else 1
     kernels = device.kernels("smoothing.cl", lanes, *(["MEMBERSHIP"] if len(groups) > 1 else []))
-    taps = gaussian_taps(CONSTANTS["WIDE_SIGMA"], WIDE_CUT)
-    reach, tap_buffer = np.int32(len(taps) // 2), device.upload(taps)
+    along_i, along_j, along_k = ((device.upload(axis), np.int32(len(axis) // 2)) for axis in taps)
+    reach = int(along_k[1])
     slab = min(_SLAB, planes)
-    partial = [workspace.get(name, 4 * columns * rows * (slab + 2 * int(reach))) for name in ("rows", "columns")]
+    partial = [workspace.get(name, 4 * columns * rows * (slab + 2 * reach)) for name in ("rows", "columns")]
     across, shape = -(-columns // lanes), (np.int32(columns), np.int32(rows))
     for first in range(0, planes, slab):
         count = min(slab, planes - first)
-        around = count + 2 * int(reach)
+        around = count + 2 * reach
         device.run(
-            kernels["smooth_rows"], (across, rows, around), *groups, np.int32(group), tap_buffer, reach,
-            *shape, np.int32(planes), np.int32(first - reach), partial[0],
+            kernels["smooth_rows"], (across, rows, around), *groups, np.int32(group), *along_i, *shape,
+            np.int32(planes), np.int32(first - reach), partial[0],
         )  # fmt: skip
-        device.run(kernels["smooth_columns"], (across, rows, around), partial[0], tap_buffer, reach, *shape, partial[1])
+        device.run(kernels["smooth_columns"], (across, rows, around), partial[0], *along_j, *shape, partial[1])
         device.run(
-            kernels["smooth_planes"], (across, rows, count), partial[1], tap_buffer, reach, *shape, np.int32(first),
-            np.uint64(group * columns * rows * planes), smooth,
+            kernels["smooth_planes"], (across, rows, count), partial[1], *along_k, *shape, np.int32(first),
+            np.uint64(offset), smooth,
         )  # fmt: skip
 
 

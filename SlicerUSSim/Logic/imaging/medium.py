@@ -16,11 +16,11 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import ndimage, special
+from scipy import special
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.imaging.borders import smoothed_indicators
+from SlicerUSSim.Logic.imaging.borders import smoothed_indicators, smoothed_members
 from SlicerUSSim.Logic.imaging.found_sheets import FoundSheets, cells_around, found_sheets
 from SlicerUSSim.Logic.imaging.sheets import sheet_planes
 from SlicerUSSim.Logic.mri.sheets.surfels import Surfels
@@ -287,15 +287,10 @@ class Medium:
         )
 
         is_fluid.ravel()[sheets] = False
-        smooth = ndimage.gaussian_filter(is_fluid.astype(np.float32), sigma_mm / spacing, mode="nearest", truncate=3.0)
-        # Phi^-1 by a table, whose size is sufficient for the resolution of the argument.
-        share = np.linspace(0.0, 1.0, 4096)
-        sigmas = np.clip(special.ndtri(share), -_FARTHEST_SIGMAS, _FARTHEST_SIGMAS)
+        smooth = smoothed_members(self.device, is_fluid, sigma_mm / spacing[::-1], 3.0)
+        sigmas = np.clip(special.ndtri(np.arange(65536) / 65535.0), -_FARTHEST_SIGMAS, _FARTHEST_SIGMAS)
         unit = 127.5 / _FARTHEST_SIGMAS
-        table = np.rint(127.5 + unit * sigmas).astype(np.uint8)
-        smooth = np.clip(smooth, 0.0, 1.0, out=smooth)
-        smooth *= len(share) - 1
-        distance = table[np.rint(smooth, out=smooth).astype(np.uint16)]
+        distance = np.rint(127.5 + unit * sigmas).astype(np.uint8)[smooth]
         self._flatten(distance, tissues, fluids, unit / 0.75)
         reach = 0.5 * membrane.thickness_mm / sigma_mm * unit
         _keep_membrane_inside(distance, reach)

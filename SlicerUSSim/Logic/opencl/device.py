@@ -18,6 +18,7 @@ import numpy as np
 from SlicerUSSim.Logic.base.errors import SimulationError
 from SlicerUSSim.Logic.opencl.devices import DeviceInfo, choose_device
 from SlicerUSSim.Logic.opencl.layout import CONSTANTS, shared_source
+from SlicerUSSim.Logic.opencl.limits import lack_of_address_space, lack_of_disk
 from SlicerUSSim.Logic.opencl.runtimes import load_pyopencl
 
 if TYPE_CHECKING:
@@ -46,6 +47,9 @@ class Device:
         self.cl = cl
         self.info = info
         self._is_pocl = "Portable Computing Language" in info.platform
+        lack = lack_of_address_space(info.platform)
+        if lack is not None:  # Intel's runtime would end the process
+            raise SimulationError(f"OpenCL device {info} cannot be opened: {lack}")
         if self._is_pocl:
             from SlicerUSSim.Logic.opencl.pocl import name_unknown_processor, remove_damaged_kernels, require_linker
 
@@ -132,11 +136,14 @@ class Device:
                     program = self.cl.Program(self.context, source).build(options=[*options, *again])
                 kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
             except self.cl.Error as error:
-                lines = [line.strip() for line in str(error).splitlines() if "error:" in line] or [str(error)]
-                raise SimulationError(
-                    f"OpenCL device {self.info} cannot build {file_name} ({lines[0]}); try another device "
-                    "(`ussim devices` lists them)"
-                ) from error
+                what = "try another device (`ussim devices` lists them)"
+                errors = [line.strip() for line in str(error).splitlines() if "error:" in line]
+                full = None if errors else lack_of_disk(self._cache_folders())
+                if full is not None:
+                    why, what = full, "free some of it, or set XDG_CACHE_HOME and TMPDIR"
+                else:
+                    why = errors[0] if errors else " ".join(str(error).split())
+                raise SimulationError(f"OpenCL device {self.info} cannot build {file_name} ({why}); {what}") from error
             except Exception as error:  # pyopencl raises whatever pickle does
                 why = f"{type(error).__name__}: {error}"
             else:
@@ -173,13 +180,12 @@ class Device:
         """A new read-only device buffer holding a copy of `array`."""
         flags = self.cl.mem_flags
         _require_not_forked()
-        self._check_size(array.nbytes)
-        return self.cl.Buffer(self.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=np.ascontiguousarray(array))
+        array = np.ascontiguousarray(array)
+        return self._buffer(array.nbytes, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=array)
 
     def empty(self, nbytes: int) -> Buffer:
         """A new uninitialised device buffer."""
-        self._check_size(nbytes)
-        return self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size=max(int(nbytes), 4))
+        return self._buffer(int(nbytes), self.cl.mem_flags.READ_WRITE, size=max(int(nbytes), 4))
 
     def zeros(self, nbytes: int) -> Buffer:
         """A new device buffer of zeros; `nbytes` is a multiple of four."""
@@ -228,6 +234,26 @@ class Device:
         for name, event in events:
             total[name] = total.get(name, 0.0) + (event.profile.end - event.profile.start) * 1e-6
         return total
+
+    @staticmethod
+    def _cache_folders() -> list[Path]:
+        """Where runtimes and pyopencl keep programs."""
+        import platformdirs
+
+        from SlicerUSSim.Logic.opencl.pocl import cache_folder
+
+        return [cache_folder(), Path(platformdirs.user_cache_dir("pyopencl", "pyopencl"))]
+
+    def _buffer(self, nbytes: int, flags: int, **content) -> Buffer:
+        """A new device buffer. Raises SimulationError with its size if the device has no room for it."""
+        self._check_size(nbytes)
+        try:
+            return self.cl.Buffer(self.context, flags, **content)
+        except (MemoryError, self.cl.MemoryError) as error:
+            raise SimulationError(
+                f"{self.info.name} has no memory for a buffer of {nbytes / 2**20:.0f} MB; close other programs, use a "
+                "smaller or coarser volume, or another device"
+            ) from error
 
     def _check_size(self, nbytes: int) -> None:
         limit = self.info.handle.max_mem_alloc_size

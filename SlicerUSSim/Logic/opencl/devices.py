@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from SlicerUSSim.Logic.base.errors import SimulationError
+from SlicerUSSim.Logic.opencl.limits import lack_of_address_space
 from SlicerUSSim.Logic.opencl.runtimes import INTEL_RUNTIME, load_pyopencl
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def choose_device(device: str | DeviceInfo | None = None) -> tuple[DeviceInfo, s
     devices = list_devices()
     _log.debug("OpenCL devices: %s", "; ".join(map(str, devices)) or "none")
     if not devices:
-        raise SimulationError(f"no OpenCL device found; {_how_to_get_one()}")
+        raise SimulationError(f"no OpenCL device found; {lack_of_address_space() or _how_to_get_one()}")
     for choice, source in (
         (device, "argument"),
         (os.environ.get("PYOPENCL_CTX"), "PYOPENCL_CTX"),

@@ -94,7 +94,7 @@ def remove_damaged_kernels(folder: Path | None = None) -> int:
 
     `folder` is by default the cache that PoCL uses.
     """
-    folder = _cache() if folder is None else folder
+    folder = cache_folder() if folder is None else folder
     removed = 0
     for program in folder.glob("??/*"):
         files = [file for pattern in ("program.bc", "*/*/*.so") for file in program.glob(pattern)]
@@ -109,8 +109,8 @@ def remove_damaged_kernels(folder: Path | None = None) -> int:
     return removed
 
 
-def _cache() -> Path:
-    """As pocl_cache_init_topdir of lib/CL/pocl_cache.c has it."""
+def cache_folder() -> Path:
+    """Where PoCL keeps programs, as pocl_cache_init_topdir of lib/CL/pocl_cache.c has it."""
     if "POCL_CACHE_DIR" in os.environ:
         return Path(os.environ["POCL_CACHE_DIR"])
     own = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")

@@ -13,6 +13,7 @@ _VIEW, _THIN_SHARE = f32(3.5), 0.35  # voxels from a thin layer to where it is l
 MOST_TURNED = f32(0.85)  # cosine of the angle between estimates of a layer's normal
 _END_REACH = f32(28)  # voxels to the ends of the volume, along a plane
 _SAMPLES_APART = f32(20)  # voxels
+_END_SAMPLE = f32(5)  # voxels from the ends of the volume and its margin
 # Normals of layers of voxels, by the size of their components, whose steps are suppressed
 _LAYERS = ((0, 0, 1), (0, 1, 1), (1, 1, 1), (0, 1, 2), (1, 1, 2), (1, 2, 2))
 _WEIGHTS = f32([0.35, 0.7, 1.0, 0.7, 0.35])  # of samples along an axis
@@ -236,7 +237,7 @@ class FlatBorders:
         size = np.abs(normal)
         upright = size.argmax(axis=-1)
         middle, across, certainty = self._axial(voxel, normal, on, upright)
-        oblique = np.flatnonzero(size.max(axis=-1) <= 0.9)
+        axial, oblique = (np.flatnonzero(is_so) for is_so in (size.max(axis=-1) > 0.9, size.max(axis=-1) <= 0.9))
         if len(oblique):
             parts = self._diagonal(normal[oblique], on[oblique], upright[oblique])
             middle[oblique], across[:, oblique], certainty[oblique] = parts
@@ -247,6 +248,8 @@ class FlatBorders:
             border = self.widest(at, normal, before, behind, 4.0)
             sure &= border.confidence >= 0.5
             normals[sample], places[sample] = border.towards, at + border.overshoot[:, None] * border.towards
+            normals[sample, axial], inwards = self._without_ends(at[axial], border.towards[axial], upright[axial])
+            places[sample, axial] += inwards
         weights = np.outer(_WEIGHTS, _WEIGHTS).ravel()[:, None, None]
         found.towards = unit((weights * normals).sum(axis=0))
         on = (weights * places).sum(axis=0) / weights.sum()
@@ -258,9 +261,9 @@ class FlatBorders:
     def _axial(self, voxel, normal, on, upright) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(middle (n, 3), steps across (2, n, 3), certainty (n,)) of the samples of planes along an axis."""
         rows, half_way = np.arange(len(voxel)), f32(0.5) * f32(self.dims) - f32(0.5)
-        low = np.minimum(f32(0.5) + _END_REACH, half_way)
-        high = np.maximum(f32(self.dims) - f32(1.5) - _END_REACH, half_way)
-        margin = np.minimum(f32(16), f32(0.5) * (high - low))
+        low = np.minimum(_END_SAMPLE, half_way)
+        high = np.maximum(f32(self.dims) - f32(1) - _END_SAMPLE, half_way)
+        margin = np.minimum(f32(2) * _SAMPLES_APART, f32(0.5) * (high - low))
         clipped = np.clip(voxel, low + margin, high - margin)
         apart = np.minimum(_SAMPLES_APART, f32(0.5) * np.minimum(clipped - low, high - clipped))
         middle, across = on.copy(), np.zeros((2, len(voxel), 3), np.float32)
@@ -274,6 +277,21 @@ class FlatBorders:
             across[side, rows, upright] = -apart[rows, axis] * normal[rows, axis] / steepest
         middle[rows, upright] -= rise / steepest
         return middle, across, np.ones(len(voxel), np.float32)
+
+    def _without_ends(self, at, normal, upright) -> tuple[np.ndarray, np.ndarray]:
+        """(normals (n, 3), displacements (n, 3) of their places) of planes along an axis as if there were no ends."""
+        rows, sigma = np.arange(len(at)), f32(2.0 * np.sqrt(self.halved.variance))
+        sizes, inwards = f32(self.dims), np.zeros_like(at)
+        normal = normal.copy()
+        for side in (1, 2):
+            axis = (upright + side) % 3
+            near, far = (at[rows, axis] - f32(1)) / sigma, (sizes[axis] - f32(2) - at[rows, axis]) / sigma
+            (first, density), (last, other_density) = _normal_distribution(near), _normal_distribution(far)
+            normal[rows, axis] /= np.maximum(first + last - f32(1), f32(0.1))
+            inwards[rows, axis] = sigma * (
+                f32(0.5) * (density - other_density) - near * (f32(1) - first) + far * (f32(1) - last)
+            )
+        return unit(normal), inwards
 
     def _diagonal(self, normal, on, upright) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The same of planes along diagonals."""

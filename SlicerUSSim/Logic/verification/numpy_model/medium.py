@@ -19,7 +19,7 @@ from SlicerUSSim.Logic.verification.numpy_model.smoothed_borders import SmoothGr
 WIDE_SIGMA, HALVED_SIGMA = 3.0, 4.0  # of the Gaussians for smoothing the indicators, voxels of their grids
 _LOSSY = 2.0  # dB/(cm MHz) of tissues that are groups of their own
 _FARTHEST = 2.2  # limit of the fluid distance in standard deviations; it has eight bits
-_SHARES = 4095  # quantisation steps of the smoothed indicator for the fluid distance
+_SHARES = 65535  # steps of its share
 _MOST_GROUPS, _MOST_VALUES = 6, 100_000_000  # of the smoothed indicators of acoustic groups
 
 

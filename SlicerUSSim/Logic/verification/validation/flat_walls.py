@@ -31,6 +31,11 @@ _PROBE = cast(
 #: Turns of the voxels in degrees, with the loss in dB that is allowed: the steps between voxels are 57 voxels long at 1
 #: degree, longer than any smoothing
 _TURNS = {1.0: 3.0, 2.0: 3.0, 3.0: 3.0, 5.0: 1.5, 8.0: 1.5, 15.0: 1.5, 30.0: 1.5}
+#: Turns about random axes in the plane, in degrees, of small maps, which have one step of the plane or none; how many
+#: of each, and half their voxels of 1 mm across the beam: in the image plane and out of it
+_SMALL_TURNS, _SMALL_MAPS, _SMALL_HALF = (0.3, 0.5, 1.0, 2.0), 8, (40.0, 26.0)
+_SMALL_PROBES = ("convex", "phased", "linear")
+
 #: Planes tilted by so much to the beam: the level along them does not vary by more dB
 _TILT_DEG, _VARIATION_DB = 5.0, 3.0
 
@@ -96,6 +101,39 @@ def turned_planes(rotation: np.ndarray, device) -> Outcome:
         curves.append(Curve(f"{spacing:g} mm", turns, np.array(lowest), turns, 0.0 * turns))
     plot = Plot("plane facing the beam", "voxels turned by [degrees]", "lowest echo [dB]", curves)
     return Outcome(tuple(rows), partial(draw_plots, plots=[plot]))
+
+
+def planes_in_small_maps(rotation: np.ndarray, device) -> Outcome:
+    """Planes that face the beam in maps of 80 x 66 x 52 voxels, re those on a face of voxels that are not turned."""
+    probes = {name: replace(PROBES[name], frequency_mhz=5.0, band_mhz=None) for name in _SMALL_PROBES}
+    normal = np.array([0.0, 1.0, 0.0])
+    random = np.random.default_rng(round(1e6 * Rotation.from_matrix(rotation).magnitude()))
+
+    def levels(turned: np.ndarray, shift_mm: float) -> dict[str, np.ndarray]:
+        phantom = layered(
+            [FLUID, BEHIND], [_DEPTH_MM - shift_mm], turned, spacing_mm=1.0, half_width_mm=_SMALL_HALF[0],
+            half_thickness_mm=_SMALL_HALF[1],
+        )  # fmt: skip
+        simulator = UltrasoundSimulator(phantom.labels, phantom.tissues, _SETTINGS, device)
+        pose = phantom.probe_to_ras.copy()
+        pose[:3, 3] -= shift_mm * pose[:3, 1]
+        return {name: _along_plane(simulator, probe, pose, normal) for name, probe in probes.items()}
+
+    straight = levels(np.eye(3), 0.0)
+    rows = []
+    for turn in _SMALL_TURNS:
+        lowest = dict.fromkeys(probes, np.inf)
+        for _ in range(_SMALL_MAPS):
+            azimuth, spin = random.uniform(0.0, 2.0 * np.pi, 2)
+            axis = np.radians(turn) * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
+            turned = (Rotation.from_rotvec(axis) * Rotation.from_rotvec([0.0, spin, 0.0])).as_matrix()
+            for name, along in levels(turned, random.uniform(-0.5, 0.5)).items():
+                facing = straight[name] > np.nanmax(straight[name]) - 0.7
+                lowest[name] = min(lowest[name], float(np.min((along - straight[name])[facing], initial=np.inf)))
+        for name, level in lowest.items():
+            what = f"turned by {turn:g} degrees, {_SMALL_MAPS} small maps of 1 mm, {name}"
+            rows.append(Row(f"lowest level, {what}", "dB", 0.0, level, 3.0, "at least"))
+    return Outcome(tuple(rows))
 
 
 def planes_along_diagonals(rotation: np.ndarray, device) -> Outcome:
@@ -243,6 +281,11 @@ def walls_near_ends(rotation: np.ndarray, device) -> Outcome:
 CHECKS = (
     Check(
         "turned planes", "A plane that faces the beam has the same level wherever its voxels are turned.", turned_planes
+    ),
+    Check(
+        "planes in small maps",
+        "A plane that faces the beam has its level where a small label map has one step of it.",
+        planes_in_small_maps,
     ),
     Check(
         "planes along diagonals",

@@ -1,0 +1,43 @@
+"""What of this computer keeps an OpenCL runtime from working: a limited address space, a full disk for its caches."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+#: Address space in bytes below which runtimes fail, or end the process: measured with PoCL 3.0 and Intel's of 2025
+LEAST_ADDRESS_SPACE = {"Intel": 1_500_000_000, "": 1_000_000_000}
+_LEAST_DISK = 4_000_000  # bytes of the programs of a simulator
+
+
+def address_space() -> int | None:
+    """Bytes of address space that this process may have (`ulimit -v`), or None for no limit."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def lack_of_address_space(platform: str = "") -> str | None:
+    """What to say if the runtime of an OpenCL platform cannot work in this process's address space, else None."""
+    limit = address_space()
+    least = next(size for name, size in LEAST_ADDRESS_SPACE.items() if name in platform)
+    if limit is None or limit >= least:
+        return None
+    return (
+        f"the address space of this process is limited to {limit / 1e6:.0f} MB (ulimit -v), expected at least "
+        f"{least / 1e6:.0f} MB"
+    )
+
+
+def lack_of_disk(folders: list[Path]) -> str | None:
+    """What to say if one of the folders that runtimes build programs in is on a full disk, else None."""
+    for folder in [*folders, Path(tempfile.gettempdir())]:
+        there = next((part for part in (folder, *folder.parents) if part.exists()), None)
+        free = None if there is None else shutil.disk_usage(there).free
+        if free is not None and free < _LEAST_DISK:
+            return f"{folder} is on a full disk ({free / 1e6:.1f} MB left, expected {_LEAST_DISK / 1e6:.0f} MB)"
+    return None
