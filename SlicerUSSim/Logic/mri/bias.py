@@ -11,9 +11,12 @@ from scipy import ndimage
 from SlicerUSSim.Logic.base.volume import Volume
 from SlicerUSSim.Logic.mri.atlas_registration import AtlasFit
 from SlicerUSSim.Logic.mri.field import anatomy, estimate_field
+from SlicerUSSim.Logic.mri.plausibility import is_whole_brain
 
 #: Millimetres of the grid on which the field is estimated
 _COARSE_MM = 4.0
+#: Length of an adult's brain: the field of a part of a brain is as smooth as that of the whole, which a coil makes
+_BRAIN_MM = 170.0
 #: Ratio of the 95th to the 5th percentile of the field in the brain, less 1: below the first its estimate is no better
 #: than none; from the second, as of surface coils, it is too strong for the polynomial and N4 goes first
 LEAST_FIELD, STRONG_FIELD = 0.1, 0.6
@@ -39,9 +42,10 @@ def corrected(
     """The image without bias field in the brain `inside` (k, j, i), if it has one or it is `wanted`.
 
     Led by an atlas (its share of tissues is `prior`, (3, voxels)), the field is estimated together with the tissues,
-    which takes a second; N4 goes first where the field is strong, and instead where there is no atlas.
+    which takes a second; N4 goes first where the field is strong, and instead where there is no atlas for a whole
+    brain. In a part of a brain N4, whose splines are then as fine as lobes, takes white matter for the field.
     """
-    if atlas is None:
+    if atlas is None and not is_whole_brain(image, inside):
         field = without_bias(image, inside, report)
         ratio = np.where(inside, image.array, 1.0) / np.maximum(np.where(inside, field, 1.0), 1e-6)
         strength = _strength(ratio, inside)
@@ -50,15 +54,20 @@ def corrected(
         return Corrected(result, _about(contrast, strength, wanted, "N4 applied" if apply else ""))
 
     def estimated(source: Volume) -> np.ndarray:
-        factor = estimate_field(source.array, inside, source.spacing_mm, contrast, prior, report).factor
-        return factor / anatomy(atlas, source, inside.shape) if contrast in ("t1", "t1gd") else factor
+        least_mm = _BRAIN_MM if atlas is None else 0.0
+        field = estimate_field(
+            source.array, inside, source.spacing_mm, contrast, prior, report, least_extent_mm=least_mm
+        )
+        if atlas is None or contrast not in ("t1", "t1gd"):
+            return field.factor
+        return field.factor / anatomy(atlas, source, inside.shape)
 
     factor = estimated(image)
     strength = _strength(factor, inside)
     if not wanted and strength <= LEAST_FIELD:
         return Corrected(image, _about(contrast, strength, wanted, ""))
     how = "removed by a polynomial fitted with the tissues"
-    if wanted or strength > STRONG_FIELD:
+    if (wanted and atlas is not None) or strength > STRONG_FIELD:
         image = image.with_array(without_bias(image, inside, report))
         factor = estimated(image)
         how = "removed by N4 and by a polynomial fitted with the tissues"
