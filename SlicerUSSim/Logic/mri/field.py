@@ -90,8 +90,8 @@ def estimate_field(
     """The field of an `image` (k, j, i) in the brain `inside`; `prior` (3, voxels) is the atlas's share of tissues.
 
     The polynomial reaches over the image, and over at least `least_extent_mm` along every axis. Without a prior it
-    leaves up to a fifth more of a whole brain's field than N4, since the middle of a brain contains more white matter
-    than its rim.
+    may leave more of a whole brain's field than N4 (a fifth more on MNI152 warped), since the middle of a brain
+    contains more white matter than its rim.
     """
     stride = np.maximum(np.rint(_STEP_MM / spacing_mm[::-1]).astype(int), 1)
     every = tuple(slice(None, None, int(n)) for n in stride)
