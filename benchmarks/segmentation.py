@@ -209,7 +209,7 @@ def measure_parts(arguments: argparse.Namespace) -> list[dict]:
             case = part_of(cast(BrainPhantom, whole), named[name])
             inside = case.mask.array > 0
             n4 = case.mri.with_array(without_bias(case.mri, inside, lambda share: None))
-            row = {"data": name}
+            row: dict[str, Any] = {"data": name}
             for method, mri, wanted in (
                 ("none", case.mri, False),
                 ("N4", n4, False),
