@@ -21,7 +21,7 @@ _BRAIN_MM = 170.0
 #: than none; from the second, as of surface coils, it is too strong for the polynomial and N4 goes first
 LEAST_FIELD, STRONG_FIELD = 0.1, 0.6
 #: The first for a part of a brain, which shows a part of what a field varies. On parts of phantoms with fields of 0 to
-#: 20 %, anything from 0 to 0.13 gives the same mean Dice to 0.0004
+#: 20 %, anything from 0 to 0.13 gives the same mean Dice to 0.0005
 LEAST_FIELD_OF_PART = 0.05
 
 
