@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from trame_slicer.core import SlicerApp
 
 from SlicerUSSim.Logic.base.errors import SimulationError, require
 from SlicerUSSim.Logic.base.volume import Volume
-from SlicerUSSim.Logic.imaging.preset import Preset
 from SlicerUSSim.Logic.mri.craniotomy import disc_diameter_mm
+from SlicerUSSim.Logic.mri.given_mask import checked_mask
 from SlicerUSSim.Logic.mri.label_agreement import follows
 from SlicerUSSim.Logic.mrml.label_nodes import labels_version
 from SlicerUSSim.Logic.mrml.logic import UltrasoundSceneLogic
 from SlicerUSSim.Logic.mrml.nodes import pose_in_labels, probe_pose, read_volume
-from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues
-from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
+from SlicerUSSim.Logic.tissue.label_maps import LabelledTissues, as_whole
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.comparison import Comparison
+from SlicerUSSim.Workstation.content import Kind
 from SlicerUSSim.Workstation.messages import Messages
-from SlicerUSSim.Workstation.opener import Files, Opener, Upload
+from SlicerUSSim.Workstation.opener import Files, LabelTable, Opener
 from SlicerUSSim.Workstation.patient_nodes import remove_patient_nodes
 from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.registration import Recording, Registration
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.state import ORGANS, SharedState
 from SlicerUSSim.Workstation.tasks import Tasks
@@ -53,10 +55,12 @@ class Loading:
         views: AnatomyViews,
         probe: ProbeControl,
         comparison: Comparison,
+        registration: Registration,
     ) -> None:
         self._shared, self._scene, self._logic, self._tasks = shared, app.scene, logic, tasks
         self._opener, self._presenter, self._messages = opener, presenter, messages
         self._views, self._probe, self._comparison = views, probe, comparison
+        self._registration = registration
         self._is_new = False  # a patient was opened, on whom the probe is not yet
         self._source_before: LabelSource | None = None  # of the labels before the last Segment
         self._dropped = ""  # name of an MRI that was closed for labels that are not of it
@@ -93,62 +97,139 @@ class Loading:
                 self.segment()
             self._open_at_start(files)
             if files.sequence is not None:
-                self._take_sequence(files.sequence, files.sequence_name)
+                recording = Recording(files.sequence, files.sequence_name, files.transform)
+                self._registration.take(recording, files.to_ras)
 
-    def open(self, files: Mapping[str, bytes]) -> None:
-        """Open what a page has sent, {name: content}: an MRI, a label map, a tracked sequence or a preset.
+    # ---- files of a page: each is read, and then taken without anything that can fail or be cancelled --------------
 
-        A label map may come with the table of its labels.
+    def reading_mri(self, path: str, contrast: str, then_segment: bool) -> Callable[[], None]:
+        """Of a new patient, segmented with this contrast."""
+        with self._reading(path):
+            mri = self._opener.mri(path)
 
-        Nothing changes if it cannot be read. An MRI or a label map takes the place of the patient before, of whom no
-        lesions, notes and messages stay.
-        """
-        with self._presenter.shown(), ExitStack() as sent:
-            with self._presenter.view.progress(f"Open {', '.join(files)}"):
-                upload = sent.enter_context(self._opener.uploaded(files))
-                take = self._read(upload)
-            take()
-
-    def _read(self, upload: Upload) -> Callable[[], None]:
-        """Read what a page has sent, and return what takes it, without anything that can fail or be cancelled."""
-        path = upload.path
-        if upload.kind == "preset":
-            preset = Preset.read(path)
-            return lambda: setattr(self._logic, "preset", preset)
-        if upload.kind == "sequence":
-            sequence, name = self._tasks.doAside(lambda: TrackedSequence.read(path)), Path(path).name.split(".")[0]
-            return lambda: self._take_sequence(sequence, name)
-        if upload.kind == "sheets":
-            sheets = self._opener.sheets(path)
-            return lambda: setattr(self._logic.parameters, "sheets", sheets)
-        if upload.kind == "labels":
-            node, found = self._opener.labels(path, upload.table)
-            kept = self._mri_of(found.labels)
-
-            def take_labels() -> None:
-                self._messages.clear()
-                self._forget_patient(node, *kept)
-                self._take_labels(node, found, kept)
-
-            return take_labels
-        mri = self._opener.mri(path)
-
-        def take_mri() -> None:
+        def take() -> None:
+            parameters = self._logic.parameters
             self._messages.clear()
             self._take_mri(mri)
+            if parameters.segmentation.contrast != contrast:
+                parameters.segmentation = replace(parameters.segmentation, contrast=contrast)
+            if then_segment:
+                self.segment()
+
+        return take
+
+    def reading_image(self, path: str) -> Callable[[], None]:
+        """The MRI or CT of a patient of whom only labels are open."""
+        with self._reading(path):
+            mri = self._opener.mri(path)
+
+        def take() -> None:
+            self._logic.parameters.mri = mri
+            self._views.show_volume(mri)
+
+        return take
+
+    def reading_second(self, path: str, contrast: str) -> Callable[[], None]:
+        """A second MRI of the patient."""
+        with self._reading(path):
+            mri = self._opener.second_mri(path)
+
+        def take() -> None:
+            parameters = self._logic.parameters
+            parameters.second_mri = mri
+            parameters.panel = replace(parameters.panel, second_contrast=contrast)
+
+        return take
+
+    def reading_labels(self, path: str, table: LabelTable | None, are_of_patient: bool | None) -> Callable[[], None]:
+        """A label map: of the patient, whose MRI stays; of a new one; None: of the MRI that is there if it follows."""
+        with self._reading(path):
+            node, found = self._opener.labels(path, table)
+            mri: Any = self._logic.parameters.mri
+            follow = self._mri_of(found.labels)
+            kept = follow if are_of_patient is None else []
+
+        def take_own() -> None:
+            self._logic.parameters.labels = node
+            checks = [f"Check: {warning}" for warning in found.warnings]
+            if mri is not None and not follow:
+                checks.append(
+                    f"Check: the intensities of {mri.GetName()} do not follow the labels (of another patient?)"
+                )
+            self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
+            for warning in found.warnings:
+                self._presenter.view.showError(warning)
+            self.show_title()
+            self._labels_ready()
+
+        def take() -> None:
+            self._messages.clear()
+            self._forget_patient(node, *kept)
+            if are_of_patient is False:
+                self._dropped = ""  # the user said that it is another patient's
+            self._take_labels(node, found, kept)
+
+        return take_own if are_of_patient else take
+
+    def are_of_mri(self, path: str) -> bool:
+        """Whether the intensities of the MRI follow a label map, as those of the same head do."""
+        mri: Any = self._logic.parameters.mri
+        if mri is None:
+            return False
+        volume = read_volume(mri)
+        with self._reading(path):
+            labels = self._opener.peek(path)
+            return self._tasks.doAside(lambda: follows(volume, as_whole(labels, path)))
+
+    def reading_organs(self, path: str) -> Callable[[], None]:
+        """The organs of the CT."""
+        with self._reading(path):
+            organs = self._opener.organs(path)
+        return lambda: self._take_organs(*organs)
+
+    def reading_brain(self, path: str) -> Callable[[], None]:
+        """A brain mask on the grid of the MRI, with which it is segmented again."""
+        with self._reading(path):
+            volume, mri = self._opener.peek(path), read_volume(self._logic.parameters.mri)
+            self._tasks.doAside(lambda: checked_mask(volume, mri))
+            node = self._opener.mask(path)
+
+        def take() -> None:
+            self._logic.parameters.mask = node
             self.segment()
 
-        return take_mri
+        return take
+
+    def reading_opening(self, path: str) -> Callable[[], None]:
+        """An opening of skin and skull."""
+        with self._reading(path):
+            node = self._opener.opening(path)
+        return lambda: setattr(self._logic.parameters, "opening", node)
+
+    def reading_lesion(self, path: str, tissue: str) -> Callable[[], None]:
+        """Lesions, laid over the tissues."""
+        with self._reading(path):
+            mask = self._opener.lesion(path)
+        return lambda: self._lay(mask, tissue, Path(path).name)
+
+    def move_probe(self, probe_to_ras: np.ndarray) -> None:
+        """Move the probe to a pose, (4, 4) probe_to_ras. Raises SimulationError without a probe."""
+        require(self._logic.parameters.probe_transform is not None, "there is no probe, expected a patient first")
+        self._probe.move(probe_to_ras)
 
     def add(self, name: str, content: bytes, tissue: str) -> None:
         """Add a mask sent by a page to the lesions, and lay them over the tissues."""
         if tissue == ORGANS:
-            with self._presenter.shown(), self._opener.uploaded({name: content}) as upload:
-                require(upload.kind == "labels", f"{name} is no label map, expected one of organs")
+            with self._presenter.shown(), self._opener.sent({name: content}) as parcel:
+                (upload, *_), _ = self._opener.uploads(parcel)
+                require(upload.kind in (Kind.LABELS, Kind.MASK), f"{name} is no label map, expected one of organs")
                 self._take_organs(*self._opener.organs(upload.path))
             return
         with self._presenter.shown(), self._opener.uploaded_mask(name, content) as volume:
             self._lay(volume, tissue, name)
+
+    def _reading(self, path: str) -> AbstractContextManager[object]:
+        return self._presenter.view.progress(f"Open {Path(path).name}")
 
     def segment(self) -> None:
         """Segment the MRI into tissues, and place a probe on the patient if there is none."""
@@ -335,14 +416,18 @@ class Loading:
         parameters = self._logic.parameters
         self._logic.stopLiveUpdate()
         self._logic.clearImage(parameters.output)
-        self._comparison.drop()
+        # Ultrasound that was opened before any patient is of this one
+        kept = [] if self._opener.patient() else self._registration.nodes
+        if not kept:
+            self._comparison.drop()
+            self._registration.forget()
         self._probe.forget_patient()
         self._presenter.forgetPatient()
         self._opener.forget_patient()
-        kept = [parameters.output, parameters.outline, parameters.probe_transform, *new]
+        kept += [parameters.output, parameters.outline, parameters.probe_transform, *new]
         for role in _OF_PATIENT:
             node: Any = getattr(parameters, role)
-            if node not in new:
+            if node not in kept:
                 setattr(parameters, role, None)
         remove_patient_nodes(self._scene, kept)
         with self._shared.changing() as now:
@@ -356,13 +441,6 @@ class Loading:
         self._presenter.setNotes()
         self.show_title()
         self._views.show_volume(node)
-
-    def _take_sequence(self, sequence: TrackedSequence, name: str) -> None:
-        """Use the probe and the poses of a tracked sequence."""
-        tracked, browser, images = self._opener.sequence(sequence, name)
-        self._logic.preset = replace(self._logic.preset, probe=tracked.probe)
-        self._logic.parameters.real = images
-        self._comparison.take(tracked, browser)
 
     def _labels_ready(self) -> None:
         if self._logic.parameters.probe_transform is None or self._is_new:
