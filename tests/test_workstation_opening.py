@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ pytest.importorskip("playwright", reason="browser tests need playwright: pip ins
 
 from SlicerUSSim.Logic import Volume
 from SlicerUSSim.Logic.imaging.preset import Preset
-from SlicerUSSim.Logic.mri.samples import head_mri
 from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Logic.verification.ct_phantoms import lumbar_spine
 from SlicerUSSim.Workstation.state import NAMES
@@ -30,7 +28,6 @@ from tests.test_workstation import (
     opened,
     pytestmark as pytestmark,
     serving,
-    set_state,
     settled,
     shown,
     state,
@@ -113,7 +110,7 @@ def ball(mri: Volume, radius_mm: float = 12.0) -> Volume:
     """A mask of a ball in the right hemisphere, on the grid of an MRI."""
     index = np.indices(mri.array.shape)[::-1].reshape(3, -1)
     points = (mri.ijk_to_ras[:3, :3] @ index + mri.ijk_to_ras[:3, 3:]).reshape(3, *mri.array.shape)
-    inside = ((points.T - [30, 10, 40]) ** 2).sum(axis=-1).T < radius_mm**2
+    inside = radius_mm**2 > ((points.T - [30, 10, 40]) ** 2).sum(axis=-1).T
     return mri.with_array(inside.astype(np.uint8))
 
 

@@ -21,8 +21,8 @@ from SlicerUSSim.Logic.tissue.probability_maps import combined_probability_maps
 from SlicerUSSim.Logic.tissue.schemes import recognised, title_of
 from SlicerUSSim.Logic.tracked.sequence import is_tracked_sequence
 
-#: More numbers are the labels of a brain or a body, and not of a lesion and what is around it
-_MOST_OF_LESION = 4
+#: More numbers, or more millilitres, are the labels of a brain or a body, and not of a lesion and what is around it
+_MOST_OF_LESION, _MOST_LESION_ML = 4, 400.0
 
 
 class Kind(Enum):
@@ -127,7 +127,9 @@ def _of_labels(path: Path, volume: Volume, size: str) -> Content:
     if scheme is not None:
         return Content(Kind.LABELS, f"a label map: {title_of(scheme, values)}, {len(values)} labels, {size}", volume)
     listed = ", ".join(map(str, values[:6])) + (", ..." if len(values) > 6 else "")
-    kind = Kind.LESIONS if len(values) <= _MOST_OF_LESION and not recognition.order else Kind.LABELS
+    millilitres = float((labels.array > 0).sum() * labels.voxel_ml)
+    may_be_lesion = len(values) <= _MOST_OF_LESION and millilitres <= _MOST_LESION_ML and not recognition.order
+    kind = Kind.LESIONS if may_be_lesion else Kind.LABELS
     which = " and ".join(candidate.title for candidate in recognition.candidates)
     fits = f" that fit {which}" if which else " of no known program"
     return Content(kind, f"a label map with the labels {listed}{'' if recognition.order else fits}, {size}", volume)

@@ -366,7 +366,7 @@ class Loading:
             self._presenter.view.showError(warning)
         checks = [f"Check: {warning}" for warning in found.warnings]
         if mris:
-            checks.append(f"of the MRI {mris[0].GetName()}, which is shown: its intensities follow the labels")
+            checks.append(_of_mri(mris[0]))
         elif self._dropped:
             checks.append(
                 f"Check: the MRI {self._dropped} was closed: its intensities do not follow the labels (of another "
@@ -451,3 +451,7 @@ class Loading:
             self._presenter.setLive(True)
         self._probe.update_surface()  # after the start of live images, which do not need it
         self._probe.look()
+
+
+def _of_mri(mri_node: Any) -> str:
+    return f"of the MRI {mri_node.GetName()}, which is shown: its intensities follow the labels"

@@ -18,7 +18,8 @@ def question_dialog() -> None:
     with v3.VDialog(model_value=(f"{question.number} > 0",), persistent=True, max_width=640, no_click_animation=True):
         html.Div(
             f"""<div class="v-card v-theme--dark pa-4" style="background: #1e2326; border-radius: 6px" id="question"
-            :data-number="{question.number}" role="group" aria-labelledby="question-title" aria-describedby="question-text">
+            :data-number="{question.number}" role="group" aria-labelledby="question-title"
+            aria-describedby="question-text">
             <h2 class="text-h6" id="question-title">{{{{ {question.title} }}}}</h2>
             <p class="text-body-2 my-2" id="question-text" style="overflow-wrap: anywhere">
             {{{{ {question.text} }}}}</p>

@@ -297,19 +297,19 @@ class Registration:
             for n, mark in enumerate(self._landmarks)
         ]
         with self._shared.changing() as now:
-            state = now.registration
-            state.recording = "" if recording is None else f"{recording.name}: {recording.what}"
+            about = now.registration
+            about.recording = "" if recording is None else f"{recording.name}: {recording.what}"
             frames = [] if recording is None else recording.sequence.frames_of_reference()
-            state.frames = [frame for frame in frames if frame != _IMAGE]
-            state.frame = "" if recording is None else recording.path.removeprefix(f"{_IMAGE}To")
-            if recording is not None and state.frame not in state.frames:
-                state.frames = [state.frame, *state.frames]
-            state.calibration = self._calibration_line(recording)
-            name = state.name if state.name in calibration else next(iter(calibration), "")
-            state.calibration_text = _text(calibration[name]) if name else ""
-            state.registration = self._from[_REGISTRATION] or (_NOT_REGISTERED if recording is not None else "")
-            state.registration_text = _text(to_ras) if self._from[_REGISTRATION] else ""
-            state.landmarks = lines
+            about.frames = [frame for frame in frames if frame != _IMAGE]
+            about.frame = "" if recording is None else recording.path.removeprefix(f"{_IMAGE}To")
+            if recording is not None and about.frame not in about.frames:
+                about.frames = [about.frame, *about.frames]
+            about.calibration = self._calibration_line(recording)
+            name = about.name if about.name in calibration else next(iter(calibration), "")
+            about.calibration_text = _text(calibration[name]) if name else ""
+            about.registration = self._from[_REGISTRATION] or (_NOT_REGISTERED if recording is not None else "")
+            about.registration_text = _text(to_ras) if self._from[_REGISTRATION] else ""
+            about.landmarks = lines
         self._presenter.view.refresh()
 
     def _calibration_line(self, recording: Recording | None) -> str:
