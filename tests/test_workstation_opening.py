@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from SlicerUSSim.Logic.tracked.sequence import TrackedSequence
 from SlicerUSSim.Logic.verification.ct_phantoms import lumbar_spine
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_label_maps import head
+from tests.test_parcel import write_series
 from tests.test_workstation import (
     browser as browser,
     click,
@@ -221,3 +224,79 @@ def test_several_files_at_once_are_opened_in_their_order(page, files, tmp_path):
     assert state(page, NAMES.title) == "labels.nii.gz" and state(page, NAMES.sequence.length) == 6
     assert page.locator("#mriSelector option:checked").inner_text().strip() == "z.nii.gz"
     assert len(errors(page)) == 1 and errors(page)[0].startswith("broken.nii.gz: ") and "/tmp" not in errors(page)[0]
+
+
+# ---- DICOM, and what is dropped --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def dicom(files, tmp_path_factory) -> Path:
+    """A folder as of a CD: two volumes and a localiser in folders of their own, with a viewer."""
+    folder = tmp_path_factory.mktemp("cd")
+    mri = Volume.read(files / "head.nii.gz")
+    scaled = mri.with_array((mri.array * (1000.0 / mri.array.max())).astype(np.int16))
+    write_series(folder / "IMAGES" / "A", scaled, 3, "T1 MPRAGE")
+    write_series(folder / "IMAGES" / "B", scaled.with_array(1000 - scaled.array), 4, "T2 tse")
+    write_series(folder / "IMAGES" / "C", Volume(scaled.array[:4], scaled.ijk_to_ras), 1, "localizer")
+    for path in (folder / "IMAGES" / "B").iterdir():  # names that are in another folder as well
+        path.rename(path.with_name(path.name.replace("IM4", "IM3")))
+    (folder / "viewer.exe").write_bytes(b"MZ")
+    return folder
+
+
+def test_of_a_dicom_folder_the_series_is_asked_and_named_by_its_description(page, dicom):
+    page.set_input_files("#open-folder", dicom)
+    text = question(page)
+    assert text == "The DICOM files have 2 series that are volumes; 1 more is no volume."
+    titles = page.locator("#question .ussim-choice").all_inner_texts()
+    assert [title.split("\n")[0] for title in titles] == [
+        "T1 MPRAGE (series 3): 74 images of 80x94", "T2 tse (series 4): 74 images of 80x94", "Cancel",
+    ]  # fmt: skip
+    answer(page, "T1 MPRAGE")
+    assert question(page).startswith("T1 MPRAGE (series 3) is an MRI of a brain without skull, 80x94x74 voxels")
+    with new_image(page):
+        answer(page, "New patient")
+    settled(page)
+    assert state(page, NAMES.title) == "T1 MPRAGE (series 3)" and not errors(page)
+    assert "1 file beside the DICOM images left out, as no image" in state(page, NAMES.opened)[0]
+    body = page.locator("body").inner_text()
+    assert "Miller" not in body and "4711" not in body and "/tmp" not in body
+
+
+DROP = """async ([files, from]) => {
+  const data = new DataTransfer();
+  for (const [name, text] of files)
+    data.items.add(new File([Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0))], name));
+  const drop = (kind) => document.querySelector(from).dispatchEvent(
+    new DragEvent(kind, { bubbles: true, cancelable: true, dataTransfer: data }));
+  drop("dragover");
+  const shown = document.body.classList.contains("ussim-dropping");
+  drop("drop");
+  return [shown, document.body.classList.contains("ussim-dropping")];
+}"""
+
+
+def test_files_are_dropped_anywhere_on_the_page(page, files, dicom):
+    paths = sorted((dicom / "IMAGES" / "A").iterdir())
+    sent = [(path.name, base64.b64encode(path.read_bytes()).decode()) for path in paths]
+    assert page.evaluate(DROP, [sent, "#ultrasound"]) == [True, False]
+    assert question(page).startswith("T1 MPRAGE (series 3) is an MRI of a brain")  # the only series is not asked
+    answer(page, "Second MRI of head.nii.gz")
+    answer(page, "t2")
+    settled(page)
+    assert page.locator("#secondMriSelector option:checked").inner_text().strip() == "T1 MPRAGE (series 3)"
+    assert not errors(page)
+
+
+def test_a_series_with_a_missing_slice_is_said_and_changes_nothing(page, dicom):
+    before = state(page, NAMES.title), shown(page, "labelsSelector")
+    paths = sorted((dicom / "IMAGES" / "A").iterdir())
+    page.set_input_files("#open-file", [path for n, path in enumerate(paths) if n != 30])
+    eventually(page, lambda: errors(page))
+    settled(page)
+    (message,) = errors(page)
+    assert (
+        message.startswith("T1 MPRAGE (series 3): slices are missing or unevenly spaced at 1 place")
+        and "/" not in message
+    )
+    assert (state(page, NAMES.title), shown(page, "labelsSelector")) == before

@@ -195,10 +195,10 @@ def test_a_landmark_is_picked_in_the_real_image_and_in_a_slice(page, recording):
     settled(page)
     shown_pose(page, 1)
     click(page, "#pick-landmark")
-    assert "click the landmark in the real image" in state(page, NAMES.messages.status)
+    page.locator("#picking").get_by_text("click the landmark in the real image").wait_for()
     box = page.locator("#real canvas").bounding_box()
     page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.6 * box["height"])
-    eventually(page, lambda: "same landmark in a slice" in state(page, NAMES.messages.status))
+    page.locator("#picking").get_by_text("click the same landmark in a slice view").wait_for()
     page.mouse.click(*in_view(views(page)[1], 0.5, 0.5))
     eventually(page, lambda: len(state(page, NAMES.registration.landmarks)) == 1)
     (line,) = state(page, NAMES.registration.landmarks)
@@ -210,7 +210,7 @@ def test_a_landmark_is_picked_in_the_real_image_and_in_a_slice(page, recording):
     eventually(page, lambda: state(page, NAMES.registration.picking) == "ultrasound")
     page.mouse.move(600, 500)
     page.keyboard.press("Escape")
-    eventually(page, lambda: state(page, NAMES.registration.picking) == "")
+    eventually(page, lambda: page.locator("#picking").inner_text() == "")
     assert len(state(page, NAMES.registration.landmarks)) == 1 and not errors(page)
 
 

@@ -86,7 +86,9 @@ class Opening:
             for known, name in parcel.renamed.items():
                 self._say(f"{name} is read as {known}, by its content")
             if parcel.left_out:
-                self._say(f"{parcel.left_out} files beside the DICOM images are none of an image and are left out")
+                self._say(
+                    f"{parcel.left_out} file{'s' * (parcel.left_out > 1)} beside the DICOM images left out, as no image"
+                )
             for upload in uploads:
                 with self._presenter.shown(), self._opener.known_names():
                     self._open(upload, uploads, meant)
@@ -121,7 +123,7 @@ class Opening:
             patients = len({one.patient for one in volumes})
             whose = f" of {patients} different patients" if patients > 1 else ""
             others = len(series) - len(volumes)
-            more = f"; {others} more are no volumes" if others else ""
+            more = f"; {others} more {'are no volumes' if others > 1 else 'is no volume'}" if others else ""
             number = self._ask(
                 "Which series?",
                 f"The DICOM files have {len(volumes)} series that are volumes{whose}{more}.",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from trame.widgets import html, vuetify3 as v3
 
-from SlicerUSSim.Workstation.registration import SECTION
+from SlicerUSSim.Workstation.registration import PICK_IMAGE, PICK_PATIENT, SECTION
 from SlicerUSSim.Workstation.state import NAMES
 
 #: Names of transforms that calibrations usually are
@@ -17,7 +17,8 @@ def question_dialog() -> None:
     none = f"trigger('answer', [{question.number}, null])"
     with v3.VDialog(model_value=(f"{question.number} > 0",), persistent=True, max_width=640, no_click_animation=True):
         html.Div(
-            f"""<div class="v-card v-theme--dark pa-4" style="background: #1e2326; border-radius: 6px" id="question"
+            f"""<div class="v-card v-theme--dark pa-4" style="background: #1e2326; color: #e6e9eb; border-radius: 6px"
+            id="question"
             :data-number="{question.number}" role="group" aria-labelledby="question-title"
             aria-describedby="question-text">
             <h2 class="text-h6" id="question-title">{{{{ {question.title} }}}}</h2>
@@ -101,6 +102,10 @@ def _landmarks() -> None:
     _button(
         "fit-landmarks", "Register by landmarks", "trigger('fit_landmarks')",
         "The rigid map with the least squared distances of three or more",
+    )  # fmt: skip
+    html.Div(
+        f"""{{{{ {{ultrasound: '{PICK_IMAGE}', patient: '{PICK_PATIENT}'}}[{state.picking}] ?? '' }}}}""",
+        id="picking", classes="ussim-opened ussim-asked", raw_attrs=['aria-live="polite"'],
     )  # fmt: skip
     for field, name, label, hint in (
         (state.typed_pixel, "landmark-pixel", "In the image", "column row"),

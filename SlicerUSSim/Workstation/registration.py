@@ -24,8 +24,9 @@ from SlicerUSSim.Workstation.tasks import Tasks
 
 _IMAGE, _REFERENCE = "Image", "Reference"
 _CALIBRATION, _REGISTRATION = "Calibration", "Registration"
-_PICK_IMAGE = "click the landmark in the real image (Escape: not)"
-_PICK_PATIENT = "click the same landmark in a slice view (Escape: not)"
+#: What is to be clicked next, as the page shows it
+PICK_IMAGE = "click the landmark in the real image (Escape: not)"
+PICK_PATIENT = "click the same landmark in a slice view (Escape: not)"
 _NOT_REGISTERED = "none: the frame of the ultrasound is taken for the patient's"
 
 
@@ -182,7 +183,7 @@ class Registration:
                 now.registration.picking = "ultrasound"
                 if now.sequence.comparison is not ComparisonMode.BESIDE:
                     now.sequence.comparison = ComparisonMode.BESIDE
-            self._presenter.view.showStatus(_PICK_IMAGE)
+            self._presenter.view.showStatus(PICK_IMAGE)
 
     def picked_in_image(self, across: float, down: float) -> None:
         """Called with a click in the real image, at fractions of its width and height."""
@@ -201,7 +202,7 @@ class Registration:
         self._hand.pick(clicked)
         with self._shared.changing() as now:
             now.registration.picking = "patient"
-        self._presenter.view.showStatus(_PICK_PATIENT)
+        self._presenter.view.showStatus(PICK_PATIENT)
 
     def stop_picking(self) -> None:
         """Wait for no landmark any more."""
