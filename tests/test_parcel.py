@@ -178,3 +178,56 @@ def test_a_damaged_image_beside_the_chosen_series_is_said(tmp_path):
         path = parcel.take(next(one for one in series if one.title.startswith("T1")), series)
         with pytest.raises(SimulationError, match=last.name):
             content.content_of(path)
+
+
+# ---- questions -------------------------------------------------------------------------------------------------------
+
+
+def test_a_question_waits_while_everything_else_goes_on_and_only_its_own_answers_count():
+    import asyncio
+
+    from trame_server.state import State
+
+    from SlicerUSSim.Logic.base.errors import Cancelled
+    from SlicerUSSim.Workstation.questions import Questions
+    from SlicerUSSim.Workstation.state import Choice, SharedState
+    from SlicerUSSim.Workstation.tasks import Tasks
+    from tests.test_browser_parts import run_in_loop
+
+    async def scenario():
+        tasks, shared, happened = Tasks(print), SharedState(State(ready=True)), []
+        questions = Questions(shared, tasks)
+
+        def ask(name: str) -> None:
+            try:
+                happened.append((name, questions.ask(name, "?", [Choice("yes", "Yes"), Choice("no", "No")])))
+            except Cancelled:
+                happened.append((name, None))
+
+        tasks.start(lambda: ask("first"))
+        tasks.start(lambda: ask("second"))
+        while shared.now.question.number == 0 or not tasks.are_done:
+            await asyncio.sleep(0.01)
+        number = shared.now.question.number
+        assert shared.now.question.title == "first" and [c.key for c in shared.now.question.choices] == ["yes", "no"]
+        tasks.start(lambda: happened.append(tasks.do(lambda: "an image")))
+        while len(happened) < 1:
+            await asyncio.sleep(0.01)
+        questions.answer(number, "perhaps")
+        questions.answer(number + 7, "yes")
+        await asyncio.sleep(0.05)
+        assert happened == ["an image"] and shared.now.question.number == number
+        questions.answer(number, "yes")
+        questions.answer(number, "no")  # of another page, too late
+        while len(happened) < 2:
+            await asyncio.sleep(0.01)
+        assert shared.now.question.title == "second"
+        questions.answer(shared.now.question.number, None)
+        while len(happened) < 3:
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.05)
+        assert tasks.are_done and shared.now.question.number == 0 and shared.now.question.choices == []
+        tasks.stop()
+        return happened
+
+    assert run_in_loop(scenario) == ["an image", ("first", "yes"), ("second", None)]
