@@ -198,6 +198,18 @@ def test_a_tracked_sequence_is_recognised_under_any_name(page, files, tmp_path, 
     assert state(page, NAMES.sequence.length) == 0
 
 
+def test_ultrasound_without_a_calibration_stays_for_the_next_patient_too(page, files, tmp_path):
+    sweep = TrackedSequence.read(files / "sweep.igs.mha")
+    bare = tuple({"ProbeToReference": entry["ProbeToReference"]} for entry in sweep.transforms)
+    TrackedSequence(sweep.images, bare, sweep.timestamps).write(tmp_path / "bare.mha")
+    click(page, "#close-patient")
+    settled(page)
+    answered(page, tmp_path / "bare.mha")
+    with new_image(page):
+        answered(page, files / "head.nii.gz")
+    assert state(page, NAMES.registration.recording).startswith("bare: 6 images") and not errors(page)
+
+
 def test_ultrasound_that_is_opened_before_any_patient_stays_for_him(page, files):
     click(page, "#close-patient")
     settled(page)

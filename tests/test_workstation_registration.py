@@ -134,6 +134,10 @@ def test_values_are_typed_and_wrong_ones_are_said_and_change_nothing(page, recor
     ):
         fill(page, "calibration", typed)
         assert errors(page)[-1].startswith(words), errors(page)
+    page.fill("#calibration-name", "Image")
+    fill(page, "calibration", recording["calibration"])
+    assert errors(page)[-1] == "Its name is 'Image', expected two frames joined by To, such as ImageToProbe"
+    page.fill("#calibration-name", "ImageToProbe")
     assert state(page, NAMES.sequence.length) == 0
     skewed = recording["calibration"] @ np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     fill(page, "calibration", skewed)

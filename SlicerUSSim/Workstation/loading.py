@@ -25,7 +25,7 @@ from SlicerUSSim.Workstation.anatomy import AnatomyViews
 from SlicerUSSim.Workstation.comparison import Comparison
 from SlicerUSSim.Workstation.content import Kind
 from SlicerUSSim.Workstation.messages import Messages
-from SlicerUSSim.Workstation.opener import Files, LabelTable, Opener
+from SlicerUSSim.Workstation.opener import FILE, Files, LabelTable, Opener
 from SlicerUSSim.Workstation.patient_nodes import remove_patient_nodes
 from SlicerUSSim.Workstation.probe_control import ProbeControl
 from SlicerUSSim.Workstation.registration import Recording, Registration
@@ -100,21 +100,29 @@ class Loading:
                 recording = Recording(files.sequence, files.sequence_name, files.transform)
                 self._registration.take(recording, files.to_ras)
 
+    @property
+    def has_users_patient(self) -> bool:
+        """Whether a patient is open, other than the demo brain as it is."""
+        parameters: Any = self._logic.parameters
+        is_demo = parameters.mri is not None and parameters.mri.GetAttribute(FILE) == ""
+        mine = (parameters.lesions, parameters.mask, parameters.second_mri)
+        is_untouched = all(node is None or self._logic.isOwnBrain(node) for node in mine)
+        return bool(self._opener.patient()) and not (is_demo and is_untouched)
+
     # ---- files of a page: each is read, and then taken without anything that can fail or be cancelled --------------
 
-    def reading_mri(self, path: str, contrast: str, then_segment: bool) -> Callable[[], None]:
-        """Of a new patient, segmented with this contrast."""
+    def reading_mri(self, path: str, contrast: str, then_segment: bool) -> Callable[[], str | None]:
+        """Of a new patient, segmented with this contrast; what is done says so if that fails."""
         with self._reading(path):
             mri = self._opener.mri(path)
 
-        def take() -> None:
+        def take() -> str | None:
             parameters = self._logic.parameters
             self._messages.clear()
             self._take_mri(mri)
             if parameters.segmentation.contrast != contrast:
                 parameters.segmentation = replace(parameters.segmentation, contrast=contrast)
-            if then_segment:
-                self.segment()
+            return None if not then_segment or self.segment() else "a new patient, whose tissues were not found"
 
         return take
 
@@ -179,7 +187,11 @@ class Loading:
         volume = read_volume(mri)
         with self._reading(path):
             labels = self._opener.peek(path)
-            return self._tasks.doAside(lambda: follows(volume, as_whole(labels, path)))
+            try:
+                whole = as_whole(labels, path)
+            except SimulationError:  # probabilities
+                return False
+            return self._tasks.doAside(lambda: follows(volume, whole))
 
     def reading_organs(self, path: str) -> Callable[[], None]:
         """The organs of the CT."""
@@ -187,16 +199,16 @@ class Loading:
             organs = self._opener.organs(path)
         return lambda: self._take_organs(*organs)
 
-    def reading_brain(self, path: str) -> Callable[[], None]:
+    def reading_brain(self, path: str) -> Callable[[], str | None]:
         """A brain mask on the grid of the MRI, with which it is segmented again."""
         with self._reading(path):
             volume, mri = self._opener.peek(path), read_volume(self._logic.parameters.mri)
             self._tasks.doAside(lambda: checked_mask(volume, mri))
             node = self._opener.mask(path)
 
-        def take() -> None:
+        def take() -> str | None:
             self._logic.parameters.mask = node
-            self.segment()
+            return None if self.segment() else "brain mask, with which no tissues were found"
 
         return take
 
@@ -231,8 +243,8 @@ class Loading:
     def _reading(self, path: str) -> AbstractContextManager[object]:
         return self._presenter.view.progress(f"Open {Path(path).name}")
 
-    def segment(self) -> None:
-        """Segment the MRI into tissues, and place a probe on the patient if there is none."""
+    def segment(self) -> bool:
+        """Segment the MRI into tissues, and place a probe on the patient if there is none; whether that was done."""
         parameters: Any = self._logic.parameters
         # A mask that Segment extracted is found again by the same options.
         mask = None if self._logic.isOwnBrain(parameters.mask) else parameters.mask
@@ -242,10 +254,12 @@ class Loading:
         lesions, organs = parameters.lesions, parameters.organs
         kinds = parameters.sheet.kinds if parameters.sheet.find else ()
         before = self._opener.known_source(parameters.labels)
-        if self._changed(self._presenter.segment):
-            self._source_before = before
-            self._opener.segmented(parameters.labels, *inputs, others, lesions, kinds, organs)
-            self._labels_ready()
+        if not self._changed(self._presenter.segment):
+            return False
+        self._source_before = before
+        self._opener.segmented(parameters.labels, *inputs, others, lesions, kinds, organs)
+        self._labels_ready()
+        return True
 
     def undo_segment(self) -> None:
         """Go back to the tissues from before the last Segment."""
@@ -416,9 +430,9 @@ class Loading:
         parameters = self._logic.parameters
         self._logic.stopLiveUpdate()
         self._logic.clearImage(parameters.output)
-        # Ultrasound that was opened before any patient is of this one
-        kept = [] if self._opener.patient() else self._registration.nodes
-        if not kept:
+        # Ultrasound that was opened before any patient of the user's is of this one
+        kept = [] if self.has_users_patient else self._registration.nodes
+        if self.has_users_patient:
             self._comparison.drop()
             self._registration.forget()
         self._probe.forget_patient()

@@ -17,7 +17,7 @@ from SlicerUSSim.Logic.tracked.pose_files import read_pose
 from SlicerUSSim.Widget.presenter import PanelPresenter
 from SlicerUSSim.Workstation.content import Kind
 from SlicerUSSim.Workstation.loading import Loading
-from SlicerUSSim.Workstation.opener import FILE, Opener, Upload
+from SlicerUSSim.Workstation.opener import Opener, Upload
 from SlicerUSSim.Workstation.parcel import Parcel
 from SlicerUSSim.Workstation.questions import Questions
 from SlicerUSSim.Workstation.registration import Registration
@@ -52,7 +52,7 @@ class Opening:
         self._registration, self._questions = registration, questions
         #: Opens a scene (.mrb) by its path, and returns what was done
         self.open_scene: Callable[[str], str] | None = None
-        self._took: dict[Kind, Callable[[Upload, list[Upload]], tuple[str, Callable[[], None]]]] = {
+        self._took: dict[Kind, Callable[[Upload, list[Upload]], tuple[str, Callable[[], object]]]] = {
             Kind.MRI: self._mri,
             Kind.CT: self._mri,
             Kind.LABELS: self._labels,
@@ -102,7 +102,8 @@ class Opening:
             deed, take = self._transform_as(upload, meant)
         else:
             deed, take = self._took[upload.kind](upload, beside)
-        take()
+        told = take()
+        deed = told if isinstance(told, str) else deed
         self._say(f"{upload.name}: {upload.content.what}: {deed}")
 
     def _say(self, line: str) -> None:
@@ -139,23 +140,14 @@ class Opening:
 
     # ---- the patient -------------------------------------------------------------------------------------------
 
-    @property
-    def _has_users_patient(self) -> bool:
-        """Whether a patient is open, other than the demo brain as it is."""
-        parameters: Any = self._logic.parameters
-        is_demo = parameters.mri is not None and parameters.mri.GetAttribute(FILE) == ""
-        mine = (parameters.lesions, parameters.mask, parameters.second_mri)
-        is_untouched = all(node is None or self._logic.isOwnBrain(node) for node in mine)
-        return bool(self._opener.patient()) and not (is_demo and is_untouched)
-
-    def _mri(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], None]]:
+    def _mri(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         parameters: Any = self._logic.parameters
         patient, is_ct = self._opener.patient(), upload.kind is Kind.CT
         contrast, before = CT if is_ct else parameters.segmentation.contrast, parameters.segmentation.contrast
         if not is_ct and before == CT:
             contrast = MRI_CONTRASTS[0]
         key = _NEW
-        if self._has_users_patient:
+        if self._loading.has_users_patient:
             choices = [Choice(_NEW, "New patient", f"{patient} is closed, with all that belongs to it")]
             if parameters.mri is None:
                 choices.append(Choice(_SHOWN, f"Image of {patient}", "Shown under the labels, which stay"))
@@ -176,23 +168,22 @@ class Opening:
             upload.path, contrast, then_segment=not is_with_labels
         )
 
-    def _second(self, upload: Upload, patient: str) -> tuple[str, Callable[[], None]]:
+    def _second(self, upload: Upload, patient: str) -> tuple[str, Callable[[], object]]:
         first = self._logic.parameters.segmentation.contrast
         contrast = self._ask(
             f"Contrast of {upload.name}?",
             f"The first MRI of {patient} is used as {first}.",
             [Choice(name, name) for name in MRI_CONTRASTS],
         )
-        self._require_same(patient)
         take = self._loading.reading_second(upload.path, contrast)
         return f"second MRI of {patient}, {contrast}; Segment uses it", take
 
-    def _labels(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], None]]:
+    def _labels(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         parameters: Any = self._logic.parameters
         patient = self._opener.patient()
         reading = self._loading.reading_labels
         came_along = any(other.kind in (Kind.MRI, Kind.CT) for other in beside)
-        if not self._has_users_patient or (came_along and self._loading.are_of_mri(upload.path)):
+        if not self._loading.has_users_patient or (came_along and self._loading.are_of_mri(upload.path)):
             return "tissues to simulate", reading(upload.path, upload.table, None)
         choices = [Choice(_NEW, "New patient", f"{patient} is closed, with all that belongs to it")]
         if parameters.mri is not None:
@@ -203,15 +194,13 @@ class Opening:
         if key == _ORGANS:
             return self._organs(upload, patient)
         if key == _OWN:
-            self._require_same(patient)
             return f"tissues of {patient}", reading(upload.path, upload.table, True)
         return f"a new patient; {patient} is closed", reading(upload.path, upload.table, False)
 
-    def _organs(self, upload: Upload, patient: str) -> tuple[str, Callable[[], None]]:
-        self._require_same(patient)
+    def _organs(self, upload: Upload, patient: str) -> tuple[str, Callable[[], object]]:
         return f"organs of the CT {patient}; Segment uses them", self._loading.reading_organs(upload.path)
 
-    def _mask(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], None]]:
+    def _mask(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         """A mask, or lesions: of the patient, or a label map."""
         parameters: Any = self._logic.parameters
         patient = self._opener.patient()
@@ -227,20 +216,19 @@ class Opening:
             tip = f"Segment makes the tissues of {patient} anew, inside the mask"
             choices.append(Choice(_BRAIN, "Use as brain mask", tip))
         if upload.kind is Kind.MASK and parameters.labels is not None:
-            choices.append(Choice(_OPENING, "Use as opening of the skull", "Chosen for Open the skull"))
+            choices.append(Choice(_OPENING, "Use as opening of the skull", "Chosen for Open skull"))
         if parameters.mri is not None and contrast == CT:
             choices.append(_organs_of(patient))
         choices.append(Choice(_NEW, "Label map of a new patient", f"{patient} is closed"))
         key = self._ask_what(upload, choices)
         if key == _NEW:
             return f"a new patient; {patient} is closed", self._loading.reading_labels(upload.path, upload.table, False)
-        self._require_same(patient)
         if key == _ORGANS:
             return self._organs(upload, patient)
         if key == _BRAIN:
             return f"brain mask of {patient}, whose tissues are made anew", self._loading.reading_brain(upload.path)
         if key == _OPENING:
-            return f"opening of {patient}, used by Open the skull", self._loading.reading_opening(upload.path)
+            return f"opening of {patient}, used by Open skull", self._loading.reading_opening(upload.path)
         tissue = key.removeprefix(_AS)
         take = self._loading.reading_lesion(upload.path, tissue)
         what = "its lesions" if tissue == _SEVERAL else tissue
@@ -248,14 +236,14 @@ class Opening:
 
     # ---- ultrasound and settings -------------------------------------------------------------------------------
 
-    def _sequence(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], None]]:
+    def _sequence(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         patient = self._opener.patient()
         recording = self._registration.read(upload.path)
         with_whom = f"compared with {patient}" if patient else "compared with the patient who is opened next"
         deed = with_whom if recording.is_calibrated else "its calibration is asked for in Tracked ultrasound"
         return f"{recording.what}: {deed}", lambda: self._registration.take(recording)
 
-    def _transform(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], None]]:
+    def _transform(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         self._require_recording(upload)
         name = upload.name.lower()
         if name.endswith(".xml"):
@@ -278,32 +266,32 @@ class Opening:
             f"{upload.name}: {upload.content.what}, expected tracked ultrasound first, to which it belongs",
         )
 
-    def _transform_as(self, upload: Upload, key: str) -> tuple[str, Callable[[], None]]:
+    def _transform_as(self, upload: Upload, key: str) -> tuple[str, Callable[[], object]]:
         registration = self._registration
         self._require_recording(upload)
         if key == _CALIBRATION:
             return "calibration of the tracked ultrasound", registration.reading_calibration(upload.path)
         return "registration of the tracked ultrasound", registration.reading_registration(upload.path)
 
-    def _sheets(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], None]]:
+    def _sheets(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         sheets = self._opener.sheets(upload.path)
         return "shown in the images", lambda: setattr(self._logic.parameters, "sheets", sheets)
 
-    def _preset(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], None]]:
+    def _preset(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         preset = self._tasks.doAside(lambda: Preset.read(upload.path))
         return "in place of the settings of before", lambda: setattr(self._logic, "preset", preset)
 
-    def _pose(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], None]]:
+    def _pose(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         pose = self._tasks.doAside(lambda: read_pose(upload.path))
         return "the probe is moved there", lambda: self._loading.move_probe(pose)
 
-    def _scene(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], None]]:
+    def _scene(self, upload: Upload, beside: list[Upload]) -> tuple[str, Callable[[], object]]:
         opened = self.open_scene
         if opened is None:
             raise SimulationError(
                 f"{upload.name}: {upload.content.what}, expected a file of a patient, tracked ultrasound or settings"
             )
-        return "the scene of before is closed", lambda: (opened(upload.path), None)[1]
+        return "the scene of before is closed", lambda: opened(upload.path)
 
     # ---- questions ---------------------------------------------------------------------------------------------
 
@@ -311,12 +299,12 @@ class Opening:
         return self._ask(f"Open {upload.name} as?", f"{upload.name} is {upload.content.what}.", choices)
 
     def _ask(self, title: str, text: str, choices: list[Choice]) -> str:
-        return self._questions.ask(title, self._opener.as_known(text), choices)
-
-    def _require_same(self, patient: str) -> None:
-        """Raise SimulationError if the patient about whom was asked is not open any more."""
+        """The key of the answer. Raises SimulationError if the patient about whom was asked is not open any more."""
+        patient = self._opener.patient()
+        key = self._questions.ask(title, self._opener.as_known(text), choices)
         now = self._opener.patient()
-        require(now == patient, f"{patient} was closed meanwhile, expected to be open for this answer")
+        require(now == patient, f"{patient or 'no patient'} was open for this question, and now {now or 'none'} is")
+        return key
 
 
 def _organs_of(patient: str) -> Choice:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -131,7 +132,7 @@ class Registration:
 
     def reading_calibration(self, path: str) -> Callable[[], None]:
         """The calibration of a file: of the name that is chosen, or those of a Plus configuration."""
-        name = self._shared.now.registration.name
+        name = _checked_name(self._shared.now.registration.name)
         with self._reading(path):
             found = self._tasks.doAside(lambda: read_calibration(path, name))
         return lambda: self._calibrate(found, f"{', '.join(found)} of {Path(path).name}")
@@ -139,7 +140,7 @@ class Registration:
     def calibrate(self, name: str, text: str) -> None:
         """Use a calibration whose 16 numbers were typed."""
         with self._presenter.shown():
-            name = name.strip()
+            name = _checked_name(name)
             matrix = check_affine(_CALIBRATION, _matrix(_CALIBRATION, text))
             self._calibrate({name: matrix}, f"{name} as typed")
 
@@ -267,7 +268,8 @@ class Registration:
         if known.is_calibrated:
             with self._presenter.view.progress("Find the probe's field"):
                 made = self._opener.sequence(sequence, recording.name, recording.path, to_ras)
-        number = self._shared.now.sequence.number if self.recording is not None else 0
+        is_same = self.recording is not None and self.recording.sequence is recording.sequence
+        number = self._shared.now.sequence.number if is_same else 0
         old, self._nodes = self._nodes, [] if made is None else made[3]
         self.recording, self._calibration, self._to_ras = recording, calibration, to_ras
         if made is None:
@@ -337,6 +339,15 @@ class Registration:
 
 #: Title of its section on the page
 SECTION = "Tracked ultrasound"
+
+
+def _checked_name(name: str) -> str:
+    name = name.strip()
+    require(
+        re.fullmatch(r"\w+To[A-Z0-9]\w*", name),
+        f"Its name is {name[:40]!r}, expected two frames joined by To, such as ImageToProbe",
+    )
+    return name
 
 
 def _matrix(what: str, text: str) -> np.ndarray:

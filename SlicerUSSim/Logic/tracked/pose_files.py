@@ -57,10 +57,13 @@ def read_pose(path: str | os.PathLike) -> np.ndarray:
 def read_matrix(path: str | os.PathLike) -> np.ndarray:
     """(4, 4) affine matrix, such as a calibration, from a text file of sixteen numbers by rows or from JSON rows.
 
+    An ITK file (.tfm, .h5, .mat, .txt) contains the inverse map in LPS, as Slicer writes a linear transform.
     The matrix may scale. Raises SimulationError for other files.
     """
     path = Path(path)
     require(path.is_file(), f"{path}: no such file")
+    if path.suffix.lower() in _ITK_SUFFIXES or _starts_like_itk(path):
+        return check_affine(f"{path}: transform", _itk_to_world(path))
     try:
         matrix = np.array(read_json(path), float) if path.suffix.lower() == ".json" else _numbers(path)
     except (TypeError, ValueError):
@@ -96,11 +99,16 @@ def _is_text(content: bytes) -> bool:
 
 
 def _read_itk(path: Path) -> np.ndarray:
+    return check_rigid(f"{path}: transform", _itk_to_world(path))
+
+
+def _itk_to_world(path: Path) -> np.ndarray:
+    """(4, 4) in RAS of the inverse of an ITK file's linear map, which is in LPS."""
     is_hdf5 = path.suffix.lower() in (".h5", ".hdf5") or starts_like_hdf5(path)
     linear = _linear_map_of_hdf5 if is_hdf5 else _linear_map
     world_to_probe = linear(path)
     require(not is_singular(world_to_probe), f"{path}: the transform is singular, expected a rigid one")
-    return check_rigid(f"{path}: transform", LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS)
+    return LPS_TO_RAS @ np.linalg.inv(world_to_probe) @ LPS_TO_RAS
 
 
 def _linear_map(path: Path) -> np.ndarray:
@@ -172,11 +180,14 @@ def read_tags(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray | None]:
 def read_calibration(path: str | os.PathLike, name: str = "ImageToProbe") -> dict[str, np.ndarray]:
     """{"ImageToProbe": (4, 4), ...} of a Plus configuration (.xml), or of a file with one matrix, which is `name`.
 
+    That is 16 numbers by rows, JSON rows, or a linear ITK transform as 3D Slicer saves it (.tfm, .h5); it may scale.
     Raises SimulationError for other files.
     """
     from SlicerUSSim.Logic.tracked.sequence import read_coordinate_definitions
 
-    return read_coordinate_definitions(path) if Path(path).suffix.lower() == ".xml" else {name: read_matrix(path)}
+    if Path(path).suffix.lower() == ".xml":
+        return read_coordinate_definitions(path)
+    return {name: read_matrix(path)}
 
 
 def read_registration(path: str | os.PathLike) -> tuple[np.ndarray, str]:
