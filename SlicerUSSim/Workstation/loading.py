@@ -164,6 +164,8 @@ class Loading:
                 checks.append(
                     f"Check: the intensities of {mri.GetName()} do not follow the labels (of another patient?)"
                 )
+            elif mri is not None:
+                checks.append(_of_mri(mri))
             self._presenter.setNotes(f"{node.GetName()}: {found.message}", *checks)
             for warning in found.warnings:
                 self._presenter.view.showError(warning)
