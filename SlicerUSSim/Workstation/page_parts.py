@@ -24,8 +24,8 @@ def question_dialog() -> None:
             <h2 class="text-h6" id="question-title">{{{{ {question.title} }}}}</h2>
             <p class="text-body-2 my-2" id="question-text" style="overflow-wrap: anywhere">
             {{{{ {question.text} }}}}</p>
-            <div class="ussim-choices"><button v-for="(choice, n) in {question.choices}" :key="choice.key"
-            class="ussim-choice" :title="choice.tip" :autofocus="n === 0"
+            <div class="ussim-choices"><button v-for="choice in {question.choices}" :key="choice.key"
+            class="ussim-choice" :title="choice.tip"
             @click="trigger('answer', [{question.number}, choice.key])">
             {{{{ choice.title }}}}<small v-if="choice.tip">{{{{ choice.tip }}}}</small></button>
             <button class="ussim-choice" id="question-cancel" @click="{none}">Cancel
