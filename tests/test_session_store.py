@@ -291,7 +291,7 @@ def test_files_of_one_name_of_two_patients_are_not_taken_for_one_another(tmp_pat
     session, told = Kept(tmp_path / "own"), []
     session.goes_on.set()
     autosave, logic, _, calls, _ = autosave_of(session, told)
-    sent = autosave._opener.sent
+    sent = autosave._opener.sent_files
     for content in (b"first", b"second"):
         (tmp_path / "head.nii.gz").write_bytes(content)
         sent.forget()

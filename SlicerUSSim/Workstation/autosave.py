@@ -159,7 +159,7 @@ class Autosave:
         is_new_sequence = sequence is not None and sequence is not self._sequence_seen
         cine = self._cine.loop, self._cine.added
         seen = (
-            anatomy, tuple(self._opener.sent.files.items()), parameters.node.GetMTime(),
+            anatomy, tuple(self._opener.sent_files.files.items()), parameters.node.GetMTime(),
             None if pose is None else pose.tobytes(), fit is not None, sequence is not None, cine, repr(page),
             self._presenter.noteLines,
         )  # fmt: skip
@@ -189,7 +189,7 @@ class Autosave:
             sequence if is_new_sequence else None, sequence is not None,
             (replace(fit[0], simulator=None), fit[1]) if fit is not None and is_new_fit else None,
             fit is not None, self._cine.since(0 if is_new_loop else self._cine_seen[1]), is_new_loop,
-            dict(self._opener.sent.files),
+            dict(self._opener.sent_files.files),
         )  # fmt: skip
         self._seen, self._anatomy_seen, self._sequence_seen, self._fit_seen = seen, anatomy, sequence, fit
         self._cine_seen = cine

@@ -139,9 +139,9 @@ class Exports:
                 return "ultrasound.mrb", scene_file(self._app), "application/zip"
         if kind == "zip":
             text, missing = self._script()
-            sent = self._opener.sent
+            sent = self._opener.sent_files
             for name in missing:
-                require(name in sent.files, f"{name} was not opened in this page, expected it beside the script")
+                require(sent.has(name), f"{name} was not opened in this page, expected it beside the script")
             content = await asyncio.get_running_loop().run_in_executor(None, sent.bundle, text, missing)
             return "ultrasound.zip", content, "application/zip"
         if kind == "gif":

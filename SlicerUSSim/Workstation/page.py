@@ -20,6 +20,7 @@ from SlicerUSSim.Logic.mri.pathology import LESIONS
 from SlicerUSSim.Logic.tissue.label_advice import PAGE_SEVERAL
 from SlicerUSSim.Widget.controls import Control, Section
 from SlicerUSSim.Widget.presenter import FROZEN, TISSUE_COLUMNS
+from SlicerUSSim.Workstation.page_parts import question_dialog, registration_section
 from SlicerUSSim.Workstation.pose_widgets import pose_numbers
 from SlicerUSSim.Workstation.session_widgets import keep_session, session_offer
 from SlicerUSSim.Workstation.state import NAMES, ORGANS, PLANES, SLICE_VIEWS, ComparisonMode
@@ -102,6 +103,7 @@ def build_page(server: Server, sections: tuple[Section, ...], layout: LayoutMana
                 layout.initialize_layout_grid(page)
         _messages()
         _script_dialog()
+        question_dialog()
 
 
 def view_tools(_server: Server, _view_id: str, view: AbstractView) -> None:
@@ -132,6 +134,8 @@ def _drawer(sections: tuple[Section, ...]) -> None:
     html.Div(f"{{{{ {NAMES.title} }}}}", classes="text-caption px-4 pb-1 text-medium-emphasis", id="title")
     with v3.VExpansionPanels(multiple=True, v_model=(NAMES.open_sections,), variant="accordion"):
         for section in _in_order(sections):
+            if section.title.startswith("Fit"):
+                registration_section()
             with v3.VExpansionPanel(value=section.title):
                 v3.VExpansionPanelTitle(section.title, style="min-height: 36px; font-size: 13px")
                 with v3.VExpansionPanelText(eager=True, id=f"section-{section.title.replace(' ', '-').lower()}"):
@@ -162,7 +166,19 @@ def _open_file() -> None:
         """<label for="open-file">Open files</label>
         <input type="file" multiple id="open-file" @change="window.ussim.send($event.target, {for: 'open'})">""",
         classes="ussim-line",
-        title="An MRI, a label map (with its table), a tracked sequence, a scene (.mrb), sheets (.vtp), a preset",
+        title="Also dropped on the page: MRI, CT, label map (with its table), mask, DICOM, tracked ultrasound, its "
+        "calibration or registration, sheets (.vtp), a scene (.mrb), preset, pose. What they are is recognised by "
+        "their content",
+    )  # fmt: skip
+    html.Div(
+        """<label for="open-folder">Open a folder</label>
+        <input type="file" webkitdirectory id="open-folder"
+        @change="window.ussim.send($event.target, {for: 'open'})">""",
+        classes="ussim-line", title="Of DICOM images; of several series the one is asked",
+    )  # fmt: skip
+    html.Div(
+        f"""<div v-for="line in {NAMES.opened}">{{{{ line }}}}</div>""", id="opened", classes="ussim-opened",
+        raw_attrs=['aria-live="polite"'],
     )  # fmt: skip
     v3.VBtn(
         "Close patient", size="small", classes="mb-1", id="close-patient", click="trigger('press', ['closePatient'])",
@@ -374,7 +390,11 @@ def _screens(keys: tuple[str, ...]) -> None:
         with html.Div(classes="ussim-screen", v_show=f"{there} && {beside}"):
             html.Div(f"Real, {{{{ {NAMES.sequence.name} }}}}", classes="ussim-caption")
             with html.Div(classes="ussim-frame", id="real"):
-                html.Div('<canvas data-stream="real"></canvas>')
+                html.Div(
+                    f"""<canvas data-stream="real"
+                    :class="{{picking: {NAMES.registration.picking} === 'ultrasound'}}"
+                    @click="window.ussim.pickLandmark($event)"></canvas>"""
+                )
 
 
 def _player() -> None:

@@ -56,7 +56,7 @@ class PoseEntry:
     def type(self, text: str) -> None:
         """Set the pose from six or sixteen numbers; called in a task."""
         with self._presenter.shown():
-            self._set(pose_of_text(text))
+            self.set(pose_of_text(text))
 
     def open(self, name: str, content: bytes) -> None:
         """Set the pose from a file that a page has sent; called in a task."""
@@ -65,7 +65,7 @@ class PoseEntry:
             path = Path(folder) / name
             path.write_bytes(content)
             try:
-                self._set(self._tasks.doAside(lambda: read_pose(path)))
+                self.set(self._tasks.doAside(lambda: read_pose(path)))
             except SimulationError as error:
                 raise SimulationError(str(error).replace(f"{folder}{os.sep}", "")) from None
 
@@ -78,7 +78,8 @@ class PoseEntry:
             write_pose(path, pose)
             return path.name, path.read_bytes()
 
-    def _set(self, pose: np.ndarray) -> None:
+    def set(self, pose: np.ndarray) -> None:
+        """Move the probe to a pose, (4, 4) probe_to_ras. Raises SimulationError without a probe."""
         require(self._pose() is not None, _NO_PROBE)
         self._move(pose)
 

@@ -23,6 +23,8 @@ from SlicerUSSim.Workstation.export import Cine
 from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.opener import Opener, show_all_tissue
 from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.registration import Registration
+from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.script import LabelSource
 from SlicerUSSim.Workstation.session_store import KeptSession, SessionStore
 from SlicerUSSim.Workstation.state import PLANES, SLICE_VIEWS, ComparisonMode, SharedState
@@ -49,6 +51,7 @@ class Restoring:
         opener: Opener,
         presenter: PanelPresenter,
         loading: Loading,
+        registration: Registration,
         probe: ProbeControl,
         cine: Cine,
         when_kept: Callable[[Callable[[], None]], None],
@@ -56,6 +59,7 @@ class Restoring:
     ) -> None:
         self._store, self._shared, self._scene, self._logic, self._tasks = store, shared, scene, logic, tasks
         self._opener, self._presenter, self._loading = opener, presenter, loading
+        self._registration = registration
         self._probe, self._cine, self._when_kept, self._now = probe, cine, when_kept, now
         self._offered: KeptSession | None = None
 
@@ -80,7 +84,7 @@ class Restoring:
                     sent = self._tasks.doAside(lambda: session.copies("sent", Path(folder)))
                 self._take(record, session.content, fit, images)
                 for name, path in sent.items():
-                    self._opener.sent.keep(name, path)
+                    self._opener.sent_files.keep(name, path)
             self._offered = None
             self._show_offer()
             self._when_kept(session.remove)  # by the session of this server; until then it stays on the disk
@@ -104,8 +108,18 @@ class Restoring:
 
     # ---- into the scene ----------------------------------------------------------------------------------------
 
-    def take_scene(self, record: SceneRecord, name: str) -> None:
-        """Show the patient of a scene file in place of the present one."""
+    def open_scene(self, path: str) -> str:
+        """Show the patient of a scene file in place of the present one; returns what was done.
+
+        Nothing changes if it cannot be read.
+        """
+        before = self._opener.patient()
+        with self._presenter.view.progress(f"Open {Path(path).name}"):
+            record = self._tasks.doAside(lambda: read_scene(path))
+        self._take_scene(record, Path(path).name)
+        return f"shown as it was{f'; {before} is closed' if before else ''}"
+
+    def _take_scene(self, record: SceneRecord, name: str) -> None:
         self._take(record, {"values": dict(record.values)}, None, [])
         parameters = self._logic.parameters
         lines = [f"{name}: a scene"]
@@ -149,7 +163,7 @@ class Restoring:
         if pose is not None:
             self._put_probe(pose)
         if record.sequence is not None:
-            self._loading.take_sequence(record.sequence, preset.probe)
+            self._registration.restore(record.sequence, preset.probe)
             self._logic.preset = preset
         page = kept.get("page", {})
         self._show_page(page)

@@ -30,11 +30,14 @@ from SlicerUSSim.Workstation.loading import Loading
 from SlicerUSSim.Workstation.messages import Messages
 from SlicerUSSim.Workstation.observed import Observed
 from SlicerUSSim.Workstation.opener import Files, Opener
+from SlicerUSSim.Workstation.opening import Opening
 from SlicerUSSim.Workstation.page import build_page, view_tools
 from SlicerUSSim.Workstation.panel import BrowserPanel
 from SlicerUSSim.Workstation.pose_entry import PoseEntry
 from SlicerUSSim.Workstation.probe_control import ProbeControl
+from SlicerUSSim.Workstation.questions import Questions
 from SlicerUSSim.Workstation.receiver import Receiver
+from SlicerUSSim.Workstation.registration import Registration
 from SlicerUSSim.Workstation.restoring import Restoring
 from SlicerUSSim.Workstation.session_store import OwnSession, SessionStore
 from SlicerUSSim.Workstation.state import NAMES, SharedState
@@ -84,8 +87,16 @@ class Workstation:
         presenter.maskFile, presenter.sheetsFile = opener.mask_file, opener.sheets_file
         self._panel.pick = self._probe.hand.pick
         self._exports = Exports(app, logic, opener, cine, presenter.presetToSave)
+        self._registration = Registration(
+            shared, logic, tasks, opener, presenter, self._comparison, self._probe.hand
+        )  # fmt: skip
         self._loading = Loading(
-            shared, app, logic, tasks, opener, presenter, self._messages, self._views, self._probe, self._comparison
+            shared, app, logic, tasks, opener, presenter, self._messages, self._views, self._probe, self._comparison,
+            self._registration,
+        )  # fmt: skip
+        self._questions = Questions(shared, tasks)
+        self._opening = Opening(
+            shared, logic, tasks, opener, presenter, self._loading, self._registration, self._questions, self._poses
         )  # fmt: skip
 
         self._session = self._begun_session(sessions)
@@ -94,10 +105,10 @@ class Workstation:
         )
         self._restoring = Restoring(
             sessions if self._session is not None else None,
-            shared, app.scene, logic, tasks, opener, presenter, self._loading, self._probe, cine,
-            self._autosave.when_kept, perf_counter,
+            shared, app.scene, logic, tasks, opener, presenter, self._loading, self._registration,
+            self._probe, cine, self._autosave.when_kept, perf_counter,
         )  # fmt: skip
-        self._loading.take_scene = self._restoring.take_scene
+        self._opening.open_scene = self._restoring.open_scene
 
         self._following = False
         self._probe_node = Observed("TransformModifiedEvent", self._probe.moved)
@@ -154,7 +165,7 @@ class Workstation:
 
     def _answer_pages(self, buttons: Buttons, stamps: LatencyStamps) -> None:
         """Register the triggers by which pages call methods."""
-        probe, comparison = self._probe, self._comparison
+        probe, comparison, registration = self._probe, self._comparison, self._registration
         triggers: dict[str, Callable[..., object]] = {
             "set": self._panel.set,
             "press": buttons.press,
@@ -168,6 +179,15 @@ class Workstation:
             "aim_image": probe.aim_image,
             "play": comparison.play,
             "show_number": comparison.show,
+            "answer": self._questions.answer,
+            "calibrate": self._in_task(registration.calibrate),
+            "register": self._in_task(registration.register),
+            "choose_frame": self._in_task(registration.choose_frame),
+            "pick_landmark": registration.pick,
+            "landmark_in_image": registration.picked_in_image,
+            "add_landmark": registration.add_typed,
+            "remove_landmark": registration.remove_landmark,
+            "fit_landmarks": self._in_task(registration.fit),
             "cancel": self._panel.cancel,
             "dismiss": self._messages.dismiss,
             "export": self._export,
@@ -192,8 +212,8 @@ class Workstation:
     def _in_task(self, method: Callable[..., None]) -> Callable[..., None]:
         return lambda *arguments: self._tasks.start(lambda: method(*arguments))
 
-    def _open_files(self, files: dict[str, bytes]) -> None:
-        self._tasks.start(lambda: self._then_refresh(self._loading.open, files))
+    def _open_files(self, files: dict[str, bytes], meant: str) -> None:
+        self._tasks.start(lambda: self._then_refresh(self._opening.open, files, meant))
 
     def _add_file(self, name: str, content: bytes, tissue: str) -> None:
         self._tasks.start(lambda: self._then_refresh(self._loading.add, name, content, tissue))
