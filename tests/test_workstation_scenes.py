@@ -28,6 +28,7 @@ from SlicerUSSim.Workstation.scene_files import read_scene
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_presenter import PlainView
 from tests.test_workstation import (
+    answer_new_patient,
     browser as browser,
     click,
     download,
@@ -91,9 +92,10 @@ def page(browser, url):
 
 
 def open_scene(page, path: Path) -> None:
+    """Open a scene in place of the patient who is open, which the page asks."""
     before = page.evaluate("window.ussim.images")
     page.set_input_files("#open-file", path)
-    page.wait_for_function("() => !window.ussim.uploading")
+    answer_new_patient(page, "The patient of the scene")
     settled(page)
     assert page.evaluate("window.ussim.images") > before, errors(page)
 
@@ -109,10 +111,21 @@ def test_the_workstation_opens_the_scene_that_it_saved(page, files, tmp_path):
     image, where = pixels(page), page.evaluate("window.ussim.image.pose")
     shutil.copy(download(page, "mrb"), tmp_path / "saved.mrb")
     page.set_input_files("#open-file", files / "labels.nii.gz")
+    answer_new_patient(page)
     page.wait_for_function("window.ussim.image?.patient === 'labels.nii.gz'")
     page.evaluate("window.trame.trigger('set', ['gainSlider', -3])")
     settled(page)
+    page.set_input_files("#open-file", tmp_path / "saved.mrb")
+    page.wait_for_function("document.getElementById('question')?.dataset.number > 0")
+    page.keyboard.press("Escape")  # opens nothing
+    page.locator("#question").wait_for(state="detached")
+    settled(page)
+    assert state(page, NAMES.title) == "labels.nii.gz" and state(page, NAMES.opened) == []
     open_scene(page, tmp_path / "saved.mrb")
+    assert state(page, NAMES.opened) == [
+        "saved.mrb: a scene of 3D Slicer or of this page: shown as it was; labels.nii.gz is closed"
+    ]
+    assert state(page, NAMES.registration.recording).startswith("sweep: 6 images")
     assert not errors(page) and state(page, NAMES.title) == "head.nii.gz" and shown(page, "gainSlider") == 5
     np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), where, atol=1e-3)
     assert np.array_equal(pixels(page), image)
@@ -199,6 +212,7 @@ def test_a_scene_that_cannot_be_read_changes_nothing_on_the_page(page, module_sc
     before, title = pixels(page), state(page, NAMES.title)
     bad = changed(module_scene[0], tmp_path / "bad.mrb", r'fileName="[^"]*\.nrrd"', 'fileName="/etc/passwd"')
     page.set_input_files("#open-file", bad)
+    answer_new_patient(page, "The patient of the scene")
     page.locator(".ussim-error").first.wait_for()
     assert errors(page)[0].startswith("bad.mrb: names a file outside itself ('passwd')")
     settled(page)

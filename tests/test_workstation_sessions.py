@@ -24,6 +24,7 @@ from SlicerUSSim.Logic.base.volume import Volume, read_array
 from SlicerUSSim.Workstation.state import NAMES
 from tests.test_workstation import (
     PATIENCE_S,
+    answer_new_patient,
     browser as browser,
     click,
     download,
@@ -208,6 +209,7 @@ def test_the_folder_is_for_the_user_alone_and_holds_this_patient_only(server, br
     assert all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in session.iterdir())
     first = [path.name for path in session.glob("anatomy-*")]
     page.set_input_files("#open-file", files / "head.nii.gz")
+    answer_new_patient(page)
     page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
     settled(page)
     kept(page)
@@ -321,6 +323,7 @@ def test_scripts_run_after_uploads_also_of_files_with_one_name_and_after_a_resta
     page = opened(browser, own.url)
     settled(page)
     page.set_input_files("#open-file", files / "head.nii.gz")
+    answer_new_patient(page)
     page.wait_for_function("window.ussim.image?.patient === 'head.nii.gz'")
     settled(page)
     mri = Volume.read(files / "head.nii.gz")
