@@ -44,6 +44,8 @@ from tests.test_workstation import (
     state,
     views,
 )
+from tests.test_workstation_opening import dicom as dicom
+from tests.test_workstation_registration import recording as recording
 
 
 class Server:
@@ -357,4 +359,40 @@ def test_scripts_run_after_uploads_also_of_files_with_one_name_and_after_a_resta
     settled(page)
     assert np.array_equal(np.asarray(Image.open(download(page, "png"))), image)
     assert np.array_equal(bundled(page, tmp_path / "again"), image)
+    page.close()
+
+
+def test_a_dicom_series_and_ultrasound_calibrated_in_the_page_come_back_after_a_crash(
+    server, browser, files, dicom, recording, tmp_path
+):
+    own = server("--labels", str(files / "labels.nii.gz"))
+    page = opened(browser, own.url)
+    settled(page)
+    page.set_input_files("#open-file", sorted((dicom / "IMAGES" / "A").iterdir()))
+    answer_new_patient(page)
+    page.wait_for_function("window.ussim.image?.patient.startsWith('T1 MPRAGE')")
+    settled(page)
+    page.set_input_files("#open-file", recording["folder"] / "phantom.igs.mha")
+    settled(page)
+    for name, file in (("calibration", "plus.xml"), ("registration", "registration.txt")):
+        page.set_input_files(f"#{name}-file", recording["folder"] / file)
+        settled(page)
+    page.evaluate("window.trame.trigger('show_number', [5])")
+    settled(page)
+    image = np.asarray(Image.open(download(page, "png")))
+    assert np.array_equal(bundled(page, tmp_path / "script"), image)
+    assert not errors(page)
+    kept(page)
+    killed_and_started(own, page)
+    reloaded(page)
+    click(page, "#restore-session")
+    page.wait_for_function("window.ussim.image?.patient.startsWith('T1 MPRAGE')")
+    settled(page)
+    assert not errors(page) and np.array_equal(np.asarray(Image.open(download(page, "png"))), image)
+    assert np.array_equal(bundled(page, tmp_path / "again"), image)
+    assert state(page, NAMES.registration.recording).startswith("phantom: 6 images")
+    assert page.locator("#registration-from").inner_text() == "Registration as it was kept"
+    page.evaluate("window.trame.trigger('show_number', [0])")
+    settled(page)
+    np.testing.assert_allclose(page.evaluate("window.ussim.image.pose"), recording["poses"][0], atol=0.5)
     page.close()
